@@ -1,4 +1,4 @@
-"""Files of which a reader never meets half, texts read with care, and folders that one process works in."""
+"""Files replaced as a whole, texts read within bounds, and locks of folders."""
 
 import io
 import os

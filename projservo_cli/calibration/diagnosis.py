@@ -1,4 +1,4 @@
-"""What is wrong with readings that do not fit: joint readings, marker numbers, detections, a lens."""
+"""Diagnosis of outliers: wrong joint readings, exchanged marker numbers, wrong detections, a lens."""
 
 import dataclasses
 import itertools

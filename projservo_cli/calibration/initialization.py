@@ -1,4 +1,4 @@
-"""Where the adjustment starts: in a guessed metric frame the marker body, then the axes, then all places.
+"""Initialization of the adjustment: in a guessed metric frame markers, axes, then all places.
 
 Or from what is known of a robot and its rig beforehand, which is tried and never trusted.
 """

@@ -1,4 +1,4 @@
-"""How far joint readings are off: errors in variables, by restricted maximum likelihood, or counted in ticks.
+"""Noise of joint readings: errors in variables, by restricted maximum likelihood, or encoder counts.
 
 What is left of the images of pose k is r = J x + G δ + ε, with ε ~ N(0, σ² I) and δ ~ N(0, σ_q² I), the true
 joints less their readings: of covariance S = σ² I + σ_q² G Gᵀ. Errors of pixels scatter from marker to

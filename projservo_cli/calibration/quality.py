@@ -1,4 +1,4 @@
-"""Whether to trust a calibration: what the data leave open, the verdict in words, and held-out poses."""
+"""Quality of a calibration: observability of joints, the verdict in words, and cross-validation."""
 
 import dataclasses
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What a calibration works on, as flat lists, and refusals of what shows no motion or no two dimensions.
+"""Readings of a calibration as flat lists, and refusals of data without motion or without two dimensions.
 
 Everything here is known before any geometry: joint readings, marker numbers, pixels.
 """

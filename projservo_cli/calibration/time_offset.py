@@ -1,4 +1,4 @@
-"""By how much the images of each view are late, from what was seen on the way between trial poses.
+"""Time offset (latency) of the images of each view, from frames between trial poses.
 
 A frame that comes with the joint reading of an instant t_q shows the joints of t_q − d. What is seen less
 what is predicted for joints at t_q − d is noise; a wrong d shows along the image velocity J_q q̇. Each frame

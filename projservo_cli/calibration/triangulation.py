@@ -1,4 +1,4 @@
-"""Each marker by itself, where cameras and joints are known: its place by consensus, which sightings fit it.
+"""Triangulation of each marker where cameras and joints are known: its place by consensus, and its inliers.
 
 A marker has three unknowns and its sightings nothing else in common, so that all of this is linear in the
 number of sightings, whatever share of them is wrong.

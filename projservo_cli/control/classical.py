@@ -1,4 +1,4 @@
-"""Classical stereo laws, to compare with: stacked views, each view by itself, points in metres."""
+"""Classical image-based and position-based laws: stacked views, each view by itself, points in metres."""
 
 from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure, pseudo_inverse, put_view
 from projservo_cli.geometry.algebra import apply, mat, vec

@@ -1,4 +1,4 @@
-"""What every control law gets and gives.
+"""Contract of every control law.
 
 A compiled law is ``law(model, task, gains, s, q, state) -> status``: it sees the model, the task,
 the pixels ``s`` of the face, and after them of further markers of its body, as projective cameras would

@@ -1,4 +1,4 @@
-"""How the mathematics is compiled: one decorator, and a cache that never serves stale code.
+"""JIT compilation of the mathematics: one decorator, and a cache that never serves stale code.
 
 Numba decides whether cached machine code is fresh by the file of the function itself, so an edited
 helper in another file would go unnoticed. The cache folder therefore carries a hash of all sources

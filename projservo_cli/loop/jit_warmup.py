@@ -1,4 +1,4 @@
-"""Compiling what a first run needs later, in a process beside the one that calibrates: 10 s of 50."""
+"""JIT warm-up: compile for the first run in another process while one calibrates, 10 s of 50."""
 
 import sys
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What is told of a run in numbers, from its log and the truth."""
+"""Metrics of a run, from its log and the ground truth."""
 
 import math
 from typing import NamedTuple

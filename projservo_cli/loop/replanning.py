@@ -1,4 +1,4 @@
-"""A run that follows a path to the goal is watched, and a path searched again where it comes to nothing.
+"""Replanning: monitor a run that follows a path, and search another path when it fails.
 
 A path is searched again, from where the robot is, where
 

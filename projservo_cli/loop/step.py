@@ -1,4 +1,4 @@
-"""What one period of the loop does beside the law: limits, counting, verdict.
+"""One period of the loop without the law: limits, counting, verdict.
 
 Precedence of the verdicts of ``verdict_at`` at one instant, first match wins; ``loop.monitors`` states what
 rules before and after it:

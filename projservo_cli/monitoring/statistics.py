@@ -1,4 +1,4 @@
-"""How images may differ from their prediction while nothing is wrong, and tests of that."""
+"""Innovation statistics: how images may differ from their prediction without a fault, and tests of that."""
 
 from collections import deque
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Whether joints keep what must hold, as numbers with a sign, from the calibrated model alone.
+"""Constraints as signed numbers: joint limits, visibility, image borders, from the calibrated model alone.
 
 The margins are those of ``planning.margins``. Of a tool with several tags visibility, width and image are
 those of the tag that keeps them best.

@@ -1,4 +1,4 @@
-"""All joint vectors that show the goal: Newton's method from random joints, and whole turns of what it finds.
+"""Inverse kinematics: all goal configurations, by Newton's method from random joints and by whole turns.
 
 The points of the face are first brought to where they are at the goal, in the coordinates of the calibrated
 frame scaled to a_inf·A = 1, which is well behaved from everywhere; then its images, which have the last word.

@@ -1,4 +1,4 @@
-"""A path to the goal through joint space: straight, or by two trees that grow towards each other.
+"""Path in joint space to a goal configuration: straight, or by RRT-Connect; or the reason for none.
 
 J. Kuffner, S. LaValle, "RRT-Connect: an efficient approach to single-query path planning", ICRA 2000. What is
 found is shortened, rounded and timed. Random numbers are those of a seed and drawn before the trees grow: a

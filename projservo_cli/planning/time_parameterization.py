@@ -1,4 +1,4 @@
-"""From corners to joints over time: a path without stops, at the speeds and accelerations that joints have.
+"""Time parameterization of a path through waypoints: no stops, within speeds and accelerations of joints.
 
 Corners are rounded by parabolas as large as validity lets them be, so that the path is C¹. Its pace is the
 quickest on a grid: Q.-C. Pham, "A general, fast, and robust implementation of the time-optimal path

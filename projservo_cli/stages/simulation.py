@@ -1,4 +1,4 @@
-"""A simulated robot as robots are: late images, coarse encoders, servos that lag, sag and have play.
+"""Simulated robot with faults: latency, coarse encoders, servo lag, gravity sag and backlash.
 
 Its time passes in ``command`` alone, so that its runs are the same to the bit wherever they are made. A servo
 goes to its set-point in a straight line by the time that is due, and holds there; it follows with a lag of

@@ -1,4 +1,4 @@
-"""The world of a simulated experiment: robot, rig and markers as a configuration describes them."""
+"""Ground truth of a simulated experiment: robot, rig and markers as a configuration describes them."""
 
 import math
 from collections.abc import Sequence

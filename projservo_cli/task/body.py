@@ -1,4 +1,4 @@
-"""The body the face belongs to: where all its markers together say it is.
+"""Pose of the rigid body that the face belongs to, from all its markers.
 
 The markers' structure and the displacements a robot can make are known from the calibration. What is
 left to measure is one displacement, six coordinates, by all markers either camera sees.

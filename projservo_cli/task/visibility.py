@@ -1,4 +1,4 @@
-"""When a camera sees the face, and which way to turn it: [RH00] section 4.2.
+"""Visibility of the face (self-occlusion), and the sense in which to turn it: [RH00] section 4.2.
 
 The margin of a camera is a·O, carried along with the face by H⁻ᵀ; it changes sign exactly where the
 camera loses or gains sight of the face. Signs are relative to the face as first seen.
