@@ -41,7 +41,6 @@ LAW = (LawSetup, ForeignLaw, Gains)
 
 def python_interface() -> Iterator[str]:
     """The functions and classes of the Python interface."""
-    yield from ("### Functions and classes",)
     for item, members in INTERFACE.items():
         yield from _described(item, members)
 
@@ -59,13 +58,13 @@ def law_contract() -> Iterator[str]:
 
 def _described(item: Any, members: tuple[str, ...]) -> Iterator[str]:
     call = "" if inspect.isclass(item) else signature(item)
-    yield from ("", f"#### `{item.__name__}{call}`", "", *markdown(inspect.getdoc(item) or ""))
+    yield from ("", f"### `{item.__name__}{call}`", "", *markdown(inspect.getdoc(item) or ""))
     for name in members:
         found = inspect.getattr_static(item, name)
         method = not isinstance(found, property) and callable(getattr(item, name))
         call = signature(getattr(item, name)) if method else ""
         about = inspect.getdoc(found) or inspect.getdoc(getattr(item, name)) or ""
-        yield from ("", f"##### `{item.__name__}.{name}{call}`", "", *markdown(about))
+        yield from ("", f"#### `{item.__name__}.{name}{call}`", "", *markdown(about))
 
 
 def signature(function: Any) -> str:
@@ -81,9 +80,11 @@ def signature(function: Any) -> str:
 
 def markdown(docstring: str) -> list[str]:
     """Lines of a docstring, its sections as lists."""
-    text = re.sub(r"``(.+?)``", r"`\1`", docstring)
+    text = re.sub(r"``(.+?)``", lambda code: f"`{' '.join(code[1].split())}`", docstring, flags=re.DOTALL)
     text = re.sub(r"\n +(?=\S)", " ", text)  # what goes on in the next line
     text = re.sub(r"^(\w[\w ]*)\n-{3,}\n", r"\n**\1**\n\n", text, flags=re.MULTILINE)
     text = re.sub(r"^(\w+(?:, \w+)*) : ", lambda name: f"- `{name[1]}`: ", text, flags=re.MULTILINE)
-    text = re.sub(r"^(\w+(?:Error|Failed)|ImageModel|Observations) (?=\w)", r"- `\1`: ", text, flags=re.MULTILINE)
-    return text.split("\n")
+    text = re.sub(
+        r"^(\w+(?:Error|Failed)|ImageModel|Observations) (?=\w)", r"- `\1`: ", text, flags=re.MULTILINE
+    )
+    return re.sub(r"\n{3,}", "\n\n", text).split("\n")
