@@ -143,8 +143,8 @@ def test_a_region_of_one_image_bars_that_image():
 
 @pytest.fixture(scope="module")
 def drawn():
-    """The paper's task with the region of the page Guidance, in a profile, and its plan."""
-    page = (ROOT / "docs" / "guidance.md").read_text(encoding="utf-8")
+    """The paper's task with the region of the page on obstacles, in a profile, and its plan."""
+    page = (ROOT / "docs" / "how-to" / "keep-out-of-obstacles.md").read_text(encoding="utf-8")
     block = next(block for block in page.split("```text\n") if block.startswith("trajectory:"))
     region = yaml.safe_load(block.split("```")[0])["trajectory"]["keep_out"]
     calibration = calibrate.run(configured("paper"))[1]
