@@ -13,13 +13,28 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.canonical import File
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
+from projservo_cli.config.inputs import (
+    calibration_inputs,
+    joints_of,
+    plan_inputs,
+    recording_inputs,
+    servo_inputs,
+)
 from projservo_cli.display import checked_array, require_radians
-from projservo_cli.experiment import Experiment, compilation, law_target, listening, scene_of
+from projservo_cli.experiment import (
+    Experiment,
+    compilation,
+    law_target,
+    listening,
+    require_simulated,
+    scene_of,
+)
 from projservo_cli.files import working_in
 from projservo_cli.laws import CODES, REPLAN, law_and_mode, name_of
 from projservo_cli.observations import Observations, rows_of
-from projservo_cli.records import Calibration, InputError, Plan
+from projservo_cli.records import Calibration, InputError, JointList, Plan
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress
@@ -28,7 +43,7 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages.external_robot import foreign_robot
-from projservo_cli.stages.world import joints_of
+from projservo_cli.stages.record import Trials
 from projservo_cli.store import load as stored_run
 from projservo_cli.store import run_path
 from projservo_cli.store.sweep_table import TABLE, SweepTable
@@ -36,7 +51,6 @@ from projservo_cli.sweeps.design import Design, require_sound
 from projservo_cli.sweeps.engine import Engine
 from projservo_cli.sweeps.folder import Folder, run_sweep
 from projservo_cli.sweeps.study import Study
-from projservo_cli.tables import JointList
 
 _WITHOUT_TASKS = 20  # runs of a cell where no number of tasks tells it
 
@@ -82,15 +96,18 @@ def simulate(
         seeded = config.replace({"calibration.seed": seed})
         config, seed = (seeded, None) if q is None else (config, seed)
     with listening(progress) as listener:
+        require_simulated(config)
+        trials = calibration_inputs(config.model_copy(update={"data": None})).source
+        assert isinstance(trials, Trials)
         if q is None:
-            return calibrating.simulated(config, progress=listener.progress)
-        joints = joints_of(config)
+            return calibrating.simulated(trials, progress=listener.progress)
+        joints = joints_of(config).joints()
         poses = rows_of(q, len(joints.types))
         require_radians("q", poses, joints.types)
         for k, pose in enumerate(poses):
             if wrong := joints.limit_passed(pose):
                 raise InputError(f"q: pose {k}: {wrong}: choose another")
-        return calibrating.simulated(config, poses, seed, progress=listener.progress)
+        return calibrating.simulated(trials, poses, seed, progress=listener.progress)
 
 
 def record(
@@ -127,25 +144,27 @@ def record(
     """
     _require_config("record", config)
     asked = config if robot is None else _with_robot(config, robot)
-    further = None
+    given, further = recording_inputs(asked), None
+    joints = given.trials.joints.joints()
     if motions is not None:
-        rows = rows_of(motions, len(joints_of(asked).types))
+        rows = rows_of(motions, len(joints.types))
         further = JointList(np.arange(len(rows)), rows, numbered=False, left=None, right=None)
     table = None if path is None else Path(path)
     with ExitStack() as stack:
         listener = stack.enter_context(listening(progress))
         if table is not None:
             stack.enter_context(working_in(table.parent, name=f".{table.name}.lock"))
-        made = recording.new_recording(asked, table, motions=further, force=force)
+        made = recording.new_recording(given, table, motions=further, force=force)
         driven = None
-        if robot is not None:
-            driven = foreign_robot(asked, joints_of(asked), len(made.marker), robot)
-        recording.record(asked, made, driven, kept=table is not None, progress=listener.progress)
+        if robot is not None and given.trials.driven is not None and given.own is not None:
+            bounds = given.trials.driven.following.bounds(joints)
+            driven = foreign_robot(given.own, bounds, joints.types, len(made.marker), robot)
+        recording.record(given, made, driven, kept=table is not None, progress=listener.progress)
     return Observations.of(
         made.observation(),
         joint_types=asked.joint_types,
         image_size=asked.image_size_px,
-        seed=recording.seed_of_trials(asked),
+        seed=given.trials.motions.seed,
     )
 
 
@@ -214,7 +233,8 @@ def calibrate(
         seen = replace(seen, noise_px=checked.data.noise_px)
     if settings.seed is not None:
         seen = replace(seen, seed=settings.seed)
-    asked = calibrating.Estimation(settings.method, settings.lens, settings.init, settings.cross_validate)
+    file = None if settings.init is None else File.of(settings.init, "JSON with screws, cameras and markers")
+    asked = calibrating.Estimation(settings.method, settings.lens, file, settings.cross_validate)
     with listening(progress) as listener:
         made = calibrating.estimate(seen, asked, progress=listener.progress)
         return ImageModel.of(*made, seen.record)
@@ -251,10 +271,8 @@ def plan(
     _say_compilation()
     described = asked.arm is not None and asked.rig is not None
     described = described and asked.markers is not None and asked.markers.points is not None
-    joints = None
-    if asked.plant.simulated and not described:
-        joints = joints_of(asked, calibration.joint_types, calibration)
-    return MotionPlan.of(planning.run(asked, calibration, joints), scene_of(asked, calibration))
+    given = plan_inputs(asked, predicted=asked.plant.simulated and not described)
+    return MotionPlan.of(planning.run(given, calibration), scene_of(asked, calibration))
 
 
 def servo(
@@ -302,7 +320,7 @@ def servo(
     if robot is not None:
         asked = _with_robot(asked, robot)
     _say_compilation()
-    trace = driving.run(asked, calibration, plan, name_of(name, mode), given)
+    trace = driving.run(servo_inputs(asked), calibration, plan, name_of(name, mode), given)
     return RunTrace.of(trace, asked.face_numbers)
 
 

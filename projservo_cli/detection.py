@@ -3,6 +3,7 @@
 Which two images belong to which joint readings, tags in one image by OpenCV, and what all images show.
 """
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -12,8 +13,27 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, Observation, WorkFailed
-from projservo_cli.tables import JointList
+from projservo_cli.records import (
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    InputError,
+    JointList,
+    Observation,
+    WorkFailed,
+)
+
+DICTIONARY = "4X4_50"
+"""Of tags, where none is given."""
+
+
+def cells_of(dictionary: str) -> int:
+    """Cells along a side of a tag, border included, by the name of its dictionary."""
+    found = re.search(r"(\d+)([XH])\d", dictionary.upper())
+    if found is None:  # ARUCO_ORIGINAL
+        return 7
+    return 2 + (int(found[1]) if found[2] == "X" else math.isqrt(int(found[1])))
+
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from projservo_cli.config import Config, load_config, shipped, to_yaml
+from projservo_cli.config.inputs import joints_of, trajectory_of
 from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, law_and_mode
@@ -21,8 +22,7 @@ from projservo_cli.records import Calibration, CrossValidation, InputError, Obse
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
 from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress
-from projservo_cli.stages.steps import STAGES, Step, result_of, steps_for
-from projservo_cli.stages.world import joints_of
+from projservo_cli.steps import STAGES, Step, given_to, result_of, steps_for
 from projservo_cli.store import SERVO, Result, Run, load, run_path, save
 
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
@@ -174,22 +174,24 @@ class Chain:
         return after
 
     def _made(self, step: Step, run: Run) -> tuple[Any, ...]:
-        """What a stage makes; its module is imported when it is needed."""
+        """What a stage makes of what it is given; its module is imported when it is needed."""
+        given, progress = step.given or given_to(step.stage, self.config), self.listener.progress
         if step.stage == "calibrate":
             from projservo_cli.stages import calibrate
 
-            return calibrate.run(self.config, progress=self.listener.progress)
+            require_simulated(self.config)
+            return calibrate.run(given, progress=progress)
         if step.stage == "plan":
             from projservo_cli.stages import plan
 
-            return (plan.run(self.config, run.calibration),)
+            return (plan.run(given, run.calibration),)
         if step.stage == "servo":
             from projservo_cli.stages import servo
 
-            return (servo.run(self.config, run.calibration, run.plan, step.law),)
+            return (servo.run(given, run.calibration, run.plan, step.law),)
         from projservo_cli.stages import report
 
-        return (report.run(self.reported(run), run.path.parent, progress=self.listener.progress),)
+        return (report.run(given, self.reported(run), run.path.parent, progress=progress),)
 
     def _compiling(self) -> AbstractContextManager[None]:
         """What compiles beside the work where a calibration is made and runs are to follow."""
@@ -204,6 +206,15 @@ class Chain:
         """The first run on a machine is slower by the time of compilation; say so."""
         if any(step.why for step in self.steps) and (told := compilation()):
             self.listener.say(told)
+
+
+def require_simulated(config: Config) -> None:
+    """Refuse to simulate the trials of a robot that is not a simulated one, with an InputError."""
+    if not config.recorded and not config.plant.simulated:
+        raise InputError(
+            f"plant {config.plant.use} is calibrated from a table: record it, projservo record calibrate, or "
+            "name one with --data"
+        )
 
 
 def compilation() -> str:
@@ -385,13 +396,13 @@ class Experiment:
 
 def scene_of(config: Config, calibration: Calibration) -> Scene:
     """What plans of a configuration are drawn in."""
-    joints = joints_of(config, calibration.joint_types, calibration)
+    joints = joints_of(config).joints(calibration.joint_types, calibration)
     size = config.image_size_px
     return Scene(
         calibration.model(),
         joints.limits,
         None if size is None else np.array(size, dtype=np.float64),
-        config.trajectory,
+        trajectory_of(config),
     )
 
 

@@ -48,6 +48,10 @@ SIZES = {
 }
 
 
+# What to do where a robot of somebody's has no joint limits.
+LIMITS_MISSING = "set robot.limits, such as {from_data: 0.1}, or limits in robot.dh or robot.screws"
+
+
 def _array(dims: str, units: str = "1", about: str = "", **default: Any) -> Any:
     """Declare an array field: the names of its dimensions, its unit and what it holds."""
     return field(metadata={"dims": tuple(dims.split()), "units": units, "about": about}, **default)
@@ -655,3 +659,15 @@ class Report:
     )
     share: FloatArray = _array("share", about="share of the task in both sides of (22)")
     composition_mm: FloatArray = _array("share", "mm", "distance of the centre between both sides of (22)")
+
+
+@dataclass(frozen=True, eq=False)
+class JointList:
+    """Joint readings of numbered poses."""
+
+    pose: IntArray  # (K,) numbers; 0, 1 … where the file has none
+    q: FloatArray  # (K, n) readings, rad or m
+    numbered: bool  # whether the file has pose numbers
+    # left, right: names of the images of each pose; None where the file has none
+    left: tuple[str, ...] | None
+    right: tuple[str, ...] | None

@@ -9,7 +9,6 @@ import numpy.typing as npt
 
 from projservo_cli.calibration import predict, prediction_variance, residual_statistics
 from projservo_cli.calibration.prediction import error_factor, joint_derivative
-from projservo_cli.config.task import Trajectory
 from projservo_cli.display import Shown, require_radians
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.records import (
@@ -23,6 +22,7 @@ from projservo_cli.records import (
     Plan,
     Trace,
 )
+from projservo_cli.task.trajectory import Trajectory
 
 _AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
 _AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there

@@ -13,7 +13,6 @@ import math
 import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.files import lines_of, write_whole
-from projservo_cli.records import FloatArray, InputError, IntArray, Observation
+from projservo_cli.records import FloatArray, InputError, IntArray, JointList, Observation
 
 _MAX_JOINTS = 64  # as many as a configuration may have
 _MAX_COLUMNS = 10_000
@@ -35,18 +34,6 @@ _RECORDING = "recording"  # column that says which recording a row belongs to
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
 _INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-
-
-@dataclass(frozen=True, eq=False)
-class JointList:
-    """Joint readings of numbered poses."""
-
-    pose: IntArray  # (K,) numbers; 0, 1 … where the file has none
-    q: FloatArray  # (K, n) readings, rad or m
-    numbered: bool  # whether the file has pose numbers
-    # left, right: names of the images of each pose; None where the file has none
-    left: tuple[str, ...] | None
-    right: tuple[str, ...] | None
 
 
 def read_table(

@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 from projservo_cli.config import load_config
-from projservo_cli.config.task import Trajectory
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.stages.servo import drive
+from tests.configured import scenario_of, trajectory_of
 from tests.conftest import ROOT
 
 
@@ -18,17 +17,17 @@ def configured(name, *overrides):
 def known_scenario(config):
     """The scenario of a configuration whose face is measured point by point; nothing is calibrated."""
     control = config.control.model_copy(update={"observation": "points"})
-    return replace(scenario_of(config.model_copy(update={"control": control})), config=config)
+    return scenario_of(config.model_copy(update={"control": control}))
 
 
 def asked(profile="linear", samples=101, duration=None, ramp=0.0, **more):
     """A motion that is asked for."""
-    return Trajectory(profile=profile, samples=samples, duration_s=duration, ramp_s=ramp, **more)
+    return trajectory_of(profile=profile, samples=samples, duration_s=duration, ramp_s=ramp, **more)
 
 
 def planned(scenario, model, profile="linear", samples=11, **more):
     """Plan of a scenario with a model of it."""
-    delta = scenario.config.trajectory.delta
+    delta = scenario.inputs.trajectory.delta
     return plan_task(model, scenario.ends, asked(profile, samples, delta=delta, **more), scenario.demands)
 
 

@@ -12,6 +12,7 @@ from projservo_cli.cli.output import Console, wrapped
 
 # Predictions so many times the noise away come from another robot, or from other units.
 _FAR = 20.0
+_TAUGHT = "# What both cameras saw: projservo teach. Name this file under task.goal, or task.start.\n"
 
 
 @main.command("teach", epilog="Example: projservo teach results/mine -c mine.yaml -o goal.yaml")
@@ -58,11 +59,12 @@ def _teach(
     there is one: markers that are off, and whether any joints show it. A goal that none do ends in exit
     code 1.
     """
-    from projservo_cli.config.robot import JointVector
+    from projservo_cli.config import plain_yaml
+    from projservo_cli.config.inputs import joints_of, plan_inputs, teach_inputs
     from projservo_cli.files import write_whole
     from projservo_cli.records import InputError, WorkFailed
+    from projservo_cli.robots.settings import Readings
     from projservo_cli.stages import teach as stage
-    from projservo_cli.stages.world import joints_of
 
     output = output or Path("start.yaml" if start else "goal.yaml")
     option.require_new(output, force=force)
@@ -71,23 +73,25 @@ def _teach(
     if at is not None:
         try:
             values = tuple(float(value) for value in at.split(","))
-            put = JointVector(joints=values, unit=at_unit).values(joints_of(settings).types)
+            put = Readings(values, at_unit).values(joints_of(settings).joints().types).tolist()
         except ValueError as error:
             raise InputError(f"--at {at}: expected a number for each joint, with commas") from error
     calibration = option.calibration_of(run, settings)
     asks = not settings.plant.simulated and sys.stdin.isatty()
     with option.writing(output):
         try:
-            taught = stage.teach(settings, frames, put, console.wait if asks else None)
+            taught = stage.teach(teach_inputs(settings), frames, put, console.wait if asks else None)
             if not start:
-                stage.require_face(settings, taught)
-            check = None if calibration is None or start else stage.checked(settings, calibration, taught)
+                stage.require_face(settings.face_numbers, taught)
+            check = None
+            if calibration is not None and not start:
+                check = stage.checked(plan_inputs(settings), calibration, taught)
         except WorkFailed as error:
             reason = " ".join(str(error).split()).removeprefix("teach: ")
             value = {"file": output.resolve(), "failed": "teach", "reason": reason}
             console.tell(value, ["teach: failed, nothing was written"])
             raise WorkFailed(f"teach: {reason}") from error
-        write_whole(output, taught.as_text())
+        write_whole(output, _TAUGHT + plain_yaml(taught.as_goal()))
     _tell_taught(console, output, taught, check, key="task.start" if start else "task.goal")
     if check is not None and not check.reached:
         raise WorkFailed(f"{output}: by the calibration, {check.reason}")

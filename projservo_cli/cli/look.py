@@ -26,6 +26,7 @@ def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
     """
     target = option.one_run("show", run, output) or Path("results", "paper")
     from projservo_cli.config import load_config
+    from projservo_cli.config.inputs import joint_names_of
     from projservo_cli.report.report_data import stage_object
     from projservo_cli.store import SERVO, load
 
@@ -33,7 +34,7 @@ def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
     config = load_config(found.path, text=found.configuration)
     laws = list(found.traces)
     stages = list(dict.fromkeys(name.split("/")[0] for name in found.results))
-    values = {stage: stage_object(stage, found, config, laws) for stage in stages}
+    values = {stage: stage_object(stage, found, joint_names_of(config), laws) for stage in stages}
 
     def words() -> Iterator[str]:
         yield f"run: {found.path}"
@@ -75,6 +76,8 @@ def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: b
     """
     if len(runs) < 2:
         raise click.UsageError("compare needs two runs or more: projservo compare RUN RUN")
+    from projservo_cli.config import load_config
+    from projservo_cli.config.inputs import about_of, settings_of
     from projservo_cli.report.page import write_comparison
     from projservo_cli.store import load
 
@@ -82,7 +85,9 @@ def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: b
         raise click.UsageError(f"{output}: name a page to write, such as {output.name or 'runs'}.html")
     option.require_new(output, force=force)
     found = [load(target) for target in runs]
-    write_comparison(found, output)
+    configs = [load_config(run.path, text=run.configuration) for run in found]
+    abouts = [(run, about_of(config)) for run, config in zip(found, configs, strict=True)]
+    write_comparison(abouts, [settings_of(config) for config in configs], output)
     value = {"page": output.resolve(), "runs": [run.path.resolve() for run in found]}
     console.tell(value, [f"compare: {len(runs)} runs: {output}"])
 

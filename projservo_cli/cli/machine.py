@@ -160,11 +160,12 @@ def _bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> No
     in turn with one numpy.linalg.svd of an 8x6 matrix.
     """
     from projservo_cli import provenance
+    from projservo_cli.config.inputs import servo_inputs
     from projservo_cli.stages.bench import Case, timings
 
     console.say("compiling kernels where they are not in the cache, then measuring: half a minute")
     settings = option.configured(config, {"sets": sets})
-    result = timings(Case(settings))
+    result = timings(Case(servo_inputs(settings)))
     collected = provenance.collect(seed=settings.seed)
     machine = {name: collected[name] for name in _MACHINE}
     console.tell({**result, "machine": machine}, _timed(result, machine))

@@ -58,14 +58,15 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
         raise click.UsageError("--joint-unit is that of --motions, which is not given")
     if len(stages) > 1:
         return _make(console, stages, options)
+    from projservo_cli.config.inputs import recording_inputs
     from projservo_cli.stages.record import new_recording
 
     config, path = option.configured(options["config"], options), options["output"]
-    poses = _motions(config, options)
-    recording, reason = new_recording(config, path, motions=poses, force=options["force"]), ""
+    poses, given = _motions(config, options), recording_inputs(config)
+    recording, reason = new_recording(given, path, motions=poses, force=options["force"]), ""
     if not options["dry_run"]:
         with option.writing(path):
-            recording = new_recording(config, path, motions=poses, force=options["force"])
+            recording = new_recording(given, path, motions=poses, force=options["force"])
             reason = _drive(console, config, recording, confirm=options["confirm"])
     value = _told_recording(recording, reason)
     console.tell(value, [*words_of("record", value), *([f"table: {path}"] if path.exists() else [])])
@@ -92,6 +93,7 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
 
 def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> str:
     """Record what is pending, and say how far it is where that is interrupted; why it failed, if it did."""
+    from projservo_cli.config.inputs import recording_inputs
     from projservo_cli.records import WorkFailed
     from projservo_cli.stages.record import record
 
@@ -101,7 +103,7 @@ def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> s
     if recording.found and recording.pending:
         console.say(f"{recording.path}: continued after {recording.found} of {total} poses")
     try:
-        record(config, recording, progress=console.progress)
+        record(recording_inputs(config), recording, progress=console.progress)
     except WorkFailed as error:
         return " ".join(str(error).split()).removeprefix("record: ")
     except KeyboardInterrupt:
@@ -266,6 +268,7 @@ def _recorded(call: _Call) -> _Call:
 
 def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
     """What there is to record into the table that a calibration is made from."""
+    from projservo_cli.config.inputs import recording_inputs
     from projservo_cli.records import InputError
     from projservo_cli.stages.record import new_recording
 
@@ -278,7 +281,8 @@ def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
             f"{run.path}: its calibration comes from {stored.inputs['table']} and would be replaced by a "
             "simulated one; choose another folder with -o, or use --force"
         )
-    return new_recording(config, Path(table), motions=_motions(config, options), force=force, redo=True)
+    poses = _motions(config, options)
+    return new_recording(recording_inputs(config), Path(table), motions=poses, force=force, redo=True)
 
 
 def _asked(
@@ -289,7 +293,7 @@ def _asked(
     recording : where it was made just now.
     """
     from projservo_cli.experiment import Chain
-    from projservo_cli.stages.steps import Step, steps_for
+    from projservo_cli.steps import Step, steps_for
 
     given, records = _law_names(options.get("laws", ())), "record" in names
     config, stored = option.resolve(options, recording=records)
@@ -299,9 +303,7 @@ def _asked(
             "use --set calibration.method=refined"
         )
     if wanted := _extras(options):
-        from projservo_cli.stages.report import require
-
-        require(config, wanted)
+        require_extras(config, wanted)
     if records and recording is None:
         recording = _recording(config, stored, options)
     stages, why = [name for name in names if name != "record"], recording.why if records else ""
@@ -314,6 +316,26 @@ def _asked(
     if not options["dry_run"]:
         _require_named(chain, options)
     return _Call(console, options, chain)
+
+
+def require_extras(config: Any, wanted: Sequence[str]) -> None:
+    """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted."""
+    from projservo_cli.config.inputs import truth_of
+    from projservo_cli.records import InputError
+    from projservo_cli.report.animation import plotly
+
+    if config.task is None:
+        text = "shows runs of laws, which need a task: set task.start and task.goal"
+        raise InputError(f"--{wanted[0]}: {text}")
+    if "view" in wanted:
+        plotly()
+        try:
+            truth_of(config)
+        except InputError as error:
+            raise InputError(
+                "--view: images alone give a robot only up to a projective frame, which has no metres to "
+                f"draw; {error}, or use --animation, which shows what the cameras saw"
+            ) from error
 
 
 def _extras(options: Mapping[str, Any]) -> list[str]:
@@ -370,9 +392,10 @@ def _work(call: _Call) -> int:
         call.beside["calibrate"] = _suggestions(chain, count)
     if (wanted := _extras(call.options)) and not chain.lacks("report"):
         call.beside["report"] = _made_extras(console, chain, wanted)
+    from projservo_cli.config.inputs import joint_names_of
     from projservo_cli.report.report_data import failed_object, stage_object
 
-    values = {}
+    values, joints = {}, joint_names_of(chain.config)
     for name in chain.names:
         if name == "record":
             reason = chain.reason if chain.lacks(name) else ""
@@ -380,7 +403,7 @@ def _work(call: _Call) -> int:
         elif chain.lacks(name):
             values[name] = failed_object(name, chain.run, chain.reason, chain.failed, chain.laws_done)
         else:
-            values[name] = stage_object(name, chain.run, chain.config, chain.laws)
+            values[name] = stage_object(name, chain.run, joints, chain.laws)
             values[name] |= call.beside.get(name, {})
     words = [line for name in values for line in words_of(name, values[name], detailed=console.verbose)]
     words += [f"table: {chain.recording.path}"] if chain.recording is not None else []
@@ -409,37 +432,41 @@ def _announce(console: Console, chain: Any) -> None:
 
 def _suggestions(chain: Any, count: int) -> dict[str, Any]:
     """Further poses for the calibration, as JSON values; the list of them is written beside the run."""
+    from projservo_cli.config.inputs import suggestion_inputs
     from projservo_cli.records import WorkFailed
     from projservo_cli.stages.calibrate import suggest_motions
 
-    calibration, config = chain.run.calibration, chain.config
+    calibration, given = chain.run.calibration, suggestion_inputs(chain.config)
     path = chain.run.path.parent / "suggestions.csv"
     try:
-        found = suggest_motions(config, chain.run.observation, calibration, count, path)
+        found = suggest_motions(given, chain.run.observation, calibration, count, path)
     except WorkFailed as error:
         return {"suggestions": [], "suggestions_reason": str(error)}
-    unit = config.data.joint_unit if config.data is not None else None
     keys = ("q", "from_pose", "delta", "variance_before", "variance_after")
     return {
         "suggestions": [{key: getattr(one, key) for key in keys} for one in found],
         "suggestions_file": path.resolve(),
-        "suggestions_unit": unit or "rad",
-        "suggestions_limited": config.robot is not None,
+        "suggestions_unit": given.unit,
+        "suggestions_limited": chain.config.robot is not None,
     }
 
 
 def _made_extras(console: Console, chain: Any, wanted: Sequence[str]) -> dict[str, Path]:
     """Write what is wanted, and the page anew, which links to it; the paths by name."""
+    from projservo_cli.config.inputs import about_of, scenery_of
     from projservo_cli.report.page import write_page
     from projservo_cli.stages import report as reporting
 
-    told = chain.reported()
-    makers = {"view": reporting.view, "animation": reporting.animation}
-    made = {}
+    told, config, made = chain.reported(), chain.config, {}
     for name in wanted:
         console.detail(f"report: making the {name}")
-        made[name] = makers[name](told, console.progress).resolve()
-    write_page(replace(told, results={**told.results, "report": chain.run.results["report"]}))
+        if name == "view":
+            path = reporting.view(scenery_of(config), told, console.progress)
+        else:
+            path = reporting.animation(config.image_size_px, told, console.progress)
+        made[name] = path.resolve()
+    told = replace(told, results={**told.results, "report": chain.run.results["report"]})
+    write_page(told, about_of(config))
     return made
 
 

@@ -3,7 +3,6 @@
 from projservo_cli.config.loading import (
     Config,
     Override,
-    digest,
     load_config,
     load_sweep,
     overrides_of,
@@ -16,7 +15,6 @@ from projservo_cli.config.loading import (
 __all__ = [
     "Config",
     "Override",
-    "digest",
     "load_config",
     "load_sweep",
     "overrides_of",

@@ -6,7 +6,6 @@ and size are bounded.
 """
 
 import difflib
-import hashlib
 import json
 import math
 import pathlib
@@ -25,8 +24,8 @@ from projservo_cli.config.robot import CONTRADICTIONS, Finding, Root
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.files import text_of
 from projservo_cli.records import InputError
-from projservo_cli.robots.mjcf import read_mjcf
-from projservo_cli.robots.urdf import read_urdf
+from projservo_cli.simulation.mjcf import read_mjcf
+from projservo_cli.simulation.urdf import read_urdf
 
 try:  # of a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
     from yaml import CSafeLoader as _Parser
@@ -419,29 +418,6 @@ def plain_yaml(values: Any) -> str:
     return yaml.dump(
         values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
     )
-
-
-def digest(
-    config: Config,
-    keys: Sequence[str],
-    *,
-    without: Sequence[str] = (),
-    extra: Mapping[str, Any] | None = None,
-) -> str:
-    """SHA-256 of parts of a configuration, in hexadecimal.
-
-    ``keys`` are sections such as ``control``, or values in them such as ``noise.servo_px``, in any order,
-    less the values ``without``, such as ``control.laws``; ``extra`` are further JSON values.
-    """
-    values = config.model_dump(mode="json")
-    for section, key in (dotted.split(".") for dotted in without):
-        (values[section] or {}).pop(key, None)
-    parts = {}
-    for dotted in keys:
-        section, _, key = dotted.partition(".")
-        parts[dotted] = values[section][key] if key and values[section] is not None else values[section]
-    text = json.dumps([parts, extra or {}], sort_keys=True, allow_nan=False, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _spell_out(values: dict[str, Any]) -> None:

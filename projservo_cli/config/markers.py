@@ -1,7 +1,6 @@
 """Points fixed to the tool, and tags whose corners they are."""
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal
 
@@ -9,23 +8,12 @@ import numpy as np
 from pydantic import Field, PlainValidator, StringConstraints, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.config.robot import Finding, Matrix44, Positive, Section, Vector3, Whole, not_rigid
+from projservo_cli.config.robot import Finding, Positive, Section, Whole
+from projservo_cli.nominal import Matrix44, Vector3, not_rigid
 from projservo_cli.records import CORNERS, FloatArray
 
 GROUND = 4.0 / 3.0
 """How much wider a tag of six cells is with a bright margin of one cell than without."""
-
-DICTIONARY = "4X4_50"
-"""Of tags, where none is given."""
-
-
-def cells_of(dictionary: str) -> int:
-    """Cells along a side of a tag, border included, by the name of its dictionary."""
-    found = re.search(r"(\d+)([XH])\d", dictionary.upper())
-    if found is None:  # ARUCO_ORIGINAL
-        return 7
-    return 2 + (int(found[1]) if found[2] == "X" else math.isqrt(int(found[1])))
-
 
 _SIZE_M = 0.06  # of tags, where none is given
 _TILT = math.radians(35.0)  # of the four tags around the middle one of a roof

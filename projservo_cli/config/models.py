@@ -24,19 +24,18 @@ from projservo_cli.config.robot import (
     Finding,
     JointVector,
     NotNegative,
-    Number,
     Positive,
     Rig,
     RobotSettings,
     Root,
     Section,
-    Vector3,
     Whole,
     are_degrees,
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
 from projservo_cli.laws import LAW_SPECS, LAWS, POINT_LAWS, REPLAN
-from projservo_cli.records import InputError
+from projservo_cli.nominal import Number, Vector3
+from projservo_cli.records import LIMITS_MISSING, InputError
 from projservo_cli.robots import plugins
 
 
@@ -149,16 +148,6 @@ class Disturbance(Section):
             yield ("frame_offset_s",), "is that of cameras that run freely: set frame_rate_hz as well"
         if self.setpoint_ticks and self.encoder_ticks is None:
             yield ("setpoint_ticks",), "takes the ticks of encoders: set encoder_ticks as well"
-
-
-# Disturbances of joints or of time, which befall trials as well: what a calibration has to reckon with.
-FAULTS = (
-    *("delay_s", "exposure_s", "jitter_s", "frame_rate_hz", "frame_offset_s", "stamps"),
-    *("encoder_ticks", "setpoint_ticks", "lag_s", "sag_deg", "flex_deg", "play_deg"),
-)
-
-# What to do where a robot of somebody's has no joint limits.
-LIMITS_MISSING = "set robot.limits, such as {from_data: 0.1}, or limits in robot.dh or robot.screws"
 
 
 def _law(name: str) -> str:
@@ -732,15 +721,3 @@ class Settings(Root):
         if self.data is not None and self.data.image_size_px is not None:
             return self.data.image_size_px
         return self.rig.image_size_px if self.rig is not None else None
-
-    @property
-    def is_by_contract(self) -> bool:
-        """Whether a law drives a robot of the contract: none that stands wherever it is sent."""
-        return self.plant.use is not None or self.disturbance != Disturbance()
-
-    @property
-    def is_ideal(self) -> bool:
-        """Whether what is driven is known to have the joints that are read, and images of that moment."""
-        none = Disturbance()
-        faults = any(getattr(self.disturbance, name) != getattr(none, name) for name in FAULTS)
-        return self.plant.use is None and not faults

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field
 
 from projservo_cli.config.models import FolderName, Plain, one_or_more
-from projservo_cli.config.robot import Count, Finding, Number, Positive, Root, Section, Whole
+from projservo_cli.config.robot import Count, Finding, Positive, Root, Section, Whole
+from projservo_cli.nominal import Number
 
 BASE, LAW = "base", "law"  # names of axes with a meaning of their own
 

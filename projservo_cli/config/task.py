@@ -12,13 +12,12 @@ from projservo_cli.config.robot import (
     Finding,
     JointVector,
     NotNegative,
-    Number,
     Positive,
     Section,
     Vector2,
-    Vector3,
     Whole,
 )
+from projservo_cli.nominal import Number, Vector3
 
 
 class _Perturbation(Section):
@@ -209,13 +208,3 @@ class Trajectory(Section):
         description="outlines of obstacles, each {left: [[u, v], ...], right: [[u, v], ...], hides: true}, "
         "that no marker enters, nor what is between those of the face",
     )
-
-    @property
-    def rehearses(self) -> bool:
-        """Whether half turns are rehearsed; where shares are searched for both senses are compared."""
-        return self.profile not in ("constrained", "auto")
-
-    @property
-    def needs_covariance(self) -> bool:
-        """Whether a plan takes the covariance of the calibration: searches through joint space, regions."""
-        return self.profile in ("joint", "auto") or bool(self.keep_out)

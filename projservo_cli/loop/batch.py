@@ -27,7 +27,7 @@ from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import Ended, Summary, summarize
 from projservo_cli.loop.step import CONVERGED, RUNNING, Limits, Log, new_log
 from projservo_cli.records import FloatArray, JointLimits, Model
-from projservo_cli.robots.simulated import Ends, Plant
+from projservo_cli.simulation.ideal import Ends, Plant
 from projservo_cli.task.body import NO_BODY, Body
 from projservo_cli.task.face import (
     FOUND,

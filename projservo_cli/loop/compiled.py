@@ -10,7 +10,7 @@ from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.loop.step import RUNNING, WAITING, Command, Instant, Limits, Log, bounded, note, verdict_at
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Plant, observe, rig_distance
+from projservo_cli.simulation.ideal import Plant, observe, rig_distance
 
 
 class Course(NamedTuple):

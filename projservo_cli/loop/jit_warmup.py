@@ -23,7 +23,7 @@ from projservo_cli.planning.margins import (
     room_along,
 )
 from projservo_cli.records import JointLimits, Model
-from projservo_cli.robots.simulated import Ends, Plant
+from projservo_cli.simulation.ideal import Ends, Plant
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import NO_PARTS
 

@@ -8,7 +8,7 @@ from projservo_cli.geometry.jit import composed, merged, njit
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.loop.step import CONVERGED, Log
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Ends, Plant, shows_face
+from projservo_cli.simulation.ideal import Ends, Plant, shows_face
 from projservo_cli.task.face import center_of
 
 MM = 1e3

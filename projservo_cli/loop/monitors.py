@@ -28,7 +28,7 @@ from projservo_cli.loop.step import (
     verdict_at,
 )
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Plant
+from projservo_cli.simulation.ideal import Plant
 
 
 class Monitored(Protocol):

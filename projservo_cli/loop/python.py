@@ -82,7 +82,7 @@ class _LoopPlant(Monitored, Protocol):
     q: FloatArray  # (n,) joints as they are, or as they were read
     H: FloatArray  # (4, 4) displacement of the face from the reference
     hidden: FloatArray
-    in_front: bool  # hidden, in_front: as of ``robots.simulated.observe``, when last observed
+    in_front: bool  # hidden, in_front: as of ``simulation.ideal.observe``, when last observed
     markers: int  # how many are observed, those of the face first
     takes_parts: bool  # whether a long step is sent in the parts that the law split it into
     weight: FloatArray | None  # (2, markers) of the pixels last observed in a fit; None for one

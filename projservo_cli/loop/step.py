@@ -28,7 +28,7 @@ from projservo_cli.control.law import LOST, SINGULAR, limit_speed
 from projservo_cli.geometry.jit import merged
 from projservo_cli.geometry.kinematics import beyond_limits
 from projservo_cli.records import FloatArray, IntArray
-from projservo_cli.robots.simulated import Plant, inside
+from projservo_cli.simulation.ideal import Plant, inside
 
 RUNNING = -1
 WAITING = -3  # for lost markers; no verdict of a run

@@ -17,13 +17,20 @@ from markupsafe import Markup
 
 from projservo_cli.calibration import WEAK_NOISE, chi2_band
 from projservo_cli.calibration.readings import REACH_M, REACH_RAD
-from projservo_cli.config import Config, load_config
 from projservo_cli.files import lies_inside, write_whole
 from projservo_cli.laws import name_of
 from projservo_cli.records import Plan, Report
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows
-from projservo_cli.report.report_data import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, VIEWS, stage_object, title
+from projservo_cli.report.report_data import (
+    ANIMATION_FILE,
+    PAGE_FILE,
+    VIEW_FILE,
+    VIEWS,
+    About,
+    stage_object,
+    title,
+)
 from projservo_cli.report.style import FORMATS, power_of_ten
 from projservo_cli.store import Run
 
@@ -173,7 +180,6 @@ class _View(NamedTuple):
 
     name: str
     folder: str  # that of the run, relative to the page
-    config: Config
     configuration: str
     made: list[tuple[str, str]]  # property and value of what made it
     extras: list[tuple[str, str]]  # label and path of what lies beside the page
@@ -187,25 +193,24 @@ class _View(NamedTuple):
     pictures: dict[str, list[_Picture]]
 
 
-def _view(run: Run, *, folder: str = "", prefix: str = "") -> _View:
+def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> _View:
     """What the page shows of a run in a ``folder``; ``prefix`` sets its names off from those of others."""
-    config, beside = load_config(run.path, text=run.configuration), run.path.parent
+    beside = run.path.parent
     stages = {name.split("/")[0] for name in run.results}
-    found = {stage: stage_object(stage, run, config, list(run.traces)) for stage in stages}
+    found = {stage: stage_object(stage, run, about.joints, list(run.traces)) for stage in stages}
     report: Report | None = run.results["report"].records[""] if "report" in stages else None
     left_out: dict[str, list[str]] = {}
     for entry in report.left_out if report else ():
         left_out.setdefault(entry["reason"], []).append(entry["what"])
     return _View(
-        config.name,
+        about.name,
         folder,
-        config,
-        run.configuration,
-        list(_made(run, config)),
+        about.configuration,
+        list(_made(run, about)),
         [(label, folder + name) for name, label in _EXTRAS.items() if (beside / name).is_file()],
-        calibration=_calibration(found["calibrate"], config) if "calibrate" in found else None,
+        calibration=_calibration(found["calibrate"], about) if "calibrate" in found else None,
         plan=found["plan"] | _visibility(run.plan) if "plan" in found else None,
-        laws=[_law(trace, config) for trace in found["servo"]["laws"]] if "servo" in found else [],
+        laws=[_law(trace, about) for trace in found["servo"]["laws"]] if "servo" in found else [],
         reported=report is not None,
         claims=report.claims if report else (),
         drift=_drift(report) if report else None,
@@ -214,10 +219,10 @@ def _view(run: Run, *, folder: str = "", prefix: str = "") -> _View:
     )
 
 
-def _made(run: Run, config: Config) -> Iterator[tuple[str, str]]:
+def _made(run: Run, about: About) -> Iterator[tuple[str, str]]:
     """What was run, from what and with what; a value that stages differ in stands with its stages."""
-    yield "configuration", f"{config.name}, {'recorded' if config.recorded else 'simulated'}"
-    yield "seed", str(config.seed)
+    yield "configuration", f"{about.name}, {'recorded' if about.recorded else 'simulated'}"
+    yield "seed", str(about.seed)
     inputs = {key: text for result in run.results.values() for key, text in result.inputs.items()}
     for key, text in inputs.items():
         yield key.replace("_sha256", " sha256"), text
@@ -245,9 +250,8 @@ def _told(key: str, made: Mapping[str, Any]) -> str:
     return "" if value is None else str(value)
 
 
-def _calibration(found: dict[str, Any], config: Config) -> dict[str, Any]:
+def _calibration(found: dict[str, Any], about: About) -> dict[str, Any]:
     """Plain values of a calibration with its sentences, and its numbers with their labels and units."""
-    estimated = config.data is not None and config.data.noise_px is None
     lens = [
         (f"lens of the {view} camera, {k}", terms[k], "")
         for view, terms in (found["lens"] or {}).items()
@@ -269,7 +273,10 @@ def _calibration(found: dict[str, Any], config: Config) -> dict[str, Any]:
         *_joints_and_time(found),
         ("time", found["seconds"], "s"),
     ]
-    return found | {"words": list(_calibration_words(found, estimated=estimated)), "numbers": numbers}
+    return found | {
+        "words": list(_calibration_words(found, estimated=about.estimates_noise)),
+        "numbers": numbers,
+    }
 
 
 def _joints_and_time(found: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
@@ -294,9 +301,9 @@ def _visibility(plan: Plan) -> dict[str, Any]:
     return {"views": views, "senses": np.degrees(plan.sense).tolist()}
 
 
-def _law(trace: dict[str, Any], config: Config) -> dict[str, Any]:
+def _law(trace: dict[str, Any], about: About) -> dict[str, Any]:
     told = {"title": title(name_of(trace["law"], trace["mode"])), "words": _law_words(trace)}
-    must = config.control.requires(trace["law"])
+    must = about.requires(trace["law"])
     return trace | told | {"converged": trace["verdict"] == "converged", "must": must}
 
 
@@ -310,11 +317,11 @@ def _drift(report: Report) -> dict[str, Any] | None:
     return {"gains": report.gain_per_step.tolist(), "rows": rows}
 
 
-def _differences(views: list[_View]) -> list[tuple[str, list[str]]]:
+def _differences(settings: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[str]]]:
     """Settings in which runs differ: the key, and what each run has; empty where it lacks the key."""
-    flat = [dict(_leaves("", view.config.model_dump(mode="json", exclude_none=True))) for view in views]
-    keys = dict.fromkeys(key for settings in flat for key in settings)
-    rows = [(key, [settings.get(key, "") for settings in flat]) for key in keys]
+    flat = [dict(_leaves("", of_run)) for of_run in settings]
+    keys = dict.fromkeys(key for of_run in flat for key in of_run)
+    rows = [(key, [of_run.get(key, "") for of_run in flat]) for key in keys]
     return [(key, values) for key, values in rows if len(set(values)) > 1]
 
 
@@ -356,38 +363,41 @@ def template(name: str) -> "Template":
     return environment.get_template(name)
 
 
-def write_page(run: Run) -> Path:
+def write_page(run: Run, about: About) -> Path:
     """Write the page of a run into its folder, from the run and the figures that lie there.
 
-    Raises InputError if the configuration cannot be read or the page cannot be written.
+    Raises InputError if the page cannot be written.
     """
     path = run.path.parent / PAGE_FILE
-    _write(path, [_view(run)])
+    _write(path, [_view(run, about)], [])
     return path
 
 
-def write_comparison(runs: Sequence[Run], path: Path) -> None:
+def write_comparison(
+    runs: Sequence[tuple[Run, About]], settings: Sequence[Mapping[str, Any]], path: Path
+) -> None:
     """Write one page that shows runs side by side; their figures are read from their folders.
 
-    Raises InputError if a configuration cannot be read or the page cannot be written.
+    settings : of the configuration of each run.
+    Raises InputError if the page cannot be written.
     """
     base, views = path.parent.resolve(), []
-    for k, run in enumerate(runs, 1):
+    for k, (run, about) in enumerate(runs, 1):
         folder = Path(os.path.relpath(run.path.parent.resolve(), base)).as_posix()
-        views.append(_view(run, folder=f"{folder}/", prefix=f"run{k}-"))
+        views.append(_view(run, about, folder=f"{folder}/", prefix=f"run{k}-"))
     shared = Counter(view.name for view in views)
     named = [
         view._replace(name=f"{view.name} ({view.folder[:-1]})") if shared[view.name] > 1 else view
         for view in views
     ]
-    _write(path, named)
+    _write(path, named, settings)
 
 
-def _write(path: Path, views: list[_View]) -> None:
+def _write(path: Path, views: list[_View], settings: Sequence[Mapping[str, Any]]) -> None:
     claims = _side_by_side((v.claims for v in views), itemgetter("claim", "source", "criterion"))
     pictures = {}
     for section in SECTIONS:
         numbered = _side_by_side((v.pictures[section] for v in views), attrgetter("number"))
         pictures[section] = [numbered[number] for number in sorted(numbered, key=int)]
-    told = {"views": views, "claims": claims, "differences": _differences(views), "pictures": pictures}
+    told = {"views": views, "claims": claims, "differences": _differences(settings), "pictures": pictures}
     write_whole(path, template("page.html").render(told))

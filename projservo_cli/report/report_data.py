@@ -8,15 +8,14 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.config import Config
-from projservo_cli.config.task import Trajectory
+from projservo_cli.canonical import File
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.laws import IMAGE_TRACK, REPLAN, TRACK, law_and_mode, title_of
+from projservo_cli.laws import IMAGE_TRACK, POINT_LAWS, REPLAN, TRACK, law_and_mode, title_of
 from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
     WHY_LOST,
@@ -28,8 +27,10 @@ from projservo_cli.records import (
     Plan,
     Trace,
 )
-from projservo_cli.robots.simulated import Arm, Plant
+from projservo_cli.simulation.arm import Arm
+from projservo_cli.simulation.ideal import Plant
 from projservo_cli.store import Run
+from projservo_cli.task.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -104,7 +105,7 @@ class Material(Fit):
     traces: Mapping[str, Trace] = field(default_factory=dict)  # runs of the laws by name
     studies: Studies | None = None  # extra runs; None where they could not be made
     no_studies: str = ""  # why not
-    trajectory: Trajectory = field(default_factory=Trajectory, kw_only=True)  # what the plan was asked for
+    trajectory: Trajectory = field(kw_only=True)  # what the plan was asked for
     plateau_steps: int = 20  # steps in which the error of a run that stands still falls by less than 1 %
 
     def compared(self) -> list[str]:
@@ -238,11 +239,35 @@ def curve_difference(first: FloatArray, second: FloatArray) -> FloatArray:
     return min(np.abs(first[:k] - second[:k]), np.abs(first[:k] + second[:k]), key=np.max)
 
 
-def stage_object(stage: str, run: Run, config: Config, laws: Sequence[str]) -> dict[str, Any]:
-    """The JSON object of a stage that was made or is up to date."""
+class About(NamedTuple):
+    """What a page tells of a configuration."""
+
+    name: str
+    seed: int
+    recorded: bool  # whether the calibration comes from a table
+    estimates_noise: bool  # whether that of its pixels is estimated
+    joints: tuple[str | None, ...]  # names of the joints
+    required: tuple[str, ...] | None  # laws that must converge; None for all but classical ones
+    text: tuple[str | File, ...]  # all of it as YAML, of which files are parts
+
+    def requires(self, law: str) -> bool:
+        """Tell whether a law that does not converge fails the call: by default all but classical ones."""
+        return law not in POINT_LAWS if self.required is None else law in self.required
+
+    @property
+    def configuration(self) -> str:
+        """All of it as YAML."""
+        return "".join(part.path if isinstance(part, File) else part for part in self.text)
+
+
+def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequence[str]) -> dict[str, Any]:
+    """The JSON object of a stage that was made or is up to date.
+
+    names : of the joints as far as somebody gave them some; laws : names of their runs.
+    """
     path = {"run": run.path.resolve()}
     if stage == "calibrate":
-        return path | _calibration(run, config)
+        return path | _calibration(run, names)
     if stage == "plan":
         return path | _plan(run)
     if stage == "servo":
@@ -270,12 +295,11 @@ def _scalars(record: Any) -> dict[str, Any]:
     return {name: getattr(record, name) for name in fields}
 
 
-def _calibration(run: Run, config: Config) -> dict[str, Any]:
+def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
     calibration = run.calibration
-    given = config.robot.joints if config.robot is not None else ()
     joints = [
         {
-            "name": (given[i].name if i < len(given) else None) or f"q{i + 1}",
+            "name": (names[i] if i < len(names) else None) or f"q{i + 1}",
             "type": letter,
             "excitation": float(calibration.excitation[i]),
             "noise": float(calibration.prediction_noise[i]),
@@ -292,8 +316,8 @@ def _calibration(run: Run, config: Config) -> dict[str, Any]:
             for view, (u, v, r, k1, k2) in terms
         }
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
-    names = ("sigma_q_interval", "sigma_scale_interval", "delay_s", "delay_interval_s", "delay_jitter_s")
-    own = {name: getattr(calibration, name) for name in names}
+    more = ("sigma_q_interval", "sigma_scale_interval", "delay_s", "delay_interval_s", "delay_jitter_s")
+    own = {name: getattr(calibration, name) for name in more}
     return _scalars(calibration) | own | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 
 

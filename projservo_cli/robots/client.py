@@ -21,7 +21,7 @@ from projservo_cli.records import BoolArray, ByteArray, FloatArray, IntArray
 from projservo_cli.robots.contract import ForeignRobot
 from projservo_cli.robots.latency import DelayPrior, Delays, squares_by_joints
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.robots.simulated import Plant, observe
+from projservo_cli.simulation.ideal import Plant, observe
 
 # Weight in the fit of a law that a sighting keeps which is off by itself.
 _REJECTED = 1e-3

@@ -6,6 +6,7 @@ least times, which a busy machine disturbs the least.
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from timeit import timeit
 from typing import Any, NamedTuple
@@ -13,15 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.config import Config
 from projservo_cli.control.law import ERRORS, Law, State, new_state
 from projservo_cli.laws import CODES, LAWS
 from projservo_cli.loop.compiled import Course, many_steps, run_compiled
 from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.loop.step import Log, new_log
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Plant
-from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.simulation.ideal import Plant
+from projservo_cli.stages.scenario import run_scenario
+from projservo_cli.stages.task import ServoInputs
 from projservo_cli.task.face import Task
 
 STATES, STEPS, PIECE, ROUNDS = 256, 150, 64, 200
@@ -42,9 +43,8 @@ class _Job(NamedTuple):
 class Case:
     """A noisy run of 256 states of a simulated task and all that a step needs, with the true model."""
 
-    def __init__(self, config: Config) -> None:
-        body = {"control": config.control.model_copy(update={"observation": "body"})}
-        scenario = scenario_of(config.model_copy(update=body))
+    def __init__(self, inputs: ServoInputs) -> None:
+        scenario = run_scenario(replace(inputs, plan=replace(inputs.plan, features="body")))
         shown, gains = scenario.exact, scenario.gains
         self.m, self.q_start, self.model, self.gains = scenario.m, shown.q_start, scenario.model, gains
         self.limits = scenario.limits._replace(

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,66 +13,29 @@ from projservo_cli.calibration import (
     calibrate,
     cross_validate,
 )
-from projservo_cli.config import Config
+from projservo_cli.canonical import File
 from projservo_cli.files import write_whole
+from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import Suggestion, suggest
 from projservo_cli.planning.prediction_covariance import Region
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, Observation
+from projservo_cli.robots.settings import JointSettings
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.record import observed, seed_of_trials
+from projservo_cli.stages.record import Trials, observed
 from projservo_cli.stages.scenario import SUGGESTIONS, generator
-from projservo_cli.stages.world import joints_of
 from projservo_cli.tables import read_table, to_csv
 
 
-def run(
-    config: Config, *, progress: Progress = silent
-) -> tuple[Observation, Calibration, CrossValidation | None]:
-    """Calibrate from simulated trial motions, or from the recorded table of the configuration.
+class Table(NamedTuple):
+    """A recorded table, and what is known of it."""
 
-    Returns what was seen, the calibration, and its held-out errors if the configuration asks for them.
-    """
-    seen, settings = observe(config, progress=progress), config.calibration
-    if settings.joint_noise_deg is not None:
-        seen = replace(seen, joint_noise=float(np.radians(settings.joint_noise_deg)))
-    asked = Estimation(settings.method, settings.lens, settings.init, settings.cross_validate)
-    return seen.record, *estimate(seen, asked, progress=progress)
-
-
-def observe(config: Config, *, progress: Progress = silent) -> Observations:
-    """Return what the table of a configuration holds, or its simulated trial motions show."""
-    if config.data is None:
-        return simulated(config, progress=progress)
-    table, noise_px = (
-        read_table(config.data.table, config.joint_types, config.data.joint_unit),
-        config.data.noise_px,
-    )
-    return Observations.of(
-        table,
-        joint_types=config.joint_types,
-        image_size=config.image_size_px,
-        noise_px=noise_px,
-        seed=seed_of_trials(config),
-    )
-
-
-def simulated(
-    config: Config, q: FloatArray | None = None, seed: int | None = None, *, progress: Progress = silent
-) -> Observations:
-    """Return what the trial motions of the simulated robot show, or poses (K, n), rad or m."""
-    observation, noise_px = observed(config, q, seed, progress=progress)
-    return Observations.of(
-        observation,
-        joint_types=config.joint_types,
-        image_size=config.image_size_px,
-        noise_px=noise_px,
-        # Where joints or images have faults, χ² of pixel noise alone decides no more than in a recording.
-        joint_noise=0.0 if config.is_ideal else None,
-        source="simulated",
-        exact=config.is_ideal,
-        seed=seed_of_trials(config),
-    )
+    file: File
+    joint_types: str | None  # one letter a joint, R or P; None for R
+    joint_unit: str | None  # of revolute joints, deg or rad; None for rad unless readings look like degrees
+    image_size: tuple[int, int] | None  # width and height, px, if they are known
+    noise_px: float | None  # standard deviation of a coordinate; None to estimate it
+    seed: int  # of random starts
 
 
 @dataclass(frozen=True)
@@ -80,16 +44,68 @@ class Estimation:
 
     method: str = "refined"  # or closed_form
     lens: bool = False  # whether to estimate two coefficients of radial distortion a camera
-    init: str | None = None  # JSON file of a robot and rig that are tried first as a start
+    init: File | None = None  # JSON of a robot and rig that are tried first as a start
     cross_validate: int | None = None  # parts into which poses are divided to predict each from the others
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationInputs:
+    """What a calibration is made from."""
+
+    source: Table | Trials
+    estimation: Estimation
+    joint_noise: float | None  # rms of joint readings less true angles, rad; None for what the source tells
+
+
+def run(
+    inputs: CalibrationInputs, *, progress: Progress = silent
+) -> tuple[Observation, Calibration, CrossValidation | None]:
+    """Calibrate from a recorded table or from simulated trial motions.
+
+    Returns what was seen, the calibration, and its held-out errors where they are asked for.
+    """
+    source = inputs.source
+    seen = recorded(source) if isinstance(source, Table) else simulated(source, progress=progress)
+    if inputs.joint_noise is not None:
+        seen = replace(seen, joint_noise=inputs.joint_noise)
+    return seen.record, *estimate(seen, inputs.estimation, progress=progress)
+
+
+def recorded(table: Table) -> Observations:
+    """Return what a table holds."""
+    return Observations.of(
+        read_table(table.file.path, table.joint_types, table.joint_unit),
+        joint_types=table.joint_types,
+        image_size=table.image_size,
+        noise_px=table.noise_px,
+        seed=table.seed,
+    )
+
+
+def simulated(
+    trials: Trials, q: FloatArray | None = None, seed: int | None = None, *, progress: Progress = silent
+) -> Observations:
+    """Return what the trial motions of the simulated robot show, or poses (K, n), rad or m."""
+    observation, noise_px = observed(trials, q, seed, progress=progress)
+    assert trials.truth is not None
+    ideal, (width, height) = trials.driven is None, trials.truth.image_size.astype(int).tolist()
+    return Observations.of(
+        observation,
+        joint_types=trials.joints.types,
+        image_size=(width, height),
+        noise_px=noise_px,
+        # Where joints or images have faults, χ² of pixel noise alone decides no more than in a recording.
+        joint_noise=0.0 if ideal else None,
+        source="simulated",
+        exact=ideal,
+        seed=trials.motions.seed,
+    )
 
 
 def estimate(
     seen: Observations, asked: Estimation, *, progress: Progress = silent
 ) -> tuple[Calibration, CrossValidation | None]:
     """Return the calibration from what was seen, and its held-out errors if they are asked for."""
-    from projservo_cli.config.robot import read_nominal
-
     held_out: list[CrossValidation] = []
 
     def hold_out(solution: Solution, noise_px: float) -> None:
@@ -107,7 +123,7 @@ def estimate(
         image_size=seen.image_size,
         seed=seen.seed,
         lens=asked.lens,
-        init=Nominal(**read_nominal(asked.init)) if asked.init is not None else None,
+        init=Nominal(**read_nominal(asked.init.path)) if asked.init is not None else None,
         joint_noise=seen.joint_noise,
         fitted=hold_out if asked.cross_validate is not None else None,
         tell=progress,
@@ -120,8 +136,18 @@ def estimate(
 WIDER, FARTHER = 0.15, 1.0
 
 
+class SuggestionInputs(NamedTuple):
+    """What further poses are suggested with, beside what was seen and the calibration."""
+
+    joints: JointSettings
+    image_size: tuple[int, int] | None  # width and height, px, if they are known
+    recorded: bool  # whether the robot may not go farther than it was
+    unit: str  # of revolute joints in the list
+    seed: int
+
+
 def suggest_motions(
-    config: Config, observation: Observation, calibration: Calibration, count: int, path: Path
+    inputs: SuggestionInputs, observation: Observation, calibration: Calibration, count: int, path: Path
 ) -> tuple[Suggestion, ...]:
     """Write poses that reduce the variance of predictions most, within the joint limits where they are known.
 
@@ -130,15 +156,15 @@ def suggest_motions(
     row each: q1 … qN, from_pose, delta_q1 … delta_qN, revolute joints in the unit of the recorded table.
     """
     observation = observation.at_rest
-    pixels, size = observation.images, config.image_size_px
+    pixels, size = observation.images, inputs.image_size
     image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
     if size is not None:
         image = np.array([[[-0.5, -0.5], np.array(size) - 0.5]] * 2)
-    targets = _region(config, observation.q, WIDER, image)
-    candidates = targets if config.recorded else _region(config, observation.q, FARTHER, image)
-    rng = generator(config.seed, SUGGESTIONS)
+    targets = _region(inputs.joints, observation.q, WIDER, image)
+    candidates = targets if inputs.recorded else _region(inputs.joints, observation.q, FARTHER, image)
+    rng = generator(inputs.seed, SUGGESTIONS)
     found = suggest(calibration, observation, candidates, targets, count, rng)
-    turn = np.degrees(1.0) if config.data is not None and config.data.joint_unit == "deg" else 1.0
+    turn = np.degrees(1.0) if inputs.unit == "deg" else 1.0
     scale = np.array([turn if kind == "R" else 1.0 for kind in calibration.joint_types])
     joints = [f"q{i}" for i in range(1, len(scale) + 1)]
     q, delta = (scale * [getattr(one, name) for one in found] for name in ("q", "delta"))
@@ -148,11 +174,11 @@ def suggest_motions(
     return found
 
 
-def _region(config: Config, q: FloatArray, share: float, image: FloatArray) -> Region:
+def _region(settings: JointSettings, q: FloatArray, share: float, image: FloatArray) -> Region:
     """The range of readings (K, n), widened at each end by a share of it as far as the limits allow."""
     span = np.ptp(q, axis=0)
     low, high = q.min(axis=0) - share * span, q.max(axis=0) + share * span
-    joints = joints_of(config, "R" * q.shape[1])
+    joints = settings.joints("R" * q.shape[1])
     # A recorded robot may have been where its configured limits do not reach.
     low = np.maximum(low, np.minimum(joints.limits.lower, q.min(axis=0)))
     high = np.minimum(high, np.maximum(joints.limits.upper, q.max(axis=0)))

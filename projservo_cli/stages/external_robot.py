@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from projservo_cli.calibration import predict
-from projservo_cli.config import Config
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
@@ -18,10 +17,18 @@ from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
 from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.robots.simulated import Plant, observe
-from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
-from projservo_cli.stages.simulation import FaultyRobot, Points, hindrance_of, robot_of
-from projservo_cli.stages.world import Joints
+from projservo_cli.robots.settings import Joints, OwnRobot
+from projservo_cli.simulation.faults import (
+    Events,
+    FaultyRobot,
+    Points,
+    SimulatedRobot,
+    hindrance_of,
+    robot_of,
+)
+from projservo_cli.simulation.ideal import Plant, observe
+from projservo_cli.stages.scenario import SERVO_NOISE, RunScenario
+from projservo_cli.stages.task import Contract, Driven
 
 # What a joint may drift, rad or m, and an image, px rms, and be called still, where its noise is less.
 _STILL, _STILL_PX = 2e-5, 0.02
@@ -33,42 +40,34 @@ _PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
 _WAITED = 5  # looks for each image that is wanted, where the same one comes again
 
 
-def bounds_of(config: Config, joints: Joints) -> Bounds:
-    """What no command to a robot may exceed, and what is taken of its servos."""
-    plant, period = config.plant, config.control.period_s
-    speed, sag = joints.limits.speed * plant.speed_scale, joints.length_of(plant.sag_deg)
-    lead = speed * (plant.lag_s + period) + sag
-    if plant.lead_deg is not None:
-        lead = joints.length_of(plant.lead_deg)
-    return Bounds(joints.limits._replace(speed=speed), lead, period, plant.lag_s, sag, joints.units)
+def foreign_robot(
+    own: OwnRobot, bounds: Bounds, types: str, markers: int, given: Robot | None = None
+) -> ForeignRobot:
+    """Make a robot of somebody's, unless it is given; an InputError where a joint has no speed limit.
 
-
-def foreign_robot(config: Config, joints: Joints, markers: int, given: Robot | None = None) -> ForeignRobot:
-    """Make the robot of ``plant.use``, unless it is given; an InputError where a joint has no speed limit."""
-    plant, target = config.plant, config.plant.use
-    assert target is not None
+    types : one letter a joint, R or P; markers : how many the robot observes.
+    """
+    limited = np.isfinite(bounds.limits.speed)
     for kind, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
-        if kind in joints.types and getattr(config.control, key) is None:
+        if any(letter == kind and not known for letter, known in zip(types, limited, strict=True)):
             raise InputError(
-                f"plant {target}: a robot that is not simulated needs a limit: set control.{key}"
+                f"plant {own.target}: a robot that is not simulated needs a limit: set control.{key}"
             )
-    robot = _made(config, target) if given is None else given
-    bounds = bounds_of(config, joints)
-    name, size = f"plant {target}", config.image_size_px
-    return ForeignRobot(robot, name, markers, bounds, plant.timeout_s, plant.open_s, size)
+    robot, name = _made(own) if given is None else given, f"plant {own.target}"
+    return ForeignRobot(robot, name, markers, bounds, own.timeout_s, own.open_s, own.image_size)
 
 
-def _made(config: Config, target: str) -> Robot:
-    """Make an object of the class of a plant, with its options."""
-    options, dictionary = dict(config.plant.options), config.markers.dictionary if config.markers else None
-    if dictionary is not None:
-        if not plugins.takes("plant", target, "dictionary"):
+def _made(own: OwnRobot) -> Robot:
+    """Make an object of the class of a robot, with its options."""
+    options = dict(own.options)
+    if own.dictionary is not None:
+        if not plugins.takes("plant", own.target, "dictionary"):
             raise InputError(
-                f"markers.dictionary: is without effect: plant.use {target} takes no argument dictionary; "
-                "leave it out, or let the class take it"
+                f"markers.dictionary: is without effect: plant.use {own.target} takes no argument "
+                "dictionary; leave it out, or let the class take it"
             )
-        options["dictionary"] = dictionary
-    robot: Robot = plugins.make("plant", target, (), options)
+        options["dictionary"] = own.dictionary
+    robot: Robot = plugins.make("plant", own.target, (), options)
     return robot
 
 
@@ -259,20 +258,19 @@ def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.var(means, axis=0, ddof=1), noise / third
 
 
-def simulated_robot(config: Config, joints: Joints, robot: FaultyRobot) -> ForeignRobot:
+def simulated_robot(driven: Driven, joints: Joints, robot: FaultyRobot) -> ForeignRobot:
     """A simulated robot of the contract, which is never late, and goes beyond its limits where it may."""
-    bounds = bounds_of(config, joints)
-    if config.plant.joint_limits == "report":
+    bounds = driven.following.bounds(joints)
+    if driven.endless:
         endless = np.full(len(joints.types), math.inf)
         bounds = bounds._replace(limits=bounds.limits._replace(lower=-endless, upper=endless))
     markers = len(robot.world.truth.number)
     return ForeignRobot(robot, "the simulated robot", markers, bounds, _NEVER_LATE_S, _NEVER_LATE_S)
 
 
-def _in_the_loop(scenario: Scenario) -> FaultyRobot:
+def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -> FaultyRobot:
     """The simulated robot of a scenario at the start of the task, which observes all markers."""
-    config, truth, plant = scenario.config, scenario.truth, scenario.plant_of("exact")
-    assert truth is not None
+    truth, plant = robot.truth, scenario.plant_of("exact")
     face, others, workspace = list(truth.face), list(truth.pins), np.zeros_like(plant.M)
 
     def see(q: FloatArray, M: FloatArray) -> FloatArray:
@@ -283,33 +281,36 @@ def _in_the_loop(scenario: Scenario) -> FaultyRobot:
         s[:, face + others] = ordered
         return s
 
-    points = Points(truth, see, False, config.noise.servo_px)
-    drawn = config.seed, SERVO_NOISE
-    return robot_of(config, truth, scenario.exact.q_start, points, drawn, config.disturbance)
+    points = Points(truth, see, False, scenario.inputs.noise_px)
+    drawn = scenario.inputs.seed, SERVO_NOISE
+    return robot_of(robot, scenario.exact.q_start, points, drawn, events)
 
 
-def connected(scenario: Scenario, law: str, given: Robot | None = None) -> DrivenRobot:
+def connected(scenario: RunScenario, law: str, given: Robot | None = None) -> DrivenRobot:
     """The robot as the loop of a law sees it: beside its truth, or what the calibration takes it for.
 
-    given : an object of the contract instead of one of ``plant.use``.
+    given : an object of the contract instead of one of a class.
     """
-    config, joints, calibration = scenario.config, scenario.joints, scenario.calibration
+    contract, joints, calibration = scenario.given.contract, scenario.joints, scenario.calibration
     assert calibration is not None
-    if scenario.truth is None:
-        plant = _believed_plant(scenario, calibration)
-        robot = foreign_robot(config, joints, len(scenario.observed), given)
+    assert contract is not None
+    driven = contract.driven
+    if isinstance(driven.robot, OwnRobot):
+        plant, bounds = _believed_plant(scenario, calibration), driven.following.bounds(joints)
+        robot = foreign_robot(driven.robot, bounds, joints.types, len(scenario.observed), given)
     else:
-        plant, robot = scenario.plant_of(law), simulated_robot(config, joints, _in_the_loop(scenario))
+        plant = scenario.plant_of(law)
+        robot = simulated_robot(driven, joints, _in_the_loop(scenario, driven.robot, contract.events))
     monitor = None
     if not scenario.untested:
-        noise = config.stop.innovation_factor * scenario.noise_px
+        noise = scenario.given.stop.innovation_factor * scenario.noise_px
         shown = np.flatnonzero(np.isin(calibration.marker, scenario.observed))
         looks = scenario.limits.max_steps + 1 + WINDOW
         monitor = ImageMonitor(calibration, noise, looks, shown, plant.image_size)
-    return DrivenRobot(robot, plant, _known_of(scenario, calibration, law), monitor)
+    return DrivenRobot(robot, plant, _known_of(scenario, contract, calibration, law), monitor)
 
 
-def _believed_plant(scenario: Scenario, calibration: Calibration) -> Plant:
+def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
     """What the calibration takes the robot and its face for."""
     task = scenario.ends.by_points().task(scenario.model)
     return Plant(
@@ -325,23 +326,23 @@ def _believed_plant(scenario: Scenario, calibration: Calibration) -> Plant:
     )
 
 
-def _known_of(scenario: Scenario, calibration: Calibration, law: str) -> Known:
+def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibration, law: str) -> Known:
     """What is known of a robot and its images before a law drives it."""
-    config, numbers = scenario.config, scenario.observed
+    numbers = scenario.observed
     return Known(
         partial(predict, calibration),
         np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
         np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
         scenario.noise_px,
         scenario.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
-        _delays_of(config, calibration),
-        config.plant.timeout_s,
+        _delays_of(contract.delay_s, calibration),
+        contract.timeout_s,
     )
 
 
-def _delays_of(config: Config, calibration: Calibration) -> DelayPrior:
+def _delays_of(given: tuple[float, float] | None, calibration: Calibration) -> DelayPrior:
     """What is known of the delays of both views: given, calibrated, or nothing."""
-    given, known = config.plant.delay_s, NOTHING_KNOWN
+    known = NOTHING_KNOWN
     if calibration.delay_s is not None:
         interval, jitter = calibration.delay_interval_s, calibration.delay_jitter_s
         assert interval is not None
@@ -349,5 +350,5 @@ def _delays_of(config: Config, calibration: Calibration) -> DelayPrior:
         sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
         known = DelayPrior(calibration.delay_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
     if given is not None:
-        known = known._replace(mean=np.array([given.left, given.right]), sigma=np.zeros(2))
+        known = known._replace(mean=np.array(given), sigma=np.zeros(2))
     return known

@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.config.models import LIMITS_MISSING
-from projservo_cli.config.task import Trajectory
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
@@ -26,13 +24,22 @@ from projservo_cli.planning.rrt_connect import (
     within_region,
 )
 from projservo_cli.planning.time_parameterization import TimedPath, joints_at, least_time
-from projservo_cli.records import NO_SPREAD, PRISMATIC, FloatArray, Model, Plan, Spread, WorkFailed
+from projservo_cli.records import (
+    LIMITS_MISSING,
+    NO_SPREAD,
+    PRISMATIC,
+    FloatArray,
+    Model,
+    Plan,
+    Spread,
+    WorkFailed,
+)
 from projservo_cli.stages.plan_summary import sight_words, verdict_of
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
 from projservo_cli.task.target import Shown
-from projservo_cli.task.trajectory import profile_shares
+from projservo_cli.task.trajectory import Trajectory, profile_shares
 
 
 class Found(NamedTuple):
@@ -89,7 +96,7 @@ def search_of(scenario: Scenario) -> JointSearch:
             tuple(calibration.places(numbers)),
             scenario.m,
             (tuple(demands.limits.lower), tuple(demands.limits.upper), tuple(demands.image_size)),
-            scenario.config.trajectory.search.seed,
+            scenario.inputs.trajectory.search_seed,
         )
     limits, closed = scenario.joints.limits, ""
     if scenario.truth is None and not (np.isfinite(limits.lower) & np.isfinite(limits.upper)).all():
@@ -161,7 +168,7 @@ _INTERPOLATED_PX = 0.05
 
 def _joint_constraints(reaching: Reaching, task: Task, trajectory: Trajectory, spread: Spread) -> Constraints:
     """What joints are held against."""
-    drawn = keep_out_of([(region.left, region.right, region.hides) for region in trajectory.keep_out])
+    drawn = keep_out_of(trajectory.keep_out)
     c = constraints_of(reaching.model, reaching.body, task, reaching.q_start, reaching.demands, drawn)
     return c._replace(spread=spread)
 
@@ -189,10 +196,10 @@ def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: J
     """A path through joint space; the linear motion where there is none."""
     c = _joint_constraints(reaching, task, trajectory, search.spread)
     aim = GoalFeatures(task.A_star, straight_views(reaching.model.lens, task.s_star), search.sigma)
-    how = SearchLimits(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
+    how = SearchLimits(trajectory.search_samples, trajectory.search_seed, trajectory.goals)
     path = find_path(c, aim, reaching.q_start, search.q_shown, how)
     if path.timing is None:
-        linear = given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
+        linear = given("linear", reaching, trajectory._replace(duration_s=None), 1.0)
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.samples, np.nan)
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)
@@ -220,7 +227,7 @@ class PathReplanner:
     """Paths to the goal of a scenario, of which a plan was made."""
 
     def __init__(self, scenario: Scenario, plan: Plan) -> None:
-        model, shown, self._trajectory = scenario.model, scenario.ends, scenario.config.trajectory
+        model, shown, self._trajectory = scenario.model, scenario.ends, scenario.inputs.trajectory
         task, amplitudes = shown.task(model), np.array([plan.tau, plan.theta_r, plan.theta_p])
         self._plan, self._search, self._made = plan, search_of(scenario), 0
         parts = plan.H_hat, amplitudes, plan.A, plan.a
@@ -254,7 +261,7 @@ class PathReplanner:
         full[IMAGE:CLEAR] += np.abs(off).max(axis=1)
         full[CLEAR] += np.abs(off).max()
         c = self._c._replace(full=full)
-        how = SearchLimits(asked.search.samples, asked.search.seed + self._made, asked.goals, excluded)
+        how = SearchLimits(asked.search_samples, asked.search_seed + self._made, asked.goals, excluded)
         start = np.clip(q, c.limits.lower, c.limits.upper)
         path = find_path(c, self._goal, start, self._search.q_shown, how)
         if path.timing is None:

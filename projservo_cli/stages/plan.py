@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from projservo_cli.config import Config
-from projservo_cli.config.task import Trajectory
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
@@ -40,10 +38,11 @@ from projservo_cli.stages.motions import (
 )
 from projservo_cli.stages.plan_summary import least_of, reason_of, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.world import Joints
+from projservo_cli.stages.task import PlanInputs
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import Shown
+from projservo_cli.task.trajectory import Trajectory
 from projservo_cli.task.visibility import (
     arc_minimum,
     margin_coefficients,
@@ -104,21 +103,19 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
         )
 
 
-def run(config: Config, calibration: Calibration, joints: Joints | None = None) -> Plan:
+def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
     """Partition the task and plan its motion, from the calibration and the images alone.
 
-    joints : other than the configuration says, of a robot of which no more than the calibration is known.
-    Raises InputError if the configuration lacks the task or the face; WorkFailed if the task cannot be
-    partitioned.
+    Raises InputError if the task is missing; WorkFailed if it cannot be partitioned.
     """
     known = set(calibration.marker.tolist())
-    missing = [number for number in config.face_numbers if number not in known]
+    missing = [number for number in inputs.face if number not in known]
     if missing:
         raise WorkFailed(
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "
             f"choose among {', '.join(map(str, sorted(known)))}"
         )
-    scenario, trajectory = scenario_of(config, calibration, joints=joints), config.trajectory
+    scenario, trajectory = scenario_of(inputs, calibration), inputs.trajectory
     if not scenario.untested:
         _require_taught_since(scenario, calibration)
     search = search_of(scenario) if trajectory.needs_covariance else None
@@ -127,12 +124,11 @@ def run(config: Config, calibration: Calibration, joints: Joints | None = None) 
 
 def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     """Refuse goal images with joint readings that the calibration contradicts, with a WorkFailed."""
-    task = scenario.config.task
+    task = scenario.inputs.task
     images = task.goal.images if task is not None else None
     if images is None or images.joints is None:
         return
-    pixels = images.pixels(scenario.config.face_numbers)
-    q = np.array(images.joints.values(calibration.joint_types))
+    pixels, q = images.pixels(), images.joints.values(calibration.joint_types)
     shown = np.swapaxes(np.array([*pixels.values()]), 0, 1)
     if fault := fault_shown(calibration, q, np.array([*pixels]), shown, scenario.demands.image_size):
         raise WorkFailed(f"the goal was taught after a change since the calibration: {fault}; teach it again")
@@ -154,7 +150,7 @@ def plan_task(
     before: list[str] = []
     shut = why_closed(model, demands, search)
     for profile in ("linear", "constrained", "joint"):
-        asked = trajectory.model_copy(update={"profile": profile})
+        asked = trajectory._replace(profile=profile)
         last = profile == "joint" or (profile == "constrained" and bool(shut))
         try:
             plan, fails = _planned(model, shown, asked, demands, search)
@@ -256,7 +252,7 @@ def _planned(
         theta_0=theta_0,
         sense=sense,
         sense_margin=sense_margin,
-        **({} if path is None else search_summary(path, along.q, time, trajectory.search.seed)),
+        **({} if path is None else search_summary(path, along.q, time, trajectory.search_seed)),
     )
     return plan, found.entered or ("" if holds or (path is not None and found.feasible) else words)
 
@@ -285,6 +281,6 @@ def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:
 
 def rotation_sense(scenario: Scenario) -> FloatArray:
     """Joint motions (2, n) of both rotations in the sense of a plan whose profile rehearses half turns."""
-    asked, joints = scenario.config.trajectory, scenario.joints
+    asked, joints = scenario.inputs.trajectory, scenario.joints
     state, _, parts, _ = _partitioned(scenario.model, scenario.ends, asked, joints.limits)
     return in_sense(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])

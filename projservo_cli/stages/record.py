@@ -1,5 +1,6 @@
 """Record: trial motions, what a robot shows there, and the table of it."""
 
+import hashlib
 import math
 import time
 from collections.abc import Iterator
@@ -8,48 +9,97 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration.readings import per_rad
-from projservo_cli.config import Config, digest
-from projservo_cli.config.markers import DICTIONARY, cells_of
-from projservo_cli.config.models import FAULTS
-from projservo_cli.detection import LEAST_CELL
-from projservo_cli.records import CORNERS, VIEWS, FloatArray, InputError, IntArray, Observation, WorkFailed
+from projservo_cli.canonical import encoded
+from projservo_cli.detection import DICTIONARY, LEAST_CELL, cells_of
+from projservo_cli.records import (
+    CORNERS,
+    VIEWS,
+    FloatArray,
+    InputError,
+    IntArray,
+    JointList,
+    Observation,
+    WorkFailed,
+)
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
+from projservo_cli.robots.settings import Joints, JointSettings, OwnRobot, Readings
+from projservo_cli.simulation.faults import robot_by_itself
+from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.external_robot import (
-    averaged,
-    bounds_of,
-    foreign_robot,
-    simulated_robot,
-    way_to,
-)
+from projservo_cli.stages.external_robot import averaged, foreign_robot, simulated_robot, way_to
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
-from projservo_cli.stages.simulation import robot_by_itself
-from projservo_cli.stages.world import Truth, joints_of, truth_of
-from projservo_cli.tables import JointList, read_table, recording_of, write_table
+from projservo_cli.stages.task import Driven
+from projservo_cli.tables import read_table, recording_of, write_table
 
-# What a recorded pixel depends on, apart from the joints, which the table itself tells.
-DEPENDS_ON = (
-    *("seed", "robot", "rig", "markers.positions_m", "markers.numbers", "noise.calibration_px"),
-    *("markers.tags", "markers.tag_size_m", "markers.dictionary"),
-    *("plant.use", "plant.options", "plant.frames", "plant.settle_s"),
-    *(f"disturbance.{name}" for name in FAULTS),
-)
 SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
 _MOST_MOVING = 200  # frames on the way in a table
 
-# Random poses where not given; how far trials are spread, rad, so that no reading repeats its error:
-# a tick of a coarse encoder, 4,096 a turn. Draws of one pose, of which each reaches less far, and the shares
-# of markers that must be within both images, and look towards both cameras.
-_RANDOM_POSES, _TICKS = 12, 4096
+# Draws of one pose, of which each reaches less far, and the shares of markers that must be within both
+# images, and look towards both cameras.
 _LEAST_SHARED = 3  # markers that both cameras see: a turn about a line through two shows in no image
 _DRAWS, _SHRINKING, _LEAST_SEEN, _LEAST_FACING = 100, 0.98, 0.75, 0.5
+
+
+class Motions(NamedTuple):
+    """Trial motions: every joint alone about a reference, then all joints at once."""
+
+    reference: Readings
+    amplitude: tuple[float, float]  # farthest trial to each side, revolute joints, rad, and prismatic ones, m
+    frames_per_joint: int
+    random_poses: int  # of all joints at once
+    # rad by which trials are spread at most, so that no reading repeats its error; 0 where none has any
+    spread: float
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """Trial motions, and the robot that is driven through them."""
+
+    motions: Motions
+    joints: JointSettings
+    truth: Truth | None  # robot, rig and markers as they are; None for a robot of somebody's
+    driven: Driven | None  # by the contract; None for one that stands wherever it is sent
+    noise_px: float  # standard deviation of simulated pixels
+    frames: int  # images of each pose that are averaged
+    settle_s: float  # for how long joints and images have stood still before
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingInputs:
+    """What a table is recorded with."""
+
+    trials: Trials
+    numbers: tuple[int, ...]  # of the markers
+    face: tuple[int, ...]  # numbers of those that must stay visible; none where nobody says so
+    dictionary: str | None  # of the tags, where somebody says so
+    tagged: bool  # whether markers are said to be corners of tags
+    sag_deg: float  # how far a joint at rest may stay from its set-point
+
+    @property
+    def key(self) -> str:
+        """The plant, and a hash of what the pixels depend on beside the joints, which the table itself tells.
+
+        What a robot of somebody's is driven with may change while it is recorded.
+        """
+        trials, own = self.trials, self.own
+        robot = own._replace(timeout_s=0.0, open_s=0.0) if own else (trials.truth, trials.driven)
+        how = trials.motions.seed, trials.noise_px, trials.frames, trials.settle_s
+        key = hashlib.sha256(encoded((robot, how, self.numbers, self.dictionary))).hexdigest()
+        return f"{own.target if own else 'simulated'} {key[:16]}"
+
+    @property
+    def own(self) -> OwnRobot | None:
+        """The robot of somebody's that is driven."""
+        robot = self.trials.driven.robot if self.trials.driven is not None else None
+        return robot if isinstance(robot, OwnRobot) else None
 
 
 @dataclass
@@ -129,24 +179,18 @@ class _Recording:
         )
 
 
-def trial_motions(config: Config) -> FloatArray:
+def trial_motions(trials: Trials) -> FloatArray:
     """Joint readings (k, n) of the reference and of all trials, rad or m.
 
     Every joint alone; then, where joints may be read or images taken with faults, all joints at once, and
     the trials are spread by fractions of an encoder's tick.
     """
-    settings = config.calibration
-    vector = config.reference
-    if vector is None:
-        raise InputError("trial motions need a reference: set calibration.reference or task.start")
-    joints = joints_of(config)
-    reference = np.array(vector.values(joints.types))
-    amplitude = np.array(
-        [settings.amplitude_m if kind == "P" else np.radians(settings.amplitude_deg) for kind in joints.types]
-    )
+    motions, joints = trials.motions, trials.joints.joints()
+    reference = motions.reference.values(joints.types)
+    amplitude = np.array([motions.amplitude[kind == "P"] for kind in joints.types])
     rows = [reference]
     for i, farthest in enumerate(amplitude):
-        for offset in np.linspace(-farthest, farthest, settings.frames_per_joint):
+        for offset in np.linspace(-farthest, farthest, motions.frames_per_joint):
             q = reference.copy()
             q[i] += offset
             if wrong := joints.limit_passed(q):
@@ -155,25 +199,25 @@ def trial_motions(config: Config) -> FloatArray:
                     "amplitude"
                 )
             rows.append(q)
-    rng = generator(seed_of_trials(config), TRIAL_POSES)
-    # The closed form takes joints that are told to stand still to do so.
-    faultless = config.is_ideal or settings.method == "closed_form"
-    count = settings.random_poses
-    if count is None:
-        count = 0 if faultless else _RANDOM_POSES
-    q = np.array(rows + [_random_pose(config, reference, amplitude, rng) for _ in range(count)])
-    if faultless:
+    rng = generator(motions.seed, TRIAL_POSES)
+    drawn = (
+        _random_pose(joints, trials.truth, amplitude, reference, rng) for _ in range(motions.random_poses)
+    )
+    q = np.array([*rows, *drawn])
+    if not motions.spread:
         return q
-    turn = 2.0 * np.pi / (config.disturbance.encoder_ticks or _TICKS)
-    tick = per_rad(np.array([*joints.types]) == "P") * turn
+    tick = per_rad(np.array([*joints.types]) == "P") * motions.spread
     return np.clip(q + tick * rng.uniform(-1.0, 1.0, q.shape), joints.limits.lower, joints.limits.upper)
 
 
 def _random_pose(
-    config: Config, reference: FloatArray, amplitude: FloatArray, rng: np.random.Generator
+    joints: Joints,
+    truth: Truth | None,
+    amplitude: FloatArray,
+    reference: FloatArray,
+    rng: np.random.Generator,
 ) -> FloatArray:
     """Joints (n,) within the amplitudes and the limits, which show the markers of a simulated robot."""
-    joints, truth = joints_of(config), truth_of(config) if config.plant.simulated else None
     for draw in range(_DRAWS):
         q = reference + amplitude * _SHRINKING**draw * rng.uniform(-1.0, 1.0, len(reference))
         if joints.limit_passed(q):
@@ -186,21 +230,12 @@ def _random_pose(
     return reference
 
 
-def seed_of_trials(config: Config) -> int:
-    """Seed of the trial motions and of all that is random in their evaluation."""
-    return config.seed if config.calibration.seed is None else config.calibration.seed
+def simulate(truth: Truth, q: FloatArray, noise_px: float, drawn: tuple[int, int]) -> Observation:
+    """Noisy images of all markers at poses (k, n); unseen outside an image.
 
-
-def simulate(
-    config: Config, truth: Truth, q: FloatArray | None = None, drawn: tuple[int, int] | None = None
-) -> Observation:
-    """Noisy images of all markers at poses (k, n), by default the trial motions; unseen outside an image.
-
-    drawn : seed and stream of the noise, by default those of the trials.
+    drawn : seed and stream of the noise.
     """
-    q = trial_motions(config) if q is None else q
-    rng = generator(*(drawn or (seed_of_trials(config), CALIBRATION_NOISE)))
-    noise = config.noise.calibration_px * rng.standard_normal((len(q), 2, len(truth.number), 2))
+    noise = noise_px * generator(*drawn).standard_normal((len(q), 2, len(truth.number), 2))
     images = truth.within(np.stack([truth.images(row, truth.M) for row in q]) + noise)
     return Observation(np.arange(len(q)), np.array(truth.number), q, images)
 
@@ -210,7 +245,7 @@ class _OutdatedError(InputError):
 
 
 def new_recording(
-    config: Config,
+    inputs: RecordingInputs,
     path: Path | None,
     *,
     motions: JointList | None = None,
@@ -224,29 +259,22 @@ def new_recording(
     force : begin anew, whatever stands at ``path``; else a table of another configuration is refused.
     redo : begin anew also where ``path`` is a recording of the same plant with another configuration.
     """
-    if config.plant.simulated:
-        truth_of(config)  # refuses what lacks a part of the simulation
-    targets, joints = trial_motions(config), joints_of(config)
-    numbers = config.markers.known if config.markers is not None else None
-    if numbers is None:
-        raise InputError("record needs to know which markers the robot observes: set markers.numbers")
+    targets, joints, key = trial_motions(inputs.trials), inputs.trials.joints.joints(), inputs.key
     if motions is not None:
         for pose, q in zip(motions.pose, motions.q, strict=True):
             if wrong := joints.limit_passed(q):
                 raise InputError(f"motions: pose {pose}: {wrong}: choose another")
         targets = np.vstack([targets, motions.q])
-    plant = config.plant.use or "simulated"
-    key = f"{plant} {digest(config, DEPENDS_ON, without=('robot.mjcf',))[:16]}"
-    recording = _Recording(path or Path(), key, targets, np.array(numbers, dtype=np.int64))
+    recording = _Recording(path or Path(), key, targets, np.array(inputs.numbers, dtype=np.int64))
     if path is None:
         return recording
     if path.exists() and force:
         return replace(recording, why="asked for by --force")
     if path.exists():
         try:
-            return _resumed(recording, bounds_of(config, joints).sag + _SLACK)
+            return _resumed(recording, joints.length_of(inputs.sag_deg) + _SLACK)
         except _OutdatedError:
-            if not redo or (recording_of(path) or "").rpartition(" ")[0] != plant:
+            if not redo or (recording_of(path) or "").rpartition(" ")[0] != key.rpartition(" ")[0]:
                 raise
             return replace(recording, why="outdated")
     return recording
@@ -283,7 +311,7 @@ def _resumed(empty: _Recording, most: FloatArray) -> _Recording:
 
 
 def record(
-    config: Config,
+    inputs: RecordingInputs,
     recording: _Recording,
     robot: ForeignRobot | None = None,
     *,
@@ -298,8 +326,12 @@ def record(
     """
     if not recording.pending:
         return
-    robot, sight = robot or _robot_of(config, recording), _Sight(config, recording)
-    poses = _simulated(config, recording) if robot is None else _recorded(robot, config, recording, sight)
+    trials, sight = inputs.trials, _Sight(inputs, recording)
+    drawn = trials.motions.seed, CALIBRATION_NOISE
+    robot = robot or _robot_of(trials, recording, drawn)
+    poses = (
+        _simulated(trials, recording, drawn) if robot is None else _recorded(robot, trials, recording, sight)
+    )
     stored, due = len(recording.done), time.monotonic() + SAVE_EVERY
     try:
         with nullcontext() if robot is None else at_rest_after(robot):
@@ -315,57 +347,50 @@ def record(
             recording.save()
 
 
-def _robot_of(
-    config: Config, recording: _Recording, drawn: tuple[int, int] | None = None
-) -> ForeignRobot | None:
+def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> ForeignRobot | None:
     """The robot that is to be driven; None for one that need not be.
 
-    drawn : seed and stream of what is random of a simulated one, by default those of the trials.
+    drawn : seed and stream of what is random of a simulated one.
     """
-    joints = joints_of(config)
-    if not config.plant.simulated:
-        return foreign_robot(config, joints, len(recording.marker))
-    if config.is_ideal:
+    driven, joints = trials.driven, trials.joints.joints()
+    if driven is None:
         return None
-    first, sigma_px = recording.targets[recording.pending[0]], config.noise.calibration_px
-    drawn = drawn or (seed_of_trials(config), CALIBRATION_NOISE)
-    robot = robot_by_itself(config, truth_of(config), first, sigma_px, *drawn)
-    return simulated_robot(config, joints, robot)
+    if isinstance(driven.robot, OwnRobot):
+        bounds = driven.following.bounds(joints)
+        return foreign_robot(driven.robot, bounds, joints.types, len(recording.marker))
+    first = recording.targets[recording.pending[0]]
+    return simulated_robot(driven, joints, robot_by_itself(driven.robot, first, trials.noise_px, drawn))
 
 
 def observed(
-    config: Config, q: FloatArray | None = None, seed: int | None = None, *, progress: Progress = silent
+    trials: Trials, q: FloatArray | None = None, seed: int | None = None, *, progress: Progress = silent
 ) -> tuple[Observation, float | None]:
     """What the simulated robot shows, and the noise of its pixels, px, if any is known.
 
     q : (K, n) poses, rad or m, with noise of a stream of its own; None for the trial motions.
     seed : of that noise; None for that of the trials.
     """
-    if not config.plant.simulated:
-        raise InputError(
-            f"plant {config.plant.use} is calibrated from a table: record it, projservo record calibrate, or "
-            "name one with --data"
-        )
-    # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
-    config = config.model_copy(update={"plant": config.plant.model_copy(update={"speed_scale": 1.0})})
-    truth, sigma_px = truth_of(config), config.noise.calibration_px
-    targets = trial_motions(config) if q is None else q
-    drawn = seed_of_trials(config) if seed is None else seed, CALIBRATION_NOISE if q is None else POSE_NOISE
+    truth, sigma_px = trials.truth, trials.noise_px
+    assert truth is not None
+    targets = trial_motions(trials) if q is None else q
+    drawn = trials.motions.seed if seed is None else seed, CALIBRATION_NOISE if q is None else POSE_NOISE
     recording = _Recording(Path(), "", targets, np.array(truth.number))
-    robot = _robot_of(config, recording, drawn)
-    if robot is None:
-        return simulate(config, truth, targets, drawn), sigma_px or None
+    robot = _robot_of(trials, recording, drawn)
+    if robot is None or trials.driven is None:
+        return simulate(truth, targets, sigma_px, drawn), sigma_px or None
     with at_rest_after(robot):
-        for _ in _recorded(robot, config, recording):
+        for _ in _recorded(robot, trials, recording):
             progress("trial motions", len(recording.done), len(recording.targets))
-    if config.plant.rendered is not None:
+    simulated = trials.driven.robot
+    if not isinstance(simulated, OwnRobot) and simulated.scene is not None:
         return recording.observation(), None
-    return recording.observation(), sigma_px / math.sqrt(config.plant.frames) or None
+    return recording.observation(), sigma_px / math.sqrt(trials.frames) or None
 
 
-def _simulated(config: Config, recording: _Recording) -> Iterator[int]:
+def _simulated(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> Iterator[int]:
     """One pending pose after the other as calibrate simulates it; the number of each."""
-    seen = simulate(config, truth_of(config), recording.targets)
+    assert trials.truth is not None
+    seen = simulate(trials.truth, recording.targets, trials.noise_px, drawn)
     for pose in recording.pending:
         recording.done[pose] = Reading(seen.q[pose], seen.images[pose], np.nan, np.full(2, np.nan), None)
         yield pose
@@ -378,21 +403,21 @@ class _Sight:
     Messages name the place, the number and the limit: a recording of nothing takes as long as any other.
     """
 
-    config: Config
+    inputs: RecordingInputs
     recording: _Recording
 
     def before(self, robot: ForeignRobot, reading: Reading) -> None:
         """Refuse to move where the first look, and those of a while after it, show too little."""
         period, waited = robot.bounds.period, 0.0
         while wrong := self._wrong(reading.s[None], "where the robot stands"):
-            if waited >= self.config.plant.settle_s:  # a camera may need some time for its first image
+            if waited >= self.inputs.trials.settle_s:  # a camera may need some time for its first image
                 raise WorkFailed(f"record: {wrong}; nothing was moved")
             time.sleep(period)
             waited, reading = waited + period, robot.read()
 
     def after(self, pose: int) -> None:
         """Refuse to go on where the reference and the trial motions of a joint that ends show too little."""
-        count = self.config.calibration.frames_per_joint
+        count = self.inputs.trials.motions.frames_per_joint
         i, last = divmod(pose, count) if count else (0, 1)
         group = [0, *range((i - 1) * count + 1, pose + 1)]
         if (
@@ -408,30 +433,27 @@ class _Sight:
 
     def _faceless(self) -> str:
         """Tell which marker of the face no pose shows to both cameras so far; empty where there is none."""
-        markers, done = self.config.markers, self.recording.done
-        assert markers is not None
+        face, done = self.inputs.face, self.recording.done
         shared = np.any([np.isfinite(one.s[..., 0]).all(axis=0) for one in done.values()], axis=0)
-        lost = [k for k in self.recording.marker[~shared].tolist() if k in (markers.front or ())]
+        lost = [k for k in self.recording.marker[~shared].tolist() if k in face]
         if not lost:
             return ""
         return (
-            f"both cameras see marker {lost[0]} of the face, markers.face {[*(markers.front or ())]}, at "
+            f"both cameras see marker {lost[0]} of the face, markers.face {[*face]}, at "
             f"none of {len(done)} poses: turn the face towards them"
         )
 
     def _wrong(self, s: FloatArray, where: str) -> str:
         """Tell why looks (k, 2, m, 2) are of no use; empty where they are."""
-        markers, seen = self.config.markers, np.isfinite(s[..., 0])
-        assert markers is not None
+        seen, given = np.isfinite(s[..., 0]), self.inputs.dictionary
         blind, total = ~seen.any(axis=(0, 2)), seen.shape[2]
-        given = self.config.plant.options.get("dictionary", markers.dictionary)
         if blind.all():
             of = f", which is {given} here" if given else ""
             return (
                 f"neither camera sees one of the {total} markers {where}: look whether they stand before "
                 f"both cameras, at light and focus, and whether the dictionary of the tags is right{of}"
             )
-        cells = cells_of(str(given or DICTIONARY))
+        cells = cells_of(given or DICTIONARY)
         for view, side in zip(VIEWS, self._widths(s), strict=True):
             if side < LEAST_CELL * cells:
                 return (
@@ -461,8 +483,7 @@ class _Sight:
         They are where the configuration says so, or where all markers are fours that look like tags: convex
         and of one sense, wherever they are seen.
         """
-        markers, number = self.config.markers, self.recording.marker
-        assert markers is not None
+        number = self.recording.marker
         order = np.argsort(number)
         corners = number[order].reshape(-1, CORNERS) if len(number) % CORNERS == 0 else np.ones((1, CORNERS))
         if (corners != corners[:, :1] + range(CORNERS)).any() or (corners[:, 0] % CORNERS).any():
@@ -472,21 +493,20 @@ class _Sight:
         after = np.roll(side, -1, axis=3)
         turn = side[..., 0] * after[..., 1] - side[..., 1] * after[..., 0]
         turn = turn[np.isfinite(turn).all(axis=-1)]
-        told = (markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None)
-        if not told and (len(corners) < 2 or not ((turn > 0.0).all() or (turn < 0.0).all())):
+        if not self.inputs.tagged and (len(corners) < 2 or not ((turn > 0.0).all() or (turn < 0.0).all())):
             return [math.inf, math.inf]
         length = np.linalg.norm(side, axis=-1)
         return [np.nanmax(one) if np.isfinite(one).any() else math.inf for one in np.moveaxis(length, 1, 0)]
 
 
 def _recorded(
-    robot: ForeignRobot, config: Config, recording: _Recording, sight: _Sight | None = None
+    robot: ForeignRobot, trials: Trials, recording: _Recording, sight: _Sight | None = None
 ) -> Iterator[int]:
     """Drive to one pending pose after the other and look; the number of each that was recorded.
 
     sight : checks what is seen, as far as that is asked for.
     """
-    steered, settle_s = Steered(robot), config.plant.settle_s
+    steered, settle_s = Steered(robot), trials.settle_s
     fit = None if sight is None else partial(sight.before, robot)
     if sight is not None:
         for pose in recording.done:  # those of a call before
@@ -501,7 +521,7 @@ def _recorded(
         seen = list(way_to(steered, recording.targets[pose], settle_s, "record", fit))
         fit = None
         recording.commands += len(seen)
-        recording.done[pose], squares, count = averaged(steered.reading, look, config.plant.frames)
+        recording.done[pose], squares, count = averaged(steered.reading, look, trials.frames)
         recording.scatter += squares.sum(), 2.0 * np.maximum(count - 1, 0).sum()
         recording.ways[pose + 1] = _moving(seen, settle_s)
         if sight is not None:

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from projservo_cli import provenance
-from projservo_cli.config import load_config
 from projservo_cli.files import replacing, require_inside, write_whole
-from projservo_cli.records import InputError, Report, Trace, WorkFailed
+from projservo_cli.records import Report, Trace, WorkFailed
 from projservo_cli.report import style
-from projservo_cli.report.animation import motion_of, plotly, write_animation, write_view
+from projservo_cli.report.animation import motion_of, write_animation, write_view
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows, study_numbers
@@ -39,35 +38,33 @@ from projservo_cli.stages.studies import (
     metric_plan,
     run_studies,
 )
-from projservo_cli.stages.world import truth_of
+from projservo_cli.stages.task import ReportInputs, Scenery
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from projservo_cli.task.face import cyclic_order
 
 if TYPE_CHECKING:
-    from projservo_cli.config import Config
     from projservo_cli.store import Run
 
 FOLDER = "figures"
 _NUMBERS = "csv"  # what is drawn, beside each figure
 
 
-def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
+def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     """Make the extra runs, draw the figures, measure the claims and write the page that tells all.
 
     run : with calibration, plan and traces; where there is no task, with the calibration. Of a robot without
         a model the page tells plan and runs, and figures those that need none.
     directory : folder of the run; receives ``figures/``, ``claims.json`` and ``report.html``.
     """
-    config = load_config(run.path, text=run.configuration)
     left_out: list[dict[str, str]] = []
     material: Fit = Fit(run.calibration, run.observation.at_rest, held_out=run.cross_validation)
     studies, share, distance, claims = None, np.zeros(0), np.zeros(0), []
-    if config.has_task:
-        bench = comparison_of(config, run.calibration, run.plan)
+    if inputs.extra is not None:
+        bench = comparison_of(inputs.extra, run.calibration, run.plan)
         with _unless_it_fails("studies", left_out):
             studies = run_studies(bench, progress=progress)
-        material = replace(_material(run, bench, studies, left_out), trajectory=config.trajectory)
+        material = _material(inputs, run, bench, studies, left_out)
         with _unless_it_fails("equation (22)", left_out):
             distance = composition_error(metric_plan(bench))
             share = np.array(LAMBDAS)
@@ -76,7 +73,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
         material = Driven(
             run.calibration, run.observation.at_rest, run.plan, run.traces, held_out=run.cross_validation
         )
-    figures = draw_all(material, directory, config.report.formats, left_out, progress)
+    figures = draw_all(material, directory, inputs.formats, left_out, progress)
     report = Report(
         figures=tuple(figures),
         left_out=tuple(left_out),
@@ -91,8 +88,8 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     write_whole(directory / CLAIMS_FILE, f"{text}\n")
     for name in (VIEW_FILE, ANIMATION_FILE):  # of other runs than those that are reported on now
         (directory / name).unlink(missing_ok=True)
-    made = Result("", run.configuration, provenance.collect(seed=config.seed), {}, {"": report})
-    write_page(replace(run, results={**run.results, "report": made}))
+    made = Result("", run.configuration, provenance.collect(seed=inputs.about.seed), {}, {"": report})
+    write_page(replace(run, results={**run.results, "report": made}), inputs.about)
     return report
 
 
@@ -106,7 +103,11 @@ def _unless_it_fails(what: str, left_out: list[dict[str, str]]) -> Iterator[None
 
 
 def _material(
-    run: "Run", bench: Comparison, studies: Studies | None, left_out: list[dict[str, str]]
+    inputs: ReportInputs,
+    run: "Run",
+    bench: Comparison,
+    studies: Studies | None,
+    left_out: list[dict[str, str]],
 ) -> Material:
     """All that figures may show and claims be about."""
     truth = bench.truth
@@ -123,6 +124,7 @@ def _material(
         "" if studies else left_out[-1]["reason"],
         bench.scenario.limits.plateau_steps,
         held_out=run.cross_validation,
+        trajectory=inputs.trajectory,
     )
 
 
@@ -163,42 +165,26 @@ def draw_all(
     return written
 
 
-def require(config: "Config", wanted: Sequence[str]) -> None:
-    """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted."""
-    if config.task is None:
-        text = "shows runs of laws, which need a task: set task.start and task.goal"
-        raise InputError(f"--{wanted[0]}: {text}")
-    if "view" in wanted:
-        plotly()
-        try:
-            truth_of(config)
-        except InputError as error:
-            raise InputError(
-                "--view: images alone give a robot only up to a projective frame, which has no metres to "
-                f"draw; {error}, or use --animation, which shows what the cameras saw"
-            ) from error
-
-
-def view(run: "Run", progress: Progress = silent) -> Path:
+def view(scenery: Scenery, run: "Run", progress: Progress = silent) -> Path:
     """Write the 3D view of a run into its folder; a WorkFailed says that no run has a step to show."""
-    config = load_config(run.path, text=run.configuration)
-    truth, traces = truth_of(config), _moved(run)
-    plant = plant_of(config, truth, run.plan.q_start)
-    joints = "simulated joints" if config.plant.simulated else "joints that the robot itself reported"
+    truth, traces = scenery.truth, _moved(run)
+    plant = plant_of(truth, run.plan.q_start, opaque=scenery.opaque)
+    joints = "simulated joints" if scenery.simulated else "joints that the robot itself reported"
     known = f"Robot, rig and face as the configuration describes them, moved by the {joints}."
     path = run.path.parent / VIEW_FILE
     progress("view", 0, 1)
-    write_view(path, motion_of(truth.robot, plant, truth.M, run.plan, traces), name=config.name, known=known)
+    motion = motion_of(truth.robot, plant, truth.M, run.plan, traces)
+    write_view(path, motion, name=scenery.name, known=known)
     progress("view", 1, 1)
     return path
 
 
-def animation(run: "Run", progress: Progress = silent) -> Path:
-    """Write the film of both camera images into the folder of a run, as GIF; fails as ``view`` does."""
+def animation(size: tuple[int, int] | None, run: "Run", progress: Progress = silent) -> Path:
+    """Write the film of both camera images into the folder of a run, as GIF; fails as ``view`` does.
+
+    size : width and height of the images, px, if they are known.
+    """
     path, traces = run.path.parent / ANIMATION_FILE, _moved(run)
-    config = load_config(run.path, text=run.configuration)
-    given = config.rig if config.rig is not None else config.data
-    size = given.image_size_px if given is not None else None
     write_animation(path, traces, cyclic_order(run.plan.A), size, progress)
     return path
 

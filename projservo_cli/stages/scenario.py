@@ -1,19 +1,18 @@
-"""The experiment a configuration describes: robot, rig, markers, start and goal, noise, disturbances.
+"""What plans are made and laws are run in: robot, rig, markers, start and goal, noise.
 
-A ``Scenario`` is made once from configuration and calibration; every run of a law takes place in one.
+A ``Scenario`` is made once from what a stage is given and a calibration; a plan is made in one. A ``Stage``
+is one with all that the run of a law takes besides.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from projservo_cli.calibration import predict
-from projservo_cli.config import Config
-from projservo_cli.config.task import TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import BODY_LAWS, LAW_SPECS
@@ -30,17 +29,12 @@ from projservo_cli.records import (
     WorkFailed,
 )
 from projservo_cli.robots.client import weights
-from projservo_cli.robots.simulated import METRIC_A_INF, NO_PINS, Ends, Plant
-from projservo_cli.stages.simulation import shown_in_frames
-from projservo_cli.stages.world import (
-    Joints,
-    Truth,
-    center_index,
-    joints_of,
-    limit_passed,
-    truth_of,
-    units_of,
-)
+from projservo_cli.robots.settings import Joints, limit_passed
+from projservo_cli.simulation.arm import METRIC_A_INF
+from projservo_cli.simulation.faults import shown_in_frames
+from projservo_cli.simulation.ideal import NO_PINS, Ends, Plant
+from projservo_cli.simulation.workspace import Truth
+from projservo_cli.stages.task import GoalImages, PlanInputs, ReachingTask, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, body_of
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 from projservo_cli.task.target import Shown
@@ -61,11 +55,10 @@ def generator(seed: int, stream: int) -> np.random.Generator:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """What the runs of a configuration with a calibration take place in."""
+    """What the plan of a task is made in, and what its runs take place in."""
 
-    config: Config
+    inputs: PlanInputs
     calibration: Calibration | None  # None: laws are given the true model
-    truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
     joints: Joints  # as the laws take them
     numbers: tuple[int, ...]  # of the markers by which the face is measured, those of the face first
     observed: tuple[int, ...]  # numbers of all markers that the robot observes, in its order
@@ -73,13 +66,16 @@ class Scenario:
     true_ends: Ends  # where the true robot holds the tool; NaN where nobody knows
     q_shown: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 where nobody knows
     noise_px: float  # of the images in the loop; no less than what a calibration leaves of recorded ones
-    gains: Gains
-    limits: Limits  # gains, limits: of the laws, and when a run ends
 
     @cached_property
     def ends(self) -> Shown:
         """Start and goal as the laws see them."""
-        return self.shown_at(self.config.seed)
+        return self.shown_at(self.inputs.seed)
+
+    @property
+    def truth(self) -> Truth | None:
+        """Robot, rig and markers as they are; None for a robot that is not simulated."""
+        return self.inputs.truth
 
     @property
     def m(self) -> int:
@@ -89,7 +85,7 @@ class Scenario:
     @property
     def untested(self) -> str:
         """Why images in the loop are not tested against the calibration; empty where they are."""
-        if self.config.stop.innovation_factor == 0.0:
+        if not self.inputs.tests_images:
             return "stop.innovation_factor is 0"
         assert self.calibration is not None
         if not self.calibration.has_covariance:
@@ -114,77 +110,46 @@ class Scenario:
 
     @cached_property
     def demands(self) -> Demands:
-        """What the planned motion must keep to, as configured."""
-        size = np.array(self.config.image_size_px or (math.inf, math.inf), dtype=np.float64)
-        joints, trajectory = self.joints, self.config.trajectory
-        margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
+        """What the planned motion must keep to."""
+        size = np.array(self.inputs.image_size or (math.inf, math.inf), dtype=np.float64)
+        joints, asked = self.joints, self.inputs.trajectory
+        margins = asked.joint_margin_m, asked.joint_margin
         keep = np.array([margins[kind != "P"] for kind in joints.types])
-        border, condition = trajectory.border_px, trajectory.least_condition
-        face, units = trajectory.least_face_px, self.joints.units
+        border, condition = asked.border_px, asked.least_condition
+        face, units = asked.least_face_px, self.joints.units
         return Demands(joints.limits, size, border, condition, keep, face, self._tags(), units)
 
     def _tags(self) -> IntArray:
         """Corners (t, 4) of tags among the markers; none for tools of which no tag is on the face."""
-        markers, order = self.config.markers, self.numbers
-        known = (markers.known or ()) if markers is not None and markers.tags is not None else ()
-        whole = [known[i : i + CORNERS] for i in range(0, len(known), CORNERS)]
-        tags = [[order.index(k) for k in tag] for tag in whole if set(tag) <= set(order)]
+        order = self.numbers
+        tags = [[order.index(k) for k in tag] for tag in self.inputs.tags if set(tag) <= set(order)]
         if not any(max(tag) < self.m for tag in tags):
             tags = []
         return np.array(tags, dtype=np.int64).reshape(-1, CORNERS)
 
-    def believed_by(self, law: str) -> Model:
-        """The model that a law is given: the calibrated one, or for a metric law the true one."""
-        if not (law in LAW_SPECS and LAW_SPECS[law].metric):
-            return self.model
-        if None in (self.config.arm, self.config.rig):
-            raise InputError(
-                f"{law} is given the metric model of robot and rig: set robot and rig, or leave it out of "
-                "control.laws"
-            )
-        return truth_of(self.config).model
-
-    def plant_of(self, law: str) -> Plant:
-        """The simulated robot as a law sees it."""
-        assert self.truth is not None
-        plant = plant_of(self.config, self.truth, self.exact.q_start)
-        M = self.truth.of(self.numbers[self.m :]) if law in BODY_LAWS else NO_PINS
-        return plant._replace(pins=M)
-
-    def noise_of(self, law: str, seed: int, instants: int) -> FloatArray:
-        """Pixel noise (instants, 2, markers, 2) of a seed as a law observes it, px.
-
-        It is the same for every law; fewer instants are the first of more.
-        """
-        numbers = self.numbers_of(law)
-        noise = np.zeros((instants, 2, len(numbers), 2))
-        sigma = self.config.noise.servo_px
-        if sigma > 0.0:
-            for these, stream in ((slice(self.m), SERVO_NOISE), (slice(self.m, None), PIN_NOISE)):
-                if noise[:, :, these].size > 0:
-                    drawn = generator(seed, stream).standard_normal(noise[:, :, these].shape)
-                    np.multiply(sigma, drawn, out=noise[:, :, these])
-        return noise
-
     @property
     def goal_sigma_px(self) -> float:
         """Standard deviation of a coordinate of the face in the images of the goal, px."""
-        goal = self.config.task.goal if self.config.task is not None else None
-        told = goal.images.sigma_px(self.numbers[: self.m]) if goal is not None and goal.images else None
-        return self.noise_px / math.sqrt(self.config.noise.shown_frames) if told is None else told
+        images = self._given
+        told = None if images is None else images.sigma_px(self.numbers[: self.m])
+        return self.noise_px / math.sqrt(self.inputs.frames) if told is None else told
+
+    @property
+    def _given(self) -> GoalImages | None:
+        """Images of the goal that are given."""
+        return None if self.inputs.task is None else self.inputs.task.goal.images
 
     def shown_at(self, seed: int) -> Shown:
         """Start and goal as the images of a seed show them, which are averages."""
-        if self.config.plant.rendered is not None and self.truth is not None:
+        if self.inputs.scene is not None:
             return self._rendered(seed)
-        sigma = self.config.noise.servo_px / math.sqrt(self.config.noise.shown_frames)
+        sigma = self.inputs.noise_px / math.sqrt(self.inputs.frames)
         if sigma == 0.0 or self.truth is None:
             return self.exact
         m, others = self.m, self.truth.pins
         which = [others.index(self.truth.number.index(number)) for number in self.numbers[m:]]
         images = np.array([self.exact.s_start, self.exact.s_star])
-        assert self.config.task is not None
-        drawn = 2 if self.config.task.goal.images is None else 1  # images that are given stay as they are
+        drawn = 2 if self._given is None else 1  # images that are given stay as they are
         images[:drawn, :, :m] += sigma * generator(seed, TARGET_NOISE).standard_normal((drawn, 2, m, 2))
         if which:
             noise = generator(seed, PIN_TARGET_NOISE).standard_normal((drawn, 2, len(others), 2))
@@ -197,13 +162,12 @@ class Scenario:
         The body is fitted to both by the deviations of their pixels, whichever is the larger. Markers of the
         face that frames do not show are put where those that they show tell them to be.
         """
-        assert self.config.task is not None
-        numbers, shown, given = self.numbers, self.exact, self.config.task.goal.images
+        numbers, shown, given = self.numbers, self.exact, self._given
         start, sigma = self._frames(shown.q_start, (seed, START_FRAMES))
         if given is None:
             goal, there = self._frames(self.q_shown[0], (seed, GOAL_FRAMES))
         else:
-            goal, there = shown.s_star, np.array(given.deviations(numbers, numbers[: self.m]))
+            goal, there = shown.s_star, np.array(given.deviations(numbers))
         sigma = np.fmax(sigma, there)
         start = self._with_face("task.start", start, shown.q_start)
         shown = shown._replace(s_start=start, s_star=self._with_face("task.goal", goal, None))
@@ -215,9 +179,9 @@ class Scenario:
 
     def _frames(self, q: FloatArray, drawn: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Pixels (2, b, 2) in rendered frames at joints (n,), rad or m, and their deviations (2, b)."""
-        assert self.truth is not None
-        which = [self.truth.number.index(number) for number in self.numbers]
-        s, sigma = shown_in_frames(self.config, self.truth, q, drawn)
+        assert self.inputs.scene is not None
+        which = [self.inputs.scene.numbers.index(number) for number in self.numbers]
+        s, sigma = shown_in_frames(self.inputs.scene, self.inputs.frames, q, drawn)
         return np.ascontiguousarray(s[:, which]), sigma[:, which]
 
     def _with_face(self, key: str, s: FloatArray, q: FloatArray | None) -> FloatArray:
@@ -242,6 +206,50 @@ class Scenario:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class RunScenario(Scenario):
+    """A scenario with what the runs of laws take besides."""
+
+    given: ServoInputs
+    gains: Gains
+    limits: Limits  # gains, limits: of the laws, and when a run ends
+
+    def believed_by(self, law: str) -> Model:
+        """The model that a law is given: the calibrated one, or for a metric law the true one."""
+        if not (law in LAW_SPECS and LAW_SPECS[law].metric):
+            return self.model
+        if self.truth is not None:
+            return self.truth.model
+        if self.inputs.arm is None or self.inputs.P is None:
+            raise InputError(
+                f"{law} is given the metric model of robot and rig: set robot and rig, or leave it out of "
+                "control.laws"
+            )
+        return self.inputs.arm.model(self.inputs.P)
+
+    def plant_of(self, law: str) -> Plant:
+        """The simulated robot as a law sees it."""
+        assert self.truth is not None
+        plant = plant_of(self.truth, self.exact.q_start, opaque=self.given.opaque)
+        M = self.truth.of(self.numbers[self.m :]) if law in BODY_LAWS else NO_PINS
+        return plant._replace(pins=M)
+
+    def noise_of(self, law: str, seed: int, instants: int) -> FloatArray:
+        """Pixel noise (instants, 2, markers, 2) of a seed as a law observes it, px.
+
+        It is the same for every law; fewer instants are the first of more.
+        """
+        numbers = self.numbers_of(law)
+        noise = np.zeros((instants, 2, len(numbers), 2))
+        sigma = self.inputs.noise_px
+        if sigma > 0.0:
+            for these, stream in ((slice(self.m), SERVO_NOISE), (slice(self.m, None), PIN_NOISE)):
+                if noise[:, :, these].size > 0:
+                    drawn = generator(seed, stream).standard_normal(noise[:, :, these].shape)
+                    np.multiply(sigma, drawn, out=noise[:, :, these])
+        return noise
+
+
 def _joints_showing(
     calibration: Calibration, numbers: Sequence[int], s: FloatArray, q_start: FloatArray
 ) -> FloatArray | None:
@@ -263,45 +271,39 @@ def _joints_showing(
     return None
 
 
-def scenario_of(
-    config: Config, calibration: Calibration | None = None, *, joints: Joints | None = None
-) -> Scenario:
-    """Make the scenario of a configuration, of its simulated robot or of the one in ``plant.use``.
+def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> Scenario:
+    """Make the scenario of a simulated robot, or of one that a calibration predicts.
 
-    joints : other than the configuration says, of a robot of which no more than the calibration is known.
-    Without a calibration laws are given the true model of the simulated robot. Raises InputError if the
-    configuration lacks a part of it, naming the key to set; WorkFailed if the goal cannot be reached or
-    seen, or the body not be measured with.
+    Without a calibration laws are given the true model of the simulated robot. Raises InputError if a part
+    of it is missing, naming the key to set; WorkFailed if the goal cannot be reached or seen, or the body not
+    be measured with.
     """
-    truth = truth_of(config) if config.plant.simulated and joints is None else None
-    face = config.face_numbers
-    if config.task is None:
+    truth, face, task = inputs.truth, inputs.face, inputs.task
+    if task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
-    joints = joints or joints_of(config, "" if calibration is None else calibration.joint_types, calibration)
-    assert config.markers is not None
-    center, sigma_px = center_index(config.markers), config.noise.servo_px
+    joints = inputs.joints.joints("" if calibration is None else calibration.joint_types, calibration)
+    sigma_px = inputs.noise_px
     if truth is not None:
         observed = truth.number
     else:
         assert calibration is not None
-        observed = _observed(config, calibration)
-    if calibration is not None and (truth is None or config.plant.rendered is not None):
+        observed = _observed(inputs, calibration)
+    if calibration is not None and (truth is None or inputs.scene is not None):
         sigma_px = max(sigma_px, calibration.sigma_fitted_px)
     body = NO_BODY
     pins: tuple[int, ...] = ()
-    if not _by_points(config, calibration):
+    if not _by_points(inputs.features, calibration):
         known = observed if calibration is None else calibration.marker.tolist()
         pins = tuple(number for number in observed if number in known and number not in face)
         body = _body(calibration or truth, (*face, *pins))
     if truth is not None:
-        exact, ends, q_goal = _simulated_ends(config.task, joints.types, truth, pins, center)
+        exact, ends, q_goal = _simulated_ends(task, joints.types, joints.units, truth, pins, inputs.center)
     else:
         assert calibration is not None
-        exact, ends, q_goal = _predicted_ends(config, calibration, joints, (*face, *pins), center)
+        exact, ends, q_goal = _predicted_ends(inputs, task, calibration, joints, (*face, *pins))
     return Scenario(
-        config,
+        inputs,
         calibration,
-        truth,
         joints,
         (*face, *pins),
         observed,
@@ -309,15 +311,21 @@ def scenario_of(
         ends,
         np.empty((0, len(joints.types))) if q_goal is None else q_goal[None],
         sigma_px,
-        _gains(config, joints),
-        _limits(config, joints, sigma_px),
     )
 
 
-def _gains(config: Config, joints: Joints) -> Gains:
+def run_scenario(inputs: ServoInputs, calibration: Calibration | None = None) -> RunScenario:
+    """Make the scenario of runs; raises as ``scenario_of``."""
+    found = scenario_of(inputs.plan, calibration)
+    parts = {field.name: getattr(found, field.name) for field in fields(found)}
+    laws = _gains(inputs, found.joints)
+    return RunScenario(**parts, given=inputs, gains=laws, limits=_limits(inputs, found))
+
+
+def _gains(inputs: ServoInputs, joints: Joints) -> Gains:
     """Gains and limits of the laws."""
-    c, endless = config.control, np.full(len(joints.types), math.inf)
-    stop = _ends_at_joint_limits(config)
+    c, endless = inputs.laws, np.full(len(joints.types), math.inf)
+    stop = inputs.stop.at_joint_limit
     return Gains(
         c.gain_t,
         c.gain_r,
@@ -325,39 +333,35 @@ def _gains(config: Config, joints: Joints) -> Gains:
         c.gain_s,
         c.ratio_rp,
         c.gain,
-        c.period_s,
-        config.trajectory.delta,
+        c.period,
+        inputs.plan.trajectory.delta,
         joints.limits if stop else joints.limits._replace(lower=-endless, upper=endless),
-        c.substeps == "auto",
+        c.substeps,
     )
 
 
-def _limits(config: Config, joints: Joints, sigma_px: float) -> Limits:
+def _limits(inputs: ServoInputs, found: Scenario) -> Limits:
     """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
-    noise_px = config.stop.noise_factor * sigma_px
+    stop = inputs.stop
+    noise_px = stop.noise_factor * found.noise_px
     return Limits(
-        joints.limits.speed,
-        config.stop.image_px + noise_px,
-        config.stop.diverged_factor,
-        config.stop.plateau_steps,
-        config.stop.max_steps,
-        _ends_at_joint_limits(config),
-        config.plant.image_border == "stop",
-        config.stop.lost_steps,
+        found.joints.limits.speed,
+        stop.image_px + noise_px,
+        stop.diverged_factor,
+        stop.plateau_steps,
+        stop.max_steps,
+        stop.at_joint_limit,
+        stop.at_border,
+        stop.lost_steps,
         noise_px,
     )
 
 
-def _ends_at_joint_limits(config: Config) -> bool:
-    """Whether a run ends at a joint limit; a robot that is not simulated is never driven beyond one."""
-    return not config.plant.simulated or config.plant.joint_limits == "stop"
-
-
-def _by_points(config: Config, calibration: Calibration | None) -> bool:
-    """Whether the face is measured point by point: as configured, else where no body is calibrated well."""
-    if config.control.observation is None:
+def _by_points(features: str | None, calibration: Calibration | None) -> bool:
+    """Whether the face is measured point by point: as asked for, else where no body is calibrated well."""
+    if features is None:
         return calibration is None or not calibration.usable  # such a body is worse than none
-    return config.control.observation == "points"
+    return features == "points"
 
 
 @lru_cache(maxsize=64)
@@ -368,11 +372,10 @@ def _body(known: Calibration | Truth, numbers: tuple[int, ...]) -> Body:
     return body_of(known.model(), known.M[known.places(numbers)])
 
 
-def _observed(config: Config, calibration: Calibration) -> tuple[int, ...]:
-    """Numbers of the markers that a robot in ``plant.use`` observes, in its order."""
-    known = config.markers.known if config.markers is not None else None
-    numbers = tuple(calibration.marker.tolist()) if known is None else known
-    for number in config.face_numbers:
+def _observed(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
+    """Numbers of the markers that a robot which is not simulated observes, in its order."""
+    numbers = tuple(calibration.marker.tolist()) if inputs.known is None else inputs.known
+    for number in inputs.face:
         if number not in numbers:
             raise InputError(f"markers.face: marker {number} is not among those observed, {[*numbers]}")
     return numbers
@@ -380,24 +383,28 @@ def _observed(config: Config, calibration: Calibration) -> tuple[int, ...]:
 
 @lru_cache(maxsize=2048)
 def _simulated_ends(
-    task: TaskSettings, types: str, truth: Truth, pins: tuple[int, ...], center: int
+    task: ReachingTask, types: str, units: tuple[str, ...], truth: Truth, pins: tuple[int, ...], center: int
 ) -> tuple[Shown, Ends, FloatArray | None]:
     """What the ends of a task look like, for any seed and noise, and the joints (n,) at the goal."""
     M_pins, robot = truth.of(pins), truth.robot
 
     def images(q: FloatArray, key: str) -> FloatArray:
         """Both apart, so that the face has the same bits with any pins."""
-        if wrong := limit_passed(q, robot.limits, units_of(task.start, types)):
+        if wrong := limit_passed(q, robot.limits, units):
             raise WorkFailed(f"{key}: {wrong}: choose others or wider limits")
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
+    def turn(q: FloatArray) -> FloatArray:
+        assert task.goal.turn is not None
+        return task.goal.turn.joints(robot, truth.P, q)
+
     numbers = tuple(truth.number[i] for i in truth.face), pins
-    shown, q_goal = _shown(task, types, numbers, center, images, lambda q: truth.turned(q, task.goal))
+    shown, q_goal = _shown(task, types, numbers, center, images, turn)
     return shown, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal), q_goal
 
 
 def _shown(
-    task: TaskSettings,
+    task: ReachingTask,
     types: str,
     numbers: tuple[Sequence[int], Sequence[int]],
     center: int,
@@ -411,16 +418,16 @@ def _shown(
     turn : joints (n,) of a goal that is a turn from the joints (n,) of the start.
     """
     pins, given = len(numbers[1]), task.goal.joints
-    q_start = q_from = np.array(task.start.values(types))
+    q_start = q_from = task.start.values(types)
     if task.start_offset is not None:
-        q_start = q_from + np.array(task.start_offset.values(types))
+        q_start = q_from + task.start_offset.values(types)
     s_start = images(q_start, "task.start" if task.start_offset is None else "task.start_offset")
     if task.goal.images is not None:
-        pixels = task.goal.images.pixels(numbers[0])
+        pixels = task.goal.images.pixels()
         s_star = np.array([pixels.get(number, _UNSEEN) for number in (*numbers[0], *numbers[1])])
         s_star = np.ascontiguousarray(np.swapaxes(s_star, 0, 1))
         return Shown(q_start, s_start, s_star, center, pins), None
-    q_goal = turn(q_from) if given is None else np.array(given.values(types))
+    q_goal = turn(q_from) if given is None else given.values(types)
     return Shown(q_start, s_start, images(q_goal, "task.goal"), center, pins), q_goal
 
 
@@ -430,12 +437,10 @@ def _unknown(base_tool: FloatArray) -> Ends:
 
 
 def _predicted_ends(
-    config: Config, calibration: Calibration, joints: Joints, numbers: Sequence[int], center: int
+    inputs: PlanInputs, task: ReachingTask, calibration: Calibration, joints: Joints, numbers: Sequence[int]
 ) -> tuple[Shown, Ends, FloatArray | None]:
     """Start and goal of a robot that is not simulated, as the calibration predicts them, as above."""
-    task = config.task
-    assert task is not None
-    m, columns = len(config.face_numbers), calibration.places(numbers)
+    m, columns = len(inputs.face), calibration.places(numbers)
     taught = None if task.goal.images is None else task.goal.images.joints
     given = (task.start, "start"), (task.goal.joints, "goal.joints"), (taught, "goal.images.joints")
     for vector, key in given:
@@ -451,20 +456,24 @@ def _predicted_ends(
         return np.ascontiguousarray(s)
 
     def turn(q: FloatArray) -> FloatArray:
-        if config.arm is None:
-            raise InputError("task.goal.turn_deg needs the model of the robot: give joints or images instead")
-        return truth_of(config).turned(q, task.goal)
+        assert task.goal.turn is not None
+        if inputs.arm is None or inputs.P is None:
+            raise InputError(
+                "task.goal.turn_deg needs the model of the robot and its rig: give joints or images instead"
+            )
+        return task.goal.turn.joints(inputs.arm, inputs.P, q)
 
-    shown, q_goal = _shown(task, joints.types, (numbers[:m], numbers[m:]), center, images, turn)
+    shown, q_goal = _shown(task, joints.types, (numbers[:m], numbers[m:]), inputs.center, images, turn)
     return shown, _unknown(np.full((4, 4), np.nan)), q_goal
 
 
-def plant_of(config: Config, truth: Truth, q_start: FloatArray) -> Plant:
+def plant_of(truth: Truth, q_start: FloatArray, *, opaque: bool) -> Plant:
     """The truth as the loop sees it from the joints q_start (n,), undisturbed.
 
+    opaque : whether the face hides its markers from a camera behind it.
     Raises WorkFailed if a camera sees the face edge-on there.
     """
-    return _plant(truth, q_start.tobytes(), config.plant.self_occlusion == "opaque")
+    return _plant(truth, q_start.tobytes(), opaque)
 
 
 @lru_cache(maxsize=2048)

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.config import Config
 from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
@@ -28,12 +27,12 @@ from projservo_cli.robots import plugins
 from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.contract import at_rest_after
 from projservo_cli.robots.plugins import what_failed
-from projservo_cli.robots.simulated import AnalyticPlant, Plant
+from projservo_cli.simulation.faults import hindrance_of
+from projservo_cli.simulation.ideal import AnalyticPlant, Plant
 from projservo_cli.stages import external_robot
 from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
-from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.simulation import hindrance_of
-from projservo_cli.stages.world import arm_of
+from projservo_cli.stages.scenario import RunScenario, run_scenario
+from projservo_cli.stages.task import ServoInputs
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.target import followed
 
@@ -42,7 +41,7 @@ from projservo_cli.task.target import followed
 class _Outcome:
     """A run as it ended."""
 
-    scenario: Scenario
+    scenario: RunScenario
     verdict: str
     why: str  # verdict, why: how it ended, and what held, disturbed or failed it, where something did
     steps: int  # commands sent
@@ -152,12 +151,12 @@ def _whole(told: Sequence[FloatArray], rows: int) -> FloatArray:
     return np.array([*told, *[missing] * (rows - len(told))])
 
 
-def _told_poses(scenario: Scenario, truths: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _told_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Poses (k, 4, 4) of the tool as a robot tells them, and at the goal (4, 4), m; NaN where unknown.
 
     truths : the poses, or joints (k, n), which tell them where the arm is configured.
     """
-    arm, goal = arm_of(scenario.config), np.full((4, 4), np.nan)
+    arm, goal = scenario.inputs.arm, np.full((4, 4), np.nan)
     if arm is not None and len(scenario.q_shown):
         goal = arm.pose(scenario.q_shown[0])
     if truths.ndim == 3:
@@ -174,8 +173,7 @@ def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
 
     None where nothing tells the size, or images disagree with the calibration: they are no measure then.
     """
-    scenario, markers = run.scenario, run.scenario.config.markers
-    assert markers is not None
+    scenario, lengths = run.scenario, run.scenario.given.lengths
     s_star = scenario.ends.by_points().s_star
     m = s_star.shape[1]
     s, noise = run.log.s[run.steps, :, :m], [_LEAST_NOISE_PX, scenario.noise_px]
@@ -187,7 +185,7 @@ def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
         return None
     # The pair of corners that is foreshortened least tells how much of the face a pixel is.
     span = np.linalg.norm(s[:, :, None] - s[:, None], axis=3)
-    known = np.isfinite(lengths := markers.lengths(scenario.numbers[:m])) & (lengths > 0.0)
+    known = np.isfinite(lengths) & (lengths > 0.0)
     if not known.any() or not np.isfinite(s).all():
         return None
     m_per_px = 1.0 / np.max(span[:, known] / lengths[known], axis=1)
@@ -257,20 +255,21 @@ class Given(NamedTuple):
     robot: Any = None  # an object of the contract; None for that of the configuration
 
 
-def run(config: Config, calibration: Calibration, plan: Plan, name: str, given: Given | None = None) -> Trace:
+def run(
+    inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, given: Given | None = None
+) -> Trace:
     """Drive one law in one mode from the start of the task to its verdict.
 
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
     given : what a caller brings along.
-    Raises InputError if the configuration lacks a part of the simulation, or the plan to follow has no time;
-    WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
-    ``control.without_plan`` refuses to go without.
+    Raises InputError if a part of the simulation is missing, or the plan to follow has no time; WorkFailed if
+    the goal cannot be reached, or the joints cannot follow the plan and ``refuses`` is set.
     """
-    return drive(scenario_of(config, calibration), plan, name, given=given).trace()
+    return drive(run_scenario(inputs, calibration), plan, name, given=given).trace()
 
 
 def drive(
-    scenario: Scenario,
+    scenario: RunScenario,
     plan: Plan | FloatArray,
     name: str,
     believed: Model | None = None,
@@ -286,39 +285,39 @@ def drive(
     """
     law, mode = law_and_mode(name)
     unplanned, planned_s = "", None
-    if scenario.config.trajectory.keep_out and not (isinstance(plan, Plan) and plan.feasible):
+    if scenario.inputs.trajectory.keep_out and not (isinstance(plan, Plan) and plan.feasible):
         raise WorkFailed("nothing is driven where trajectory.keep_out is set and the plan is not feasible")
     if mode != REPLAN and isinstance(plan, Plan):
-        if not np.isfinite(plan.q).all() and scenario.config.control.without_plan != "refuse":
+        if not np.isfinite(plan.q).all() and not scenario.given.refuses:
             unplanned = f"no joints can follow the plan: {plan.reason}"
         elif plan.duration is not None:
-            planned_s = plan.duration / scenario.config.plant.speed_scale
+            planned_s = plan.duration / scenario.given.speed_scale
     asked = _Asked(scenario, plan, law, mode == REPLAN or bool(unplanned), believed, given or Given())
-    if scenario.truth is None or scenario.config.is_by_contract:
+    if scenario.given.contract is not None:
         run = asked.by_contract()
-    elif isinstance(plan, Plan) and (not _in_compiled_loop(scenario.config, law) or asked.is_guided):
+    elif isinstance(plan, Plan) and (not _in_compiled_loop(scenario.given, law) or asked.is_guided):
         run = asked.simulated()
     else:
         run = asked.compiled()
     return replace(run, law=law, mode=mode, planned_s=planned_s, unplanned=unplanned)
 
 
-def _in_compiled_loop(config: Config, law: str) -> bool:
+def _in_compiled_loop(inputs: ServoInputs, law: str) -> bool:
     """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
-    return law in CODES and config.plant.speed_scale == 1.0 and not config.is_by_contract
+    return law in CODES and inputs.speed_scale == 1.0 and inputs.contract is None
 
 
-def sense_is_enough(config: Config, name: str) -> bool:
+def sense_is_enough(inputs: ServoInputs, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
-    return mode == REPLAN and _in_compiled_loop(config, law)
+    return mode == REPLAN and _in_compiled_loop(inputs, law)
 
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
     """A run that is to be driven."""
 
-    scenario: Scenario
+    scenario: RunScenario
     plan: Plan | FloatArray  # of the task, or the joint motions (2, n) of its rotations where that is enough
     law: str
     replans: bool  # whether the law goes its own way instead of following the plan
@@ -329,11 +328,8 @@ class _Asked:
     def is_guided(self) -> bool:
         """Whether the run follows a plan which gives way to another one where it fails."""
         scenario = self.scenario
-        if (
-            self.replans
-            or self.law not in CODES
-            or scenario.config.trajectory.profile not in ("joint", "auto")
-        ):
+        searched = scenario.inputs.trajectory.profile in ("joint", "auto")
+        if self.replans or self.law not in CODES or not searched:
             return False
         return not why_closed(scenario.model, scenario.demands, search_of(scenario))
 
@@ -344,7 +340,7 @@ class _Asked:
         parts = MOST_PARTS if scenario.gains.substeps else 0
         log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts)
         plant, state = scenario.plant_of(self.law), controller.state
-        noise = scenario.noise_of(self.law, scenario.config.seed, limits.max_steps + 1)
+        noise = scenario.noise_of(self.law, scenario.inputs.seed, limits.max_steps + 1)
         course = Course(plant, limits, q_start.copy())
         code, steps = run_compiled(controller.law, course, noise, state, log)
         return _Outcome(scenario, VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
@@ -352,7 +348,7 @@ class _Asked:
     def simulated(self) -> _Outcome:
         """Drive a law on the simulated robot without a fault in the Python loop."""
         scenario = self.scenario
-        noise = scenario.noise_of(self.law, scenario.config.seed, scenario.limits.max_steps + 1)
+        noise = scenario.noise_of(self.law, scenario.inputs.seed, scenario.limits.max_steps + 1)
         plant = AnalyticPlant(scenario.plant_of(self.law), scenario.ends.q_start, noise)
         return self._in_python(self._controller(), plant)
 
@@ -362,7 +358,8 @@ class _Asked:
         That of ``plant.use`` is driven there. Before its first motion, what it sees must agree with the
         calibration where it stands. The robot is stopped and closed on every way out.
         """
-        scenario = self.scenario
+        scenario, contract = self.scenario, self.scenario.given.contract
+        assert contract is not None
         own = scenario.truth is None
         if own and (scenario.calibration is None or not scenario.calibration.usable):
             raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
@@ -376,7 +373,8 @@ class _Asked:
                 wrong = driven.fits()
                 if wrong:
                     raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
-                start, settle_s = scenario.ends.q_start, scenario.config.plant.settle_s
+                assert contract.settle_s is not None
+                start, settle_s = scenario.ends.q_start, contract.settle_s
                 for _ in external_robot.way_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
                         raise WorkFailed(f"stopped on the way to the start, since {wrong}")
@@ -390,7 +388,7 @@ class _Asked:
         scenario, execution = self.scenario, None
         if self.is_guided and isinstance(law, BuiltInLaw):
             assert isinstance(self.plan, Plan)
-            follow, searches = partial(self._task, law.law.model), scenario.config.control.searches_anew
+            follow, searches = partial(self._task, law.law.model), scenario.given.searches_anew
             replanner = PathReplanner(scenario, self.plan)
             execution = ExecutionMonitor(law, follow, replanner, searches, scenario.limits, stall)
         code, steps, log = run_in_python(
@@ -399,7 +397,7 @@ class _Asked:
             scenario.ends.by_points().s_star,
             scenario.gains.period,
             scenario.limits,
-            scenario.config.plant.speed_scale,
+            scenario.given.speed_scale,
             stall=stall,
             execution=execution,
         )
@@ -423,7 +421,7 @@ class _Asked:
     def _task(self, model: Model, plan: Plan) -> Task:
         """The task as a built-in law with a model is given it, with the plan that it follows."""
         scenario = self.scenario
-        task, scale = scenario.shown_to(self.law).task(model), scenario.config.plant.speed_scale
+        task, scale = scenario.shown_to(self.law).task(model), scenario.given.speed_scale
         return followed(model, task, plan, scenario.gains.period, scale)
 
     def _built_in(self) -> BuiltInLaw:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.config import Config
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.algebra import (
     as_array,
@@ -21,11 +20,12 @@ from projservo_cli.geometry.algebra import (
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.report.report_data import DIRECT, Studies
+from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive
-from projservo_cli.stages.world import Truth, truth_of
+from projservo_cli.stages.task import ServoInputs
 
 GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
 PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)
@@ -40,7 +40,7 @@ H_PE = np.array([[1.1, 0.2, -0.1, 0.3], [-0.2, 0.9, 0.2, -0.1], [0.1, -0.1, 1.2,
 class Comparison:
     """What all extra runs share: the task without noise, with the configured gains."""
 
-    scenario: Scenario  # without noise and disturbances, and without an end at a border or a joint limit
+    scenario: RunScenario  # without noise and disturbances, and without an end at a border or a joint limit
     # by operators, ``true`` (metric), ``twin`` (the same in a projective frame) and ``calibrated``
     models: dict[str, Model]
     sense: FloatArray  # (2, n) joint motions of both rotations as planned, for the sense of a half turn
@@ -75,17 +75,12 @@ def projective_twin(model: Model) -> Model:
     )
 
 
-def comparison_of(config: Config, calibration: Calibration, plan: Plan) -> Comparison:
+def comparison_of(inputs: ServoInputs, calibration: Calibration, plan: Plan) -> Comparison:
     """Set up the extra runs; images are without noise, but for a goal that is known by them alone.
 
-    They are of laws by themselves: nothing keeps them out of regions.
+    inputs : of laws by themselves on the ideal plant: nothing keeps them out of regions.
     """
-    truth_of(config)  # refuses what lacks a part of the simulation
-    alone = {
-        "control": config.control.model_copy(update={"observation": "points"}),
-        "trajectory": config.trajectory.model_copy(update={"keep_out": ()}),
-    }
-    scenario = scenario_of(config.idealized.model_copy(update=alone), calibration)
+    scenario = run_scenario(inputs, calibration)
     limits = scenario.limits._replace(stop_at_joint_limit=False, stop_at_border=False)
     scenario = replace(scenario, limits=limits)
     assert scenario.truth is not None
@@ -130,8 +125,8 @@ def run_studies(
 
 def metric_plan(bench: Comparison) -> Plan:
     """The task partitioned with the true metric model, so that its operators are in metres."""
-    short = {"profile": "linear", "samples": 2, "duration_s": None}
-    trajectory, robot = bench.scenario.config.trajectory.model_copy(update=short), bench.truth.robot
+    asked, robot = bench.scenario.inputs.trajectory, bench.truth.robot
+    trajectory = asked._replace(profile="linear", samples=2, duration_s=None)
     shown, limits = bench.scenario.ends, limits_alone(robot.limits)
     return plan_task(bench.models["true"], shown, trajectory, limits)
 

@@ -3,27 +3,38 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration import predict
-from projservo_cli.config import Config, plain_yaml
-from projservo_cli.config.task import TaskSettings
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
+from projservo_cli.robots.settings import JointSettings, OwnRobot, Readings
+from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.external_robot import at_rest, averaged, foreign_robot, simulated_robot
 from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
-from projservo_cli.stages.simulation import FaultyRobot, robot_by_itself
-from projservo_cli.stages.world import joints_of, truth_of
+from projservo_cli.stages.task import Driven, Goal, GoalImages, PlanInputs, ReachingTask
 
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
 _SLACK = 1e-3  # rad or m; by how much more than it sags a reading may change
 # From how far, rad or m, a simulated robot comes to where it is put, and how long it then rests, s.
 _BESIDE, _AT_REST_S = 0.02, 3
+
+
+@dataclass(frozen=True, eq=False)
+class TeachInputs:
+    """What a pose is taught with."""
+
+    driven: Driven
+    joints: JointSettings
+    numbers: tuple[int, ...]  # of the markers
+    noise_px: float  # standard deviation of simulated pixels
+    settle_s: float  # for how long joints and images have stood still before
+    seed: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,19 +56,31 @@ class _Taught:
             (int(self.marker[k]), VIEWS[view]) for view, k in np.argwhere(np.isnan(self.s[..., 0])).tolist()
         ]
 
-    def as_text(self) -> str:
-        """The file that ``task.goal`` and ``task.start`` take."""
-        head = "# What both cameras saw: projservo teach. Name this file under task.goal, or task.start.\n"
-        return head + plain_yaml(self.as_goal())
+    @property
+    def images(self) -> GoalImages:
+        """What was seen, as the goal of a task."""
+        left, right = (
+            tuple(None if math.isnan(u) else (u, v) for u, v in pixels.round(_DIGITS).tolist())
+            for pixels in self.s
+        )
+        sigma = [
+            tuple(None if math.isnan(x) else x for x in side.round(_DIGITS).tolist())
+            if np.isfinite(side).any()
+            else None
+            for side in self.sigma
+        ]
+        readings = Readings(tuple(self.q.tolist()), "rad")
+        return GoalImages(tuple(self.marker.tolist()), left, right, sigma[0], sigma[1], readings)
 
     def as_goal(self) -> dict[str, Any]:
         """What stands under ``task.goal`` of a configuration."""
-        images: dict[str, Any] = {"markers": self.marker.tolist()}
-        for name, pixels in zip(VIEWS, self.s, strict=True):
-            images[name] = [None if math.isnan(u) else [u, v] for u, v in pixels.round(_DIGITS).tolist()]
-        for name, sigma in zip(("sigma_left_px", "sigma_right_px"), self.sigma, strict=True):
-            if np.isfinite(sigma).any():
-                images[name] = [None if math.isnan(x) else x for x in sigma.round(_DIGITS).tolist()]
+        seen = self.images
+        images: dict[str, Any] = {"markers": [*seen.markers]}
+        for name, pixels in zip(VIEWS, (seen.left, seen.right), strict=True):
+            images[name] = [None if pixel is None else [*pixel] for pixel in pixels]
+        for name, sigma in (("sigma_left_px", seen.sigma_left), ("sigma_right_px", seen.sigma_right)):
+            if sigma is not None:
+                images[name] = [*sigma]
         return {"images": images | {"joints": {"joints": self.q.tolist(), "unit": "rad"}}}
 
 
@@ -71,30 +94,31 @@ class _Checked(NamedTuple):
 
 
 def teach(
-    config: Config, frames: int, at: Sequence[float] | None = None, wait: Callable[[str], None] | None = None
+    inputs: TeachInputs,
+    frames: int,
+    at: Sequence[float] | None = None,
+    wait: Callable[[str], None] | None = None,
 ) -> _Taught:
     """Look where the robot stands, and average so many frames of each camera.
 
     at : joints (n,) that a simulated robot is put to, rad or m.
     wait : tells somebody what to do, and returns when that is done; None where nobody can be asked, so that
         the arm is not released.
-    Raises InputError if the configuration lacks a part of it; WorkFailed if the robot fails.
+    Raises InputError if ``at`` is missing or beyond a limit; WorkFailed if the robot fails.
     """
-    numbers = config.markers.known if config.markers is not None else None
-    if numbers is None:
-        raise InputError("teach needs to know which markers the robot observes: set markers.numbers")
-    joints = joints_of(config)
-    if not config.plant.simulated:
+    joints, driven, period = inputs.joints.joints(), inputs.driven, inputs.driven.following.period
+    moved = None
+    if isinstance(driven.robot, OwnRobot):
         if at is not None:
             raise InputError("--at is where a simulated robot is put to; move yours by hand")
-        robot = foreign_robot(config, joints, len(numbers))
+        bounds = driven.following.bounds(joints)
+        robot = foreign_robot(driven.robot, bounds, joints.types, len(inputs.numbers))
     else:
         if at is None:
             raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
         if wrong := joints.limit_passed(np.array(at)):
             raise InputError(f"--at: {wrong}: choose others")
-        robot = simulated_robot(config, joints, _put_to(config, np.array(at)))
-    period, moved = config.control.period_s, None
+        robot = simulated_robot(driven, joints, _put_to(inputs, driven.robot, np.array(at)))
 
     def look() -> Reading:
         """A look after a period, in which a simulated robot holds where it was put to."""
@@ -115,7 +139,7 @@ def teach(
             wait("take your hands away")
         first, reading = robot.read(), look()
         if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
-            reading = [reading, *at_rest(reading, look, config.plant.settle_s, "teach")][-1]
+            reading = [reading, *at_rest(reading, look, inputs.settle_s, "teach")][-1]
         stood = reading.q if moved is None else moved
         mean, squares, count = averaged(reading, look, frames)
         since = "while images were taken" if moved is None else "since the arm was held again"
@@ -123,7 +147,7 @@ def teach(
     sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
     sigma = sigma if mean.sigma_px is None else mean.sigma_px
     return _Taught(
-        np.array(numbers, dtype=np.int64),
+        np.array(inputs.numbers, dtype=np.int64),
         mean.q,
         mean.s,
         np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan),
@@ -145,32 +169,31 @@ def _require_still(bounds: Bounds, before: FloatArray, after: FloatArray, since:
         )
 
 
-def _put_to(config: Config, q: FloatArray) -> FaultyRobot:
+def _put_to(inputs: TeachInputs, simulated: SimulatedRobot, q: FloatArray) -> FaultyRobot:
     """The simulated robot at rest at joints (n,), rad or m, come to from beside, so that play tells."""
-    truth = truth_of(config)
-    aside = generator(config.seed, TAUGHT_NOISE).choice((-_BESIDE, _BESIDE), len(q))
-    beside = np.clip(q + aside, truth.robot.limits.lower, truth.robot.limits.upper)
-    robot = robot_by_itself(config, truth, beside, config.noise.servo_px, config.seed, TAUGHT_NOISE)
+    arm, drawn = simulated.truth.robot, (inputs.seed, TAUGHT_NOISE)
+    aside = generator(*drawn).choice((-_BESIDE, _BESIDE), len(q))
+    beside = np.clip(q + aside, arm.limits.lower, arm.limits.upper)
+    robot = robot_by_itself(simulated, beside, inputs.noise_px, drawn)
     for second in range(1, 1 + _AT_REST_S):
         robot.command(q, np.zeros_like(q), float(second))
     return robot
 
 
-def checked(config: Config, calibration: Calibration, taught: _Taught) -> _Checked:
+def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _Checked:
     """Whether joints reach what was taught, by a calibration, and which markers are off what they show.
 
-    taught : with the whole face.
+    inputs : of a plan from anywhere; taught : with the whole face.
     """
-    joints = joints_of(config, calibration.joint_types, calibration)
-    start = np.clip(taught.q, joints.limits.lower, joints.limits.upper).tolist()
-    asked = {
-        "task": TaskSettings.model_validate(
-            {"start": {"joints": start, "unit": "rad"}, "goal": taught.as_goal()}
-        ),
-        "trajectory": config.trajectory.model_copy(update={"profile": "joint", "keep_out": ()}),
-    }
+    joints = inputs.joints.joints(calibration.joint_types, calibration)
+    start = Readings(tuple(np.clip(taught.q, joints.limits.lower, joints.limits.upper).tolist()), "rad")
+    asked = replace(
+        inputs,
+        task=ReachingTask(start, None, Goal(images=taught.images)),
+        trajectory=inputs.trajectory._replace(profile="joint", keep_out=()),
+    )
     try:
-        plan = planning.run(config.model_copy(update=asked), calibration)
+        plan = planning.run(asked, calibration)
         reached, reason = plan.feasible, plan.reason
         q = plan.q[-1] if reached else taught.q
     except WorkFailed as error:
@@ -188,9 +211,8 @@ def checked(config: Config, calibration: Calibration, taught: _Taught) -> _Check
     return _Checked(off, far, reached, reason)
 
 
-def require_face(config: Config, taught: _Taught) -> None:
+def require_face(face: Sequence[int], taught: _Taught) -> None:
     """Refuse what does not show the whole face to both cameras, with a WorkFailed."""
-    face = config.face_numbers
     if unseen := [(number, side) for number, side in taught.unseen if number in face]:
         number, side = unseen[0]
         raise WorkFailed(

@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import product
@@ -14,16 +15,17 @@ import numpy as np
 
 from projservo_cli.calibration.prediction import displacements, image_points, moved_points
 from projservo_cli.config import Config, Override, load_config, to_yaml
+from projservo_cli.config.inputs import calibration_inputs, trajectory_of, truth_of
 from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.config.task import Goal, TaskSettings
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import law_and_mode, names_of
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
-from projservo_cli.robots.simulated import METRIC_A_INF
 from projservo_cli.robots.source import source_hash
-from projservo_cli.stages.steps import affects, key_of
-from projservo_cli.stages.world import Truth, truth_of
+from projservo_cli.simulation.arm import METRIC_A_INF
+from projservo_cli.simulation.workspace import Truth
+from projservo_cli.steps import key_of
 
 RANGE = 0.9
 LEAST_COSINE = math.cos(math.radians(75.0))
@@ -132,7 +134,8 @@ def _overrides(what: str, key: str, value: Any) -> list[Override]:
 
 
 # Streams of the sweep's seed.
-RUNS, CALIBRATIONS, TASKS, VALUES, CALIBRATION_VALUES = range(5)
+RUNS, CALIBRATIONS, TASKS, VALUES, CALIBRATION_VALUES, PROBES = range(6)
+_PROBES = 4  # values that tell whether a calibration depends on them
 
 
 def _sample(distribution: Distribution, rng: np.random.Generator) -> Any:
@@ -288,7 +291,7 @@ class Design:
     @lru_cache(maxsize=4096)  # noqa: B019 - a process has one design
     def calibration_key(self, cell: int, calibration: int) -> str:
         """Hash of all a calibration depends on; cells that share it share the calibration."""
-        return key_of(self.calibrated(cell, calibration).model_copy(update={"seed": 0}), "calibrate")
+        return key_of(calibration_inputs(self.calibrated(cell, calibration)))
 
     def calibrations(self) -> Iterator[tuple[str, Config]]:
         """Key of each calibration that is needed, each once, and a configuration that needs it."""
@@ -301,7 +304,7 @@ class Design:
 
     def with_covariance(self) -> set[str]:
         """Keys of the calibrations of which a run needs the covariance, each 0.1 MB."""
-        cells = [c for c in range(self.cells) if self.cell(c).trajectory.needs_covariance]
+        cells = [c for c in range(self.cells) if trajectory_of(self.cell(c)).needs_covariance]
         return {self.calibration_key(*place) for place in product(cells, range(self._calibrations))}
 
     @property
@@ -346,10 +349,25 @@ class Design:
         sequence = np.random.SeedSequence(self.sweep.seed, spawn_key=(stream, number))
         return int(sequence.generate_state(1, np.uint64)[0] >> 1)
 
+    @cached_property
+    def _of_calibrations(self) -> set[str]:
+        """Keys that are drawn and that a calibration depends on, as values drawn for them tell."""
+        rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(PROBES,)))
+        probes = [{key: _sample(one, rng) for key, one in self.sweep.random.items()} for _ in range(_PROBES)]
+        found = set()
+        for key, cell, probe in product(self.sweep.random, range(self.cells), probes[1:]):
+            if key not in found:
+                cases = (probes[0], probes[0] | {key: probe[key]})
+                with suppress(InputError):  # a value that makes no configuration is told where it is drawn
+                    configs = [_changed(self.cell(cell), values, "random") for values in cases]
+                    first, second = (key_of(calibration_inputs(config)) for config in configs)
+                    found |= {key} if first != second else set()
+        return found
+
     def _drawn(self, stream: int, number: int) -> dict[str, Any]:
         """Values of the keys that a stream is for: whether the calibration depends on them."""
         of_calibration = stream == CALIBRATION_VALUES
-        keys = [key for key in self.sweep.random if affects(key, "calibrate") is of_calibration]
+        keys = [key for key in self.sweep.random if (key in self._of_calibrations) is of_calibration]
         if not keys:
             return {}
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(stream, number)))

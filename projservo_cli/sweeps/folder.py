@@ -19,11 +19,12 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli import provenance
 from projservo_cli.config import Config, to_yaml
+from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.files import write_whole
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages import Progress, calibrate
-from projservo_cli.stages.steps import result_of, steps_for
+from projservo_cli.steps import given_to, result_of, steps_for
 from projservo_cli.store import Result, Run, load, save
 from projservo_cli.store.sweep_table import TABLE, SweepTable, assemble, write_part
 from projservo_cli.sweeps.design import Design, name_of_run
@@ -302,21 +303,27 @@ def _shares_settings(design: Design) -> bool:
     settings = math.lcm(design.sweep.calibrations, tasks)
     if design.sweep.random or settings > SETTINGS or design.sweep.runs < settings:
         return False
-    return all(is_compiled(design, design.cell(cell)) for cell in range(design.cells))
+    return all(in_kernel(design, cell) for cell in range(design.cells))
+
+
+def in_kernel(design: Design, cell: int) -> bool:
+    """Whether the kernel of whole runs makes those of a cell."""
+    config = design.cell(cell)
+    return is_compiled(design, servo_inputs(config), name_of_run(config))
 
 
 def _calibrate(wanted: tuple[str, Config]) -> _Calibrated:
     """Make the calibration of a key, on one thread like all that must be the same to the bit."""
     with threadpool_limits(1):
         try:
-            return _Calibrated(*wanted, calibrate.run(wanted[1]))
+            return _Calibrated(*wanted, calibrate.run(given_to("calibrate", wanted[1])))
         except WorkFailed as error:
             return _Calibrated(*wanted, None, str(error))
 
 
 def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) -> None:
     """Fill an empty cache by one process, which ends here: the compiler keeps hundreds of megabytes."""
-    loop = LOOPS[is_compiled(design, design.cell(0))]
+    loop = LOOPS[in_kernel(design, 0)]
     if not engine.here or engine.workers == 1 or CACHE_FOLDER is None or any(CACHE_FOLDER.rglob(loop)):
         return
     say("compiling kernels, once, before the processes start")

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.config import Config
+from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.laws import BODY_LAWS, CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Setting, Trials
@@ -18,9 +18,10 @@ from projservo_cli.loop.step import RUNNING, VERDICTS
 from projservo_cli.records import Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rotation_sense
-from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive, sense_is_enough
-from projservo_cli.stages.steps import key_of
+from projservo_cli.stages.task import PlanInputs, ServoInputs
+from projservo_cli.steps import key_of
 from projservo_cli.sweeps.design import RUNS, Design, name_of_run
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
@@ -143,8 +144,9 @@ def run_part(part: Part) -> _Made:
                 continue
             _put(table, rows, {"usable": int(calibration.usable)})
             config = design.config(first)
-            if is_compiled(design, config):
-                _put(table, rows, _measured(config, calibration, table["seed"][rows]))
+            given, name = servo_inputs(config), name_of_run(config)
+            if is_compiled(design, given, name):
+                _put(table, rows, _measured(given, name, calibration, table["seed"][rows]))
                 these = np.array([run for run in these if run in wanted], dtype=np.int64)
             for run in these.tolist():
                 row, trace = _run(design, run, calibration, keep=run in wanted)
@@ -164,11 +166,10 @@ def _alike(design: Design, runs: IntArray) -> Iterator[IntArray]:
     yield from (runs[these] for these in np.split(order, np.flatnonzero(np.diff(group[order])) + 1))
 
 
-def is_compiled(design: Design, config: Config) -> bool:
+def is_compiled(design: Design, given: ServoInputs, name: str) -> bool:
     """Whether a run is made by the kernel of whole runs, which needs no plan and leaves no trace."""
-    assert config.robot is not None
-    six = len(config.robot.joint_types) == COORDINATES
-    kernel = six and sense_is_enough(config, name_of_run(config)) and config.trajectory.rehearses
+    six = len(given.plan.joints.types) == COORDINATES
+    kernel = six and sense_is_enough(given, name) and given.plan.trajectory.rehearses
     return kernel and not design.sweep.between_samples
 
 
@@ -192,10 +193,10 @@ def _put(table: _Columns, rows: IntArray, values: Mapping[str, Any]) -> None:
         table[name][rows] = value.encode() if isinstance(value, str) else value
 
 
-def _measured(config: Config, calibration: Calibration, seeds: IntArray) -> dict[str, Any]:
+def _measured(given: ServoInputs, name: str, calibration: Calibration, seeds: IntArray) -> dict[str, Any]:
     """What is measured of compiled runs, by column."""
     try:
-        numbers = _numbers_of(scenario_of(config, calibration), name_of_run(config), seeds.tolist())
+        numbers = _numbers_of(run_scenario(given, calibration), name, seeds.tolist())
     except WorkFailed:
         return {"verdict": NOT_STARTED}
     found: dict[str, Any] = {name: numbers[:, i] for i, name in enumerate(NUMBERS)}
@@ -212,7 +213,7 @@ INSTANTS, FURTHER = 192, 4
 TOGETHER = 16
 
 
-def _numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
+def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatArray:
     """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone."""
     setting = Setting(
         code=CODES[law],
@@ -220,7 +221,7 @@ def _numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArra
         believed=scenario.believed_by(law),
         body=scenario.exact.body,
         shares_task=law in BODY_LAWS,
-        rehearse=scenario.config.trajectory.rehearses,
+        rehearse=scenario.inputs.trajectory.rehearses,
         gains=scenario.gains,
         course=Course(scenario.plant_of(law), scenario.limits, scenario.exact.q_start),
         ends=scenario.true_ends,
@@ -255,11 +256,11 @@ _plans: dict[str, Plan] = {}
 PLANS = 128  # that are kept
 
 
-def _plan(config: Config, calibration: Calibration, calibration_key: str) -> Plan:
+def _plan(given: PlanInputs, calibration: Calibration, calibration_key: str) -> Plan:
     """Plan of a run; laws on the same images share one."""
-    key = key_of(config, "plan", before=calibration_key)
+    key = key_of(given, before=calibration_key)
     if key not in _plans:
-        made = planning.run(config, calibration)
+        made = planning.run(given, calibration)
         if len(_plans) >= PLANS:
             del _plans[next(iter(_plans))]
         _plans[key] = made
@@ -271,13 +272,13 @@ def _run(
 ) -> tuple[dict[str, Any], Trace | None]:
     """What is measured of one run, by column, and its trace where it is kept."""
     config = design.config(run)
-    name, (cell, _, number, _) = name_of_run(config), design.numbers(run)
+    given, name, (cell, _, number, _) = servo_inputs(config), name_of_run(config), design.numbers(run)
     try:
-        scenario = scenario_of(config, calibration)
-        if sense_is_enough(config, name) and config.trajectory.rehearses:
+        scenario = run_scenario(given, calibration)
+        if sense_is_enough(given, name) and given.plan.trajectory.rehearses:
             made = drive(scenario, rotation_sense(scenario), name)
         else:
-            made = drive(scenario, _plan(config, calibration, design.calibration_key(cell, number)), name)
+            made = drive(scenario, _plan(given.plan, calibration, design.calibration_key(cell, number)), name)
     except WorkFailed:
         return {"verdict": NOT_STARTED}, None
     row = {"verdict": made.verdict, "steps": made.steps, **made.summary._asdict()}

@@ -10,8 +10,7 @@ from scipy.stats import chi2
 
 from projservo_cli.calibration import predict
 from projservo_cli.config import load_config
-from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.world import truth_of
+from tests.configured import calibrate, plan, servo, truth_of
 from tests.known import driven as driven_with
 from tests.known import known_scenario, planned
 

@@ -14,10 +14,11 @@ import pytest
 import projservo_cli as ps
 from projservo_cli import cli
 from projservo_cli.calibration import prediction_variance
+from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.records import Calibration, Observation, Trace
-from projservo_cli.stages import calibrate
-from projservo_cli.stages.steps import key_of
+from projservo_cli.steps import key_of
 from projservo_cli.tables import read_table, write_table
+from tests.configured import calibrate
 from tests.conftest import ROOT
 
 CONFIGS = ("apart", "coupled", "hobby", "paper", "seven", "stanford", "ur5")
@@ -452,7 +453,7 @@ def test_no_public_name_is_hidden_by_a_module():
 def test_a_calibration_stands_where_nothing_changed_that_it_is_made_from(name, change, same):
     before = ps.Config.load(name).replace(LATE if name == "hobby" else {})
     after = before.replace(change)
-    assert (key_of(before, "calibrate") == key_of(after, "calibrate")) is same
+    assert (key_of(calibration_inputs(before)) == key_of(calibration_inputs(after))) is same
 
 
 @pytest.mark.parametrize("change", [{"control.period_s": 0.08}, {"plant.speed_scale": 0.5}])
@@ -460,4 +461,4 @@ def test_what_is_in_no_key_changes_nothing_and_what_changes_something_is_in_one(
     before = ps.Config.load("hobby").replace(FEW | LATE)
     after = before.replace(change)
     same = np.array_equal(ps.simulate(before).images, ps.simulate(after).images, equal_nan=True)
-    assert (key_of(before, "calibrate") == key_of(after, "calibrate")) is same
+    assert (key_of(calibration_inputs(before)) == key_of(calibration_inputs(after))) is same

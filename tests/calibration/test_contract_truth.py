@@ -8,9 +8,9 @@ import pytest
 
 from projservo_cli.calibration import predict
 from projservo_cli.config import load_config
-from projservo_cli.stages import calibrate as stage
-from projservo_cli.stages.world import truth_of
 from projservo_cli.tables import write_table
+from tests.configured import calibrate as stage
+from tests.configured import truth_of
 
 PAPER = Path(__file__).parents[2] / "configs" / "paper.yaml"
 # Another arm, another rig, another body; the same numbers of joints, types, pixels and markers.

@@ -10,7 +10,7 @@ import pytest
 from projservo_cli.calibration import Nominal, calibrate, predict
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.readings import Readings
-from projservo_cli.config.robot import read_nominal as fields_of
+from projservo_cli.nominal import read_nominal as fields_of
 from projservo_cli.records import InputError, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
 

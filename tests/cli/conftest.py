@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from projservo_cli import calibration, cli, files
+from projservo_cli import calibration, cli, files, steps
 from projservo_cli.laws import law_and_mode
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
-from projservo_cli.stages import calibrate, plan, report, servo, steps
+from projservo_cli.stages import calibrate, plan, report, servo
+from projservo_cli.stages.calibrate import CalibrationInputs, Table
+from projservo_cli.stages.task import PlanInputs, ServoInputs
 from projservo_cli.tables import read_table
 from tests.fake_records import fake
 
@@ -58,34 +60,36 @@ class Stages:
             raise self.fails[name]
         self.made.append(name)
 
-    def calibrate(self, config: Any, *, progress: Any) -> Any:
+    def calibrate(self, inputs: CalibrationInputs, *, progress: Any) -> Any:
         progress("trial motions", 1, 2)
-        if config.recorded:
-            data = config.data
-            source, observation = "recorded", read_table(data.table, data.joints, data.joint_unit)
+        told = inputs.source
+        if isinstance(told, Table):
+            types, seed, source = told.joint_types, told.seed, "recorded"
+            observation = read_table(told.file.path, types, told.joint_unit)
         else:
-            source, observation = "simulated", fake(Observation, 1, {"joint": len(config.joint_types)})
+            types, seed, source = told.joints.types, told.motions.seed, "simulated"
+            observation = fake(Observation, 1, {"joint": len(types)})
         self._make("calibrate")
         n = observation.q.shape[1]
-        types = config.joint_types or "R" * n
+        types = types or "R" * n
         given = {"source": source, "joint_types": types, "chi2_per_dof": float("nan"), "advice": ("more",)}
         given |= {"outlier": np.array([[3, 1, 0], [4, 2, 2]]), "suspect": np.zeros((0, 2), dtype=np.int64)}
-        return observation, fake(Calibration, config.seed, {"joint": n}, **given), None
+        return observation, fake(Calibration, seed, {"joint": n}, **given), None
 
-    def plan(self, config: Any, calibration: Any) -> Any:
+    def plan(self, inputs: PlanInputs, calibration: Any) -> Any:
         self._make("plan")
         verdict = self.verdicts.get("plan", "")
-        given = {"profile": config.trajectory.profile, "feasible": verdict != "infeasible"}
+        given = {"profile": inputs.trajectory.profile, "feasible": verdict != "infeasible"}
         joints = {"joint": len(calibration.q_reference)}
-        return fake(Plan, config.seed, joints, reason="too near", **given)
+        return fake(Plan, inputs.seed, joints, reason="too near", **given)
 
-    def servo(self, config: Any, calibration: Any, plan: Any, law: str) -> Any:
+    def servo(self, inputs: ServoInputs, calibration: Any, plan: Any, law: str) -> Any:
         self._make(law)
         name, mode = law_and_mode(law)
         given = {"law": name, "mode": mode, "verdict": self.verdicts.get(law, "converged")}
-        return fake(Trace, config.seed, {"joint": len(calibration.q_reference)}, **given)
+        return fake(Trace, inputs.plan.seed, {"joint": len(calibration.q_reference)}, **given)
 
-    def report(self, run: Any, directory: Any, *, progress: Any) -> Any:
+    def report(self, inputs: Any, run: Any, directory: Any, *, progress: Any) -> Any:
         self._make("report")
         self.reported.append((list(run.traces), run.configuration))
         claim = {"claim": "c", "source": "s", "measured": "3 mm", "criterion": "< 4 mm", "holds": True}

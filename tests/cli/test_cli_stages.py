@@ -10,6 +10,7 @@ from tqdm import tqdm
 from projservo_cli import progress
 from projservo_cli.cli.output import Console
 from projservo_cli.records import InputError
+from projservo_cli.report import animation as film
 from projservo_cli.report import page
 from projservo_cli.stages import report as reporting
 from projservo_cli.store import load
@@ -71,7 +72,7 @@ def test_a_mode_that_cannot_be_is_refused_before_anything_is_made(projservo, sta
         ("control.mode=[replan, image_track]", ["stacked_image_track", "report"]),
         ("report.formats=[png]", ["report"]),
         ("noise.servo_px=0.1", ALL[1:]),
-        ("name=other", []),
+        ("name=other", ["report"]),  # which prints it
     ],
 )
 def test_only_what_depends_on_a_change_is_redone(projservo, reported, change, remade):
@@ -398,16 +399,16 @@ def test_a_view_and_an_animation_are_made_beside_a_report_that_is_up_to_date(
     made = []
 
     def make(name):
-        def write(run, progress):
+        def write(shown, run, progress):
             made.append((name, list(run.traces)))
             return run.path.parent / name
 
         return write
 
-    monkeypatch.setattr(reporting, "plotly", lambda: None)
+    monkeypatch.setattr(film, "plotly", lambda: None)
     monkeypatch.setattr(reporting, "view", make("view.html"))
     monkeypatch.setattr(reporting, "animation", make("animation.gif"))
-    monkeypatch.setattr(page, "write_page", lambda run: made.append(("page", sorted(run.results))))
+    monkeypatch.setattr(page, "write_page", lambda run, about: made.append(("page", sorted(run.results))))
     answer = projservo("report", "-o", "out", "--animation", "--view", "--json")
     assert answer.code == 0
     laws = ["direct_three", "stacked"]
@@ -423,7 +424,7 @@ def test_a_view_that_cannot_be_made_is_refused_before_any_work(projservo, stages
     def lacks():
         raise InputError("the 3D view needs plotly: pip install '.[view]'")
 
-    monkeypatch.setattr(reporting, "plotly", lacks)
+    monkeypatch.setattr(film, "plotly", lacks)
     answer = projservo("report", "-c", "tiny.yaml", "-o", "out", "--view")
     assert answer.code == 2
     assert answer.err == "projservo: the 3D view needs plotly: pip install '.[view]'\n"

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from projservo_cli.files import working_in
-from projservo_cli.report.page import write_page
 from projservo_cli.store import load, save
+from tests.configured import page_of
 
 ESCAPES = "\x1b[2J\x07\x9b31m\u202egnp.exe\u2028</script><img src=x onerror=alert(1)>"
 
@@ -34,7 +34,7 @@ def test_texts_of_a_run_command_no_terminal_and_become_no_part_of_the_page(projs
         assert answer.code == 0
         assert plain(answer.out + answer.err), [c for c in answer.out if not c.isprintable()]
     assert answer.json["plan"]["reason"] == ESCAPES
-    text = write_page(load(hostile)).read_text(encoding="utf-8")
+    text = page_of(load(hostile)).read_text(encoding="utf-8")
     assert "<img src=x" not in text
     assert "</script>" not in text
     assert "&lt;img src=x" in text

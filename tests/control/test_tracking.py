@@ -8,9 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.cli.output import words_of
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import scenario_of
-from projservo_cli.stages.world import truth_of
+from tests.configured import calibrate, plan, scenario_of, servo, truth_of, under
 from tests.known import configured, driven
 
 pytestmark = pytest.mark.volume
@@ -46,7 +44,7 @@ def test_the_centre_keeps_to_its_line_and_arrives_in_time(seed, frames):
     assert 1e3 * np.sqrt((beside**2).sum(axis=1).mean()) <= 1.5
     # In time it is where the loop comes to rest without noise: at the goal as its images show it.
     scenario = scenario_of(config, calibration)
-    scenario = replace(scenario, config=config.idealized, exact=scenario.ends)
+    scenario = under(scenario, config.idealized, exact=scenario.ends)
     rest = driven(scenario, planned, "exact_track", None, image_px=1e-3, noise_px=0.0, max_steps=400)
     assert rest.verdict == "converged"
     there = (off(trace, body, rest.pose[-1]) <= ARRIVED).all(axis=0)

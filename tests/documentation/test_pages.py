@@ -13,8 +13,8 @@ import projservo_cli
 from docs.generate.regions import GROUPS
 from projservo_cli import cli
 from projservo_cli.config import load_config
-from projservo_cli.robots.mjcf import mujoco
-from projservo_cli.stages.world import truth_of
+from projservo_cli.simulation.mjcf import mujoco
+from tests.configured import truth_of
 from tests.detection.rendering import render, square
 from tests.documentation.blocks import PAGES, ROOT, blocks_of, matches, run_page
 

@@ -22,9 +22,8 @@ from projservo_cli.monitoring import statistics
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW, ErrorModel, Memory
-from projservo_cli.stages import calibrate
-from projservo_cli.stages.world import truth_of
 from tests.calibration.simulated_robot import random_robot, trials
+from tests.configured import calibrate, truth_of
 from tests.known import configured
 
 SIGMA, PERIOD = 0.5, 0.04

@@ -5,8 +5,8 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.world import truth_of
 from projservo_cli.task.target import Shown
+from tests.configured import truth_of
 from tests.conftest import ROOT
 from tests.known import asked, known_scenario
 

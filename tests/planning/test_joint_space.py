@@ -11,13 +11,11 @@ from projservo_cli.calibration import predict
 from projservo_cli.config.robot import JointVector
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages import calibrate, servo
-from projservo_cli.stages import plan as planning
-from projservo_cli.stages.scenario import scenario_of
-from projservo_cli.stages.world import truth_of
 from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import followed
 from projservo_cli.task.trajectory import planned
+from tests.configured import calibrate, scenario_of, servo, truth_of
+from tests.configured import plan as planning
 from tests.known import asked, configured
 
 pytestmark = pytest.mark.volume

@@ -15,8 +15,8 @@ from projservo_cli.planning.margins import CLEAR
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at
 from projservo_cli.planning.time_parameterization import joints_at
 from projservo_cli.records import Spread, WorkFailed
-from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.plan_summary import reason_of
+from tests.configured import calibrate, plan, servo
 from tests.conftest import ROOT
 from tests.known import configured
 from tests.planning.joint_space_cases import COUNT, case

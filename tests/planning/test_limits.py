@@ -8,10 +8,8 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
-from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.record import new_recording, record
-from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.tables import read_table
+from tests.configured import calibrate, plan, record, scenario_of, servo
 
 ROOT = Path(__file__).parents[2]
 # The arm's trials turn each joint by 30° to both sides of this reference.
@@ -32,7 +30,7 @@ def mine(tmp_path_factory):
     """A file that describes a recorded robot, and how it is read with overrides."""
     folder = tmp_path_factory.mktemp("mine")
     simulated = load_config(ROOT / "configs/ur5.yaml")
-    record(simulated, new_recording(simulated, folder / "trials.csv"))
+    record.record(simulated, record.new_recording(simulated, folder / "trials.csv"))
     (folder / "mine.yaml").write_text(MINE, encoding="utf-8")
 
     @lru_cache

@@ -10,9 +10,9 @@ from projservo_cli.planning.product_space import plan_path
 from projservo_cli.records import InputError, position_limits
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.studies import projective_twin
-from projservo_cli.stages.world import truth_of
 from projservo_cli.sweeps.design import STRATA, random_tasks
 from projservo_cli.task.target import Shown
+from tests.configured import truth_of
 from tests.known import asked, configured, known_scenario
 from tests.planning.cases import constrained, reaching_of
 from tests.planning.oracle import TrueTask

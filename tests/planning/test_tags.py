@@ -8,12 +8,11 @@ from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.planning.constraints import FINE_PX, constraints_of
 from projservo_cli.planning.margins import IMAGE, VISIBILITY
 from projservo_cli.planning.rrt_connect import margins_at
-from projservo_cli.robots.simulated import METRIC_A_INF
-from projservo_cli.stages import calibrate
+from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.stages.motions import search_of
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.stages.servo import drive
+from tests.configured import calibrate, scenario_of
 from tests.known import configured
 
 # Joint 4 alone leads from start to goal, deg, and turns the middle tag away from both cameras on the way.
@@ -86,7 +85,7 @@ def limited(made):
 def test_a_motion_of_the_paper_is_judged_by_the_best_tag():
     made = scenario("trajectory.profile=linear")
     truth, demands = made.truth, made.demands
-    plan = plan_task(made.model, made.ends, made.config.trajectory, demands)
+    plan = plan_task(made.model, made.ends, made.inputs.trajectory, demands)
     found = np.array([in_truth(truth, q) for q in plan.q])
     side, border = found[:, :, :2] / found[0, 0, :2], found[:, :, 4:]
     half, px = 0.5 * truth.image_size.min(), demands.border_px
@@ -101,7 +100,7 @@ def test_a_motion_of_the_paper_is_judged_by_the_best_tag():
 def test_the_middle_tag_may_turn_away_where_another_stays_in_sight(profile):
     made = scenario(f"trajectory.profile={profile}")
     demands, search = limited(made), search_of(made)
-    shown = made.model, made.ends, made.config.trajectory
+    shown = made.model, made.ends, made.inputs.trajectory
     plan = plan_task(*shown, demands, search)
     assert plan.feasible, plan.reason
     seen = np.array([in_truth(made.truth, q) for q in plan.q])
@@ -116,7 +115,7 @@ def test_a_run_that_sees_another_tag_alone_for_a_while_arrives():
     """The face turns away, and is lost to both cameras besides; the body is measured by the others."""
     unseen = "disturbance.lost_markers={from_step: 10, steps: 30, markers: [0, 1, 2, 3]}"
     made = scenario("trajectory.profile=joint", "noise.servo_px=0.2", unseen, calibrated=True)
-    plan = plan_task(made.model, made.ends, made.config.trajectory, limited(made), search_of(made))
+    plan = plan_task(made.model, made.ends, made.inputs.trajectory, limited(made), search_of(made))
     trace = drive(made, plan, "exact_track").trace()
     assert np.isnan(trace.s[10:40, :, :4]).all()
     assert trace.verdict == "converged"

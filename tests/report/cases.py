@@ -11,7 +11,8 @@ from projservo_cli.records import PRISMATIC, Calibration
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import Material
 from projservo_cli.robots.client import Film
-from projservo_cli.stages import record, studies
+from projservo_cli.stages import studies
+from tests.configured import record
 from tests.fake_records import fake
 from tests.known import configured, driven, known_scenario, planned
 
@@ -56,7 +57,18 @@ def case(name="paper", steps=SHORT, whole=False):
     return (
         config,
         bench,
-        Material(calibration, observation, model, true.robot, plant, plan, numbers, traces, extra),
+        Material(
+            calibration,
+            observation,
+            model,
+            true.robot,
+            plant,
+            plan,
+            numbers,
+            traces,
+            extra,
+            trajectory=scenario.inputs.trajectory,
+        ),
     )
 
 

@@ -8,6 +8,7 @@ import pytest
 from projservo_cli.config import to_yaml
 from projservo_cli.stages import report
 from projservo_cli.store import Result, Run
+from tests.configured import report_on
 from tests.known import configured
 from tests.report.cases import SHORT, SPECS, case
 
@@ -37,7 +38,7 @@ def run(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "FIGURES", [SPECS[name] for name in SOME])
         patch.setattr(report, "run_studies", lambda bench, progress: case()[2].studies)
-        record = report.run(run, folder)
+        record = report_on(run, folder)
     return dataclasses.replace(run, results=run.results | {"report": Result("k", "", MADE, {}, {"": record})})
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.report.animation import MOST_INSTANTS, motion_of
-from projservo_cli.stages.world import truth_of
+from tests.configured import truth_of
 from tests.report.cases import SHORT, case
 
 

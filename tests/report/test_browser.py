@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from projservo_cli.report.page import write_comparison
 from projservo_cli.report.report_data import PAGE_FILE
-from projservo_cli.stages import report as extras
+from tests.configured import compared, view_of
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 # A machine without a graphics processor draws three dimensions by software.
@@ -73,13 +72,13 @@ def opened(browser, path, width=1400, dark=False):
 @pytest.fixture(scope="module")
 def view(run):
     pytest.importorskip("plotly", reason="plotly is not installed: pip install '.[view]'")
-    return extras.view(run)
+    return view_of(run)
 
 
 @pytest.fixture(scope="module")
 def pages(run, view, tmp_path_factory):
     comparison = tmp_path_factory.mktemp("comparison") / "compare.html"
-    write_comparison([run, run], comparison)
+    compared([run, run], comparison)
     return {"report": run.path.parent / PAGE_FILE, "comparison": comparison, "view": view}
 
 

@@ -13,9 +13,9 @@ from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Fit
 from projservo_cli.robots.client import Film
-from projservo_cli.stages import calibrate, report
-from projservo_cli.stages.steps import steps_for
+from projservo_cli.steps import steps_for
 from projservo_cli.store import Result, Run
+from tests.configured import calibrate, report_on
 from tests.fake_records import fake
 from tests.known import configured
 from tests.report.cases import SPECS, case
@@ -195,7 +195,7 @@ def test_a_recorded_run_without_a_task_is_reported_on_with_its_calibration(tmp_p
     run = Run(tmp_path / "run.h5", to_yaml(config), {"calibrate": Result("", "", {}, {}, records)})
     for names, with_plan in ((["report"], False), (["plan", "report"], True)):
         assert ("plan" in [step.stage for step in steps_for(config, run, names)]) == with_plan
-    made = report.run(run, tmp_path)
+    made = report_on(run, tmp_path)
     assert (made.figures, made.claims) == (("figures/fig13_calibration.svg",), ())
     assert (tmp_path / made.figures[0]).read_bytes().startswith(b"<?xml")
     assert [entry["what"] for entry in made.left_out] == [
@@ -237,7 +237,7 @@ def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_t
     assert [step.name for step in steps if not step.why] == ["calibrate", "plan", "servo/direct_three"]
     assert [step.name for step in steps if step.why] == ["report"]
     run.results.pop("servo/exact")
-    told = report.run(run, tmp_path)
+    told = report_on(run, tmp_path)
     assert told.figures == ("figures/fig13_calibration.svg", "figures/fig17_frames.svg")
     assert {entry["reason"] for entry in told.left_out} == {
         "no model of robot and cameras is known that could be drawn: set robot, rig and markers"

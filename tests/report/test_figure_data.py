@@ -10,7 +10,7 @@ from projservo_cli.report import style
 from projservo_cli.report.figures import planned, scene
 from projservo_cli.report.figures.path_deviation import study_numbers
 from projservo_cli.report.report_data import along_line, title
-from projservo_cli.robots.simulated import camera_center
+from projservo_cli.simulation.arm import camera_center
 from projservo_cli.task.trajectory import trajectory_displacement
 from tests.report.cases import GAINS, SPECS, case
 from tests.samples import prismatic, revolute

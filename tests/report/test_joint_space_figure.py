@@ -12,7 +12,7 @@ from projservo_cli.report.figures.joint_space import PIECES
 from projservo_cli.stages import studies
 from projservo_cli.stages.motions import JointSearch
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.world import truth_of
+from tests.configured import truth_of
 from tests.known import asked, configured
 from tests.report.cases import SPECS, case
 from tests.report.test_figure_drawing import drawn, require_readable

@@ -7,13 +7,13 @@ import json
 import numpy as np
 import pytest
 
+from projservo_cli import steps
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import CrossValidation
-from projservo_cli.report.page import write_comparison, write_page
 from projservo_cli.report.report_data import PAGE_FILE
-from projservo_cli.stages import steps
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
+from tests.configured import compared, page_of
 from tests.fake_records import fake
 from tests.report.cases import SPECS, case
 from tests.report.conftest import SOME, read, words
@@ -32,7 +32,7 @@ def altered(run, folder, *, report=None, **results):
 
 
 def shown(run):
-    return read(write_page(run))
+    return read(page_of(run))
 
 
 def test_the_page_loads_nothing_and_runs_nothing(page, run):
@@ -138,7 +138,7 @@ def test_the_same_run_gives_the_same_bytes(run):
     path = run.path.parent / PAGE_FILE
     texts = []
     for _ in range(2):
-        write_page(run)
+        page_of(run)
         texts.append(path.read_bytes())
     assert texts[0] == texts[1]
 
@@ -200,7 +200,7 @@ def test_runs_stand_side_by_side_and_a_figure_that_one_lacks_leaves_its_place_em
     other = altered(run, run.path.parent, report={"figures": [f"figures/{name}.svg" for name in SOME[1:]]})
     other = dataclasses.replace(other, configuration=run.configuration.replace("seed: 1", "seed: 22"))
     path = tmp_path / "both.html"
-    write_comparison([run, other], path)
+    compared([run, other], path)
     page = read(path)
     names = [element.attributes["id"] for element in page.all() if "id" in element.attributes]
     assert len(set(names)) == len(names)

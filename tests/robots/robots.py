@@ -7,9 +7,9 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.loop.python import BuiltInLaw
-from projservo_cli.stages.world import truth_of
 from projservo_cli.task.face import MIDPOINT
 from projservo_cli.task.target import Shown
+from tests.configured import truth_of
 
 CALLS = []
 

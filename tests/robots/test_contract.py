@@ -10,9 +10,8 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.robots.contract import ForeignRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.stages.external_robot import bounds_of, way_to
-from projservo_cli.stages.simulation import robot_by_itself
-from projservo_cli.stages.world import joints_of, truth_of
+from projservo_cli.stages.external_robot import way_to
+from tests.configured import bounds_of, joints_of, robot_by_itself, truth_of
 from tests.documentation.blocks import PAGES, ROOT, blocks_of
 from tests.documentation.test_pages import put_truth
 from tests.robots.robots import Sound

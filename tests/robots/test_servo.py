@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.config import load_config
 from projservo_cli.records import Calibration
-from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.scenario import Scenario
 from projservo_cli.store import load
 from projservo_cli.tables import read_table
+from tests.configured import scenario_of
 from tests.fake_records import fake
 from tests.robots import robots
 from tests.robots.robots import CALLS
@@ -188,11 +189,11 @@ def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
 
 
 def test_a_calibration_without_covariance_tests_nothing_and_says_so():
-    config = load_config(UR5)
+    inputs = SimpleNamespace(tests_images=True)
     bare = fake(Calibration, shared_error=np.full((3, 3), np.nan))
-    assert "has no covariance" in Scenario.untested.fget(SimpleNamespace(config=config, calibration=bare))
+    assert "has no covariance" in Scenario.untested.fget(SimpleNamespace(inputs=inputs, calibration=bare))
     sound = fake(Calibration, shared_error=np.eye(3))
-    assert Scenario.untested.fget(SimpleNamespace(config=config, calibration=sound)) == ""
+    assert Scenario.untested.fget(SimpleNamespace(inputs=inputs, calibration=sound)) == ""
 
 
 def test_lost_markers_are_waited_for(servo):

@@ -5,10 +5,8 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
-from projservo_cli.rendered.cameras import Frames
-from projservo_cli.rendered.model import rendered_model
-from projservo_cli.robots.mjcf import mujoco
-from projservo_cli.stages.world import truth_of
+from projservo_cli.simulation.mjcf import mujoco
+from tests.configured import eyes_of, truth_of
 
 # A two-joint arm before two cameras, of which the left one has skew, the right one unequal focal lengths.
 SMALL = """
@@ -47,14 +45,6 @@ def small():
     """The configuration of a small rendered robot, with overrides."""
     text = SMALL.replace("MATRIX", str(_skewed().tolist()))
     return lambda *overrides: load_config("small.yaml", overrides, text=text)
-
-
-def eyes_of(config):
-    """The cameras of a configuration, not open."""
-    truth = truth_of(config)
-    return Frames(
-        rendered_model(config.arm, truth.robot, config.rig, truth.P, config.markers, config.plant.rendered)
-    )
 
 
 @pytest.fixture

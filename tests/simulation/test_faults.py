@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.config.models import Disturbance
+from projservo_cli.config import load_config, plain_yaml
+from projservo_cli.config.inputs import events_of, faults_of
 from projservo_cli.records import REVOLUTE, position_limits
-from projservo_cli.robots.simulated import Arm
-from projservo_cli.stages.simulation import FaultyRobot, Points, World, full_reach
-from projservo_cli.stages.world import Truth
+from projservo_cli.simulation.arm import Arm
+from projservo_cli.simulation.faults import FaultyRobot, Points, World, full_reach
+from projservo_cli.simulation.workspace import Truth
 from tests.samples import displacement, pixels, revolute, rig
 
 PERIOD = 0.04
@@ -42,7 +43,8 @@ def images(q, M=M):
 def robot(sigma_px=0.0, seed=1, q_start=(0.0, 0.0), **disturbance):
     truth = Truth(arm(), CAMERAS, M, (0, 1, 2), (), 0, np.full(2, math.inf))
     world = World(truth, np.array(q_start), Points(truth, truth.images, True, sigma_px), PERIOD, seed, 0)
-    return FaultyRobot(world, Disturbance.model_validate(disturbance))
+    config = load_config(None, text=plain_yaml({"data": {"table": "none"}, "disturbance": disturbance}))
+    return FaultyRobot(world, faults_of(config), events_of(config))
 
 
 def driven(plant, targets):

@@ -7,8 +7,8 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
-from projservo_cli.rendered.physics import Physics
-from projservo_cli.stages.world import truth_of
+from projservo_cli.simulation.physics import Physics
+from tests.configured import truth_of
 from tests.simulation.conftest import eyes_of
 
 # A pendulum of 2 kg at 0.5 m behind a joint about the vertical axis, and a finger of its own.

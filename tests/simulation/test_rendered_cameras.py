@@ -87,13 +87,8 @@ HASHED = """
 import hashlib, sys
 import numpy as np
 from projservo_cli.config import load_config
-from projservo_cli.rendered.cameras import Frames
-from projservo_cli.rendered.model import rendered_model
-from projservo_cli.stages.world import truth_of
-config = load_config("small.yaml", ["plant.options={k1: -0.1}"], text=sys.stdin.read())
-truth = truth_of(config)
-given = config.arm, truth.robot, config.rig, truth.P, config.markers, config.plant.rendered
-eyes = Frames(rendered_model(*given))
+from tests.configured import eyes_of
+eyes = eyes_of(load_config("small.yaml", ["plant.options={k1: -0.1}"], text=sys.stdin.read()))
 eyes.open()
 seen = [eyes.look(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)]
 print(hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest())

@@ -1,10 +1,10 @@
 """Configured benchmarks with their true model: what stages plan and servo do without a calibration."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
+from tests.configured import under
 from tests.known import configured, driven, known_scenario, planned
 
 
@@ -26,7 +26,7 @@ class Case:
     def servo(self, law, model=None, gains=None, sense=None, **limits):
         """Trace of one law without noise, by default with the true metric model and the planned sense."""
         gains, clean = self.gains if gains is None else gains, self.config.idealized
-        scenario = replace(self.scenario, config=clean, exact=self.ends, gains=gains)
+        scenario = under(self.scenario, clean, exact=self.ends, gains=gains)
         sense = self.plan.rotation_sense() if sense is None else sense
         return driven(scenario, sense, law, self.truth.model if model is None else model, **limits)
 

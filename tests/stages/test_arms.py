@@ -9,9 +9,7 @@ from scipy.linalg import expm
 from projservo_cli.config import load_config
 from projservo_cli.geometry.kinematics import joint_operators, project
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import scenario_of
-from projservo_cli.stages.world import truth_of
+from tests.configured import calibrate, plan, scenario_of, servo, truth_of
 from tests.conftest import ROOT
 from tests.samples import revolute
 

@@ -6,7 +6,7 @@ from scipy.linalg import expm
 
 from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, servo
+from tests.configured import calibrate, plan, servo
 from tests.conftest import ROOT
 from tests.samples import revolute
 

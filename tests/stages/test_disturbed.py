@@ -5,8 +5,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
-from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.world import truth_of
+from tests.configured import calibrate, plan, servo, truth_of
 from tests.conftest import ROOT
 
 UNTESTED = "stop.innovation_factor=0"

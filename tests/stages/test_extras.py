@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from projservo_cli.cli.stages import require_extras
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report import animation as film
-from projservo_cli.report.page import write_page
 from projservo_cli.report.report_data import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
 from projservo_cli.stages import report
 from projservo_cli.store import Result
+from tests.configured import animation_of, page_of, report_on, view_of
 from tests.known import configured
 from tests.report.cases import case
 from tests.report.conftest import MADE, read, stored
@@ -30,7 +31,7 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def view(run):
     pytest.importorskip("plotly", reason="plotly is not installed: pip install '.[view]'")
-    return report.view(run)
+    return view_of(run)
 
 
 def test_the_view_is_one_file_that_loads_nothing(view):
@@ -63,8 +64,8 @@ def test_the_view_holds_every_instant_of_every_law(run, view):
 def test_without_plotly_the_view_says_what_to_install(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
     with pytest.raises(InputError, match=r"pip install '\.\[view\]'"):
-        report.require(configured("paper"), ["view"])
-    report.require(configured("paper"), ["animation"])
+        require_extras(configured("paper"), ["view"])
+    require_extras(configured("paper"), ["animation"])
 
 
 def test_what_has_no_metres_or_no_task_is_refused_with_the_remedy():
@@ -72,16 +73,16 @@ def test_what_has_no_metres_or_no_task_is_refused_with_the_remedy():
     config = configured("paper")
     projective = config.model_copy(update={"robot": None})
     with pytest.raises(InputError, match=r"--view: .*no metres.*robot\.dh or robot\.screws.*--animation"):
-        report.require(projective, ["view"])
-    report.require(projective, ["animation"])
+        require_extras(projective, ["view"])
+    require_extras(projective, ["animation"])
     with pytest.raises(InputError, match=r"--animation: .*task"):
-        report.require(config.model_copy(update={"task": None}), ["animation"])
+        require_extras(config.model_copy(update={"task": None}), ["animation"])
 
 
 def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):
     monkeypatch.setattr(film, "FRAMES", 6)  # a tenth of them, each of which takes its time
     told = []
-    path = report.animation(run, lambda *progress: told.append(progress))
+    path = animation_of(run, lambda *progress: told.append(progress))
     assert told == [("animation", k, 6) for k in range(1, 7)]
     assert path.stat().st_size < MOST_BYTES[ANIMATION_FILE] / 10
     with Image.open(path) as image:
@@ -95,11 +96,11 @@ def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):
         assert last == [film.FRAME_MS] * 5 + [film.LAST_MS]
         assert image.convert("RGB").getpixel((1, 1)) == (255, 255, 255)
     before = path.read_bytes()
-    report.animation(run)
+    animation_of(run)
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize("make", [report.view, report.animation])
+@pytest.mark.parametrize("make", [view_of, animation_of])
 def test_runs_without_a_step_have_nothing_to_show(run, make):
     pytest.importorskip("plotly", reason="plotly is not installed: pip install '.[view]'")
     kept = {name: result for name, result in run.results.items() if not name.startswith("servo/")}
@@ -111,15 +112,15 @@ def test_the_page_links_to_what_there_is_and_a_new_report_removes_it(tmp_path, m
     monkeypatch.setattr(report, "draw_all", lambda *arguments: [])
     monkeypatch.setattr(report, "run_studies", lambda bench, progress: case()[2].studies)
     run = stored(tmp_path)
-    made = Result("k", "", MADE, {}, {"": report.run(run, tmp_path)})
+    made = Result("k", "", MADE, {}, {"": report_on(run, tmp_path)})
     run = dataclasses.replace(run, results={**run.results, "report": made})
     assert "See it move" not in (tmp_path / PAGE_FILE).read_text(encoding="utf-8")
     (tmp_path / VIEW_FILE).touch()
     (tmp_path / ANIMATION_FILE).touch()
-    write_page(run)
+    page_of(run)
     links = {a.attributes["href"] for a in read(tmp_path / PAGE_FILE).all("a")}
     assert {VIEW_FILE, ANIMATION_FILE} <= links
-    report.run(run, tmp_path)
+    report_on(run, tmp_path)
     assert not (tmp_path / VIEW_FILE).exists()
     assert not (tmp_path / ANIMATION_FILE).exists()
     assert "See it move" not in (tmp_path / PAGE_FILE).read_text(encoding="utf-8")

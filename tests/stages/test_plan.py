@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from projservo_cli.planning.margins import limits_alone
-from projservo_cli.stages import calibrate
-from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import plan_task, rotation_sense
-from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.task.trajectory import PROFILES
+from tests.configured import calibrate, scenario_of
+from tests.configured import plan as planning
 from tests.known import asked, configured
 from tests.samples import frame, in_frame, pixels
 from tests.stages.cases import case

@@ -8,15 +8,13 @@ import pytest
 from projservo_cli import files
 from projservo_cli.cli.output import Console
 from projservo_cli.config import load_config
-from projservo_cli.config.markers import cells_of
+from projservo_cli.detection import cells_of
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.robots.contract import ForeignRobot
-from projservo_cli.stages import record as stage
-from projservo_cli.stages.external_robot import bounds_of, foreign_robot
-from projservo_cli.stages.record import simulate, trial_motions
-from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.store import load
 from projservo_cli.tables import read_joint_list, read_table
+from tests.configured import bounds_of, foreign_robot, joints_of, simulate, trial_motions, truth_of
+from tests.configured import record as stage
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 UR5, STANFORD = CONFIGS / "ur5.yaml", CONFIGS / "stanford.yaml"
@@ -87,7 +85,7 @@ def test_an_interrupted_recording_goes_on_where_it_was(projservo, monkeypatch, g
 
 
 def test_the_table_grows_while_the_robot_moves(monkeypatch):
-    monkeypatch.setattr(stage, "SAVE_EVERY", 0.0)
+    monkeypatch.setattr("projservo_cli.stages.record.SAVE_EVERY", 0.0)
     config = load_config(UR5, ["calibration.frames_per_joint=2"])
     path, sizes = Path("t.csv"), []
     recording = stage.new_recording(config, path)

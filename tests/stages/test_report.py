@@ -4,12 +4,14 @@ import json
 import numpy as np
 import pytest
 
+from projservo_cli import steps
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures.path_deviation import study_numbers
 from projservo_cli.report.report_data import DIRECT
-from projservo_cli.stages import report, steps, studies
+from projservo_cli.stages import report, studies
 from projservo_cli.store import Result, Run, load, save
+from tests.configured import report_on
 from tests.known import configured
 from tests.report.cases import GAINS, PERIODS_S, SPECS, case
 from tests.report.conftest import stored
@@ -54,7 +56,7 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
     (tmp_path / "figures" / "fig01_partition.pdf").write_text("of an earlier report")
     steps = []
     run = stored(tmp_path, "report.formats=[png]", material=material)
-    record = report.run(run, tmp_path, progress=lambda *step: steps.append(step))
+    record = report_on(run, tmp_path, progress=lambda *step: steps.append(step))
     assert not stale.exists()
     assert not (tmp_path / "figures" / "fig01_partition.pdf").exists()
     assert record.figures == ("figures/fig01_partition.png", "figures/fig08_drift.png")
@@ -127,7 +129,7 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
         assert ("pose of the goal is unknown" in spec.lacking(material)) == spec.goal
     monkeypatch.setattr(report, "FIGURES", (SPECS["fig03_scene"], SPECS["fig12_joints"]))
     monkeypatch.setattr(report, "run_studies", lambda bench, progress: material.studies)
-    record = report.run(stored(tmp_path, "report.formats=[svg]", material=material), tmp_path)
+    record = report_on(stored(tmp_path, "report.formats=[svg]", material=material), tmp_path)
     assert len(record.figures) == 2
     assert not any("drift" in claim["claim"] or "nan" in claim["measured"] for claim in record.claims)
     content = json.loads((tmp_path / "claims.json").read_text(encoding="utf-8"))
@@ -144,7 +146,7 @@ def test_what_fails_is_named_and_its_figures_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "run_studies", fail)
     monkeypatch.setattr(report, "metric_plan", fail)
     monkeypatch.setattr(report, "FIGURES", (SPECS["fig12_joints"],))
-    record = report.run(stored(tmp_path), tmp_path)
+    record = report_on(stored(tmp_path), tmp_path)
     assert [entry["what"] for entry in record.left_out] == ["studies", "equation (22)", "fig12_joints"]
     assert all(entry["reason"].endswith(reason) for entry in record.left_out)
     assert (record.figures, record.drift_mm.size, record.share.size) == ((), 0, 0)
@@ -166,7 +168,7 @@ def test_a_report_needs_a_plan(tmp_path):
     run = stored(tmp_path)
     run = dataclasses.replace(run, results={"calibrate": run.results["calibrate"]})
     with pytest.raises(InputError, match="holds no plan"):
-        report.run(run, tmp_path)
+        report_on(run, tmp_path)
 
 
 def test_both_sides_of_eq_22_agree_to_first_order_only():

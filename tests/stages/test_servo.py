@@ -119,6 +119,6 @@ def test_no_size_and_no_images_that_agree_are_no_measure():
         assert (told.estimated_position_error_mm is not None) == agrees
     unsized = example.config.markers.model_copy(update={"positions_m": None})
     for markers, size in ((unsized, None), (unsized.model_copy(update={"tag_size_m": 0.1}), 0.1)):
-        config = example.config.model_copy(update={"markers": markers})
-        told = replace(run, scenario=replace(run.scenario, config=config)).trace()
+        given = replace(run.scenario.given, lengths=markers.lengths(example.config.face_numbers))
+        told = replace(run, scenario=replace(run.scenario, given=given)).trace()
         assert (told.estimated_position_error_mm is None) == (size is None)

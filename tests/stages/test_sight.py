@@ -10,9 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.task.body import NO_BODY
+from tests.configured import calibrate, plan, scenario_of, servo, under
 from tests.known import driven
 from tests.stages.cases import Case, case
 
@@ -52,12 +51,12 @@ def steady(law, sigma, observation, runs):
     if observation == "points":
         scenario = replace(scenario, numbers=scenario.numbers[:4], exact=scenario.exact.by_points())
     sense = planned.rotation_sense()
-    noise = scenario.config.noise.model_copy(update={"servo_px": sigma, "shown_frames": 1})
+    noise = example.config.noise.model_copy(update={"servo_px": sigma, "shown_frames": 1})
     position, rotation, verdicts = [], [], Counter()
     for seed in range(runs):
-        config = scenario.config.model_copy(update={"noise": noise, "seed": seed})
+        config = example.config.model_copy(update={"noise": noise, "seed": seed})
         limits = {"image_px": 1e-9, "max_steps": STEPS}
-        trace = driven(replace(scenario, config=config), sense, law, None, **limits)
+        trace = driven(under(scenario, config), sense, law, None, **limits)
         verdicts[trace.verdict] += 1
         assert trace.observation == observation
         gap = 1e3 * np.linalg.norm(trace.center[TAIL:] - example.goal_center, axis=1)

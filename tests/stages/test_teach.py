@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from projservo_cli.config import load_config
+from projservo_cli.config import load_config, plain_yaml
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.robots.contract import Reading
-from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.external_robot import averaged
-from projservo_cli.stages.teach import checked, require_face, teach
-from projservo_cli.stages.world import truth_of
+from tests.configured import calibrate, checked, plan, require_face, servo, teach, truth_of
 from tests.conftest import ROOT
 
 HOBBY = ROOT / "configs" / "hobby.yaml"
@@ -63,7 +61,7 @@ def test_with_play_a_taught_goal_is_met_where_joints_would_miss_it(calibration, 
     """By what the true pose shows: several times nearer than joints that play in their bearings."""
     given = config(*PLAY)
     path = tmp_path / "goal.yaml"
-    path.write_text(teach(given, 20, AT).as_text(), encoding="utf-8")
+    path.write_text(plain_yaml(teach(given, 20, AT).as_goal()), encoding="utf-8")
     asked = load_config(HOBBY, [*SHARP, f"task.goal={path}", f"task.start={path}"])
     assert asked.task.start.values("RRRRR") == pytest.approx(AT)
     taught = config(*PLAY, f"task.goal={path}", "stop.innovation_factor=0")

@@ -3,22 +3,16 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from projservo_cli.config import Config, load_config
-from projservo_cli.stages import record as trials
-from projservo_cli.stages.world import joints_of, truth_of
+from projservo_cli.config import load_config
+from tests.configured import joints_of, truth_of
+from tests.configured import record as trials
 
 UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
 
 
-@pytest.fixture
-def faulty(monkeypatch):
-    monkeypatch.setattr(Config, "is_ideal", False)
-
-
-def test_poses_of_all_joints_follow_and_no_reading_comes_twice(faulty):
-    config = load_config(UR5)
+def test_poses_of_all_joints_follow_and_no_reading_comes_twice():
+    config = load_config(UR5, ["disturbance.jitter_s=0.001"])
     q, truth, joints = trials.trial_motions(config), truth_of(config), joints_of(config)
     assert q.shape == (1 + 6 * 8 + 12, 6)
     np.testing.assert_array_equal(q, trials.trial_motions(config))

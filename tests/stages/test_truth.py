@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages.record import simulate
-from projservo_cli.stages.scenario import plant_of, scenario_of
-from projservo_cli.stages.world import truth_of
+from tests.configured import plant_of, scenario_of, simulate, truth_of
 from tests.known import configured as loaded
 from tests.known import known_scenario
 from tests.stages.cases import case

@@ -11,9 +11,9 @@ import pytest
 
 from projservo_cli.files import lies_inside, replacing, require_inside, working_in
 from projservo_cli.records import InputError
-from projservo_cli.report.page import write_comparison
 from projservo_cli.store import save
 from projservo_cli.tables import write_table
+from tests.configured import compared
 from tests.conftest import ROOT
 from tests.store.sound import sound_run
 
@@ -130,7 +130,7 @@ def test_a_full_disk_is_told_and_the_old_file_stays(little_disk):
     (little_disk / "filling").write_bytes(bytes(240_000))
     writers = [
         lambda: save(replace(run, path=path)),
-        lambda: write_comparison([run, run], path),
+        lambda: compared([run, run], path),
         lambda: write_table(run.observation, path),
     ]
     for write in writers:

@@ -12,8 +12,8 @@ import projservo_cli
 from projservo_cli import cli
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
-from projservo_cli.stages.world import truth_of
 from projservo_cli.store import save
+from tests.configured import truth_of
 from tests.store.sound import sound_run
 
 STANFORD = Path(__file__).parents[2] / "configs" / "stanford.yaml"

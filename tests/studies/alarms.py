@@ -18,9 +18,8 @@ import numpy as np
 
 from projservo_cli.config.robot import JointVector
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.world import truth_of
 from projservo_cli.sweeps.design import random_tasks
+from tests.configured import calibrate, plan, servo, truth_of
 from tests.known import configured
 from tests.studies.planning_tables import in_two_processes, quantiles, rate, write_rows
 

@@ -17,8 +17,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.world import truth_of
+from tests.configured import calibrate, plan, servo, truth_of
 from tests.studies.conditions import (
     ARMS,
     CONDITIONS,

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.config.robot import JointVector
-from projservo_cli.stages.simulation import FaultyRobot
-from projservo_cli.stages.world import truth_of
+from projservo_cli.simulation.faults import FaultyRobot
 from projservo_cli.sweeps.design import STRATA, random_tasks
+from tests.configured import truth_of
 from tests.known import configured
 from tests.studies.planning_tables import write_rows
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, record, servo
+from tests.configured import calibrate, plan, record, servo
 from tests.monitoring.stand_in import ARMS, KINDS, LAST, StandIn, seen, tool_pose
 from tests.studies.planning_tables import in_two_processes, quantiles, rate
 

@@ -9,7 +9,7 @@ Markers are lost for 20 steps, for 32 (longer than they are waited for), and for
 from collections import Counter
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, servo
+from tests.configured import calibrate, plan, servo
 from tests.studies.planning_tables import (
     asked_for,
     in_two_processes,

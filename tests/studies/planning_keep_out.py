@@ -26,13 +26,13 @@ from projservo_cli.planning.keep_out import keep_out_of
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, within_region
 from projservo_cli.records import WorkFailed
-from projservo_cli.robots.simulated import METRIC_A_INF
-from projservo_cli.stages import calibrate, plan
-from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.simulation.arm import METRIC_A_INF
+from projservo_cli.simulation.workspace import Truth
+from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.servo import drive
-from projservo_cli.stages.world import Truth, joints_of, truth_of
 from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import Shown
+from tests.configured import calibrate, joints_of, plan, scenario_of, truth_of
 from tests.known import configured
 
 ARMS = {"paper": 67, "ur5": 67, "stanford": 66}

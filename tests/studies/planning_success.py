@@ -16,10 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import plan, servo
-from projservo_cli.stages.world import truth_of
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweeps.folder import Folder, run_of
+from tests.configured import plan, servo, truth_of
 from tests.studies.planning_tables import has_no_way, in_two_processes, quantiles, rate, write_rows
 
 GUIDED, ALONE = "exact_track", "exact"

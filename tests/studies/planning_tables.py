@@ -17,9 +17,9 @@ from projservo_cli.planning.constraints import constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path
-from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import Shown
+from tests.configured import joints_of, truth_of
 from tests.known import configured
 
 # Configurations with images of 0.5 px noise, each with a seed of its own for its tasks.

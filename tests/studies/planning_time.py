@@ -10,8 +10,7 @@ import time
 from tqdm import tqdm
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan
-from projservo_cli.stages.scenario import scenario_of
+from tests.configured import calibrate, plan, scenario_of
 from tests.studies.planning_tables import asked_for, quantiles, task_configs, write_rows
 
 PROFILES = ("joint", "auto")

@@ -24,9 +24,8 @@ import pytest
 
 from projservo_cli.laws import POINT_LAWS
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, record, servo
-from projservo_cli.stages.simulation import FaultyRobot, robot_by_itself, shown_in_frames
-from projservo_cli.stages.world import truth_of
+from projservo_cli.simulation.faults import FaultyRobot
+from tests.configured import calibrate, plan, record, robot_by_itself, servo, shown_in_frames, truth_of
 from tests.conftest import ROOT
 from tests.studies import hand_eye
 from tests.studies.arrival import errors
@@ -74,7 +73,7 @@ def recorded(condition):
     """A calibration, what it is made from and how corners compare with the truth."""
     config = base_of(condition)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("projservo_cli.stages.simulation.FaultyRobot", Watched)
+        patch.setattr("projservo_cli.simulation.faults.FaultyRobot", Watched)
         Watched.counts[:], Watched.squares[:], Watched.lens = 0.0, 0.0, condition == "lens"
         seen, sigma_px = record.observed(config)
         patch.setattr("projservo_cli.stages.calibrate.observed", lambda *args, **kwargs: (seen, sigma_px))

@@ -12,9 +12,9 @@ import numpy as np
 
 from projservo_cli.config.robot import JointVector
 from projservo_cli.records import FloatArray
-from projservo_cli.stages.simulation import hindrance_of, robot_by_itself, shown_in_frames
-from projservo_cli.stages.world import truth_of
+from projservo_cli.simulation.faults import hindrance_of
 from projservo_cli.sweeps.design import STRATA, random_tasks
+from tests.configured import robot_by_itself, shown_in_frames, truth_of
 from tests.conftest import SHARED
 from tests.known import configured
 from tests.studies.planning_tables import write_rows

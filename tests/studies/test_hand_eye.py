@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.stages.world import truth_of
+from tests.configured import truth_of
 from tests.known import configured
 
 cv2 = pytest.importorskip("cv2")

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.simulation import FaultyRobot
+from projservo_cli.simulation.faults import FaultyRobot
+from tests.configured import calibrate, plan, servo
 from tests.known import configured
 from tests.studies.conditions import ARMS, SEEDS, task_config
 from tests.studies.planning_tables import in_two_processes, write_rows
@@ -140,7 +140,7 @@ def driven(job):
     for seed in list(SEEDS)[:count]:
         mine = task_config(config, arm, seed)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("projservo_cli.stages.simulation.FaultyRobot", robot)
+            patch.setattr("projservo_cli.simulation.faults.FaultyRobot", robot)
             try:
                 trace = servo.run(mine, calibration, plan.run(mine, calibration), "exact_track")
                 found = {"verdict": trace.verdict, "reason": trace.reason, "steps": trace.steps}

@@ -6,12 +6,13 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.config import load_sweep
+from projservo_cli.config import load_sweep, to_yaml
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.records import InputError
-from projservo_cli.stages.world import truth_of
 from projservo_cli.sweeps.design import Design, read_design
+from tests.configured import truth_of
 from tests.conftest import ROOT
+from tests.known import configured
 from tests.sweeps.cases import design
 
 
@@ -84,7 +85,7 @@ def test_distributions_keep_to_their_bounds_and_moments():
     keys = dict(zip(("control.gain_t", "control.gain_r", "control.gain_p", "name"), given, strict=True))
     values = {"name": "n", "base": ("b",), "seed": 5, "runs": 4000, "grid": {"law": ["exact"]}}
     values["random"] = {key: {kind: given[kind]} for key, kind in keys.items()}
-    found = Design(SweepConfig.model_validate(values), ())
+    found = Design(SweepConfig.model_validate(values), (("b", to_yaml(configured("paper"))),))
     drawn = [found.drawn(run) for run in range(4000)]
     draws = {kind: np.array([values[key] for values in drawn]) for key, kind in keys.items()}
     # Four standard errors of the mean of 4000 draws.

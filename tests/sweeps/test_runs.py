@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import scenario_of
-from projservo_cli.stages.world import truth_of
+from projservo_cli.stages import plan as planning
 from projservo_cli.sweeps import runs
 from projservo_cli.sweeps.design import name_of_run
-from projservo_cli.sweeps.runs import Part, is_compiled, run_part
+from projservo_cli.sweeps.folder import in_kernel
+from projservo_cli.sweeps.runs import Part, run_part
+from tests.configured import calibrate, plan, scenario_of, servo, truth_of
 from tests.known import configured
 from tests.sweeps.cases import design
 
@@ -132,8 +132,8 @@ def test_the_deviation_is_unknown_where_images_alone_show_the_goal():
 
 @pytest.mark.volume
 def test_laws_on_the_same_images_share_the_plan(monkeypatch):
-    planned, plan_of = [], plan.run
-    monkeypatch.setattr(plan, "run", lambda *given: planned.append(given) or plan_of(*given))
+    planned, plan_of = [], planning.run
+    monkeypatch.setattr(planning, "run", lambda *given: planned.append(given) or plan_of(*given))
     run_part(part_of(design(**CASES["constrained"] | {"runs": 2, "seed": 7})))
     assert len(planned) == 2
 
@@ -165,5 +165,5 @@ def test_a_run_whose_images_show_nothing_has_a_verdict_and_no_numbers():
 )
 def test_runs_that_need_more_than_their_images_are_made_elsewhere(key, value):
     plain, other = (design(grid={"law": ["exact"]}, set=given) for given in ({}, {key: value}))
-    assert is_compiled(plain, plain.cell(0))
-    assert not is_compiled(other, other.cell(0))
+    assert in_kernel(plain, 0)
+    assert not in_kernel(other, 0)

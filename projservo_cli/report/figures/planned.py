@@ -12,7 +12,7 @@ from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.report_data import VIEWS, Data, Material, registered
-from projservo_cli.robots.simulated import METRIC_A_INF, roll_axis
+from projservo_cli.simulation.arm import METRIC_A_INF, roll_axis
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.trajectory import trajectory_displacement
 

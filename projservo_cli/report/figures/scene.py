@@ -8,7 +8,8 @@ from projservo_cli.geometry.kinematics import forward_kinematics, joint_operator
 from projservo_cli.records import PRISMATIC, FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, Material, registered
-from projservo_cli.robots.simulated import Plant, camera_center
+from projservo_cli.simulation.arm import camera_center
+from projservo_cli.simulation.ideal import Plant
 from projservo_cli.task.face import center_of
 
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face

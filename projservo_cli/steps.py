@@ -1,72 +1,41 @@
 """Dependencies of stages: which results are up to date, and which must be made first.
 
-Every result carries a key: a hash of the configuration its stage depends on and of the key of the
-stage before it. Keys follow from the configuration alone, so what is to be done is known before
+Every result carries a key: a hash of what its stage is given, and of the keys of the results that it is made
+from. Keys follow from the configuration and the files that it names, so what is to be done is known before
 anything is done.
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from projservo_cli import provenance
-from projservo_cli.config import Config, digest, to_yaml
-from projservo_cli.config.models import FAULTS
+from projservo_cli.canonical import encoded
+from projservo_cli.config import Config, to_yaml
+from projservo_cli.config.inputs import (
+    calibration_inputs,
+    files_of,
+    plan_inputs,
+    report_inputs,
+    servo_inputs,
+)
 from projservo_cli.laws import law_and_mode, names_of
 from projservo_cli.records import InputError
 from projservo_cli.report.report_data import CLAIMS_FILE, PAGE_FILE
 from projservo_cli.robots.source import source_hash
 from projservo_cli.store import SERVO, Result, Run
 
-STAGES = ("calibrate", "plan", "servo", "report")
-# What of the configuration each stage depends on, beside the stage before it.
-_WORLD = ("robot", "rig", "markers")
-_TASK = ("seed", *_WORLD, "noise.servo_px", "noise.shown_frames", "task")
-_PACE = (
-    "control.joint_speed_limit_deg_s",
-    "control.prismatic_speed_limit_m_s",
-    "control.joint_acceleration_limit_deg_s2",
-    "control.prismatic_acceleration_limit_m_s2",
-)
-# Of trial motions that a simulated robot with faults, or before rendered cameras, is driven through.
-_DRIVEN = (
-    "control.period_s",
-    "control.joint_speed_limit_deg_s",
-    "control.prismatic_speed_limit_m_s",
-    *(
-        "plant.frames",
-        "plant.settle_s",
-        "plant.lag_s",
-        "plant.sag_deg",
-        "plant.lead_deg",
-        "plant.joint_limits",
-    ),
-)
-_DEPENDS_ON: dict[str, tuple[str, ...]] = {
-    "calibrate": (
-        *("seed", *_WORLD, "noise.calibration_px", "calibration", "data", "task.start"),
-        *(f"disturbance.{name}" for name in FAULTS),
-    ),
-    "plan": (*_TASK, "trajectory", "control.observation", "plant.use", *_PACE),
-    "servo": (*_TASK, "trajectory.delta", "control", "plant", "disturbance", "stop"),
-    "report": ("report", "control.must_converge"),
+# The stages in their order, and what makes the record that each is given.
+_GIVEN: dict[str, Callable[[Config, Mapping[str, str]], Any]] = {
+    "calibrate": calibration_inputs,
+    "plan": plan_inputs,
+    "servo": servo_inputs,
+    "report": report_inputs,
 }
-# Where a file lies does not matter, only what it says. Which laws are run, in which modes, and which of
-# them must converge, changes the run of none of them.
-_NOT_HASHED: dict[str, tuple[str, ...]] = {
-    "calibrate": ("data.table", "calibration.init", "robot.mjcf"),
-    "plan": ("data.table", "robot.mjcf"),
-    "servo": ("data.table", "robot.mjcf", "control.laws", "control.mode", "control.must_converge"),
-    "report": ("data.table",),
-}
-# What files that are read hold.
-_EXPECTED = {
-    "table": "a table",
-    "init": "JSON with screws, cameras and markers",
-    "mjcf": "a model of MuJoCo",
-}
+STAGES = tuple(_GIVEN)
+_HASH = "_sha256"  # behind the name of a file, of its hash
 
 
 @dataclass(frozen=True)
@@ -80,6 +49,7 @@ class Step:
     why: str = ""  # why it has to be made; empty where the stored one is up to date
     note: str = ""  # what changed that does not outdate it, in words
     unkeyed: bool = False  # whether nothing tells what its law is, so that it is never up to date
+    given: Any = None  # the record that the stage is given; None where it cannot be made
 
     @property
     def name(self) -> str:
@@ -109,12 +79,12 @@ def steps_for(
     recording : why the table has to be recorded first; keys of what rests on it are not known until then.
     """
     stages = STAGES[: max(map(STAGES.index, named)) + 1]
-    inputs = {} if recording else _file_hashes(config, run)
+    given = _Given() if recording else _given(config, run, stages)
 
     def planned(stages: Sequence[str], laws: Sequence[str]) -> list[Step]:
         steps: list[Step] = []
         sources = _sources(laws, config, run) if "servo" in stages else {}
-        for step in _needed(config, inputs, sources, stages):
+        for step in _needed(given, sources, stages):
             remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
             steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
         return steps
@@ -135,19 +105,9 @@ def steps_for(
     return steps
 
 
-def key_of(config: Config, stage: str, **before: Any) -> str:
-    """Hash of what a stage depends on: of the configuration, and of JSON values on what it is made from."""
-    if config.plant.rendered is not None and stage in ("calibrate", "plan"):
-        before["options"] = config.plant.rendered.model_dump()  # by which images look
-    driven = stage == "calibrate" and not config.recorded and config.plant.simulated and not config.is_ideal
-    parts = (*_DEPENDS_ON[stage], *(_DRIVEN if driven else ()))
-    return digest(config, parts, without=_NOT_HASHED[stage], extra=before)
-
-
-def affects(key: str, stage: str) -> bool:
-    """Whether a stage depends on a key of the configuration."""
-    parts = [f"{part}." for part in _DEPENDS_ON[stage]]
-    return any(part.startswith(f"{key}.") or f"{key}.".startswith(part) for part in parts)
+def key_of(given: Any, **more: Any) -> str:
+    """Hash of what a stage is given, and of further values: what it is made from, and by which law."""
+    return hashlib.sha256(encoded([given, more])).hexdigest()
 
 
 class _Read(NamedTuple):
@@ -186,42 +146,48 @@ def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
     return found
 
 
-def _needed(
-    config: Config, inputs: dict[str, str], laws: Mapping[str, _Read], stages: Sequence[str]
-) -> Iterator[Step]:
-    """Every result of the stages with its key, each made from those before."""
-    before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
-    before += [inputs["mjcf_sha256"]] if "mjcf" in inputs else []
-    for stage in stages:
-        keys = []
-        of_files = {"": _Read(inputs if stage == "calibrate" else {})}
-        for law, read in (laws if stage == "servo" else of_files).items():
-            own = {"source": read.hashed} if read.hashed else {}
-            keys.append(key_of(config, stage, before=before, law=law, **own))
-            yield Step(stage, law, keys[-1], read.inputs, note=read.note, unkeyed=read.unkeyed)
-        before = [*keys]
+class _Given(NamedTuple):
+    """What stages are given."""
+
+    records: Mapping[str, Any] = {}  # by stage; none where the configuration lacks a part of it
+    files: Mapping[str, str] = {}  # what the files that are read are, by name, and their hashes
 
 
-def _file_hashes(config: Config, run: Run) -> dict[str, str]:
-    """Hashes of the files that are read; the stored one where that very file is gone since."""
-    files = {"table": config.data.table if config.data is not None else None, "init": config.calibration.init}
-    if config.plant.rendered is not None and config.arm is not None:
-        files["mjcf"] = config.arm.mjcf
+def _given(config: Config, run: Run, stages: Sequence[str]) -> _Given:
+    """What each stage is given, as far as the configuration tells it; making the others says what is missing.
+
+    An InputError where a file cannot be read. Where a file is gone since, its stored hash stands.
+    """
     stored = run.results["calibrate"].inputs if "calibrate" in run.results else {}
-    found: dict[str, str] = {}
-    for name, given in files.items():
-        if given is None:
-            continue
-        digested = f"{name}_sha256"
-        if stored.get(name) == given and not Path(given).exists():
-            found |= {name: given, digested: stored[digested]}
-            continue
-        try:
-            found |= {name: given, digested: hashlib.sha256(Path(given).read_bytes()).hexdigest()}
-        except OSError as error:
-            what = f"cannot be read: {error.strerror or error}; expected {_EXPECTED[name]}"
-            raise InputError(f"{given}: {what}") from error
-    return found
+    gone = {
+        stored[name]: digest for key, digest in stored.items() if (name := key.removesuffix(_HASH)) != key
+    }
+    files: dict[str, str] = {}
+    for name, file in files_of(config, gone).items():
+        files |= {name: file.path, name + _HASH: file.sha256}
+    records: dict[str, Any] = {}
+    for stage in stages:
+        with suppress(InputError):
+            records[stage] = _GIVEN[stage](config, gone)
+    return _Given(records, files)
+
+
+def given_to(stage: str, config: Config) -> Any:
+    """The record that a stage is given; an InputError where a part of the configuration is missing."""
+    return _GIVEN[stage](config, {})
+
+
+def _needed(given: _Given, laws: Mapping[str, _Read], stages: Sequence[str]) -> Iterator[Step]:
+    """Every result of the stages with its key, each made from those before."""
+    before: list[str] = []
+    for stage in stages:
+        keys, record = [], given.records.get(stage)
+        of_files = {"": _Read(given.files if stage == "calibrate" else {})}
+        for law, read in (laws if stage == "servo" else of_files).items():
+            more = {"before": before, "law": law, "source": dict(read.hashed)}
+            keys.append("" if record is None else key_of(record, **more))
+            yield Step(stage, law, keys[-1], read.inputs, note=read.note, unkeyed=read.unkeyed, given=record)
+        before = keys
 
 
 def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:

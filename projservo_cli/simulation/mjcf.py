@@ -2,13 +2,15 @@
 
 import os
 import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.records import FloatArray, InputError
-from projservo_cli.robots.urdf import arm_screws, joint_screw, listed
+from projservo_cli.simulation.urdf import arm_screws, joint_screw, listed
 
 
 def mujoco() -> Any:
@@ -118,3 +120,27 @@ def read_mjcf(path: str, tip: str) -> dict[str, Any]:
     tool = np.eye(4)
     tool[:3, :3], tool[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
     return arm_screws(joints, model.qpos0[model.jnt_qposadr[chain]], tool @ held)
+
+
+def files_named(path: str) -> list[str]:
+    """Return the files that an MJCF file names, and those that these name: parts of it, meshes, textures.
+
+    Names are relative to the folder of the model, or to one of those that its compiler is told.
+    """
+    home, found, due = Path(path).parent, dict[str, None](), [Path(path)]
+    folders = [home]
+    while due:
+        try:
+            elements = list(ET.parse(due.pop()).getroot().iter())
+        except (OSError, ET.ParseError):  # MuJoCo says so
+            continue
+        told = [element.get(key) for element in elements for key in ("assetdir", "meshdir", "texturedir")]
+        folders += [home / folder for folder in told if folder]
+        for element in elements:
+            for name in (value for key, value in element.items() if key.startswith("file")):
+                files = (folder / part for folder in folders for part in (name, Path(name).name))
+                file = next((file for file in files if file.is_file()), None)
+                if file is not None and str(file) not in found:
+                    found[str(file)] = None
+                    due += [file] if file.suffix == ".xml" else []
+    return list(found)

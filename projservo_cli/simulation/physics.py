@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, WorkFailed
-from projservo_cli.rendered.model import RenderedModel
-from projservo_cli.robots.mjcf import mujoco
+from projservo_cli.simulation.mjcf import mujoco
+from projservo_cli.simulation.scene import RenderedModel
 
 _STEP_S = 0.002  # longest step of the integration
 _RATE = 100.0  # 1/s, at which a servo that need not sag takes back an error
@@ -52,15 +52,18 @@ class Physics:
     Raises InputError where an actuator of the file cannot be driven, or does not sag as it is told.
     """
 
-    def __init__(self, scene: RenderedModel, q: FloatArray, lag_s: float, sag: float) -> None:
-        arm, servo = scene.arm, scene.options.servo
-        self._model, self._places, self._rates = copy.copy(scene.model), scene.places, scene.rates
-        self._joints = scene.joints
-        self._data, self._base = scene.begin(self._model, q), int(self._model.jnt_bodyid[scene.joints[0]])
+    def __init__(self, rendered: RenderedModel, q: FloatArray, lag_s: float, sag: float) -> None:
+        arm, servo = rendered.scene.arm, rendered.scene.servo
+        self._model, self._places, self._rates = copy.copy(rendered.model), rendered.places, rendered.rates
+        self._joints = rendered.joints
+        self._data, self._base = (
+            rendered.begin(self._model, q),
+            int(self._model.jnt_bodyid[rendered.joints[0]]),
+        )
         self._step_s, self._lag_s = min(_STEP_S, float(self._model.opt.timestep)), lag_s
         self._own = {
             i: actuator
-            for i, joint in enumerate(scene.joints)
+            for i, joint in enumerate(rendered.joints)
             if (actuator := _take(self._model, int(joint), keep=servo == "own")) is not None
         }
         if sag > 0.0 and self._own:
@@ -70,7 +73,7 @@ class Physics:
             )
         turning = arm.joint_types != PRISMATIC
         self._compensated = ~turning if sag > 0.0 else np.ones(len(q), dtype=np.bool_)
-        inertia, load = self._heaviest(scene)
+        inertia, load = self._heaviest(rendered)
         stiff = inertia * (_RATE / _LOOP_S if servo == "velocity" else _RATE**2)
         self._stiffness = np.where(self._compensated, stiff, load / sag if sag > 0.0 else 0.0)
         critical = 2.0 * np.sqrt(self._stiffness * inertia)
@@ -193,11 +196,11 @@ class Physics:
         """What gravity and motion ask of each joint (n,), N m or N, less what the file compensates."""
         return np.array((self._data.qfrc_bias - self._data.qfrc_gravcomp)[self._rates])
 
-    def _heaviest(self, scene: RenderedModel) -> tuple[FloatArray, float]:
+    def _heaviest(self, rendered: RenderedModel) -> tuple[FloatArray, float]:
         """Most inertia (n,) of each joint, kg m² or kg, and the most gravity asks of any that turns, N m."""
-        mj, rng, arm = mujoco(), np.random.default_rng(0), scene.arm
+        mj, rng, arm = mujoco(), np.random.default_rng(0), rendered.scene.arm
         low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
-        data, turning = scene.begin(self._model, arm.q_reference), arm.joint_types != PRISMATIC
+        data, turning = rendered.begin(self._model, arm.q_reference), arm.joint_types != PRISMATIC
         unit, moved = np.eye(self._model.nv), np.zeros(self._model.nv)
         inertia, load = np.zeros(len(low)), 0.0
         for q in rng.uniform(low, high, (_POSTURES, len(low))):

@@ -15,17 +15,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.readings import per_rad
-from projservo_cli.config import Config
-from projservo_cli.config.markers import Markers
-from projservo_cli.config.models import FAULTS, Disturbance, FrozenJoint, LostMarkers, RenderedOptions
-from projservo_cli.config.robot import Rig, RobotSettings
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import PRISMATIC, ByteArray, FloatArray
-from projservo_cli.rendered.cameras import Frames
-from projservo_cli.rendered.model import RenderedModel, rendered_model
-from projservo_cli.rendered.physics import Physics
-from projservo_cli.robots.simulated import Arm
-from projservo_cli.stages.world import Truth
+from projservo_cli.simulation.arm import Arm
+from projservo_cli.simulation.cameras import Frames
+from projservo_cli.simulation.physics import Physics
+from projservo_cli.simulation.scene import Scene, rendered_model
+from projservo_cli.simulation.workspace import Truth
 
 # Joints are worked out this often at least, s, and taken as straight lines between.
 _GRID_S = 0.005
@@ -33,6 +29,85 @@ _EXPOSED = 5  # instants of an exposure that are averaged
 _POSTURES = 500  # that are drawn to see how far an arm reaches
 _BEFORE = 2**20  # frames before the opening are numbered too
 _CLOCKS_S = 100.0  # how far clocks of cameras are off at most
+
+
+class Faults(NamedTuple):
+    """What is wrong with a simulated robot all the time, what a calibration has to reckon with too."""
+
+    delay_s: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # from the middle of an exposure to the readings beside its image
+    exposure_s: float = 0.0  # over which an image is averaged
+    jitter_s: float = 0.0  # standard deviation of when single images are taken
+    frame_rate_hz: float | None = None  # of cameras that run freely; None for an image taken at each look
+    frame_offset_s: float = 0.0  # by which the right camera's images come after the left one's
+    stamps: bool = False  # whether images carry the middle of their exposure
+    encoder_ticks: int | None = None  # steps of joint readings in a turn
+    setpoint_ticks: bool = False  # whether set-points are whole ticks too
+    lag_s: float = 0.0  # time constant with which joints follow their set-points
+    sag: float = 0.0  # by which gravity turns a joint off its set-point at full reach, rad
+    flex: float = 0.0  # the same of a link beyond its encoder, rad
+    play: float = 0.0  # between each encoder and its link, from end to end, rad
+
+
+class LostMarkers(NamedTuple):
+    """Markers that neither camera sees for a while; all of them where none is named."""
+
+    from_step: int
+    steps: int | None  # None for ever
+    markers: tuple[int, ...] | None
+
+
+class Bump(NamedTuple):
+    """A joint knocked aside, or one that slips on its encoder."""
+
+    at_step: int
+    joint: int  # counted from 0
+    by: float  # rad or m
+    read: bool  # whether its reading follows
+
+
+class FrozenJoint(NamedTuple):
+    """A joint whose reading stands still while it moves."""
+
+    from_step: int
+    steps: int | None  # None for ever
+    joint: int  # counted from 0
+
+
+class CameraMoved(NamedTuple):
+    """A camera that is knocked, so that all it sees is shifted."""
+
+    at_step: int
+    by_px: tuple[tuple[float, float], tuple[float, float]]  # along u and v, left and right
+
+
+class MarkerMoved(NamedTuple):
+    """A marker that is knocked aside on the tool."""
+
+    at_step: int
+    marker: int  # its number
+    by: tuple[float, float, float]  # in the frame of the tool, m
+
+
+class Events(NamedTuple):
+    """What befalls a simulated robot and its images in a run."""
+
+    lost_markers: LostMarkers | None = None
+    bump: Bump | None = None
+    frozen_joint: FrozenJoint | None = None
+    camera_moved: CameraMoved | None = None
+    marker_moved: MarkerMoved | None = None
+
+
+class SimulatedRobot(NamedTuple):
+    """A simulated robot that takes time for what it does."""
+
+    truth: Truth
+    faults: Faults
+    scene: Scene | None  # before rendered cameras; None for cameras that see points
+    period: float  # of the loop, s
 
 
 class _Eyes(Protocol):
@@ -127,54 +202,49 @@ def _random(*key: int) -> np.random.Generator:
 
 
 def robot_by_itself(
-    config: Config, truth: Truth, q_start: FloatArray, sigma_px: float, seed: int, stream: int
+    robot: SimulatedRobot, q_start: FloatArray, sigma_px: float, drawn: tuple[int, int]
 ) -> "FaultyRobot":
-    """The simulated robot at joints (n,), rad or m, that nothing befalls and whose images have borders."""
-    points = Points(truth, truth.images, True, sigma_px)
-    events = [name for name in type(config.disturbance).model_fields if name not in FAULTS]
-    given = config.disturbance.model_copy(update=dict.fromkeys(events))
-    return robot_of(config, truth, q_start, points, (seed, stream), given)
+    """The simulated robot at joints (n,), rad or m, that nothing befalls and whose images have borders.
+
+    drawn : seed, and stream of its random numbers.
+    """
+    return robot_of(robot, q_start, Points(robot.truth, robot.truth.images, True, sigma_px), drawn, Events())
 
 
 def robot_of(
-    config: Config,
-    truth: Truth,
-    q_start: FloatArray,
-    points: Points,
-    drawn: tuple[int, int],
-    given: Disturbance,
+    robot: SimulatedRobot, q_start: FloatArray, points: Points, drawn: tuple[int, int], events: Events
 ) -> "FaultyRobot":
-    """The simulated robot at joints (n,), rad or m, before the cameras of the plant.
+    """The simulated robot at joints (n,), rad or m, before its cameras.
 
-    points : cameras that see points, for a plant that is not rendered.
-    drawn : seed, and stream of its random numbers; given : what is wrong with it, and what befalls it.
+    points : cameras that see points, for a robot that is not before rendered ones.
+    drawn : seed, and stream of its random numbers.
     """
-    period = config.control.period_s
-    if config.plant.rendered is None:
-        return FaultyRobot(World(truth, q_start, points, period, *drawn), given)
-    scene = _scene(config, truth)
-    servos = Physics(scene, q_start, given.lag_s, math.radians(given.sag_deg))
-    return FaultyRobot(World(truth, q_start, Frames(scene), period, *drawn, servos), given)
+    truth, faults, scene, period = robot
+    if scene is None:
+        return FaultyRobot(World(truth, q_start, points, period, *drawn), faults, events)
+    rendered = rendered_model(scene)
+    servos = Physics(rendered, q_start, faults.lag_s, faults.sag)
+    return FaultyRobot(World(truth, q_start, Frames(rendered), period, *drawn, servos), faults, events)
 
 
 def shown_in_frames(
-    config: Config, truth: Truth, q: FloatArray, drawn: tuple[int, int]
+    scene: Scene, frames: int, q: FloatArray, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Pixels (2, m, 2) that frames of the robot at rest at joints (n,), rad or m, show on average.
+    """Pixels (2, m, 2) that frames of a robot at rest at joints (n,), rad or m, show on average.
 
     And their standard deviations (2, m), of which averaging takes nothing: the same view errs alike. Both are
     NaN where most frames of a view do not show a marker.
 
     drawn : seed, and stream of its random numbers.
     """
-    return _looked(_scene(config, truth), config.noise.shown_frames, q.tobytes(), drawn)
+    return _looked(scene, frames, q.tobytes(), drawn)
 
 
 @lru_cache(maxsize=256)
 def _looked(
-    scene: RenderedModel, frames: int, q_bytes: bytes, drawn: tuple[int, int]
+    scene: Scene, frames: int, q_bytes: bytes, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    eyes, q = Frames(scene), np.frombuffer(q_bytes)[None]
+    eyes, q = Frames(rendered_model(scene)), np.frombuffer(q_bytes)[None]
     found = np.full((frames, 2, len(scene.numbers), 3), np.nan)
     eyes.open()
     try:
@@ -188,33 +258,18 @@ def _looked(
     return np.ascontiguousarray(mean[..., :2]), np.ascontiguousarray(mean[..., 2])
 
 
-def _scene(config: Config, truth: Truth) -> RenderedModel:
-    assert config.arm is not None
-    assert config.rig is not None
-    assert config.markers is not None
-    assert config.plant.rendered is not None
-    return _built(truth, config.arm, config.rig, config.markers, config.plant.rendered)
-
-
-@lru_cache(maxsize=4)
-def _built(
-    truth: Truth, robot: RobotSettings, rig: Rig, markers: Markers, options: RenderedOptions
-) -> RenderedModel:
-    return rendered_model(robot, truth.robot, rig, truth.P, markers, options)
-
-
 class FaultyRobot:
     """A simulated robot of the contract.
 
-    world : the robot and its rig; given : what is wrong with it, and what befalls it.
+    world : the robot and its rig; faults : what is wrong with it; events : what befalls it.
     ``taken``: (2,) when both frames of the last look were taken, s, which no robot knows.
     ``frames``: (2, height, width) the last frames of rendered cameras; None of others.
     """
 
-    def __init__(self, world: World, given: Disturbance) -> None:
-        self.world, self._given = world, given
-        self._joints = _Joints(world, given)
-        self._cameras = [_Camera(self._joints, world, given, view) for view in range(2)]
+    def __init__(self, world: World, faults: Faults, events: Events) -> None:
+        self.world, self._faults, self._events = world, faults, events
+        self._joints = _Joints(world, faults, events.bump)
+        self._cameras = [_Camera(self._joints, world, faults, events, view) for view in range(2)]
         self._frozen: float | None = None
         self.taken = np.full(2, math.nan)
 
@@ -229,15 +284,15 @@ class FaultyRobot:
         self.taken[:] = [frame.middle for frame in frames]
         pixels = np.stack([frame.pixels for frame in frames])
         told = [frame.sigma for frame in frames if frame.sigma is not None]
-        if not self._given.stamps and not told:
+        if not self._faults.stamps and not told:
             return q, pixels
-        stamps = (now, frames[0].stamp, frames[1].stamp) if self._given.stamps else (None, None, None)
+        stamps = (now, frames[0].stamp, frames[1].stamp) if self._faults.stamps else (None, None, None)
         return (q, pixels, *stamps, np.stack(told)) if told else (q, pixels, *stamps)
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Go to joints (n,) by the time that is due, s; where none comes then, they are held."""
         del speed
-        self._joints.go(_whole(target, self._given.setpoint_ticks * self._joints.tick), due)
+        self._joints.go(_whole(target, self._faults.setpoint_ticks * self._joints.tick), due)
 
     def now(self) -> float:
         """Time since the opening, s."""
@@ -261,10 +316,10 @@ class FaultyRobot:
 
     def _reading(self) -> FloatArray:
         """Joint readings (n,) as encoders count them."""
-        q, frozen = _whole(self._joints.servos.motor, self._joints.tick), self._given.frozen_joint
+        q, frozen = _whole(self._joints.servos.motor, self._joints.tick), self._events.frozen_joint
         if frozen is not None and _lasts(frozen, _step(self.now(), self.world.period)):
-            self._frozen = q[frozen.joint - 1] if self._frozen is None else self._frozen
-            q[frozen.joint - 1] = self._frozen
+            self._frozen = q[frozen.joint] if self._frozen is None else self._frozen
+            q[frozen.joint] = self._frozen
         return q
 
 
@@ -335,17 +390,17 @@ class _Joints:
     ``tick``: (n,) of the encoders, 0 for none. All rad or m.
     """
 
-    def __init__(self, world: World, given: Disturbance) -> None:
-        self.arm, self._bump = world.truth.robot, given.bump
-        self._struck_at = math.inf if given.bump is None else given.bump.at_step * world.period
+    def __init__(self, world: World, faults: Faults, bump: Bump | None) -> None:
+        self.arm, self._bump = world.truth.robot, bump
+        self._struck_at = math.inf if bump is None else bump.at_step * world.period
         scale = per_rad(self.arm.joint_types == PRISMATIC)
-        self.tick = scale * (2.0 * math.pi / given.encoder_ticks if given.encoder_ticks else 0.0)
-        self._play = 0.5 * math.radians(given.play_deg) * scale
+        self.tick = scale * (2.0 * math.pi / faults.encoder_ticks if faults.encoder_ticks else 0.0)
+        self._play = 0.5 * faults.play * scale
         # What gravity costs a joint that holds the tool at full reach, rad.
-        sag, self._flex = math.radians(given.sag_deg), math.radians(given.flex_deg)
+        sag, self._flex = faults.sag, faults.flex
         self._loaded = sag > 0.0 or self._flex > 0.0
         self._reach = full_reach(self.arm) if self._loaded else 1.0
-        self.servos = world.servos or _FirstOrder(self._load, world.q_start, given.lag_s, sag)
+        self.servos = world.servos or _FirstOrder(self._load, world.q_start, faults.lag_s, sag)
         self._link = self.servos.motor.copy()  # beyond the play
         self._slip = np.zeros(len(self._link))  # beyond both
         self.times, self.links = [0.0], [self._link + self._flex * self._load(self._link)]
@@ -380,8 +435,8 @@ class _Joints:
     def _strike(self) -> None:
         """A joint is knocked aside, or slips."""
         assert self._bump is not None
-        by, turn = np.zeros(len(self._link)), self._bump.by_deg
-        by[self._bump.joint - 1] = self._bump.by_m or 0.0 if turn is None else math.radians(turn)
+        by = np.zeros(len(self._link))
+        by[self._bump.joint] = self._bump.by
         self._struck_at = math.inf
         if self._bump.read:
             self.servos.strike(by)
@@ -408,15 +463,15 @@ class _Frame(NamedTuple):
 class _Camera:
     """One of both cameras, which runs freely or takes a frame at each look."""
 
-    def __init__(self, joints: _Joints, world: World, given: Disturbance, view: int) -> None:
-        self._joints, self._world, self._given = joints, world, given
+    def __init__(self, joints: _Joints, world: World, faults: Faults, events: Events, view: int) -> None:
+        self._joints, self._world, self._faults, self._events = joints, world, faults, events
         self._view, self._looks = view, 0
         # No frame is read before it was exposed whole.
-        self._delay = max((given.delay_s.left, given.delay_s.right)[view], 0.5 * given.exposure_s)
-        self._interval = 0.0 if given.frame_rate_hz is None else 1.0 / given.frame_rate_hz
+        self._delay = max(faults.delay_s[view], 0.5 * faults.exposure_s)
+        self._interval = 0.0 if faults.frame_rate_hz is None else 1.0 / faults.frame_rate_hz
         self._clock = float(world.random(view, 0).uniform(-_CLOCKS_S, _CLOCKS_S))
         self._first = float(world.random(0, 0).uniform(0.0, 1.0)) * self._interval
-        self._first += view * given.frame_offset_s
+        self._first += view * faults.frame_offset_s
         self._last: tuple[int, _Frame] | None = None
 
     def newest(self, now: float) -> _Frame:
@@ -424,7 +479,7 @@ class _Camera:
         if not self._interval:
             self._looks += 1
             middle = now - self._delay + self._jitter(self._looks)
-            return self._exposed(self._looks, min(middle, now - 0.5 * self._given.exposure_s))
+            return self._exposed(self._looks, min(middle, now - 0.5 * self._faults.exposure_s))
         k = math.floor((now - self._delay - self._first) / self._interval) + 2
         while self._middle(k) + self._delay > now:
             k -= 1
@@ -437,25 +492,25 @@ class _Camera:
         return self._first + k * self._interval + self._jitter(k)
 
     def _jitter(self, k: int) -> float:
-        if not self._given.jitter_s:
+        if not self._faults.jitter_s:
             return 0.0
-        return self._given.jitter_s * float(self._world.random(self._view, _BEFORE + k).standard_normal())
+        return self._faults.jitter_s * float(self._world.random(self._view, _BEFORE + k).standard_normal())
 
     def _exposed(self, k: int, middle: float) -> _Frame:
         """The frame of a number, its exposure half over at a time, s."""
-        world, given, step = self._world, self._given, _step(middle, self._world.period)
-        truth, befell, moved = world.truth, given.marker_moved, None
+        world, events, step = self._world, self._events, _step(middle, self._world.period)
+        truth, befell, moved = world.truth, events.marker_moved, None
         if befell is not None and step >= befell.at_step:
-            moved = befell.marker, np.array(befell.by_m)
-        many = _EXPOSED if given.exposure_s else 1
-        instants = middle + given.exposure_s * ((np.arange(many) + 0.5) / many - 0.5)
+            moved = befell.marker, np.array(befell.by)
+        many = _EXPOSED if self._faults.exposure_s else 1
+        instants = middle + self._faults.exposure_s * ((np.arange(many) + 0.5) / many - 0.5)
         rng = world.random(self._view, _BEFORE + k)
         rng.standard_normal()  # that of the jitter
         q = np.array([self._joints.at(t) for t in instants])
         pixels, sigma = world.eyes.look(self._view, q, moved, rng)
-        if (knocked := given.camera_moved) is not None and step >= knocked.at_step:
-            pixels += knocked.by_view()[self._view]
-        if (lost := given.lost_markers) is not None and _lasts(lost, step):
+        if (knocked := events.camera_moved) is not None and step >= knocked.at_step:
+            pixels += knocked.by_px[self._view]
+        if (lost := events.lost_markers) is not None and _lasts(lost, step):
             pixels[[truth.number.index(number) for number in lost.markers or truth.number]] = math.nan
         if world.eyes.borders:
             pixels = truth.within(pixels)

@@ -1,4 +1,4 @@
-"""The simulated robot and its rig: from published dimensions, and as the compiled loop sees them."""
+"""The ideal plant: a robot that stands wherever it is sent, as the compiled loop sees it."""
 
 import math
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from projservo_cli.geometry.algebra import (
     vec,
 )
 from projservo_cli.geometry.jit import merged, njit
-from projservo_cli.geometry.kinematics import forward, forward_kinematics, row
+from projservo_cli.geometry.kinematics import forward, row
 from projservo_cli.geometry.lens import bend
 from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.face import center_of, face_plane
@@ -181,52 +181,3 @@ class AnalyticPlant:
 
     def stop(self) -> None:
         """Nothing moves between commands."""
-
-
-METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
-
-
-class Arm(NamedTuple):
-    """True kinematics of a serial robot in its base frame."""
-
-    H_hat_0: FloatArray  # (n, 4, 4) twists at the reference, per rad or m
-    joint_types: IntArray  # (n,) ``REVOLUTE`` or ``PRISMATIC``
-    q_reference: FloatArray  # (n,) rad or m
-    base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
-    limits: JointLimits  # of the joints
-
-    def model(self, P: FloatArray) -> Model:
-        """Metric model of the robot seen by the cameras P (2, 3, 4)."""
-        return Model(
-            np.ascontiguousarray(P, dtype=np.float64),
-            self.H_hat_0,
-            self.joint_types,
-            self.q_reference,
-            METRIC_A_INF.copy(),
-        )
-
-    def pose(self, q: FloatArray) -> FloatArray:
-        """Pose (4, 4) of the tool at the joints q (n,), m."""
-        result: FloatArray = forward_kinematics(self.model(np.zeros((2, 3, 4))), q) @ self.base_tool
-        return result
-
-
-def camera_center(camera: FloatArray) -> FloatArray:
-    """Optical centre (3,) of a metric camera (3, 4), m."""
-    return np.asarray(-np.linalg.solve(camera[:, :3], camera[:, 3]))
-
-
-def _optical_axis(camera: FloatArray) -> FloatArray:
-    """Unit viewing direction (3,) of a metric camera (3, 4)."""
-    forward_direction = np.linalg.det(camera[:, :3]) * camera[2, :3]
-    return np.asarray(forward_direction / np.linalg.norm(forward_direction))
-
-
-def roll_axis(P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Roll axis of a rig: the point midway between the optical centres, m, and the mean direction.
-
-    P : (2, 3, 4) metric cameras.
-    """
-    point = 0.5 * (camera_center(P[0]) + camera_center(P[1]))
-    direction = _optical_axis(P[0]) + _optical_axis(P[1])
-    return point, direction / np.linalg.norm(direction)

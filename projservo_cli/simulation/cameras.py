@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.records import CORNERS, ByteArray, FloatArray, InputError
-from projservo_cli.rendered.model import CAMERAS, FINER, RenderedModel, drawn_at, lens_of
-from projservo_cli.robots.mjcf import mujoco, no_gl
+from projservo_cli.simulation.mjcf import mujoco, no_gl
+from projservo_cli.simulation.scene import CAMERAS, FINER, RenderedModel, drawn_at, lens_of
 
 _STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
 
@@ -15,13 +15,14 @@ _STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
 class Frames:
     """Both cameras of a scene, which a thread opens, looks with and closes.
 
-    ``scene``: what they see. ``last``: (2, height, width) the last frames of both, as they were searched.
+    ``rendered``: what they see. ``last``: (2, height, width) the last frames of both, as they were searched.
     """
 
     borders = True
 
-    def __init__(self, scene: RenderedModel) -> None:
-        self.scene, self._finder, self._options = scene, scene.finder, scene.options
+    def __init__(self, rendered: RenderedModel) -> None:
+        scene = rendered.scene
+        self.rendered, self._finder, self._scene = rendered, rendered.finder, scene
         self._places = {number: i for i, number in enumerate(scene.numbers)}
         width, height = scene.size
         self.last: ByteArray = np.zeros((2, height, width), dtype=np.uint8)
@@ -30,16 +31,16 @@ class Frames:
 
     def open(self) -> None:
         """Make ready to draw, in the thread that looks; an InputError says what to install for that."""
-        mj, scene = mujoco(), self.scene
-        height, width = self.last.shape[1] + 2 * scene.margin, self.last.shape[2] + 2 * scene.margin
+        mj, rendered = mujoco(), self.rendered
+        height, width = self.last.shape[1] + 2 * rendered.margin, self.last.shape[2] + 2 * rendered.margin
         try:
-            self._renderer = mj.Renderer(scene.model, FINER * height, FINER * width)
+            self._renderer = mj.Renderer(rendered.model, FINER * height, FINER * width)
         except Exception as error:  # of another kind for each library of GL
             raise InputError(no_gl(error)) from error
-        self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._options.light == "side"
+        self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._scene.light == "side"
         self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SKYBOX] = 0  # of a file: it takes longer than the rest
-        self._model = copy.copy(scene.model)
-        self._data = scene.begin(self._model, scene.model.qpos0[scene.places])
+        self._model = copy.copy(rendered.model)
+        self._data = rendered.begin(self._model, rendered.model.qpos0[rendered.places])
         self._shown = mj.MjvOption()
         self._shown.sitegroup[:] = 0
 
@@ -62,9 +63,9 @@ class Frames:
         shots = [self._drawn(view, joints) for joints in (q[len(q) // 2 :][:1] if still else q)]
         image = np.mean(shots, axis=0, dtype=np.float32)
         cv = self._finder.cv
-        if self._options.blur_px > 0.0:
-            image = cv.GaussianBlur(image, (0, 0), self._options.blur_px)
-        image += np.float32(self._options.grey_noise) * rng.standard_normal(image.shape, dtype=np.float32)
+        if self._scene.blur_px > 0.0:
+            image = cv.GaussianBlur(image, (0, 0), self._scene.blur_px)
+        image += np.float32(self._scene.grey_noise) * rng.standard_normal(image.shape, dtype=np.float32)
         self.last[view] = np.clip(np.rint(image), 0, 255).astype(np.uint8)
         return self._found(view)
 
@@ -81,7 +82,7 @@ class Frames:
     def _drawn(self, view: int, q: FloatArray) -> ByteArray:
         """Grey values (height, width) of what a camera sees at joints (n,), without blur and noise."""
         mj = mujoco()
-        self._data.qpos[self.scene.places] = q
+        self._data.qpos[self.rendered.places] = q
         mj.mj_kinematics(self._model, self._data)
         mj.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, CAMERAS[view], self._shown)
@@ -89,24 +90,26 @@ class Frames:
         fine, cv = np.ascontiguousarray(self._renderer.render()[..., 1]), self._finder.cv
         if self._maps is not None:
             fine = cv.remap(fine, *self._maps[view], cv.INTER_LANCZOS4)
-        return np.asarray(cv.resize(fine, self.scene.size, interpolation=cv.INTER_AREA))
+        return np.asarray(cv.resize(fine, self._scene.size, interpolation=cv.INTER_AREA))
 
     def _move(self, moved: tuple[int, FloatArray] | None) -> None:
         """Put every plate where it is, but for one that was moved."""
-        self._model.geom_pos[:] = self.scene.model.geom_pos
+        self._model.geom_pos[:] = self.rendered.model.geom_pos
         if moved is not None:
-            plate = self.scene.plates[self._places[moved[0]] // CORNERS]
-            self._model.geom_pos[list(plate)] += self.scene.tool @ moved[1]
+            plate = self.rendered.plates[self._places[moved[0]] // CORNERS]
+            self._model.geom_pos[list(plate)] += self.rendered.tool @ moved[1]
 
     def _mapped(self, P: FloatArray) -> list[tuple[FloatArray, FloatArray]] | None:
         """Where each finer pixel of a frame is in what is drawn, u and v of each view, in finer pixels."""
-        width, height = FINER * self.scene.size[0], FINER * self.scene.size[1]
+        width, height = FINER * self._scene.size[0], FINER * self._scene.size[1]
         offset = 0.5 * (FINER - 1)  # centres of pixels have whole coordinates
         u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
         pixels = (np.stack([u, v], axis=-1).reshape(-1, 2) - offset) / FINER
-        lens = lens_of(P, self._options.k1)
+        lens = lens_of(P, self._scene.k1)
         drawn = drawn_at(P, lens, np.stack([pixels, pixels]))
         if np.array_equal(drawn[0], pixels) and np.array_equal(drawn[1], pixels):
             return None
-        maps = (FINER * (drawn + self.scene.margin) + offset).reshape(2, height, width, 2).astype(np.float32)
+        maps = (
+            (FINER * (drawn + self.rendered.margin) + offset).reshape(2, height, width, 2).astype(np.float32)
+        )
         return [(np.ascontiguousarray(both[..., 0]), np.ascontiguousarray(both[..., 1])) for both in maps]

@@ -1,22 +1,21 @@
-"""The model of a rendered robot: an arm, tags on its tool, two cameras and light."""
+"""The scene before rendered cameras: an arm, tags on its tool, two cameras and light."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.config.markers import DICTIONARY, Markers, Tag
-from projservo_cli.config.models import RenderedOptions
-from projservo_cli.config.robot import Rig, RobotSettings
+from projservo_cli.canonical import File
 from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray
-from projservo_cli.robots.mjcf import chain_of, compiled, mujoco, spec_of, tip_of
-from projservo_cli.robots.simulated import Arm, roll_axis
+from projservo_cli.simulation.arm import Arm, roll_axis
+from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, spec_of, tip_of
 
 # Thickness of the first link of an arm and of the last, in lengths of the arm, and of none in any.
 _THICK, _THIN, _LEAST_LINK_M = 0.05, 0.03, 1e-3
@@ -39,20 +38,43 @@ CAMERAS = ("left camera", "right camera")
 """Names of both in the model."""
 
 
+class Tag(NamedTuple):
+    """A tag on the tool."""
+
+    number: int  # in its dictionary; its corners are markers 4 t to 4 t + 3
+    size_m: float  # side of its black square
+    pose: tuple[tuple[float, ...], ...]  # (4, 4) in the frame of the tool, m: it looks along z, y is up on it
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What rendered cameras see, and how."""
+
+    arm: Arm
+    P: FloatArray  # (2, 3, 4) cameras, px
+    size: tuple[int, int]  # width and height of the images, px
+    tags: tuple[Tag, ...]
+    numbers: tuple[int, ...]  # of the markers, four corners a tag
+    dictionary: str  # of the tags
+    mjcf: File | None  # the model of the arm, with the files that it names; None for one of capsules
+    tip: str  # body or site of the model that is the tool
+    servo: str  # own, position or velocity
+    grey_noise: float  # standard deviation of a pixel, grey levels of 255
+    blur_px: float
+    k1: float  # radial distortion, in units of the focal length
+    light: str  # soft or side
+
+
 @dataclass(frozen=True, eq=False)
 class RenderedModel:
     """A compiled model, and what in it stands for what."""
 
-    options: RenderedOptions
+    scene: Scene
     finder: TagFinder
-    numbers: tuple[int, ...]  # of the markers, four corners a tag
-    arm: Arm
-    P: FloatArray  # (2, 3, 4) cameras, px
     model: Any  # MjModel, which nobody changes
     key: int  # of the keyframe that is its beginning, −1 for none
     joints: IntArray  # (n,) its joints of the arm, base to tool
     plates: tuple[tuple[int, ...], ...]  # for each tag the geoms that are its plate
-    size: tuple[int, int]  # width and height of the images, px
     margin: int  # by which drawings are wider at each side, px
     tool: FloatArray  # (3, 3) rotation of the tool in the frame of the body that holds the tags
 
@@ -93,29 +115,29 @@ def lens_of(P: FloatArray, k1: float) -> FloatArray:
     return np.column_stack([K[:, 0, 2], K[:, 1, 2], radius, np.full(2, k1), np.zeros(2)])
 
 
-def rendered_model(
-    robot: RobotSettings, arm: Arm, rig: Rig, P: FloatArray, markers: Markers, options: RenderedOptions
-) -> RenderedModel:
-    """The scene of a robot, whose kinematics are those of an arm, before cameras P (2, 3, 4).
+@lru_cache(maxsize=4)
+def rendered_model(scene: Scene) -> RenderedModel:
+    """The compiled model of a scene.
 
     Raises InputError if MuJoCo or OpenCV is missing, or the scene cannot be made.
     """
-    mj, finder = mujoco(), TagFinder(markers.dictionary or DICTIONARY)
-    spec, where = mj.MjSpec() if robot.mjcf is None else spec_of(robot.mjcf), robot.mjcf or "the arm"
-    if robot.mjcf is None:
-        _add_arm(spec, arm)
+    mj, finder, P = mujoco(), TagFinder(scene.dictionary), scene.P
+    where = scene.mjcf.path if scene.mjcf else "the arm"
+    spec = spec_of(where) if scene.mjcf else mj.MjSpec()
+    if not scene.mjcf:
+        _add_arm(spec, scene.arm)
     bare = compiled(spec, where)
-    if robot.mjcf is None:
-        holder, tool = bare.nbody - 1, arm.base_tool
+    if scene.mjcf:
+        holder, tool = tip_of(bare, scene.tip, where)
     else:
-        holder, tool = tip_of(bare, robot.tip or "", where)
+        holder, tool = bare.nbody - 1, scene.arm.base_tool
     joints = np.array(chain_of(bare, holder, where))
     tip = next(body for body in spec.bodies if body.id == holder)
-    _add_tags(spec, tip, tool, markers.all_tags, finder)
-    _put_light(spec, options.light, P)
+    _add_tags(spec, tip, tool, scene.tags, finder)
+    _put_light(spec, scene.light, P)
     K, R, t = (np.array(parts) for parts in zip(*map(_decomposed, P), strict=True))
-    width, height = rig.image_size_px
-    margin = _margin(P, options.k1, width, height)
+    width, height = scene.size
+    margin = _margin(P, scene.k1, width, height)
     K_wide = K + margin * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
     _add_cameras(spec, K_wide, R, t, (width + 2 * margin, height + 2 * margin))
     model = compiled(spec, where)
@@ -123,19 +145,14 @@ def rendered_model(
     light = rates[model.dof_armature[rates] == 0.0]
     model.dof_armature[light] = min(_ARMATURE, _ARMATURE_SHARE * float(model.dof_M0[rates].max()))
     mj.mj_setConst(model, mj.MjData(model))
-    plates = tuple(tuple(model.geom(_name(tag, side)).id for side in _SIDES) for tag in markers.all_tags)
-    assert markers.known is not None
+    plates = tuple(tuple(model.geom(_name(tag, side)).id for side in _SIDES) for tag in scene.tags)
     return RenderedModel(
-        options=options,
+        scene=scene,
         finder=finder,
-        numbers=markers.known,
-        arm=arm,
-        P=P,
         model=model,
         key=0 if model.nkey else -1,
         joints=joints,
         plates=plates,
-        size=(width, height),
         margin=margin,
         tool=tool[:3, :3],
     )

@@ -1,0 +1,109 @@
+"""Canonical bytes of the records that stages read: equal bytes for equal values, and the values again.
+
+A key is a hash of these bytes, so that what a stage is given, and nothing else, decides what is outdated.
+Files stand in them by their content.
+"""
+
+import dataclasses
+import hashlib
+import importlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from projservo_cli.records import InputError
+
+
+class File(NamedTuple):
+    """A file that a stage reads, which may lie anywhere."""
+
+    path: str
+    sha256: str  # of its content
+
+    @classmethod
+    def of(cls, path: str, expected: str, gone: str = "", further: Sequence[str] = ()) -> "File":
+        """Return the file at a path; an InputError with what was ``expected`` where it cannot be read.
+
+        gone : hash that it had, which stands where there is no such file any more.
+        further : files that it names, whose content counts too.
+        """
+        if gone and not Path(path).exists():
+            return cls(path, gone)
+        contents = []
+        for name in (path, *further):
+            try:
+                contents.append(hashlib.sha256(Path(name).read_bytes()).hexdigest())
+            except OSError as error:
+                reason = f"cannot be read: {error.strerror or error}; expected {expected}"
+                raise InputError(f"{name}: {reason}") from error
+        return cls(path, hashlib.sha256("".join(contents).encode()).hexdigest() if further else contents[0])
+
+
+def encoded(record: Any) -> bytes:
+    """Return the canonical bytes of a record of plain values, arrays, files and further records."""
+    return json.dumps(_plain(record), separators=(",", ":"), ensure_ascii=False).encode()
+
+
+def decoded(content: bytes, files: Mapping[str, str]) -> Any:
+    """Return the record of which these are the canonical bytes.
+
+    files : where files lie, by the hash of their content.
+    """
+    return _value(json.loads(content), files)
+
+
+def files_in(record: Any) -> list[File]:
+    """Return all files of a record, each once."""
+    if isinstance(record, File):
+        return [record]
+    parts: Iterable[Any] = _fields(record).values()
+    if isinstance(record, (tuple, list, dict)):
+        parts = record.values() if isinstance(record, dict) else record
+    return list(dict.fromkeys(file for part in parts for file in files_in(part)))
+
+
+def _fields(record: Any) -> dict[str, Any]:
+    """Values of a dataclass or a named tuple by their names; none of other values."""
+    if dataclasses.is_dataclass(record):
+        return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    return {name: getattr(record, name) for name in getattr(record, "_fields", ())}
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON, in which every mapping has one key, which says what it is of."""
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, File):
+        return {"file": value.sha256}
+    if isinstance(value, np.ndarray):
+        return {"array": [value.dtype.str, value.shape, value.tobytes().hex()]}
+    if fields := _fields(value):
+        kind = f"{type(value).__module__}:{type(value).__qualname__}"
+        return {kind: {name: _plain(inner) for name, inner in fields.items()}}
+    if isinstance(value, dict):
+        return {"mapping": {key: _plain(value[key]) for key in sorted(value)}}
+    if isinstance(value, (tuple, list)):
+        return {type(value).__name__: [_plain(inner) for inner in value]}
+    raise TypeError(f"{type(value).__name__} has no canonical bytes")
+
+
+def _value(plain: Any, files: Mapping[str, str]) -> Any:
+    if not isinstance(plain, dict):
+        return plain
+    ((kind, held),) = plain.items()
+    if kind == "file":
+        return File(files[held], held)
+    if kind == "array":
+        dtype, shape, content = held
+        return np.frombuffer(bytes.fromhex(content), dtype=dtype).reshape(shape).copy()
+    if kind in ("tuple", "list"):
+        found = [_value(inner, files) for inner in held]
+        return found if kind == "list" else tuple(found)
+    values = {name: _value(inner, files) for name, inner in held.items()}
+    if kind == "mapping":
+        return values
+    module, name = kind.split(":")
+    return getattr(importlib.import_module(module), name)(**values)

@@ -1,0 +1,567 @@
+"""From a configuration to what each stage is given: the values that it reads, and no others.
+
+Every function returns a record, of which the key of the result is a hash. What is resolved here, units,
+defaults that depend on other values and descriptions of robot and rig, is resolved nowhere below.
+"""
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, TypeVar
+
+import numpy as np
+
+from projservo_cli.canonical import File
+from projservo_cli.config.loading import Config, to_yaml
+from projservo_cli.config.markers import Markers
+from projservo_cli.config.models import Disturbance, RenderedOptions
+from projservo_cli.config.robot import Camera, JointVector, Rig, RobotSettings
+from projservo_cli.config.task import Goal as GoalSettings
+from projservo_cli.detection import DICTIONARY
+from projservo_cli.records import (
+    CORNERS,
+    NO_LENS,
+    PRISMATIC,
+    REVOLUTE,
+    FloatArray,
+    InputError,
+    position_limits,
+)
+from projservo_cli.report.report_data import About
+from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Pace, Readings
+from projservo_cli.simulation import dh
+from projservo_cli.simulation.arm import Arm, twist
+from projservo_cli.simulation.faults import (
+    Bump,
+    CameraMoved,
+    Events,
+    Faults,
+    FrozenJoint,
+    LostMarkers,
+    MarkerMoved,
+    SimulatedRobot,
+)
+from projservo_cli.simulation.mjcf import files_named
+from projservo_cli.simulation.scene import Scene, Tag, lens_of
+from projservo_cli.simulation.workspace import Truth, Turn, look_at, metric_camera
+from projservo_cli.stages.calibrate import CalibrationInputs, Estimation, SuggestionInputs, Table
+from projservo_cli.stages.record import Motions, RecordingInputs, Trials
+from projservo_cli.stages.task import (
+    Contract,
+    Driven,
+    Goal,
+    GoalImages,
+    LawSettings,
+    PlanInputs,
+    ReachingTask,
+    ReportInputs,
+    Scenery,
+    ServoInputs,
+    StopSettings,
+)
+from projservo_cli.stages.teach import TeachInputs
+from projservo_cli.task.face import MIDPOINT
+from projservo_cli.task.trajectory import KeptOut, Trajectory
+
+_RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
+_TICKS = 4096  # in a turn of an encoder that is as coarse as any
+# Accelerations that the profile joint takes where no limit is given, deg/s² and m/s².
+_ACCELERATION_DEG_S2, _ACCELERATION_M_S2 = 500.0, 2.0
+_EXPECTED = {
+    "table": "a table",
+    "init": "JSON with screws, cameras and markers",
+    "mjcf": "a model of MuJoCo",
+}
+_Record = TypeVar("_Record", bound=tuple[Any, ...])
+Gone = Mapping[str, str]  # hashes that files had, by their paths, which stand where the files are gone
+
+
+def calibration_inputs(config: Config, gone: Gone | None = None) -> CalibrationInputs:
+    """What a calibration is made from: a table, else trials of the simulated robot."""
+    settings, table = config.calibration, file_of(config, "table", gone)
+    source: Table | Trials
+    if config.data is not None and table is not None:
+        data = config.data
+        size = config.image_size_px
+        source = Table(table, config.joint_types, data.joint_unit, size, data.noise_px, _seed(config))
+    else:
+        # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
+        source = _trials(config, _truth(config, face=False), None, gone, speed_scale=1.0)
+    noise = None if settings.joint_noise_deg is None else float(np.radians(settings.joint_noise_deg))
+    how = Estimation(settings.method, settings.lens, file_of(config, "init", gone), settings.cross_validate)
+    return CalibrationInputs(source, how, noise)
+
+
+def recording_inputs(config: Config) -> RecordingInputs:
+    """What a table is recorded with."""
+    markers, plant = config.markers, config.plant
+    numbers = markers.known if markers is not None else None
+    truth = _truth(config, face=False) if plant.simulated else None
+    if markers is None or numbers is None:
+        raise InputError("record needs to know which markers the robot observes: set markers.numbers")
+    own = None if plant.simulated else _own(config)
+    trials = _trials(config, truth, own, None, speed_scale=plant.speed_scale)
+    # A robot that a caller brings along takes the place of the ideal plant too.
+    trials = replace(trials, frames=plant.frames, settle_s=plant.settle_s)
+    given = plant.options.get("dictionary", markers.dictionary)
+    return RecordingInputs(
+        trials=trials,
+        numbers=numbers,
+        face=markers.front or (),
+        dictionary=None if given is None else str(given),
+        tagged=(markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None),
+        sag_deg=plant.sag_deg,
+    )
+
+
+def teach_inputs(config: Config) -> TeachInputs:
+    """What a pose is taught with."""
+    numbers = config.markers.known if config.markers is not None else None
+    if numbers is None:
+        raise InputError("teach needs to know which markers the robot observes: set markers.numbers")
+    robot: SimulatedRobot | OwnRobot
+    if config.plant.simulated:
+        robot = _simulated(config, truth_of(config), None)
+    else:
+        robot = _own(config)
+    driven = Driven(robot, _following(config, config.plant.speed_scale), _endless(config))
+    noise, settle_s = config.noise.servo_px, config.plant.settle_s
+    return TeachInputs(driven, joints_of(config), numbers, noise, settle_s, config.seed)
+
+
+def suggestion_inputs(config: Config) -> SuggestionInputs:
+    """What further poses are suggested with."""
+    unit = config.data.joint_unit if config.data is not None else None
+    joints, size = joints_of(config), config.image_size_px
+    return SuggestionInputs(joints, size, config.recorded, unit or "rad", config.seed)
+
+
+def plan_inputs(config: Config, gone: Gone | None = None, *, predicted: bool = False) -> PlanInputs:
+    """What a plan is made from.
+
+    predicted : whether a calibration predicts start and goal of a simulated robot, which is not described.
+    """
+    face, markers = config.face_numbers, config.markers
+    assert markers is not None
+    simulated = config.plant.simulated and not predicted
+    known = markers.known if markers.tags is not None else ()
+    return PlanInputs(
+        task=task_of(config),
+        seed=config.seed,
+        truth=truth_of(config) if simulated else None,
+        arm=arm_of(config),
+        P=None if config.rig is None else cameras_of(config.rig),
+        scene=scene_of(config, gone) if simulated else None,
+        face=face,
+        center=_center(markers),
+        known=markers.known,
+        tags=tuple(known[i : i + CORNERS] for i in range(0, len(known or ()), CORNERS)) if known else (),
+        joints=joints_of(config),
+        image_size=config.image_size_px,
+        noise_px=config.noise.servo_px,
+        frames=config.noise.shown_frames,
+        features=config.control.observation,
+        tests_images=config.stop.innovation_factor > 0.0,
+        trajectory=trajectory_of(config),
+    )
+
+
+def servo_inputs(config: Config, gone: Gone | None = None) -> ServoInputs:
+    """What the run of a law is made from."""
+    plan, control, stop, plant = plan_inputs(config, gone), config.control, config.stop, config.plant
+    assert config.markers is not None
+    # A robot that is not simulated is never driven beyond a limit.
+    at_limit = not plant.simulated or plant.joint_limits == "stop"
+    return ServoInputs(
+        plan=plan,
+        laws=_taken(LawSettings, control, period=control.period_s, substeps=control.substeps == "auto"),
+        stop=_taken(StopSettings, stop, at_joint_limit=at_limit, at_border=plant.image_border == "stop"),
+        opaque=plant.self_occlusion == "opaque",
+        speed_scale=plant.speed_scale,
+        searches_anew=control.searches_anew,
+        refuses=control.without_plan == "refuse",
+        lengths=config.markers.lengths(plan.face),
+        contract=_contract(config, plan, gone),
+    )
+
+
+def _contract(config: Config, plan: PlanInputs, gone: Gone | None) -> Contract | None:
+    """How a law drives a robot of the contract; None for one that stands wherever it is sent."""
+    plant = config.plant
+    if plant.use is None and config.disturbance == Disturbance():
+        return None
+    robot: SimulatedRobot | OwnRobot = _own(config)
+    if plan.truth is not None:
+        robot = _simulated(config, plan.truth, gone)
+    driven = Driven(robot, _following(config, plant.speed_scale), _endless(config))
+    delay = None if plant.delay_s is None else (plant.delay_s.left, plant.delay_s.right)
+    settle_s = plant.settle_s if plan.truth is None else None
+    return Contract(driven, events_of(config), plant.timeout_s, delay, settle_s)
+
+
+def report_inputs(config: Config, gone: Gone | None = None) -> ReportInputs:
+    """What a report is made from: all of the configuration, which its page prints, and the extra runs."""
+    about, trajectory = about_of(config, files_of(config, gone).values()), trajectory_of(config)
+    formats = config.report.formats
+    if not config.has_task:
+        return ReportInputs(about, formats, None, trajectory)
+    alone = {
+        "control": config.control.model_copy(update={"observation": "points"}),
+        "trajectory": config.trajectory.model_copy(update={"keep_out": ()}),
+    }
+    extra = servo_inputs(config.idealized.model_copy(update=alone), gone)
+    return ReportInputs(about, formats, extra, trajectory)
+
+
+def about_of(config: Config, read: Iterable[File] = ()) -> About:
+    """What a page tells of a configuration, in whose text files that are read may lie anywhere."""
+    files = {file.path: file for file in read}
+    pieces = [to_yaml(config)]
+    if files:
+        pieces = re.split("(" + "|".join(map(re.escape, files)) + ")", pieces[0])
+    return About(
+        name=config.name,
+        seed=config.seed,
+        recorded=config.recorded,
+        estimates_noise=config.data is not None and config.data.noise_px is None,
+        joints=joint_names_of(config),
+        required=config.control.must_converge,
+        text=tuple(files.get(piece, piece) for piece in pieces),
+    )
+
+
+def joint_names_of(config: Config) -> tuple[str | None, ...]:
+    """Names of the joints as far as somebody gave them some."""
+    return tuple(joint.name for joint in config.robot.joints) if config.robot is not None else ()
+
+
+def scenery_of(config: Config) -> Scenery:
+    """What runs are shown in; an InputError where robot, rig and markers are not described."""
+    opaque = config.plant.self_occlusion == "opaque"
+    return Scenery(config.name, truth_of(config), opaque, config.plant.simulated)
+
+
+def settings_of(config: Config) -> dict[str, Any]:
+    """All values of a configuration that are set."""
+    found: dict[str, Any] = config.model_dump(mode="json", exclude_none=True)
+    return found
+
+
+def files_of(config: Config, gone: Gone | None = None) -> dict[str, File]:
+    """Files that are read, by what they are; an InputError where one cannot be read."""
+    found = {kind: file_of(config, kind, gone) for kind in _EXPECTED}
+    return {kind: file for kind, file in found.items() if file is not None}
+
+
+def file_of(config: Config, kind: str, gone: Gone | None = None) -> File | None:
+    """The file of a kind, if the configuration names one; an InputError where it cannot be read."""
+    rendered = config.plant.rendered is not None and config.arm is not None
+    path = {
+        "table": config.data.table if config.data is not None else None,
+        "init": config.calibration.init,
+        "mjcf": config.arm.mjcf if config.arm is not None and rendered else None,
+    }[kind]
+    if path is None:
+        return None
+    further = files_named(path) if kind == "mjcf" else ()
+    return File.of(path, _EXPECTED[kind], (gone or {}).get(path, ""), further)
+
+
+# Robot, rig and markers.
+
+
+def truth_of(config: Config) -> Truth:
+    """Robot, rig and markers as they are; an InputError where a part of it is missing.
+
+    The same object for the same values, by which what is worked out of it is kept.
+    """
+    return _truth(config, face=True)
+
+
+def _truth(config: Config, *, face: bool) -> Truth:
+    """The truth, perhaps without a face, of which a calibration knows nothing."""
+    if config.arm is None:
+        raise InputError("this stage drives a simulated robot: set robot.dh or robot.screws")
+    if config.rig is None:
+        raise InputError("this stage needs a simulated rig: set rig.left, rig.right and rig.image_size_px")
+    if config.markers is None or config.markers.points is None:
+        raise InputError("this stage needs the markers of the simulated robot: set markers.positions_m")
+    rendered = config.plant.rendered
+    k1 = 0.0 if rendered is None else rendered.k1
+    markers = config.markers if face else config.markers.model_copy(update={"center": "midpoint"})
+    return _made_truth(config.arm, config.rig, markers, k1, face)
+
+
+@lru_cache(maxsize=32)
+def _made_truth(described: RobotSettings, rig: Rig, markers: Markers, k1: float, face: bool) -> Truth:
+    robot, P, numbers = _arm(described), cameras_of(rig), markers.known
+    assert numbers is not None
+    points = np.c_[markers.points, np.ones(len(numbers))]
+    return Truth(
+        robot,
+        P,
+        points @ robot.base_tool.T,
+        numbers,
+        tuple(numbers.index(number) for number in markers.front or ()) if face else (),
+        _center(markers),
+        np.array(rig.image_size_px, dtype=np.float64),
+        lens_of(P, k1) if k1 else NO_LENS,
+        np.zeros(3) if markers.normals is None else markers.normals @ robot.base_tool[:3, :3].T,
+    )
+
+
+def arm_of(config: Config) -> Arm | None:
+    """The arm of a configuration; None where its kinematics are not given."""
+    return None if config.arm is None else _arm(config.arm)
+
+
+@lru_cache(maxsize=32)
+def _arm(described: RobotSettings) -> Arm:
+    """Arm of screws, or of a Denavit–Hartenberg table, whose reference is all joints zero."""
+    kinds = described.joint_types
+    types = np.array([PRISMATIC if kind == "P" else REVOLUTE for kind in kinds], dtype=np.int64)
+    limits = position_limits(*np.array(described.ranges, dtype=np.float64).T.copy())
+    if described.screws is not None:
+        screws = described.screws
+        twists = np.array([twist(joint.w, joint.v) for joint in screws.joints])
+        q_reference = np.array(screws.reference.values(kinds))
+        return Arm(twists, types, q_reference, np.array(screws.base_tool), limits)
+    assert described.dh is not None
+    table = described.dh
+    links = [
+        dh.Link(row.type, math.radians(row.theta_deg), row.d_m, row.a_m, math.radians(row.alpha_deg))
+        for row in table.joints
+    ]
+    twists, base_tool = dh.screws_of(links, np.array(table.tool), modified=table.convention == "modified")
+    return Arm(twists, types, np.zeros(len(kinds)), base_tool, limits)
+
+
+@lru_cache(maxsize=32)
+def cameras_of(rig: Rig) -> FloatArray:
+    """Cameras (2, 3, 4) of a rig, to px."""
+    return np.array([_camera(rig.left), _camera(rig.right)])
+
+
+def _camera(camera: Camera) -> FloatArray:
+    if camera.matrix is not None:
+        return metric_camera(np.array(camera.matrix))
+    assert camera.focal_px is not None
+    assert camera.principal_point_px is not None
+    assert camera.position_m is not None
+    assert camera.target_m is not None
+    (f_u, f_v), (u, v) = camera.focal_px, camera.principal_point_px
+    K = np.array([[f_u, 0.0, u], [0.0, f_v, v], [0.0, 0.0, 1.0]])
+    return look_at(K, camera.position_m, camera.target_m, camera.up)
+
+
+def _center(markers: Markers) -> int:
+    """Position of the centre marker within the face, or ``MIDPOINT``."""
+    midpoint = markers.center == "midpoint" or not markers.front
+    return MIDPOINT if midpoint else (markers.front or ()).index(int(markers.center))
+
+
+def scene_of(config: Config, gone: Gone | None = None) -> Scene | None:
+    """What rendered cameras see; None for cameras that see points."""
+    options = config.plant.rendered
+    if options is None:
+        return None
+    assert config.arm is not None
+    assert config.rig is not None
+    assert config.markers is not None
+    return _scene(config.arm, config.rig, config.markers, options, file_of(config, "mjcf", gone))
+
+
+@lru_cache(maxsize=8)
+def _scene(
+    robot: RobotSettings, rig: Rig, markers: Markers, options: RenderedOptions, mjcf: File | None
+) -> Scene:
+    assert markers.known is not None
+    return Scene(
+        arm=_arm(robot),
+        P=cameras_of(rig),
+        size=rig.image_size_px,
+        tags=tuple(Tag(tag.number, tag.size_m, tag.pose) for tag in markers.all_tags),
+        numbers=markers.known,
+        dictionary=markers.dictionary or DICTIONARY,
+        mjcf=mjcf,
+        tip=robot.tip or "",
+        servo=options.servo,
+        grey_noise=options.grey_noise,
+        blur_px=options.blur_px,
+        k1=options.k1,
+        light=options.light,
+    )
+
+
+# What drives.
+
+
+def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
+    """Joints as far as they are configured; ``paced`` with their speeds."""
+    robot, vector, c = config.robot, config.reference, config.control
+    limits = robot.limits if robot is not None else None
+    ranges = robot.ranges if robot is not None and limits is None else None
+    turning = c.joint_acceleration_limit_deg_s2 or _ACCELERATION_DEG_S2
+    pace = Pace(
+        math.inf if c.joint_speed_limit_deg_s is None else math.radians(c.joint_speed_limit_deg_s),
+        math.inf if c.prismatic_speed_limit_m_s is None else c.prismatic_speed_limit_m_s,
+        math.radians(turning),
+        c.prismatic_acceleration_limit_m_s2 or _ACCELERATION_M_S2,
+    )
+    return JointSettings(
+        types=config.joint_types or "",
+        ranges=ranges if limits is None else limits.joints,
+        in_degrees=limits is not None and limits.unit == "deg",
+        widened=None if limits is None else limits.from_data,
+        unit="rad" if vector is None else vector.unit,
+        known=0 if vector is None else len(vector.joints),
+        pace=pace if paced else Pace(),
+    )
+
+
+def _readings(vector: JointVector | None) -> Readings | None:
+    return None if vector is None else Readings(vector.joints, vector.unit)
+
+
+def _following(config: Config, speed_scale: float) -> Following:
+    """How commands go to a robot of the contract."""
+    plant = config.plant
+    return Following(config.control.period_s, speed_scale, plant.lag_s, plant.sag_deg, plant.lead_deg)
+
+
+def _endless(config: Config) -> bool:
+    return config.plant.simulated and config.plant.joint_limits == "report"
+
+
+def _own(config: Config) -> OwnRobot:
+    """The robot of somebody's."""
+    plant, markers = config.plant, config.markers
+    dictionary = markers.dictionary if markers is not None else None
+    size, options = config.image_size_px, dict(plant.options)
+    return OwnRobot(plant.use or "", options, dictionary, plant.timeout_s, plant.open_s, size)
+
+
+def _simulated(config: Config, truth: Truth, gone: Gone | None) -> SimulatedRobot:
+    """The simulated robot that takes time for what it does."""
+    return SimulatedRobot(truth, faults_of(config), scene_of(config, gone), config.control.period_s)
+
+
+def faults_of(config: Config) -> Faults:
+    """What is wrong with the simulated robot all the time."""
+    given = config.disturbance
+    return _taken(
+        Faults,
+        given,
+        delay_s=(given.delay_s.left, given.delay_s.right),
+        sag=math.radians(given.sag_deg),
+        flex=math.radians(given.flex_deg),
+        play=math.radians(given.play_deg),
+    )
+
+
+def events_of(config: Config) -> Events:
+    """What befalls the simulated robot in a run."""
+    given, found = config.disturbance, dict[str, Any]()
+    if given.lost_markers is not None:
+        found["lost_markers"] = _taken(LostMarkers, given.lost_markers)
+    if (bump := given.bump) is not None:
+        by = bump.by_m or 0.0 if bump.by_deg is None else math.radians(bump.by_deg)
+        found["bump"] = Bump(bump.at_step, bump.joint - 1, by, bump.read)
+    if given.frozen_joint is not None:
+        found["frozen_joint"] = _taken(FrozenJoint, given.frozen_joint, joint=given.frozen_joint.joint - 1)
+    if given.camera_moved is not None:
+        moved = given.camera_moved.by_view()
+        found["camera_moved"] = CameraMoved(given.camera_moved.at_step, (moved[0], moved[1]))
+    if given.marker_moved is not None:
+        found["marker_moved"] = _taken(MarkerMoved, given.marker_moved, by=given.marker_moved.by_m)
+    return Events(**found)
+
+
+# Trials, task and trajectory.
+
+
+def _seed(config: Config) -> int:
+    """Seed of the trial motions and of all that is random in their evaluation."""
+    return config.seed if config.calibration.seed is None else config.calibration.seed
+
+
+def _trials(
+    config: Config,
+    truth: Truth | None,
+    own: OwnRobot | None,
+    gone: Gone | None,
+    *,
+    speed_scale: float,
+) -> Trials:
+    """Trial motions and the robot that is driven through them: somebody's, else the simulated one."""
+    settings, vector = config.calibration, config.reference
+    robot: SimulatedRobot | OwnRobot | None = own
+    if vector is None:
+        raise InputError("trial motions need a reference: set calibration.reference or task.start")
+    faults, scene = faults_of(config), scene_of(config, gone) if own is None else None
+    driven = own is not None or scene is not None or faults != Faults()
+    # The closed form takes joints that are told to stand still to do so.
+    faultless = not driven or settings.method == "closed_form"
+    poses = settings.random_poses
+    if poses is None:
+        poses = 0 if faultless else _RANDOM_POSES
+    motions = Motions(
+        Readings(vector.joints, vector.unit),
+        (float(np.radians(settings.amplitude_deg)), settings.amplitude_m),
+        settings.frames_per_joint,
+        poses,
+        0.0 if faultless else 2.0 * math.pi / (config.disturbance.encoder_ticks or _TICKS),
+        _seed(config),
+    )
+    noise, joints = config.noise.calibration_px, joints_of(config, paced=driven)
+    if not driven:
+        return Trials(motions, joints, truth, None, noise, 1, 0.0)
+    if robot is None:
+        assert truth is not None
+        robot = SimulatedRobot(truth, faults, scene, config.control.period_s)
+    how = Driven(robot, _following(config, speed_scale), _endless(config))
+    plant = config.plant
+    return Trials(motions, joints, truth, how, noise, plant.frames, plant.settle_s)
+
+
+def task_of(config: Config) -> ReachingTask | None:
+    """The task; None where there is none."""
+    task = config.task
+    if task is None:
+        return None
+    start = Readings(task.start.joints, task.start.unit)
+    return ReachingTask(start, _readings(task.start_offset), _goal(task.goal, config))
+
+
+def _goal(goal: GoalSettings, config: Config) -> Goal:
+    turn = images = None
+    if goal.turn_deg is not None:
+        near = goal.perturbation
+        displacement = None if near is None else (near.translation_m, near.rotation_rad)
+        turn = Turn(math.radians(goal.turn_deg), displacement)
+    if (seen := goal.images) is not None:
+        numbers = seen.markers or config.face_numbers
+        sigma = seen.sigma_left_px, seen.sigma_right_px
+        images = GoalImages(numbers, seen.left, seen.right, *sigma, _readings(seen.joints))
+    return Goal(_readings(goal.joints), turn, images)
+
+
+def trajectory_of(config: Config) -> Trajectory:
+    """The planned motion that is asked for."""
+    given = config.trajectory
+    return _taken(
+        Trajectory,
+        given,
+        joint_margin=math.radians(given.joint_margin_deg),
+        search_samples=given.search.samples,
+        search_seed=given.search.seed,
+        keep_out=tuple(KeptOut(region.left, region.right, region.hides) for region in given.keep_out),
+    )
+
+
+def _taken(record: type[_Record], section: Any, **others: Any) -> _Record:
+    """A record of the values of a section that have its names, and of others."""
+    names: tuple[str, ...] = record._fields  # type: ignore[attr-defined]
+    return record(**{name: getattr(section, name) for name in names if name not in others} | others)

@@ -1,0 +1,134 @@
+"""The file of what is believed of a robot, its rig and its markers, as a start for a calibration."""
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+
+from projservo_cli.files import text_of
+from projservo_cli.records import FloatArray, InputError
+
+Number = Annotated[float, Strict()]
+Vector3 = tuple[Number, Number, Number]
+Vector4 = tuple[Number, Number, Number, Number]
+Matrix34 = tuple[Vector4, Vector4, Vector4]
+Matrix44 = tuple[Vector4, Vector4, Vector4, Vector4]
+_MAX_BYTES = 10_000_000  # of the file
+_TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
+
+
+def not_rigid(T: Matrix44) -> str:
+    """Why a matrix is no pose; empty where it is one."""
+    R = np.array(T)[:3, :3]
+    if T[3] != (0, 0, 0, 1):
+        return "the last row must be [0, 0, 0, 1]"
+    if abs(R).max() > 2 or abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
+        return "the upper left 3×3 block must be a rotation, written with seven digits or more"
+    return ""
+
+
+def not_a_screw(kind: str, w: Vector3, v: Vector3) -> Iterator[tuple[str, str]]:
+    """What keeps w and v from being a screw of a joint, R or P: which of both, and why."""
+    axis = "w" if kind == "R" else "v"
+    length = math.hypot(*(w if kind == "R" else v))
+    if abs(length - 1) > _TOLERANCE:
+        yield axis, f"must be of unit length for a joint of type {kind}, it is {length:g}"
+    if kind == "P" and math.hypot(*w) > _TOLERANCE:
+        yield "w", "must be zero for a joint of type P"
+    if kind == "R" and abs(np.dot(w, v)) > _TOLERANCE:
+        yield "v", "must be orthogonal to w: a revolute joint has no pitch"
+
+
+class _Screw(BaseModel):
+    """A unit axis w with v = −w × point, or w zero and a unit direction v."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    w: Vector3
+    v: Vector3
+
+
+class _Believed(BaseModel):
+    """The keys of a file that are read; others are ignored."""
+
+    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
+
+    screws: Annotated[list[_Screw], Field(min_length=1)]
+    q_reference: list[float]
+    camera_left: Matrix34
+    camera_right: Matrix34
+    markers_tool: Annotated[list[Vector3], Field(min_length=1)]
+    marker_numbers: list[int] | None = None
+    T_base_tool_at_reference: Matrix44
+
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """Keys whose values do not fit together or make no sense, and why."""
+        n, m = len(self.screws), len(self.markers_tool)
+        if len(self.q_reference) != n:
+            yield "q_reference", f"{len(self.q_reference)} values for {n} screws"
+        if self.marker_numbers and not len(self.marker_numbers) == len(set(self.marker_numbers)) == m:
+            yield "marker_numbers", f"give each of the {m} markers its own number"
+        for name in ("camera_left", "camera_right"):
+            if np.linalg.matrix_rank(np.array(getattr(self, name))) < 3:
+                yield name, "a camera matrix has three independent rows"
+        if what := not_rigid(self.T_base_tool_at_reference):
+            yield "T_base_tool_at_reference", what
+
+
+def read_nominal(path: Path | str) -> dict[str, Any]:
+    """Read what is believed of a robot, its rig and its markers: the fields of ``calibration.Nominal``.
+
+    path : JSON with ``screws`` (w and v of each joint at the reference, base frame, rad and m),
+    ``q_reference`` (rad or m), ``camera_left`` and ``camera_right`` (3×4 matrices to px), ``markers_tool``
+    (m) with ``T_base_tool_at_reference``, and perhaps ``marker_numbers`` (0, 1 …).
+    Raises InputError ``file: key: what`` when it cannot be read or makes no sense.
+    """
+    found = _believed(path)
+    for key, what in found.contradictions():
+        raise InputError(f"{path}: {key}: {what}")
+    numbers = found.marker_numbers or range(len(found.markers_tool))
+    body = np.c_[np.array(found.markers_tool), np.ones(len(numbers))]
+    return {
+        "where": str(path),
+        "P": np.array([found.camera_left, found.camera_right]),
+        "H_hat": np.array([_twist(f"{path}: screws.{i}", screw) for i, screw in enumerate(found.screws)]),
+        "q_reference": np.array(found.q_reference, dtype=np.float64),
+        "marker": np.array(numbers, dtype=np.int64),
+        "M": body @ np.array(found.T_base_tool_at_reference).T,
+    }
+
+
+def _believed(path: Path | str) -> _Believed:
+    text = text_of(path, "screws, cameras and markers (JSON)", _MAX_BYTES)
+    try:
+        return _Believed.model_validate_json(json.dumps(json.loads(text)))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}:{error.lineno}:{error.colno}: not JSON: {error.msg}") from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key, what = ".".join(map(str, first["loc"])), first["msg"]
+        raise InputError(
+            f"{path}: {key or 'the file'}: {what[:1].lower()}{what[1:]}; expected screws, q_reference, "
+            "camera_left, camera_right, markers_tool and T_base_tool_at_reference"
+        ) from error
+    except (RecursionError, ValueError) as error:
+        raise InputError(f"{path}: not JSON that can be read; expected screws, cameras, markers") from error
+
+
+def _twist(where: str, screw: _Screw) -> FloatArray:
+    """Twist (4, 4) of a screw that a configured robot may have, freed of what rounding left of a pitch."""
+    w, v = np.array(screw.w), np.array(screw.v)
+    for key, what in not_a_screw("R" if w.any() else "P", screw.w, screw.v):
+        raise InputError(f"{where}: {key} {what}")
+    twist = np.zeros((4, 4))
+    if not w.any():
+        twist[:3, 3] = v / np.linalg.norm(v)
+        return twist
+    w = w / np.linalg.norm(w)
+    twist[:3, :3] = np.cross(np.eye(3), w)
+    twist[:3, 3] = v - w * (w @ v)
+    return twist

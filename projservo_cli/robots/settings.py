@@ -1,0 +1,128 @@
+"""What is configured of a robot: its joints and their limits, what its servos may do, and its class."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from projservo_cli.calibration.readings import per_rad
+from projservo_cli.records import Calibration, FloatArray, InputError, JointLimits, in_unit
+from projservo_cli.robots.contract import Bounds
+
+
+class Readings(NamedTuple):
+    """Joint readings as somebody gave them."""
+
+    joints: tuple[float, ...]
+    unit: str  # of the revolute joints, deg or rad; prismatic ones are in m
+
+    def values(self, types: str) -> FloatArray:
+        """Readings (n,) in rad (R) and m (P); a ValueError when the numbers of joints differ."""
+        pairs = zip(self.joints, types, strict=True)
+        turn = math.radians if self.unit == "deg" else float
+        return np.array([turn(value) if letter == "R" else float(value) for value, letter in pairs])
+
+
+class Pace(NamedTuple):
+    """How fast joints may move: per s and per s², rad for revolute joints and m for prismatic ones."""
+
+    revolute: float = math.inf
+    prismatic: float = math.inf
+    turning: float = math.inf  # acceleration
+    sliding: float = math.inf
+
+
+class Joints(NamedTuple):
+    """What is known of the joints of a robot."""
+
+    types: str  # one letter a joint, R or P
+    limits: JointLimits  # infinite where none is set; accelerations of the profile joint alone
+    units: tuple[str, ...]  # in which messages give readings: deg, rad or m
+
+    def length_of(self, degrees: float) -> FloatArray:
+        """An angle as (n,) rad, for prismatic joints the length, m, that makes as much of a difference."""
+        return math.radians(degrees) * per_rad(np.array([*self.types]) == "P")
+
+    def limit_passed(self, q: FloatArray) -> str:
+        """Return which of the readings (n,), rad or m, lies beyond its limits, in words; empty for none."""
+        return limit_passed(q, self.limits, self.units)
+
+
+def limit_passed(q: FloatArray, limits: JointLimits, units: Sequence[str]) -> str:
+    """Return which of the readings (n,), rad or m, lies beyond its limits, in its unit; empty for none."""
+    for i in np.flatnonzero((q < limits.lower) | (q > limits.upper)).tolist():
+        at, low, high = (in_unit(values[i], units[i]) for values in (q, limits.lower, limits.upper))
+        return f"joint {i + 1} would be at {at}, beyond its limits {low} to {high}"
+    return ""
+
+
+class JointSettings(NamedTuple):
+    """Joints as far as they are configured; data tell what is missing."""
+
+    types: str  # one letter a joint, R or P; empty where only a table tells
+    ranges: tuple[tuple[float, float], ...] | None  # lowest and highest readings; None for no limits
+    in_degrees: bool  # whether those of revolute joints are in degrees
+    widened: float | None  # the limits are what joints cover in the data, widened by this share of it
+    unit: str  # in which somebody gave readings of revolute joints, deg or rad
+    known: int  # of how many joints readings were given; 0 where nobody did
+    pace: Pace = Pace()
+
+    def joints(self, default_types: str = "", calibration: Calibration | None = None) -> Joints:
+        """Joints of the robot; of ``default_types``, else revolute ones, where nobody tells their types.
+
+        calibration : whose data tell limits where they are taken from there; without, none are.
+        """
+        types, pace = self.types or default_types or "R" * self.known, self.pace
+        lower, upper = self._limits(types, calibration)
+        slides = [kind == "P" for kind in types]
+        speed = np.where(slides, pace.prismatic, pace.revolute)
+        acceleration = np.where(slides, pace.sliding, pace.turning)
+        units = tuple("m" if kind == "P" else self.unit for kind in types)
+        return Joints(types, JointLimits(lower, upper, speed, acceleration), units)
+
+    def _limits(self, types: str, calibration: Calibration | None) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper limits (n,), rad or m; infinite where nothing tells them."""
+        if self.widened is not None and calibration is not None:
+            share, span = self.widened, calibration.excitation
+            return calibration.lowest - share * span, calibration.lowest + (1.0 + share) * span
+        pairs = self.ranges or ((-math.inf, math.inf),) * len(types)
+        if len(pairs) != len(types):
+            raise InputError(f"robot.limits.joints: give a pair for each of {len(types)} joints")
+        turn = math.radians if self.in_degrees else float
+        rows = [
+            [turn(x) if kind == "R" else float(x) for x in pair]
+            for pair, kind in zip(pairs, types, strict=True)
+        ]
+        lower, upper = np.array(rows, dtype=np.float64).reshape(-1, 2).T.copy()
+        return lower, upper
+
+
+class Following(NamedTuple):
+    """How commands go to a robot of the contract, and what is taken of its servos."""
+
+    period: float  # of commands, s
+    speed_scale: float  # factor of every command
+    lag_s: float  # by how much joints may lag behind their set-points
+    sag_deg: float  # how far a joint at rest may stay from its set-point
+    lead_deg: float | None  # how far a set-point may lead the reading; None for what lag and sag ask for
+
+    def bounds(self, joints: Joints) -> Bounds:
+        """Return what no command may exceed, and what is taken of the servos."""
+        speed, sag = joints.limits.speed * self.speed_scale, joints.length_of(self.sag_deg)
+        lead = speed * (self.lag_s + self.period) + sag
+        if self.lead_deg is not None:
+            lead = joints.length_of(self.lead_deg)
+        limits = joints.limits._replace(speed=speed)
+        return Bounds(limits, lead, self.period, self.lag_s, sag, joints.units)
+
+
+class OwnRobot(NamedTuple):
+    """A robot of somebody's."""
+
+    target: str  # its class, module:Class
+    options: dict[str, Any]  # arguments that the class is made with
+    dictionary: str | None  # of tags, which a class that takes it is given
+    timeout_s: float  # most time an answer may take
+    open_s: float  # most time that opening may take
+    image_size: tuple[int, int] | None  # width and height of its images, px, if they are known

@@ -1,0 +1,165 @@
+"""What plans, runs and reports are given: the task, what start and goal are measured with, what drives."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from projservo_cli.records import FloatArray
+from projservo_cli.report.report_data import About
+from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings
+from projservo_cli.simulation.arm import Arm
+from projservo_cli.simulation.faults import Events, SimulatedRobot
+from projservo_cli.simulation.scene import Scene
+from projservo_cli.simulation.workspace import Truth, Turn
+from projservo_cli.task.trajectory import Trajectory
+
+_Pixel = tuple[float, float]
+
+
+class GoalImages(NamedTuple):
+    """Pixels of markers at the goal, with how sure they are."""
+
+    markers: tuple[int, ...]  # numbers of the markers that pixels are of
+    left: tuple[_Pixel | None, ...]
+    right: tuple[_Pixel | None, ...]  # left, right: u and v of each marker, px; None where unseen
+    sigma_left: tuple[float | None, ...] | None
+    sigma_right: (
+        tuple[float | None, ...] | None
+    )  # their standard deviations, px; None where they are not told
+    joints: Readings | None  # there
+
+    def pixels(self) -> dict[int, tuple[_Pixel, _Pixel]]:
+        """Left and right pixel of each marker, NaN where unseen."""
+        unseen = math.nan, math.nan
+        each = zip(self.markers, self.left, self.right, strict=True)
+        return {number: (left or unseen, right or unseen) for number, left, right in each}
+
+    def deviations(self, numbers: Sequence[int]) -> list[list[float]]:
+        """Standard deviation of markers in the left and in the right image, px; NaN where it is not told."""
+        sides = [side or (None,) * len(self.markers) for side in (self.sigma_left, self.sigma_right)]
+        told = [dict(zip(self.markers, side, strict=True)) for side in sides]
+        return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in told]
+
+    def sigma_px(self, face: Sequence[int]) -> float | None:
+        """Standard deviation of a coordinate of the markers of the face, rms; None where it is not told."""
+        told = [sigma**2 for side in self.deviations(face) for sigma in side]
+        return None if any(map(math.isnan, told)) else math.sqrt(sum(told) / len(told))
+
+
+class Goal(NamedTuple):
+    """The goal: joint readings, a turn, or images; the others are None."""
+
+    joints: Readings | None = None
+    turn: Turn | None = None
+    images: GoalImages | None = None
+
+
+class ReachingTask(NamedTuple):
+    """A task from start to goal; a goal that is a turn stays that of the start without the offset."""
+
+    start: Readings
+    start_offset: Readings | None
+    goal: Goal
+
+
+@dataclass(frozen=True, eq=False)
+class PlanInputs:
+    """What a plan is made from, beside the calibration."""
+
+    task: ReachingTask | None
+    seed: int  # of the noise of start and goal
+    truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
+    arm: Arm | None  # kinematics as they are described, if they are
+    P: FloatArray | None  # (2, 3, 4) cameras as they are described, px, if they are
+    scene: Scene | None  # where cameras are rendered
+    face: tuple[int, ...]  # numbers of the markers that must stay visible
+    center: int  # position of the centre marker within the face, or ``MIDPOINT``
+    known: tuple[int, ...] | None  # numbers of all markers; None where the calibration tells them
+    tags: tuple[tuple[int, ...], ...]  # numbers of the corners of each tag among them
+    joints: JointSettings
+    image_size: tuple[int, int] | None  # width and height, px, if they are known
+    noise_px: float  # standard deviation of simulated pixels
+    frames: int  # that are averaged of start and goal
+    features: str | None  # points, body, or None for body where the calibration is usable
+    tests_images: bool  # whether images are tested against the calibration
+    trajectory: Trajectory
+
+
+class LawSettings(NamedTuple):
+    """Gains of the laws in 1/s, and how they step."""
+
+    gain_t: float
+    gain_r: float
+    gain_p: float
+    gain_s: float
+    ratio_rp: float
+    gain: float
+    period: float  # s
+    substeps: bool
+
+
+class StopSettings(NamedTuple):
+    """When a closed loop ends."""
+
+    image_px: float
+    noise_factor: float  # widens ``image_px`` by so many times the noise
+    max_steps: int
+    diverged_factor: float
+    plateau_steps: int
+    lost_steps: int
+    innovation_factor: float  # of the noise, beyond which images disturb a run; 0 tests nothing
+    at_joint_limit: bool
+    at_border: bool  # at_joint_limit, at_border: whether they end a run
+
+
+class Driven(NamedTuple):
+    """A robot of the contract and how it is driven."""
+
+    robot: SimulatedRobot | OwnRobot
+    following: Following
+    endless: bool  # whether a simulated one goes beyond its limits
+
+
+class Contract(NamedTuple):
+    """What a run by the contract takes besides."""
+
+    driven: Driven
+    events: Events  # that befall a simulated robot
+    timeout_s: float  # most time that an answer may take
+    delay_s: tuple[float, float] | None  # of the images of both cameras; None to estimate them
+    settle_s: float | None  # for how long a robot of somebody's has stood still at the start
+
+
+@dataclass(frozen=True, eq=False)
+class ServoInputs:
+    """What the run of a law is made from, beside calibration and plan."""
+
+    plan: PlanInputs  # what the plan was made from
+    laws: LawSettings
+    stop: StopSettings
+    opaque: bool  # whether the face hides its markers from a camera behind it
+    speed_scale: float  # factor of every command
+    searches_anew: int  # how often a way is searched anew where one comes to nothing
+    refuses: bool  # whether a law is not run where no joints could follow the plan
+    lengths: FloatArray  # (m, m) distances between the markers of the face, m; NaN where nothing tells them
+    contract: Contract | None  # None for the ideal plant
+
+
+@dataclass(frozen=True, eq=False)
+class ReportInputs:
+    """What a report is made from, beside calibration, plan and runs."""
+
+    about: About
+    formats: tuple[str, ...]  # of the files of each figure
+    extra: ServoInputs | None  # of laws by themselves on the ideal plant; None where there is no task
+    trajectory: Trajectory  # what the plan was asked for
+
+
+class Scenery(NamedTuple):
+    """What runs are shown in."""
+
+    name: str  # of the configuration
+    truth: Truth  # robot, rig and face as they are described
+    opaque: bool  # whether the face hides its markers from a camera behind it
+    simulated: bool  # whether joints are those of a simulation, else those that a robot reported

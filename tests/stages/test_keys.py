@@ -1,0 +1,303 @@
+"""Keys: a stage reads what its key is made of and nothing else, and a key is made of no more than that."""
+
+import dataclasses
+import json
+import random
+import shutil
+import subprocess
+import sys
+from functools import cache
+
+import numpy as np
+import pytest
+import yaml
+
+from projservo_cli.canonical import decoded, encoded, files_in
+from projservo_cli.config import load_config, to_yaml
+from projservo_cli.config.inputs import calibration_inputs, plan_inputs, report_inputs, servo_inputs
+from projservo_cli.records import InputError
+from projservo_cli.simulation.mjcf import files_named
+from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.steps import key_of
+from tests.configured import record
+from tests.conftest import ROOT
+
+GIVEN = {"calibrate": calibration_inputs, "plan": plan_inputs, "servo": servo_inputs, "report": report_inputs}
+# Short, and with all that is random: noise in trials, loop, start and goal.
+QUICK = ("calibration.frames_per_joint=4", "stop.max_steps=12", "noise.servo_px=0.3", "trajectory.samples=11")
+CASES = {
+    "ideal": ("paper", ()),
+    "searched": ("ur5", ("trajectory.profile=auto", "control.mode=track")),
+    "faults": (
+        "hobby",
+        ("disturbance.lag_s=0.05", "disturbance.bump={at_step: 4, joint: 1, by_deg: 2}"),
+    ),
+}
+LAW = "exact"
+
+
+def configured(case, *overrides):
+    """A case, or another shipped configuration, with other values."""
+    name, own = CASES.get(case, (case, ()))
+    return load_config(ROOT / "configs" / f"{name}.yaml", [*QUICK, *own, *overrides])
+
+
+def made(stage, given, before):
+    """What a stage makes, by the records that it is given."""
+    if stage == "calibrate":
+        return calibrate.run(given)
+    if stage == "plan":
+        return (plan.run(given, before["calibrate"][1]),)
+    return (servo.run(given, before["calibrate"][1], before["plan"][0], LAW),)
+
+
+def same(first, second):
+    """Whether records are equal to the bit, but for the time that they took."""
+    for one, other in zip(first, second, strict=True):
+        if one is None or other is None:
+            if one is not other:
+                return False
+            continue
+        for field in dataclasses.fields(one):
+            values = (getattr(one, field.name), getattr(other, field.name))
+            if field.name != "seconds" and encoded(values[0]) != encoded(values[1]):
+                return False
+    return True
+
+
+@cache
+def chain(name):
+    """What each stage of a case makes, and the configuration."""
+    config = configured(name)
+    results = {}
+    for stage in ("calibrate", "plan", "servo"):
+        results[stage] = made(stage, GIVEN[stage](config), results)
+    return config, results
+
+
+OPENED = []
+sys.addaudithook(lambda event, arguments: OPENED.append(str(arguments[0])) if event == "open" else None)
+
+
+@pytest.mark.parametrize("stage", ["calibrate", "plan", "servo"])
+@pytest.mark.parametrize("name", CASES)
+def test_a_stage_makes_the_same_of_its_bytes_and_opens_no_file(name, stage):
+    config, results = chain(name)
+    given = GIVEN[stage](config)
+    content, files = encoded(given), {file.sha256: file.path for file in files_in(given)}
+    again = decoded(content, files)
+    assert encoded(again) == content
+    OPENED.clear()
+    found = made(stage, again, results)
+    system = (str(ROOT / "projservo_cli"), sys.prefix, sys.base_prefix, "/proc", "/sys", "/usr", "/dev")
+    other = [file for file in OPENED if not file.startswith(system) and "kernels-" not in file]
+    assert not [file for file in other if file not in files.values() and not file.isdecimal()]
+    assert same(found, results[stage])
+
+
+def values_of(config):
+    """Each key that holds a number or a word, with other values that it may have."""
+    found = {}
+
+    def leaves(path, value):
+        for key, inner in value.items():
+            here = f"{path}{key}"
+            if isinstance(inner, dict):
+                leaves(f"{here}.", inner)
+            elif isinstance(inner, bool):
+                found[here] = [not inner]
+            elif isinstance(inner, (int, float)):
+                found[here] = [inner + 1, 2 * inner, 0.5 * inner]
+            elif inner is None:
+                found[here] = [1, 0.5]
+
+    leaves("", yaml.safe_load(to_yaml(config)))
+    words = {
+        "plant.joint_limits": ["stop"],
+        "plant.image_border": ["stop"],
+        "plant.self_occlusion": ["opaque"],
+        "control.substeps": ["none"],
+        "control.observation": ["points"],
+        "control.without_plan": ["refuse"],
+        "trajectory.profile": ["exponential", "rotation_first"],
+        "report.formats": [["png"]],
+        "control.laws": [["stacked"]],
+        "control.must_converge": [[]],
+    }
+    return found | words
+
+
+def pairs(count):
+    """Pairs of a configuration and a stage whose key stays when one value is another, drawn by a seed."""
+    rng, found, tried = random.Random(20), [], 0
+    choices = {name: list(values_of(chain(name)[0]).items()) for name in CASES}
+    while len(found) < count and tried < 3_000:
+        tried += 1
+        name = rng.choice([*CASES])
+        key, values = rng.choice(choices[name])
+        stage, value = rng.choice(["calibrate", "plan", "servo"]), rng.choice(values)
+        try:
+            other = configured(name, f"{key}={json.dumps(value)}")
+            kept = all(
+                key_of(GIVEN[one](other)) == key_of(GIVEN[one](chain(name)[0]))
+                for one in ("calibrate", "plan", "servo")[: ("calibrate", "plan", "servo").index(stage) + 1]
+            )
+        except InputError:
+            continue
+        if kept and (name, key, stage) not in [one[:3] for one in found]:
+            found.append((name, key, stage, other))
+    return found
+
+
+@pytest.mark.volume
+def test_what_keeps_its_key_is_the_same_to_the_bit():
+    drawn = pairs(40)
+    assert len(drawn) == 40
+    for name, key, stage, other in drawn:
+        _, results = chain(name)
+        assert same(made(stage, GIVEN[stage](other), results), results[stage]), (name, key, stage)
+
+
+KEPT = [
+    ("ideal", "plan", "control.gain_t=1"),
+    ("ideal", "plan", "control.period_s=0.05"),
+    ("ideal", "plan", "stop.max_steps=5"),
+    ("ideal", "calibrate", "plant.timeout_s=3"),
+    ("ideal", "calibrate", "plant.speed_scale=0.5"),
+    ("ideal", "calibrate", "control.period_s=0.05"),
+    ("ideal", "calibrate", "control.joint_speed_limit_deg_s=20"),
+    ("ideal", "calibrate", "markers.center=0"),
+    ("ideal", "servo", "control.laws=[stacked]"),
+    ("ideal", "servo", "control.mode=[replan, track]"),
+    ("ideal", "servo", "control.must_converge=[]"),
+    ("ideal", "servo", "plant.timeout_s=3"),
+    ("ideal", "servo", "name=other"),
+    ("faults", "calibrate", "plant.timeout_s=3"),
+    ("faults", "calibrate", "plant.speed_scale=0.5"),
+    ("faults", "calibrate", "control.gain_t=1"),
+]
+CHANGED = [
+    ("ideal", "plan", "control.joint_speed_limit_deg_s=20"),
+    ("ideal", "plan", "stop.innovation_factor=0"),
+    ("ideal", "plan", "markers.center=0"),
+    ("ideal", "servo", "control.gain_t=1"),
+    ("ideal", "servo", "plant.speed_scale=0.5"),
+    ("ideal", "servo", "control.period_s=0.05"),
+    ("faults", "calibrate", "control.period_s=0.05"),
+    ("faults", "calibrate", "control.joint_speed_limit_deg_s=20"),
+    ("faults", "calibrate", "plant.settle_s=1"),
+    ("faults", "servo", "plant.timeout_s=3"),
+    ("ideal", "report", "name=other"),
+    ("ideal", "report", "control.must_converge=[]"),
+]
+
+
+@pytest.mark.parametrize(("name", "stage", "change"), KEPT)
+def test_a_key_is_made_of_no_more_than_the_stage_reads(name, stage, change):
+    keys = [key_of(GIVEN[stage](configured(name, *more))) for more in ((), (change,))]
+    assert keys[0] == keys[1]
+
+
+@pytest.mark.parametrize(("name", "stage", "change"), CHANGED)
+def test_a_key_is_made_of_no_less_than_the_stage_reads(name, stage, change):
+    keys = [key_of(GIVEN[stage](configured(name, *more))) for more in ((), (change,))]
+    assert keys[0] != keys[1]
+
+
+def test_tables_and_goal_files_count_by_their_content(tmp_path):
+    config = configured("ur5", "calibration.cross_validate=null")
+    table = tmp_path / "trials.csv"
+    record.record(config, record.new_recording(config, table))
+    told = configured("ur5", f"data.table={table}")
+    key, report = key_of(calibration_inputs(told)), key_of(report_inputs(told))
+    moved = tmp_path / "elsewhere" / "moved.csv"
+    moved.parent.mkdir()
+    shutil.move(table, moved)
+    elsewhere = configured("ur5", f"data.table={moved}")
+    assert key_of(calibration_inputs(elsewhere)) == key
+    assert key_of(report_inputs(elsewhere)) == report
+    given = calibration_inputs(elsewhere)
+    again = decoded(encoded(given), {given.source.file.sha256: str(moved)})
+    OPENED.clear()
+    assert same(calibrate.run(again), calibrate.run(given))
+    assert str(moved) in OPENED
+    gone = {str(moved): given.source.file.sha256}
+    content = moved.read_text(encoding="utf-8")
+    moved.unlink()
+    assert key_of(calibration_inputs(elsewhere, gone)) == key
+    moved.write_text(content.replace("0,0,", "0,1,", 1), encoding="utf-8")
+    assert key_of(calibration_inputs(elsewhere, gone)) != key
+
+
+MESH = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+PART = """<mujocoinclude><body name="tool" pos="0 0 0.3"><joint name="b" axis="0 1 0"/>
+{}</body></mujocoinclude>"""
+ARM = """<mujoco><compiler meshdir="meshes"/><asset><mesh name="link" file="link.obj"/></asset><worldbody>
+<body name="base"><joint name="a" axis="0 0 1"/><geom type="mesh" mesh="link"/>
+<include file="part.xml"/></body>
+</worldbody></mujoco>"""
+
+
+def test_a_model_of_mujoco_counts_with_the_files_that_it_names(tmp_path):
+    pytest.importorskip("mujoco")
+
+    def key(folder, mesh=MESH, size=0.05):
+        (folder / "meshes").mkdir(parents=True, exist_ok=True)
+        (folder / "meshes" / "link.obj").write_text(mesh, encoding="utf-8")
+        geom = f'<geom type="sphere" size="{size}"/>'
+        (folder / "part.xml").write_text(PART.format(geom), encoding="utf-8")
+        (folder / "arm.xml").write_text(ARM, encoding="utf-8")
+        robot = f"robot={{mjcf: {folder / 'arm.xml'}, tip: tool}}"
+        start = "task={start: {joints: [0, 0.1], unit: rad}, goal: {joints: {joints: [0.2, 0.3], unit: rad}}}"
+        alone = "noise.servo_px=0", "calibration.reference=null"
+        config = configured("rendered", robot, start, *alone)
+        found = {stage: key_of(GIVEN[stage](config)) for stage in ("calibrate", "plan", "servo", "report")}
+        assert len(set(found.values())) == 4
+        return found
+
+    first = key(tmp_path / "one")
+    assert key(tmp_path / "two") == first
+    named = files_named(str(tmp_path / "one" / "arm.xml"))
+    assert [name.removeprefix(str(tmp_path)) for name in named] == ["/one/meshes/link.obj", "/one/part.xml"]
+    larger = MESH.replace("0.1 0 0", "0.2 0 0")
+    for other in (key(tmp_path / "two", mesh=larger), key(tmp_path / "two", size=0.06)):
+        assert not {*other.values()} & {*first.values()}
+
+
+URDF = """<robot name="r"><link name="base"/><link name="tool"/>
+<joint name="a" type="revolute"><parent link="base"/><child link="tool"/><axis xyz="0 0 1"/>
+<limit lower="-2" upper="{}" effort="1" velocity="1"/></joint></robot>"""
+
+
+def test_of_a_urdf_the_screws_count_and_not_its_place_or_text(tmp_path):
+    def key(name, upper=2.0, comment=""):
+        path = tmp_path / name
+        path.write_text(URDF.format(upper) + comment, encoding="utf-8")
+        vectors = "task={start: {joints: [0], unit: rad}, goal: {joints: {joints: [0.2], unit: rad}}}"
+        config = configured(
+            "paper", f"robot={{urdf: {path}, tip: tool}}", vectors, "calibration.reference=null"
+        )
+        return key_of(calibration_inputs(config))
+
+    assert key("a.urdf") == key("b.urdf", comment="<!-- moved -->")
+    assert key("a.urdf") != key("a.urdf", upper=1.5)
+
+
+def test_canonical_bytes_tell_values_apart():
+    values = [1, 1.0, True, "1", None, (1,), [1], {"a": 1}, np.ones(1), np.ones(1, np.int64), np.ones((1, 1))]
+    assert len({encoded(value) for value in values}) == len(values)
+    for value in values:
+        assert encoded(decoded(encoded(value), {})) == encoded(value)
+    with pytest.raises(TypeError, match="object has no canonical bytes"):
+        encoded(object())
+
+
+def test_no_function_below_the_experiment_takes_a_configuration():
+    """The layers say so too; this names what an import inside a function would hide."""
+    found = subprocess.run(
+        ["grep", "-rlE", r"projservo_cli\.config|: Config\b", str(ROOT / "projservo_cli")],
+        capture_output=True, text=True, check=True,
+    ).stdout.split()  # fmt: skip
+    below = {path.removeprefix(f"{ROOT}/projservo_cli/") for path in found if path.endswith(".py")}
+    above = ("cli/", "sweeps/", "config/", "api.py", "experiment.py", "steps.py", "__init__.py")
+    assert not {path for path in below if not path.startswith(above)}
