@@ -361,6 +361,17 @@ def test_a_marker_that_was_off_and_is_gone_is_not_judged(arm):
     assert first_alarm(arm, q, s) == (None, "")
 
 
+@pytest.mark.parametrize("way", [2, 5])
+def test_errors_of_corners_that_last_hide_no_camera_that_moves_by_more(arm, way):
+    """Nothing is new in a frame: corners err as they like in four views, but not all by two deviations."""
+    q = arm.way(way)[0][[0, STEPS // 3, 2 * STEPS // 3, -1]].repeat(8, axis=0)
+    s = arm.images(at_once(q))
+    s += SIGMA * np.random.default_rng(3 + way).standard_normal((4, *s.shape[1:])).repeat(8, axis=0)
+    assert first_alarm(arm, q, s) == (None, "")
+    s[:, 0, :, 0] += 5.0 * SIGMA
+    assert "the left camera was moved" in first_alarm(arm, q, s)[1]
+
+
 @pytest.fixture(scope="module")
 def sliding():
     """A robot with a prismatic joint, what its trials showed, and smooth joints (k, n)."""
