@@ -48,6 +48,8 @@ _LEAST_MOVED_PX = 1.0
 _COVERED = 0.5
 # Share of the sightings of a view that may not be off by themselves for long: then the view is.
 _MOST_FOR_LONG = 0.25
+# Share of a slip that the set-point of a joint went without its reading: then the reading is frozen.
+_UNANSWERED = 0.5
 # Looks that are remembered one by one.
 _REMEMBERED = 80
 # Chance of a false alarm of one look alone: that of a look among so many.
@@ -85,7 +87,8 @@ class ImageMonitor:
     ``fault``: what is wrong, in words; empty while nothing is, or while it is not clear what.
     ``looks``: how many showed a marker and were tested. ``agreeing``: looks of one view in a row that agree.
     ``rejected``: (2, m) sightings of the last look that are off by themselves, of all markers of the
-    calibration.
+    calibration. ``unanswered``: (n,) how far each set-point went since the reading of its joint last changed,
+    rad or m; the client of the robot sets it.
     """
 
     def __init__(
@@ -118,6 +121,7 @@ class ImageMonitor:
         self._crowded = 0  # looks in a row of which many sightings are off by themselves
         self._forgiven: list[int] = []
         self.fault, self.agreeing = "", 0
+        self.unanswered = np.zeros(len(calibration.q_reference))
         self.rejected = np.zeros((2, self._all), dtype=np.bool_)
 
     @property
@@ -284,7 +288,7 @@ class ImageMonitor:
         causes = causes_of(evidence, self.calibration.marker, self._centre)
         if markers is not None:
             causes = (cause for cause in causes if cause.kind == "marker" and cause.which in markers)
-        found = [one for one in evidence.explanations(causes) if is_possible(one)]
+        found = [self._frozen(one) for one in evidence.explanations(causes) if is_possible(one)]
         if not found:  # markers that the chosen looks do not show
             return found
         # Where even the best leaves more than chance does, the unit is what that leaves.
@@ -296,6 +300,15 @@ class ImageMonitor:
             return found
         moved = [one for one in found if one.cause.kind == "marker" and one.score > _CLEAR] or found[:1]
         return [together(moved), *(one for one in found if one.cause.kind != "marker")]
+
+    def _frozen(self, found: Explanation) -> Explanation:
+        """A slip by what the set-point went without the reading as what it is: the reading is frozen."""
+        cause = found.cause
+        if cause.kind == "slipped":
+            slip = float(found.theta[0])
+            if self.unanswered[cause.which] * slip > _UNANSWERED * slip**2:
+                return found._replace(cause=cause._replace(kind="frozen"))
+        return found
 
     def _evidence(self, kept: list[_Kept], before: Sums) -> Evidence:
         """Looks to be explained, those of one view worth what they are."""

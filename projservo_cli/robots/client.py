@@ -171,6 +171,7 @@ class DrivenRobot:
         q_then = history.at(frames.t)
         if self.monitor is not None:
             q_dot = np.stack([history.speed_at(float(t)) for t in frames.t])
+            self.monitor.unanswered = self.steered.set_point.unanswered
             fault = self.monitor.look(
                 frames.t, q_then, q_dot, frames.sigma, images, frames.fresh, stated=stated
             )

@@ -22,7 +22,7 @@ class SetPoint:
     """
 
     def __init__(self, bounds: Bounds, q: FloatArray) -> None:
-        self._bounds, self.target = bounds, q.copy()
+        self._bounds, self.target, self._answered = bounds, q.copy(), q.copy()
         self.short: BoolArray = np.zeros(len(q), dtype=np.bool_)
         self._q, self._sag = q.copy(), np.zeros(len(q))
         self._behind = np.zeros(len(q))  # by how much a servo of that lag would be
@@ -32,8 +32,14 @@ class SetPoint:
         """Joints (n,) at which the arm comes to rest if nothing more is sent, rad or m."""
         return self.target - self._sag
 
+    @property
+    def unanswered(self) -> FloatArray:
+        """How far (n,) the set-point went since the reading of each joint last changed, rad or m."""
+        return self.target - self._answered
+
     def read(self, q: FloatArray, seconds: float) -> None:
         """Learn the sag from a reading (n,), so long after the last one: only while hardly anything moves."""
+        self._answered = np.where(q != self._q, self.target, self._answered)
         self._q = q.copy()
         weight = 1.0 / (1.0 + (self._behind / (_STILL * self._bounds.sag)) ** 2)
         share = -math.expm1(-seconds / self._bounds.lag_s)

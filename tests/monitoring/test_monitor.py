@@ -372,6 +372,25 @@ def test_errors_of_corners_that_last_hide_no_camera_that_moves_by_more(arm, way)
     assert "the left camera was moved" in first_alarm(arm, q, s)[1]
 
 
+@pytest.mark.parametrize(
+    ("unanswered", "name"), [(3.0, "the reading of joint 2 stands still"), (0.5, "joint 2 slipped by")]
+)
+def test_a_slip_by_what_the_set_point_went_without_the_reading_is_a_frozen_one(arm, unanswered, name):
+    """The arm is held since: images show the same of both."""
+    q = arm.way(3)[0][-1:].repeat(20, axis=0)
+    slip = np.radians(3.0) * np.eye(6)[1]
+    s = noisy(arm.images(at_once(q - slip)), 3)
+    test = ImageMonitor(arm.calibration, SIGMA, LOOKS)
+    test.unanswered = -unanswered / 3.0 * slip
+    still, new = np.zeros((2, 6)), np.ones(2, dtype=bool)
+    for k in range(len(q)):
+        said = test.look(np.full(2, PERIOD * k), at_once(q)[k], still, np.zeros(2), s[k], new)
+        if said:
+            break
+    assert name in said
+    assert "; or " not in said
+
+
 @pytest.fixture(scope="module")
 def sliding():
     """A robot with a prismatic joint, what its trials showed, and smooth joints (k, n)."""
