@@ -83,23 +83,23 @@ def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
     return chosen
 
 
-LEAST_CELL = 2.3
+MIN_CELL = 2.3
 """Width of a cell, px, below which edges of a tag cannot be fitted: its border is one cell wide."""
 
-_LEAST_SIDE = 6.0  # px: a side that is shorter is none to fit
-_LEAST_REACH, _MOST_REACH = 1.5, 6.0  # px on either side of an edge: less is no profile
-_LEAST_BLUR, _MOST_BLUR = 0.2, 10.0  # px: a sharper edge cannot be told
+_MIN_SIDE = 6.0  # px: a side that is shorter is none to fit
+_MIN_REACH, _MAX_REACH = 1.5, 6.0  # px on either side of an edge: less is no profile
+_MIN_BLUR, _MAX_BLUR = 0.2, 10.0  # px: a sharper edge cannot be told
 # Rms residual of a profile that something covers, in contrasts, the worst first; clean ones have some 0.02.
 _SPOILT = (0.2, 0.14, 0.1, 0.07, 0.05)
 _SPOILT_SHARE = 0.25  # of the profiles of a side that may be covered
 _BORDER = 2  # cells of border along a side of a tag, besides those of its code
 # Of the sides as they were guessed only so many profiles are looked at; least of them; steps of both fits.
-_ROUGH_PROFILES, _LEAST_PROFILES, _STEPS = 16, 3, (6, 3)
+_ROUGH_PROFILES, _MIN_PROFILES, _STEPS = 16, 3, (6, 3)
 _FAR = 2.0, 0.05  # px, and share of the longest side, that a corner may be from its guess, besides the blur
 _EDGE = 6  # numbers of an edge
 # Height of the arc that a lens makes of a side, px, as a deviation; least noise of grey values, and one
 # beside which no bow is seen.
-_BOW, _LEAST_NOISE, _RIGID = 0.01, 0.3, 1e3
+_BOW, _MIN_NOISE, _RIGID = 0.01, 0.3, 1e3
 # What the model of an edge leaves out, px; and beyond how many cells the next edge is, times how much of it.
 _FLOOR, _LEAK = 0.002, (0.5, 0.6)
 # White that a camera clips, grey value, less what noise and JPEG take of it. An edge fitted to min(k Φ, 1)
@@ -107,7 +107,7 @@ _FLOOR, _LEAK = 0.002, (0.5, 0.6)
 _CLIPPED, _OVEREXPOSED = 252.0, 0.42
 # Deviation of a corner that OpenCV finds where blur and cell are one pixel, and how it falls with the cell;
 # the blur that is reckoned with where no edge tells it, in cells; from what cell on, px, it grows no more.
-_UNREFINED, _BY_CELL, _BLURRED, _LEAST_UNREFINED = 1.2, -0.75, 0.4, 1.25
+_UNREFINED, _BY_CELL, _BLURRED, _MIN_UNREFINED = 1.2, -0.75, 0.4, 1.25
 
 
 class _Sides(NamedTuple):
@@ -167,7 +167,7 @@ class _Strips(NamedTuple):
         counts = (np.abs(n) <= reach[:, None, None]) & (place[0] <= last[:, None, None])
         height, width = image.shape
         inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        whole = (inside | ~counts).all(axis=(1, 2)) & (last - first + 1.0 >= _LEAST_PROFILES)
+        whole = (inside | ~counts).all(axis=(1, 2)) & (last - first + 1.0 >= _MIN_PROFILES)
         grey = image[np.clip(v, 0, height - 1).astype(int), np.clip(u, 0, width - 1).astype(int)]
         weight = (counts & whole[:, None, None]).astype(np.float64)
         return cls(grey, t / sides.length[:, None, None] - 0.5, n, weight)
@@ -196,7 +196,7 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
     Bows are held to what lenses make, by the noise (S,) of grey values.
     """
     stiff = np.zeros((len(x), _EDGE))
-    stiff[:, -1] = np.square(np.clip(noise, _LEAST_NOISE, _RIGID) / _BOW)
+    stiff[:, -1] = np.square(np.clip(noise, _MIN_NOISE, _RIGID) / _BOW)
 
     def equations(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal matrices, gradients and sums of squares."""
@@ -212,7 +212,7 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
         ridge = damping[:, None] * np.diagonal(A, axis1=1, axis2=2) + 1e-9
         step = np.linalg.solve(A + ridge[:, :, None] * np.eye(_EDGE), g[..., None])[..., 0]
         moved = x - step
-        moved[:, 4] = np.clip(np.abs(moved[:, 4]), _LEAST_BLUR, _MOST_BLUR)
+        moved[:, 4] = np.clip(np.abs(moved[:, 4]), _MIN_BLUR, _MAX_BLUR)
         new = equations(moved)
         better = new[2] <= cost
         x = np.where(better[:, None], moved, x)
@@ -253,12 +253,12 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
     """
     line, variance, edge = (np.full((len(before), size), np.nan) for size in (3, 2, _EDGE))
     found = _Edges(line, variance, edge, np.zeros(len(before), dtype=np.bool_))
-    fits = np.flatnonzero((all_sides.length > _LEAST_SIDE) & (all_sides.cell > LEAST_CELL))
+    fits = np.flatnonzero((all_sides.length > _MIN_SIDE) & (all_sides.cell > MIN_CELL))
     if fits.size == 0:
         return found
     sides, blur = _Sides(*(part[fits] for part in all_sides)), before[fits, 4]
     known = np.isfinite(blur)
-    reach = np.clip(0.5 * sides.cell, _LEAST_REACH, np.where(known, 3.0 * blur + 1.0, _MOST_REACH))
+    reach = np.clip(0.5 * sides.cell, _MIN_REACH, np.where(known, 3.0 * blur + 1.0, _MAX_REACH))
     margin = np.where(known, np.maximum(0.08 * sides.length, 2.0 * blur) + 1.0, 0.12 * sides.length + 1.0)
     strips = _Strips.of(image, sides, reach, margin, _ROUGH_PROFILES if rough else image.size)
     x = _first_edges(strips)
@@ -382,7 +382,7 @@ def _unrefined(cell: FloatArray, blur: FloatArray) -> FloatArray:
 
     A formula that was fitted to drawn and to rendered tags of all sizes, tilts and blurs.
     """
-    cell = np.maximum(cell, _LEAST_UNREFINED).reshape(-1, 4)
+    cell = np.maximum(cell, _MIN_UNREFINED).reshape(-1, 4)
     cell = np.minimum(cell, np.roll(cell, 1, axis=1))
     known = blur[np.isfinite(blur)]
     typical = float(np.median(known)) if known.size else _BLURRED * cell

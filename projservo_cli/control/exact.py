@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 from projservo_cli.control.law import (
-    MOST_PARTS,
+    MAX_PARTS,
     OK,
     SINGULAR,
     Gains,
@@ -187,17 +187,17 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     share = speed_share(state.q_dot, gains.speed, gains.period)
     step = _scaled(whole, share, 1)
     most = _first_order(step, state)
-    count = min(MOST_PARTS, max(1, math.ceil(most / _PART_STEP)))
+    count = min(MAX_PARTS, max(1, math.ceil(most / _PART_STEP)))
     step = _scaled(step, 1.0, count)
     while not _continued(model, task, q, step, state):
-        if count == MOST_PARTS:
+        if count == MAX_PARTS:
             # Across a singularity the first-order step is all there is.
             _first_order(step, state)
             for i in range(q.shape[0]):
                 state.q_dot[i] /= gains.period
             state.share[0], state.parts[0], state.blocked[0] = share, 0, -1
             return OK
-        count = min(MOST_PARTS, 2 * count)
+        count = min(MAX_PARTS, 2 * count)
         step = _scaled(step, 1.0, count)
     state.blocked[0] = _blocked_joint(q, state.path[count], gains)
     if state.blocked[0] >= 0:

@@ -41,7 +41,7 @@ from projservo_cli.task.trajectory import following
 from projservo_cli.task.visibility import limited_translation
 
 # Parts a law may split one step into.
-MOST_PARTS = 128
+MAX_PARTS = 128
 
 # No limit, for any number of joints a configuration may have.
 UNLIMITED = np.full(64, np.inf)
@@ -147,7 +147,7 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
         fit=np.full(3, np.nan),
         face_px=np.full(1, np.nan),
         normal=np.zeros((COORDINATES, COORDINATES + 1)),
-        path=np.zeros((MOST_PARTS + 1, n)),
+        path=np.zeros((MAX_PARTS + 1, n)),
         share=np.full(1, -1.0),
         parts=np.zeros(1, dtype=np.int64),
         blocked=np.full(1, -1, dtype=np.int64),

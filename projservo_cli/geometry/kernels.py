@@ -21,7 +21,7 @@ _KERNEL_TOLERANCE = 0.1
 # A last pivot below this is zero to working precision: back-substitution alone gives the kernel.
 _EXACT_TOLERANCE = 1e-14
 _GAIN_TOLERANCE = 1e-12
-_MOST_ITERATIONS = 100
+_MAX_ITERATIONS = 100
 # A solution by normal equations, and once more with what rounding left of it.
 _PASSES = 2
 
@@ -158,7 +158,7 @@ def kernel_vector(system: System, m: int, x: FloatArray) -> bool:
     _normalize(z, n)
     if last > _EXACT_TOLERANCE * first:
         gain = 0.0
-        for _ in range(_MOST_ITERATIONS):
+        for _ in range(_MAX_ITERATIONS):
             for j in range(n):
                 total = z[j]
                 for i in range(j):

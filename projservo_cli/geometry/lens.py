@@ -17,7 +17,7 @@ from projservo_cli.records import BoolArray, FloatArray
 FIRST = 3
 """Where k1 stands in a lens; k2 follows."""
 
-MOST_STEPS = 50
+MAX_STEPS = 50
 # A Newton step of this share of the radius is the last: the next would be its square, below round-off.
 SETTLED = 1e-9
 
@@ -68,7 +68,7 @@ def _straight_radius(k1: float, k2: float, radius: float) -> float:
         while high * _compiled_factor(k1, k2, high * high) < radius:
             high *= 2.0
     rho = min(radius, high)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         square = rho * rho
         factor = _compiled_factor(k1, k2, square)
         slope = factor + 2.0 * (square * _compiled_rate(k1, k2, square))

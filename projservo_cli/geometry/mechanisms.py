@@ -210,7 +210,7 @@ def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
     return least_norm(work.system, work.J, xi, q_hat)
 
 
-_MOST_NEWTON_STEPS = 6
+_MAX_NEWTON_STEPS = 6
 # A Newton step this short, rad or m, is the last: the next would be its square, below round-off.
 SETTLED = 1e-8
 
@@ -237,7 +237,7 @@ def reach(model: Model, face: Seen, goal: Mat4, q: FloatArray, work: Work, settl
     B, rhs, newton, columns = work.system.B, work.system.rhs, work.newton, work.columns
     redundant = columns.shape[0] < n
     x = work.xi if redundant else newton
-    for _ in range(_MOST_NEWTON_STEPS):
+    for _ in range(_MAX_NEWTON_STEPS):
         H = mul(operators_at(model, q, work.H_hat), face.H_back)
         for k in range(m):
             reached = apply(H, vec(face.A[k]))

@@ -8,7 +8,7 @@ from numba import literal_unroll
 
 from projservo_cli.control.law import (
     ERRORS,
-    MOST_PARTS,
+    MAX_PARTS,
     Gains,
     Law,
     State,
@@ -200,7 +200,7 @@ class Trials:
             state=new_state(n, m, shown),
             own_state=new_state(n, m, observed),
             log=new_log(
-                n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if setting.gains.substeps else 0
+                n, observed, limits.max_steps, len(ERRORS), MAX_PARTS if setting.gains.substeps else 0
             ),
         )
         self.rehearsal = _Rehearsal(setting.model, q_start, m, (plant.lower, plant.upper))

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.calibration.readings import per_rad
+from projservo_cli.calibration.detections import per_rad
 from projservo_cli.config import Config, digest
 from projservo_cli.config.markers import DICTIONARY, cells_of
 from projservo_cli.config.models import FAULTS
-from projservo_cli.detection import LEAST_CELL
+from projservo_cli.detection import MIN_CELL
 from projservo_cli.records import CORNERS, VIEWS, FloatArray, InputError, IntArray, Observation, WorkFailed
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
@@ -433,10 +433,10 @@ class _Sight:
             )
         cells = cells_of(str(given or DICTIONARY))
         for view, side in zip(VIEWS, self._widths(s), strict=True):
-            if side < LEAST_CELL * cells:
+            if side < MIN_CELL * cells:
                 return (
                     f"tags are {side:.3g} px wide in the {view} image {where}, {side / cells:.2g} px a cell "
-                    f"({LEAST_CELL:g} at least): take larger tags, nearer cameras, or more pixels"
+                    f"({MIN_CELL:g} at least): take larger tags, nearer cameras, or more pixels"
                 )
         if blind.any():
             view, other = (VIEWS[i] for i in np.argsort(~blind))

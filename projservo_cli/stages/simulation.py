@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from projservo_cli.calibration.readings import per_rad
+from projservo_cli.calibration.detections import per_rad
 from projservo_cli.config import Config
 from projservo_cli.config.markers import Markers
 from projservo_cli.config.models import FAULTS, Disturbance, FrozenJoint, LostMarkers, RenderedOptions

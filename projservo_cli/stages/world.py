@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.readings import per_rad
+from projservo_cli.calibration.detections import per_rad
 from projservo_cli.config import Config
 from projservo_cli.config.markers import Markers
 from projservo_cli.config.robot import Camera, JointVector, Rig, RobotSettings
