@@ -25,7 +25,7 @@ from scipy.sparse import csr_array
 
 from projservo_cli.calibration.detections import RAYLEIGH, Detections, per_block
 from projservo_cli.calibration.prediction import CAMERA, LENS, Parameters, image_points
-from projservo_cli.geometry.lens import FIRST, bent
+from projservo_cli.geometry.lens import K1, bent
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray
 
 
@@ -196,7 +196,7 @@ class LeastSquares:
         lens = params.lens
         if lens is not None:
             lens = lens.copy()
-            lens[:, FIRST:] += x[self.joint[-1] : self.shared].reshape(2, LENS)
+            lens[:, K1:] += x[self.joint[-1] : self.shared].reshape(2, LENS)
         offsets = params.offsets
         if self.tau is not None and further.size:
             offsets = (0.0 if offsets is None else offsets) + self.tau * further.reshape(self.q.shape)

@@ -27,7 +27,7 @@ from projservo_cli.calibration.lens_estimation import fit_lens, share_explained
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, assess, cross_validate
 from projservo_cli.calibration.time_offset import with_time_offset
-from projservo_cli.geometry.lens import FIRST
+from projservo_cli.geometry.lens import K1
 from projservo_cli.records import Calibration, Errors, InputError, Observation
 
 _METHODS = ("refined", "closed_form")
@@ -283,7 +283,7 @@ def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tupl
         if share == 0.0:
             return ()
         return (f"lens distortion would explain {100.0 * share:.0f} % of the squared residuals: try --lens",)
-    k = calibration.lens[:, FIRST:].ravel()
+    k = calibration.lens[:, K1:].ravel()
     of_lenses = calibration.shared_error[-k.size :]
     statistic = k @ np.linalg.solve(of_lenses @ of_lenses.T, k)
     if statistic < chdtri(k.size, _NO_LENS_TAIL):

@@ -50,7 +50,7 @@ def backward(model: Model, q: FloatArray) -> Mat4:
 
 @internal
 def forward_between(model: Model, q: FloatArray, i: int, x: float) -> Mat4:
-    """Forward kinematics, [RH00] eq. (6), at a share x of the way from row i of joints (k, n) to the next."""
+    """Forward kinematics, [RH00] eq. (6), interpolated by x from row i of joints (k, n) to the next."""
     H = IDENTITY
     for l in range(q.shape[1]):
         amount = (1.0 - x) * float(q[i, l]) + x * float(q[i + 1, l]) - float(model.q_reference[l])
@@ -62,8 +62,8 @@ def forward_between(model: Model, q: FloatArray, i: int, x: float) -> Mat4:
 def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
     """Joint operators at q, [RH00] eq. (19) with the truncated product H̄_i of (6); returns the whole product.
 
-    Each joint is undone, moved about its reference and redone: Ĥ_i(q) = H̄_i Ĥ_i⁰ H̄_i⁻¹, where the
-    joint's own factor of H̄_i commutes with Ĥ_i⁰ and is left out.
+    Ĥ_i(q) = H̄_i Ĥ_i⁰ H̄_i⁻¹ undoes the joint, moves it about its reference and redoes it. The joint's own
+    factor of H̄_i commutes with Ĥ_i⁰ and is omitted.
     """
     n = q.shape[0]
     H = IDENTITY
@@ -95,9 +95,9 @@ def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
 
 @njit
 def image_velocity(P: FloatArray, A: Vec4, D: Vec4) -> tuple[float, float, float, float]:
-    """Pixel of a point A and its velocity for one camera, of its velocity D: [RH00] eq. (7), corrected.
+    """Pixel u, v of a point A in one camera, and its velocity for a velocity D of the point.
 
-    Returns u, v (px) and their velocities. The point must not lie in the camera's principal plane.
+    [RH00] eq. (7), corrected. The point must not lie in the camera's principal plane.
     """
     m = (row(P, 0, A), row(P, 1, A), row(P, 2, A))
     d = (row(P, 0, D), row(P, 1, D), row(P, 2, D))

@@ -88,5 +88,5 @@ def test_newton_finds_the_joints_of_a_redundant_arm(types, rng):
 
 
 def test_no_metric_is_made_up_for_joints_that_keep_none(rng):
-    with pytest.raises(WorkFailed, match="keep no metric"):
+    with pytest.raises(WorkFailed, match="preserve no metric"):
         invariant_rotations(rng.normal(size=(5, 3, 3)))

@@ -72,7 +72,7 @@ def test_a_robot_that_turns_about_one_direction_has_a_body_all_the_same():
 
 
 def test_joints_that_keep_no_metric_have_no_body(rng):
-    with pytest.raises(WorkFailed, match="keep no metric"):
+    with pytest.raises(WorkFailed, match="preserve no metric"):
         body_of(arm()._replace(H_hat_0=rng.normal(size=(6, 4, 4))), markers())
 
 
