@@ -25,7 +25,7 @@ from scipy.sparse import csr_array
 
 from projservo_cli.calibration.detections import RAYLEIGH, Detections, per_block
 from projservo_cli.calibration.prediction import CAMERA, LENS, Parameters, image_points
-from projservo_cli.geometry.lens import K1, bent
+from projservo_cli.geometry.lens import K1, distort
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray
 
 
@@ -142,7 +142,7 @@ class LeastSquares:
         points = params.moved(self.joints(params), detections.pose_of, detections.marker_of)
         m = image_points(params.P, points)
         pixels = m[..., :2] / m[..., 2:]
-        return pixels if params.lens is None else bent(params.lens[:, None], pixels), m[..., 2]
+        return pixels if params.lens is None else distort(params.lens[:, None], pixels), m[..., 2]
 
     def residual(self, params: Parameters) -> FloatArray:
         """Predicted minus seen pixels (2, N, 2), weighted, zero where not seen."""

@@ -11,7 +11,7 @@ from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import Solution, fit_from
 from projservo_cli.calibration.initialization import Search
 from projservo_cli.calibration.prediction import LENS
-from projservo_cli.geometry.lens import straight_views, within
+from projservo_cli.geometry.lens import before_fold, undistort
 from projservo_cli.records import FloatArray, WorkFailed
 
 # Minimum share of the squared residuals that a lens explains for a suspicion.
@@ -80,7 +80,7 @@ def fit_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
     if found is not None:
         assert found.params.lens is not None
         unbent, _ = problem.pixels(dataclasses.replace(found.params, lens=None))
-        if within(found.params.lens[:, None], unbent)[found.used].all():
+        if before_fold(found.params.lens[:, None], unbent)[found.used].all():
             straight = undistorted(detections, found.params.lens)
             return found, Epipolar.of(straight, search.rng)
     raise WorkFailed(
@@ -93,6 +93,6 @@ def undistorted(detections: Detections, lens: FloatArray | None) -> Detections:
     """Undistort detections by lenses (2, 5); those that no point distorts to are unseen."""
     if lens is None:
         return detections
-    pixels = straight_views(lens, detections.pixels)
+    pixels = undistort(lens, detections.pixels)
     seen = detections.seen & np.isfinite(pixels).all(axis=2)
     return dataclasses.replace(detections, pixels=np.where(seen[..., None], pixels, 0.0), seen=seen)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.lens import bent, bent_derivative, through
+from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible
 from projservo_cli.records import (
     BoolArray,
     Calibration,
@@ -76,8 +76,8 @@ def projection_derivative(
     G[..., 2] = -pixels / m[..., 2:]
     if lens is None:
         return pixels, G, None
-    by_pixel, by_lens = bent_derivative(lens[:, None], pixels)
-    return bent(lens[:, None], pixels), by_pixel @ G, by_lens
+    by_pixel, by_lens = distort_derivative(lens[:, None], pixels)
+    return distort(lens[:, None], pixels), by_pixel @ G, by_lens
 
 
 class Images(NamedTuple):
@@ -114,7 +114,7 @@ class Parameters:
         """
         m = image_points(self.P, moved_points(displacements(self.H_hat, self.prismatic, q), self.M)[0])
         pixels: FloatArray = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
-        return pixels if self.lens is None else through(self.lens[:, None], pixels)
+        return pixels if self.lens is None else distort_visible(self.lens[:, None], pixels)
 
     def motion(self, q: FloatArray) -> FloatArray:
         """Displacements (K, 4, 4) by all joints together at joints (K, n), [RH00] eq. (6)."""

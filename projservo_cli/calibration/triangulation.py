@@ -13,7 +13,7 @@ from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.detections import per_block
 from projservo_cli.calibration.epipolar import homogeneous, triangulated
 from projservo_cli.calibration.prediction import Parameters, projection_derivative
-from projservo_cli.geometry.lens import straight_views
+from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 # Number of initial points tried for each marker, triangulated from single observations.
@@ -94,7 +94,7 @@ class Tracks:
         rows = both[first[chosen] + (number * step).astype(np.int64)]
         pixels = detections.pixels[:, rows]
         if params.lens is not None:
-            pixels = straight_views(params.lens, pixels)
+            pixels = undistort(params.lens, pixels)
         M = triangulated(params.P[:, None] @ self.motion[detections.pose_of[rows]], homogeneous(pixels))
         points = np.full((len(wanted), 3), np.nan)
         points[chosen] = M[:, :3] / M[:, 3:]

@@ -25,7 +25,7 @@ def vec(A: FloatArray) -> Vec4:
 
 
 @inline
-def put_vec(target: FloatArray, A: Vec4) -> None:
+def vec_into(target: FloatArray, A: Vec4) -> None:
     """Write a value into a row of an array."""
     target[0] = A[0]
     target[1] = A[1]
@@ -40,12 +40,12 @@ def mat(H: FloatArray) -> Mat4:
 
 
 @inline
-def put_mat(target: FloatArray, H: Mat4) -> None:
+def mat_into(target: FloatArray, H: Mat4) -> None:
     """Write a value into a 4×4 array."""
-    put_vec(target[0], H[0:4])
-    put_vec(target[1], H[4:8])
-    put_vec(target[2], H[8:12])
-    put_vec(target[3], H[12:16])
+    vec_into(target[0], H[0:4])
+    vec_into(target[1], H[4:8])
+    vec_into(target[2], H[8:12])
+    vec_into(target[3], H[12:16])
 
 
 @inline

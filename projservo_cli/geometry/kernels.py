@@ -52,7 +52,7 @@ def new_system(n: int, rows: int) -> System:
 
 
 @merged
-def put_row(target: FloatArray, source: FloatArray) -> None:
+def row_into(target: FloatArray, source: FloatArray) -> None:
     """Copy a row; assigning a slice needs the runtime for allocations."""
     for i in range(target.shape[0]):
         target[i] = source[i]

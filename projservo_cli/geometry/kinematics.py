@@ -8,15 +8,15 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     as_array,
     mat,
+    mat_into,
     mul,
-    put_mat,
     rotation,
     rotation_and_inverse,
     translation,
     vec,
 )
 from projservo_cli.geometry.jit import inline, internal, merged, njit
-from projservo_cli.geometry.lens import through
+from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.records import NO_LENS, PRISMATIC, FloatArray, Model
 
 
@@ -70,7 +70,7 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
     H_inverse = IDENTITY
     for i in range(n):
         operator = mat(model.H_hat_0[i])
-        put_mat(H_hat[i], mul(mul(H, operator), H_inverse))
+        mat_into(H_hat[i], mul(mul(H, operator), H_inverse))
         amount = float(q[i]) - float(model.q_reference[i])
         if i == n - 1:
             H = mul(H, _joint_displacement(operator, model.joint_types[i], amount))
@@ -136,7 +136,7 @@ def project(P: FloatArray, M: FloatArray, lens: FloatArray = NO_LENS) -> FloatAr
     """Pixels (2, ..., 2) of points (..., 4) by cameras (2, 3, 4) and lenses (2, 5), [RH00] eq. (1)."""
     m = np.einsum("vij,...j->v...i", P, M)
     pixels: FloatArray = m[..., :2] / m[..., 2:]
-    return through(lens.reshape(len(lens), *(1,) * (m.ndim - 2), 5), pixels)
+    return distort_visible(lens.reshape(len(lens), *(1,) * (m.ndim - 2), 5), pixels)
 
 
 def image_jacobian(P: FloatArray, M: FloatArray, H_hat: FloatArray) -> FloatArray:

@@ -87,7 +87,7 @@ def _undistorted_radius(k1: float, k2: float, radius: float) -> float:
 
 
 @njit
-def straighten(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
+def undistort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     """Undistort a pixel; NaN if no pixel before the fold distorts to it."""
     k1, k2 = float(lens[3]), float(lens[4])
     if k1 == 0.0 and k2 == 0.0:
@@ -103,7 +103,7 @@ def straighten(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
 
 
 @merged
-def bends(lens: FloatArray) -> bool:
+def distorts(lens: FloatArray) -> bool:
     """Whether any of the lenses (2, 5) distorts."""
     for view in range(lens.shape[0]):
         if float(lens[view, 3]) != 0.0 or float(lens[view, 4]) != 0.0:
@@ -112,17 +112,17 @@ def bends(lens: FloatArray) -> bool:
 
 
 @merged
-def straight(lens: FloatArray, s: FloatArray, found: FloatArray) -> None:
+def undistort_into(lens: FloatArray, s: FloatArray, found: FloatArray) -> None:
     """Undistort pixels (2, N, 2) by lenses (2, 5) into ``found``; NaN as for ``undistort_pixel``."""
     for view in range(s.shape[0]):
         for k in range(s.shape[1]):
-            pixel = straighten(lens[view], float(s[view, k, 0]), float(s[view, k, 1]))
+            pixel = undistort_pixel(lens[view], float(s[view, k, 0]), float(s[view, k, 1]))
             found[view, k, 0] = pixel[0]
             found[view, k, 1] = pixel[1]
 
 
 @njit
-def bend(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
+def distort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     """Distort a pixel; NaN beyond the fold."""
     k1, k2 = float(lens[3]), float(lens[4])
     if k1 == 0.0 and k2 == 0.0:
@@ -141,7 +141,7 @@ def _offsets(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArr
     return x, np.asarray((x**2).sum(axis=-1))
 
 
-def bent(lens: FloatArray, pixels: FloatArray) -> FloatArray:
+def distort(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """Distort pixels (..., 2) by lenses (..., 5), beyond the fold too; the vectorised ``distort_pixel``."""
     _, square = _offsets(lens, pixels)
     factor = _factor(lens[..., 3], lens[..., 4], square)[..., None]
@@ -149,31 +149,31 @@ def bent(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     return result
 
 
-def straight_views(lens: FloatArray, s: FloatArray) -> FloatArray:
+def undistort(lens: FloatArray, s: FloatArray) -> FloatArray:
     """Undistort pixels (2, N, 2), NaN if unseen, by lenses (2, 5); the pixels themselves without a lens."""
     s = np.ascontiguousarray(s, dtype=np.float64)
-    if not bends(lens):
+    if not distorts(lens):
         return s
     found = np.empty_like(s)
-    straight(lens, s, found)
+    undistort_into(lens, s, found)
     return found
 
 
-def within(lens: FloatArray, pixels: FloatArray) -> BoolArray:
+def before_fold(lens: FloatArray, pixels: FloatArray) -> BoolArray:
     """Mask (...) of undistorted pixels (..., 2) before the fold of a lens (..., 5)."""
     _, square = _offsets(lens, pixels)
     limit = np.vectorize(_fold_limit, otypes=[np.float64])(lens[..., 3], lens[..., 4])
     return np.asarray(square < limit)
 
 
-def through(lens: FloatArray, pixels: FloatArray) -> FloatArray:
+def distort_visible(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """Distort pixels as cameras report them, NaN beyond the fold; the pixels themselves without a lens."""
     if not lens[..., K1:].any():
         return pixels
-    return np.where(within(lens, pixels)[..., None], bent(lens, pixels), np.nan)
+    return np.where(before_fold(lens, pixels)[..., None], distort(lens, pixels), np.nan)
 
 
-def bent_derivative(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+def distort_derivative(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Derivatives of distorted pixels by undistorted ones (..., 2, 2), and by k1 and k2 (..., 2, 2)."""
     x, square = _offsets(lens, pixels)
     k1, k2 = lens[..., 3], lens[..., 4]

@@ -21,9 +21,9 @@ from projservo_cli.geometry.algebra import (
     mat,
     mul,
     multiple,
-    put_vec,
     sub,
     vec,
+    vec_into,
 )
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kernels import (
@@ -97,8 +97,8 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
     a_1, a_2 = dual_pencil(A, D)
     for i in range(q_hat.shape[0]):
         operator = mat(work.basis[i])
-        put_vec(work.system.B[i, 0:4], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
-        put_vec(work.system.B[i, 4:8], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
+        vec_into(work.system.B[i, 0:4], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
+        vec_into(work.system.B[i, 4:8], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
     return _moving(work, q_hat)
 
 
@@ -107,8 +107,8 @@ def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> t
     """Revolution around the axis through two points, [RH00] eq. (9), scaled to radians."""
     for i in range(q_hat.shape[0]):
         operator = mat(work.basis[i])
-        put_vec(work.system.B[i, 0:4], apply(operator, A_1))
-        put_vec(work.system.B[i, 4:8], apply(operator, A_2))
+        vec_into(work.system.B[i, 0:4], apply(operator, A_1))
+        vec_into(work.system.B[i, 4:8], apply(operator, A_2))
     return _to_radians(work, q_hat)
 
 
@@ -117,8 +117,8 @@ def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[b
     """Revolution around a point within a plane, [RH00] eq. (10), scaled to radians."""
     for i in range(q_hat.shape[0]):
         operator = mat(work.basis[i])
-        put_vec(work.system.B[i, 0:4], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
-        put_vec(work.system.B[i, 4:8], apply(operator, A))
+        vec_into(work.system.B[i, 0:4], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
+        vec_into(work.system.B[i, 4:8], apply(operator, A))
     return _to_radians(work, q_hat)
 
 
@@ -162,7 +162,7 @@ def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     return True, multiple(nu, H)
 
 
-def span_of(model: Model, A: FloatArray) -> Span:
+def make_span(model: Model, A: FloatArray) -> Span:
     """Six operators that span the displacements of the calibrated frame; ``OWN`` for six joints.
 
     Rotations are about the middle of the points A (m, 4), a_inf·A = 1, per rad. A unit of translation moves
@@ -241,9 +241,9 @@ def reach(model: Model, face: Seen, goal: Mat4, q: FloatArray, work: Work, settl
         H = mul(operators_at(model, q, work.H_hat), face.H_back)
         for k in range(m):
             reached = apply(H, vec(face.A[k]))
-            put_vec(rhs[4 * k : 4 * k + 4], sub(apply(goal, vec(face.A[k])), reached))
+            vec_into(rhs[4 * k : 4 * k + 4], sub(apply(goal, vec(face.A[k])), reached))
             for i in range(columns.shape[0]):
-                put_vec(B[i, 4 * k : 4 * k + 4], apply(mat(columns[i]), reached))
+                vec_into(B[i, 4 * k : 4 * k + 4], apply(mat(columns[i]), reached))
         if not least_squares(work.system, 4 * m, x):
             return False
         if redundant and not joint_motion(work, x, newton):

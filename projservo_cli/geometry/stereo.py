@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Vec4, dot, meet, put_vec, scale, vec
+from projservo_cli.geometry.algebra import Vec4, dot, meet, scale, vec, vec_into
 from projservo_cli.geometry.jit import composed, merged
 from projservo_cli.records import FloatArray, WorkFailed
 
@@ -114,18 +114,18 @@ def triangulate_points(P: FloatArray, a_inf: FloatArray, s: FloatArray) -> Float
     Raises WorkFailed if the rays of a marker do not determine a finite point.
     """
     M = np.empty((s.shape[1], 4))
-    lost = put_points(P, fundamental_matrix(P), a_inf, s, M)
+    lost = points_into(P, fundamental_matrix(P), a_inf, s, M)
     if lost >= 0:
         raise WorkFailed(NO_POINT.format(lost))
     return M
 
 
 @composed
-def put_points(P: FloatArray, F: FloatArray, a_inf: FloatArray, s: FloatArray, M: FloatArray) -> int:
+def points_into(P: FloatArray, F: FloatArray, a_inf: FloatArray, s: FloatArray, M: FloatArray) -> int:
     """Triangulate the first m stereo pixels into M (m, 4); the first pixel without a point, or −1."""
     for k in range(M.shape[0]):
         found, point = triangulate(P, F, a_inf, s[0, k], s[1, k])
         if not found:
             return k
-        put_vec(M[k], point)
+        vec_into(M[k], point)
     return -1

@@ -41,9 +41,9 @@ from projservo_cli.stages.world import (
     truth_of,
     units_of,
 )
-from projservo_cli.task.body import NO_BODY, Body, body_of
+from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
-from projservo_cli.task.target import Shown
+from projservo_cli.task.target import TaskImages
 
 _UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera sees
 # Weight of a marker in a fit that was put where others tell it to be. Starts from which joints that show a
@@ -69,7 +69,7 @@ class Scenario:
     joints: Joints  # as the laws take them
     numbers: tuple[int, ...]  # of the markers by which the face is measured, those of the face first
     observed: tuple[int, ...]  # numbers of all markers that the robot observes, in its order
-    exact: Shown  # start and goal without noise; predicted for a robot that is not simulated
+    exact: TaskImages  # start and goal without noise; predicted for a robot that is not simulated
     true_ends: Ends  # where the true robot holds the tool; NaN where nobody knows
     q_shown: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 where nobody knows
     noise_px: float  # of the images in the loop; no less than what a calibration leaves of recorded ones
@@ -77,7 +77,7 @@ class Scenario:
     limits: Limits  # gains, limits: of the laws, and when a run ends
 
     @cached_property
-    def ends(self) -> Shown:
+    def ends(self) -> TaskImages:
         """Start and goal as the laws see them."""
         return self.shown_at(self.config.seed)
 
@@ -96,7 +96,7 @@ class Scenario:
             return "the calibration has no covariance, which the method refined gives"
         return ""
 
-    def shown_to(self, law: str) -> Shown:
+    def shown_to(self, law: str) -> TaskImages:
         """Start and goal as a law measures them: with the body, or point by point."""
         return self.ends if law in BODY_LAWS else self.ends.by_points()
 
@@ -174,7 +174,7 @@ class Scenario:
         told = goal.images.sigma_px(self.numbers[: self.m]) if goal is not None and goal.images else None
         return self.noise_px / math.sqrt(self.config.noise.shown_frames) if told is None else told
 
-    def shown_at(self, seed: int) -> Shown:
+    def shown_at(self, seed: int) -> TaskImages:
         """Start and goal as the images of a seed show them, which are averages."""
         if self.config.plant.rendered is not None and self.truth is not None:
             return self._rendered(seed)
@@ -192,7 +192,7 @@ class Scenario:
             images[:drawn, :, m:] += sigma * noise[:, :, which]
         return self.exact._replace(s_start=images[0], s_star=images[1])
 
-    def _rendered(self, seed: int) -> Shown:
+    def _rendered(self, seed: int) -> TaskImages:
         """Start and goal as rendered frames show them; images of the goal that are given stay as they are.
 
         The body is fitted to both by the deviations of their pixels, whichever is the larger. Markers of the
@@ -367,8 +367,8 @@ def _by_points(config: Config, calibration: Calibration | None) -> bool:
 def _body(known: Calibration | Truth, numbers: tuple[int, ...]) -> Body:
     """Body of markers of a calibration, by their numbers, the same for every run with it."""
     if isinstance(known, Truth):
-        return body_of(known.model, known.of(numbers))
-    return body_of(known.model(), known.M[known.places(numbers)])
+        return make_body(known.model, known.of(numbers))
+    return make_body(known.model(), known.M[known.places(numbers)])
 
 
 def _observed(config: Config, calibration: Calibration) -> tuple[int, ...]:
@@ -384,7 +384,7 @@ def _observed(config: Config, calibration: Calibration) -> tuple[int, ...]:
 @lru_cache(maxsize=2048)
 def _simulated_ends(
     task: TaskSettings, types: str, truth: Truth, pins: tuple[int, ...], center: int
-) -> tuple[Shown, Ends, FloatArray | None]:
+) -> tuple[TaskImages, Ends, FloatArray | None]:
     """What the ends of a task look like, for any seed and noise, and the joints (n,) at the goal."""
     M_pins, robot = truth.of(pins), truth.robot
 
@@ -406,7 +406,7 @@ def _shown(
     center: int,
     images: Callable[[FloatArray, str], FloatArray],
     turn: Callable[[FloatArray], FloatArray],
-) -> tuple[Shown, FloatArray | None]:
+) -> tuple[TaskImages, FloatArray | None]:
     """Start and goal of a task, and the joints (n,) at the goal, None where only images tell of it.
 
     numbers : of the markers of the face and of the pins.
@@ -422,9 +422,9 @@ def _shown(
         pixels = task.goal.images.pixels(numbers[0])
         s_star = np.array([pixels.get(number, _UNSEEN) for number in (*numbers[0], *numbers[1])])
         s_star = np.ascontiguousarray(np.swapaxes(s_star, 0, 1))
-        return Shown(q_start, s_start, s_star, center, pins), None
+        return TaskImages(q_start, s_start, s_star, center, pins), None
     q_goal = turn(q_from) if given is None else np.array(given.values(types))
-    return Shown(q_start, s_start, images(q_goal, "task.goal"), center, pins), q_goal
+    return TaskImages(q_start, s_start, images(q_goal, "task.goal"), center, pins), q_goal
 
 
 def _unknown(base_tool: FloatArray) -> Ends:
@@ -434,7 +434,7 @@ def _unknown(base_tool: FloatArray) -> Ends:
 
 def _predicted_ends(
     config: Config, calibration: Calibration, joints: Joints, numbers: Sequence[int], center: int
-) -> tuple[Shown, Ends, FloatArray | None]:
+) -> tuple[TaskImages, Ends, FloatArray | None]:
     """Start and goal of a robot that is not simulated, as the calibration predicts them, as above."""
     task = config.task
     assert task is not None
