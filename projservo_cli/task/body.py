@@ -96,7 +96,7 @@ NO_BODY = Body(
     H_hat=np.zeros((3, 4, 4)),
     turn=np.zeros((0, 3, 3)),
     a_inf=np.zeros(4),
-    shown=np.zeros((2, 0), dtype=np.bool_),
+    in_goal=np.zeros((2, 0), dtype=np.bool_),
     weight=np.ones((2, 0)),
 )
 
@@ -130,7 +130,7 @@ def make_body(model: Model, M: FloatArray) -> Body:
         H_hat=np.ascontiguousarray(D.T @ L @ D @ carry),
         turn=np.ascontiguousarray(np.einsum("rab,bc,kc->kra", L, D, offset)),
         a_inf=np.ascontiguousarray(model.a_inf),
-        shown=np.ones((2, len(M)), dtype=np.bool_),
+        in_goal=np.ones((2, len(M)), dtype=np.bool_),
         weight=np.ones((2, len(M))),
     )
 

@@ -48,7 +48,7 @@ def test_exchanged_markers_are_named():
     found = findings(calibration)
     assert {(one["pose"], *one["markers"]) for one in found["swapped"]} == wrong
     assert found["outliers"] == []
-    assert any("another's number" in line for line in calibration.advice)
+    assert any("under the number of another" in line for line in calibration.advice)
 
 
 def test_wrong_joint_readings_are_named():
