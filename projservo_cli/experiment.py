@@ -389,8 +389,7 @@ def scene_of(config: Config, calibration: Calibration) -> Scene:
     size = config.image_size_px
     return Scene(
         calibration.model(),
-        joints.lower,
-        joints.upper,
+        joints.limits,
         None if size is None else np.array(size, dtype=np.float64),
         config.trajectory,
     )

@@ -1,4 +1,4 @@
-"""Atomic writes of files, checked reads of texts, and locks on folders."""
+"""Files replaced as a whole, texts read within bounds, and locks of folders."""
 
 import io
 import os

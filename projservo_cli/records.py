@@ -75,6 +75,21 @@ PRISMATIC = 1
 NO_LENS = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2)
 
 
+class JointLimits(NamedTuple):
+    """Limits of joints, (n,) each; infinite for none."""
+
+    lower: FloatArray
+    upper: FloatArray  # lower, upper: rad or m
+    speed: FloatArray  # most motion per second, rad/s or m/s
+    acceleration: FloatArray  # rad/s² or m/s²
+
+
+def position_limits(lower: FloatArray, upper: FloatArray) -> JointLimits:
+    """Limits (n,) of the positions of joints, rad or m, alone."""
+    endless = np.full(len(lower), math.inf)
+    return JointLimits(lower=lower, upper=upper, speed=endless, acceleration=endless)
+
+
 class Model(NamedTuple):
     """Robot and rig as the kernels see them, in one frame, projective or metric.
 

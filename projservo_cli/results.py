@@ -17,6 +17,7 @@ from projservo_cli.records import (
     CrossValidation,
     FloatArray,
     InputError,
+    JointLimits,
     Model,
     Observation,
     Plan,
@@ -221,8 +222,7 @@ class Scene(NamedTuple):
     """What a plan is drawn in."""
 
     model: Model  # as calibrated
-    lower: FloatArray
-    upper: FloatArray  # lower, upper: (n,) limits, rad or m, infinite where none is set
+    limits: JointLimits  # infinite where none is set
     image_size: FloatArray | None  # (2,) px; None where unknown
     trajectory: Trajectory  # what was asked for
 

@@ -11,7 +11,7 @@ from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.step import VERDICTS, Limits, new_log
-from projservo_cli.records import FloatArray, Model
+from projservo_cli.records import FloatArray, Model, position_limits
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.task.body import make_body
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
@@ -67,8 +67,8 @@ def plant_of(model, M, center=MIDPOINT, opaque=False) -> Plant:
     a = np.array(face_plane(np.ascontiguousarray(M), order, center_of(M, center)))
     n = len(model.q_reference)
     return Plant(
-        model, M, order, center, O, np.sign(O @ a), np.array([1280.0, 1024.0]), np.full(n, -9.0),
-        np.full(n, 9.0), opaque,
+        model, M, order, center, O, np.sign(O @ a), np.array([1280.0, 1024.0]),
+        position_limits(np.full(n, -9.0), np.full(n, 9.0)), opaque,
     )  # fmt: skip
 
 
@@ -115,7 +115,7 @@ class Run:
         if memory is not None:
             self.state.driven[:] = memory
         task = scene.task(G) if task is None else task
-        gains = gains._replace(speed=bounds.speed)
+        gains = gains._replace(limits=gains.limits._replace(speed=bounds.speed))
         course = Course(scene.plant, bounds, scene.q_start.copy())
         built_in = Law(CODES[law], scene.seen(G), task, gains)
         self.code, self.steps = run_compiled(built_in, course, noise, self.state, self.full)

@@ -1,4 +1,4 @@
-"""Detections that a calibration works on, as flat lists, and checks that they show motion in two dimensions.
+"""Detections of a calibration as flat lists, and refusals of data without motion or without two dimensions.
 
 The checks need joint readings, marker numbers and pixels, and no geometry yet.
 """

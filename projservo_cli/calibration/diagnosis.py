@@ -1,4 +1,4 @@
-"""Diagnosis of outliers and misfits: wrong joint readings, exchanged marker numbers, wrong detections."""
+"""Diagnosis of outliers: wrong joint readings, exchanged marker numbers, wrong detections, a lens."""
 
 import dataclasses
 import itertools

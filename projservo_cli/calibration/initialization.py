@@ -1,4 +1,4 @@
-"""Initial parameters of the adjustment: in a guessed metric frame the marker body, joint axes, then points.
+"""Initialization of the adjustment: in a guessed metric frame markers, axes, then all places.
 
 A nominal robot and rig may serve as a start too; it is tried, and kept only if it leads to a good fit.
 """

@@ -1,4 +1,4 @@
-"""Noise of joint readings: errors in variables, by restricted maximum likelihood, or from encoder ticks.
+"""Noise of joint readings: errors in variables, by restricted maximum likelihood, or encoder counts.
 
 The residual of the images of pose k is r = J x + G δ + ε, with ε ~ N(0, σ² I) and δ ~ N(0, σ_q² I), the true
 joints less their readings; its covariance is S = σ² I + σ_q² G Gᵀ. Errors of pixels scatter from marker to

@@ -1,4 +1,4 @@
-"""Quality of a calibration: uncertainty of predictions, assessment with advice, cross-validation."""
+"""Quality of a calibration: observability of joints, the verdict in words, and cross-validation."""
 
 import dataclasses
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Time offset of each camera against the joint readings, from images of motions between trial poses.
+"""Time offset (latency) of the images of each view, from frames between trial poses.
 
 A frame that comes with the joint reading of time t_q shows the joints of t_q − d. Seen less predicted pixels
 for joints at t_q − d are noise; an error of d shows along the image velocity J_q q̇. Each frame estimates its

@@ -1,4 +1,4 @@
-"""Robust triangulation of each marker by itself, for known cameras and joints, and its outliers.
+"""Triangulation of each marker where cameras and joints are known: its place by consensus, and its inliers.
 
 A marker has three unknowns and its observations nothing else in common, so the cost is linear in the number
 of observations, whatever share of them is wrong.

@@ -1,4 +1,4 @@
-"""What robots and cameras tell on the command line: ``teach``, ``detect`` and ``validate``."""
+"""Commands on data of robots and cameras: ``teach``, ``detect`` and ``validate``."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The command ``projservo``: one group whose stages chain, and what becomes of errors: exit codes."""
+"""The command ``projservo``: one group whose stages chain, and the exit codes of errors."""
 
 import difflib
 import inspect

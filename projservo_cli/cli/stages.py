@@ -1,4 +1,4 @@
-"""The stages and their chain: what is to be done, doing it, and saying what came out."""
+"""Commands of the stages and of their chain: dry run, work, summary."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence

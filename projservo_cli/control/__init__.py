@@ -72,7 +72,8 @@ def _keep_near(reference: Reference, gains: Gains, q: FloatArray, unique: bool, 
         if unique:
             step += _CORRECTED * (gains.period * state.q_dot[i] - step)
         q_next = near_joint_path(reference, float(state.clock[0]) + 1.0, i, q[i] + step)
-        state.q_dot[i] = (min(max(q_next, gains.lower[i]), gains.upper[i]) - q[i]) / gains.period
+        q_next = min(max(q_next, gains.limits.lower[i]), gains.limits.upper[i])
+        state.q_dot[i] = (q_next - q[i]) / gains.period
     state.parts[0], state.blocked[0] = 0, -1
 
 
@@ -85,5 +86,5 @@ def _go_on(reference: Reference, gains: Gains, status: int, limited: bool, state
     if status != OK:
         return
     if not limited:
-        state.share[0] = limit_speed(state.q_dot, gains.speed)
+        state.share[0] = limit_speed(state.q_dot, gains.limits.speed)
     state.clock[0] += reference.rate * state.share[0]

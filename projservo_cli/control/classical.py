@@ -1,4 +1,4 @@
-"""Classical stereo laws for comparison: stacked views, each view by itself, points in metres."""
+"""Classical image-based and position-based laws: stacked views, each view by itself, points in metres."""
 
 from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure, pseudo_inverse, view_into
 from projservo_cli.geometry.algebra import apply, mat, vec

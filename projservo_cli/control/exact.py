@@ -123,7 +123,7 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
 def _blocked_joint(q: FloatArray, q_next: FloatArray, gains: Gains) -> int:
     """First joint that a motion from q to q_next moves beyond a limit, or farther beyond it; else −1."""
     for i in range(q.shape[0]):
-        if q_next[i] > max(q[i], gains.upper[i]) or q_next[i] < min(q[i], gains.lower[i]):
+        if q_next[i] > max(q[i], gains.limits.upper[i]) or q_next[i] < min(q[i], gains.limits.lower[i]):
             return i
     return -1
 
@@ -185,7 +185,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
         for i in range(q.shape[0]):
             state.q_dot[i] /= gains.period
         return OK
-    share = speed_share(state.q_dot, gains.speed, gains.period)
+    share = speed_share(state.q_dot, gains.limits.speed, gains.period)
     step = _scaled(whole, share, 1)
     largest = _first_order(step, state)
     count = min(MAX_PARTS, max(1, math.ceil(largest / _PART_STEP)))

@@ -1,4 +1,4 @@
-"""Contract of the control laws, and the steps that they share.
+"""Contract of every control law.
 
 A compiled law is ``law(model, task, gains, s, q, state) -> status``. Its inputs are the model, the task, the
 undistorted pixels ``s`` of the face and then of further markers of its body, and the joint readings ``q``,
@@ -33,7 +33,7 @@ from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
 from projservo_cli.geometry.lens import undistort_pixel
 from projservo_cli.geometry.mechanisms import OWN, Span, Work, joint_motion, rotation_mechanism, workspace
 from projservo_cli.geometry.stereo import triangulate
-from projservo_cli.records import FloatArray, IntArray, Model
+from projservo_cli.records import FloatArray, IntArray, JointLimits, Model, position_limits
 from projservo_cli.task.body import ALL_VIEWS, GOAL_VIEWS, carry, fit_body
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import NO_PARTS, Parts, Split, partition
@@ -43,7 +43,7 @@ from projservo_cli.task.visibility import limited_translation
 # Maximum number of parts of a step.
 MAX_PARTS = 128
 # No limits, for any number of joints of a configuration.
-UNLIMITED = np.full(64, np.inf)
+UNLIMITED = position_limits(np.full(64, -np.inf), np.full(64, np.inf))
 # Status of a law: a command.
 OK = 0
 # Status of a law: the face is not measured.
@@ -66,9 +66,8 @@ class Gains(NamedTuple):
     gain : of the classical laws, 1/s.
     period : control period, s.
     delta : share of τ_0 that one pure translation may use.
-    speed : (n,) maximum joint velocity, rad/s or m/s; infinite for none.
+    limits : of the joints; a path ends at those of position, infinite if a run may pass them.
     substeps : whether a step is sent in the parts of its solution.
-    lower, upper : (n,) joint limits, rad or m, at which a path ends; infinite for none.
     """
 
     gain_t: float
@@ -79,10 +78,8 @@ class Gains(NamedTuple):
     gain: float
     period: float
     delta: float
-    speed: FloatArray = UNLIMITED
+    limits: JointLimits = UNLIMITED
     substeps: bool = False
-    lower: FloatArray = -UNLIMITED
-    upper: FloatArray = UNLIMITED
 
 
 class Law(NamedTuple):

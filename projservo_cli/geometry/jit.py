@@ -1,4 +1,4 @@
-"""Decorators that compile the mathematics with Numba, and a cache that never serves stale code.
+"""JIT compilation of the mathematics: one decorator, and a cache that never serves stale code.
 
 Numba checks cached machine code against the file of the function alone, and would miss an edited helper in
 another file. The cache folder therefore carries a hash of the sources of all compiled functions and of their

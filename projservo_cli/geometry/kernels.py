@@ -1,4 +1,4 @@
-"""Kernel vectors and least squares of small dense matrices by Gram–Schmidt orthogonalisation.
+"""Null space (kernel vectors) and least squares of small dense matrices by Gram–Schmidt orthogonalisation.
 
 Matrices are stored by columns: row j of the array is column j of the matrix, contiguous in memory.
 All arrays are workspaces of the caller. Loops take four rows at a time, which the compiler turns into vector

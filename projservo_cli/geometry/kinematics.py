@@ -1,4 +1,4 @@
-"""Projective kinematics of a robot: [RH00] equations (6), (7) and (19)."""
+"""Forward kinematics and image Jacobian in projective space: [RH00] equations (6), (7) and (19)."""
 
 import numpy as np
 

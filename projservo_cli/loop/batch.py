@@ -26,7 +26,7 @@ from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import Ended, Summary, summarize
 from projservo_cli.loop.step import CONVERGED, RUNNING, Limits, Log, new_log
-from projservo_cli.records import FloatArray, Model
+from projservo_cli.records import FloatArray, JointLimits, Model
 from projservo_cli.robots.simulated import Ends, Plant
 from projservo_cli.task.body import NO_BODY, Body
 from projservo_cli.task.face import (
@@ -52,7 +52,6 @@ _REHEARSAL = Gains(
     gain_t=0.1, gain_r=0.1, gain_p=0.1, gain_s=0.1, ratio_rp=1.0, gain=0.1, period=1.0, delta=0.9
 )
 _DIRECT_TWO = CODES["direct_two"]
-_Bounds = tuple[FloatArray, FloatArray]
 
 
 class _Rehearsal:
@@ -62,11 +61,13 @@ class _Rehearsal:
     error and at most 5° a step; the sense that arrives without passing a joint limit is taken, between equals
     the one that arrives in fewer steps.
 
-    model : calibrated; q_start : (n,) first joints, rad or m; m : markers of the face; bounds : lower and
-        upper limits (n,) of the joints; span : of an arm of n ≠ 6 joints.
+    model : calibrated; q_start : (n,) first joints, rad or m; m : markers of the face; bounds : of
+        the joints; span : of an arm of n ≠ 6 joints.
     """
 
-    def __init__(self, model: Model, q_start: FloatArray, m: int, bounds: _Bounds, span: Span = OWN) -> None:
+    def __init__(
+        self, model: Model, q_start: FloatArray, m: int, bounds: JointLimits, span: Span = OWN
+    ) -> None:
         self.model, self.q_start, self.bounds, n = model, q_start, bounds, len(q_start)
         self.noise, self.state = np.zeros((_REHEARSAL_STEPS + 1, 2, m, 2)), new_state(n, m, span=span)
         self.log = new_log(n, m, _REHEARSAL_STEPS, len(ERRORS))
@@ -79,7 +80,7 @@ class _Rehearsal:
         seen = model._replace(P=model.P * np.sign(depth)[:, None, None])
         M = np.ascontiguousarray(state.A @ as_array(backward(model, self.q_start)).T)
         endless = np.full(2, np.inf)
-        plant = Plant(seen, M, task.order, task.center, task.O, task.visible, endless, *self.bounds, False)
+        plant = Plant(seen, M, task.order, task.center, task.O, task.visible, endless, self.bounds, False)
         law = Law(_DIRECT_TWO, seen, task._replace(body=NO_BODY), _REHEARSAL)
         step = np.full(len(self.q_start), _REHEARSAL_STEP)
         q_hat_p = state.q_hat[2].copy()
@@ -110,13 +111,13 @@ class _Rehearsal:
 
 
 def begin(
-    model: Model, task: Task, s: FloatArray, q_start: FloatArray, bounds: _Bounds | None
+    model: Model, task: Task, s: FloatArray, q_start: FloatArray, bounds: JointLimits | None
 ) -> tuple[State, Parts, bool]:
     """Measure and partition the task at its start.
 
     model : calibrated; task : in its frame.
     s : (2, b, 2) straight pixels at the start; q_start : (n,) joints there, rad or m.
-    bounds : lower and upper limits (n,) of the joints, rad or m, where a half turn is to be made in the sense
+    bounds : limits of the joints, where a half turn is to be made in the sense
         that is better when rehearsed.
     Returns the state with the face and the joint motions; the parts; False where neither sense of a half turn
     arrived. Raises WorkFailed if the face is not seen, or a motion not unique.
@@ -203,7 +204,7 @@ class Trials:
                 n, observed, limits.max_steps, len(ERRORS), MAX_PARTS if setting.gains.substeps else 0
             ),
         )
-        self.rehearsal = _Rehearsal(setting.model, q_start, m, (plant.lower, plant.upper))
+        self.rehearsal = _Rehearsal(setting.model, q_start, m, plant.limits)
 
     def numbers(self, shown: FloatArray, noise: FloatArray) -> FloatArray:
         """Measure the task, partition it, drive the law to its verdict and sum up: (r, ``NUMBERS``).

@@ -1,4 +1,4 @@
-"""Compiling what a first run needs later, in a process beside the one that calibrates: 10 s of 50."""
+"""JIT warm-up: compile for the first run in another process while one calibrates, 10 s of 50."""
 
 import sys
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from projservo_cli.planning.margins import (
     limits_alone,
     room_along,
 )
-from projservo_cli.records import Model
+from projservo_cli.records import JointLimits, Model
 from projservo_cli.robots.simulated import Ends, Plant
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import NO_PARTS
@@ -51,6 +51,7 @@ def _compile_now() -> None:
 def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     """Kernels and arguments of the types that all runs have; their values mean nothing."""
     q, O, matrices, order = np.zeros(4), np.zeros((2, 4)), np.zeros((4, 4, 4)), np.zeros(4, np.int64)
+    limits = JointLimits(q, q, q, q)
     model = Model(P=np.zeros((2, 3, 4)), H_hat_0=matrices, joint_types=order, q_reference=q, a_inf=q)
     task = Task(
         s_star=np.zeros((2, 4, 2)),
@@ -69,14 +70,13 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         O=O,
         visible=q,
         image_size=q,
-        lower=q,
-        upper=q,
+        limits=limits,
         opaque=True,
     )
     state, log = new_state(4, 4), new_log(4, 4, 1, len(ERRORS))
     reaching = Reaching(
         model=model,
-        demands=limits_alone(q, q),
+        demands=limits_alone(limits),
         H_hat=matrices,
         amplitudes=q,
         A=matrices[0],

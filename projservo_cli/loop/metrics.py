@@ -1,4 +1,4 @@
-"""What is told of a run in numbers, from its log and the truth."""
+"""Metrics of a run, from its log and the ground truth."""
 
 import math
 from typing import NamedTuple
@@ -93,7 +93,7 @@ def _keeps_within(plant: Plant, log: Log, steps: int) -> bool:
     for k in range(steps + 1):
         for i in range(log.q.shape[1]):
             q = log.q[k, i]
-            if not plant.lower[i] - _ROUND_OFF <= q <= plant.upper[i] + _ROUND_OFF:
+            if not plant.limits.lower[i] - _ROUND_OFF <= q <= plant.limits.upper[i] + _ROUND_OFF:
                 return False
         if not shows_face(plant, mat(log.H[k]), log.scratch[0]):
             return False

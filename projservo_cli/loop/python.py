@@ -166,7 +166,7 @@ def run_in_python(
     """
     try:
         require_spelt(f"law {type(law).__name__}", law, ("errors", *OPTIONAL))
-        log = new_log(len(plant.plant.lower), plant.markers, limits.max_steps, len(ERRORS))
+        log = new_log(len(plant.plant.limits.lower), plant.markers, limits.max_steps, len(ERRORS))
         for column in (log.read, log.q, log.s, log.error, log.judged):
             column[:] = math.nan
         monitors = Monitors(plant, limits, stall, execution)
@@ -175,8 +175,9 @@ def run_in_python(
             try:
                 verdict, q_dot = _instant(law, plant, s_star, monitors, log, k)
                 if verdict == RUNNING:
-                    told = float(_told(law, "share")[0]), int(_told(law, "blocked")[0])
-                    verdict = monitors.of_command(log, k, Command(q_dot, *told, period, scale))
+                    share, blocked = float(_optional(law, "share")[0]), int(_optional(law, "blocked")[0])
+                    asked = Command(q_dot, share, blocked, period, scale)
+                    verdict = monitors.of_command(log, k, asked)
                     if verdict == RUNNING:
                         _send(law, plant, log.scratch[0, : len(q_dot)], limits, period, scale)
                 if verdict == WAITING:
@@ -209,8 +210,8 @@ def _instant(
         if plant.weight is not None and isinstance(law, BuiltInLaw):
             law.weigh(plant.weight)
         status, q_dot = law(log.s[k], log.read[k])
-        log.errors[k], log.fit[k] = law.errors, _told(law, "fit")
-        face_px = float(_told(law, "face_px")[0])
+        log.errors[k], log.fit[k] = law.errors, _optional(law, "fit")
+        face_px = float(_optional(law, "face_px")[0])
         log.judged[k] = face_px if math.isfinite(face_px) else log.judged[k]
     return monitors.of_instant(
         log, k, Instant(in_front=plant.in_front, left=left, distance=distance, status=status, q_dot=q_dot)
@@ -225,13 +226,13 @@ def _send(
     A law that keeps to its path bounds its joint steps to first order only; what one exceeds the limit by
     costs time instead of leaving the path.
     """
-    path = _told(law, "path")
+    path = _optional(law, "path")
     steps = np.diff(path, axis=0) if len(path) > 2 and scale >= 1.0 and plant.takes_parts else dq[None].copy()
     for step in steps:
         least = float(np.max(np.abs(step) / (limits.speed * scale)))
         plant.command(step, max(period / len(steps), least))
 
 
-def _told(law: LoopLaw, name: str) -> Any:
+def _optional(law: LoopLaw, name: str) -> Any:
     """What a law says of its last step beside the command."""
     return getattr(law, name, OPTIONAL[name])

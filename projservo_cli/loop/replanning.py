@@ -1,4 +1,4 @@
-"""A run that follows a path to the goal is watched, and a path searched again where it comes to nothing.
+"""Replanning: monitor a run that follows a path, and search another path when it fails.
 
 A path is searched again, from where the robot is, where
 
@@ -69,13 +69,8 @@ class ExecutionMonitor:
         limits: Limits,
         stall: StallMonitor | None = None,
     ) -> None:
-        self.law, self.follow, self.replanner, self.left, self.limits = (
-            law,
-            follow,
-            replanner,
-            searches,
-            limits,
-        )
+        self.law, self.follow, self.replanner = law, follow, replanner
+        self.left, self.limits = searches, limits
         self.attempts: list[str] = []
         self._stall = stall
         self._excluded: list[FloatArray] = []

@@ -1,4 +1,4 @@
-"""Whether a robot has arrived, or stands still away from its goal, judged while it runs.
+"""Settling: whether a robot has arrived, or is stalled away from its goal, judged while it runs.
 
 A robot that need not follow what it is sent has arrived once it stands. Joints that lag or sag, and images
 that are late, show at the goal what they have not shown on the way.

@@ -1,4 +1,4 @@
-"""What one period of the loop does beside the law: limits, counting, verdict.
+"""One period of the loop without the law: limits, counting, verdict.
 
 Precedence of the verdicts of ``verdict_at`` at one instant, first match wins; ``loop.monitors`` states what
 rules before and after it:
@@ -126,7 +126,7 @@ def note(log: Log, k: int, s_star: FloatArray, plant: Plant, limits: Limits) -> 
     left = _outside(log.s[k], s_star.shape[1], plant.image_size)
     if left and log.events[0] < 0.0:
         log.events[0] = k
-    joint = beyond_limits(log.read[k], plant.lower, plant.upper)
+    joint = beyond_limits(log.read[k], plant.limits.lower, plant.limits.upper)
     if joint >= 0 and log.events[1] < 0.0 and not limits.stop_at_joint_limit:
         log.events[1] = k
         log.events[2] = joint
@@ -275,7 +275,7 @@ def bounded(log: Log, k: int, asked: Command, plant: Plant, limits: Limits) -> i
         q_dot[i] *= asked.scale
         dq[i] = q_dot[i] * asked.period
     if limits.stop_at_joint_limit:
-        joint = _shorten(log.read[k], dq, plant.lower, plant.upper)
+        joint = _shorten(log.read[k], dq, plant.limits.lower, plant.limits.upper)
         if joint >= 0:
             for i in range(q_dot.shape[0]):
                 q_dot[i] = dq[i] / asked.period

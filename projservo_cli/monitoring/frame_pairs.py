@@ -24,7 +24,7 @@ class Frame(NamedTuple):
     noise: FloatArray  # (m,) standard deviation of the pixels, px
 
 
-class Look(NamedTuple):
+class FramePair(NamedTuple):
     """Both images of one time; a view without a frame then sees no marker."""
 
     t: FloatArray  # (2,) s, from the first look on
@@ -58,7 +58,7 @@ class Pairing:
         """Note the instants (2,) that both views have come to, s."""
         self._reached = np.maximum(self._reached, t)
 
-    def next(self, at_rest: bool) -> Look | None:
+    def next(self, at_rest: bool) -> FramePair | None:
         """Next look; None while a frame waits for that of the other view.
 
         at_rest : the robot has not moved yet, so that frames of any two instants show the same.
@@ -75,12 +75,14 @@ class Pairing:
         one = frames[0] or frames[1]
         return None if one is None else self._look(one, frames)
 
-    def _look(self, one: Frame, frames: list[Frame | None]) -> Look:
-        """Look of the frames of both views, at least one of them."""
+    def _look(self, one: Frame, frames: list[Frame | None]) -> FramePair:
+        """FramePair of the frames of both views, at least one of them."""
         both = [frame or one._replace(image=np.full_like(one.image, np.nan)) for frame in frames]
         last, self._last = self._last or one, one
         self._start = one.t if self._start is None else self._start
         stacked = (np.array([frame[i] for frame in both]) for i in range(len(one)))
         t, q, q_dot, late, images, noise = stacked
         curved = _STRAIGHT * np.abs(one.q_dot - last.q_dot) * abs(one.t - last.t)
-        return Look(t=t - self._start, q=q, q_dot=q_dot, late=late, images=images, noise=noise, curved=curved)
+        return FramePair(
+            t=t - self._start, q=q, q_dot=q_dot, late=late, images=images, noise=noise, curved=curved
+        )

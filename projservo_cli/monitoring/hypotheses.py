@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
 from projservo_cli.calibration.prediction import Parameters
-from projservo_cli.monitoring.frame_pairs import Look
+from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.statistics import ErrorModel, Residual, Sums
 from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
 
@@ -80,7 +80,7 @@ class Evidence:
     def __init__(
         self,
         errors: ErrorModel,
-        looks: list[Look],
+        looks: list[FramePair],
         residuals: list[Residual],
         weights: FloatArray,
         agreed: Sums,
@@ -161,12 +161,12 @@ class Evidence:
         tried = [self._tried(cause) for cause in causes]
         tried.sort(key=lambda one: -one[0])
         return [
-            self._anew(self._fitted(cause, start))
+            self._refitted(self._fitted(cause, start))
             for rank, (_, cause, start) in enumerate(tried)
             if rank < _FITTED or start.size <= 1
         ]
 
-    def _anew(self, found: Explanation) -> Explanation:
+    def _refitted(self, found: Explanation) -> Explanation:
         """Explanation of a cause that is far off, with errors of joints and calibration as they act there.
 
         Looks are taken back to where nothing is wrong, and what is left of the cause is fitted to those.

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
-from projservo_cli.monitoring.frame_pairs import Frame, Look, Pairing
+from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
     Explanation,
@@ -59,7 +59,7 @@ _AT_REST = 1e-3
 class _Kept(NamedTuple):
     """A look as it was tested."""
 
-    look: Look
+    look: FramePair
     residual: Residual
     view: int  # number of the view that it is of
     views: int  # views that agreed up to it
@@ -171,10 +171,10 @@ class ImageMonitor:
     def give_up(self) -> str:
         """Return the fault that is pending, by what is known of it."""
         if self.pending and not self.fault:
-            self.fault = self._told(self._explanations(self._since_onset(), self._before))
+            self.fault = self._message(self._explanations(self._since_onset(), self._before))
         return self.fault
 
-    def _take(self, look: Look) -> None:
+    def _take(self, look: FramePair) -> None:
         """Test a look, and judge what is known by now."""
         memory = self._detector.memory
         look = look._replace(noise=memory.noise(look.noise))
@@ -236,7 +236,7 @@ class ImageMonitor:
             return
         clear = self._off >= _TWO_AT or len(_rivals(found)) == 1
         if (explains and clear and not self._kept[-1].covered) or self._off == _NAMED_AT[-1]:
-            self.fault = self._told(found)
+            self.fault = self._message(found)
 
     def _crowd_is_fault(self) -> bool:
         """Whether many sightings are aside for long, and all of these looks together are beyond chance."""
@@ -262,7 +262,7 @@ class ImageMonitor:
             if any(look.q_dot.any() for look, *_ in kept):
                 best = self._explanations(kept, self._before)[0]
                 if best.cause.kind in ("late", "frozen") and self._explains(best):
-                    self.fault = self._told([best])
+                    self.fault = self._message([best])
         self._off = 0
 
     def _since_onset(self) -> list[_Kept]:
@@ -347,9 +347,9 @@ class ImageMonitor:
             if lasts and best.score > _CLEAR and self._explains(best):
                 moved.append(best)
         if moved:
-            self.fault = self._told([together(moved)])
+            self.fault = self._message([together(moved)])
 
-    def _told(self, found: list[Explanation]) -> str:
+    def _message(self, found: list[Explanation]) -> str:
         """Sentence on the fault by the likeliest of causes."""
         residual = self._kept[-1].residual
         rms = np.sqrt(np.square(residual.r).sum() / max(2.0 * residual.seen.sum(), 1.0))

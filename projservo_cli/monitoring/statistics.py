@@ -1,4 +1,4 @@
-"""How images may differ from their prediction while nothing is wrong, and tests of that."""
+"""Innovation statistics: how images may differ from their prediction without a fault, and tests of that."""
 
 from collections import deque
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from projservo_cli.calibration.detections import MIN_SIGMA, per_rad
 from projservo_cli.calibration.prediction import CAMERA, Parameters, dense_pixel_changes, parameters_from
-from projservo_cli.monitoring.frame_pairs import Look
+from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
 
 # Looks in a row that must agree: one may be blurred, or a marker taken for another.
@@ -137,7 +137,7 @@ class ErrorModel:
             return common
         return np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), common)
 
-    def residual(self, look: Look) -> Residual:
+    def residual(self, look: FramePair) -> Residual:
         """Residuals of a look and their derivatives, each view at its own joints."""
         scene, away, views = self.scene, look.q - self.calibration.q_reference, np.arange(2)
         m, n, rows = len(scene.M), len(scene.H_hat), 4 * len(scene.M)
@@ -184,7 +184,7 @@ class ErrorModel:
         return np.asarray(np.maximum(found / (near.sum(axis=(2, 3)) + _PRIOR_SIGHTINGS), 1.0))
 
     def _fault_derivative(
-        self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, look: Look
+        self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, look: FramePair
     ) -> FloatArray:
         """Derivatives (2, m, 2, f) of pixels by what may be wrong, in the order of ``_directions_of``.
 

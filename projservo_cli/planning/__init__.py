@@ -1,1 +1,1 @@
-"""Paths through joint space that keep the face in sight: goals, validity, search, timing."""
+"""Motion planning in joint space with a visible face: goal configurations, constraints, search, timing."""

@@ -1,4 +1,4 @@
-"""Whether joints keep what must hold, as numbers with a sign, from the calibrated model alone.
+"""Constraints as signed numbers: joint limits, visibility, image borders, from the calibrated model alone.
 
 The margins are those of ``planning.margins``. Of a tool with several tags visibility, width and image are
 those of the tag that keeps them best.
@@ -30,7 +30,7 @@ from projservo_cli.planning.margins import (
     straight_pixel,
     tag_planes,
 )
-from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, Model, Spread
+from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, JointLimits, Model, Spread
 from projservo_cli.task.face import Task, center_of, face_plane
 
 # Of what start and goal have themselves, so much is asked for there.
@@ -58,14 +58,12 @@ class Constraints(NamedTuple):
     a: FloatArray  # (t, 4) their planes at the reference
     O: FloatArray  # (2, 4) optical centres, a·O = 1 of the face at the start
     depth: FloatArray  # (2,) least third coordinate of a marker at the start
-    lower: FloatArray
-    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
-    speed: FloatArray  # (n,) most motion per second, rad/s or m/s
+    limits: JointLimits  # of the joints
     image_size: FloatArray  # (2,) px; infinite where an image has no border
     keep: FloatArray  # (n,) distance from a limit that counts as margin one, rad or m
     full: FloatArray  # (10,) margins asked for
     ends: FloatArray  # (k, n) start and goals, near which less is asked for
-    had: FloatArray  # (k, 10) what is asked for there
+    end_demands: FloatArray  # (k, 10) what is asked for there
     spread: Spread = NO_SPREAD
     keep_out: KeepOut = NO_KEEP_OUT
 
@@ -96,14 +94,12 @@ def constraints_of(
         a=np.ascontiguousarray((tag_planes(tags, A, m, face) if len(tags) else face[None]) @ H),
         O=np.ascontiguousarray(task.O / (task.O @ face)[:, None]),
         depth=(A @ model.P[:, 2].T).min(axis=0),
-        lower=demands.lower,
-        upper=demands.upper,
-        speed=demands.speed,
+        limits=demands.limits,
         image_size=demands.image_size,
         keep=np.maximum(demands.keep, 1e-9),
         full=np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, FINE_PX]),
         ends=np.zeros((0, n)),
-        had=np.zeros((0, MARGINS)),
+        end_demands=np.zeros((0, MARGINS)),
         keep_out=keep_out,
     )
 
@@ -112,7 +108,7 @@ def constraints_of(
 def _limits_into(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
     least = math.inf
     for i in range(q.shape[0]):
-        least = min(least, min(q[i] - c.lower[i], c.upper[i] - q[i]) / c.keep[i])
+        least = min(least, min(q[i] - c.limits.lower[i], c.limits.upper[i] - q[i]) / c.keep[i])
     margins[JOINTS] = least
 
 
@@ -314,10 +310,10 @@ def demands_into(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
     for i in range(MARGINS):
         demands[i] = c.full[i]
     for e in range(c.ends.shape[0]):
-        rise = time_between(c.speed, q, c.ends[e]) / RISE
+        rise = time_between(c.limits.speed, q, c.ends[e]) / RISE
         if rise < 1.0:
             for i in range(MARGINS):
-                demands[i] = min(demands[i], c.had[e, i] + rise * (c.full[i] - c.had[e, i]))
+                demands[i] = min(demands[i], c.end_demands[e, i] + rise * (c.full[i] - c.end_demands[e, i]))
 
 
 @merged
@@ -381,7 +377,7 @@ def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
         if not trial.margins[i] > trial.demands[i]:
             trial.failures[i] += 1
             for j in range(q.shape[0] if i == JOINTS else 0):
-                room = min(q[j] - c.lower[j], c.upper[j] - q[j]) / c.keep[j]
+                room = min(q[j] - c.limits.lower[j], c.limits.upper[j] - q[j]) / c.keep[j]
                 trial.failures[MARGINS + j] += not room > trial.demands[JOINTS]
             return False
     return True

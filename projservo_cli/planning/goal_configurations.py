@@ -1,4 +1,4 @@
-"""All joint vectors that show the goal: Newton's method from random joints, and whole turns of what it finds.
+"""Inverse kinematics: all goal configurations, by Newton's method from random joints and by whole turns.
 
 The points of the face are first brought to where they are at the goal, in the coordinates of the calibrated
 frame scaled to a_inf·A = 1, which is well behaved from everywhere; then its images, which have the last word.
@@ -284,8 +284,8 @@ def _turns(c: Constraints, start: FloatArray, q: FloatArray, slack: FloatArray) 
     """
     turn, slides = 2.0 * math.pi, c.model.joint_types == PRISMATIC
     half = np.where(slides, math.inf, 0.5 * turn)
-    low = np.where(np.isfinite(c.lower), c.lower, start - half) - slack - q
-    high = np.where(np.isfinite(c.upper), c.upper, start + half) + slack - q
+    low = np.where(np.isfinite(c.limits.lower), c.limits.lower, start - half) - slack - q
+    high = np.where(np.isfinite(c.limits.upper), c.limits.upper, start + half) + slack - q
     nearest = np.round((start - q) / turn)
     first = np.where(slides, 0.0, np.maximum(np.ceil(low / turn), nearest - TURNS))
     last = np.minimum(np.floor(high / turn), nearest + TURNS) + 1.0
@@ -305,9 +305,9 @@ def _rank(
     """
     sure = np.full(len(q), min(1.0, DEFINITE / deviation.max()))
     if not certain:
-        room = np.minimum(q - c.lower, c.upper - q) / (DEVIATIONS * deviation)
+        room = np.minimum(q - c.limits.lower, c.limits.upper - q) / (DEVIATIONS * deviation)
         sure = np.minimum(sure, room.min(axis=1))
-    time = (np.abs(q - start) / c.speed).max(axis=1)
+    time = (np.abs(q - start) / c.limits.speed).max(axis=1)
     return np.where(sure >= 1.0, time, UNSURE * (1.0 if certain else 2.0 - np.maximum(sure, -1.0)))
 
 
@@ -338,7 +338,7 @@ def goals_of(
         where = _where(c, solution, trial) if len(turns) > 0 else HIDDEN
         met[where] += 1
         if where == SHOWN:
-            goals.append(np.clip(turns, c.lower, c.upper))
+            goals.append(np.clip(turns, c.limits.lower, c.limits.upper))
             ranks.append(_rank(c, start, turns, deviation, certain))
     rank = np.concatenate(ranks)
     order = np.argsort(rank, kind="stable")

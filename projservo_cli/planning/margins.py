@@ -47,7 +47,7 @@ from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
 from projservo_cli.geometry.kinematics import backward, forward, image_motion, operators_at, project, row
 from projservo_cli.geometry.lens import distort_pixel, distorts
 from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, make_span, reach, workspace
-from projservo_cli.records import FloatArray, IntArray, Model
+from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients
 
@@ -104,9 +104,7 @@ MOST_PARTS = 256
 class Demands(NamedTuple):
     """What a planned motion must keep to."""
 
-    lower: FloatArray
-    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
-    speed: FloatArray  # (n,) most joint motion per second, rad/s or m/s; infinite for none
+    limits: JointLimits  # of the joints
     image_size: FloatArray  # (2,) width and height of both images, px; infinite where an image has no border
     border_px: float  # least distance of a marker from the border of an image, px
     conditioning: float  # least reciprocal condition of the image Jacobian of the face
@@ -118,17 +116,14 @@ class Demands(NamedTuple):
     units: tuple[str, ...] = ()  # of each joint, as it is told: deg, rad or m
 
 
-def limits_alone(lower: FloatArray, upper: FloatArray) -> Demands:
-    """Demands of joint limits alone, (n,) rad or m."""
-    endless = np.full(len(lower), math.inf)
+def limits_alone(limits: JointLimits) -> Demands:
+    """Demands of joint limits alone."""
     return Demands(
-        lower=lower,
-        upper=upper,
-        speed=endless,
+        limits=limits,
         image_size=np.full(2, math.inf),
         border_px=0.0,
         conditioning=0.0,
-        keep=np.zeros(len(lower)),
+        keep=np.zeros(len(limits.lower)),
     )
 
 
@@ -236,7 +231,7 @@ def image_margin(demands: Demands, distance: FloatArray) -> FloatArray:
 @merged
 def joint_margin(demands: Demands, q: FloatArray, i: int) -> float:
     """Margin of the limits of joint i of q (n,); 1 for a joint without."""
-    lower, upper = float(demands.lower[i]), float(demands.upper[i])
+    lower, upper = float(demands.limits.lower[i]), float(demands.limits.upper[i])
     if not math.isfinite(upper - lower):
         return 1.0
     return min(max(2.0 * min(float(q[i]) - lower, upper - float(q[i])) / (upper - lower), WORST), 1.0)

@@ -57,7 +57,7 @@ VIEWS = [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]
 
 def duration(motion: Motion) -> float:
     """Time a motion takes at the joint-speed limit, s; NaN where nothing limits or joints cannot follow."""
-    speed = motion.reaching.demands.speed
+    speed = motion.reaching.demands.limits.speed
     return float(least_time(speed, motion.along.q)[-1]) if np.isfinite(speed).any() else math.nan
 
 
@@ -66,7 +66,7 @@ def evenly(motion: Motion, sigma: FloatArray) -> FloatArray:
 
     Where the joints cannot follow or nothing moves, of the length of the path in shares.
     """
-    time = least_time(motion.reaching.demands.speed, motion.along.q)
+    time = least_time(motion.reaching.demands.limits.speed, motion.along.q)
     if not time[-1] > 0.0:
         time = least_time(np.ones(3), motion.mu)
     mu = np.stack([np.interp(sigma * time[-1], time, column) for column in motion.mu.T], axis=1)
@@ -140,7 +140,7 @@ class _Lattice(NamedTuple):
 
     def moved(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
         """What takes time along a motion in the lattice (s, n), and its speeds (n,)."""
-        speed = motion.reaching.demands.speed
+        speed = motion.reaching.demands.limits.speed
         if not self.follows:
             return motion.mu, np.ones(3)
         return motion.along.q, speed if np.isfinite(speed).any() else np.ones_like(speed)

@@ -1,4 +1,4 @@
-"""A path to the goal through joint space: straight, or by two trees that grow towards each other.
+"""Path in joint space to a goal configuration: straight, or by RRT-Connect; or the reason for none.
 
 J. Kuffner, S. LaValle, "RRT-Connect: an efficient approach to single-query path planning", ICRA 2000. What is
 found is shortened, rounded and timed. Random numbers are those of a seed and drawn before the trees grow: a
@@ -25,7 +25,7 @@ from projservo_cli.planning.goal_configurations import STARTS, UNSURE, GoalFeatu
 from projservo_cli.planning.keep_out import only
 from projservo_cli.planning.margins import CLEAR, FRONT, IMAGE, JOINTS
 from projservo_cli.planning.time_parameterization import TimedPath, least_time, time_parameterized
-from projservo_cli.records import NO_SPREAD, FloatArray, IntArray
+from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, JointLimits
 
 # Longest edge of a tree, s at the speed limits.
 REACH = 0.8
@@ -88,12 +88,12 @@ def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
 
     What they show was seen there, so that a deviation of the prediction takes nothing from it.
     """
-    had = np.array([margins_at(c, q)[0] for q in ends])
+    demands = np.array([margins_at(c, q)[0] for q in ends])
     seen = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
     seen = np.where(np.isfinite(seen), seen, 0.0)
-    had = np.minimum(c.full, np.where(seen > 0.0, had - (1.0 - SHARE) * seen, had - ROUND_OFF))
-    poor = (had < c.full).any(axis=1)
-    return c._replace(ends=np.ascontiguousarray(ends[poor]), had=np.ascontiguousarray(had[poor]))
+    demands = np.minimum(c.full, np.where(seen > 0.0, demands - (1.0 - SHARE) * seen, demands - ROUND_OFF))
+    poor = (demands < c.full).any(axis=1)
+    return c._replace(ends=np.ascontiguousarray(ends[poor]), end_demands=np.ascontiguousarray(demands[poor]))
 
 
 def margins_at(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -123,8 +123,9 @@ def first_within(c: Constraints, q: FloatArray) -> tuple[int, int]:
     n = q.shape[1]
     endless = np.full(n, math.inf)
     full = np.r_[np.full(CLEAR, -1e12), c.full[CLEAR]]  # finite, as demands are interpolated
-    speed = np.where(np.isfinite(c.speed), c.speed, 1.0)
-    c = with_ends(c._replace(lower=-endless, upper=endless, full=full, speed=speed), q[[0, -1]])
+    speed = np.where(np.isfinite(c.limits.speed), c.limits.speed, 1.0)
+    limits = JointLimits(-endless, endless, speed, c.limits.acceleration)
+    c = with_ends(c._replace(limits=limits, full=full), q[[0, -1]])
     trial = new_trial(n, len(c.M))
     for i in range(len(q) - 1):
         if reached(c, q[i], q[i + 1], trial) < 1.0:
@@ -138,13 +139,11 @@ def find_path(
     start: FloatArray,
     known: FloatArray,
     search: SearchLimits,
-    acceleration: FloatArray,
 ) -> JointPath:
     """Find a path from the start to joints that show the goal.
 
     start : (n,) joints, rad or m.
     known : (k, n) joints known to show the goal, k ≥ 0.
-    acceleration : (n,) rad/s² or m/s².
     """
     n, rng = len(start), np.random.default_rng(search.seed)
     starts = np.vstack([known, start[None], _drawn(c, start, STARTS, rng)])
@@ -178,14 +177,14 @@ def find_path(
         best, draws, trees = _shortest(c, start, asked, most, rng, trial)
         path = path._replace(draws=path.draws + draws, trees=trees)
         if len(best) > 0:
-            return path._replace(corners=best, timing=time_parameterized(c, best, acceleration, trial))
+            return path._replace(corners=best, timing=time_parameterized(c, best, trial))
     return path
 
 
 def _drawn(c: Constraints, start: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
     """Random joints (count, n) within the limits; within half a turn of the start where there are none."""
-    low = np.where(np.isfinite(c.lower), c.lower, start - np.pi)
-    high = np.where(np.isfinite(c.upper), c.upper, start + np.pi)
+    low = np.where(np.isfinite(c.limits.lower), c.limits.lower, start - np.pi)
+    high = np.where(np.isfinite(c.limits.upper), c.limits.upper, start + np.pi)
     return np.asarray(low + (high - low) * rng.random((count, len(start))))
 
 
@@ -201,9 +200,9 @@ def _shortest(
     straight = next((goal for goal in goals if reached(c, start, goal, trial) == 1.0), None)
     if straight is not None:
         best = np.stack([start, straight])
-        shortest = least_time(c.speed, best)[-1]
+        shortest = least_time(c.limits.speed, best)[-1]
     trees: tuple[Tree, Tree] | None = None
-    if not shortest <= LONGER * (np.abs(goals - start) / c.speed).max(axis=1).min():
+    if not shortest <= LONGER * (np.abs(goals - start) / c.limits.speed).max(axis=1).min():
         for _ in range(WAYS):
             left = (most if math.isinf(shortest) else FURTHER) - draws
             if left <= 0:
@@ -212,7 +211,7 @@ def _shortest(
             draws, trees = draws + used, trees or grown
             if found is not None:
                 found = _shortened(c, found, rng, trial)
-                if (time := least_time(c.speed, found)[-1]) < shortest:
+                if (time := least_time(c.limits.speed, found)[-1]) < shortest:
                     best, shortest, trees = found, time, grown
     return best, draws, trees
 
@@ -249,7 +248,7 @@ def _nearest(c: Constraints, tree: Tree, q: FloatArray) -> int:
     for k in range(tree.size[0]):
         most = 0.0
         for i in range(n):
-            most = max(most, abs(tree.q[k, i] - q[i]) / c.speed[i])
+            most = max(most, abs(tree.q[k, i] - q[i]) / c.limits.speed[i])
             if most >= best:
                 break
         if most < best:
@@ -263,7 +262,7 @@ def _extended(c: Constraints, tree: Tree, q: FloatArray, trial: Trial) -> tuple[
     node = _nearest(c, tree, q)
     n = q.shape[0]
     while True:
-        time = time_between(c.speed, tree.q[node], q)
+        time = time_between(c.limits.speed, tree.q[node], q)
         if time <= LEAST:
             return node, True
         if tree.size[0] == tree.q.shape[0]:
@@ -319,7 +318,7 @@ def _branch(tree: Tree, node: int) -> FloatArray:
 
 def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
     """What is left of a path (k, n) when straight paths cut it short: first between drawn places on it."""
-    time = least_time(c.speed, path)
+    time = least_time(c.limits.speed, path)
     for ends in np.sort(rng.random((SHORTENINGS, 2)), axis=1):
         if len(path) <= 2:
             return path
@@ -328,9 +327,9 @@ def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial
         if i == j:  # on one straight piece
             continue
         new = np.stack([np.interp((low, high), time, column) for column in path.T], axis=1)
-        if least_time(c.speed, new)[-1] < high - low and reached(c, new[0], new[1], trial) == 1.0:
+        if least_time(c.limits.speed, new)[-1] < high - low and reached(c, new[0], new[1], trial) == 1.0:
             path = np.vstack([path[: i + 1], new, path[j + 1 :]])
-            time = least_time(c.speed, path)
+            time = least_time(c.limits.speed, path)
     k = 1
     while k < len(path) - 1:
         if reached(c, path[k - 1], path[k + 1], trial) == 1.0:

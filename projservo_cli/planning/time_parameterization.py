@@ -1,4 +1,4 @@
-"""From corners to joints over time: a path without stops, at the speeds and accelerations that joints have.
+"""Time parameterization of a path through waypoints: no stops, within speeds and accelerations of joints.
 
 Corners are rounded by parabolas as large as validity lets them be, so that the path is C¹. Its pace is the
 quickest on a grid: Q.-C. Pham, "A general, fast, and robust implementation of the time-optimal path
@@ -50,7 +50,7 @@ def least_time(speed: FloatArray, q: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum((np.abs(np.diff(q, axis=0)) / speed).max(axis=1))])
 
 
-def time_parameterized(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Trial) -> TimedPath:
+def time_parameterized(c: Constraints, path: FloatArray, trial: Trial) -> TimedPath:
     """The pace of a path of corners (k, n), from rest to rest at ``ROOM`` of the limits."""
     path = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > LEAST]]
     if len(path) == 1:
@@ -58,15 +58,15 @@ def time_parameterized(c: Constraints, path: FloatArray, acceleration: FloatArra
         return TimedPath(
             s=np.array([0.0, 1.0]), q=path + still, dq=still, ddq=still[:1], x=np.zeros(2), time=np.zeros(2)
         )
-    times = np.diff(least_time(c.speed, path))
+    times = np.diff(least_time(c.limits.speed, path))
     slopes = np.diff(path, axis=0) / times[:, None]
     sizes = np.zeros(len(path))
     for k in range(1, len(path) - 1):
         sizes[k] = _rounding(c, path[k], slopes[k - 1 : k + 1], 0.5 * times[k - 1 : k + 1].min(), trial)
     timed = _on_grid(path, times, slopes, sizes)
     with np.errstate(divide="ignore", over="ignore"):
-        timed.x[:] = ((ROOM * c.speed / np.abs(timed.dq)) ** 2).min(axis=1)
-    _pace_into(timed, ROOM * acceleration)
+        timed.x[:] = ((ROOM * c.limits.speed / np.abs(timed.dq)) ** 2).min(axis=1)
+    _pace_into(timed, ROOM * c.limits.acceleration)
     return timed
 
 

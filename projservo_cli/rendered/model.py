@@ -126,18 +126,18 @@ def rendered_model(
     plates = tuple(tuple(model.geom(_name(tag, side)).id for side in _SIDES) for tag in markers.all_tags)
     assert markers.known is not None
     return RenderedModel(
-        options,
-        finder,
-        markers.known,
-        arm,
-        P,
-        model,
-        0 if model.nkey else -1,
-        joints,
-        plates,
-        (width, height),
-        margin,
-        tool[:3, :3],
+        options=options,
+        finder=finder,
+        numbers=markers.known,
+        arm=arm,
+        P=P,
+        model=model,
+        key=0 if model.nkey else -1,
+        joints=joints,
+        plates=plates,
+        size=(width, height),
+        margin=margin,
+        tool=tool[:3, :3],
     )
 
 

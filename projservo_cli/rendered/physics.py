@@ -196,7 +196,7 @@ class Physics:
     def _heaviest(self, scene: RenderedModel) -> tuple[FloatArray, float]:
         """Most inertia (n,) of each joint, kg m² or kg, and the most gravity asks of any that turns, N m."""
         mj, rng, arm = mujoco(), np.random.default_rng(0), scene.arm
-        low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.lower, arm.upper))
+        low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
         data, turning = scene.begin(self._model, arm.q_reference), arm.joint_types != PRISMATIC
         unit, moved = np.eye(self._model.nv), np.zeros(self._model.nv)
         inertia, load = np.zeros(len(low)), 0.0

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from projservo_cli.records import Calibration, CrossValidation, Observation, Plan, Trace
+from projservo_cli.records import Calibration, CrossValidation, Observation, Plan, Trace, position_limits
 from projservo_cli.report import figures, style
 from projservo_cli.report.figures.images import draw_image_errors
 from projservo_cli.report.report_data import Fit, title
@@ -29,15 +29,17 @@ def of_calibration(
 def of_plan(plan: Plan, scene: Any) -> "Figure":
     """Draw figure 16: the motion in both images, its joints and its margins over time.
 
-    scene : has ``model``, ``lower``, ``upper``, ``image_size`` and ``trajectory``.
+    scene : has ``model``, ``limits``, ``image_size`` and ``trajectory``.
     """
     spec = _spec(_PLAN)
     extent = np.nanmax(plan.s, axis=(0, 1, 2)) if scene.image_size is None else scene.image_size
     lowest, highest = plan.q.min(axis=0), plan.q.max(axis=0)
     robot = SimpleNamespace(
         joint_types=scene.model.joint_types,
-        lower=np.where(np.isfinite(scene.lower), scene.lower, lowest),
-        upper=np.where(np.isfinite(scene.upper), scene.upper, highest),
+        limits=position_limits(
+            np.where(np.isfinite(scene.limits.lower), scene.limits.lower, lowest),
+            np.where(np.isfinite(scene.limits.upper), scene.limits.upper, highest),
+        ),
     )
     plant = SimpleNamespace(order=cyclic_order(plan.A), image_size=extent)
     shown = {"plan": plan, "calibrated": scene.model, "trajectory": scene.trajectory}

@@ -129,7 +129,7 @@ class DrivenRobot:
         self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.shown])
         self._instants = Delays(known.predicted, known.delays, known.sigma_px, known.timeout_s, known.sigma_q)
         self._carried = np.zeros((2, self.markers, 2))
-        self.q = np.zeros(len(plant.lower))
+        self.q = np.zeros(len(plant.limits.lower))
         self.H = np.eye(4)
         self.hidden = np.zeros(2)
         self.disturbance = ""

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame
-from projservo_cli.records import ByteArray, FloatArray, InputError, WorkFailed, in_unit
+from projservo_cli.records import ByteArray, FloatArray, InputError, JointLimits, WorkFailed, in_unit
 from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
@@ -43,14 +43,12 @@ class Reading(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """What no command may exceed, and how servos follow; (n,) each, rad or m, per s where it is a speed.
+    """What no command may exceed, and how servos follow; (n,) each, rad or m.
 
     ``units`` are those in which messages tell joints: deg, rad or m; empty where nobody says.
     """
 
-    lower: FloatArray
-    upper: FloatArray  # lower, upper: joint limits; infinite for none
-    speed: FloatArray  # with the factor of every command
+    limits: JointLimits  # of speed with the factor of every command
     lead: FloatArray  # of a set-point before the last reading
     period: float  # of the loop, s
     lag_s: float  # time constant with which joints follow, s
@@ -63,7 +61,7 @@ class Bounds(NamedTuple):
 
     def within_limits(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Least and most (n,) that a set-point may be at a reading (n,): one beyond a limit may return."""
-        return np.minimum(self.lower, q), np.maximum(self.upper, q)
+        return np.minimum(self.limits.lower, q), np.maximum(self.limits.upper, q)
 
     def not_far_ahead(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Least and most (n,) that a set-point may be without leading a reading (n,) too far."""
@@ -133,7 +131,7 @@ class ForeignRobot:
     ) -> None:
         self.robot, self.name, self.bounds, self.image_size = robot, name, bounds, image_size
         self.timeout_s, self.open_s = timeout_s, open_s
-        self._joints, self._markers = len(bounds.speed), markers
+        self._joints, self._markers = len(bounds.limits.speed), markers
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
         self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
         self._last: Reading | None = None
@@ -354,7 +352,7 @@ class ForeignRobot:
         q = self._last.q
         sent = q if self._sent is None else self._sent
         # From the last set-point on, which after a pause was held: thinking took a period at most.
-        step = bounds.speed * max(0.0, due - max(self._due, self._shown[0] - bounds.period))
+        step = bounds.limits.speed * max(0.0, due - max(self._due, self._shown[0] - bounds.period))
         allowed = {
             "beyond its limits": bounds.within_limits(q),
             "too far ahead of the reading": bounds.not_far_ahead(q),
@@ -366,8 +364,8 @@ class ForeignRobot:
             for i in np.flatnonzero((target < low - slack) | (target > high + slack)).tolist():
                 at, least, most = (bounds.told(i, values[i]) for values in (target, low, high))
                 return f"the set-point of joint {i + 1}, {at}, is {what}: allowed are {least} to {most}"
-        for i in np.flatnonzero(np.abs(speed) > bounds.speed * (1.0 + _ROUND_OFF)).tolist():
-            at, most = (bounds.told(i, values[i]) for values in (speed, bounds.speed))
+        for i in np.flatnonzero(np.abs(speed) > bounds.limits.speed * (1.0 + _ROUND_OFF)).tolist():
+            at, most = (bounds.told(i, values[i]) for values in (speed, bounds.limits.speed))
             return f"the speed of joint {i + 1}, {at}/s, is beyond its limit of {most}/s"
         return ""
 

@@ -1,4 +1,4 @@
-"""When the images of a robot were taken by the clock of its joint readings, and where the joints were then.
+"""Latency: when images were taken by the clock of the joint readings, and where the joints were then.
 
 The delay of a view is the instant of a joint reading less the middle of the exposure of the image that came
 with it. Only this difference can be seen, so a constant offset is always estimated: of the stamp of a frame

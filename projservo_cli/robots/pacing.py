@@ -45,7 +45,7 @@ class SetPoint:
         target = np.clip(before + dq, *bounds.not_far_ahead(q))
         self.short = target != before + dq
         self.target = np.clip(target, *bounds.within_limits(q))
-        speed = np.clip((self.target - before) / seconds, -bounds.speed, bounds.speed)
+        speed = np.clip((self.target - before) / seconds, -bounds.limits.speed, bounds.limits.speed)
         fades = math.exp(-seconds / lag)
         self._behind = fades * self._behind + (1.0 - fades) * lag * np.abs(speed)
         return self.target.copy(), speed

@@ -1,4 +1,4 @@
-"""Robots and laws of others: from the name a user gives to the object that is driven.
+"""Plug-in robots and laws: from the name a user gives (entry point, module:Class) to the object.
 
 A name is ``module:Class``, or one that an installed package registers under the entry point groups
 ``projservo.plants`` and ``projservo.laws``. Looking a name up reads metadata alone; only ``make``

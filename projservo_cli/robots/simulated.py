@@ -19,7 +19,7 @@ from projservo_cli.geometry.algebra import (
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, row
 from projservo_cli.geometry.lens import distort_pixel
-from projservo_cli.records import FloatArray, IntArray, Model
+from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.face import center_of, face_plane
 
 NO_PINS = np.zeros((0, 4))
@@ -43,8 +43,7 @@ class Plant(NamedTuple):
     O: FloatArray  # (2, 4) optical centres
     visible: FloatArray  # (2,) sign of a·O on the visible side of the face
     image_size: FloatArray  # (2,) width and height, px; infinite where an image has no border
-    lower: FloatArray
-    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
+    limits: JointLimits  # of the joints
     opaque: bool  # whether the face hides its markers from a camera behind it
     # (p, 4) further markers of the body at the reference, m; a camera sees those within its image
     pins: FloatArray = NO_PINS
@@ -194,8 +193,7 @@ class Arm(NamedTuple):
     joint_types: IntArray  # (n,) ``REVOLUTE`` or ``PRISMATIC``
     q_reference: FloatArray  # (n,) rad or m
     base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
-    lower: FloatArray
-    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
+    limits: JointLimits  # of the joints
 
     def model(self, P: FloatArray) -> Model:
         """Metric model of the robot seen by the cameras P (2, 3, 4)."""

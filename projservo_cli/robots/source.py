@@ -1,4 +1,4 @@
-"""Source of what others wrote: which files a class of theirs consists of, found without running any."""
+"""Source files of a plug-in class, found without running any."""
 
 import ast
 import hashlib

@@ -154,6 +154,6 @@ def _region(config: Config, q: FloatArray, share: float, image: FloatArray) -> R
     low, high = q.min(axis=0) - share * span, q.max(axis=0) + share * span
     joints = joints_of(config, "R" * q.shape[1])
     # A recorded robot may have been where its configured limits do not reach.
-    low = np.maximum(low, np.minimum(joints.lower, q.min(axis=0)))
-    high = np.minimum(high, np.maximum(joints.upper, q.max(axis=0)))
+    low = np.maximum(low, np.minimum(joints.limits.lower, q.min(axis=0)))
+    high = np.minimum(high, np.maximum(joints.limits.upper, q.max(axis=0)))
     return Region(low, high, image)

@@ -36,11 +36,11 @@ _WAITED = 5  # looks for each image that is wanted, where the same one comes aga
 def bounds_of(config: Config, joints: Joints) -> Bounds:
     """What no command to a robot may exceed, and what is taken of its servos."""
     plant, period = config.plant, config.control.period_s
-    speed, sag = joints.speed * plant.speed_scale, joints.length_of(plant.sag_deg)
+    speed, sag = joints.limits.speed * plant.speed_scale, joints.length_of(plant.sag_deg)
     lead = speed * (plant.lag_s + period) + sag
     if plant.lead_deg is not None:
         lead = joints.length_of(plant.lead_deg)
-    return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag, joints.units)
+    return Bounds(joints.limits._replace(speed=speed), lead, period, plant.lag_s, sag, joints.units)
 
 
 def foreign_robot(config: Config, joints: Joints, markers: int, given: Robot | None = None) -> ForeignRobot:
@@ -74,12 +74,13 @@ def _made(config: Config, target: str) -> Robot:
 
 def _require_no_turn_off(bounds: Bounds, q: FloatArray) -> None:
     """Refuse joints (n,) of which one reads a whole turn off: it would turn back by that, with its cables."""
-    beyond = ((q < bounds.lower) | (q > bounds.upper)) & np.isfinite(bounds.upper - bounds.lower)
+    lower, upper = bounds.limits.lower, bounds.limits.upper
+    beyond = ((q < lower) | (q > upper)) & np.isfinite(upper - lower)
     for i in np.flatnonzero(beyond).tolist():
-        turns = np.round((q[i] - 0.5 * (bounds.lower[i] + bounds.upper[i])) / (2.0 * np.pi))
-        if bounds.units[i] == "m" or not bounds.lower[i] <= q[i] - 2.0 * np.pi * turns <= bounds.upper[i]:
+        turns = np.round((q[i] - 0.5 * (lower[i] + upper[i])) / (2.0 * np.pi))
+        if bounds.units[i] == "m" or not lower[i] <= q[i] - 2.0 * np.pi * turns <= upper[i]:
             continue
-        limits = f"{bounds.told(i, bounds.lower[i])} to {bounds.told(i, bounds.upper[i])}"
+        limits = f"{bounds.told(i, lower[i])} to {bounds.told(i, upper[i])}"
         raise WorkFailed(
             f"nothing was moved: joint {i + 1} reads {bounds.told(i, q[i])}, a whole turn beyond its limits "
             f"{limits}: home it again where it stands"
@@ -103,7 +104,8 @@ def way_to(
     if fit is not None:
         fit(robot.reading)
     while (gap := q - robot.target).any():
-        robot.command(gap / np.max(np.abs(gap) / (bounds.speed * bounds.period), initial=1.0), bounds.period)
+        periods = np.max(np.abs(gap) / (bounds.limits.speed * bounds.period), initial=1.0)
+        robot.command(gap / periods, bounds.period)
         stands = still.joints(robot.look())
         yield robot.reading
         away = np.abs(q - robot.reading.q) - np.abs(q - begun)
@@ -262,7 +264,7 @@ def simulated_robot(config: Config, joints: Joints, robot: FaultyRobot) -> Forei
     bounds = bounds_of(config, joints)
     if config.plant.joint_limits == "report":
         endless = np.full(len(joints.types), math.inf)
-        bounds = bounds._replace(lower=-endless, upper=endless)
+        bounds = bounds._replace(limits=bounds.limits._replace(lower=-endless, upper=endless))
     markers = len(robot.world.truth.number)
     return ForeignRobot(robot, "the simulated robot", markers, bounds, _NEVER_LATE_S, _NEVER_LATE_S)
 
@@ -318,8 +320,7 @@ def _believed_plant(scenario: Scenario, calibration: Calibration) -> Plant:
         task.O,
         task.visible,
         scenario.demands.image_size,
-        scenario.joints.lower,
-        scenario.joints.upper,
+        scenario.joints.limits,
         False,
     )
 

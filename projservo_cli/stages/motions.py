@@ -63,7 +63,7 @@ def given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_transla
     """Shares of a profile of the paper; ``pure_translation`` of the translation at most before a rotation."""
     sigma = np.linspace(0.0, 1.0, trajectory.samples)
     motion = along_shares(reaching, profile_shares(profile, sigma, pure_translation))
-    speed = reaching.demands.speed
+    speed = reaching.demands.limits.speed
     shortest = least_time(speed, motion.along.q) if np.isfinite(speed).any() else np.nan * sigma
     time = _timed(shortest, sigma, trajectory)
     return Found(motion, motion, time, *sight_words(profile, motion))
@@ -72,7 +72,6 @@ def given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_transla
 class JointSearch(NamedTuple):
     """What the profile ``joint`` takes beside model, images and demands."""
 
-    acceleration: FloatArray  # (n,) most joint acceleration, rad/s² or m/s²
     q_shown: FloatArray  # (k, n) joints known to show the goal, rad or m
     sigma: float  # standard deviation of a coordinate of the images of the goal, px
     spread: Spread = NO_SPREAD  # how far predictions err
@@ -89,18 +88,18 @@ def search_of(scenario: Scenario) -> JointSearch:
             calibration,
             tuple(calibration.places(numbers)),
             scenario.m,
-            (tuple(demands.lower), tuple(demands.upper), tuple(demands.image_size)),
+            (tuple(demands.limits.lower), tuple(demands.limits.upper), tuple(demands.image_size)),
             scenario.config.trajectory.search.seed,
         )
-    joints, closed = scenario.joints, ""
-    if scenario.truth is None and not (np.isfinite(joints.lower) & np.isfinite(joints.upper)).all():
+    limits, closed = scenario.joints.limits, ""
+    if scenario.truth is None and not (np.isfinite(limits.lower) & np.isfinite(limits.upper)).all():
         closed = f"nothing tells the limits of all joints: {LIMITS_MISSING}"
-    return JointSearch(joints.acceleration, scenario.q_shown, scenario.goal_sigma_px, spread, closed)
+    return JointSearch(scenario.q_shown, scenario.goal_sigma_px, spread, closed)
 
 
 def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
     """Why no path through joint space can be looked for, or given a time; empty where it can."""
-    for i in np.flatnonzero(~np.isfinite(demands.speed)):
+    for i in np.flatnonzero(~np.isfinite(demands.limits.speed)):
         kind = "prismatic" if model.joint_types[i] == PRISMATIC else "joint"
         unit = "m_s" if kind == "prismatic" else "deg_s"
         return f"joint {i + 1} has no speed limit: set control.{kind}_speed_limit_{unit}"
@@ -191,7 +190,7 @@ def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: J
     c = _joint_constraints(reaching, task, trajectory, search.spread)
     aim = GoalFeatures(task.A_star, undistort(reaching.model.lens, task.s_star), search.sigma)
     how = SearchLimits(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
-    path = find_path(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
+    path = find_path(c, aim, reaching.q_start, search.q_shown, how)
     if path.timing is None:
         linear = given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.samples, np.nan)
@@ -256,8 +255,8 @@ class PathReplanner:
         full[CLEAR] += np.abs(off).max()
         c = self._c._replace(full=full)
         how = SearchLimits(asked.search.samples, asked.search.seed + self._made, asked.goals, excluded)
-        start = np.clip(q, c.lower, c.upper)
-        path = find_path(c, self._goal, start, self._search.q_shown, how, self._search.acceleration)
+        start = np.clip(q, c.limits.lower, c.limits.upper)
+        path = find_path(c, self._goal, start, self._search.q_shown, how)
         if path.timing is None:
             return None
         found = _sampled_path(self._reaching, path.timing, asked.samples)

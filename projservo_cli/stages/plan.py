@@ -21,6 +21,7 @@ from projservo_cli.records import (
     Calibration,
     FloatArray,
     InputError,
+    JointLimits,
     Model,
     Plan,
     WorkFailed,
@@ -37,7 +38,7 @@ from projservo_cli.stages.motions import (
     search_of,
     why_closed,
 )
-from projservo_cli.stages.plan_summary import least_of, reason_of, told_of, verdict_of
+from projservo_cli.stages.plan_summary import least_of, reason_of, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.world import Joints
 from projservo_cli.task.face import Task, center_of, face_plane
@@ -52,7 +53,7 @@ from projservo_cli.task.visibility import (
 
 
 def _partitioned(
-    model: Model, shown: TaskImages, trajectory: Trajectory, lower: FloatArray, upper: FloatArray
+    model: Model, shown: TaskImages, trajectory: Trajectory, limits: JointLimits
 ) -> tuple[State, Task, Parts, str]:
     """Measure and partition the task at its start; half turns are rehearsed within joint limits.
 
@@ -60,7 +61,7 @@ def _partitioned(
     rotations, a half turn in the sense that was rehearsed, and what to say of the rehearsal.
     """
     task, seen = shown.task(model), undistort(model.lens, shown.s_start)
-    bounds = (lower, upper) if trajectory.rehearses else None
+    bounds = limits if trajectory.rehearses else None
     state, parts, arrives = begin(model, task, seen, shown.q_start, bounds)
     return state, task, parts, "" if arrives else "; neither sense of the half turn arrived when rehearsed"
 
@@ -202,7 +203,7 @@ def _planned(
 ) -> tuple[Plan, str]:
     """Plan of one profile, and what of its constraints fails, in words; empty where all hold."""
     face = shown.by_points()
-    state, task, parts, note = _partitioned(model, shown, trajectory, demands.lower, demands.upper)
+    state, task, parts, note = _partitioned(model, shown, trajectory, demands.limits)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
@@ -259,7 +260,7 @@ def _planned(
         theta_0=theta_0,
         sense=sense,
         sense_margin=sense_margin,
-        **({} if path is None else told_of(path, along.q, time, trajectory.search.seed)),
+        **({} if path is None else search_summary(path, along.q, time, trajectory.search.seed)),
     )
     return plan, found.entered or ("" if holds or (path is not None and found.feasible) else words)
 
@@ -289,5 +290,5 @@ def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:
 def rotation_sense(scenario: Scenario) -> FloatArray:
     """Joint motions (2, n) of both rotations in the sense of a plan whose profile rehearses half turns."""
     asked, joints = scenario.config.trajectory, scenario.joints
-    state, _, parts, _ = _partitioned(scenario.model, scenario.ends, asked, joints.lower, joints.upper)
+    state, _, parts, _ = _partitioned(scenario.model, scenario.ends, asked, joints.limits)
     return in_sense(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])

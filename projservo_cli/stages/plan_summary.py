@@ -61,7 +61,8 @@ def _words(motion: Motion, constraint: int, instant: int) -> str:
         q = found.q[instant]
         i = min(range(len(q)), key=lambda i: joint_margin(demands, q, i))
         unit = demands.units[i] if demands.units else "rad or m"
-        here, low, high = (in_unit(values[i], unit, 4) for values in (q, demands.lower, demands.upper))
+        limits = demands.limits
+        here, low, high = (in_unit(values[i], unit, 4) for values in (q, limits.lower, limits.upper))
         return f"joint {i + 1} is at {here}, its limits are {low} to {high}, {at}"
     return (
         f"the {CONSTRAINTS[CONDITIONING].asked} is {found.condition[instant]:.2g} "
@@ -115,7 +116,7 @@ _MOST_NODES = 2_000
 _TOLD = 2
 
 
-def told_of(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> dict[str, Any]:
+def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> dict[str, Any]:
     """Fields of a plan that a search came to, with joints (s, n) at times (s,); NaN where it found none."""
     told: dict[str, Any] = {
         "goals": path.n_goals,
@@ -172,7 +173,7 @@ def _instead(c: Constraints, q: FloatArray, margin: int, asked: float) -> str:
     words, view = constraint_at(margin)
     if margin != JOINTS:
         return f"{words.asked.format(VIEWS[view])} {asked:.2g} px instead of {c.full[margin]:g} px"
-    i = int(np.argmin(np.minimum(q - c.lower, c.upper - q) / c.keep))
+    i = int(np.argmin(np.minimum(q - c.limits.lower, c.limits.upper - q) / c.keep))
     slides = c.model.joint_types[i] == PRISMATIC
     full, unit = (1e3 * c.keep[i], " mm") if slides else (math.degrees(c.keep[i]), "°")
     return f"{words.asked.format(i + 1)} {asked * full:.2g}{unit} instead of {full:.3g}{unit}"

@@ -166,7 +166,7 @@ def trial_motions(config: Config) -> FloatArray:
         return q
     turn = 2.0 * np.pi / (config.disturbance.encoder_ticks or _TICKS)
     tick = per_rad(np.array([*joints.types]) == "P") * turn
-    return np.clip(q + tick * rng.uniform(-1.0, 1.0, q.shape), joints.lower, joints.upper)
+    return np.clip(q + tick * rng.uniform(-1.0, 1.0, q.shape), joints.limits.lower, joints.limits.upper)
 
 
 def _random_pose(

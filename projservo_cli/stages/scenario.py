@@ -117,12 +117,11 @@ class Scenario:
         """What the planned motion must keep to, as configured."""
         size = np.array(self.config.image_size_px or (math.inf, math.inf), dtype=np.float64)
         joints, trajectory = self.joints, self.config.trajectory
-        limits = joints.lower, joints.upper, joints.speed
         margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
         keep = np.array([margins[kind != "P"] for kind in joints.types])
         border, condition = trajectory.border_px, trajectory.least_condition
         face, units = trajectory.least_face_px, self.joints.units
-        return Demands(*limits, size, border, condition, keep, face, self._tags(), units)
+        return Demands(joints.limits, size, border, condition, keep, face, self._tags(), units)
 
     def _tags(self) -> IntArray:
         """Corners (t, 4) of tags among the markers; none for tools of which no tag is on the face."""
@@ -328,10 +327,8 @@ def _gains(config: Config, joints: Joints) -> Gains:
         c.gain,
         c.period_s,
         config.trajectory.delta,
-        joints.speed,
+        joints.limits if stop else joints.limits._replace(lower=-endless, upper=endless),
         c.substeps == "auto",
-        joints.lower if stop else -endless,
-        joints.upper if stop else endless,
     )
 
 
@@ -339,7 +336,7 @@ def _limits(config: Config, joints: Joints, sigma_px: float) -> Limits:
     """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
     noise_px = config.stop.noise_factor * sigma_px
     return Limits(
-        joints.speed,
+        joints.limits.speed,
         config.stop.image_px + noise_px,
         config.stop.diverged_factor,
         config.stop.plateau_steps,
@@ -390,7 +387,7 @@ def _simulated_ends(
 
     def images(q: FloatArray, key: str) -> FloatArray:
         """Both apart, so that the face has the same bits with any pins."""
-        if wrong := limit_passed(q, robot.lower, robot.upper, units_of(task.start, types)):
+        if wrong := limit_passed(q, robot.limits, units_of(task.start, types)):
             raise WorkFailed(f"{key}: {wrong}: choose others or wider limits")
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
@@ -491,7 +488,6 @@ def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
         O,
         np.where(sides > 0.0, 1.0, -1.0),
         truth.image_size,
-        truth.robot.lower,
-        truth.robot.upper,
+        truth.robot.limits,
         opaque,
     )

@@ -1,4 +1,4 @@
-"""A simulated robot as robots are: late images, coarse encoders, servos that lag, sag and have play.
+"""Simulated robot with faults: latency, coarse encoders, servo lag, gravity sag and backlash.
 
 Its time passes in ``command`` alone, so that its runs are the same to the bit wherever they are made. A servo
 goes to its set-point in a straight line by the time that is due, and holds there; it follows with a lag of
@@ -271,7 +271,7 @@ class FaultyRobot:
 def full_reach(arm: Arm) -> float:
     """Longest lever that a joint has to the tool, m: the most found in postures drawn within the limits."""
     rng = np.random.default_rng(0)
-    low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.lower, arm.upper))
+    low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
     postures = rng.uniform(low, high, (_POSTURES, len(low)))
     turning = arm.joint_types != PRISMATIC
     return float(max(np.linalg.norm(_tool_velocity(arm, q)[turning], axis=1).max() for q in postures))

@@ -1,4 +1,4 @@
-"""What is up to date, and what has to be made first.
+"""Dependencies of stages: which results are up to date, and which must be made first.
 
 Every result carries a key: a hash of the configuration its stage depends on and of the key of the
 stage before it. Keys follow from the configuration alone, so what is to be done is known before

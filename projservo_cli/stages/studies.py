@@ -132,7 +132,7 @@ def metric_plan(bench: Comparison) -> Plan:
     """The task partitioned with the true metric model, so that its operators are in metres."""
     short = {"profile": "linear", "samples": 2, "duration_s": None}
     trajectory, robot = bench.scenario.config.trajectory.model_copy(update=short), bench.truth.robot
-    shown, limits = bench.scenario.ends, limits_alone(robot.lower, robot.upper)
+    shown, limits = bench.scenario.ends, limits_alone(robot.limits)
     return plan_task(bench.models["true"], shown, trajectory, limits)
 
 

@@ -149,7 +149,7 @@ def _put_to(config: Config, q: FloatArray) -> FaultyRobot:
     """The simulated robot at rest at joints (n,), rad or m, come to from beside, so that play tells."""
     truth = truth_of(config)
     aside = generator(config.seed, TAUGHT_NOISE).choice((-_BESIDE, _BESIDE), len(q))
-    beside = np.clip(q + aside, truth.robot.lower, truth.robot.upper)
+    beside = np.clip(q + aside, truth.robot.limits.lower, truth.robot.limits.upper)
     robot = robot_by_itself(config, truth, beside, config.noise.servo_px, config.seed, TAUGHT_NOISE)
     for second in range(1, 1 + _AT_REST_S):
         robot.command(q, np.zeros_like(q), float(second))
@@ -162,7 +162,7 @@ def checked(config: Config, calibration: Calibration, taught: _Taught) -> _Check
     taught : with the whole face.
     """
     joints = joints_of(config, calibration.joint_types, calibration)
-    start = np.clip(taught.q, joints.lower, joints.upper).tolist()
+    start = np.clip(taught.q, joints.limits.lower, joints.limits.upper).tolist()
     asked = {
         "task": TaskSettings.model_validate(
             {"start": {"joints": start, "unit": "rad"}, "goal": taught.as_goal()}

@@ -1,4 +1,4 @@
-"""The world of a simulated experiment: robot, rig and markers as a configuration describes them."""
+"""Ground truth of a simulated experiment: robot, rig and markers as a configuration describes them."""
 
 import math
 from collections.abc import Sequence
@@ -23,9 +23,11 @@ from projservo_cli.records import (
     Calibration,
     FloatArray,
     InputError,
+    JointLimits,
     Model,
     WorkFailed,
     in_unit,
+    position_limits,
 )
 from projservo_cli.rendered.model import lens_of
 from projservo_cli.robots.simulated import Arm, Ends, camera_center, roll_axis
@@ -39,10 +41,7 @@ class Joints(NamedTuple):
     """What a configuration says of the joints."""
 
     types: str  # one letter a joint, R or P
-    lower: FloatArray
-    upper: FloatArray  # lower, upper: (n,) limits, rad or m; infinite where none is set
-    speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
-    acceleration: FloatArray  # (n,) most in the profile joint, rad/s² or m/s²
+    limits: JointLimits  # infinite where none is set; accelerations of the profile joint alone
     units: tuple[str, ...]  # in which messages give readings: deg, rad or m
 
     def length_of(self, degrees: float) -> FloatArray:
@@ -51,13 +50,13 @@ class Joints(NamedTuple):
 
     def limit_passed(self, q: FloatArray) -> str:
         """Return which of the readings (n,), rad or m, lies beyond its limits, in words; empty for none."""
-        return limit_passed(q, self.lower, self.upper, self.units)
+        return limit_passed(q, self.limits, self.units)
 
 
-def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray, units: Sequence[str]) -> str:
+def limit_passed(q: FloatArray, limits: JointLimits, units: Sequence[str]) -> str:
     """Return which of the readings (n,), rad or m, lies beyond its limits, in its unit; empty for none."""
-    for i in np.flatnonzero((q < lower) | (q > upper)).tolist():
-        at, low, high = (in_unit(values[i], units[i]) for values in (q, lower, upper))
+    for i in np.flatnonzero((q < limits.lower) | (q > limits.upper)).tolist():
+        at, low, high = (in_unit(values[i], units[i]) for values in (q, limits.lower, limits.upper))
         return f"joint {i + 1} would be at {at}, beyond its limits {low} to {high}"
     return ""
 
@@ -77,7 +76,7 @@ def joints_of(config: Config, default_types: str = "", calibration: Calibration 
     turning = math.radians(c.joint_acceleration_limit_deg_s2 or _ACCELERATION_DEG_S2)
     sliding = c.prismatic_acceleration_limit_m_s2 or _ACCELERATION_M_S2
     acceleration = np.array([sliding if kind == "P" else turning for kind in types])
-    return Joints(types, lower, upper, speed, acceleration, units_of(vector, types))
+    return Joints(types, JointLimits(lower, upper, speed, acceleration), units_of(vector, types))
 
 
 def units_of(vector: JointVector | None, types: str) -> tuple[str, ...]:
@@ -254,12 +253,12 @@ def _robot_of(described: RobotSettings) -> Arm:
     """
     kinds = described.joint_types
     types = np.array([PRISMATIC if kind == "P" else REVOLUTE for kind in kinds], dtype=np.int64)
-    lower, upper = np.array(described.ranges, dtype=np.float64).T.copy()
+    limits = position_limits(*np.array(described.ranges, dtype=np.float64).T.copy())
     if described.screws is not None:
         screws = described.screws
         twists = np.array([_twist(joint.w, joint.v) for joint in screws.joints])
         q_reference = np.array(screws.reference.values(kinds))
-        return Arm(twists, types, q_reference, np.array(screws.base_tool), lower, upper)
+        return Arm(twists, types, q_reference, np.array(screws.base_tool), limits)
     assert described.dh is not None
     table, T, moved = described.dh, np.eye(4), []
     for joint in table.joints:
@@ -270,7 +269,7 @@ def _robot_of(described: RobotSettings) -> Arm:
         axis = _twist([0, 0, 0], [0, 0, 1]) if joint.type == "P" else _twist([0, 0, 1], [0, 0, 0])
         moved.append(T @ axis @ np.linalg.inv(T))
         T = T @ turn @ tilt
-    return Arm(np.array(moved), types, np.zeros(len(kinds)), T @ np.array(table.tool), lower, upper)
+    return Arm(np.array(moved), types, np.zeros(len(kinds)), T @ np.array(table.tool), limits)
 
 
 def _camera_of(camera: Camera) -> FloatArray:
@@ -301,14 +300,14 @@ def _inverse_kinematics(robot: Arm, goal: FloatArray, q_start: FloatArray) -> Fl
     solution with the least joint motion wins. goal : (4, 4) pose of the tool, m; q_start : (n,) rad or m.
     """
     rng = np.random.default_rng(0)
-    span_lower = np.maximum(robot.lower, q_start - 2 * math.pi)
-    span_upper = np.minimum(robot.upper, q_start + 2 * math.pi)
+    span_lower = np.maximum(robot.limits.lower, q_start - 2 * math.pi)
+    span_upper = np.minimum(robot.limits.upper, q_start + 2 * math.pi)
     found = []
     for trial in range(31):
         q = _newton(robot, goal, q_start if trial == 0 else rng.uniform(span_lower, span_upper))
         if q is not None:
             q = _unwind(robot, q, q_start)
-            if np.all(q >= robot.lower) and np.all(q <= robot.upper):
+            if np.all(q >= robot.limits.lower) and np.all(q <= robot.limits.upper):
                 found.append(q)
     if not found:
         x, y, z = goal[:3, 3]
@@ -347,7 +346,7 @@ def _unwind(robot: Arm, q: FloatArray, near: FloatArray) -> FloatArray:
         if kind == PRISMATIC:
             continue
         candidates = q[i] + 2 * math.pi * np.arange(-4, 5)
-        inside = candidates[(candidates >= robot.lower[i]) & (candidates <= robot.upper[i])]
+        inside = candidates[(candidates >= robot.limits.lower[i]) & (candidates <= robot.limits.upper[i])]
         if len(inside):
             turned[i] = inside[np.argmin(np.abs(inside - near[i]))]
     return turned

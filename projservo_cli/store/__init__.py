@@ -1,4 +1,4 @@
-"""The run file: all results of an experiment, one group each, with its records in it or in subgroups.
+"""Run file (HDF5): all that an experiment made, one group a result, with the records in it or in subgroups.
 
 Only this package opens HDF5. The groups are ``calibrate``, ``plan``, ``servo/<law>`` and ``report``. Arrays
 are netCDF-4 variables, by h5netcdf; scalars and texts are attributes of their group. Files are written as a

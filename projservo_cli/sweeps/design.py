@@ -40,8 +40,8 @@ def random_tasks(
     q_front : (n,) joints at which the cameras see the front of the face, rad or m.
     Returns joints (count, n) at start and goal, rad or m.
     """
-    robot = truth.robot
-    middle, half = 0.5 * (robot.lower + robot.upper), 0.5 * RANGE * (robot.upper - robot.lower)
+    limits = truth.robot.limits
+    middle, half = 0.5 * (limits.lower + limits.upper), 0.5 * RANGE * (limits.upper - limits.lower)
     if not np.isfinite(half).all():
         raise InputError("random tasks need joint limits: set limits of every joint of the robot")
     front = math.copysign(1.0, float(_cosines(truth, _poses(truth, q_front[None]))[0, 0]))

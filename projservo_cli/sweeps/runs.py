@@ -215,15 +215,15 @@ TOGETHER = 16
 def _numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
     """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone."""
     setting = Setting(
-        CODES[law],
-        scenario.model,
-        scenario.believed_by(law),
-        scenario.exact.body,
-        law in BODY_LAWS,
-        scenario.config.trajectory.rehearses,
-        scenario.gains,
-        Course(scenario.plant_of(law), scenario.limits, scenario.exact.q_start),
-        scenario.true_ends,
+        code=CODES[law],
+        model=scenario.model,
+        believed=scenario.believed_by(law),
+        body=scenario.exact.body,
+        shares_task=law in BODY_LAWS,
+        rehearse=scenario.config.trajectory.rehearses,
+        gains=scenario.gains,
+        course=Course(scenario.plant_of(law), scenario.limits, scenario.exact.q_start),
+        ends=scenario.true_ends,
     )
     trials = Trials(setting, len(scenario.numbers))
     found = np.empty((len(seeds), len(NUMBERS)))

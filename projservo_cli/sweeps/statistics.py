@@ -1,4 +1,4 @@
-"""Statistics of a sweep: how often runs succeed, how they end, and laws compared on the same tasks."""
+"""Statistics of a sweep: success rates with Wilson intervals, verdicts, laws compared on the same tasks."""
 
 import json
 import math

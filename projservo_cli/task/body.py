@@ -1,4 +1,4 @@
-"""Measurement of the body that the face belongs to, from all its markers together.
+"""Pose of the rigid body that the face belongs to, from all its markers.
 
 The calibration gives the structure of the markers and the displacements that the robot can make. One
 displacement of six coordinates remains, estimated from all markers that either camera sees.

@@ -1,4 +1,4 @@
-"""Construction of the task that laws get: by the face, by all markers of the body, with a plan to follow."""
+"""Target of a law: its task by the face, by all markers of the body, and with a plan to follow."""
 
 import math
 from typing import NamedTuple

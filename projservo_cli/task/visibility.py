@@ -1,4 +1,4 @@
-"""Visibility of the face in each camera, and the sense of rotations that preserves it: [RH00] section 4.2.
+"""Visibility of the face (self-occlusion), and the sense in which to turn it: [RH00] section 4.2.
 
 The margin of a camera is a·O, with H⁻ᵀ moving the face; it changes sign exactly where the camera loses or
 gains sight of the face. Signs are relative to the face at the start.

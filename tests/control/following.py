@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from projservo_cli.planning.margins import limits_alone
-from projservo_cli.records import NO_LENS
+from projservo_cli.records import NO_LENS, JointLimits
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.task.target import TaskImages, followed
 from tests.known import asked
@@ -18,7 +18,7 @@ def planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0):
     """Plan of a scene in the frame of its model, at a joint-speed limit."""
     model = sc.seen(G)
     n = len(sc.q_start)
-    demands = limits_alone(np.full(n, -9.0), np.full(n, 9.0))._replace(speed=np.full(n, speed))
+    demands = limits_alone(JointLimits(np.full(n, -9.0), np.full(n, 9.0), *np.full((2, n), speed)))
     shown = TaskImages(sc.q_start, sc.s_start, sc.s_star, sc.plant.center)
     motion = asked(profile, duration=duration, ramp=ramp)
     return plan_task(model._replace(lens=NO_LENS), shown, motion, demands)

@@ -1,17 +1,16 @@
 """The fenced blocks of a page of Markdown, and running them as a reader would."""
 
-import importlib
 import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-import pytest
-
 from projservo_cli import cli
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
+PAGES = {page.stem: page for page in sorted(DOCS.rglob("*.md")) if page.stem != "index"}
+INDEXES = sorted(DOCS.rglob("index.md"))
 FENCE = re.compile(
     r"(?:^<!-- not run: (?P<excuse>[^\n]*) -->\n)?"
     r"^```(?P<info>[^\n`]*)\n(?P<body>.*?)^```$",
@@ -35,13 +34,6 @@ class Block:
     file: str  # name of the file it shows, empty for none
     excuse: str  # why it cannot be run, empty where it can
     follows: bool  # whether nothing but an empty line is between it and the block before
-
-
-def imported(*names):
-    """Extensions that the documentation is built with, as modules."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(DOCS))
-        return [importlib.import_module(f"extensions.{name}") for name in names]
 
 
 def blocks_of(page):

@@ -1,11 +1,12 @@
 """Formulas of the documentation as browsers get them."""
 
+import importlib
 import re
 import xml.etree.ElementTree as ET
 
 import pytest
 
-from tests.documentation.blocks import DOCS, imported
+from tests.documentation.blocks import PAGES
 
 FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$\n]+?)\$", re.S)
 ACCENTS = {"ˆ", "˙", "‾", "¯"}
@@ -14,8 +15,7 @@ ACCENTS = {"ˆ", "˙", "‾", "¯"}
 @pytest.fixture(scope="module")
 def mathml():
     pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install '.[docs]'")
-    (module,) = imported("mathml")
-    return module
+    return importlib.import_module("docs.extensions.mathml")
 
 
 def tree(mathml, tex):
@@ -25,8 +25,8 @@ def tree(mathml, tex):
 
 
 def formulas():
-    for page in ("mathematics.md", "law.md"):
-        text = re.sub(r"```.*?```", "", (DOCS / page).read_text(encoding="utf-8"), flags=re.S)
+    for page in ("mathematics", "laws", "planning"):
+        text = re.sub(r"```.*?```", "", PAGES[page].read_text(encoding="utf-8"), flags=re.S)
         yield from (display or inline for display, inline in FORMULA.findall(text))
 
 

@@ -46,7 +46,9 @@ def test_arrays_that_another_run_left_are_as_good_as_new(law, rng):
     fresh = Run(sc, law, bounds=bounds._replace(lost_steps=5), noise=noise)
     used = Run(sc, law, bounds=bounds, noise=7.0 * rng.normal(size=noise.shape))
     reset(used.state)
-    built_in = Law(CODES[law], sc.model, sc.task(None), GAINS._replace(speed=bounds.speed))
+    built_in = Law(
+        CODES[law], sc.model, sc.task(None), GAINS._replace(limits=GAINS.limits._replace(speed=bounds.speed))
+    )
     course = Course(sc.plant, bounds._replace(lost_steps=5), sc.q_start.copy())
     verdict, steps = run_compiled(built_in, course, noise, used.state, used.full)
     assert (verdict, steps) == (fresh.code, fresh.steps)
@@ -129,9 +131,9 @@ def test_left_image():
 def test_joint_limit():
     """Stopped at it, the last step shortened, or only recorded with the joint that passed."""
     sc = scene()
-    upper = sc.plant.upper.copy()
+    upper = sc.plant.limits.upper.copy()
     upper[2] = sc.q_start[2] + 0.5 * STEP[2]
-    sc = sc._replace(plant=sc.plant._replace(upper=upper))
+    sc = sc._replace(plant=sc.plant._replace(limits=sc.plant.limits._replace(upper=upper)))
     told = Run(sc, "direct_three")
     assert told.verdict == "converged"
     first = int(np.argmax(told.log.q[:, 2] > upper[2]))

@@ -16,10 +16,10 @@ STOP = {"stop_at_joint_limit": True}
 def narrowed(share=0.5, joint=2):
     """Scene with a joint limited at a share of its way, and gains that know the limits."""
     sc = scene()
-    upper = sc.plant.upper.copy()
+    upper = sc.plant.limits.upper.copy()
     upper[joint] = sc.q_start[joint] + share * STEP[joint]
-    sc = sc._replace(plant=sc.plant._replace(upper=upper))
-    return sc, GAINS._replace(lower=sc.plant.lower, upper=upper)
+    sc = sc._replace(plant=sc.plant._replace(limits=sc.plant.limits._replace(upper=upper)))
+    return sc, GAINS._replace(limits=GAINS.limits._replace(lower=sc.plant.limits.lower, upper=upper))
 
 
 def off_line(center):
@@ -36,7 +36,7 @@ def test_exact_goes_along_its_path_to_the_limit(share):
     stopped = Run(sc, "exact", gains, limits(**STOP))
     assert stopped.verdict == "joint limit"
     assert stopped.log.events[1:3].tolist() == [-1, 2]
-    assert 0 <= sc.plant.upper[2] - stopped.log.q[-1, 2] < 1e-9
+    assert 0 <= sc.plant.limits.upper[2] - stopped.log.q[-1, 2] < 1e-9
     assert off_line(stopped.center).max() < 1e-10
     # What is left is what the law measures there: the task was not finished, the face moved on the way.
     first, last = stopped.log.errors[0], stopped.log.errors[-1]
@@ -57,7 +57,7 @@ def test_both_loops_end_at_the_limit_alike(law, sigma, rng):
     code, steps, log = in_python(sc, law, bounds, noise, gains=gains)
     assert (VERDICTS[code], steps) == (compiled.verdict, compiled.steps)
     assert compiled.verdict == "joint limit"
-    assert (log.q[: steps + 1] <= sc.plant.upper).all()
+    assert (log.q[: steps + 1] <= sc.plant.limits.upper).all()
     same_logs(log, compiled.full, steps)
 
 
@@ -67,7 +67,7 @@ def test_a_scaled_run_stops_at_the_limit_too():
     plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((401, 2, 4, 2)))
     code, _, _ = run_in_python(built_in, plant, sc.s_star, GAINS.period, limits(**STOP), 0.25)
     assert VERDICTS[code] == "joint limit"
-    assert 0 <= sc.plant.upper[2] - plant.q[2] < 1e-5
+    assert 0 <= sc.plant.limits.upper[2] - plant.q[2] < 1e-5
 
 
 def test_limits_beside_the_path_change_nothing():
@@ -77,7 +77,7 @@ def test_limits_beside_the_path_change_nothing():
     assert (beside.verdict, beside.steps) == ("converged", free.steps)
     np.testing.assert_array_equal(beside.log.q, free.log.q)
     # Nor does the limit that a joint begins beyond and returns from.
-    lower = sc.plant.lower.copy()
+    lower = sc.plant.limits.lower.copy()
     lower[2] = sc.q_start[2] + 0.1 * STEP[2]
-    returning = Run(sc, "exact", gains._replace(lower=lower), limits(**STOP))
+    returning = Run(sc, "exact", gains._replace(limits=gains.limits._replace(lower=lower)), limits(**STOP))
     np.testing.assert_array_equal(returning.log.q, free.log.q)

@@ -22,7 +22,9 @@ SPEED = np.full(6, 0.5)
 def in_python(sc, law, bounds, noise, G=None, task=None, gains=GAINS):
     plant = AnalyticPlant(sc.plant, sc.q_start, noise)
     task = sc.task(G) if task is None else task
-    built_in = BuiltInLaw(CODES[law], sc.seen(G), task, gains._replace(speed=bounds.speed))
+    built_in = BuiltInLaw(
+        CODES[law], sc.seen(G), task, gains._replace(limits=gains.limits._replace(speed=bounds.speed))
+    )
     return run_in_python(built_in, plant, sc.s_star, GAINS.period, bounds)
 
 
@@ -99,9 +101,13 @@ BOUNDS = [
 def test_both_loops_end_alike(bounds):
     """The other verdicts: converged, diverged, max steps, plateau, joint limit, left image."""
     sc = scene()
-    upper = sc.plant.upper.copy()
+    upper = sc.plant.limits.upper.copy()
     upper[2] = sc.q_start[2] + 0.5 * STEP[2]
-    sc = sc._replace(plant=sc.plant._replace(upper=upper, image_size=np.array([1280.0, 700.0])))
+    sc = sc._replace(
+        plant=sc.plant._replace(
+            limits=sc.plant.limits._replace(upper=upper), image_size=np.array([1280.0, 700.0])
+        )
+    )
     bounds = limits(**{"max_steps": 60, **bounds})
     noise = np.zeros((bounds.max_steps + 1, 2, 4, 2))
     compiled = Run(sc, "direct_three", bounds=bounds, noise=noise)

@@ -7,12 +7,13 @@ import pytest
 
 from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import CONVERGED, NOT_FOLLOWING, PLATEAU, RUNNING, WAITING, new_log
+from projservo_cli.records import JointLimits
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.latency import NOTHING_KNOWN
 from tests.scene import limits
 
 PERIOD, TICK = 0.1, 1.5e-3
-BOUNDS = Bounds(*np.zeros((4, 2)), PERIOD, 0.15, np.full(2, 0.017), ("rad", "deg"))
+BOUNDS = Bounds(JointLimits(*np.zeros((4, 2))), np.zeros(2), PERIOD, 0.15, np.full(2, 0.017), ("rad", "deg"))
 LIMITS = limits(2, image_px=1.0, max_steps=1000)
 
 

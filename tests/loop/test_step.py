@@ -28,6 +28,7 @@ from projservo_cli.loop.step import (
     note,
     verdict_at,
 )
+from projservo_cli.records import position_limits
 from tests.scene import limits, scene
 
 # Each verdict with what brings it about, in the order of precedence.
@@ -137,7 +138,9 @@ def test_speed_is_limited_by_uniform_scaling(rng):
 
 
 def test_a_step_is_shortened_to_the_first_limit():
-    plant = scene().plant._replace(lower=np.array([-1.0, -2.0, -np.inf]), upper=np.array([1.0, 2.0, np.inf]))
+    plant = scene().plant._replace(
+        limits=position_limits(np.array([-1.0, -2.0, -np.inf]), np.array([1.0, 2.0, np.inf]))
+    )
     stop = {"plant": plant, "stop_at_joint_limit": True}
     code, factor, dq = command([0.5, -1.0, 40.0], [0.8, 0.0, 0.0], **stop)
     assert (code, factor) == (RUNNING, 1.0)

@@ -19,7 +19,7 @@ from projservo_cli.calibration.prediction import (
     parameters_from,
 )
 from projservo_cli.monitoring import statistics
-from projservo_cli.monitoring.frame_pairs import Look
+from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW, ErrorModel, Memory
 from projservo_cli.stages import calibrate
@@ -313,7 +313,7 @@ def test_a_look_with_sightings_aside_is_not_kept_where_it_moves_the_calibration_
         q = np.repeat(arm.way(k)[0][-1:], 2, axis=0)
         s = noisy(arm.images(at_once(q[:1])), k)[0] + pulled
         noise = np.full((2, len(arm.scene.M)), SIGMA)
-        look = Look(np.full(2, PERIOD * k), q, still, np.zeros(2), s, noise, np.zeros(6))
+        look = FramePair(np.full(2, PERIOD * k), q, still, np.zeros(2), s, noise, np.zeros(6))
         memory.keep(errors.residual(look), PERIOD * k, whole)
         assert memory.views == views
 

@@ -24,7 +24,6 @@ class Case(NamedTuple):
     q_goal: object
     c: Constraints
     aim: GoalFeatures
-    acceleration: object
 
 
 @lru_cache(maxsize=8)
@@ -42,8 +41,9 @@ def case(name, k):
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
     task = TaskImages(q_start, s_start, s_star, truth.center).task(truth.model)
     A = truth.M_face @ truth.displacement(q_start).T
-    speed = np.where(np.isfinite(joints.speed), joints.speed, 1.0)
+    speed = np.where(np.isfinite(joints.limits.speed), joints.limits.speed, 1.0)
     keep = np.array([0.002 if kind == "P" else np.radians(1.0) for kind in joints.types])
-    demands = Demands(joints.lower, joints.upper, speed, truth.image_size, 5.0, 0.0, keep, 8.0)
+    limits = joints.limits._replace(speed=speed)
+    demands = Demands(limits, truth.image_size, 5.0, 0.0, keep, 8.0)
     c = constraints_of(truth.model, A, task, q_start, demands)
-    return Case(truth, q_start, q_goal, c, GoalFeatures(task.A_star, s_star, 0.0), joints.acceleration)
+    return Case(truth, q_start, q_goal, c, GoalFeatures(task.A_star, s_star, 0.0))

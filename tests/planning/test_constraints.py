@@ -27,7 +27,7 @@ def test_signs_are_those_of_the_metric_truth(name):
 
     start, _ = sides(found.q_start)
     signs = set()
-    for q in rng.uniform(c.lower, c.upper, (200, len(c.lower))):
+    for q in rng.uniform(c.limits.lower, c.limits.upper, (200, len(c.limits.lower))):
         margins, s = margins_at(c, q)
         side, depth = sides(q)
         np.testing.assert_array_equal(margins[VISIBILITY : VISIBILITY + 2] > 0.0, side * start > 0.0)
@@ -37,7 +37,7 @@ def test_signs_are_those_of_the_metric_truth(name):
             inside = np.minimum(s + 0.5, truth.image_size - 0.5 - s).min(axis=(1, 2))
             np.testing.assert_allclose(margins[IMAGE : IMAGE + 2], inside, atol=1e-6)
         signs.add((*(margins[VISIBILITY : VISIBILITY + 2] > 0.0), *(depth > 0.0)))
-        nearest = np.minimum(q - c.lower, c.upper - q) / c.keep
+        nearest = np.minimum(q - c.limits.lower, c.limits.upper - q) / c.keep
         assert margins[JOINTS] == pytest.approx(nearest.min())
     assert len(signs) > 3
 

@@ -14,7 +14,7 @@ def goals_in(found, seed=0):
     """Goals of a case, their rank, and what was counted."""
     c, n = found.c, len(found.q_start)
     draws = np.random.default_rng(seed).random((400, n))
-    starts = np.vstack([found.q_start, c.lower + (c.upper - c.lower) * draws])
+    starts = np.vstack([found.q_start, c.limits.lower + (c.limits.upper - c.limits.lower) * draws])
     return goals_of(c, found.aim, found.q_start, NONE[:, :n], starts)
 
 
@@ -30,9 +30,9 @@ def test_every_goal_shows_the_goal_within_the_limits(name, k):
     for q in goals[times < UNSURE]:  # others may have been brought to the limit they lie beyond
         assert np.abs(truth.images(q, truth.M_face) - found.aim.s_star).max() < 1e-4
     for q in goals:
-        assert ((q >= found.c.lower) & (q <= found.c.upper)).all()
+        assert ((q >= found.c.limits.lower) & (q <= found.c.limits.upper)).all()
     assert (np.diff(times) >= 0.0).all()
-    wanted = (np.abs(goals - found.q_start) / found.c.speed).max(axis=1)
+    wanted = (np.abs(goals - found.q_start) / found.c.limits.speed).max(axis=1)
     np.testing.assert_allclose(times[times < UNSURE], wanted[times < UNSURE])
     apart = np.abs(goals[:, None] - goals[None]).max(axis=2) + 9.0 * np.eye(len(goals))
     assert apart.min() > np.radians(1.0)
@@ -62,7 +62,7 @@ def test_turns_are_goals_of_their_own():
 
 def test_joints_that_turn_often_have_no_more_goals_than_are_near():
     found = case("ur5", 1)
-    often = found.c._replace(lower=np.full(6, -1e4), upper=np.full(6, 1e4))
+    often = found.c._replace(limits=found.c.limits._replace(lower=np.full(6, -1e4), upper=np.full(6, 1e4)))
     starts = np.vstack([found.q_start, found.q_goal])
     goals, rank, (solutions, *_) = goals_of(often, found.aim, found.q_start, NONE[:, :6], starts)
     assert len(goals) == 5**6 * solutions
@@ -73,17 +73,17 @@ def test_joints_that_turn_often_have_no_more_goals_than_are_near():
 def test_few_are_the_nearest_of_many():
     found = case("ur5", 2)
     many, times, _ = goals_in(found)
-    way = find_path(
-        found.c, found.aim, found.q_start, NONE[:, :6], SearchLimits(max_goals=5), found.acceleration
-    )
+    way = find_path(found.c, found.aim, found.q_start, NONE[:, :6], SearchLimits(max_goals=5))
     assert way.n_goals == len(many)
-    np.testing.assert_allclose(times[:5], (np.abs(way.goals - found.q_start) / found.c.speed).max(axis=1))
+    fastest = np.abs(way.goals - found.q_start) / found.c.limits.speed
+    np.testing.assert_allclose(times[:5], fastest.max(axis=1))
 
 
 def test_a_goal_beyond_the_limits_is_told():
     found = case("paper", 0)
     # Limits around the start that none of the solutions lies within.
-    c = found.c._replace(lower=found.q_start - 1e-3, upper=found.q_start + 1e-3)
-    way = find_path(c, found.aim, found.q_start, NONE[:, :6], SearchLimits(), found.acceleration)
+    near = found.c.limits._replace(lower=found.q_start - 1e-3, upper=found.q_start + 1e-3)
+    c = found.c._replace(limits=near)
+    way = find_path(c, found.aim, found.q_start, NONE[:, :6], SearchLimits())
     assert len(way.goals) == len(way.corners) == way.n_goals == 0
     assert way.solutions == way.hidden > 0

@@ -102,7 +102,7 @@ def test_no_marker_enters_a_box_that_stands_on_the_straight_way():
     for k in range(COUNT):
         found = case("paper", k)
         nothing = np.empty((0, 6))
-        free = find_path(found.c, found.aim, found.q_start, nothing, SearchLimits(), found.acceleration)
+        free = find_path(found.c, found.aim, found.q_start, nothing, SearchLimits())
         middle, (left, right) = box_of(
             found, joints_at(free.timing, np.array([0.5 * free.timing.time[-1]]))[0], 0.02
         )
@@ -113,7 +113,7 @@ def test_no_marker_enters_a_box_that_stands_on_the_straight_way():
         ):
             continue
         tried += 1
-        way = find_path(c, found.aim, found.q_start, nothing, SearchLimits(), found.acceleration)
+        way = find_path(c, found.aim, found.q_start, nothing, SearchLimits())
         if len(way.corners) == 0:
             continue
         around += 1
@@ -131,20 +131,20 @@ def test_a_region_of_one_image_bars_that_image():
     nothing = np.empty((0, 6))
     everywhere = np.array([[-1e4, -1e4], [1e4, -1e4], [1e4, 1e4], [-1e4, 1e4]])
     c = found.c._replace(keep_out=keep_out_of([(everywhere, None, True)]))
-    way = find_path(c, found.aim, found.q_start, nothing, SearchLimits(max_samples=200), found.acceleration)
+    way = find_path(c, found.aim, found.q_start, nothing, SearchLimits(max_samples=200))
     assert len(way.corners) == 0
     assert reason_of(way) == "the start is already within region 1"
     around = found.aim.s_star[0, 1] + [[-3.0, -3.0], [3.0, -3.0], [0.0, 5.0]]
     c = found.c._replace(keep_out=keep_out_of([(around, None, True)]))
-    way = find_path(c, found.aim, found.q_start, nothing, SearchLimits(max_samples=200), found.acceleration)
+    way = find_path(c, found.aim, found.q_start, nothing, SearchLimits(max_samples=200))
     assert way.solutions == way.hidden + way.blocked
     assert f"and {way.blocked} within a region that is kept out of" in reason_of(way)
 
 
 @pytest.fixture(scope="module")
 def drawn():
-    """The paper's task with the region of the page Guidance, in a profile, and its plan."""
-    page = (ROOT / "docs" / "guidance.md").read_text(encoding="utf-8")
+    """The paper's task with the region of the page on obstacles, in a profile, and its plan."""
+    page = (ROOT / "docs" / "how-to" / "keep-out-of-obstacles.md").read_text(encoding="utf-8")
     block = next(block for block in page.split("```text\n") if block.startswith("trajectory:"))
     region = yaml.safe_load(block.split("```")[0])["trajectory"]["keep_out"]
     calibration = calibrate.run(configured("paper"))[1]

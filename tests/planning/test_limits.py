@@ -49,15 +49,16 @@ def test_limits_from_data_are_what_they_cover_widened_by_a_share_of_it(mine):
     config, calibration = mine("robot.limits.from_data=0.1")
     low, high = REFERENCE - np.radians(30.0), REFERENCE + np.radians(30.0)
     scenario = scenario_of(config, calibration)
-    np.testing.assert_allclose(scenario.joints.lower, low - np.radians(6.0), atol=1e-6)
-    np.testing.assert_allclose(scenario.joints.upper, high + np.radians(6.0), atol=1e-6)
-    np.testing.assert_array_equal(scenario.gains.lower, scenario.joints.lower)  # which laws never pass
+    np.testing.assert_allclose(scenario.joints.limits.lower, low - np.radians(6.0), atol=1e-6)
+    np.testing.assert_allclose(scenario.joints.limits.upper, high + np.radians(6.0), atol=1e-6)
+    # Laws never pass them.
+    np.testing.assert_array_equal(scenario.gains.limits.lower, scenario.joints.limits.lower)
     np.testing.assert_array_equal(
         read_table(config.data.table, "RRRRRR", "rad").q.min(axis=0), calibration.lowest
     )
     found = plan.run(load_joint(config), calibration)
     assert found.feasible, found.reason
-    assert ((found.q > scenario.joints.lower) & (found.q < scenario.joints.upper)).all()
+    assert ((found.q > scenario.joints.limits.lower) & (found.q < scenario.joints.limits.upper)).all()
 
 
 def load_joint(config):
@@ -68,7 +69,7 @@ def load_joint(config):
 def test_limits_from_a_list(mine):
     pairs = "[[0, 360], [-180, 0], [-180, 0], [-90, 90], [0, 180], [0, 360]]"
     config, calibration = mine(f"robot.limits={{joints: {pairs}, unit: deg}}", "trajectory.profile=joint")
-    lower = scenario_of(config, calibration).joints.lower
+    lower = scenario_of(config, calibration).joints.limits.lower
     np.testing.assert_allclose(lower, np.radians([0, -180, -180, -90, 0, 0]))
     found = plan.run(config, calibration)
     assert found.feasible

@@ -16,6 +16,7 @@ from projservo_cli.planning.margins import (
 )
 from projservo_cli.planning.product_space import shortest, widest
 from projservo_cli.planning.time_parameterization import least_time
+from projservo_cli.records import position_limits
 from tests.planning.cases import reaching_of
 from tests.samples import frame, in_frame, pixels, poe
 from tests.stages.cases import case
@@ -66,7 +67,7 @@ def test_a_marker_behind_a_camera_is_as_far_outside_as_can_be():
 
 
 def test_margin_of_joint_limits():
-    demands = limits_alone(np.array([-1.0, -np.inf]), np.array([3.0, np.inf]))
+    demands = limits_alone(position_limits(np.array([-1.0, -np.inf]), np.array([3.0, np.inf])))
     for q_0, wanted in ((1.0, 1.0), (2.0, 0.5), (-1.5, -0.25)):
         q = np.array([q_0, 99.0])
         assert [joint_margin(demands, q, i) for i in range(2)] == [wanted, 1.0]

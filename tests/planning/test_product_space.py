@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.planning.product_space import plan_path
-from projservo_cli.records import InputError
+from projservo_cli.records import InputError, position_limits
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.studies import projective_twin
 from projservo_cli.stages.world import truth_of
@@ -67,7 +67,7 @@ def test_a_planned_motion_keeps_what_it_says(name):
     assert (np.diff(plan.mu, axis=0) >= -1e-15).all()
     np.testing.assert_array_equal(plan.mu[[0, -1]], [[0, 0, 0], [1, 1, 1]])
     robot = example.truth.robot
-    assert ((plan.q > robot.lower) & (plan.q < robot.upper)).all()
+    assert ((plan.q > robot.limits.lower) & (plan.q < robot.limits.upper)).all()
     start = np.linalg.inv(poe(example.truth.model, plan.q_start))
     M = np.array([plan.A @ (poe(example.truth.model, q) @ start).T for q in plan.q])
     s = np.stack([pixels(example.truth.P, points) for points in M])
@@ -132,11 +132,11 @@ def test_what_makes_a_task_infeasible_is_named():
     assert plan.constraint == "image"
     assert "470 px asked for" in plan.reason
     assert "mu_t" in plan.reason
-    upper = example.truth.robot.upper.copy()
+    upper = example.truth.robot.limits.upper.copy()
     upper[0] = example.ends.q_start[0] + 0.01
-    lower = example.truth.robot.lower.copy()
+    lower = example.truth.robot.limits.lower.copy()
     lower[0] = example.ends.q_start[0] - 0.01
-    plan = constrained("paper", lower=lower, upper=upper)
+    plan = constrained("paper", limits=position_limits(lower, upper))
     assert not plan.feasible
     assert plan.constraint == "joints"
     assert "joint 1 is at" in plan.reason
@@ -183,8 +183,8 @@ def test_random_tasks_stay_in_sight_wherever_a_grid_search_finds_a_way(arm):
 
 def test_random_tasks_are_what_they_say():
     _, truth, tasks = tasks_of("ur5", 12, 3)
-    half = 0.5 * (truth.robot.upper - truth.robot.lower)
-    middle = 0.5 * (truth.robot.upper + truth.robot.lower)
+    half = 0.5 * (truth.robot.limits.upper - truth.robot.limits.lower)
+    middle = 0.5 * (truth.robot.limits.upper + truth.robot.limits.lower)
     strata = []
     for ends in zip(*tasks, strict=True):
         R_start, R_goal = (poe(truth.model, q)[:3, :3] for q in ends)
@@ -207,6 +207,8 @@ def test_random_tasks_are_what_they_say():
 
 def test_random_tasks_need_limits():
     _, truth, _ = tasks_of("ur5", 6, 1)
-    endless = replace(truth, robot=truth.robot._replace(upper=np.full(6, np.inf)))
+    endless = replace(
+        truth, robot=truth.robot._replace(limits=truth.robot.limits._replace(upper=np.full(6, np.inf)))
+    )
     with pytest.raises(InputError, match="joint limits"):
         random_tasks(endless, np.zeros(6), 6, np.random.default_rng(0))

@@ -79,7 +79,8 @@ def test_the_tag_that_counts_is_the_best_of_all_tried_one_by_one():
 def limited(made):
     """What the motion keeps to, where joints other than the fourth hardly move."""
     ends = np.radians([START, GOAL])
-    return made.demands._replace(lower=ends.min(axis=0) - 0.03, upper=ends.max(axis=0) + 0.03)
+    limits = made.demands.limits._replace(lower=ends.min(axis=0) - 0.03, upper=ends.max(axis=0) + 0.03)
+    return made.demands._replace(limits=limits)
 
 
 def test_a_motion_of_the_paper_is_judged_by_the_best_tag():

@@ -23,7 +23,7 @@ class Sound:
     def __init__(self, config, noise_px=0.5):
         CALLS.clear()
         self.world = truth_of(load_config(config))
-        self.q = self.world.robot.lower * 0 + [3.66, -1.68, -1.85, 0.28, 1.16, 3.53]
+        self.q = self.world.robot.limits.lower * 0 + [3.66, -1.68, -1.85, 0.28, 1.16, 3.53]
         self.noise_px, self.random = noise_px, np.random.default_rng(5)
         self.count, self.time = 0, 0.0
 

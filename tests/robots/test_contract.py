@@ -1,4 +1,4 @@
-"""One contract for all robots: those of README and documentation, and simulated ones with faults."""
+"""One contract for all robots: those of the documentation, and simulated ones with faults."""
 
 import importlib
 import sys
@@ -13,8 +13,8 @@ from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages.external_robot import bounds_of, way_to
 from projservo_cli.stages.simulation import robot_by_itself
 from projservo_cli.stages.world import joints_of, truth_of
-from tests.documentation.blocks import DOCS, ROOT, blocks_of
-from tests.documentation.test_pages import put_robot
+from tests.documentation.blocks import PAGES, ROOT, blocks_of
+from tests.documentation.test_pages import put_truth
 from tests.robots.robots import Sound
 
 CONFIG = ROOT / "configs" / "ur5.yaml"
@@ -40,8 +40,8 @@ def robot(request, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
-    put_robot(tmp_path)
-    for block in blocks_of(DOCS / "robot.md"):
+    put_truth(tmp_path)
+    for block in blocks_of(PAGES["robot-class"]):
         if block.file:
             (tmp_path / block.file).write_text(block.text)
     for module in ("drives", *DOCUMENTED):

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from projservo_cli.records import WorkFailed
+from projservo_cli.records import JointLimits, WorkFailed
 from projservo_cli.robots import contract
 from projservo_cli.robots.contract import Bounds, ForeignRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
@@ -18,7 +18,12 @@ from projservo_cli.stages.external_robot import way_to
 
 PERIOD = 0.04
 BOUNDS = Bounds(
-    np.full(2, -1.0), np.ones(2), np.ones(2), np.full(2, 0.3), PERIOD, 0.15, np.full(2, 1e-3), ("rad",) * 2
+    JointLimits(np.full(2, -1.0), *np.ones((3, 2))),
+    np.full(2, 0.3),
+    PERIOD,
+    0.15,
+    np.full(2, 1e-3),
+    ("rad",) * 2,
 )
 
 

@@ -5,12 +5,15 @@ import math
 import numpy as np
 import pytest
 
+from projservo_cli.records import JointLimits
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.pacing import SetPoint
 
 PERIOD = 0.04
 SAG = np.full(2, math.radians(1.0))
-BOUNDS = Bounds(np.full(2, -1.5), np.full(2, 1.5), np.full(2, 2.0), np.full(2, 0.4), PERIOD, 0.15, SAG)
+BOUNDS = Bounds(
+    JointLimits(np.full(2, -1.5), np.full(2, 1.5), *np.full((2, 2), 2.0)), np.full(2, 0.4), PERIOD, 0.15, SAG
+)
 
 
 def test_an_arm_that_follows_rests_where_it_is_read_to_the_bit():

@@ -217,7 +217,7 @@ def test_joint_limits_end_a_run_whatever_is_configured(calibrated):
     gains, limits = scenario.gains, scenario.limits
     assert limits.stop_at_joint_limit
     assert limits.image_px == 0.01 + 2.0 * calibration.sigma_fitted_px
-    np.testing.assert_array_equal(gains.speed, np.full(6, np.radians(125.0)))
+    np.testing.assert_array_equal(gains.limits.speed, np.full(6, np.radians(125.0)))
 
 
 def test_a_robot_without_speed_limit_is_refused(servo):

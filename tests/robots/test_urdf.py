@@ -93,8 +93,8 @@ def test_a_urdf_moves_as_mujoco_has_it(tmp_path, rng):
     expected = poses(model, "tool", ["turn", "lift", "spin"], readings)
     assert np.array([arm.pose(q) for q in readings]) == pytest.approx(expected, abs=1e-12)
     assert config.joint_types == "RPR"
-    assert arm.lower.tolist() == [-2.0, -0.1, -math.inf]
-    assert arm.upper.tolist() == [1.5, 0.4, math.inf]
+    assert arm.limits.lower.tolist() == [-2.0, -0.1, -math.inf]
+    assert arm.limits.upper.tolist() == [1.5, 0.4, math.inf]
 
 
 def test_an_mjcf_moves_as_mujoco_has_it(tmp_path, rng):
@@ -107,7 +107,7 @@ def test_an_mjcf_moves_as_mujoco_has_it(tmp_path, rng):
     assert at_site.base_tool == pytest.approx(arm.base_tool @ displacement([0, 0, 0], [0, 0.1, 0]), abs=1e-12)
     assert config.joint_types == "RRP"
     assert arm.q_reference.tolist() == [0.2, 0.0, 0.0]
-    assert arm.lower.tolist() == [-1.0, -math.inf, -0.1]
+    assert arm.limits.lower.tolist() == [-1.0, -math.inf, -0.1]
 
 
 @pytest.mark.parametrize(

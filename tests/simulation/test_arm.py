@@ -69,7 +69,7 @@ def test_dh_tables_of_both_conventions(convention, rng):
     for q in (np.zeros(6), *rng.uniform(-2, 2, (5, 6))):
         assert robot.pose(q) == pytest.approx(chain(q, convention == "modified"), abs=1e-13)
     assert robot.joint_types.tolist() == [0, 0, 1, 0, 0, 0]
-    assert robot.lower == pytest.approx([*np.radians([-3, -3]), -3, *np.radians([-3, -3, -3])])
+    assert robot.limits.lower == pytest.approx([*np.radians([-3, -3]), -3, *np.radians([-3, -3, -3])])
 
 
 def test_puma_at_its_ready_pose():
@@ -123,5 +123,5 @@ def test_the_joints_of_a_goal_hold_the_tool_there(turn_deg):
     turn[:3, 3] = around - turn[:3, :3] @ around
     nudge = displacement(np.array(goal.perturbation.rotation_rad), goal.perturbation.translation_m)
     assert truth.robot.pose(q) == pytest.approx(turn @ truth.robot.pose(q_start) @ nudge, abs=1e-9)
-    assert (truth.robot.lower <= q).all()
-    assert (q <= truth.robot.upper).all()
+    assert (truth.robot.limits.lower <= q).all()
+    assert (q <= truth.robot.limits.upper).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.config.models import Disturbance
-from projservo_cli.records import REVOLUTE
+from projservo_cli.records import REVOLUTE, position_limits
 from projservo_cli.robots.simulated import Arm
 from projservo_cli.stages.simulation import FaultyRobot, Points, World, full_reach
 from projservo_cli.stages.world import Truth
@@ -28,7 +28,7 @@ def arm():
     twists = np.array([revolute([x, 0, 0], [0, 1, 0]) for x in (0.0, 0.4)])
     limits = np.full(2, math.pi)
     tool = displacement([0, 0, 0], [0.7, 0, 0])
-    return Arm(twists, np.full(2, REVOLUTE), np.zeros(2), tool, -limits, limits)
+    return Arm(twists, np.full(2, REVOLUTE), np.zeros(2), tool, position_limits(-limits, limits))
 
 
 def displaced(q):

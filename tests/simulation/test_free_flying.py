@@ -15,7 +15,7 @@ from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
 from projservo_cli.loop.step import VERDICTS, Limits
-from projservo_cli.records import REVOLUTE, Model
+from projservo_cli.records import REVOLUTE, Model, position_limits
 from projservo_cli.robots.simulated import METRIC_A_INF, AnalyticPlant, Plant
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 from projservo_cli.task.target import TaskImages
@@ -47,7 +47,9 @@ def free_flying_plant(P, M, center):
     O = optical_centers(P, METRIC_A_INF)
     side = np.sign(O @ np.array(face_plane(M, order, center_of(M, center))))
     endless = np.full(6, np.inf)
-    return Plant(model, M, order, center, O, side, np.full(2, np.inf), -endless, endless, False)
+    return Plant(
+        model, M, order, center, O, side, np.full(2, np.inf), position_limits(-endless, endless), False
+    )
 
 
 def task_of_reference(perturbation):

@@ -87,7 +87,7 @@ def test_the_better_of_both_senses_is_taken(name):
 
 def test_a_start_that_is_the_goal_is_a_plan_without_motion():
     example = case("ur5")
-    bounds = limits_alone(example.truth.robot.lower, example.truth.robot.upper)
+    bounds = limits_alone(example.truth.robot.limits)
     shown = example.ends._replace(s_star=example.ends.s_start)
     plan = plan_task(example.truth.model, shown, asked(samples=5), bounds)
     assert plan.tau == 0.0

@@ -233,7 +233,7 @@ def test_every_step_keeps_the_speed_limit_and_the_joint_limits():
     assert (np.abs(steps) <= limit * (1 + 1e-9)).all()
     assert recording.commands == len(steps)
     truth, path = robot.world.robot, np.array(robot.past)
-    assert ((path >= truth.lower - 1e-9) & (path <= truth.upper + 1e-9)).all()
+    assert ((path >= truth.limits.lower - 1e-9) & (path <= truth.limits.upper + 1e-9)).all()
     # each leg takes the least number of commands, one more for rounding, and half a second to stand still
     ways = np.vstack([robot.past[:1], recording.targets])
     legs = np.ceil(np.abs(np.diff(ways, axis=0)) / limit - 1e-9).max(axis=1)

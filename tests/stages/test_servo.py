@@ -73,7 +73,7 @@ def test_joint_limit_stops_where_it_is_told_to():
     assert trace.steps == passed.first_beyond_limit
     assert trace.limit_joint == passed.limit_joint
     assert f"joint {trace.limit_joint + 1}" in trace.reason
-    bounds = example.plant.lower, example.plant.upper
+    bounds = example.plant.limits.lower, example.plant.limits.upper
     assert np.abs(np.subtract(bounds, trace.q[-1]))[:, trace.limit_joint].min() < 1e-10
     assert (trace.translation_left, trace.rotation_left_deg) == (None, None)  # it measures neither
 

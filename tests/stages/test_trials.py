@@ -28,7 +28,7 @@ def test_poses_of_all_joints_follow_and_no_reading_comes_twice(faulty):
     assert (moved[1:49].sum(axis=1) <= 1).all()
     assert (moved[49:].sum(axis=1) >= 5).all()
     assert np.abs(q - q[0]).max() <= np.radians(30.0) + 2.0 * tick
-    assert ((q >= joints.lower) & (q <= joints.upper)).all()
+    assert ((q >= joints.limits.lower) & (q <= joints.limits.upper)).all()
     seen = np.isfinite(trials.simulate(config, truth).images).all(axis=(1, 3))
     assert seen.mean(axis=1).min() >= 0.5
 

@@ -21,7 +21,7 @@ def test_configuration_is_the_reference_robot_unchanged(name, reference_truth):
     assert truth.P[1].tolist() == reference["camera_right"]
     assert truth.robot.base_tool.tolist() == reference["T_base_tool_at_reference"]
     assert truth.robot.q_reference.tolist() == reference["q_reference"]
-    assert [truth.robot.lower.tolist(), truth.robot.upper.tolist()] == reference["q_limits"]
+    assert [truth.robot.limits.lower.tolist(), truth.robot.limits.upper.tolist()] == reference["q_limits"]
     for H_hat, screw in zip(truth.robot.H_hat_0, reference["screws"], strict=True):
         assert [H_hat[2, 1], H_hat[0, 2], H_hat[1, 0]] == screw["w"]
         assert H_hat[:3, 3].tolist() == screw["v"]

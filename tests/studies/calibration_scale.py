@@ -1,7 +1,7 @@
 """How the time of a calibration grows with its points: ``python -m tests.studies.calibration_scale``.
 
-Writes docs/scale.csv, a row a number of points: seconds of the processor and peak memory of a process of its
-own, draws docs/scale.svg and prints the slope of log time by log points.
+Writes docs/images/scale.csv, a row a number of points: seconds of the processor and peak memory of a process
+of its own, draws docs/images/scale.svg and prints the slope of log time by log points.
 """
 
 import csv
@@ -17,7 +17,7 @@ from projservo_cli.calibration import calibrate
 from tests.calibration.mistakes import table
 from tests.conftest import ROOT
 
-DOCS = ROOT / "docs"
+IMAGES = ROOT / "docs" / "images"
 POINTS = (10, 30, 100, 300, 1000, 3000, 10000)
 
 
@@ -40,7 +40,7 @@ def main(most=POINTS[-1]):
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             rows.append(pool.apply(measured, (points,)))
             print(*rows[-1], flush=True)
-    with open(DOCS / "scale.csv", "w", encoding="utf-8", newline="") as file:
+    with open(IMAGES / "scale.csv", "w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["points", "sightings", "seconds", "memory_mb"])
         writer.writerows(rows)
@@ -65,7 +65,7 @@ def drawn(values):
     axes.set_ylabel("time (s)")
     axes.legend(frameon=False)
     axes.grid(alpha=0.3)
-    figure.savefig(DOCS / "scale.svg", metadata={"Date": None})
+    figure.savefig(IMAGES / "scale.svg", metadata={"Date": None})
 
 
 if __name__ == "__main__":

@@ -130,8 +130,8 @@ def joints_for(arm, hand, near):
     """
     rng, low, high = (
         np.random.default_rng(0),
-        np.clip(arm.lower, -math.pi, None),
-        np.clip(arm.upper, None, math.pi),
+        np.clip(arm.limits.lower, -math.pi, None),
+        np.clip(arm.limits.upper, None, math.pi),
     )
     low, high = np.minimum(low, near - 1e-6), np.maximum(high, near + 1e-6)
 

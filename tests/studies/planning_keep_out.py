@@ -160,9 +160,7 @@ def true_constraints(config, truth: Truth, task: Drawn, q):
     s_start, s_star = (truth.images(x, truth.M_face) for x in (q, task.q_goal))
     aimed = TaskImages(q, s_start, s_star, truth.center).task(truth.model)
     joints = joints_of(config)
-    demands = limits_alone(joints.lower, joints.upper)._replace(
-        speed=joints.speed, image_size=truth.image_size
-    )
+    demands = limits_alone(joints.limits)._replace(image_size=truth.image_size)
     A = truth.M[[*truth.face, *truth.pins]] @ truth.displacement(q).T
     c = constraints_of(truth.model, A, aimed, q, demands)
     return c._replace(
@@ -182,8 +180,7 @@ def way_exists(config, truth: Truth, task: Drawn):
         for seed in range(seeds):
             how = SearchLimits(samples, seed, 4096)
             searches += 1
-            acceleration = joints_of(config).acceleration
-            if len(find_path(c, aim, task.q_start, task.q_goal[None], how, acceleration).corners):
+            if len(find_path(c, aim, task.q_start, task.q_goal[None], how).corners):
                 return True, searches
     return False, searches
 

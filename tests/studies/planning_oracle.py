@@ -37,12 +37,12 @@ def of_ompl(c, q_start, goals, samples, seed):
     n, demands = len(q_start), np.zeros(MARGINS)
     space, bounds = base.RealVectorStateSpace(n), base.RealVectorBounds(n)
     for i in range(n):
-        bounds.setLow(i, float(c.lower[i] / c.speed[i]))
-        bounds.setHigh(i, float(c.upper[i] / c.speed[i]))
+        bounds.setLow(i, float(c.limits.lower[i] / c.limits.speed[i]))
+        bounds.setHigh(i, float(c.limits.upper[i] / c.limits.speed[i]))
     space.setBounds(bounds)
 
     def joints(state):
-        return c.speed * np.array([state[i] for i in range(n)])
+        return c.limits.speed * np.array([state[i] for i in range(n)])
 
     def is_valid(state):
         q = joints(state)
@@ -52,7 +52,7 @@ def of_ompl(c, q_start, goals, samples, seed):
     def state_of(q):
         state = space.allocState()
         for i in range(n):
-            state[i] = float(q[i] / c.speed[i])
+            state[i] = float(q[i] / c.limits.speed[i])
         return state
 
     setup = geometric.SimpleSetup(space)
@@ -71,7 +71,8 @@ def of_ompl(c, q_start, goals, samples, seed):
         return np.nan
     setup.simplifySolution(PATIENCE_S[1])
     path = setup.getSolutionPath()
-    return least_time(c.speed, np.array([joints(path.getState(i)) for i in range(path.getStateCount())]))[-1]
+    states = [joints(path.getState(i)) for i in range(path.getStateCount())]
+    return least_time(c.limits.speed, np.array(states))[-1]
 
 
 def of_toppra(pace, speed, acceleration):
@@ -99,11 +100,12 @@ def slowest_joint(way, speed, acceleration):
 
 def compared(config):
     """A way of a task, in numbers, against what other programs make of it."""
-    c, aim, q_start, q_goal, acceleration = true_search(config, margins=True)
+    c, aim, q_start, q_goal = true_search(config, margins=True)
+    acceleration = c.limits.acceleration
     seed = config.seed
     how = SearchLimits(config.trajectory.search.samples, seed, config.trajectory.goals)
     begin = time.process_time()
-    way = find_path(c, aim, q_start, q_goal[None], how, acceleration)
+    way = find_path(c, aim, q_start, q_goal[None], how)
     row = {
         "seed": seed,
         "s": time.process_time() - begin,
@@ -112,13 +114,13 @@ def compared(config):
     }
     if way.timing is None:
         return row
-    straight, length = len(way.corners) == 2, least_time(c.speed, way.corners)[-1]
+    straight, length = len(way.corners) == 2, least_time(c.limits.speed, way.corners)[-1]
     row |= {"straight": straight, "length": length, "duration": float(way.timing.time[-1])}
     if find_spec("toppra"):
-        row["toppra"] = of_toppra(way.timing, c.speed, acceleration)
+        row["toppra"] = of_toppra(way.timing, c.limits.speed, acceleration)
     if straight:
-        return row | {"slowest_joint": slowest_joint(way, c.speed, acceleration)}
-    nearest = (np.abs(way.goals - q_start) / c.speed).max(axis=1).min()
+        return row | {"slowest_joint": slowest_joint(way, c.limits.speed, acceleration)}
+    nearest = (np.abs(way.goals - q_start) / c.limits.speed).max(axis=1).min()
     row["straight_to_nearest"] = nearest
     if find_spec("ompl"):
         ends = with_ends(c, np.vstack([q_start[None], way.goals]))

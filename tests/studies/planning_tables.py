@@ -42,7 +42,7 @@ def task_configs(name, count, *overrides):
 
 
 def true_search(config, *, margins=False):
-    """Constraints, aim, joints at both ends of a task and accelerations by the true model.
+    """Constraints, aim and joints at both ends of a task by the true model.
 
     margins : whether it keeps those of the configuration; else none, and a border of 0.
     """
@@ -52,15 +52,13 @@ def true_search(config, *, margins=False):
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
     task = TaskImages(q_start, s_start, s_star, truth.center).task(truth.model)
     A = truth.M_face @ truth.displacement(q_start).T
-    demands = limits_alone(joints.lower, joints.upper)._replace(
-        speed=joints.speed, image_size=truth.image_size
-    )
+    demands = limits_alone(joints.limits)._replace(image_size=truth.image_size)
     if margins:
         deg = np.radians(asked.joint_margin_deg)
         keep = np.array([asked.joint_margin_m if kind == "P" else deg for kind in joints.types])
         demands = demands._replace(border_px=asked.border_px, least_face_px=asked.least_face_px, keep=keep)
     c = constraints_of(truth.model, A, task, q_start, demands)
-    return c, GoalFeatures(task.A_star, s_star, 0.0), q_start, q_goal, joints.acceleration
+    return c, GoalFeatures(task.A_star, s_star, 0.0), q_start, q_goal
 
 
 def asked_for(study, about, tasks, arms=tuple(ARMS), counted="of each arm"):
@@ -74,9 +72,9 @@ def asked_for(study, about, tasks, arms=tuple(ARMS), counted="of each arm"):
 
 def has_no_way(config):
     """Whether no search with the true model finds a way."""
-    c, aim, q_start, q_goal, acceleration = true_search(config)
+    c, aim, q_start, q_goal = true_search(config)
     return not any(
-        len(find_path(c, aim, q_start, q_goal[None], SearchLimits(SAMPLES, seed), acceleration).corners)
+        len(find_path(c, aim, q_start, q_goal[None], SearchLimits(SAMPLES, seed)).corners)
         for seed in range(SEARCHES)
     )
 

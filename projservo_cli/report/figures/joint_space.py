@@ -60,7 +60,7 @@ def _data(material: Material) -> Data:
         "prismatic": slides,
         "q_deg_or_mm": plan.q * unit,
         "q_start_deg_or_mm": plan.q_start * unit,
-        "limits_deg_or_mm": np.stack([material.robot.lower, material.robot.upper]) * unit,
+        "limits_deg_or_mm": np.stack([material.robot.limits.lower, material.robot.limits.upper]) * unit,
         "corner_s": np.zeros((0, 2)) if plan.corner is None else plan.corner,
         "visibility": plan.margin,
         "joints": plan.joint_margin[:, None],

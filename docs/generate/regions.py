@@ -1,0 +1,135 @@
+"""Generated regions: references written by the code that they describe."""
+
+import dataclasses
+import inspect
+import types
+import typing
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import click
+
+from docs.generate import keys, python
+from docs.generate.markdown import table, text
+from projservo_cli import records
+from projservo_cli.cli import main
+from projservo_cli.config.schema import json_schema, sweep_schema
+from projservo_cli.equations import REGISTER
+from projservo_cli.loop import step
+from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED
+
+# Where a run file holds which record.
+GROUPS = {
+    "calibrate/observation": records.Observation,
+    "calibrate/calibration": records.Calibration,
+    "calibrate/cross_validation": records.CrossValidation,
+    "plan": records.Plan,
+    "servo/<law>": records.Trace,
+    "report": records.Report,
+}
+
+
+def run_file() -> Iterator[str]:
+    """The groups of a run file, with the attributes and arrays of each."""
+    for group, record in GROUPS.items():
+        about = (record.__doc__ or "").split("\n\n")[0]
+        yield from (f"## {text(group)}", "", text(about), "")
+        yield from table(("attribute", "type", "unit", "what it is"), fields(record, arrays=False))
+        yield from table(("array", "dimensions", "unit", "what it is"), fields(record, arrays=True))
+
+
+def fields(record: type, *, arrays: bool) -> Iterator[tuple[str, ...]]:
+    """Rows of the table of a record's attributes, or of its arrays."""
+    hints = typing.get_type_hints(record)
+    for field in dataclasses.fields(record):
+        about, dims = field.metadata, field.metadata.get("dims")
+        if arrays == (dims is not None):
+            what = plain(hints[field.name]) if dims is None else text(", ".join(dims))
+            units = text(about["units"]) if arrays or "number" in what else ""
+            yield f"`{field.name}`", what, units, text(about["about"])
+
+
+def plain(hint: Any) -> str:
+    """A type of an attribute in words; what may be missing is None in Python."""
+    names = {str: "text", float: "number", int: "whole number", bool: "0 or 1"}
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        inner = [part for part in typing.get_args(hint) if part is not type(None)]
+        return f"{plain(inner[0])}, may be missing"
+    return names.get(hint, "JSON")
+
+
+def commands() -> Iterator[str]:
+    """The commands, with what each takes."""
+    for name, command in main.commands.items():
+        with click.Context(main, info_name="projservo") as group:
+            context = click.Context(command, group, info_name=name)
+        summary, *paragraphs = inspect.cleandoc(command.help or "").split("\n\n")
+        yield from ("", f"## projservo {name}", "", text(summary), "")
+        yield from ("```text", command.get_usage(context).removeprefix("Usage: "), "```", "")
+        for paragraph in paragraphs:
+            yield from (text(" ".join(paragraph.split())), "")
+        yield from (
+            "For example:",
+            "",
+            "```text",
+            (command.epilog or "").removeprefix("Example: "),
+            "```",
+            "",
+        )
+        for option in command.params:
+            if (record := option.get_help_record(context)) is not None:
+                yield f"- `{record[0]}`: {text(record[1])}"
+
+
+def equations() -> Iterator[str]:
+    """The equations of the paper, the code of each, and what is misprinted."""
+    yield from table(
+        ("equation", "in the code", "erratum"),
+        (
+            (
+                f"({entry.number}) {text(entry.title)}",
+                " ".join(f"`{name.removeprefix('projservo_cli.')}`" for name in entry.functions),
+                text(entry.erratum),
+            )
+            for entry in REGISTER
+        ),
+    )
+
+
+def sweep_columns() -> Iterator[str]:
+    """The columns that the table of every sweep has, and the one that it may have."""
+    kinds = {"f": "number", "i": "whole number", "u": "whole number", "S": "text"}
+    yield from table(
+        ("column", "value", "unit", "what it is"),
+        (
+            (
+                f"`{column.name}`",
+                kinds[column.dtype[0]],
+                text(column.units.removeprefix("1")),
+                text(column.about),
+            )
+            for column in (*NUMBERED, *MEASURED, BETWEEN)
+        ),
+    )
+    yield from ("", f"A sweep with `between_samples` has `{BETWEEN.name}`.")
+
+
+def verdicts() -> Iterator[str]:
+    """All verdicts of a run, and their order."""
+    yield ", ".join(f"`{verdict}`" for verdict in ALL_VERDICTS) + "."
+    yield ""
+    yield from python.markdown(inspect.cleandoc(step.__doc__ or "").split("\n\n", 1)[1])
+
+
+WRITERS: dict[str, Callable[[], Iterator[str]]] = {
+    "configuration-keys": lambda: keys.all_keys(json_schema()),
+    "sweep-keys": lambda: keys.all_keys(sweep_schema()),
+    "sweep-columns": sweep_columns,
+    "run-file-groups": run_file,
+    "commands": commands,
+    "equations": equations,
+    "verdicts": verdicts,
+    "python-interface": python.python_interface,
+    "robot-contract": python.robot_contract,
+    "law-contract": python.law_contract,
+}

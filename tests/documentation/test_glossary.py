@@ -1,0 +1,106 @@
+"""Test the glossary against the names of the code."""
+
+import dataclasses
+import re
+
+import pytest
+
+from projservo_cli import records
+from projservo_cli.config.schema import json_schema, sweep_schema
+from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED
+from tests.documentation.blocks import DOCS
+
+SCHEMAS = (json_schema(), sweep_schema())
+
+
+def rows():
+    """Cells of each term: term, meaning, names, origin."""
+    text = (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8")
+    found = [
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line[:1] == "|"
+    ]
+    return [row for row in found if row[0] not in {"term", "---"}]
+
+
+def names():
+    """All names of the third column."""
+    return {name for row in rows() for name in re.findall(r"`([^`]+)`", row[2])}
+
+
+def values(schema):
+    """All values that a JSON Schema lists."""
+    if isinstance(schema, dict):
+        yield from (str(value) for value in schema.get("enum", ()) or ())
+        yield from [schema["const"]] if "const" in schema else []
+        for part in schema.values():
+            yield from values(part)
+    elif isinstance(schema, list):
+        for part in schema:
+            yield from values(part)
+
+
+def columns():
+    return {column.name for column in (*NUMBERED, *MEASURED, BETWEEN)}
+
+
+def keys():
+    """Names of all configuration keys."""
+    sections = [part for schema in SCHEMAS for part in (schema, *schema["$defs"].values())]
+    return {key for part in sections for key in part.get("properties", ())}
+
+
+def modes_and_profiles():
+    sections = SCHEMAS[0]["$defs"]
+    parts = (sections["Control"]["properties"]["mode"], sections["Trajectory"]["properties"]["profile"])
+    return {value for part in parts for value in values(part)}
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        set(ALL_VERDICTS),
+        columns(),
+        *({*schema["properties"]} for schema in SCHEMAS),
+        *({*SCHEMAS[0]["$defs"][name]["properties"]} for name in ("Disturbance", "Stop")),
+        set(values(SCHEMAS[0]["properties"]["law"])),
+        modes_and_profiles(),
+    ],
+    ids=[
+        "verdicts",
+        "columns",
+        "configuration",
+        "sweep",
+        "disturbance",
+        "stop",
+        "laws",
+        "modes and profiles",
+    ],
+)
+def test_names_of_the_code_have_a_term(wanted):
+    assert wanted
+    assert wanted - names() == set()
+
+
+def test_names_of_the_glossary_stand_in_the_code():
+    fields = {
+        field.name
+        for kind in vars(records).values()
+        if dataclasses.is_dataclass(kind) and isinstance(kind, type)
+        for field in dataclasses.fields(kind)
+    }
+    fields |= {name for kind in vars(records).values() for name in getattr(kind, "_fields", ())}
+    # A test of the page on commands compares these with the output of the commands.
+    output = set(re.findall(r"`(\w+)`", (DOCS / "reference" / "commands.md").read_text(encoding="utf-8")))
+    known = fields | output | keys() | columns() | set(ALL_VERDICTS)
+    known |= {value for schema in SCHEMAS for value in values(schema)}
+    assert names() - known == set()
+
+
+def test_a_term_stands_once_with_one_sentence_and_its_origin():
+    terms = [row[0] for row in rows()]
+    assert len(terms) == len(set(terms)) > 60
+    for row in rows():
+        assert len(row) == 4
+        assert row[1]
+        assert "." not in row[1].rstrip("."), row[0]
+        assert row[3].startswith(("[RH00]", "field", "projservo", "Kalibr")), row[0]
