@@ -1,6 +1,6 @@
-"""Markers found in stereo images: ArUco and AprilTag corners to a fraction of a pixel.
+"""Marker detection in stereo images: ArUco and AprilTag corners to a fraction of a pixel.
 
-Which two images belong to which joint readings, tags in one image by OpenCV, and what all images show.
+It pairs images with joint readings, finds tags by OpenCV, refines their corners, and collects all images.
 """
 
 import math
@@ -39,13 +39,13 @@ _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm",
 
 
 def pair_images(left: str, right: str, joints: JointList, where: str) -> list[tuple[int, Path, Path]]:
-    """Number of the pose and both images, of every pose.
+    """Pair images with poses: number and both images of every pose.
 
     left, right : a folder, or a pattern such as ``left/*.png``.
-    joints : the poses. Named images are looked up by name; with pose numbers, the image of a pose is the one
-        whose name ends in its number; else the images are taken in the order of their names.
-    where : the file of the poses, for messages.
-    Raises InputError when there are no images, or one of a pose is missing or not the only one.
+    joints : the poses. Images are found by their names in the list, else by the pose number at the end of
+        their names, else in the order of their names.
+    where : file of the poses, for messages.
+    Raises InputError if there are no images, or that of a pose is missing or ambiguous.
     """
     poses = joints.pose.tolist()
     if joints.left is not None and joints.right is not None:
@@ -103,31 +103,56 @@ def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
     return chosen
 
 
-LEAST_CELL = 2.3
-"""Width of a cell, px, below which edges of a tag cannot be fitted: its border is one cell wide."""
-
-_LEAST_SIDE = 6.0  # px: a side that is shorter is none to fit
-_LEAST_REACH, _MOST_REACH = 1.5, 6.0  # px on either side of an edge: less is no profile
-_LEAST_BLUR, _MOST_BLUR = 0.2, 10.0  # px: a sharper edge cannot be told
-# Rms residual of a profile that something covers, in contrasts, the worst first; clean ones have some 0.02.
+# Minimum width of a cell, px, to fit edges of a tag, whose border is one cell wide.
+MIN_CELL = 2.3
+# Minimum length of a side to fit, px.
+_MIN_SIDE = 6.0
+# Minimum extent of a profile on either side of an edge, px.
+_MIN_REACH = 1.5
+# Maximum extent of a profile on either side of an edge, px.
+_MAX_REACH = 6.0
+# Minimum blur of an edge, px: pixels do not resolve a sharper one.
+_MIN_BLUR = 0.2
+# Maximum blur of an edge, px.
+_MAX_BLUR = 10.0
+# Rms residuals of occluded profiles, in contrasts, rejected in this order; clean profiles have some 0.02.
 _SPOILT = (0.2, 0.14, 0.1, 0.07, 0.05)
-_SPOILT_SHARE = 0.25  # of the profiles of a side that may be covered
-_BORDER = 2  # cells of border along a side of a tag, besides those of its code
-# Of the sides as they were guessed only so many profiles are looked at; least of them; steps of both fits.
-_ROUGH_PROFILES, _LEAST_PROFILES, _STEPS = 16, 3, (6, 3)
-_FAR = 2.0, 0.05  # px, and share of the longest side, that a corner may be from its guess, besides the blur
-_EDGE = 6  # numbers of an edge
-# Height of the arc that a lens makes of a side, px, as a deviation; least noise of grey values, and one
-# beside which no bow is seen.
-_BOW, _LEAST_NOISE, _RIGID = 0.01, 0.3, 1e3
-# What the model of an edge leaves out, px; and beyond how many cells the next edge is, times how much of it.
-_FLOOR, _LEAK = 0.002, (0.5, 0.6)
-# White that a camera clips, grey value, less what noise and JPEG take of it. An edge fitted to min(k Φ, 1)
-# is off by a share of the blur that is fitted: this is its root mean square for exposures k from 1 to 1½.
-_CLIPPED, _OVEREXPOSED = 252.0, 0.42
-# Deviation of a corner that OpenCV finds where blur and cell are one pixel, and how it falls with the cell;
-# the blur that is reckoned with where no edge tells it, in cells; from what cell on, px, it grows no more.
-_UNREFINED, _BY_CELL, _BLURRED, _LEAST_UNREFINED = 1.2, -0.75, 0.4, 1.25
+# Maximum share of occluded profiles of a side.
+_SPOILT_SHARE = 0.25
+# Number of cells of border along a side of a tag, besides those of its code.
+_BORDER = 2
+# Maximum number of profiles in the first fit of a side.
+_ROUGH_PROFILES = 16
+# Minimum number of profiles of a side.
+_MIN_PROFILES = 3
+# Numbers of steps of the first and of the second fit.
+_STEPS = (6, 3)
+# Maximum distance of a corner from its guess, px, and as a share of the longest side, besides the blur.
+_FAR = (2.0, 0.05)
+# Number of parameters of an edge.
+_EDGE = 6
+# Standard deviation of the height of the arc that a lens makes of a side, px.
+_BOW = 0.01
+# Minimum noise of grey values.
+_MIN_NOISE = 0.3
+# Noise of grey values that suppresses the arc in the first fit.
+_RIGID = 1e3
+# Error of the model of an edge, px.
+_FLOOR = 0.002
+# Error by the next edge, as a share of a cell, and its distance, as a share of a cell.
+_LEAK = (0.5, 0.6)
+# Grey value from which white is clipped, less noise and JPEG artefacts.
+_CLIPPED = 252.0
+# Rms error of an edge fitted to min(k Φ, 1), as a share of the blur, for exposures k from 1 to 1½.
+_OVEREXPOSED = 0.42
+# Deviation of a corner of OpenCV for a blur and a cell of one pixel, px, fitted to rendered tags.
+_UNREFINED = 1.2
+# Exponent of the cell width in that deviation, fitted likewise.
+_BY_CELL = -0.75
+# Blur where no edge shows it, in cells.
+_BLURRED = 0.4
+# Cell width below which the deviation grows no more, px.
+_MIN_UNREFINED = 1.25
 
 
 class _Sides(NamedTuple):
@@ -141,7 +166,7 @@ class _Sides(NamedTuple):
 
     @classmethod
     def of(cls, corners: FloatArray, cells: int) -> "_Sides":
-        """Sides of tags with corners (Q, 4, 2) and so many cells along a side."""
+        """Sides of tags with corners (Q, 4, 2) and a number of cells along a side."""
         start, end = corners.reshape(-1, 2), np.roll(corners, -1, axis=1).reshape(-1, 2)
         length = np.linalg.norm(end - start, axis=1)
         along = (end - start) / np.maximum(length, 1e-9)[:, None]
@@ -152,27 +177,27 @@ class _Sides(NamedTuple):
 
 
 class _Strips(NamedTuple):
-    """The pixels along sides, profile by profile: rows or columns of the image, whichever cross the side."""
+    """Pixels along sides, profile by profile: rows or columns of the image, whichever cross the side."""
 
     grey: FloatArray  # (S, C, R) grey values
-    t: FloatArray  # (S, C, R) place along the side, −½ to ½
-    n: FloatArray  # (S, C, R) place across, px
+    t: FloatArray  # (S, C, R) coordinate along the side, −½ to ½
+    n: FloatArray  # (S, C, R) coordinate across, px
     weight: FloatArray  # (S, C, R) one for pixels that count, else zero
 
     @classmethod
     def of(
-        cls, image: FloatArray, sides: _Sides, reach: FloatArray, margin: FloatArray, most: int
+        cls, image: FloatArray, sides: _Sides, reach: FloatArray, margin: FloatArray, max_profiles: int
     ) -> "_Strips":
-        """Pixels within reach (S,) of sides, less a margin (S,) at either end; at most so many profiles.
+        """Pixels within reach (S,) of sides, less a margin (S,) at either end, in up to ``max_profiles``.
 
-        None of a side with too few profiles, or of which a pixel lies outside the image.
+        A side with too few profiles, or with a pixel outside the image, has none.
         """
         s = np.arange(len(reach))
         main = np.argmax(np.abs(sides.along), axis=1)  # the coordinate that counts the profiles
         slope = sides.along[s, main]
         ends = sides.start[s, main] + slope * np.stack([margin, sides.length - margin])
         first, last = np.ceil(ends.min(axis=0)), np.floor(ends.max(axis=0))
-        stride = np.maximum(1.0, np.ceil((last - first + 1.0) / most))
+        stride = np.maximum(1.0, np.ceil((last - first + 1.0) / max_profiles))
         profiles = int(max(1.0, ((last - first) // stride).max() + 1.0))
         half = int(np.ceil((reach / np.abs(slope)).max())) + 1
         place = np.empty((2, len(s), profiles, 2 * half + 1))  # by main and other coordinate
@@ -187,17 +212,17 @@ class _Strips(NamedTuple):
         counts = (np.abs(n) <= reach[:, None, None]) & (place[0] <= last[:, None, None])
         height, width = image.shape
         inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-        whole = (inside | ~counts).all(axis=(1, 2)) & (last - first + 1.0 >= _LEAST_PROFILES)
+        whole = (inside | ~counts).all(axis=(1, 2)) & (last - first + 1.0 >= _MIN_PROFILES)
         grey = image[np.clip(v, 0, height - 1).astype(int), np.clip(u, 0, width - 1).astype(int)]
         weight = (counts & whole[:, None, None]).astype(np.float64)
         return cls(grey, t / sides.length[:, None, None] - 0.5, n, weight)
 
 
 def _edge_model(x: FloatArray, strips: _Strips) -> tuple[FloatArray, FloatArray]:
-    """Residual (S, C, R) of edges x = (b, a, n_0, k, σ, c) (S, 6), and derivative (S, 6, C R), weighed both.
+    """Weighted residual (S, C, R) of edges x = (b, a, n_0, k, σ, c) (S, 6), and derivative (S, 6, C R).
 
-    An edge is b + a Φ((n − n_0 − k t − c (4 t² − ⅓))/σ), Φ the normal distribution: blurred by σ, and in t
-    straight but for a bow c, the height of its arc, which a lens makes of it.
+    An edge is b + a Φ((n − n_0 − k t − c (4 t² − ⅓))/σ), Φ the normal distribution: blurred by σ, and in t a
+    straight line with an arc of height c by lens distortion.
     """
     b, a, n_0, k, sigma, c = x.T[:, :, None, None]
     arc = 4.0 * strips.t**2 - 1.0 / 3.0
@@ -211,12 +236,12 @@ def _edge_model(x: FloatArray, strips: _Strips) -> tuple[FloatArray, FloatArray]
 
 
 def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
-    """Edges (S, 6) of least squares by Levenberg–Marquardt steps, all at once, and their normal matrices.
+    """Edges (S, 6) of least squares by Levenberg–Marquardt steps, together, and their normal matrices.
 
-    Bows are held to what lenses make, by the noise (S,) of grey values.
+    The noise (S,) of grey values sets the weight of a prior on the arcs.
     """
     stiff = np.zeros((len(x), _EDGE))
-    stiff[:, -1] = np.square(np.clip(noise, _LEAST_NOISE, _RIGID) / _BOW)
+    stiff[:, -1] = np.square(np.clip(noise, _MIN_NOISE, _RIGID) / _BOW)
 
     def equations(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal matrices, gradients and sums of squares."""
@@ -232,7 +257,7 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
         ridge = damping[:, None] * np.diagonal(A, axis1=1, axis2=2) + 1e-9
         step = np.linalg.solve(A + ridge[:, :, None] * np.eye(_EDGE), g[..., None])[..., 0]
         moved = x - step
-        moved[:, 4] = np.clip(np.abs(moved[:, 4]), _LEAST_BLUR, _MOST_BLUR)
+        moved[:, 4] = np.clip(np.abs(moved[:, 4]), _MIN_BLUR, _MAX_BLUR)
         new = equations(moved)
         better = new[2] <= cost
         x = np.where(better[:, None], moved, x)
@@ -242,7 +267,7 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
 
 
 def _first_edges(strips: _Strips) -> FloatArray:
-    """Edges (S, 6) to start from: the grey values at the inner and at the outer end of the strips."""
+    """Initial edges (S, 6) by the grey values at the inner and at the outer end of the strips."""
     far = np.abs(strips.n) > 0.5 * np.where(strips.weight > 0.0, np.abs(strips.n), 0.0).max(
         axis=(1, 2), keepdims=True
     )
@@ -256,29 +281,29 @@ def _first_edges(strips: _Strips) -> FloatArray:
 
 
 class _Edges(NamedTuple):
-    """Edges through the sides of tags, four of each one after the other; NaN where one is not clean."""
+    """Edges through the sides of tags, four of each in a row; NaN if one is not clean."""
 
     line: FloatArray  # (S, 3) l·(u, v, 1) = 0, normals of unit length
     variance: FloatArray  # (S, 2) of the distance from the true edge, at the start and at the end, px²
     x: FloatArray  # (S, 6) b, a, n_0, k, σ, c
-    spoilt: BoolArray  # (S,) whether one is not clean though there are pixels enough
+    spoilt: BoolArray  # (S,) whether one is not clean despite enough pixels
 
 
 def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, rough: bool) -> _Edges:
-    """Edges about sides that are nearly where they should be, by edges known before (S, 6) or NaN.
+    """Fit edges about approximate sides, from earlier edges (S, 6) or NaN.
 
-    Roughly by few profiles, else by all but those that something covers, if these are few. Grey values err
-    independently, by what the residuals of the side show. Besides, the model errs by what blur carries over
-    from the next edge, one cell away, which depends on the code, and by white that is clipped.
+    rough : use few profiles; else all but occluded ones, if these are few.
+    The variance has the independent errors of grey values, as of the residuals of the side, and errors of the
+    model: blur from the next edge, one cell away, which depends on the code, and clipped white.
     """
     line, variance, edge = (np.full((len(before), size), np.nan) for size in (3, 2, _EDGE))
     found = _Edges(line, variance, edge, np.zeros(len(before), dtype=np.bool_))
-    fits = np.flatnonzero((all_sides.length > _LEAST_SIDE) & (all_sides.cell > LEAST_CELL))
+    fits = np.flatnonzero((all_sides.length > _MIN_SIDE) & (all_sides.cell > MIN_CELL))
     if fits.size == 0:
         return found
     sides, blur = _Sides(*(part[fits] for part in all_sides)), before[fits, 4]
     known = np.isfinite(blur)
-    reach = np.clip(0.5 * sides.cell, _LEAST_REACH, np.where(known, 3.0 * blur + 1.0, _MOST_REACH))
+    reach = np.clip(0.5 * sides.cell, _MIN_REACH, np.where(known, 3.0 * blur + 1.0, _MAX_REACH))
     margin = np.where(known, np.maximum(0.08 * sides.length, 2.0 * blur) + 1.0, 0.12 * sides.length + 1.0)
     strips = _Strips.of(image, sides, reach, margin, _ROUGH_PROFILES if rough else image.size)
     x = _first_edges(strips)
@@ -311,7 +336,7 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
 
 
 def _clipped(strips: _Strips) -> FloatArray:
-    """Share (S,) of the pixels outside of edges that are as bright as an image can be."""
+    """Share (S,) of clipped white pixels outside of edges."""
     outside = strips.weight * (strips.n > 0.0)
     clipped = outside * (strips.grey >= _CLIPPED)
     return np.asarray(clipped.sum(axis=(1, 2)) / np.maximum(outside.sum(axis=(1, 2)), 1.0))
@@ -320,7 +345,7 @@ def _clipped(strips: _Strips) -> FloatArray:
 def _uncovered(
     strips: _Strips, noise: FloatArray, x: FloatArray, A: FloatArray
 ) -> tuple[_Strips, FloatArray, FloatArray, BoolArray]:
-    """Strips without the profiles that something covers, fitted again; whether (S,) these were few."""
+    """Remove occluded profiles and fit again; strips, edges, and a mask (S,) of sides with few of them."""
     whole, rms = strips.weight.any(axis=2), _rms_of_profiles(x, strips)
     for share in _SPOILT:
         spoilt = rms > np.maximum(share * x[:, 1], 3.0 * noise)[:, None]
@@ -337,13 +362,13 @@ def _uncovered(
 
 
 def _rms_of_profiles(x: FloatArray, strips: _Strips) -> FloatArray:
-    """Root mean square (S, C) of what a model (S, 6) leaves of each profile of a side."""
+    """Root mean square residual (S, C) of each profile of a side by a model (S, 6)."""
     residual, _ = _edge_model(x, strips)
     return np.asarray(np.sqrt((residual**2).sum(axis=2) / np.maximum(strips.weight.sum(axis=2), 1.0)))
 
 
 def _noise(strips: _Strips) -> FloatArray:
-    """Median difference (S,) of neighbours along the sides: about the standard deviation of a pixel."""
+    """Noise (S,) of a pixel, about the median difference of neighbours along the sides."""
     both = (strips.weight[:, 1:] * strips.weight[:, :-1]).reshape(len(strips.t), -1) > 0.0
     steps = np.abs(np.diff(strips.grey, axis=1)).reshape(both.shape)
     middle = both.sum(axis=1, keepdims=True) // 2
@@ -354,21 +379,21 @@ def _noise(strips: _Strips) -> FloatArray:
 class Corners(NamedTuple):
     """Corners of tags."""
 
-    pixels: FloatArray  # (…, 4, 2) px, in order around the tag; NaN where it is covered or the guess is wrong
-    sigma: FloatArray  # (…, 4) standard deviation of either coordinate, px; NaN there
-    clean: BoolArray  # (…, 4) whether both edges of a corner are clean; else it is where it was guessed
+    pixels: FloatArray  # (…, 4, 2) px, in order around the tag; NaN if occluded or the guess is wrong
+    sigma: FloatArray  # (…, 4) standard deviation of either coordinate, px; NaN likewise
+    clean: BoolArray  # (…, 4) whether both edges of a corner are clean; else it stays at its guess
 
 
 def refine_corners(image: FloatArray, guess: FloatArray, cells: int) -> Corners:
-    """Corners of tags from the edges between their black border and the bright ground around them.
+    """Refine corners of tags by the edges between their black border and the bright ground around them.
 
-    A corner is where two edges cross: their distances from the true ones add up over the sine of the angle
-    between them. Where there are too few pixels for one of them the guess stays, with its own deviation. None
-    is left where something covers one of them, or one passes far from the guess: that is wrong too.
+    A corner is the crossing of two edges, whose errors add up over the sine of the angle between them. With
+    too few pixels for an edge the guess stays, with its own deviation. A corner is rejected if an edge is
+    occluded, or passes far from the guess.
 
     image : (height, width) grey values; pixel centres have whole coordinates.
-    guess : (Q, 4, 2) u, v of corners as OpenCV finds them, within about two pixels.
-    cells : of a tag along a side, border included; the border is one cell wide.
+    guess : (Q, 4, 2) u, v of corners as of OpenCV, within about two pixels.
+    cells : number of cells of a tag along a side, border included; the border is one cell wide.
     """
     corners = np.asarray(guess, dtype=np.float64)
     x = np.full((4 * len(corners), _EDGE), np.nan)
@@ -385,24 +410,24 @@ def refine_corners(image: FloatArray, guess: FloatArray, cells: int) -> Corners:
         corners = np.where(np.isfinite(crossing), crossing, guess)
     blur, longest = x[:, 4].reshape(-1, 4), sides.length.reshape(-1, 4).max(axis=1, keepdims=True)
     far = _FAR[0] + _FAR[1] * longest + np.nan_to_num(np.fmax(blur, np.roll(blur, 1, axis=1)))
-    passes = [np.abs((edge[..., :2] * guess).sum(axis=2) + edge[..., 2]) for edge in (line, last)]
-    away = np.fmax(np.fmax(*passes), np.linalg.norm(crossing - guess, axis=2))
+    offsets = [np.abs((edge[..., :2] * guess).sum(axis=2) + edge[..., 2]) for edge in (line, last)]
+    away = np.fmax(np.fmax(*offsets), np.linalg.norm(crossing - guess, axis=2))
     spoilt = edges.spoilt.reshape(-1, 4)
     away[spoilt | np.roll(spoilt, 1, axis=1)] = np.inf
     clean = np.isfinite(crossing).all(axis=2) & (away <= far)
     pixels = np.where(clean[..., None], crossing, np.where((away > far)[..., None], np.nan, guess))
-    # A crossing so near the corner that OpenCV finds is no worse than that.
+    # A crossing that near to the corner of OpenCV is as good at least.
     unrefined = _unrefined(sides.cell, blur)
     deviation = np.where(away > far, np.nan, np.where(clean, np.fmin(sigma, unrefined), unrefined))
     return Corners(pixels, deviation, clean)
 
 
 def _unrefined(cell: FloatArray, blur: FloatArray) -> FloatArray:
-    """Deviation (Q, 4) of corners as OpenCV finds them, by cells (4 Q,) across sides and blurs (Q, 4), px.
+    """Deviation (Q, 4) of corners of OpenCV, px, by cells (4 Q,) across sides and blurs (Q, 4).
 
-    A formula that was fitted to drawn and to rendered tags of all sizes, tilts and blurs.
+    The formula is a fit to drawn and rendered tags of all sizes, tilts and blurs.
     """
-    cell = np.maximum(cell, _LEAST_UNREFINED).reshape(-1, 4)
+    cell = np.maximum(cell, _MIN_UNREFINED).reshape(-1, 4)
     cell = np.minimum(cell, np.roll(cell, 1, axis=1))
     known = blur[np.isfinite(blur)]
     typical = float(np.median(known)) if known.size else _BLURRED * cell
@@ -410,11 +435,11 @@ def _unrefined(cell: FloatArray, blur: FloatArray) -> FloatArray:
 
 
 class TagFinder:
-    """Finds the tags of one dictionary.
+    """Detector of the tags of one dictionary.
 
-    dictionary : name as OpenCV has it, with or without ``DICT_``, any case: ``4X4_50``, ``APRILTAG_36H11``.
+    dictionary : name of OpenCV, with or without ``DICT_``, any case: ``4X4_50``, ``APRILTAG_36H11``.
     ``cv``: the module of OpenCV.
-    Raises InputError when OpenCV is not installed or does not know the dictionary.
+    Raises InputError if OpenCV is not installed or has no such dictionary.
     """
 
     def __init__(self, dictionary: str) -> None:
@@ -427,15 +452,15 @@ class TagFinder:
         self._tags = tags = aruco.getPredefinedDictionary(getattr(aruco, name))
         parameters = aruco.DetectorParameters()
         parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-        # Tags in the shade stand before brighter ground: windows of more sizes, and less contrast.
+        # Shaded tags before brighter ground need windows of more sizes, and less contrast.
         parameters.adaptiveThreshWinSizeStep, parameters.adaptiveThreshConstant = 4, 5
         self._detector = aruco.ArucoDetector(tags, parameters)
         self._cells = int(tags.markerSize) + _BORDER
 
     def read(self, path: Path) -> FloatArray:
-        """Grey values (height, width) of an image as the camera took it, unturned.
+        """Read grey values (height, width) of an image, ignoring its orientation tag.
 
-        Raises InputError when the file is not an image.
+        Raises InputError if the file is not an image.
         """
         try:
             content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
@@ -448,9 +473,9 @@ class TagFinder:
         return np.asarray(image, dtype=np.float64)
 
     def picture(self, number: int, cell_px: int) -> ByteArray:
-        """Grey values of a tag with its bright margin of one cell, in cells of so many px.
+        """Grey values of a tag with a bright margin of one cell, in cells of ``cell_px``.
 
-        Raises InputError where the dictionary has no such tag.
+        Raises InputError if the dictionary has no such tag.
         """
         known = len(self._tags.bytesList)
         if number >= known:
@@ -459,9 +484,9 @@ class TagFinder:
         return np.pad(tag, cell_px, constant_values=255)
 
     def find(self, image: FloatArray) -> tuple[dict[int, Corners], int]:
-        """Corners (4, …) of each tag in an image, and how many tags were there more than once.
+        """Corners (4, …) of each tag in an image, and the number of tags that occur more than once.
 
-        A tag that is there more than once is left out, since which of them is meant cannot be told.
+        A tag that occurs more than once is ambiguous and rejected.
 
         image : (height, width) grey values from 0 to 255.
         """
@@ -488,17 +513,17 @@ def _opencv() -> Any:
 
 @dataclass
 class _Findings:
-    """What was found in all images."""
+    """Detected tags of all images."""
 
     # pixels and their deviation (4 or 1, 3) of each tag, by pose, view and number of the tag
     images: dict[tuple[int, int, int], FloatArray] = field(default_factory=dict)
-    ambiguous: int = 0  # tags left out because they were in an image more than once
-    unrefined: int = 0  # corners (or centres) of tags of which an edge is not clean
-    empty: int = 0  # images without a tag
+    ambiguous: int = 0  # number of tags rejected because they occur more than once in an image
+    unrefined: int = 0  # number of corners (or centres) of tags with an edge that is not clean
+    empty: int = 0  # number of images without a tag
 
     @property
     def tags(self) -> list[int]:
-        """Numbers of all tags, rising."""
+        """Numbers of all tags, sorted."""
         return sorted({tag for _, _, tag in self.images})
 
 
@@ -515,9 +540,9 @@ def observe_tags(
     q : (K, n) joint readings of the poses.
     finder : of the tags.
     points : ``corners``: corner k of tag t is marker 4 t + k; ``centers``: tag t is marker t.
-    progress : told after each pose.
-    Raises InputError if an image cannot be read, or has another size than those before it from the same
-    camera; WorkFailed if there is no tag in any image, or none that both views saw at a pose.
+    progress : called after each pose.
+    Raises InputError if an image cannot be read, or has another size than earlier ones of the same camera;
+    WorkFailed if there is no tag in any image, or none that both views saw at a pose.
     """
     found = _Findings()
     shapes: dict[int, tuple[int, ...]] = {}
@@ -540,8 +565,8 @@ def observe_tags(
         progress("detect", k + 1, len(pairs))
     if not found.images:
         raise WorkFailed(
-            f"no tag in any of {2 * len(pairs)} images: look whether --dictionary is that of your tags, "
-            "and whether a bright margin of one cell surrounds each"
+            f"no tag in any of {2 * len(pairs)} images: check that --dictionary is that of your tags, and "
+            "that a bright margin of one cell surrounds each"
         )
     numbers, each = found.tags, 4 if points == "corners" else 1
     seen = np.full((len(pairs), 2, len(numbers), each, 3), np.nan)
@@ -552,7 +577,7 @@ def observe_tags(
     seen = seen.reshape(len(pairs), 2, len(marker), 3)
     observation = Observation(pose, marker, q, seen[..., :2], sigma=seen[..., 2])
     if not np.isfinite(observation.images[..., 0]).all(axis=1).any():
-        raise WorkFailed("no tag was seen by both cameras at the same pose: look whether the images pair up")
+        raise WorkFailed("no tag was seen by both cameras at the same pose: check the pairing of the images")
     return observation, found
 
 
@@ -560,7 +585,7 @@ def _center(tag: Corners) -> FloatArray:
     """Crossing of the diagonals of a tag, the image of its centre, and its deviation: (1, 3) px."""
 
     def crossing(pixels: FloatArray) -> FloatArray:
-        """Of quadrilaterals (…, 4, 2): (…, 2)."""
+        """Crossing (…, 2) of the diagonals of quadrilaterals (…, 4, 2)."""
         a, b, c, d = np.moveaxis(np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1), -2, 0)
         p = np.cross(np.cross(a, c), np.cross(b, d))
         return np.asarray(p[..., :2] / p[..., 2:])

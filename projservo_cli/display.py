@@ -1,4 +1,4 @@
-"""How records print themselves, and turn into labelled arrays."""
+"""Text and table output of records, and their conversion to labelled arrays."""
 
 import dataclasses
 import html
@@ -10,23 +10,24 @@ import numpy.typing as npt
 
 from projservo_cli.records import VIEWS, FloatArray, InputError
 
-_WIDTH = 100  # characters of a line
+_WIDTH = 100  # maximum length of a line, characters
+_TWO_TURNS = 4.0 * np.pi  # rad; no joint of an arm with stops turns that far from its zero
 
 
-class Shown:
-    """Adds to a record a short text, a table for notebooks, and labelled arrays.
+class Displayable:
+    """Mixin that gives a record a short text, a table for notebooks, and labelled arrays.
 
-    A class that takes it up gives ``summary``, and is a dataclass after its record.
+    A subclass has ``summary``, and is a dataclass derived from its record too.
     """
 
     def summary(self) -> dict[str, str]:
-        """Return what there is to tell, in words, by name: eleven entries at most."""
+        """Return a summary in words, by name: eleven entries at most."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
-        told = self.summary()
-        width = max(map(len, told))
-        lines = [f"{name:{width}}  {value}" for name, value in told.items()]
+        summary = self.summary()
+        width = max(map(len, summary))
+        lines = [f"{name:{width}}  {value}" for name, value in summary.items()]
         short = (line if len(line) <= _WIDTH else line[: _WIDTH - 1] + "…" for line in lines)
         return "\n".join([type(self).__name__, *(f"  {line}" for line in short)])
 
@@ -37,12 +38,12 @@ class Shown:
         return f"<table><caption>{type(self).__name__}</caption>{''.join(rows)}</table>"
 
     def to_xarray(self) -> Any:
-        """Return all arrays and scalars as a Dataset: those of the run file, with coordinates.
+        """Return all arrays and scalars as a Dataset, as in the run file, with coordinates.
 
         Raises
         ------
         InputError
-            When xarray is not installed.
+            If xarray is not installed.
         """
         from projservo_cli.store import dataset_of
 
@@ -53,7 +54,7 @@ class Shown:
     def coordinates(self) -> dict[str, Any]:
         """Return coordinates of dimensions, by their names."""
         sizes: dict[str, int] = {}
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]  # those who take it up are dataclasses
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]  # subclasses are dataclasses
             value = getattr(self, field.name)
             if value is not None and "dims" in field.metadata:
                 sizes |= dict(zip(field.metadata["dims"], np.shape(value), strict=True))
@@ -65,7 +66,7 @@ class Shown:
 
 
 def pandas() -> Any:
-    """Return the package; an InputError where it is not installed."""
+    """Return the package pandas. Raises InputError if it is not installed."""
     try:
         import pandas as found
     except ImportError as error:
@@ -73,11 +74,8 @@ def pandas() -> Any:
     return found
 
 
-_TWO_TURNS = 4.0 * np.pi  # rad; no arm with stops turns a joint that far from its zero
-
-
 def require_radians(name: str, q: FloatArray, joint_types: str) -> None:
-    """Refuse joint readings (..., n) of which a revolute one can hardly be rad, with an InputError."""
+    """Raise InputError for joint readings (..., n) with a revolute one that can hardly be in rad."""
     turning = np.array([letter == "R" for letter in joint_types])
     beyond = np.argwhere((np.abs(q) > _TWO_TURNS) & turning)
     if beyond.size:
@@ -91,9 +89,10 @@ def require_radians(name: str, q: FloatArray, joint_types: str) -> None:
 def checked_array(
     name: str, given: npt.ArrayLike, shape: Sequence[int | None], said: str, *, finite: bool = False
 ) -> FloatArray:
-    """Numbers of a shape, of which None is any length of one or more; an InputError that says what is wrong.
+    """Convert to an array of numbers and check its shape; None stands for any length of one or more.
 
     said : the shape, for messages.
+    Raises InputError, naming the array and the shapes.
     """
     try:
         array = np.array(given, dtype=np.float64)

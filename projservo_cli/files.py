@@ -12,53 +12,54 @@ from pathlib import Path
 from projservo_cli.records import InputError
 
 _LOCK = ".lock"
-_LONGEST = 10_000_000  # bytes of a line that is a line
-_TEMPORARY = re.compile(r"\..+\.([0-9]+)\.[0-9a-f]{8}\.part")  # with the number of the process
+_LONGEST = 10_000_000  # maximum size of a line, bytes
+_TEMPORARY = re.compile(r"\..+\.([0-9]+)\.[0-9a-f]{8}\.part")  # name with the number of the process
 
 
 @contextmanager
-def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
-    """Yield a temporary neighbour of ``path`` that takes its place when the block succeeds.
+def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
+    """Yield a temporary neighbour of ``path`` that replaces it when the block succeeds.
 
-    The new content is on the disk before the old name points to it, unless it need not be ``lasting`` since
-    it can be made again at any time. Raises InputError when it cannot be written, or the disk is full.
+    durable : whether the new content is on the disk before the name points to it; False for files that can be
+        made again.
+    Raises InputError if it cannot be written, or the disk is full.
     """
-    with _told(path):
+    with _write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
     try:
-        with _told(path):
+        with _write_errors(path):
             temporary.touch(exist_ok=False)
             yield temporary
-            if lasting:
+            if durable:
                 _synchronise(temporary)
             temporary.replace(path)
-            if lasting:
+            if durable:
                 _synchronise(path.parent)
     finally:
-        with suppress(OSError):  # where nothing can be written, nothing can be removed
+        with suppress(OSError):  # a folder without write permission
             temporary.unlink(missing_ok=True)
 
 
 def write_whole(path: Path, content: str | bytes) -> Path:
-    """Write a file as ``replacing`` does, text in UTF-8; its path."""
+    """Write a file as ``replacing`` does, text in UTF-8, and return its path."""
     with replacing(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
 
 
-def text_of(path: Path | str, expected: str, most: int) -> str:
-    """The text of a file of at most so many bytes in UTF-8, with or without byte-order mark.
+def text_of(path: Path | str, expected: str, max_bytes: int) -> str:
+    """Text of a file of up to ``max_bytes`` in UTF-8, with or without byte-order mark.
 
-    Raises InputError, with what was ``expected``, when there is none.
+    Raises InputError, naming the ``expected`` content, if the file is no such text.
     """
     try:
         with Path(path).open("rb") as file:
-            content = file.read(most + 1)
+            content = file.read(max_bytes + 1)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected {expected}") from error
-    if len(content) > most:
-        raise InputError(f"{path}: larger than {most // 1_000_000} MB; expected {expected}")
+    if len(content) > max_bytes:
+        raise InputError(f"{path}: larger than {max_bytes // 1_000_000} MB; expected {expected}")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -66,18 +67,18 @@ def text_of(path: Path | str, expected: str, most: int) -> str:
         raise InputError(f"{path}:{line}: not UTF-8 text; expected {expected}") from error
 
 
-def lines_of(path: Path | str, expected: str, most: int) -> Iterator[str]:
-    """The lines of a file like that of ``text_of``, with their ends, read one after the other.
+def lines_of(path: Path | str, expected: str, max_bytes: int) -> Iterator[str]:
+    """Yield the lines, with their ends, of a file like that of ``text_of``.
 
-    Raises InputError, with the line, where there is none, or one has a NUL byte or no end.
+    Raises InputError, with the line, at a NUL byte, a line without end, or if the file is no text.
     """
     number, size = 1, 0
     try:
         with Path(path).open("rb") as file:
             while content := file.readline(_LONGEST + 1):
                 size += len(content)
-                if size > most:
-                    raise InputError(f"{path}: larger than {most // 1_000_000} MB; expected {expected}")
+                if size > max_bytes:
+                    raise InputError(f"{path}: larger than {max_bytes // 1_000_000} MB; expected {expected}")
                 if len(content) > _LONGEST:
                     raise InputError(f"{path}:{number}: a line without an end; expected {expected}")
                 if b"\0" in content:
@@ -93,40 +94,40 @@ def lines_of(path: Path | str, expected: str, most: int) -> Iterator[str]:
 
 @contextmanager
 def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
-    """Keep other processes from working in a folder, and remove what killed ones left there.
+    """Lock a folder against other processes, and remove leftovers of killed ones.
 
-    The lock is the system's: it ends with the process, however that ends.
+    The operating system ends the lock with the process.
 
-    folder : is made where there is none, and removed where nothing was written into it.
-    parts : folders in it, from which leftovers are removed as well.
-    name : of the lock, where not all of the folder is worked on.
-    Raises InputError where another process is at work, with its number, or the folder cannot be written to.
+    folder : created if missing, and removed if it stays empty.
+    parts : folders in it whose leftovers are removed too.
+    name : file name of the lock, if it covers a part of the folder.
+    Raises InputError if another process holds the lock, with its number, or the folder is not writable.
     """
     from filelock import FileLock, Timeout
 
     path, new = folder / name, not folder.exists()
     lock = FileLock(path, timeout=0)
-    with _told(folder, "; choose a folder you can write to"):
+    with _write_errors(folder, "; choose a folder you can write to"):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire()
         except Timeout as error:
             number = ""
-            with suppress(OSError):  # it may be gone by now
+            with suppress(OSError):  # the lock may be gone by now
                 number = path.read_text(encoding="ascii", errors="replace").strip()
             owner = f"process {number}" if number.isdecimal() else "another process"
             raise InputError(
                 f"{folder}: {owner} is at work there; wait for its end, or choose another folder with -o"
             ) from error
     try:
-        with suppress(OSError):  # who it is only serves the message
+        with suppress(OSError):  # only messages need the number of the process
             path.write_text(f"{os.getpid()}\n", encoding="ascii")
         for part in ("", *parts):
             _clear_leftovers(folder / part)
         yield
     finally:
         with suppress(OSError):
-            path.unlink()  # while it is held, so that no other process can hold what is removed
+            path.unlink()  # before the release, so that no other process holds a removed lock
         lock.release()
         if new:
             with suppress(OSError):
@@ -134,7 +135,7 @@ def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
 
 
 def tidy(folder: Path, *parts: str) -> None:
-    """Remove what a killed process left in a folder, where no other works there and nothing is to be done."""
+    """Remove leftovers of a killed process from a folder, if no other works there."""
     if (folder / _LOCK).exists():
         with suppress(InputError), working_in(folder, *parts):
             pass
@@ -149,7 +150,7 @@ def lies_inside(path: Path, folder: Path) -> bool:
 
 
 def require_inside(path: Path, folder: Path) -> None:
-    """Refuse a path that symbolic links lead out of a folder, with an ``InputError``."""
+    """Raise InputError for a path that symbolic links lead out of a folder."""
     if not lies_inside(path, folder):
         raise InputError(
             f"{path}: a symbolic link leads out of {folder}; remove it, or choose another folder with -o"
@@ -157,8 +158,8 @@ def require_inside(path: Path, folder: Path) -> None:
 
 
 @contextmanager
-def _told(path: Path, remedy: str = "") -> Iterator[None]:
-    """Tell in one line what keeps a file or a folder from being written."""
+def _write_errors(path: Path, remedy: str = "") -> Iterator[None]:
+    """Turn an OSError into an InputError of one line."""
     try:
         yield
     except OSError as error:
@@ -166,8 +167,8 @@ def _told(path: Path, remedy: str = "") -> Iterator[None]:
 
 
 def _clear_leftovers(folder: Path) -> None:
-    """Remove the temporary files in a folder whose writers were killed; those of processes that run stay."""
-    if sys.platform == "win32" or not folder.is_dir():  # no process can be asked for there
+    """Remove the temporary files of processes that no longer run from a folder."""
+    if sys.platform == "win32" or not folder.is_dir():  # Windows has no signal 0 to test for a process
         return
     for path in folder.iterdir():
         found = _TEMPORARY.fullmatch(path.name)
@@ -177,12 +178,12 @@ def _clear_leftovers(folder: Path) -> None:
             os.kill(int(found[1]), 0)
         except ProcessLookupError:
             path.unlink(missing_ok=True)
-        except (PermissionError, OverflowError):  # it runs for somebody else, or is no process
+        except (PermissionError, OverflowError):  # a process of another user, or no process number
             pass
 
 
 def _synchronise(path: Path) -> None:
-    if path.is_dir() and os.name == "nt":  # a folder cannot be opened there
+    if path.is_dir() and os.name == "nt":  # Windows opens no folders
         return
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:

@@ -1,4 +1,4 @@
-"""What cameras saw of a robot, with all that a calibration has to know beside the pixels."""
+"""Observations of a robot by two cameras, with all inputs of a calibration besides the pixels."""
 
 import dataclasses
 import tempfile
@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.display import Shown, checked_array, pandas
+from projservo_cli.display import Displayable, checked_array, pandas
 from projservo_cli.records import FloatArray, InputError, Observation
 from projservo_cli.tables import in_radians, read_table, to_csv, write_table
 
-_TABLE = "table"  # what messages call one that is no file
+_TABLE = "table"  # name in messages of a table that is not a file
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class Observations(Shown, Observation):
-    """Stereo images of markers at a sequence of poses, and what is known of them.
+class Observations(Displayable, Observation):
+    """Stereo images of markers at a sequence of poses, and their properties.
 
     Attributes
     ----------
@@ -32,8 +32,8 @@ class Observations(Shown, Observation):
     noise_px : standard deviation of a coordinate, px; None to estimate it.
     joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad); None to estimate it.
     source : ``simulated`` or ``recorded``.
-    exact : whether the pixel noise is all that is wrong with them, so that χ² decides against ``noise_px``.
-    seed : of the random starts of a calibration.
+    exact : whether pixel noise is their only error, so that χ² decides against ``noise_px``.
+    seed : seed of the random starts of a calibration.
     """
 
     joint_types: str = ""
@@ -46,14 +46,14 @@ class Observations(Shown, Observation):
 
     @classmethod
     def of(cls, observation: Observation, **known: Any) -> "Observations":
-        """Return a record with what is known beside it."""
+        """Return the observations of a record, with further properties."""
         fields = {field.name: getattr(observation, field.name) for field in dataclasses.fields(Observation)}
         types = known.pop("joint_types", None) or "R" * observation.q.shape[1]
         return cls(**fields, joint_types=types, **known)
 
     @property
     def record(self) -> Observation:
-        """What a run file keeps of it."""
+        """Record that a run file stores."""
         return Observation(**{one.name: getattr(self, one.name) for one in dataclasses.fields(Observation)})
 
     @classmethod
@@ -70,19 +70,19 @@ class Observations(Shown, Observation):
         image_size: tuple[int, int] | None = None,
         noise_px: float | None = None,
     ) -> "Observations":
-        """Return what arrays hold.
+        """Return observations from arrays.
 
         Parameters
         ----------
         q : (K, n) joint readings, rad or m unless ``joint_unit`` says deg.
         pixels : (K, 2, m, 2) raw pixels u, v of each marker in the left and the right image, NaN unseen.
         joint_types : one letter a joint, R or P; by default all R.
-        joint_unit : ``deg`` or ``rad`` of revolute joints; by default rad, where readings beyond two turns
-            are taken for a mistaken unit and refused.
+        joint_unit : ``deg`` or ``rad`` of revolute joints; by default rad, and readings beyond two turns are
+            refused as a mistaken unit.
         marker, pose : (m,) and (K,) numbers; by default from 0.
         sigma : (K, 2, m) standard deviations of a coordinate, px.
-        image_size : width and height, px; by default what the pixels span.
-        noise_px : standard deviation of a coordinate, px, where there is one for all; by default estimated.
+        image_size : width and height, px; by default the extent of the pixels.
+        noise_px : standard deviation of a coordinate, px, if it is common to all; by default estimated.
 
         Raises
         ------
@@ -126,20 +126,20 @@ class Observations(Shown, Observation):
         image_size: tuple[int, int] | None = None,
         noise_px: float | None = None,
     ) -> "Observations":
-        """Return what an observation table holds.
+        """Return observations from an observation table.
 
         Parameters
         ----------
         table : a pandas table or a mapping of columns, as [observation tables] have them, or the path of one.
         joint_types : one letter a joint column, R or P; by default all R.
         joint_unit : ``deg`` or ``rad`` of the revolute columns; by default rad.
-        image_size : width and height, px; by default what the pixels span.
+        image_size : width and height, px; by default the extent of the pixels.
         noise_px : standard deviation of a coordinate, px; by default that of the table, else estimated.
 
         Raises
         ------
         InputError
-            When a column is missing, or a row makes no sense.
+            If a column is missing, or a row is not valid.
         """
         if isinstance(table, (str, Path)):
             found = read_table(table, joint_types, joint_unit)
@@ -156,7 +156,7 @@ class Observations(Shown, Observation):
             return of_pandas.read_csv(path)
 
     def summary(self) -> dict[str, str]:
-        """Return what there is to tell, in words, by name."""
+        """Return a summary in words, by name."""
         seen = np.isfinite(self.images[..., 0])
         moving = 0 if self.moving is None else int((self.moving > 0).sum())
         noise = "to be estimated" if self.noise_px is None else f"{self.noise_px:g} px"
@@ -201,8 +201,8 @@ def _read(text: str, joint_types: str | None, joint_unit: str | None) -> Observa
         try:
             return read_table(path, joint_types, joint_unit)
         except InputError as error:
-            told = str(error).replace(str(path), _TABLE)
-            raise InputError(told.replace("--joint-unit deg", "joint_unit='deg'")) from error
+            message = str(error).replace(str(path), _TABLE)
+            raise InputError(message.replace("--joint-unit deg", "joint_unit='deg'")) from error
 
 
 def rows_of(q: npt.ArrayLike, n: int) -> FloatArray:

@@ -1,21 +1,22 @@
-"""A progress bar on a terminal, for work that tells how far it is."""
+"""A progress bar on a terminal."""
 
 import sys
 import threading
 import time
 from typing import Any
 
+# Period at which the clock of a bar advances, s.
 TICK_S = 0.5
 
 
 class Bar:
-    """Shows how far the work is, one bar at a time; silent where standard error is no terminal."""
+    """Progress bar, one at a time; silent if standard error is no terminal."""
 
     def __init__(self) -> None:
         self._bar: Any = None
 
     def __call__(self, what: str, done: int, total: int) -> None:
-        """Move the bar of ``what`` to so much of a total, and remove it at the end."""
+        """Move the bar of ``what`` to ``done`` of ``total``, and remove it at the end."""
         if not sys.stderr.isatty():
             return
         if self._bar is None or self._bar.desc != what:
@@ -30,7 +31,7 @@ class Bar:
             self.close()
 
     def say(self, text: str) -> None:
-        """Print a message on standard error, above the bar where one is shown."""
+        """Print a message on standard error, above a visible bar."""
         if self._bar is not None:
             self._bar.write(text, file=sys.stderr)
         else:
@@ -43,7 +44,7 @@ class Bar:
             self._bar = None
 
     def _tick(self, bar: Any) -> None:
-        """Let the clock of a bar go on while its work reports nothing."""
+        """Advance the clock of a bar while its work reports no progress."""
         while self._bar is bar:
             bar.refresh()
             time.sleep(TICK_S)

@@ -1,6 +1,6 @@
-"""What a result was made with: versions, machine, date, command, state of the sources.
+"""Provenance of a result: versions, machine, date, command, state of the sources.
 
-The version is told to whoever imports the package, so that slow imports wait until they are needed.
+The package imports this module for its version, so slow imports are inside functions.
 """
 
 import os
@@ -16,7 +16,7 @@ _PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
 
 
 def collect(*, seed: int) -> dict[str, Any]:
-    """Everything that may explain a difference between two runs of a seed; values are JSON."""
+    """Collect facts that may explain a difference between two runs of a seed; values are JSON."""
     return {
         "projservo": __version__,
         "python": platform.python_version(),
@@ -36,7 +36,7 @@ def collect(*, seed: int) -> dict[str, Any]:
 
 @cache
 def version_of(package: str) -> str | None:
-    """The version of an installed package; None where it is not installed."""
+    """Version of an installed package; None if it is not installed."""
     import importlib.metadata
 
     try:
@@ -47,7 +47,7 @@ def version_of(package: str) -> str | None:
 
 @cache
 def _git(*arguments: str) -> str | None:
-    """Answer of git about the checkout this package runs from; None where it is none."""
+    """Output of git for the checkout of this package; None outside of one."""
     import subprocess
 
     root = Path(__file__).resolve().parent.parent
@@ -64,7 +64,7 @@ def _git(*arguments: str) -> str | None:
 
 @cache
 def _cpu() -> str:
-    """Name of the processor, as the system tells it."""
+    """Name of the processor."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

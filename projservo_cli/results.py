@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from projservo_cli.calibration import predict, prediction_variance, residual_statistics
 from projservo_cli.calibration.prediction import error_factor, joint_derivative
-from projservo_cli.display import Shown, require_radians
+from projservo_cli.display import Displayable, require_radians
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.records import (
     Calibration,
@@ -33,7 +33,7 @@ def _fields_of(record: Any, kind: type) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class ImageModel(Shown, Calibration):
+class ImageModel(Displayable, Calibration):
     """A calibration that says where markers appear: all of its arrays, and what they are for.
 
     Views are left and right, markers in the order of ``marker``, pixels are raw u and v, joint
@@ -228,7 +228,7 @@ class Scene(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class MotionPlan(Shown, Plan):
+class MotionPlan(Displayable, Plan):
     """A plan that shows itself."""
 
     scene: Scene | None = None  # what it is drawn in, where that is at hand
@@ -270,7 +270,7 @@ class MotionPlan(Shown, Plan):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class RunTrace(Shown, Trace):
+class RunTrace(Displayable, Trace):
     """A trace that shows itself."""
 
     face: tuple[int, ...] = ()  # numbers of the markers of the face, where they are known

@@ -1,10 +1,10 @@
 """Observation tables: one row per marker seen at one robot pose, as comma-separated values.
 
-Columns, in any order: ``pose, marker, q1 … qN, u_left, v_left, u_right, v_right``, perhaps ``sigma_left,
-sigma_right, moving, t_q, t_left, t_right``; further columns are ignored. Joint readings are rad or m, pixels
-are raw, empty pixel cells mean *unseen*. Sigmas are standard deviations of the pixels, px. A pose with a
-number in ``moving`` is a moment of that motion; times are s, empty where unknown. Files are UTF-8 with or
-without byte-order mark, with any line ends.
+Columns, in any order: ``pose, marker, q1 … qN, u_left, v_left, u_right, v_right``, and optionally
+``sigma_left, sigma_right, moving, t_q, t_left, t_right``; others are ignored. Joint readings are rad or m,
+pixels are raw, empty pixel cells mean *unseen*. Sigmas are standard deviations of the pixels, px. A pose with
+a number in ``moving`` belongs to that motion; times are s, empty if unknown. Files are UTF-8 with or without
+byte-order mark, with any line ends.
 """
 
 import csv
@@ -23,14 +23,16 @@ import numpy.typing as npt
 from projservo_cli.files import lines_of, write_whole
 from projservo_cli.records import FloatArray, InputError, IntArray, JointList, Observation
 
-_MAX_JOINTS = 64  # as many as a configuration may have
-_MAX_COLUMNS = 10_000
-_MAX_BYTES = 1_000_000_000  # of a table; more would not be calibrated from
-_MAX_CELLS = 12_000_000  # poses × markers: mistyped numbers of poses must not fill the memory
-_TWO_TURNS = 4.0 * math.pi  # rad; no arm with stops turns a joint that far from its zero
-_PIXELS, _SIGMAS = ("u_left", "v_left", "u_right", "v_right"), ("sigma_left", "sigma_right")
-_MOVING, _TIMES = "moving", ("t_q", "t_left", "t_right")
-_RECORDING = "recording"  # column that says which recording a row belongs to
+_MAX_JOINTS = 64  # maximum number of joints, as in a configuration
+_MAX_COLUMNS = 10_000  # maximum number of columns
+_MAX_BYTES = 1_000_000_000  # maximum size of a table, far beyond what a calibration takes
+_MAX_CELLS = 12_000_000  # maximum of poses × markers: mistyped pose numbers must not fill the memory
+_TWO_TURNS = 4.0 * math.pi  # rad; no joint of an arm with stops turns that far from its zero
+_PIXELS = ("u_left", "v_left", "u_right", "v_right")  # columns of pixels
+_SIGMAS = ("sigma_left", "sigma_right")  # columns of their standard deviations
+_MOVING = "moving"  # column of the number of a motion
+_TIMES = ("t_q", "t_left", "t_right")  # columns of times, s
+_RECORDING = "recording"  # column of the recording that a row belongs to
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
 _INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -42,10 +44,10 @@ def read_table(
     """Read an observation table.
 
     joint_types : one letter a joint column, R or P, by default all R.
-    joint_unit : unit of the revolute columns, ``deg`` or ``rad``; by default rad, where readings beyond two
-        turns are taken for a mistaken unit and refused.
-    Returns poses in the order of their first row, markers by number; NaN where unseen; readings in rad and m.
-    Raises InputError ``file:line: what`` when the file cannot be read or a row makes no sense.
+    joint_unit : unit of the revolute columns, ``deg`` or ``rad``; by default rad, and readings beyond two
+        turns are refused as a mistaken unit.
+    Returns poses in the order of their first row, markers by number; NaN if unseen; readings in rad and m.
+    Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
     """
     optional = [*_SIGMAS, _MOVING, *_TIMES]
     sheet = _Sheet(path, ["pose", "marker", *_PIXELS], joint_types, optional=optional)
@@ -55,7 +57,7 @@ def read_table(
     rows, seen = array("q"), array("d")  # pose and marker; pixels, then their deviations
     for row in sheet.rows():
         pose, marker = row.integer("pose"), row.integer("marker")
-        seen.extend(row.sighting(stated))
+        seen.extend(row.observation(stated))
         rows.extend((pose, marker))
         of_pose = {name: row.number(name) for name in sheet.joints} | row.moment()
         line, first = readings.setdefault(pose, (row.line, of_pose))
@@ -68,7 +70,7 @@ def read_table(
         if (line := lines.setdefault(pose, {}).setdefault(marker, row.line)) != row.line:
             raise InputError(f"{row.where}: marker {marker} at pose {pose} is already in line {line}")
     if not rows:
-        raise InputError(f"{sheet.file}: the table has a header but no rows; nothing was observed")
+        raise InputError(f"{sheet.file}: the table has a header but no rows; add an observation a row")
     del lines
     of_row = np.frombuffer(rows, dtype=np.int64).reshape(-1, 2)
     poses = {pose: k for k, pose in enumerate(readings)}
@@ -83,7 +85,7 @@ def read_table(
     if sigma is not None:
         sigma[k, :, j] = of_seen[:, 4:]
     numbers, values = np.array([*poses], dtype=np.int64), [of_pose for _, of_pose in readings.values()]
-    # (K, columns); what is not known becomes NaN
+    # (K, columns); unknown values become NaN
     q_read, moving, times = (
         np.array([[of_pose.get(name) for name in names] for of_pose in values], dtype=np.float64)
         for names in (sheet.joints, (_MOVING,), _TIMES)
@@ -103,11 +105,11 @@ def read_table(
 def read_joint_list(
     path: Path | str, joint_types: str | None = None, joint_unit: str | None = None
 ) -> JointList:
-    """Read a list of joint readings, one pose a row: columns ``q1 … qN``, perhaps ``pose, left, right``.
+    """Read a list of joint readings, one pose a row: columns ``q1 … qN``, optionally ``pose, left, right``.
 
     joint_types : as for an observation table.
     joint_unit : ``deg`` or ``rad`` as for an observation table; with ``rad`` readings stay as they are.
-    Raises InputError ``file:line: what`` when the file cannot be read or a row makes no sense.
+    Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
     """
     sheet = _Sheet(path, [], joint_types, optional=["pose", "left", "right"])
     sheet.has_both(("left", "right"))
@@ -122,7 +124,7 @@ def read_joint_list(
         if "" in names[-1]:
             raise InputError(f"{row.where}: an image has no name; name both, or drop the row")
     if not readings:
-        raise InputError(f"{sheet.file}: there is a header but no rows; no pose was given")
+        raise InputError(f"{sheet.file}: the list has a header but no rows; add a pose a row")
     poses = np.array([*lines], dtype=np.int64)
     q = sheet.in_radians(poses, np.array(readings), joint_unit)
     left, right = zip(*names, strict=True) if names[0] else (None, None)
@@ -130,7 +132,7 @@ def read_joint_list(
 
 
 def recording_of(path: Path | str) -> str | None:
-    """The recording that all rows of a table belong to; None where they name none or several."""
+    """Recording that all rows of a table belong to; None if they name none or several."""
     sheet = _Sheet(path, [], optional=[_RECORDING])
     found = {row[_RECORDING] for row in sheet.rows() if _RECORDING in row}
     return found.pop() if len(found) == 1 else None
@@ -139,8 +141,7 @@ def recording_of(path: Path | str) -> str | None:
 def write_table(observation: Observation, path: Path | str, *, recording: str = "") -> None:
     """Write an observation table that ``read_table`` reads back to the last bit.
 
-    Every marker of every pose has a row, with empty cells where unseen. ``recording``, if given, stands in a
-    further column of every row.
+    Every marker of every pose has a row, with empty cells if unseen. ``recording`` fills a further column.
     """
     K, m = len(observation.pose), len(observation.marker)
     columns = {"pose": np.repeat(observation.pose, m), "marker": np.tile(observation.marker, K)}
@@ -167,13 +168,13 @@ def _or_empty(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def to_csv(arrays: Mapping[str, npt.NDArray[Any]], down: int | None = None) -> str:
-    """All arrays side by side, each from the first row on; cells past the end of an array are empty.
+    """Write arrays side by side, each from the first row on; cells past the end of an array are empty.
 
-    Numbers are written so that reading them gives the same numbers.
+    Numbers are written without loss.
 
     arrays : by name.
-    down : axis that runs down; by default the longest of each array. The others stand in the heading, the
-        NumPy expression of the column, such as ``images[0,:,1]``.
+    down : axis along the rows; by default the longest of each array. The heading of a column is its NumPy
+        expression, such as ``images[0,:,1]``.
     """
     found = [column for name, array in arrays.items() for column in _columns(name, np.asarray(array), down)]
     stream = io.StringIO()
@@ -186,25 +187,25 @@ def to_csv(arrays: Mapping[str, npt.NDArray[Any]], down: int | None = None) -> s
 def _columns(name: str, array: npt.NDArray[Any], down: int | None) -> Iterator[tuple[str, list[str]]]:
     """Heading and cells of each column of an array; a scalar is a column of one entry."""
     if array.ndim < 2:
-        yield name, [_shown(value) for value in np.atleast_1d(array).tolist()]
+        yield name, [_cell(value) for value in np.atleast_1d(array).tolist()]
         return
     down = int(np.argmax(array.shape)) if down is None else down
     rows = np.moveaxis(array, down, 0)
     for index in np.ndindex(*rows.shape[1:]):
-        place = [*map(str, index[:down]), ":", *map(str, index[down:])]
-        yield f"{name}[{','.join(place)}]", [_shown(value) for value in rows[(slice(None), *index)].tolist()]
+        axes = [*map(str, index[:down]), ":", *map(str, index[down:])]
+        yield f"{name}[{','.join(axes)}]", [_cell(value) for value in rows[(slice(None), *index)].tolist()]
 
 
-def _shown(value: Any) -> str:
+def _cell(value: Any) -> str:
     return str(int(value)) if isinstance(value, bool) else str(value)
 
 
 def in_radians(
     where: str, joint_types: str, pose: IntArray, q: FloatArray, unit: str | None, option: str
 ) -> FloatArray:
-    """Readings (K, n) in rad and m; those that can hardly be rad are refused unless a unit is given.
+    """Convert readings (K, n) to rad and m; implausible rad are refused unless a unit is given.
 
-    where, option : what holds them, and how to give a unit, for messages.
+    where, option : file or argument of the readings, and option of the unit, for messages.
     """
     revolute = np.array([letter in "Rr" for letter in joint_types])
     if unit == "deg":
@@ -228,11 +229,11 @@ class _Row(dict[str, str]):
 
     @property
     def where(self) -> str:
-        """The file with the line."""
+        """File and line, for messages."""
         return f"{self.file}:{self.line}"
 
-    def sighting(self, stated: bool) -> list[float]:
-        """Pixels of both views, perhaps followed by their deviations, NaN where unseen."""
+    def observation(self, stated: bool) -> list[float]:
+        """Pixels of both views, and their deviations if stated, NaN if unseen."""
         pixels, sigmas = [], []
         for u, v, deviation in zip(_PIXELS[::2], _PIXELS[1::2], _SIGMAS, strict=True):
             seen = self[u] != ""
@@ -250,7 +251,7 @@ class _Row(dict[str, str]):
         return int(self[column])
 
     def moment(self) -> dict[str, float | None]:
-        """What the columns tell of the motion and the times of a pose; None for a time that is not known."""
+        """Number of the motion and times of a pose, by column; None for an unknown time."""
         found: dict[str, float | None] = {
             name: self.number(name) if self[name] else None for name in _TIMES if name in self
         }
@@ -277,7 +278,7 @@ class _Row(dict[str, str]):
 
 
 class _Sheet:
-    """A table: the columns that are read (those needed, q1 … qN, optional ones if present), and its rows."""
+    """A table with the columns that are read (needed ones, q1 … qN, optional ones if present)."""
 
     def __init__(
         self,
@@ -304,7 +305,7 @@ class _Sheet:
     def _wrong(
         self, names: Sequence[str], needed: Sequence[str], wanted: Sequence[str], joint_types: str | None
     ) -> str:
-        """What is wrong with the header; empty where nothing is."""
+        """Describe an error of the header; empty if there is none."""
         n = len(self.joints)
         if len(names) > _MAX_COLUMNS:
             return f"{len(names)} columns; a table has at most {_MAX_COLUMNS}"
@@ -324,14 +325,14 @@ class _Sheet:
         return ""
 
     def has_both(self, pair: tuple[str, str]) -> bool:
-        """Whether both columns of a pair are there; an InputError for one without the other."""
+        """Whether both columns of a pair are present. Raises InputError for one without the other."""
         present = [name in self.columns for name in pair]
         if any(present) and not all(present):
             raise InputError(f"{self.file}:1: give the columns {pair[0]} and {pair[1]} both, or neither")
         return all(present)
 
     def rows(self) -> Iterator[_Row]:
-        """Each row that is not blank; an InputError at one of another length than the header."""
+        """Yield the rows that are not blank. Raises InputError at a row of another length than the header."""
         while (cells := self._next()) is not None:
             if not any(cell.strip() for cell in cells):
                 continue
@@ -354,5 +355,5 @@ class _Sheet:
             ) from error
 
     def in_radians(self, pose: IntArray, q: FloatArray, unit: str | None) -> FloatArray:
-        """Readings (K, n) in rad and m; those that can hardly be rad are refused unless it is asked for."""
+        """Convert readings (K, n) to rad and m, as ``in_radians``."""
         return in_radians(self.file, "".join(self._joint_types), pose, q, unit, "--joint-unit {}")

@@ -6,16 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.control.law import ERRORS, Gains, Law, new_state
-from projservo_cli.geometry.lens import bent
+from projservo_cli.geometry.lens import distort
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.step import VERDICTS, Limits, new_log
 from projservo_cli.records import FloatArray, Model, position_limits
 from projservo_cli.simulation.ideal import Plant
-from projservo_cli.task.body import body_of
+from projservo_cli.task.body import make_body
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
-from projservo_cli.task.target import Shown
+from projservo_cli.task.target import TaskImages
 from tests.samples import METRIC_A_INF, arm, face, in_frame, pixels, poe
 
 GAINS = Gains(2.5, 2.5, 2.5, 2.5, 1.0, 2.5, 0.04, 0.9)
@@ -38,7 +38,7 @@ class Scene(NamedTuple):
 
     def task(self, G=None) -> Task:
         """Task in the frame of the model ``self.seen(G)``."""
-        return Shown(self.q_start, self.s_start, self.s_star, self.plant.center).task(self.seen(G))
+        return TaskImages(self.q_start, self.s_start, self.s_star, self.plant.center).task(self.seen(G))
 
     def seen(self, G=None) -> Model:
         """Model in another frame."""
@@ -48,10 +48,12 @@ class Scene(NamedTuple):
         """The same task measured with face and pins; images of the pins are the true ones."""
         model = self.seen(G)
         M = np.concatenate([self.plant.M, self.plant.pins])
-        body = body_of(model, M if G is None else M @ G.T)
+        body = make_body(model, M if G is None else M @ G.T)
         lens = self.model.lens[:, None]
-        s = [bent(lens, pixels(self.model.P, M @ poe(self.model, q).T)) for q in (self.q_start, self.q_goal)]
-        return Shown(self.q_start, *s, self.plant.center, len(self.plant.pins), body).task(model)
+        s = [
+            distort(lens, pixels(self.model.P, M @ poe(self.model, q).T)) for q in (self.q_start, self.q_goal)
+        ]
+        return TaskImages(self.q_start, *s, self.plant.center, len(self.plant.pins), body).task(model)
 
     def images(self, q) -> FloatArray:
         """True pixels of the face at the joints q."""

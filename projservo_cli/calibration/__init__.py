@@ -1,9 +1,9 @@
 """Projective kinematics from stereo images of trial motions: [RH00] section 2.
 
-The path of a calibration: what was seen (``readings``) → the rig (``epipolar``) → a start (``start``) →
-bundle adjustment (``adjustment``) of the ``forward`` model, robustly (``fit``) → what was left out
-(``diagnosis``) → its frame and covariance (``projective``) → the verdict (``quality``); ``estimate`` leads
-through it, and ``prediction`` is what the result is for, with how far it errs.
+``estimate`` runs the steps: pixels (``detections``), geometry of the rig (``epipolar``), initial parameters
+(``initialization``), robust bundle adjustment (``fit``, ``adjustment``), outliers (``diagnosis``), frame and
+covariance (``projective``), assessment (``quality``). ``prediction`` has the forward model, and predicts
+images and their errors from the result.
 """
 
 from projservo_cli.calibration.estimate import calibrate

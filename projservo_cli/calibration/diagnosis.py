@@ -10,216 +10,232 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
-from projservo_cli.calibration.adjustment import LeastSquares, cross_matrix, minimize, settled
+from projservo_cli.calibration.adjustment import LeastSquares, cross_matrix, fit_offsets, minimize
+from projservo_cli.calibration.detections import RAYLEIGH, Detections
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution, fit_from, median_px
-from projservo_cli.calibration.initialization import Search, carrying, starts, still
-from projservo_cli.calibration.lens_estimation import straightened
-from projservo_cli.calibration.prediction import CAMERA, Scene
-from projservo_cli.calibration.readings import RAYLEIGH, Readings
+from projservo_cli.calibration.initialization import Search, starting_markers, starts, stationary
+from projservo_cli.calibration.lens_estimation import undistorted
+from projservo_cli.calibration.prediction import CAMERA, Parameters
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
-# A pose is explained by a corrected joint reading when its median residual falls below so many σ.
+# Median residual, in σ, below which a corrected joint reading explains a pose.
 _CORRECTED = 3.0
-# Sightings of a pose by which wrong joint readings are told; least readings of a marker to judge it.
-_SHOWN, _SEEN = 50, 3
-# Sightings both views agree on, in units of the epipolar noise, are no errors of detection.
+# Maximum number of observations of a pose in the search for wrong joint readings.
+_MAX_OF_POSE = 50
+# Minimum number of detections of a marker to diagnose it.
+_SEEN = 3
+# Epipolar distance, in units of its noise, below which an observation is no error of detection.
 _CONSISTENT = 3.0
-# Share of sightings both views agree on that may be left out of a fit, and share of the sightings of a pose
-# that a wrong motion puts off at least: single corners under a slant err along the epipolar line.
-_MOST_UNEXPLAINED, _LEAST_OF_POSE = 0.02, 0.25
-# Sightings of one pose that agree on joints by more than chance.
+# Maximum share of observations that both views agree on and a fit may reject.
+_MAX_UNEXPLAINED = 0.02
+# Minimum share of a pose's observations that a wrong motion displaces: single slanted corners err alike.
+_MIN_OF_POSE = 0.25
+# Minimum number of observations of one pose whose agreement on joints is more than chance.
 _AGREEING = 5
-# Markers by which the noise at free poses is told.
+# Maximum number of markers in the estimate of noise at free poses.
 _FREED = 150
+# Number of hypotheses about a joint at fault that are fitted completely.
+_FOLLOWED = 2
+# Number of adjustment steps of the screws by which hypotheses are compared before.
+_SCREW_STEPS = 8
+# Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
+_SIMPLER = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Outliers:
-    """Explanations of what was left out."""
+    """Explanations of rejected detections."""
 
     suspect: IntArray  # (S, 2) row of the pose and index of the joint whose reading no image agrees with
-    swapped: IntArray  # (W, 3) row of the pose, index of the marker that was read and of the one it is
-    poses: IntArray  # (P,) rows of poses whose images are of other joints than those read
-    explained: BoolArray  # (2, N) readings that these explain
+    id_switches: IntArray  # (W, 3) row of the pose, index of the marker as numbered and of the true one
+    poses: IntArray  # (P,) rows of poses whose images show other joints than those read
+    explained: BoolArray  # (2, N) detections that these explain
 
     @classmethod
-    def nothing(cls, readings: Readings) -> "Outliers":
-        """No explanation of anything."""
+    def empty(cls, detections: Detections) -> "Outliers":
+        """Return no explanations."""
         rows = np.zeros((0, 3), dtype=np.int64)
-        return cls(rows[:, :2], rows, rows[:, 0], np.zeros_like(readings.seen))
+        return cls(rows[:, :2], rows, rows[:, 0], np.zeros_like(detections.seen))
 
     @classmethod
     def of(cls, solution: Solution) -> "Outliers":
-        """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings."""
-        problem, scene, used = solution.problem, solution.scene, solution.used
-        readings, sigma = problem.readings, solution.sigma_px
-        out = readings.seen & ~used
-        swapped, explained = _swaps(problem, scene, out, OUTLIER * sigma)
+        """Explain rejected detections, first by exchanged marker numbers, then by wrong joint readings."""
+        problem, params, used = solution.problem, solution.params, solution.used
+        detections, sigma = problem.detections, solution.sigma_px
+        out = detections.seen & ~used
+        id_switches, explained = _id_switches(problem, params, out, OUTLIER * sigma)
         suspects, poses = list[tuple[int, int]](), list[int]()
-        for k in np.flatnonzero(readings.count_at(used) == 0):
-            here = readings.pose_of == k
-            pose = dataclasses.replace(readings, seen=readings.seen & ~explained).rows(here)
+        for k in np.flatnonzero(detections.count_at(used) == 0):
+            here = detections.pose_of == k
+            pose = dataclasses.replace(detections, seen=detections.seen & ~explained).rows(here)
             rows = np.flatnonzero(pose.seen.any(axis=0))
             if rows.size < 3:
                 continue
-            some = np.isin(np.arange(len(pose.pose_of)), rows[:: max(1, rows.size // _SHOWN)])
+            some = np.isin(np.arange(len(pose.pose_of)), rows[:: max(1, rows.size // _MAX_OF_POSE)])
             alone = LeastSquares.of(pose.rows(some), problem.q_reference).with_noise(problem.tau)
-            joints = _wrong_joints(alone, scene, sigma)
+            joints = _wrong_joints(alone, params, sigma)
             suspects += [(int(k), i) for i in joints]
-            if joints or _is_elsewhere(alone, scene, problem.q, sigma):
+            if joints or _fits_other_joints(alone, params, problem.q, sigma):
                 explained[:, here] |= out[:, here]
                 poses += [] if joints else [int(k)]
         pairs = np.array(suspects, dtype=np.int64).reshape(-1, 2)
-        return cls(pairs, swapped, np.array(poses, dtype=np.int64), explained)
+        return cls(pairs, id_switches, np.array(poses, dtype=np.int64), explained)
 
 
-def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) -> tuple[IntArray, BoolArray]:
-    """Sightings (W, 3) that lie where another marker belongs in every view, and their readings (2, N).
+def _id_switches(
+    problem: LeastSquares, params: Parameters, out: BoolArray, limit: float
+) -> tuple[IntArray, BoolArray]:
+    """Observations (W, 3) that lie where another marker belongs in every view, and their detections (2, N).
 
-    The other is itself not seen there, or left out; a view that fits its own marker speaks against it.
+    The other marker is unseen or rejected there. A detection that fits its own marker contradicts a switch.
     """
-    readings = problem.readings
-    joints, rows = problem.joints(settled(problem, scene)), np.flatnonzero((out == readings.seen).all(axis=0))
+    detections = problem.detections
+    joints, rows = (
+        problem.joints(fit_offsets(problem, params)),
+        np.flatnonzero((out == detections.seen).all(axis=0)),
+    )
     found = set()
     explained = np.zeros_like(out)
-    for k in np.unique(readings.pose_of[rows]):
-        here = readings.pose_of == k
-        free = np.ones(readings.marker.size, dtype=bool)
-        free[readings.marker_of[here & ~out.any(axis=0)]] = False
-        predicted = np.nan_to_num(scene.seen(joints[k : k + 1])[0], nan=-np.inf)
+    for k in np.unique(detections.pose_of[rows]):
+        here = detections.pose_of == k
+        free = np.ones(detections.marker.size, dtype=bool)
+        free[detections.marker_of[here & ~out.any(axis=0)]] = False
+        predicted = np.nan_to_num(params.predict(joints[k : k + 1])[0], nan=-np.inf)
         others = np.flatnonzero(free & np.isfinite(predicted).all(axis=(0, 2)))
         trees = [cKDTree(predicted[v, others]) for v in (0, 1)]
         for row in rows[here[rows]]:
-            # A view that did not see the marker has no say.
+            # A view that did not see the marker counts for nothing.
             near = [
-                trees[v].query_ball_point(readings.pixels[v, row], limit / readings.weight[v, row])
-                for v in np.flatnonzero(readings.seen[:, row])
+                trees[v].query_ball_point(detections.pixels[v, row], limit / detections.weight[v, row])
+                for v in np.flatnonzero(detections.seen[:, row])
             ]
-            marker = int(readings.marker_of[row])
+            marker = int(detections.marker_of[row])
             fits = np.setdiff1d(others[np.array(reduce(np.intersect1d, near), dtype=np.int64)], marker)
             if fits.size == 1:
                 found.add((int(k), marker, int(fits[0])))
                 explained[:, row] = out[:, row]
-    # An exchange shows in both markers and is one finding.
-    listed = sorted((k, a, b) for k, a, b in found if a < b or (k, b, a) not in found)
-    return np.array(listed, dtype=np.int64).reshape(-1, 3), explained
+    # A switch of two markers shows in both and counts once.
+    switches = sorted((k, a, b) for k, a, b in found if a < b or (k, b, a) not in found)
+    return np.array(switches, dtype=np.int64).reshape(-1, 3), explained
 
 
-def _is_elsewhere(pose: LeastSquares, scene: Scene, q: FloatArray, sigma: float) -> bool:
-    """Whether other joints explain the images of a pose: those of another one (K, n), or near these."""
+def _fits_other_joints(pose: LeastSquares, params: Parameters, q: FloatArray, sigma: float) -> bool:
+    """Whether other joints explain the images of a pose: those of another pose (K, n), or near these."""
     poses = [dataclasses.replace(pose, q=np.broadcast_to(at, pose.q.shape), tau=None) for at in q]
-    levels = [median_px(one.residual(scene), one.readings.seen) for one in poses]
+    levels = [median_px(one.residual(params), one.detections.seen) for one in poses]
     nearest = poses[int(np.argmin(levels))]
-    level = min(min(levels), _corrected_level(nearest, scene, list(range(q.shape[1])), sigma))
+    level = min(min(levels), _corrected_level(nearest, params, list(range(q.shape[1])), sigma))
     return level <= _CORRECTED * RAYLEIGH * sigma
 
 
-def why_lost(solution: Solution, kept: BoolArray) -> IntArray:
-    """Markers left out whole, (T, 2): index, and why, an index into ``WHY_LOST``; others (m,) are kept."""
-    readings = solution.problem.readings
+def rejection_reasons(solution: Solution, kept: BoolArray) -> IntArray:
+    """Rejected markers (T, 2), those not ``kept`` (m,): index, and reason, an index into ``WHY_LOST``."""
+    detections = solution.problem.detections
     near = np.linalg.norm(solution.residual, axis=2) <= OUTLIER * solution.sigma_px
-    fits = readings.count_of(readings.seen & near)
-    seen = readings.count_of(readings.seen)
-    why = np.select([still(readings, solution.sigma_px), seen < _SEEN, fits > seen / _SEEN], [0, 3, 2], 1)
+    fits = detections.count_of(detections.seen & near)
+    seen = detections.count_of(detections.seen)
+    why = np.select(
+        [stationary(detections, solution.sigma_px), seen < _SEEN, fits > seen / _SEEN], [0, 3, 2], 1
+    )
     return np.stack([np.flatnonzero(~kept), why[~kept]], axis=1)
 
 
-def _wrong_joints(pose: LeastSquares, scene: Scene, sigma: float) -> tuple[int, ...]:
-    """The joint, or else the pair of joints, whose correction explains the images of a pose; or none."""
+def _wrong_joints(pose: LeastSquares, params: Parameters, sigma: float) -> tuple[int, ...]:
+    """Joint, or else pair of joints, whose correction explains the images of a pose; or none."""
     for size in (1, 2):
         pairs = list(itertools.combinations(range(pose.q.shape[1]), size))
-        levels = [_corrected_level(pose, scene, list(joints), sigma) for joints in pairs]
+        levels = [_corrected_level(pose, params, list(joints), sigma) for joints in pairs]
         if min(levels, default=np.inf) <= _CORRECTED * RAYLEIGH * sigma:
             return pairs[int(np.argmin(levels))]
     return ()
 
 
-def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int], sigma: float) -> float:
-    """Median residual after some joints of a pose are fitted to its images, nearly by least distances, px.
+def _corrected_level(pose: LeastSquares, params: Parameters, joints: list[int], sigma: float) -> float:
+    """Median residual, px, after a robust fit of some joints of a pose to its images.
 
-    The others may be off by their noise.
+    The other joints may be off by their noise.
     """
-    seen, n = pose.readings.seen, pose.q.shape[1]
+    seen, n = pose.detections.seen, pose.q.shape[1]
     others = np.setdiff1d(np.arange(n) if pose.tau is not None else joints, joints)
     moved = np.eye(n)[[*joints, *others]]
 
     def residual(x: FloatArray) -> FloatArray:
-        images = dataclasses.replace(pose, q=pose.q + x @ moved).residual(scene)[seen].ravel()
+        images = dataclasses.replace(pose, q=pose.q + x @ moved).residual(params)[seen].ravel()
         return images if pose.tau is None else np.concatenate([images, x[len(joints) :] / pose.tau[others]])
 
     found = least_squares(residual, np.zeros(len(moved)), loss="soft_l1", f_scale=sigma)
     return float(np.median(np.linalg.norm(found.fun[: 2 * int(seen.sum())].reshape(-1, 2), axis=1)))
 
 
-def _doubtful(solution: Solution, found: Outliers, epipolar: Epipolar) -> BoolArray:
-    """Sightings (N,) left out without explanation that both views agree on, where they are not alone.
+def _doubtful_observations(solution: Solution, found: Outliers, epipolar: Epipolar) -> BoolArray:
+    """Mask (N,) of rejected, unexplained observations that both views agree on, if a pose has several.
 
-    Errors of detection break the epipolar geometry; what obeys it speaks against the model of the robot.
+    Errors of detection break the epipolar geometry; observations that obey it contradict the robot model.
     """
-    readings = straightened(solution.problem.readings, solution.scene.lens)
-    both = readings.both
+    detections = undistorted(solution.problem.detections, solution.params.lens)
+    both = detections.both
     out = both & ~solution.used.all(axis=0) & ~found.explained.any(axis=0)
-    out[both] &= epipolar.within(readings.rows(both), _CONSISTENT)
-    at, poses = readings.pose_of, len(readings.q)
+    out[both] &= epipolar.within(detections.rows(both), _CONSISTENT)
+    at, poses = detections.pose_of, len(detections.q)
     share = np.bincount(at[out], minlength=poses) / np.maximum(np.bincount(at[both], minlength=poses), 1)
-    return np.asarray(out & (share >= _LEAST_OF_POSE)[at])
+    return np.asarray(out & (share >= _MIN_OF_POSE)[at])
 
 
-def unexplained(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
-    """What speaks against a fit: sightings left out that both views agree on, in words, else empty."""
-    sightings = int(solution.problem.readings.both.sum())
-    count = int(_doubtful(solution, found, epipolar).sum())
-    if count <= max(3.0, _MOST_UNEXPLAINED * sightings):
+def describe_unexplained(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
+    """Describe rejected observations that both views agree on, which contradict a fit; else empty."""
+    total = int(solution.problem.detections.both.sum())
+    count = int(_doubtful_observations(solution, found, epipolar).sum())
+    if count <= max(3.0, _MAX_UNEXPLAINED * total):
         return ""
     return (
-        f"in {count} of {sightings} sightings both cameras agree with each other but not with the robot; "
+        f"in {count} of {total} observations both cameras agree with each other but not with the robot; "
         "check the joint readings and types (R or P)"
     )
 
 
-def other_motion(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
-    """Other joints than those read that sightings left out agree on, in words, else empty.
+def describe_other_motion(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
+    """Describe a motion other than the joint readings that rejected observations agree on; else empty.
 
-    Of sightings that both views agree on, at poses of which the rest is kept.
+    It takes observations that both views agree on, at poses of which the rest is kept.
     """
-    problem, sightings = solution.problem, int(solution.problem.readings.both.sum())
-    out, count = _doubtful(solution, found, epipolar), 0
-    for k in np.unique(problem.readings.pose_of[out]):
-        rows = np.flatnonzero(out & (problem.readings.pose_of == k))
+    problem, total = solution.problem, int(solution.problem.detections.both.sum())
+    out, count = _doubtful_observations(solution, found, epipolar), 0
+    for k in np.unique(problem.detections.pose_of[out]):
+        rows = np.flatnonzero(out & (problem.detections.pose_of == k))
         if rows.size < _AGREEING:
             continue
-        some = rows[:: max(1, rows.size // _SHOWN)]
-        alone = LeastSquares.of(problem.readings.rows(some), problem.q_reference).with_noise(problem.tau)
-        count += rows.size if _is_elsewhere(alone, solution.scene, problem.q, solution.sigma_px) else 0
-    if count <= max(3.0, _MOST_UNEXPLAINED * sightings):
+        some = rows[:: max(1, rows.size // _MAX_OF_POSE)]
+        alone = LeastSquares.of(problem.detections.rows(some), problem.q_reference).with_noise(problem.tau)
+        count += rows.size if _fits_other_joints(alone, solution.params, problem.q, solution.sigma_px) else 0
+    if count <= max(3.0, _MAX_UNEXPLAINED * total):
         return ""
     return (
-        f"{count} of {sightings} sightings show other joints than those read; check how poses and images are "
+        f"{count} of {total} observations show other joints than those read; check how poses and images are "
         "paired, and the joint readings and types (R or P)"
     )
 
 
 def noise_at_free_poses(solution: Solution) -> float:
-    """Noise per coordinate that is left where the body may move freely to each pose, px.
+    """Noise per coordinate, px, of a fit in which the body moves freely to each pose.
 
-    No error of joints has a part in it: residuals are cleared, to first order, of what cameras, markers and
-    rigid motions of the poses can undo. What a robot does to images is among these.
+    Errors of joints have no part in it: to first order it removes from the residuals everything that
+    cameras, markers and rigid motions of the poses can undo, hence any motion of a robot.
     """
-    solution = solution.kept().of_some(_FREED)
-    problem, readings, used = solution.problem, solution.problem.readings, solution.used[..., None, None]
-    (K, m), N = (len(problem.q), readings.marker.size), readings.pose_of.size
-    images = solution.scene.images(problem.joints(solution.scene), readings.pose_of, readings.marker_of)
+    solution = solution.kept().thinned(_FREED)
+    problem, detections, used = solution.problem, solution.problem.detections, solution.used[..., None, None]
+    (K, m), N = (len(problem.q), detections.marker.size), detections.pose_of.size
+    images = solution.params.images(problem.joints(solution.params), detections.pose_of, detections.marker_of)
     points = images.points[0][:, :3]
     turned = cross_matrix(np.median(points, axis=0) - points)  # about the middle, negative
-    J, by_place = problem.derivative(solution.scene), images.by_point[0][..., :3]
-    by_motion = np.concatenate([by_place @ turned, by_place], axis=3) * readings.weight[..., None, None]
+    J, by_place = problem.derivative(solution.params), images.by_point[0][..., :3]
+    by_motion = np.concatenate([by_place @ turned, by_place], axis=3) * detections.weight[..., None, None]
     X = np.zeros((2, N, 2, 2 * CAMERA + 3 * m + 6 * K))
     for v in (0, 1):
         X[v, ..., v * CAMERA : (v + 1) * CAMERA] = J[v, ..., :CAMERA]
     for block, values, first in (
-        (readings.marker_of, J[..., -3:], 2 * CAMERA),
-        (readings.pose_of, by_motion, 2 * CAMERA + 3 * m),
+        (detections.marker_of, J[..., -3:], 2 * CAMERA),
+        (detections.pose_of, by_motion, 2 * CAMERA + 3 * m),
     ):
         width = values.shape[-1]
         columns = first + width * block[:, None, None] + np.arange(width)
@@ -234,71 +250,66 @@ def noise_at_free_poses(solution: Solution) -> float:
     return float(np.sqrt(max(left @ left - explained.sum(), 0.0) / max(dof, 1)))
 
 
-def listed(readings: Readings, out: BoolArray) -> IntArray:
-    """Readings of a mask (2, N) as sorted rows (L, 3): pose number, marker number, view (2 for both)."""
+def outlier_rows(detections: Detections, out: BoolArray) -> IntArray:
+    """List the detections of a mask (2, N) as sorted rows (L, 3): pose, marker number, view (2 for both)."""
     rows = np.flatnonzero(out.any(axis=0))
     view = np.where(out[:, rows].all(axis=0), 2, np.where(out[0, rows], 0, 1))
     found = np.stack(
-        [readings.pose[readings.pose_of[rows]], readings.marker[readings.marker_of[rows]], view], axis=1
+        [detections.pose[detections.pose_of[rows]], detections.marker[detections.marker_of[rows]], view],
+        axis=1,
     )
     return found[np.lexsort(found.T[::-1])].astype(np.int64)
 
 
-# Hypotheses that are followed to the end, and steps of the screws by which they are compared before.
-_FOLLOWED, _SCREW_STEPS = 2, 8
-# A joint that stands still is a prismatic one of no speed: it is preferred unless the residuals with the
-# other are smaller by more than this share.
-_SIMPLER = 0.1
+def joint_at_fault(search: Search, max_px: float) -> str:
+    """Describe the one change of one joint with which the model fits the data; empty if none.
 
-
-def blamed_joint(search: Search, most_px: float) -> str:
-    """The one change of one joint with which the model does describe the data, in words; empty if none.
-
-    All changes are compared first; the best are followed to the maximum of the likelihood and believed only
-    where that passes as a calibration would and leaves no more than a noise, px.
+    A rough fit compares all changes. The best are fitted completely and accepted only if the fit passes as a
+    calibration does, with a noise of at most ``max_px``.
     """
-    readings = search.problem.readings
-    few = readings.of_markers(carrying(readings, search.epipolar.noise_px, search.rng))
+    detections = search.problem.detections
+    few = detections.of_markers(starting_markers(detections, search.epipolar.noise_px, search.rng))
     changes = _hypotheses(few, search.problem.q_reference)
     candidates = []
     try:
         for done, (words, changed, handicap) in enumerate(changes):
-            search.tell("calibration, joint at fault", done, len(changes))
-            seen = changed.readings.seen
-            for start in islice(starts(dataclasses.replace(search, problem=changed), changed.readings), 1):
-                scene = minimize(changed, start, seen, robust=True, cameras=False, most=_SCREW_STEPS).scene
-                # By logarithms neither a few gross errors nor many small ones outweigh the rest.
-                level = np.mean(np.log(np.linalg.norm(changed.residual(scene)[seen], axis=1) + 1e-9))
-                candidates.append((float(level) + handicap, words, changed, scene))
+            search.progress("calibration, joint at fault", done, len(changes))
+            seen = changed.detections.seen
+            for start in islice(starts(dataclasses.replace(search, problem=changed), changed.detections), 1):
+                params = minimize(
+                    changed, start, seen, robust=True, cameras=False, max_steps=_SCREW_STEPS
+                ).params
+                # In logarithms neither a few gross errors nor many small ones outweigh the rest.
+                level = np.mean(np.log(np.linalg.norm(changed.residual(params)[seen], axis=1) + 1e-9))
+                candidates.append((float(level) + handicap, words, changed, params))
     except WorkFailed:
         return ""
     candidates.sort(key=lambda candidate: candidate[0])
-    for _, words, changed, scene in candidates[:_FOLLOWED]:
-        found = fit_from(changed, scene, search.epipolar)
-        if found is None or found.sigma_px > most_px:
+    for _, words, changed, params in candidates[:_FOLLOWED]:
+        found = fit_from(changed, params, search.epipolar)
+        if found is None or found.sigma_px > max_px:
             continue
-        if not unexplained(found, Outliers.nothing(changed.readings), search.epipolar):
+        if not describe_unexplained(found, Outliers.empty(changed.detections), search.epipolar):
             return words
     return ""
 
 
-def _hypotheses(readings: Readings, q_reference: FloatArray) -> list[tuple[str, LeastSquares, float]]:
-    """Every joint of the other type, every joint standing still: in words, as it then is, its handicap."""
+def _hypotheses(detections: Detections, q_reference: FloatArray) -> list[tuple[str, LeastSquares, float]]:
+    """Hypotheses that a joint is of the other type or stands still: description, problem, penalty."""
     found = []
-    for i, slides in enumerate(readings.prismatic):
-        flipped = readings.prismatic.copy()
+    for i, slides in enumerate(detections.prismatic):
+        flipped = detections.prismatic.copy()
         flipped[i] = not slides
         given, fits = ("prismatic", "revolute") if slides else ("revolute", "prismatic")
         words = f"by the images joint {i + 1} is {fits}, not {given}: check --joints"
-        found.append(
-            (words, LeastSquares.of(dataclasses.replace(readings, prismatic=flipped), q_reference), _SIMPLER)
-        )
+        other = dataclasses.replace(detections, prismatic=flipped)
+        found.append((words, LeastSquares.of(other, q_reference), _SIMPLER))
     for i in range(len(q_reference) if len(q_reference) > 1 else 0):
         words = (
             f"by the images joint {i + 1} stands still while its readings move: check that they are its own"
         )
         fewer = dataclasses.replace(
-            readings, q=np.delete(readings.q, i, axis=1), prismatic=np.delete(readings.prismatic, i)
+            detections, q=np.delete(detections.q, i, axis=1), prismatic=np.delete(detections.prismatic, i)
         )
         found.append((words, LeastSquares.of(fewer, np.delete(q_reference, i)), 0.0))
     return found

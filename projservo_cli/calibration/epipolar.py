@@ -1,7 +1,7 @@
 """Epipolar geometry from noisy correspondences, some of them wrong, and reconstructions from it.
 
-The metric reconstruction rests on guesses (focal length, image centre, square pixels): a place to start
-from, never a result. All of it is free in the adjustment, whose result is projective.
+The metric reconstruction rests on guesses (focal length, image centre, square pixels) and only starts the
+adjustment, which frees all of it and whose result is projective.
 
 [HZ04] is R. Hartley, A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., 2004.
 """
@@ -14,51 +14,78 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-from projservo_cli.calibration.readings import LEAST_SIGMA, MAD, Readings, medians
+from projservo_cli.calibration.detections import MAD, MIN_SIGMA, Detections, medians
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
-# Correspondences and readings farther than this many standard deviations do not count.
+# Residual, in standard deviations, above which correspondences and detections are outliers.
 OUTLIER = 5.0
-# Most correspondences that are taken; random eights of them, and by how many these are judged.
-_CORRESPONDENCES, _SAMPLES, _JUDGES = 20_000, 500, 1000
-_PARAMETERS = 7  # of a fundamental matrix
-_TIGHT = 1e-14  # relative change of the loss, the parameters and the gradient at the end of its search
-# Deviations within which residuals are the core of their distribution, and the mean square of a normal
-# variable there; rounds of its search, the change that ends it, and the step of its derivative; logarithm of
-# a factor that is as good as open.
-_CORE, _CORE_MEAN = 3.0, 0.9733369246625415
-_CORE_ROUNDS, _CORE_SETTLED, _CORE_STEP, _CORE_OPEN = 100, 1e-9, 0.1, 10.0
-# Least median distance of the right view from a homography of the left one, in units of the noise.
-_LEAST_PARALLAX = 3.0
+# Maximum number of correspondences used.
+_CORRESPONDENCES = 20_000
+# Number of random minimal samples, of eight correspondences each.
+_SAMPLES = 500
+# Number of correspondences that score each sample.
+_JUDGES = 1000
+# Degrees of freedom of a fundamental matrix.
+_PARAMETERS = 7
+# Relative change of the loss, the parameters and the gradient that ends its search.
+_TIGHT = 1e-14
+# Size of residuals, in deviations, up to which they form the core of their distribution.
+_CORE = 3.0
+# Mean square of a standard normal variable within the core.
+_CORE_MEAN = 0.9733369246625415
+# Maximum number of rounds of the search for the deviation of the core.
+_CORE_ROUNDS = 100
+# Relative change of the deviation that ends this search.
+_CORE_SETTLED = 1e-9
+# Relative step of the derivative of the scores by the deviation.
+_CORE_STEP = 0.1
+# Logarithm of the maximum factor by which the interval extends on either side.
+_CORE_OPEN = 10.0
+# Minimum median distance of the right view from a homography of the left one, in units of the noise.
+_MIN_PARALLAX = 3.0
+# Rounds of the search for an isotropic frame.
+_WHITENINGS = 30
+# Maximum number of markers a pose of which all pairs are compared.
+_PAIRED = 20
+# Minimum focal length tried, in image sizes, as in the centre of a fisheye.
+_SHORTEST = 0.4
+# Maximum focal length tried, in image sizes: a long lens, with the extent of the data as the image size.
+_LONGEST = 24.0
+# Number of focal lengths tried, in even steps of the logarithm.
+_TRIALS = 28
+# Maximum number of minima of the scan that are kept.
+_MAX_GUESSES = 3
+# Accuracy of a refined minimum, in steps of the scan.
+_FINE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Epipolar:
-    """Fundamental matrix and what its residuals say."""
+    """Fundamental matrix and the noise of its residuals."""
 
     F: FloatArray  # (3, 3) with rightᵀ F left = 0, unit norm, px
     sigma_px: float  # noise per image coordinate from the residuals, px
-    inlier: BoolArray  # (N,) which of the correspondences taken agree with F
-    core: "Core"  # the same noise where many correspondences are wrong, and how sure it is
+    inlier: BoolArray  # (N,) whether a correspondence used agrees with F
+    core: "Core"  # the same noise, robust against many wrong correspondences, and its interval
 
     @classmethod
-    def of(cls, readings: Readings, rng: np.random.Generator) -> "Epipolar":
-        """Fundamental matrix and noise of what both views saw, some of it wrong.
+    def of(cls, detections: Detections, rng: np.random.Generator) -> "Epipolar":
+        """Estimate the fundamental matrix and the noise from observations by both views, some of them wrong.
 
-        The least median of Sampson distances over random eights, then reweighted eight-point solutions, then
-        a Cauchy loss over minimal parameters.
+        By the minimum median of Sampson distances over random samples of eight, then reweighted eight-point
+        solutions, then a Cauchy loss over minimal parameters.
 
-        Raises WorkFailed with fewer than eight pairs, or where they do not determine the geometry.
+        Raises WorkFailed with fewer than eight pairs, or if they do not determine the geometry.
         """
-        (left, right), weight = readings.pixels[:, readings.both], readings.weight[:, readings.both]
+        (left, right), weight = detections.pixels[:, detections.both], detections.weight[:, detections.both]
         count = len(left)
         if count < 8:
             raise WorkFailed(
-                f"{count} sightings of a marker by both cameras at once: at least 8 are needed; check that "
-                "rows hold the pixels of both views"
+                f"{count} observations of a marker by both cameras at once (8 required): check that rows "
+                "hold the pixels of both views"
             )
         T, T_ = _normalization(left), _normalization(right)
-        pose_of = readings.pose_of[readings.both]
+        pose_of = detections.pose_of[detections.both]
         if count > _CORRESPONDENCES:
             some = rng.choice(count, _CORRESPONDENCES, replace=False)
             left, right, weight, count = left[some], right[some], weight[:, some], _CORRESPONDENCES
@@ -78,10 +105,10 @@ class Epipolar:
         residual, _ = _sampson(in_pixels, homogeneous(left), homogeneous(right), weight)
         inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
         if inlier.sum() <= _PARAMETERS:
-            raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
+            raise WorkFailed("the observations of the two cameras share no epipolar geometry: check the rows")
         sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
         parallax = _transfer(a[inlier], b[inlier]) / T_[0, 0]
-        if float(np.median(parallax)) < _LEAST_PARALLAX * sigma:
+        if float(np.median(parallax)) < _MIN_PARALLAX * sigma:
             raise WorkFailed(
                 "both cameras see the same up to a change of image coordinates: without a baseline, or "
                 "with all markers always in one plane, there is no depth; move the cameras apart, or the "
@@ -91,26 +118,26 @@ class Epipolar:
 
     @property
     def noise_px(self) -> float:
-        """Noise to reckon with, px per coordinate: exact images have round-off."""
-        return max(self.sigma_px, LEAST_SIGMA)
+        """Noise, px per coordinate, at least ``MIN_SIGMA``."""
+        return max(self.sigma_px, MIN_SIGMA)
 
     @property
     def relative_error(self) -> float:
-        """Standard error of the noise as a share of it, one residual a correspondence less those F takes."""
+        """Relative standard error of the noise, one residual a correspondence less the parameters of F."""
         return float(1.0 / np.sqrt(2.0 * (np.count_nonzero(self.inlier) - _PARAMETERS)))
 
-    def within(self, readings: Readings, deviations: float) -> BoolArray:
-        """Which of readings (N,) that both views saw obey the geometry to so many standard deviations."""
-        left, right = homogeneous(readings.pixels)
-        return np.abs(_sampson(self.F, left, right, readings.weight)[0]) <= deviations * self.sigma_px
+    def within(self, detections: Detections, deviations: float) -> BoolArray:
+        """Mask (N,) of observations by both views that obey the geometry to some standard deviations."""
+        left, right = homogeneous(detections.pixels)
+        return np.abs(_sampson(self.F, left, right, detections.weight)[0]) <= deviations * self.sigma_px
 
 
 class Core(NamedTuple):
     """Deviation of the normal core of residuals, and its 95 % interval (2,), px.
 
-    What lies within so many deviations counts, less as much of a flat background as lies beyond them up to
-    twice as many: neither few gross errors nor many that begin within the noise widen it. Poses, not
-    residuals, are the independent draws of the interval: corners err alike in one image.
+    It counts residuals within ``_CORE`` deviations, less a flat background estimated from those between one
+    and two times that: neither few gross errors nor many small ones widen it. Poses, not residuals, are
+    independent draws for the interval, since the corners of one image err alike.
     """
 
     sigma_px: float
@@ -118,7 +145,7 @@ class Core(NamedTuple):
 
     @classmethod
     def of(cls, residual: FloatArray, pose_of: IntArray) -> "Core":
-        """From residuals (N,) at poses (N,), seven of which are fitted."""
+        """Estimate it from residuals (N,) at poses (N,), less the parameters of the fundamental matrix."""
         r, s = np.abs(residual), _deviation(residual, 1e-12)
         for _ in range(_CORE_ROUNDS):
             before, s = s, s * float(np.sqrt(min(max(_core_square(r / s), 0.25), 4.0)))
@@ -135,13 +162,13 @@ class Core(NamedTuple):
 
 
 def _core_scores(ratio: FloatArray) -> FloatArray:
-    """Scores (N,) of sizes of residuals in deviations (N,): they add up to nothing at the right one."""
+    """Scores (N,) of absolute residuals in deviations (N,): their sum vanishes at the right deviation."""
     inside, beyond = ratio < _CORE, (ratio >= _CORE) & (ratio < 2.0 * _CORE)
     return np.where(inside, ratio**2 - _CORE_MEAN, 0.0) - np.where(beyond, _CORE**2 / 3.0 - _CORE_MEAN, 0.0)
 
 
 def _core_square(ratio: FloatArray) -> float:
-    """Variance of the core over that by which sizes of residuals are divided (N,)."""
+    """Variance of the core of absolute residuals (N,) in deviations, less the background."""
     inside = ratio < _CORE
     count = int(np.count_nonzero(inside))
     flat = min(int(np.count_nonzero((ratio >= _CORE) & (ratio < 2.0 * _CORE))), count // 2)
@@ -149,9 +176,9 @@ def _core_square(ratio: FloatArray) -> float:
     return square / max(count - flat, 1) / _CORE_MEAN
 
 
-def _deviation(r: FloatArray, least: float) -> float:
-    """Robust standard deviation of residuals about zero."""
-    return max(float(np.median(np.abs(r))) / MAD, least)
+def _deviation(r: FloatArray, floor: float) -> float:
+    """Robust standard deviation of residuals about zero, at least ``floor``."""
+    return max(float(np.median(np.abs(r))) / MAD, floor)
 
 
 def homogeneous(pixels: FloatArray) -> FloatArray:
@@ -160,7 +187,7 @@ def homogeneous(pixels: FloatArray) -> FloatArray:
 
 
 def _normalization(pixels: FloatArray) -> FloatArray:
-    """Similarity (3, 3) that brings pixels (N, 2) to zero median and unit deviation: [HZ04] 4.4."""
+    """Similarity (3, 3) that normalizes pixels (N, 2) to zero median and unit deviation: [HZ04] 4.4."""
     center = np.median(pixels, axis=0)
     spread = float(np.median(np.abs(pixels - center))) or 1.0
     return np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, spread]]) / spread
@@ -171,7 +198,8 @@ def _sampson(
 ) -> tuple[FloatArray, FloatArray]:
     """Signed first-order distances (…, N) of points (N, 3) from F (…, 3, 3), the root of [HZ04] eq. (11.9).
 
-    And the length (…, N) of the gradient of rightᵀ F left by all four pixels, each over its weight (2, N).
+    Also returns the length (…, N) of the gradient of rightᵀ F left by all four pixel coordinates, each over
+    its weight (2, N).
     """
     lines_right, lines_left = left @ np.swapaxes(F, -1, -2), right @ F
     by_right, by_left = ((lines[..., :2] ** 2).sum(axis=-1) for lines in (lines_right, lines_left))
@@ -194,7 +222,7 @@ def _eight_point(left: FloatArray, right: FloatArray, weight: FloatArray | None 
 
 
 def _refine(F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArray) -> FloatArray:
-    """Least Cauchy loss of the Sampson distances over the seven parameters of F.
+    """Refine F to the minimum Cauchy loss of the Sampson distances over its seven parameters.
 
     F = U diag(cos φ, sin φ, 0) Vᵀ; U and V turn by rotation vectors. Source of the parameters:
     A. Bartoli, P. Sturm, "Nonlinear estimation of the fundamental matrix with minimal parameters",
@@ -258,9 +286,9 @@ def triangulated(P: FloatArray, m: FloatArray) -> FloatArray:
 
 
 def _isotropic_frame(points: FloatArray) -> FloatArray:
-    """Frame change W (4, 4) after which points (N, 4) of unit norm have a multiple of I as second moment.
+    """Frame change W (4, 4) that makes the second moment of points (N, 4) of unit norm a multiple of I.
 
-    Without it one coordinate is a thousand times another and every linear method after it fails.
+    Without it one coordinate is a thousand times another, and every later linear method fails.
     """
     W = np.eye(4)
     for _ in range(_WHITENINGS):
@@ -270,38 +298,30 @@ def _isotropic_frame(points: FloatArray) -> FloatArray:
     return W
 
 
-_WHITENINGS = 30
-_PAIRED = 20  # markers a pose of which all pairs are compared
-# Focal lengths tried, in units of the image size: from a fisheye's centre to a long lens. Without an
-# image size the extent of the data stands in for it, which may be several times smaller.
-_SHORTEST, _LONGEST, _TRIALS, _MOST_GUESSES = 0.4, 24.0, 28, 3
-_FINE = 0.01  # of the steps of the scan, to which minima are refined
-
-
 @dataclass(frozen=True, eq=False)
 class ImageFrame:
-    """Guessed principal points (2, 2) and sizes (2,) of both images, px; whether the images are known."""
+    """Guessed principal points (2, 2) and sizes (2,) of both images, px, and whether the size was given."""
 
     center: FloatArray
     size: FloatArray
     known: bool
 
     @classmethod
-    def of(cls, readings: Readings, image_size: tuple[int, int] | None) -> "ImageFrame":
-        """Of a width and height, px, or of the extent of the data in each view."""
+    def of(cls, detections: Detections, image_size: tuple[int, int] | None) -> "ImageFrame":
+        """Frame of a width and height, px, else of the extent of the data in each view."""
         if image_size is not None:
             center = np.tile(0.5 * np.asarray(image_size, dtype=np.float64), (2, 1))
             return cls(center, np.full(2, float(max(image_size))), True)
-        # The outermost percent is left out: it may be outliers.
+        # The outermost percent may be outliers.
         low, high = np.stack(
-            [np.percentile(readings.pixels[v][readings.seen[v]], [1, 99], axis=0) for v in (0, 1)], axis=1
+            [np.percentile(detections.pixels[v][detections.seen[v]], [1, 99], axis=0) for v in (0, 1)], axis=1
         )
         size = (high - low).max(axis=1)
         return cls(0.5 * (low + high), np.where(size > 0.0, size, 1.0), False)
 
 
 def metric_guesses(
-    epipolar: Epipolar, readings: Readings, frame: ImageFrame, factor: float
+    epipolar: Epipolar, detections: Detections, frame: ImageFrame, factor: float
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Cameras (2, 3, 4) and points (N, 3) seen by both, in some guessed metric frames, best first.
 
@@ -310,11 +330,11 @@ def metric_guesses(
 
     Raises WorkFailed if no two markers were seen together at two poses.
     """
-    both = readings.both
-    pairs = marker_pairs(readings.pose_of[both], readings.marker_of[both])
+    both = detections.both
+    pairs = marker_pairs(detections.pose_of[both], detections.marker_of[both])
 
     def guess(log_focal: float, factor: float) -> tuple[FloatArray, FloatArray]:
-        return _guess_at(epipolar.F, readings, frame, factor * float(np.exp(log_focal)))
+        return _guess_at(epipolar.F, detections, frame, factor * float(np.exp(log_focal)))
 
     def spread_at(log_focal: float) -> float:
         return _distance_spread(guess(log_focal, 1.0)[1], pairs)
@@ -325,8 +345,8 @@ def metric_guesses(
         raise WorkFailed("no two markers are seen together at two poses: more markers must be seen at once")
     padded = np.concatenate([[np.inf], spread, [np.inf]])
     minima = np.flatnonzero((spread <= padded[:-2]) & (spread < padded[2:]))
-    minima = minima[np.argsort(spread[minima])][:_MOST_GUESSES]
-    # A minimum at which the body changes its shape a lot more than at the best is none to start from.
+    minima = minima[np.argsort(spread[minima])][:_MAX_GUESSES]
+    # A minimum at which the body deforms far more than at the best one is no start.
     minima = minima[spread[minima] <= max(4.0 * spread[minima[0]], 0.05)]
     step = float(grid[1] - grid[0])
     found = []
@@ -338,7 +358,7 @@ def metric_guesses(
 
 
 def _guess_at(
-    F: FloatArray, readings: Readings, frame: ImageFrame, focal: float
+    F: FloatArray, detections: Detections, frame: ImageFrame, focal: float
 ) -> tuple[FloatArray, FloatArray]:
     """Cameras (2, 3, 4), and points (N, 3) at median distance one, by a focal length over image size.
 
@@ -351,8 +371,8 @@ def _guess_at(
     U, _, Vt = np.linalg.svd(K[1].T @ F @ K[0])
     U, Vt = U * np.sign(np.linalg.det(U)), Vt * np.sign(np.linalg.det(Vt))
     W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    x, y = (np.linalg.solve(K[v], homogeneous(readings.pixels[v][readings.both]).T).T for v in (0, 1))
-    # Turn and baseline, and depths along the rays of both cameras.
+    x, y = (np.linalg.solve(K[v], homogeneous(detections.pixels[v][detections.both]).T).T for v in (0, 1))
+    # Rotation and baseline, and depths along the rays of both cameras.
     solutions = [
         (R, t, *_ray_depths(R, t, x, y)) for R in (U @ W @ Vt, U @ W.T @ Vt) for t in (U[:, 2], -U[:, 2])
     ]
@@ -373,9 +393,9 @@ def _ray_depths(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> t
 
 
 def marker_pairs(pose_of: IntArray, marker_of: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Two markers seen at the same pose: rows of the first, of the second, and which two markers they are.
+    """Pairs of markers seen at the same pose: rows of the first and of the second, and index of the pair.
 
-    Of at most so many markers a pose: by one order for all poses, so that the same pairs come again.
+    One random order selects at most ``_PAIRED`` markers a pose, so the same pairs recur at all poses.
     """
     rank = np.random.default_rng(0).permutation(int(marker_of.max()) + 1)
     pairs = []
@@ -391,7 +411,7 @@ def marker_pairs(pose_of: IntArray, marker_of: IntArray) -> tuple[IntArray, IntA
 def log_distances(
     points: FloatArray, pairs: tuple[IntArray, IntArray, IntArray]
 ) -> tuple[FloatArray, BoolArray]:
-    """|log distance − its median over the poses| of pairs of points (N, 3), and which are seen twice."""
+    """|log distance − its median over the poses| of pairs of points (N, 3), and whether it is seen twice."""
     first, second, pair = pairs
     log = np.log(np.maximum(np.linalg.norm(points[first] - points[second], axis=1), 1e-12))
     middle = medians(log[:, None], pair)[:, 0]

@@ -1,4 +1,4 @@
-"""``calibrate``: from an observation to projective kinematics, with its verdict."""
+"""``calibrate``: from an observation to projective kinematics and their assessment."""
 
 import dataclasses
 import time
@@ -10,43 +10,53 @@ from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.detections import Detections, require_images, require_motion
 from projservo_cli.calibration.diagnosis import (
     Outliers,
-    blamed_joint,
-    listed,
+    describe_other_motion,
+    describe_unexplained,
+    joint_at_fault,
     noise_at_free_poses,
-    other_motion,
-    unexplained,
-    why_lost,
+    outlier_rows,
+    rejection_reasons,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
-from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, solve, with_joint_noise
-from projservo_cli.calibration.initialization import Nominal, Search, Tell
-from projservo_cli.calibration.lens_estimation import share_explained, with_lens
+from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
+from projservo_cli.calibration.initialization import Nominal, Progress, Search
+from projservo_cli.calibration.lens_estimation import fit_lens, share_explained
 from projservo_cli.calibration.projective import Projective, closed_form_operators
-from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate, judged
-from projservo_cli.calibration.readings import Readings, require_images, require_motion
-from projservo_cli.calibration.time_offset import with_delay
-from projservo_cli.geometry.lens import FIRST
+from projservo_cli.calibration.quality import WEAK_NOISE, assess, cross_validate
+from projservo_cli.calibration.time_offset import with_time_offset
+from projservo_cli.geometry.lens import K1
 from projservo_cli.records import Calibration, Errors, InputError, Observation
 
 _METHODS = ("refined", "closed_form")
-# Fitted noise over the expected one from which on, though the fit passes, one joint may be to blame: it is
-# where its change leaves no more than this share.
-_DOUBTFUL_RATIO, _DOUBTFUL_SHARE = 2.0, 0.5
-# Share of the residuals that makes a lens the likely reason of a refusal, and the probability with which
-# noise alone exceeds coefficients that show no lens.
-_DECISIVE_SHARE, _NO_LENS_TAIL = 0.5, 0.01
-# A fit must keep this share of the motion of each joint, and where it leaves out much, of the readings. Then
-# it may err by no more than these ratios of what is expected: in its residuals, in which what is wrong and
-# stays hides, and when it predicts each of so many parts of the poses.
-_KEPT, _DOUBTED_RATIO, _DOUBTED_ERROR, _PARTS = 0.5, 1.15, 1.3, 3
-# Shares of the readings that are much to leave out: those that neither exchanges nor joints explain, all.
-_MUCH, _MOST = 0.1, 0.4
-# Share of readings that may lie outside the images: they are outliers.
+# Fitted over expected noise above which a fit that passes may still have one joint at fault.
+_DOUBTFUL_RATIO = 2.0
+# Maximum share of the noise that a change of one joint leaves if that joint is at fault.
+_DOUBTFUL_SHARE = 0.5
+# Minimum share of the squared residuals that makes a lens the likely cause of a misfit.
+_DECISIVE_SHARE = 0.5
+# Probability that noise alone exceeds the estimated coefficients of a lens without distortion.
+_NO_LENS_TAIL = 0.01
+# Minimum share that a fit keeps of the motion of each joint and, if it rejects much, of the detections.
+_KEPT = 0.5
+# Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
+_DOUBTED_RATIO = 1.15
+# Maximum held-out over predicted error of a fit that rejects much.
+_DOUBTED_ERROR = 1.3
+# Number of parts in the cross-validation of a fit that rejects much.
+_PARTS = 3
+# Share of rejected detections, explained ones apart, above which a fit rejects much.
+_MUCH = 0.1
+# Share of rejected detections, explained ones included, above which a fit rejects much.
+_MAX_REJECTED = 0.4
+# Maximum share of pixels outside the images, as outliers may be.
 _STRAYS = 0.01
-# As many lines of advice as fit a screen, and as many examples as a line names.
-_MOST_ADVICE, _EXAMPLES = 5, 3
+# Maximum number of lines of advice.
+_MAX_ADVICE = 5
+# Maximum number of markers that a message names.
+_EXAMPLES = 3
 
 
 def calibrate(
@@ -62,9 +72,9 @@ def calibrate(
     init: Nominal | None = None,
     joint_noise: float | None = 0.0,
     fitted: Callable[[Solution, float], None] | None = None,
-    tell: Tell = lambda what, done, total: None,
+    progress: Progress = lambda what, done, total: None,
 ) -> Calibration:
-    """Projective kinematics [RH00] section 2 from pixels and joint readings alone.
+    """Return the projective kinematics, [RH00] section 2, from pixels and joint readings alone.
 
     Parameters
     ----------
@@ -72,22 +82,26 @@ def calibrate(
     joint_types : one letter a joint, R or P.
     method : ``refined`` (maximum likelihood) or ``closed_form`` (eqs. 4, 5).
     sigma_px : noise per coordinate, px; None takes the root mean square of the observation's ``sigma``,
-        of a recording times the common factor that both views show, else estimates it from the epipolar
-        geometry. Readings with a sigma of their own are weighed by it.
+        for a recording times the common factor that both views show, else estimates it from the epipolar
+        geometry. The sigma of a detection sets its weight.
     source : ``simulated`` (χ² decides against ``sigma_px``) or ``recorded``.
     image_size : width and height, px, for the start of the search; None takes the extent of the data.
-    seed : of the random starts.
+    seed : seed of the random starts.
     lens : whether to estimate two coefficients of radial distortion a camera, about the image centre.
-    init : robot and rig to try first as a start of ``refined``; the search follows where that misses.
+    init : robot and rig that ``refined`` tries first as a start; a search follows if that fails.
     joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad), for ``refined``;
         None estimates it, and takes 0 unless the images show it.
-    fitted : told the solution of ``refined`` and its noise, px, for what needs more than the record.
-    tell : told how far ``refined`` is: what it does, how much of it is done, and of how much.
+    fitted : called with the solution of ``refined`` and its noise, px, where the record is not enough.
+    progress : called with the current task of ``refined``, how much of it is done, and its total.
+
+    Returns
+    -------
+    The calibration, with ``usable``, ``reason`` and ``advice``.
 
     Raises
     ------
     InputError
-        If the arguments make no sense.
+        If an argument is out of its range.
     WorkFailed
         If the data do not support a calibration: which joint or marker, and why.
     """
@@ -111,35 +125,37 @@ def calibrate(
     solution = None
     # The matrices are small: a second thread costs more than it gives.
     with threadpool_limits(limits=1):
-        readings = Readings.of(observation, joint_types)
-        require_motion(readings)
+        detections = Detections.of(observation, joint_types)
+        require_motion(detections)
         if lens and image_size is not None:
-            _require_size(readings, image_size)
-        require_images(readings, sigma_px)
+            _require_size(detections, image_size)
+        require_images(detections, sigma_px)
         rng = np.random.default_rng(seed)
-        epipolar = Epipolar.of(readings, rng)
-        expect = partial(Expected.of, sigma_px=sigma_px, source=source, stated_px=readings.stated_px)
+        epipolar = Epipolar.of(detections, rng)
+        expect = partial(Expected.of, sigma_px=sigma_px, source=source, stated_px=detections.stated_px)
         expected = expect(epipolar)
-        if not lens:  # else after it, for it bends the epipolar lines
+        if not lens:  # else after its estimation, since it bends the epipolar lines
             expected.require_scale()
-        require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
+        require_images(detections, max(epipolar.sigma_px, expected.sigma_px))
         if method == "closed_form":
-            result = _closed_form(readings, epipolar, expected)
+            result = _closed_form(detections, epipolar, expected)
         else:
-            problem = LeastSquares.of(readings, readings.reference())
-            search = Search(problem, epipolar, ImageFrame.of(readings, image_size), rng, tell, joint_noise)
-            solution, expected, result = _most_likely(search, expect, lens, init)
+            problem = LeastSquares.of(detections, detections.reference())
+            search = Search(
+                problem, epipolar, ImageFrame.of(detections, image_size), rng, progress, joint_noise
+            )
+            solution, expected, result = _maximum_likelihood(search, expect, lens, init)
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
             fitted(solution, expected.noise_px(solution))
         if method == "refined":
-            result = with_delay(result, observation)
+            result = with_time_offset(result, observation)
     return dataclasses.replace(result, source=source, seconds=seconds)
 
 
-def _require_size(readings: Readings, size: tuple[int, int]) -> None:
-    """Refuse an image size, width and height in px, that does not hold 99 of 100 pixels seen."""
-    seen = readings.pixels[readings.seen]
+def _require_size(detections: Detections, size: tuple[int, int]) -> None:
+    """Refuse an image size, width and height in px, that holds fewer than 99 of 100 pixels seen."""
+    seen = detections.pixels[detections.seen]
     if np.mean(((seen >= -0.5) & (seen <= np.array(size) - 0.5)).all(axis=1)) < 1.0 - _STRAYS:
         low, high = np.percentile(seen, [1, 99], axis=0)
         raise InputError(
@@ -148,55 +164,58 @@ def _require_size(readings: Readings, size: tuple[int, int]) -> None:
         )
 
 
-def _most_likely(
+def _maximum_likelihood(
     search: Search, expect: Callable[[Epipolar], Expected], lens: bool, init: Nominal | None
 ) -> tuple[Solution, Expected, Calibration]:
-    """Maximum likelihood, the noise it is measured by, and its record; a misfit names the joint if it can."""
+    """Maximum-likelihood solution, its expected noise and its record.
+
+    Raises Misfit, naming the joint at fault if one explains it.
+    """
     epipolar = search.epipolar
     expected = expect(epipolar)
     try:
         solution, note = solve(search, expected, init)
         if lens:
-            search.tell("calibration, lens", 0, 1)
-            solution, epipolar = with_lens(solution, search)
+            search.progress("calibration, lens", 0, 1)
+            solution, epipolar = fit_lens(solution, search)
             expected = expect(epipolar)
             expected.require_scale()
-        solution = with_joint_noise(solution, expected, search.joint_noise)
+        solution = fit_joint_noise(solution, expected, search.joint_noise)
         result = _refined(solution, epipolar, expected, search.frame)
     except Misfit as refused:
-        # The joints of a simulation are as configured: their types and readings are not to blame.
-        cause = "" if expected.known else blamed_joint(search, REFUSE_RATIO * expected.sigma_px)
+        # The joints of a simulation are as configured, so none is at fault.
+        cause = "" if expected.known else joint_at_fault(search, REFUSE_RATIO * expected.sigma_px)
         if not cause:
             raise
         raise Misfit(f"{cause}; as given, {refused}") from None
     cause = ""
     if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
-        cause = blamed_joint(search, _DOUBTFUL_SHARE * solution.sigma_px)
+        cause = joint_at_fault(search, _DOUBTFUL_SHARE * solution.sigma_px)
     advice = tuple(filter(None, (cause, *result.advice, note)))
-    return solution, expected, dataclasses.replace(result, advice=advice[:_MOST_ADVICE])
+    return solution, expected, dataclasses.replace(result, advice=advice[:_MAX_ADVICE])
 
 
 def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: ImageFrame) -> Calibration:
-    """Record of the maximum likelihood in its projective frame, with its covariance."""
+    """Record of the maximum-likelihood solution in its projective frame, with its covariance."""
     share = share_explained(whole, frame)
     solution, kept = whole.determined()
     try:
-        refusal = expected.refusal(solution) or _unmoved(solution)
+        refusal = expected.refusal(solution) or _describe_unmoved(solution)
         if refusal is not None:
             raise Misfit(refusal)
         found = Outliers.of(solution)
-        doubt = unexplained(solution, found, epipolar)
+        doubt = describe_unexplained(solution, found, epipolar)
         kept_by = np.sum([solution.used | found.explained, solution.used], axis=(1, 2))
-        out, gone = 1.0 - kept_by / whole.problem.readings.seen.sum()
+        out, gone = 1.0 - kept_by / whole.problem.detections.seen.sum()
         suspicion = "lens" if share else "joint readings"
-        if doubt or out > _MUCH or gone > _MOST:
+        if doubt or out > _MUCH or gone > _MAX_REJECTED:
             why = _contradiction(whole, solution, found, epipolar)
-            if not share and solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:  # joints are cleared
+            if not share and solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:  # not the joints
                 suspicion = "outliers"
             if why or (doubt and share >= _DECISIVE_SHARE):
-                told = f"{100.0 * gone:.0f} % of the readings do not fit it, and {why}"
-                told = other_motion(solution, found, epipolar) or doubt or told
-                raise Misfit(f"the fit does not describe the data: {told}")
+                summary = f"{100.0 * gone:.0f} % of the detections do not fit it, and {why}"
+                summary = describe_other_motion(solution, found, epipolar) or doubt or summary
+                raise Misfit(f"the fit does not describe the data: {summary}")
     except Misfit as refused:
         if share < _DECISIVE_SHARE:
             raise
@@ -208,38 +227,40 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
     if kept.all():
         return dataclasses.replace(record, advice=advice)
-    readings = whole.problem.readings
-    names = ", ".join(map(str, readings.marker[~kept][:_EXAMPLES]))
+    detections = whole.problem.detections
+    names = ", ".join(map(str, detections.marker[~kept][:_EXAMPLES]))
     more = f" and {few} more" if (few := np.count_nonzero(~kept) - _EXAMPLES) > 0 else ""
-    seldom = f"hardly any reading of marker {names}{more} fits: not part of the model; see it more often"
-    outlier = np.concatenate([record.outlier, listed(readings, readings.seen & ~kept[readings.marker_of])])
+    seldom = f"hardly any detection of marker {names}{more} fits: rejected; record it in more poses"
+    outlier = np.concatenate(
+        [record.outlier, outlier_rows(detections, detections.seen & ~kept[detections.marker_of])]
+    )
     outlier = outlier[np.lexsort(outlier.T[::-1])]
-    lost = why_lost(whole, kept)
-    lost[:, 0] = readings.marker[lost[:, 0]]
+    lost = rejection_reasons(whole, kept)
+    lost[:, 0] = detections.marker[lost[:, 0]]
     return dataclasses.replace(record, outlier=outlier, lost=lost, advice=(*advice, seldom))
 
 
-def _unmoved(solution: Solution) -> str | None:
-    """A joint that moves in what is left out, as of a wrong type or wrong readings, in words, or None."""
-    readings = solution.problem.readings
-    kept = np.unique(readings.pose_of[solution.used.any(axis=0)])
-    square = (readings.q - readings.q.mean(axis=0)) ** 2
+def _describe_unmoved(solution: Solution) -> str | None:
+    """Describe a joint whose motion is mostly rejected, as with a wrong type or wrong readings, or None."""
+    detections = solution.problem.detections
+    kept = np.unique(detections.pose_of[solution.used.any(axis=0)])
+    square = (detections.q - detections.q.mean(axis=0)) ** 2
     short = square[kept].sum(axis=0) < _KEPT * square.sum(axis=0)
     if not short.any():
         return None
     i = int(np.argmax(short))
-    return f"the fit leaves out most motion of joint {i + 1}; check its readings and its type (R or P)"
+    return f"the fit rejects most motion of joint {i + 1}; check its readings and its type (R or P)"
 
 
 def _contradiction(whole: Solution, solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
-    """What speaks against what is kept where much is not, in words, and what would help; empty if nothing.
+    """Describe evidence against a fit that rejects much, and a remedy; empty if there is none.
 
-    By noise that the images show themselves, whatever was said about it. Where a fit leaves more than that
-    of the rig, it must leave no more than bodies that move freely would, as points that slip do, and what is
-    left out must agree on no other motion.
+    The noise is that of the images, whatever was given. A fit that leaves more than the noise of the rig must
+    leave no more than bodies that move freely, as slipping points do, and the rejected detections must agree
+    on no other motion.
     """
-    if solution.used.sum() < _KEPT * whole.problem.readings.seen.sum():
-        return "that is most of them; leave out what is not on the robot, and check the joint readings"
+    if solution.used.sum() < _KEPT * whole.problem.detections.seen.sum():
+        return "that is most of them; remove markers that are not on the robot, and check the joint readings"
     if solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:
         ratio = solution.sigma_px / max(epipolar.noise_px, noise_at_free_poses(solution))
         if ratio > _DOUBTED_RATIO:
@@ -247,42 +268,42 @@ def _contradiction(whole: Solution, solution: Solution, found: Outliers, epipola
                 f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types "
                 "(R or P)"
             )
-        if other := other_motion(solution, found, epipolar):
+        if other := describe_other_motion(solution, found, epipolar):
             return other
     held_out = cross_validate(solution.kept(), solution.sigma_px, _PARTS, 0)
     rms, predicted = held_out.rms_px, held_out.predicted_rms_px
     if held_out.failed or rms is None or predicted is None or rms > _DOUBTED_ERROR * predicted:
-        return "the rest does not predict poses that it has not seen; record more poses and more markers"
+        return "the rest does not predict held-out poses; record more poses and more markers"
     return ""
 
 
 def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tuple[str, ...]:
-    """What to do about the lens: where none was sought by the share it explains, else by its uncertainty."""
+    """Advice about the lens, by the share of residuals it would explain, else by its uncertainty."""
     if calibration.lens is None:
         if share == 0.0:
             return ()
         return (f"lens distortion would explain {100.0 * share:.0f} % of the squared residuals: try --lens",)
-    k = calibration.lens[:, FIRST:].ravel()
+    k = calibration.lens[:, K1:].ravel()
     of_lenses = calibration.shared_error[-k.size :]
     statistic = k @ np.linalg.solve(of_lenses @ of_lenses.T, k)
     if statistic < chdtri(k.size, _NO_LENS_TAIL):
-        return ("the images show no lens distortion: leave out --lens",)
+        return ("the images show no lens distortion: omit --lens",)
     if not centered:
         return (
-            "the lens distortion is centred on the region where markers were seen: give --image-size, and "
-            "it is centred on the image",
+            "the lens distortion is centred on the region where markers were seen: give --image-size to "
+            "centre it on the image",
         )
     return ()
 
 
-def _closed_form(readings: Readings, epipolar: Epipolar, expected: Expected) -> Calibration:
-    """Record of the closed forms [RH00] eqs. (4), (5): all readings count, and there is no covariance."""
-    result, q_reference, known = closed_form_operators(readings, epipolar.F, epipolar.sigma_px)
-    problem = LeastSquares.of(readings.of_markers(known), q_reference)
-    seen = problem.readings.seen
+def _closed_form(detections: Detections, epipolar: Epipolar, expected: Expected) -> Calibration:
+    """Record of the closed forms [RH00] eqs. (4), (5): all detections count, without covariance."""
+    result, q_reference, known = closed_form_operators(detections, epipolar.F, epipolar.sigma_px)
+    problem = LeastSquares.of(detections.of_markers(known), q_reference)
+    seen = problem.detections.seen
     dof = 2 * int(np.count_nonzero(seen)) - problem.size
-    solution = Solution(problem, result.scene, problem.residual(result.scene), seen, dof)
-    found = Outliers.nothing(problem.readings)
+    solution = Solution(problem, result.params, problem.residual(result.params), seen, dof)
+    found = Outliers.empty(problem.detections)
     return _record(result, solution, expected, None, found, "lens or joint readings")
 
 
@@ -294,30 +315,32 @@ def _record(
     found: Outliers,
     suspicion: str,
 ) -> Calibration:
-    """Record of a fit in its projective frame; WorkFailed if a joint is not determined.
+    """Record of a fit in its projective frame.
 
-    ``errors`` are those of its parameters, None for a method without; ``found`` explains readings left out,
-    and ``suspicion`` is what may be to blame for more than pixel noise.
+    errors : of its parameters, None for a method without.
+    found : explanations of rejected detections.
+    suspicion : likely cause if residuals exceed pixel noise.
+    Raises WorkFailed if a joint is not determined.
     """
     method = "closed_form" if errors is None else "refined"
-    problem, readings, scene = solution.problem, solution.problem.readings, result.scene
+    problem, detections, params = solution.problem, solution.problem.detections, result.params
     if errors is None:
-        m, unknown = len(scene.M), np.full(scene.P.size + scene.H_hat.size, np.nan)
+        m, unknown = len(params.M), np.full(params.P.size + params.H_hat.size, np.nan)
         off = Errors(unknown[:, None], np.full((m, 4, 1), np.nan), np.full((m, 4, 3), np.nan))
     else:
         off = result.errors(solution, errors).scaled(expected.noise_px(solution))
-    outlier = listed(readings, readings.seen & ~solution.used & ~found.explained)
-    counts = (len(outlier), len(found.suspect) + len(found.poses), len(found.swapped))
-    verdict = judged(solution, errors, expected, counts, suspicion)
+    outlier = outlier_rows(detections, detections.seen & ~solution.used & ~found.explained)
+    counts = (len(outlier), len(found.suspect) + len(found.poses), len(found.id_switches))
+    verdict = assess(solution, errors, expected, counts, suspicion)
     operator_defect, trace_defect, plane_defect = result.defects()
     corner_squares, corner_q = solution.corners()
     used_rows, joint_noise = solution.used.any(axis=0), solution.joint_noise
-    # More than noise, as far as the readings tell.
+    # Residuals beyond noise are an error of the model.
     over = solution.sigma_px**2 - expected.sigma_px**2 if expected.warns(solution) else 0.0
     return Calibration(
         method=method,
         source="",
-        joint_types="".join("P" if slides else "R" for slides in readings.prismatic),
+        joint_types="".join("P" if slides else "R" for slides in detections.prismatic),
         usable=verdict.usable,
         reason=verdict.reason,
         advice=verdict.advice,
@@ -331,33 +354,33 @@ def _record(
         chi2_per_dof=expected.ratio(solution) ** 2,
         dof=solution.dof,
         seconds=0.0,
-        P=scene.P,
-        H_hat_0=scene.H_hat,
+        P=params.P,
+        H_hat_0=params.H_hat,
         q_reference=problem.q_reference,
         a_inf=result.a_inf,
-        marker=readings.marker,
-        M=scene.M,
+        marker=detections.marker,
+        M=params.M,
         shared_error=off.shared,
         marker_error=off.marker,
         own_error=off.own,
         excitation=verdict.span,
-        lowest=readings.q[np.unique(readings.pose_of)].min(axis=0),
+        lowest=detections.q[np.unique(detections.pose_of)].min(axis=0),
         weak=verdict.noise > WEAK_NOISE,
         operator_defect=operator_defect,
         trace_defect=trace_defect,
         plane_defect=plane_defect,
         prediction_noise=verdict.noise,
-        merged_poses=int(np.unique(readings.pose_of[used_rows]).size),
-        merged_markers=int(np.unique(readings.marker_of[used_rows]).size),
+        merged_poses=int(np.unique(detections.pose_of[used_rows]).size),
+        merged_markers=int(np.unique(detections.marker_of[used_rows]).size),
         outlier=outlier,
-        suspect=np.stack([readings.pose[found.suspect[:, 0]], found.suspect[:, 1] + 1], axis=1),
-        lost_poses=readings.pose[found.poses],
+        suspect=np.stack([detections.pose[found.suspect[:, 0]], found.suspect[:, 1] + 1], axis=1),
+        lost_poses=detections.pose[found.poses],
         swapped=np.concatenate(
-            [readings.pose[found.swapped[:, :1]], readings.marker[found.swapped[:, 1:]]], axis=1
+            [detections.pose[found.id_switches[:, :1]], detections.marker[found.id_switches[:, 1:]]], axis=1
         ),
         predicted_rms_px=None if verdict.error is None else verdict.error[0],
         predicted_p99_px=None if verdict.error is None else verdict.error[1],
-        lens=scene.lens,
+        lens=params.lens,
         sigma_q=None if joint_noise is None else joint_noise.sigma_q,
         sigma_q_interval=None if joint_noise is None else joint_noise.interval,
         ticks=joint_noise is not None and joint_noise.ticks,

@@ -1,6 +1,6 @@
 """Initialization of the adjustment: in a guessed metric frame markers, axes, then all places.
 
-Or from what is known of a robot and its rig beforehand, which is tried and never trusted.
+A nominal robot and rig may serve as a start too; it is tried, and kept only if it leads to a good fit.
 """
 
 from collections.abc import Callable, Iterator
@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.adjustment import LeastSquares, cross_matrix
+from projservo_cli.calibration.detections import MAD, Detections, per_block
 from projservo_cli.calibration.epipolar import (
     Epipolar,
     ImageFrame,
@@ -17,8 +18,7 @@ from projservo_cli.calibration.epipolar import (
     marker_pairs,
     metric_guesses,
 )
-from projservo_cli.calibration.prediction import Scene
-from projservo_cli.calibration.readings import MAD, Readings, per_block
+from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import (
     PRISMATIC,
@@ -31,62 +31,89 @@ from projservo_cli.records import (
     WorkFailed,
 )
 
-Tell = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What a search for the maximum likelihood works on."""
+    """Inputs of a search for the maximum likelihood."""
 
     problem: LeastSquares
     epipolar: Epipolar
     frame: ImageFrame
     rng: np.random.Generator
-    tell: Tell  # told what is done, how much of it, and of how much
+    progress: Progress  # called with the current task, the amount done and the total
     joint_noise: float | None = 0.0  # rms of joint readings less true joints, rad; None to estimate it
 
 
-# Shared markers that carry an alignment: four resist one wrong marker, three are the least.
-_SAFE, _LEAST = 4, 3
-_ROUNDS, _TRIPLES = 8, 60
-# Markers that scatter so much more than most are not of the body; poses so full may be the first.
-_LOOSE, _FULL = 6.0, 0.8
+# Number of shared markers for a safe alignment: four resist one wrong marker.
+_SAFE = 4
+# Minimum number of shared markers for an alignment.
+_MIN_MARKERS = 3
+# Rounds of reweighting in an alignment.
+_ROUNDS = 8
+# Number of random triples of markers tried.
+_TRIPLES = 60
+# Scatter of a marker over the median above which it is not part of the body.
+_LOOSE = 6.0
+# Number of markers at a pose, over the maximum, from which it may be the first.
+_FULL = 0.8
+# Number of observations by both views wanted at each pose of the start.
+_WANTED = 25
+# Number of markers up to which the start takes all.
+_FEW = 40
+# Motion in the images, in units of the noise, below which a marker is stationary.
+_STILL = 6.0
+# Motion in the images, over the third quartile of the markers, below which a marker is stationary.
+_STILL_SHARE = 0.05
+# Number of random sets of axes to start from.
+_STARTS = 20
+# Maximum number of Levenberg–Marquardt steps on the axes.
+_TURNS = 60
+# Maximum number of sets of axes that are kept.
+_MAX_SETS = 3
+# Loss of a minimum over the best one above which it does not explain the rotations.
+_UNLIKELY = 4.0
+# Difference of axes, rad, below which two sets lie in one valley, along which only images determine them.
+_DISTINCT = 0.5
+# Loss a pose above which axes contradict the rotations: an error of 45°, more than a guessed frame causes.
+_CONTRADICTION = 5.5
+# Residual, rad, above which the loss on rotations flattens.
+_WIDTH = 0.05
+# Weight that pulls axis points, hardly determined for nearly parallel joints, towards the body.
+_RIDGE = 0.03
+# Minimum width of the loss on points, over their distance, so that the bias of the ridge rejects no motion.
+_MIN_SCALE = 1e-3
 
 
-# Sightings by both views wanted at each pose of markers to start from; markers below which all are taken.
-_WANTED, _FEW = 25, 40
-# Motion in the images below which a marker stands still: in units of the noise, and of that of most markers.
-_STILL, _STILL_SHARE = 6.0, 0.05
-
-
-def still(readings: Readings, noise_px: float) -> BoolArray:
-    """Which markers (m,) move in no image, as what is no part of the robot."""
-    move = np.zeros((readings.marker.size, 2))
+def stationary(detections: Detections, noise_px: float) -> BoolArray:
+    """Mask (m,) of markers that move in no image and so are not on the robot."""
+    move = np.zeros((detections.marker.size, 2))
     for v in (0, 1):
-        rows = np.flatnonzero(readings.seen[v])
-        low, high = np.full((2, readings.marker.size, 2), [[[np.inf]], [[-np.inf]]])
-        np.minimum.at(low, readings.marker_of[rows], readings.pixels[v, rows])
-        np.maximum.at(high, readings.marker_of[rows], readings.pixels[v, rows])
+        rows = np.flatnonzero(detections.seen[v])
+        low, high = np.full((2, detections.marker.size, 2), [[[np.inf]], [[-np.inf]]])
+        np.minimum.at(low, detections.marker_of[rows], detections.pixels[v, rows])
+        np.maximum.at(high, detections.marker_of[rows], detections.pixels[v, rows])
         move[:, v] = np.where(np.isfinite(low), high - low, 0.0).max(axis=1)
     moved = move.max(axis=1)
-    often = readings.count_of(readings.seen) > 2
+    often = detections.count_of(detections.seen) > 2
     limit = max(_STILL * noise_px, _STILL_SHARE * float(np.percentile(moved, 75)))
     return np.asarray(often & (moved <= limit))
 
 
-def carrying(readings: Readings, noise_px: float, rng: np.random.Generator) -> BoolArray:
-    """Markers (m,) to start from: moving ones, long seen, and no more than each pose needs."""
-    m, both = readings.marker.size, readings.both
-    moving = ~still(readings, noise_px)
+def starting_markers(detections: Detections, noise_px: float, rng: np.random.Generator) -> BoolArray:
+    """Mask (m,) of markers for the start: moving, seen at many poses, and no more than each pose needs."""
+    m, both = detections.marker.size, detections.both
+    moving = ~stationary(detections, noise_px)
     if m <= _FEW:
         return moving if moving.sum() >= _WANTED else np.ones(m, dtype=bool)
     rows = np.flatnonzero(both)
-    count = np.bincount(readings.marker_of[rows], minlength=m)
+    count = np.bincount(detections.marker_of[rows], minlength=m)
     edge = np.cumsum(count) - count
-    lack = np.full(len(readings.q), _WANTED)
+    lack = np.full(len(detections.q), _WANTED)
     chosen = np.zeros(m, dtype=bool)
     for j in np.lexsort((rng.random(m), -np.minimum(count, np.median(count)), ~moving)):
-        poses = readings.pose_of[rows[edge[j] : edge[j] + count[j]]]
+        poses = detections.pose_of[rows[edge[j] : edge[j] + count[j]]]
         if count[j] > 1 and (lack[poses] > 0).any():
             chosen[j] = True
             lack[poses] -= 1
@@ -97,28 +124,28 @@ def carrying(readings: Readings, noise_px: float, rng: np.random.Generator) -> B
 class _Alignment:
     """The body in its own frame and its rigid motion to each pose."""
 
-    body: FloatArray  # (m, 3) markers, NaN where never merged, or not rigid
+    body: FloatArray  # (m, 3) markers, NaN if never aligned, or not rigid
     R: FloatArray  # (K, 3, 3) rotations from the body to the pose
-    merged: BoolArray  # (K,) poses whose rotation is known
+    merged: BoolArray  # (K,) whether the rotation of a pose is known
 
 
-def _merged(reconstructed: FloatArray, readings: Readings, rng: np.random.Generator) -> _Alignment:
-    """Body and poses from the points (N, 3) that both cameras saw, grown from the fullest pose."""
-    K, both = len(readings.q), readings.both
-    points = np.zeros((K, readings.marker.size, 3))
+def _grow_body(reconstructed: FloatArray, detections: Detections, rng: np.random.Generator) -> _Alignment:
+    """Body and poses from the points (N, 3) seen by both cameras, grown from a pose with many markers."""
+    K, both = len(detections.q), detections.both
+    points = np.zeros((K, detections.marker.size, 3))
     seen = np.zeros(points.shape[:2], dtype=bool)
-    where = readings.pose_of[both], readings.marker_of[both]
+    where = detections.pose_of[both], detections.marker_of[both]
     points[where], seen[where] = reconstructed, True
     R, t = np.tile(np.eye(3), (K, 1, 1)), np.zeros((K, 3))
     seed = _seed(reconstructed, *where)
     body = np.where(seen[seed][:, None], points[seed], np.nan)
     found = np.arange(K) == seed
-    for shared in (_SAFE, _LEAST, _LEAST):
+    for shared in (_SAFE, _MIN_MARKERS, _MIN_MARKERS):
         grown = True
         while grown:
             known = np.isfinite(body[:, 0])
             usable = seen & known
-            rows = usable.sum(axis=1) >= max(min(shared, int(known.sum())), _LEAST)
+            rows = usable.sum(axis=1) >= max(min(shared, int(known.sum())), _MIN_MARKERS)
             for k in np.flatnonzero(rows & ~found):
                 R[k], t[k] = _consensus(body[usable[k]], points[k, usable[k]], rng)
             if rows.any():
@@ -127,13 +154,13 @@ def _merged(reconstructed: FloatArray, readings: Readings, rng: np.random.Genera
             grown = bool((rows & ~found).any())
             found |= rows
             local = np.einsum("kji,kmj->kmi", R, points - t[:, None])
-            body = _rigid(np.where((seen & found[:, None])[..., None], local, np.nan))
+            body = _rigid_body(np.where((seen & found[:, None])[..., None], local, np.nan))
             grown |= int(np.isfinite(body[:, 0]).sum()) > int(known.sum())
     return _Alignment(body, R, found)
 
 
-def _rigid(local: FloatArray) -> FloatArray:
-    """Median places (m, 3) of what poses show (K, m, 3), NaN where they scatter much more than most."""
+def _rigid_body(local: FloatArray) -> FloatArray:
+    """Median points (m, 3) of markers (K, m, 3) over the poses, NaN if they scatter far more than most."""
     body = np.full(local.shape[1:], np.nan)
     some = np.isfinite(local[..., 0]).any(axis=0)
     body[some] = np.nanmedian(local[:, some], axis=0)
@@ -165,22 +192,22 @@ def _align(body: FloatArray, points: FloatArray, weight: FloatArray) -> tuple[Fl
 def _consensus(
     body: FloatArray, points: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """The rigid motion of three of the places (m, 3) that leaves the least median distance of points (m, 3).
+    """Rigid motion of the body (m, 3) with the minimum median distance to points (m, 3), over random triples.
 
-    P. J. Rousseeuw, "Least median of squares regression", JASA 79, 1984: half of them may be wrong.
+    Half of the points may be wrong: P. J. Rousseeuw, "Least median of squares regression", JASA 79, 1984.
     """
     m = len(body)
-    three = np.argsort(rng.random((_TRIPLES, m)), axis=1)[:, :_LEAST]
+    three = np.argsort(rng.random((_TRIPLES, m)), axis=1)[:, :_MIN_MARKERS]
     R, t = _align(body[three], points[three], np.ones(three.shape))
     distance = np.sort(np.linalg.norm(points - body @ np.swapaxes(R, 1, 2) - t[:, None], axis=2), axis=1)
-    best = int(np.argmin(distance[:, min(max(m // 2, _LEAST + 1), m - 1)]))
+    best = int(np.argmin(distance[:, min(max(m // 2, _MIN_MARKERS + 1), m - 1)]))
     return R[best], t[best]
 
 
 def _robust_align(
     body: FloatArray, points: FloatArray, seen: BoolArray, motion: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """``_align`` under a Cauchy loss by reweighting from some motions, its scale the median residual."""
+    """Align as ``_align`` under a Cauchy loss by reweighting, from initial motions."""
     R, t = motion
     for _ in range(_ROUNDS):
         residual = np.linalg.norm(points - body @ np.swapaxes(R, 1, 2) - t[:, None], axis=2)
@@ -190,7 +217,7 @@ def _robust_align(
 
 
 def _seed(points: FloatArray, pose_of: IntArray, marker_of: IntArray) -> int:
-    """Of the full poses that whose points (N, 3) lie most nearly as in the other poses that show them."""
+    """Pose with many markers whose distances between points (N, 3) agree best with those at other poses."""
     pairs = marker_pairs(pose_of, marker_of)
     deviation, compared = log_distances(points, pairs)
     count = np.bincount(pose_of)
@@ -202,19 +229,6 @@ def _seed(points: FloatArray, pose_of: IntArray, marker_of: IntArray) -> int:
     return int(full[np.argmin(typical)])
 
 
-_STARTS, _TURNS, _MOST_SETS = 20, 60, 3
-# Minima with so many times the least loss are not worth a try: they do not explain the rotations.
-_UNLIKELY = 4.0
-# Sets that differ less, rad, lie in one valley: along it the rotations hardly determine the axes, and
-# images decide.
-_DISTINCT = 0.5
-# Loss a pose beyond which axes contradict the rotations: a typical error of 45°, far more than a
-# guessed metric frame or some wrong joint readings bring about.
-_CONTRADICTION = 5.5
-# Residual, rad, beyond which the loss on rotations flattens.
-_WIDTH = 0.05
-
-
 def _rotation_axes(
     alignment: _Alignment,
     q: FloatArray,
@@ -223,7 +237,7 @@ def _rotation_axes(
 ) -> list[FloatArray]:
     """Sets of axes (n, 3) that explain the rotations at joint values (K, n), distinct minima, best first.
 
-    From many random sets. None where no axes explain the rotations at all; axes of prismatic joints have no
+    Fitted from many random sets; empty if no axes explain the rotations. Axes of prismatic joints have no
     meaning.
     """
     R, q = alignment.R[alignment.merged], q[alignment.merged]
@@ -236,7 +250,7 @@ def _rotation_axes(
     for s in order[loss[order] <= enough]:
         if not any(np.abs((w[s] - other)[~prismatic]).max(initial=0.0) < _DISTINCT for other in kept):
             kept.append(w[s])
-        if len(kept) == _MOST_SETS:
+        if len(kept) == _MAX_SETS:
             break
     return kept
 
@@ -324,27 +338,23 @@ def _cauchy(residual: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.log1p(square).sum(axis=1), 1.0 / (1.0 + square)
 
 
-# Pull of axis points towards the body, in units of the typical equation: keeps the axes of nearly
-# parallel joints, whose places are hardly determined, from running away.
-_RIDGE = 0.03
-# Least width of the loss on points, in units of their distance: the ridge's own bias must not weigh
-# down the motions that show an axis best.
-_LEAST_SCALE = 1e-3
-
-
-def _place(
-    w: FloatArray, guess: tuple[FloatArray, FloatArray], readings: Readings, q: FloatArray, rigid: BoolArray
-) -> Scene:
-    """Axis points, directions of translation and markers, linear in the points once all axes are known.
+def _solve_points(
+    w: FloatArray,
+    guess: tuple[FloatArray, FloatArray],
+    detections: Detections,
+    q: FloatArray,
+    rigid: BoolArray,
+) -> Parameters:
+    """Axis points, directions of translation and markers, by linear equations for known axes.
 
     A point of marker j at pose k is R̄_n X_j + Σ R̄_{i−1} ((I − R_i) p_i, or q_i v_i if prismatic):
-    least squares under a Cauchy loss with a small ridge, from the markers that are rigid (m,). Turned back by
-    R̄_n, the unknown X_j of a marker is the mean of what the rest leaves. Translations get one common speed.
-    Joint values (K, n) are from the reference; the readings of both views are those of the guess.
+    least squares under a Cauchy loss with a small ridge, over rigid markers (m,). Rotated back by R̄_n, the
+    unknown X_j is the mean of the remaining residuals. All translations get one common speed. Joint values
+    (K, n) are from the reference.
     """
-    (P, points), prismatic = guess, readings.prismatic
-    n, m = w.shape[0], readings.marker.size
-    pose_of, marker_of = readings.pose_of[readings.both], readings.marker_of[readings.both]
+    (P, points), prismatic = guess, detections.prismatic
+    n, m = w.shape[0], detections.marker.size
+    pose_of, marker_of = detections.pose_of[detections.both], detections.marker_of[detections.both]
     chain = _chain(w, q, prismatic)
     back = np.swapaxes(chain[n], 1, 2)
     by_joint = [
@@ -352,29 +362,28 @@ def _place(
         for i, slides in enumerate(prismatic)
     ]
     rows = np.concatenate(by_joint, axis=2)[pose_of]
-    # Axis points and markers are sought from the centre of the points; R̄_n 0 and R̄_i p vanish there
-    # only after the centre's own motion is taken out.
+    # Unknowns are relative to the centre of the points, so the motion of the centre itself is subtracted.
     center = np.median(points, axis=0)
     shift = np.where(prismatic[:, None], 0.0, center)
     target = (back[pose_of] @ points[..., None])[..., 0] - center - rows @ shift.ravel()
     ridge = np.where(prismatic, 0.0, _RIDGE**2).repeat(3) + 1e-9 * len(points)
-    places, X = _robust_solve(rows, target, ridge, marker_of, rigid)
-    places, X = places.reshape(n, 3) + shift, X + center
+    p, X = _robust_solve(rows, target, ridge, marker_of, rigid)
+    p, X = p.reshape(n, 3) + shift, X + center
     H_hat = np.zeros((n, 4, 4))
     H_hat[~prismatic, :3, :3] = cross_matrix(w[~prismatic])
-    H_hat[~prismatic, :3, 3] = -np.cross(w, places)[~prismatic]
-    length = np.linalg.norm(places, axis=1)[prismatic]
+    H_hat[~prismatic, :3, 3] = -np.cross(w, p)[~prismatic]
+    length = np.linalg.norm(p, axis=1)[prismatic]
     if prismatic.any():
-        H_hat[prismatic, :3, 3] = places[prismatic] / length[:, None] * np.median(length)
-    return Scene(P, H_hat, prismatic, np.hstack([X, np.ones((m, 1))]))
+        H_hat[prismatic, :3, 3] = p[prismatic] / length[:, None] * np.median(length)
+    return Parameters(P, H_hat, prismatic, np.hstack([X, np.ones((m, 1))]))
 
 
 def _robust_solve(
     rows: FloatArray, target: FloatArray, ridge: FloatArray, marker_of: IntArray, trusted: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Least squares of three equations a point under a Cauchy loss by reweighting: x, and markers (m, 3).
+    """Solve three equations a point under a Cauchy loss by reweighting: x, and markers (m, 3).
 
-    The residual target − rows x (N, 3) less the marker's own place; from the markers that are trusted (m,).
+    The residual is target − rows x (N, 3) less the mean of its marker; only trusted markers (m,) count.
     """
     whole = np.concatenate([rows, target[..., None]], axis=2)
     weight = trusted[marker_of].astype(np.float64)
@@ -385,34 +394,37 @@ def _robust_solve(
         A = np.tensordot(left * weight[:, None, None], left, axes=((0, 1), (0, 1)))
         x = np.linalg.solve(A[:-1, :-1] + np.diag(ridge), A[:-1, -1])
         residual = np.linalg.norm(left[..., -1] - left[..., :-1] @ x, axis=1)
-        scale = max(float(np.median(residual)) / MAD, _LEAST_SCALE)
+        scale = max(float(np.median(residual)) / MAD, _MIN_SCALE)
         weight = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)
     return np.asarray(x), np.asarray(means[..., -1] - means[..., :-1] @ x)
 
 
-def starts(search: Search, readings: Readings, factors: tuple[float, ...] = (1.0,)) -> Iterator[Scene]:
-    """Scenes to start from, most promising first: factors of the best focal lengths, and axes for each.
+def starts(
+    search: Search, detections: Detections, factors: tuple[float, ...] = (1.0,)
+) -> Iterator[Parameters]:
+    """Yield initial parameters, most promising first: factors of the best focal lengths, and axes for each.
 
-    The readings are those of the problem, perhaps at some of its poses.
+    detections : those of the problem, or of some of its poses.
+    Raises WorkFailed if no three markers are seen together.
     """
     for factor in factors:
-        for guess in metric_guesses(search.epipolar, readings, search.frame, factor):
-            alignment = _merged(guess[1], readings, search.rng)
+        for guess in metric_guesses(search.epipolar, detections, search.frame, factor):
+            alignment = _grow_body(guess[1], detections, search.rng)
             rigid = np.isfinite(alignment.body[:, 0])
-            if int(rigid.sum()) < _LEAST:
+            if int(rigid.sum()) < _MIN_MARKERS:
                 raise WorkFailed(
                     "no three markers are seen together by both cameras: more must be seen at once"
                 )
             q = search.problem.q
-            for w in _rotation_axes(alignment, q, readings.prismatic, search.rng):
-                scene = _place(w, guess, readings, q, rigid)
-                if np.isfinite(scene.H_hat).all() and np.isfinite(scene.M).all():
-                    yield scene
+            for w in _rotation_axes(alignment, q, detections.prismatic, search.rng):
+                params = _solve_points(w, guess, detections, q, rigid)
+                if np.isfinite(params.H_hat).all() and np.isfinite(params.M).all():
+                    yield params
 
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """What is believed of robot, rig and markers, in one metric frame."""
+    """Nominal robot, rig and markers, in one metric frame."""
 
     where: str  # name of its file, for messages
     P: FloatArray  # (2, 3, 4) cameras to pixels
@@ -426,26 +438,26 @@ class Nominal:
         """One letter a joint, R or P."""
         return "".join("R" if H_hat[:3, :3].any() else "P" for H_hat in self.H_hat)
 
-    def scene(self, readings: Readings, q_reference: FloatArray) -> Scene:
-        """Start for the readings, about their reference joints (n,), rad or m.
+    def start(self, detections: Detections, q_reference: FloatArray) -> Parameters:
+        """Initial parameters for detections, about their reference joints (n,), rad or m.
 
-        Raises InputError if the joints are others, or a marker that was seen is not known.
+        Raises InputError if the joint types differ, or a detected marker is missing.
         """
-        own, letters = self.joint_types, "".join("P" if slides else "R" for slides in readings.prismatic)
+        own, letters = self.joint_types, "".join("P" if slides else "R" for slides in detections.prismatic)
         if own != letters:
             raise InputError(
                 f"{self.where}: its joints are {own}, those of the data {letters}; "
-                "give one screw a joint, or leave --init out"
+                "give one screw a joint, or omit --init"
             )
-        missing = np.setdiff1d(readings.marker, self.marker)
+        missing = np.setdiff1d(detections.marker, self.marker)
         if missing.size:
             raise InputError(
                 f"{self.where}: marker {missing[0]} of the data is not in it; add the marker (marker_numbers "
-                "says which is which), or leave --init out"
+                "says which is which), or omit --init"
             )
-        types = np.where(readings.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
+        types = np.where(detections.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
         model = Model(self.P, self.H_hat, types, self.q_reference, np.array([0.0, 0.0, 0.0, 1.0]))
         column = {int(number): j for j, number in enumerate(self.marker)}
-        M = self.M[[column[int(number)] for number in readings.marker]]
+        M = self.M[[column[int(number)] for number in detections.marker]]
         M = M @ forward_kinematics(model, q_reference).T
-        return Scene(self.P, joint_operators(model, q_reference), readings.prismatic, M)
+        return Parameters(self.P, joint_operators(model, q_reference), detections.prismatic, M)

@@ -1,10 +1,10 @@
 """Noise of joint readings: errors in variables, by restricted maximum likelihood, or encoder counts.
 
-What is left of the images of pose k is r = J x + G δ + ε, with ε ~ N(0, σ² I) and δ ~ N(0, σ_q² I), the true
-joints less their readings: of covariance S = σ² I + σ_q² G Gᵀ. Errors of pixels scatter from marker to
-marker, those of joints move all markers of a pose together, which is how they are told apart.
+The residual of the images of pose k is r = J x + G δ + ε, with ε ~ N(0, σ² I) and δ ~ N(0, σ_q² I), the true
+joints less their readings; its covariance is S = σ² I + σ_q² G Gᵀ. Errors of pixels scatter from marker to
+marker, while those of joints move all markers of a pose together: this separates them.
 
-It is taken over the markers of which most readings count, for many markers say no more about few joints.
+The likelihood takes the markers with most inliers, since more markers say little more about few joints.
 
 Source of the restricted likelihood: H. D. Patterson, R. Thompson, "Recovery of inter-block information when
 block sizes are unequal", Biometrika 58(3), 1971; of the test at the border of the parameters: S. G. Self,
@@ -21,23 +21,40 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
 from projservo_cli.calibration.adjustment import JointErrors, LeastSquares
-from projservo_cli.calibration.prediction import Scene
-from projservo_cli.calibration.readings import per_rad
+from projservo_cli.calibration.detections import per_rad
+from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.records import BoolArray, FloatArray
 
-# Noise of joints that is looked for, rad: of the best encoders, and beyond any robot.
-_LEAST, _MOST = 1e-6, np.radians(1.0)
-_GRID, _FARTHER, _NEVER, _NONE = 33, 5.0, 1e30, -np.inf
-_SHARE = 0.001  # of what is left without noise of joints, that pixels may be to blame for, at least
-_OPEN = 1e-12  # information of a direction that images leave open, over that of the best known one
-# Twice the gain of the logarithm of the likelihood by chance: in 1 of 100 at the border; 95 % of an interval.
-_SIGNIFICANT, _INTERVAL = 5.412, 3.841
-# What fits without and with noise may differ by: so many times what they stay below in 999 of 1,000 cases.
-_CHANCE, _LENIENT = 0.999, 1.5
-# Markers over which the likelihood is taken, at most.
-_MOST_MARKERS = 50
-# Ticks are no finer than this, rad or m; readings lie on them to this share.
-_LEAST_TICK, _ON_TICK = 1e-5, 0.01
+# Minimum noise of joints searched, rad, that of the best encoders.
+_MIN_SIGMA_Q = 1e-6
+# Maximum noise of joints searched, rad, beyond that of any robot.
+_MAX_SIGMA_Q = np.radians(1.0)
+# Number of noise ratios in the scan.
+_GRID = 33
+# Logarithm by which the lower end of the interval may lie below the scan.
+_FARTHER = 5.0
+# Deviance where the likelihood is not defined.
+_NEVER = 1e30
+# Logarithm of a noise ratio of zero.
+_NONE = -np.inf
+# Minimum share of the residual noise that stays with the pixels.
+_SHARE = 0.001
+# Information of a direction, over that of the best known one, below which images leave it open.
+_OPEN = 1e-12
+# Deviance that χ² exceeds by chance in 1 of 100 cases at the border of the parameters: Self and Liang.
+_SIGNIFICANT = 5.412
+# Deviance at the ends of a 95 % interval, χ² of one degree of freedom.
+_INTERVAL = 3.841
+# Probability of the bound on the difference of fits without and with noise.
+_CHANCE = 0.999
+# Factor on that bound, as the test is of first order.
+_LENIENT = 1.5
+# Maximum number of markers in the likelihood.
+_MAX_MARKERS = 50
+# Minimum size of encoder ticks, rad or m.
+_MIN_TICK = 1e-5
+# Distance of a reading from its tick, in minimum ticks, within which it is on it.
+_ON_TICK = 0.01
 
 
 @dataclass(frozen=True)
@@ -45,81 +62,82 @@ class JointNoise:
     """Deviation of joint readings from the true joints, rad; of prismatic joints × 0.3 m/rad."""
 
     sigma_q: float
-    interval: FloatArray | None  # (2,) of 95 %; None where it was given or explains nothing
+    interval: FloatArray | None  # (2,) of 95 %; None if it was given or explains nothing
     over_pixels: float  # sigma_q over the noise of pixels, rad/px
-    ticks: bool = False  # whether it is that of counted ticks
+    ticks: bool = False  # whether it is that of encoder ticks
 
     @classmethod
     def estimated(
-        cls, problem: LeastSquares, scene: Scene, used: BoolArray, sigma_px: float | None
+        cls, problem: LeastSquares, params: Parameters, used: BoolArray, sigma_px: float | None
     ) -> "JointNoise":
-        """What is most likely by the images used (2, N), at a noise of pixels, or of any for None.
+        """Estimate by maximum likelihood from the detections used (2, N), at a noise of pixels, None for any.
 
-        Zero where chance may do as well. Where readings lie on ticks and the interval holds what these make,
-        that is taken.
+        Zero if it is not significant; that of encoder ticks if readings lie on ticks and the interval
+        contains it.
         """
-        readings = problem.readings
-        keep = np.zeros(len(scene.M), dtype=np.bool_)
-        keep[np.argsort(-readings.count_of(used), kind="stable")[:_MOST_MARKERS]] = True
+        detections = problem.detections
+        keep = np.zeros(len(params.M), dtype=np.bool_)
+        keep[np.argsort(-detections.count_of(used), kind="stable")[:_MAX_MARKERS]] = True
         if not keep.all():
-            used, scene = used[:, keep[readings.marker_of]], replace(scene, M=scene.M[keep])
+            used, params = used[:, keep[detections.marker_of]], replace(params, M=params.M[keep])
             problem = problem.of_markers(keep)
-        likelihood = _Likelihood(problem, scene, used, sigma_px)
-        # Ratios of both noises, rad/px, as logarithms: even steps from the least that matters to the most,
-        # at which pixels may be left with far less noise.
+        likelihood = _Likelihood(problem, params, used, sigma_px)
+        # Logarithms of the ratio of both noises, rad/px; at the maximum pixels may have far less noise.
         sigma = likelihood.sigma(_NONE)
-        ends = _LEAST / sigma, _MOST / (sigma if likelihood.given is not None else _SHARE * sigma)
-        places = np.log(np.geomspace(*ends, _GRID))
-        values = [likelihood.deviance(place) for place in places]
+        ends = (
+            _MIN_SIGMA_Q / sigma,
+            _MAX_SIGMA_Q / (sigma if likelihood.given is not None else _SHARE * sigma),
+        )
+        log_ratios = np.log(np.geomspace(*ends, _GRID))
+        values = [likelihood.deviance(log_ratio) for log_ratio in log_ratios]
         best = int(np.argmin(values))
-        near = places[max(best - 1, 0)], places[min(best + 1, _GRID - 1)]
-        found = minimize_scalar(likelihood.deviance, bounds=near, method="bounded")
-        place, least, none = float(found.x), float(found.fun), likelihood.deviance(_NONE)
+        bounds = log_ratios[max(best - 1, 0)], log_ratios[min(best + 1, _GRID - 1)]
+        found = minimize_scalar(likelihood.deviance, bounds=bounds, method="bounded")
+        log_ratio, minimum, none = float(found.x), float(found.fun), likelihood.deviance(_NONE)
 
         def beyond(at: float) -> float:
-            """How far a place is beyond the interval."""
-            return likelihood.deviance(at) - least - _INTERVAL
+            """Deviance beyond the end of the interval."""
+            return likelihood.deviance(at) - minimum - _INTERVAL
 
-        low, high = 0.0, _MOST
-        if none - least > _INTERVAL:
-            low = likelihood.sigma_q(brentq(beyond, places[0] - _FARTHER, place))
-        if beyond(places[-1]) > 0.0:
-            high = likelihood.sigma_q(brentq(beyond, place, places[-1]))
-        if high >= _MOST:  # no noise: a model that is wrong asks for any amount of it
+        low, high = 0.0, _MAX_SIGMA_Q
+        if none - minimum > _INTERVAL:
+            low = likelihood.sigma_q(brentq(beyond, log_ratios[0] - _FARTHER, log_ratio))
+        if beyond(log_ratios[-1]) > 0.0:
+            high = likelihood.sigma_q(brentq(beyond, log_ratio, log_ratios[-1]))
+        if high >= _MAX_SIGMA_Q:  # a wrong model asks for any amount of noise
             return NO_JOINT_NOISE
-        if none - least <= _SIGNIFICANT:
+        if none - minimum <= _SIGNIFICANT:
             return cls(0.0, np.array([0.0, high]), 0.0)
-        if likelihood.contradicted(place):
+        if likelihood.contradicted(log_ratio):
             return NO_JOINT_NOISE
-        counted = tick_noise(problem.readings.q, problem.readings.prismatic)
-        ticks, sigma_q = low <= counted <= high, likelihood.sigma_q(place)
+        counted = tick_noise(problem.detections.q, problem.detections.prismatic)
+        ticks, sigma_q = low <= counted <= high, likelihood.sigma_q(log_ratio)
         taken = counted if ticks else sigma_q
-        return cls(taken, np.array([low, high]), float(np.exp(place)) * taken / sigma_q, ticks)
+        return cls(taken, np.array([low, high]), float(np.exp(log_ratio)) * taken / sigma_q, ticks)
 
 
-NO_JOINT_NOISE = JointNoise(0.0, None, 0.0)  # where none explains what is left
+NO_JOINT_NOISE = JointNoise(0.0, None, 0.0)  # if no noise of joints explains the residuals
 
 
 class _Likelihood:
-    """Restricted likelihood of what is left of the images about a scene.
+    """Restricted likelihood of the residuals, by the logarithm of the noise of joints over pixels, rad/px."""
 
-    At a place: the logarithm of the noise of joints over that of pixels, rad/px.
-    """
-
-    def __init__(self, problem: LeastSquares, scene: Scene, used: BoolArray, sigma_px: float | None) -> None:
+    def __init__(
+        self, problem: LeastSquares, params: Parameters, used: BoolArray, sigma_px: float | None
+    ) -> None:
         self.given = sigma_px
-        unit, J = per_rad(problem.readings.prismatic), problem.derivative(scene)
+        unit, J = per_rad(problem.detections.prismatic), problem.derivative(params)
         D = problem.dense(J, used)
         A = D.T @ D
-        errors, residual = JointErrors(problem, scene, used, unit), problem.residual(scene)
-        if problem.tau is not None:  # at the joints as read
-            residual = residual - errors.change(problem.strain(scene) * problem.tau / unit)
+        errors, residual = JointErrors(problem, params, used, unit), problem.residual(params)
+        if problem.tau is not None:  # at the joint readings
+            residual = residual - errors.change(problem.strain(params) * problem.tau / unit)
         residual = used[..., None] * residual
         scale = np.sqrt(np.maximum(np.diagonal(A), 1e-300))
-        gauge = scale[:, None] * problem.gauge(scene)
+        gauge = scale[:, None] * problem.gauge(params)
         free = np.linalg.qr(gauge, mode="complete")[0][:, gauge.shape[1] :] / scale[:, None]
         values, basis = np.linalg.eigh(free.T @ A @ free)
-        # A robot of one or two joints leaves more open than the gauge. In units in which A is the identity.
+        # A robot of one or two joints leaves more open than the gauge. Scale so that A is the identity.
         known = values > _OPEN * values[-1]
         free = free @ (basis[:, known] / np.sqrt(values[known]))
         self.dof = 2 * int(np.count_nonzero(used)) - free.shape[1]
@@ -129,60 +147,59 @@ class _Likelihood:
         self.g = free.T @ (D.T @ residual.ravel())
         self.square = float((residual**2).sum())
 
-    def _normal(self, place: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Normal equations A, g in the free directions, and squares (K n,) of what joints do to images."""
-        square = np.exp(2.0 * place) * self.eigenvalue
+    def _normal(self, log_ratio: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Normal equations A, g in the free directions, and squared image changes (K n,) by the joints."""
+        square = np.exp(2.0 * log_ratio) * self.eigenvalue
         share = square / (1.0 + square)
         A = np.eye(len(self.g)) - (self.B.T * share) @ self.B
         return A, self.g - self.B.T @ (share * self.h), square
 
-    def _parts(self, place: float) -> tuple[float, float]:
-        """Squares that are left, px², and logarithms of determinants, at a place."""
-        A, g, square = self._normal(place)
+    def _parts(self, log_ratio: float) -> tuple[float, float]:
+        """Sum of squared residuals, px², and logarithms of determinants."""
+        A, g, square = self._normal(log_ratio)
         factor = cho_factor(A)
         left = self.square - float(square / (1.0 + square) @ self.h**2) - float(g @ cho_solve(factor, g))
         logs = 2.0 * float(np.log(np.diagonal(factor[0])).sum())
         return max(left, 1e-300), logs + float(np.log1p(square).sum())
 
-    def contradicted(self, place: float) -> bool:
-        """Whether fits without and with noise of joints predict images that noise alone does not set apart.
+    def contradicted(self, log_ratio: float) -> bool:
+        """Whether fits without and with noise of joints differ by more than noise, so the model errs.
 
-        Both are right where what is left is noise, and the first only wastes some of the data. Where the
-        model errs, as for links that flex, they are off by different amounts: J. A. Hausman, "Specification
-        tests in econometrics", Econometrica 46(6), 1978. Both are taken to first order about the scene,
-        so that no fit is made for nothing. The second is the most precise one where there is such noise,
-        so that the variance of the difference is the difference of the variances.
+        If residuals are noise, both are consistent. If the model errs, as with link deflection, they are
+        biased by different amounts: J. A. Hausman, "Specification tests in econometrics", Econometrica 46(6),
+        1978. Both are taken to first order, which saves a fit. The second is efficient, so the variance of
+        the difference is the difference of the variances.
         """
-        A, g, square = self._normal(place)
+        A, g, square = self._normal(log_ratio)
         inverse = np.linalg.inv(A)
         apart = self.g - inverse @ g
         variance = np.eye(len(A)) + (self.B.T * square) @ self.B - inverse
-        variances = self.sigma(place) ** 2 * np.maximum(np.linalg.eigvalsh(variance), 0.0)
+        variances = self.sigma(log_ratio) ** 2 * np.maximum(np.linalg.eigvalsh(variance), 0.0)
         return float(apart @ apart) > _LENIENT * quantile(variances, _CHANCE)
 
-    def deviance(self, place: float) -> float:
-        """Twice the negative logarithm of the likelihood, up to a constant; of the best noise of pixels."""
+    def deviance(self, log_ratio: float) -> float:
+        """Twice the negative log-likelihood, up to a constant, at the most likely noise of pixels."""
         try:
-            left, logs = self._parts(place)
-        except np.linalg.LinAlgError:  # of joints that may be anywhere nothing is left to tell the robot by
+            left, logs = self._parts(log_ratio)
+        except np.linalg.LinAlgError:  # joints that may be anywhere leave the robot undetermined
             return _NEVER
         if self.given is not None:
             return left / self.given**2 + logs
         return float(self.dof * np.log(left) + logs)
 
-    def sigma(self, place: float) -> float:
-        """Noise of pixels at a place: as given, else the most likely one, px."""
+    def sigma(self, log_ratio: float) -> float:
+        """Noise of pixels, px: as given, else the most likely one."""
         if self.given is not None:
             return self.given
-        return float(np.sqrt(self._parts(place)[0] / max(self.dof, 1)))
+        return float(np.sqrt(self._parts(log_ratio)[0] / max(self.dof, 1)))
 
-    def sigma_q(self, place: float) -> float:
-        """Noise of joints at a place, rad."""
-        return float(np.exp(place) * self.sigma(place))
+    def sigma_q(self, log_ratio: float) -> float:
+        """Noise of joints, rad."""
+        return float(np.exp(log_ratio) * self.sigma(log_ratio))
 
 
 def tick_noise(q: FloatArray, prismatic: BoolArray) -> float:
-    """Deviation of readings (K, n) of whole ticks from the true joints, rms of the joints, rad; 0 without."""
+    """Noise, rms of the joints, rad, of readings (K, n) rounded to encoder ticks; 0 without ticks."""
     ticks = np.array([_tick(column) for column in q.T])
     if (ticks == 0.0).any():
         return 0.0
@@ -190,22 +207,22 @@ def tick_noise(q: FloatArray, prismatic: BoolArray) -> float:
 
 
 def _tick(values: FloatArray) -> float:
-    """The step of which all distances of values (K,) are multiples; 0 where there is none."""
+    """Step of which all distances of values (K,) are multiples; 0 if there is none."""
     steps = np.diff(np.unique(values))
-    steps = steps[steps > 0.1 * _LEAST_TICK]
+    steps = steps[steps > 0.1 * _MIN_TICK]
     tick = reduce(_common_measure, steps.tolist(), 0.0)
-    return float(np.median(steps / np.round(steps / tick))) if len(steps) > 1 and tick >= _LEAST_TICK else 0.0
+    return float(np.median(steps / np.round(steps / tick))) if len(steps) > 1 and tick >= _MIN_TICK else 0.0
 
 
 def _common_measure(a: float, b: float) -> float:
-    """Greatest number that both are multiples of: Euclid's algorithm, on numbers that are rounded."""
-    while b > _ON_TICK * _LEAST_TICK:
+    """Greatest common measure of two rounded numbers, by Euclid's algorithm."""
+    while b > _ON_TICK * _MIN_TICK:
         a, b = b, abs(a - b * round(a / b))
     return a
 
 
 def quantile(variances: FloatArray, probability: float) -> float:
-    """Quantile of a sum of squares of independent normal variables of variances (r,), by its three moments.
+    """Quantile of a sum of squares of independent normal variables of variances (r,), by three moments.
 
     Source: M. J. Buckley, G. K. Eagleson, "An approximation to the distribution of quadratic forms in
     normal random variables", Australian Journal of Statistics 30A, 1988.

@@ -1,4 +1,4 @@
-"""Estimation of radial lens distortion: whether the residuals ask for it, and the fit that frees it."""
+"""Estimation of radial lens distortion: a test of the residuals for it, and the fit with it."""
 
 import dataclasses
 
@@ -6,46 +6,48 @@ import numpy as np
 from scipy.special import fdtri
 
 from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.detections import MAX_JUDGED, Detections
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import Solution, fit_from
 from projservo_cli.calibration.initialization import Search
 from projservo_cli.calibration.prediction import LENS
-from projservo_cli.calibration.readings import MOST_JUDGED, Readings
-from projservo_cli.geometry.lens import straight_views, within
+from projservo_cli.geometry.lens import before_fold, undistort
 from projservo_cli.records import FloatArray, WorkFailed
 
-# A lens is suspected where it explains this share of the squared residuals and chance, with its tail
-# probability, would not.
-_LEAST_SHARE, _TAIL = 0.02, 1e-3
-_LEAST_CHI2 = 1e-20
+# Minimum share of the squared residuals that a lens explains for a suspicion.
+_MIN_SHARE = 0.02
+# Probability that chance explains as much.
+_TAIL = 1e-3
+# Minimum sum of squared residuals, px², against a division by zero.
+_MIN_CHI2 = 1e-20
 
 
 def share_explained(solution: Solution, frame: ImageFrame) -> float:
-    """Share of the squared residuals that a lens would explain; zero where there is one, or chance may do.
+    """Share of the squared residuals that a lens would explain; zero with a lens, or if not significant.
 
-    Nothing is fitted: the scores of k1 and k2, cleared of what the other parameters explain, add up to
-    the gain; C. R. Rao, "Large sample tests of statistical hypotheses concerning several parameters",
-    1948. Errors of a pose's joint readings move all of its images alike, so that poses, not readings,
-    are the independent draws: H. Hotelling's test of 1931 that the scores of the poses have no mean.
+    A score test needs no fit: the scores of k1 and k2, orthogonal to the other parameters, give the gain;
+    C. R. Rao, "Large sample tests of statistical hypotheses concerning several parameters", 1948. Errors of
+    a pose's joint readings move all of its images alike, so poses, not detections, are independent draws:
+    H. Hotelling's test of 1931 that the scores of the poses have no mean.
     """
-    if solution.scene.lens is not None:
+    if solution.params.lens is not None:
         return 0.0
-    solution = solution.of_some(MOST_JUDGED)
-    readings = solution.problem.readings
-    poses = np.unique(readings.pose_of[solution.used.any(axis=0)])
+    solution = solution.thinned(MAX_JUDGED)
+    detections = solution.problem.detections
+    poses = np.unique(detections.pose_of[solution.used.any(axis=0)])
     K, d = poses.size, 2 * LENS
     if d + 1 >= K:
         return 0.0
     columns = _cleared_columns(solution, frame)
-    left = solution.problem.whitened(solution.scene, solution.raw.reshape(-1, 1), solution.used)
+    left = solution.problem.whitened(solution.params, solution.raw.reshape(-1, 1), solution.used)
     scores = (columns * left.reshape(solution.raw.shape)).sum(axis=(1, 3))
-    by_pose = np.stack([np.bincount(readings.pose_of, score)[poses] for score in scores])
+    by_pose = np.stack([np.bincount(detections.pose_of, score)[poses] for score in scores])
     total = by_pose.sum(axis=1)
     flat = columns.reshape(d, -1)
-    share = float(total @ np.linalg.lstsq(flat @ flat.T, total)[0]) / max(solution.chi2, _LEAST_CHI2)
+    share = float(total @ np.linalg.lstsq(flat @ flat.T, total)[0]) / max(solution.chi2, _MIN_CHI2)
     square = float(total @ np.linalg.lstsq(K * np.cov(by_pose), total)[0])
     chance = float(fdtri(d, K - d, 1.0 - _TAIL)) * d * (K - 1) / (K - d)
-    return share if square > chance and share >= _LEAST_SHARE else 0.0
+    return share if square > chance and share >= _MIN_SHARE else 0.0
 
 
 def _undistorted(frame: ImageFrame) -> FloatArray:
@@ -54,11 +56,11 @@ def _undistorted(frame: ImageFrame) -> FloatArray:
 
 
 def _cleared_columns(solution: Solution, frame: ImageFrame) -> FloatArray:
-    """Change of the images by k1, k2 of both views (4, 2, N, 2), less what other parameters can undo."""
-    exact = LeastSquares.of(solution.problem.readings, solution.problem.q_reference, lens=True)
+    """Changes of the images by k1, k2 of both views (4, 2, N, 2), orthogonal to the other parameters."""
+    exact = LeastSquares.of(solution.problem.detections, solution.problem.q_reference, lens=True)
     problem = exact.with_noise(solution.problem.tau)
-    scene = dataclasses.replace(solution.scene, lens=_undistorted(frame))
-    J = problem.whitened(scene, problem.dense(problem.derivative(scene), solution.used), solution.used)
+    params = dataclasses.replace(solution.params, lens=_undistorted(frame))
+    J = problem.whitened(params, problem.dense(problem.derivative(params), solution.used), solution.used)
     J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     first, last = problem.joint[-1], problem.shared
     others, lenses = np.delete(J, np.s_[first:last], axis=1), J[:, first:last]
@@ -66,20 +68,20 @@ def _cleared_columns(solution: Solution, frame: ImageFrame) -> FloatArray:
     return np.asarray(left.T.reshape(-1, *solution.residual.shape))
 
 
-def with_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
-    """The solution with radial distortion freed, and the epipolar geometry of what it straightens.
+def fit_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
+    """Fit with radial distortion, and estimate the epipolar geometry of the undistorted detections.
 
-    Which readings count is found anew. Raises WorkFailed if the data do not determine the distortion.
+    Inliers are selected again. Raises WorkFailed if the data do not determine the distortion.
     """
-    readings = solution.problem.readings
-    problem = LeastSquares.of(readings, solution.problem.q_reference, lens=True)
-    scene = dataclasses.replace(solution.scene, lens=_undistorted(search.frame))
-    found = fit_from(problem, scene, search.epipolar)
+    detections = solution.problem.detections
+    problem = LeastSquares.of(detections, solution.problem.q_reference, lens=True)
+    params = dataclasses.replace(solution.params, lens=_undistorted(search.frame))
+    found = fit_from(problem, params, search.epipolar)
     if found is not None:
-        assert found.scene.lens is not None
-        unbent, _ = problem.pixels(dataclasses.replace(found.scene, lens=None))
-        if within(found.scene.lens[:, None], unbent)[found.used].all():
-            straight = straightened(readings, found.scene.lens)
+        assert found.params.lens is not None
+        unbent, _ = problem.pixels(dataclasses.replace(found.params, lens=None))
+        if before_fold(found.params.lens[:, None], unbent)[found.used].all():
+            straight = undistorted(detections, found.params.lens)
             return found, Epipolar.of(straight, search.rng)
     raise WorkFailed(
         "the images do not determine the distortion of the lenses: record poses with markers all over "
@@ -87,10 +89,10 @@ def with_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
     )
 
 
-def straightened(readings: Readings, lens: FloatArray | None) -> Readings:
-    """Readings as projective cameras would have seen them; unseen where lenses (2, 5) bend no pixel there."""
+def undistorted(detections: Detections, lens: FloatArray | None) -> Detections:
+    """Undistort detections by lenses (2, 5); those that no point distorts to are unseen."""
     if lens is None:
-        return readings
-    pixels = straight_views(lens, readings.pixels)
-    seen = readings.seen & np.isfinite(pixels).all(axis=2)
-    return dataclasses.replace(readings, pixels=np.where(seen[..., None], pixels, 0.0), seen=seen)
+        return detections
+    pixels = undistort(lens, detections.pixels)
+    seen = detections.seen & np.isfinite(pixels).all(axis=2)
+    return dataclasses.replace(detections, pixels=np.where(seen[..., None], pixels, 0.0), seen=seen)

@@ -1,7 +1,7 @@
 """Prediction of images at many poses: the vectorised forward model, its derivative and its covariance.
 
-The twin of the kernels in ``geometry``: the same equations for all poses and points together, which the
-adjustment, predictions and random tasks share.
+It has the equations of the kernels in ``geometry`` for all poses and points together, for the adjustment,
+predictions and random tasks.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.lens import bent, bent_derivative, through
+from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible
 from projservo_cli.records import (
     BoolArray,
     Calibration,
@@ -22,7 +22,9 @@ from projservo_cli.records import (
     apart,
 )
 
+# Number of parameters of a camera, a 3×4 matrix.
 CAMERA = 12
+# Number of parameters of a lens, k1 and k2.
 LENS = 2
 
 
@@ -42,9 +44,10 @@ def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> Flo
 
 
 def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
-    """Points (m, 4) or (K, m, 4) after the last joints alone, (n + 1, K, m, 4): [RH00] eq. (6) from its end.
+    """Points M, (m, 4) or (K, m, 4), moved by the last joints only, (n + 1, K, m, 4): [RH00] eq. (6).
 
-    By displacements (n, K, 4, 4). Entry n holds points at the reference, entry 0 those moved by all joints.
+    E : (n, K, 4, 4) displacements. Entry n of the result has points at the reference, entry 0 those moved by
+    all joints.
     """
     n, K = E.shape[:2]
     Y = np.empty((n + 1, K, *M.shape[-2:]))
@@ -73,17 +76,17 @@ def projection_derivative(
     G[..., 2] = -pixels / m[..., 2:]
     if lens is None:
         return pixels, G, None
-    by_pixel, by_lens = bent_derivative(lens[:, None], pixels)
-    return bent(lens[:, None], pixels), by_pixel @ G, by_lens
+    by_pixel, by_lens = distort_derivative(lens[:, None], pixels)
+    return distort(lens[:, None], pixels), by_pixel @ G, by_lens
 
 
 class Images(NamedTuple):
-    """Pixels of N sightings and their derivatives."""
+    """Pixels of N observations and their derivatives."""
 
     pixels: FloatArray  # (2, N, 2) px
     points: FloatArray  # (n + 1, N, 4) the point behind each joint, entry 0 moved by all joints
     by_camera: FloatArray  # (2, N, 2, 12)
-    by_point: FloatArray  # (n + 1, 2, N, 2, 4) by ``points``, the joints before it held
+    by_point: FloatArray  # (n + 1, 2, N, 2, 4) by ``points``, for fixed joints before it
     by_lens: FloatArray | None  # (2, N, 2, 2) by k1 and k2, if there is a lens
 
     def by_joint(self, H_hat: FloatArray) -> FloatArray:
@@ -93,39 +96,36 @@ class Images(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
-    """Rig, robot and markers, in any one frame; joint values are from the reference, rad or m."""
+class Parameters:
+    """Fitted parameters of rig, robot and markers in one frame; joint values from the reference, rad or m."""
 
     P: FloatArray  # (2, 3, 4) cameras to pixels
     H_hat: FloatArray  # (n, 4, 4) operators at the reference
     prismatic: BoolArray  # (n,) whether the joint is prismatic
     M: FloatArray  # (m, 4) markers at the reference
     lens: FloatArray | None = None  # (2, 5) lenses, None without
-    # (K, n) true joints less their readings at the poses of a problem, rad or m; None where they are exact
+    # (K, n) true joints less their readings at the poses of a problem, rad or m; None if they are exact
     offsets: FloatArray | None = None
 
-    def seen(self, q: FloatArray) -> FloatArray:
+    def predict(self, q: FloatArray) -> FloatArray:
         """Pixels (K, 2, m, 2) of all markers at joints (K, n), [RH00] eqs. (1), (6).
 
-        NaN for a point that does not lie in front of the camera, or beyond where its lens turns back.
+        NaN for a point behind the camera, or beyond the radius at which its lens model folds back.
         """
         m = image_points(self.P, moved_points(displacements(self.H_hat, self.prismatic, q), self.M)[0])
         pixels: FloatArray = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
-        return pixels if self.lens is None else through(self.lens[:, None], pixels)
+        return pixels if self.lens is None else distort_visible(self.lens[:, None], pixels)
 
     def motion(self, q: FloatArray) -> FloatArray:
         """Displacements (K, 4, 4) by all joints together at joints (K, n), [RH00] eq. (6)."""
         return reduce(np.matmul, displacements(self.H_hat, self.prismatic, q))
 
     def moved(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> FloatArray:
-        """Points (N, 4) of sightings, moved by all joints."""
+        """Points (N, 4) of observations after the motion of all joints."""
         return np.asarray((self.motion(q)[pose_of] @ self.M[marker_of][..., None])[..., 0])
 
     def images(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> Images:
-        """Sightings (N,) of markers at rows of q (K, n), with their derivatives.
-
-        From images to the point behind each joint by [RH00] eq. (6).
-        """
+        """Images (N,) of markers at rows of q (K, n), with derivatives by [RH00] eq. (6)."""
         E = displacements(self.H_hat, self.prismatic, q)[:, pose_of]
         Y = moved_points(E, self.M[marker_of][:, None])[:, :, 0]
         pixels, G, by_lens = projection_derivative(self.P, self.lens, Y[0])
@@ -137,16 +137,16 @@ class Scene:
         return Images(pixels, Y, by_camera, D, by_lens)
 
     def everywhere(self, q: FloatArray) -> Images:
-        """Images of all markers at joints (K, n), pose by pose, with their derivatives."""
+        """Images of all markers at joints (K, n), pose by pose, with derivatives."""
         pose_of, marker_of = np.divmod(np.arange(len(q) * len(self.M)), len(self.M))
         return self.images(q, pose_of, marker_of)
 
     def derivative(self, q: FloatArray, images: Images | None = None) -> tuple[FloatArray, FloatArray]:
         """Derivatives of all markers' pixels by P, H_hat (ravelled), and by the marker's own coordinates.
 
-        (K, 2, m, 2, 24 + 16 n), four columns more with a lens for k1 and k2 of both views, and
-        (K, 2, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so
-        dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of ``everywhere``, where they are known.
+        Of shapes (K, 2, m, 2, 24 + 16 n), with four more columns for k1 and k2 of both views if there is a
+        lens, and (K, 2, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so
+        dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of ``everywhere``, if known.
         """
         (K, n), m = q.shape, len(self.M)
         pose_of = np.repeat(np.arange(K), m)
@@ -170,7 +170,7 @@ class Scene:
     def gauge(self) -> FloatArray:
         """Orthonormal directions (24 + 16 n + 4 m, 18) of P, H_hat, M that change no image.
 
-        Those of the frame and of the scales of both cameras; four rows of zeros before M for lenses.
+        They change the frame and the scales of both cameras; with lenses four rows of zeros precede M.
         """
         Z = np.eye(16).reshape(16, 1, 4, 4)
         lenses = np.zeros((16, 0 if self.lens is None else 2 * LENS))
@@ -181,25 +181,28 @@ class Scene:
         return np.asarray(np.linalg.svd(np.vstack([frame, cameras]).T, full_matrices=False)[0])
 
 
-def scene_of(calibration: Calibration) -> Scene:
-    """The scene of a record."""
+def parameters_from(calibration: Calibration) -> Parameters:
+    """Parameters of a calibration record."""
     c = calibration
-    return Scene(c.P, c.H_hat_0, c.prismatic, c.M, c.lens)
+    return Parameters(c.P, c.H_hat_0, c.prismatic, c.M, c.lens)
 
 
-def _scene(calibration: Calibration, q: FloatArray) -> tuple[Scene, FloatArray]:
-    """The scene of a record, and joint values (K, n) from its reference after a check of the readings."""
+def _checked(calibration: Calibration, q: FloatArray) -> tuple[Parameters, FloatArray]:
+    """Parameters of a record, and joint values (K, n) from its reference.
+
+    Raises InputError if the readings have another number of joints or are not finite.
+    """
     q = np.asarray(q, dtype=np.float64)
     n = len(calibration.H_hat_0)
     if q.ndim != 2 or q.shape[1] != n:
-        raise InputError(f"joint readings of shape {q.shape}: expected one row of {n} a pose")
+        raise InputError(f"joint readings of shape {q.shape}: expected (poses, {n})")
     if not np.isfinite(q).all():
         raise InputError("joint readings must be finite numbers")
-    return scene_of(calibration), q - calibration.q_reference
+    return parameters_from(calibration), q - calibration.q_reference
 
 
 def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
-    """Pixels of all markers in both views at joint readings, [RH00] eqs. (1), (6).
+    """Return the pixels of all markers in both views at joint readings, [RH00] eqs. (1), (6).
 
     Parameters
     ----------
@@ -208,26 +211,26 @@ def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
 
     Returns
     -------
-    (K, 2, m, 2) pixels, markers in the order of ``calibration.marker``; NaN for a point that does
-    not lie in front of the camera, or beyond where its lens distortion turns back.
+    (K, 2, m, 2) pixels, markers in the order of ``calibration.marker``; NaN for a point behind the camera,
+    or beyond the radius at which its lens model folds back.
 
     Raises
     ------
     InputError
         If the readings have another number of joints or are not finite.
     """
-    scene, q = _scene(calibration, q)
-    return scene.seen(q)
+    params, q = _checked(calibration, q)
+    return params.predict(q)
 
 
 def residual_statistics(calibration: Calibration, observation: Observation) -> dict[str, Any]:
-    """How far predicted pixels are from seen ones, a distance for each marker and view.
+    """Statistics of the distance between predicted and seen pixels, one for each marker and view.
 
-    calibration : projective kinematics; observation : stereo images of the same robot, px; those in motion do
-    not count.
-    Returns ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``skipped`` with the
-    pairs; of markers the calibration does not know, of points behind the camera, and not seen. Raises
-    InputError if the readings have another number of joints or are not finite.
+    calibration : projective kinematics.
+    observation : stereo images of the same robot, px; poses in motion do not count.
+    Returns ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``skipped``, the numbers
+    of pairs of unknown markers, behind the camera, and missing.
+    Raises InputError if the readings have another number of joints or are not finite.
     """
     observation = observation.at_rest
     known = np.isin(observation.marker, calibration.marker)
@@ -258,45 +261,46 @@ def distance_statistics(distance: FloatArray) -> dict[str, Any]:
 
 
 def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
-    """Variance of predicted pixels from the covariance of the calibration, to first order.
+    """Variances (K, 2, m, 2) of predicted pixels u, v from the covariance of the calibration, px².
 
     calibration : projective kinematics with its covariance; q : (K, n) joint readings, rad or m.
-    Returns (K, 2, m, 2) variances of u and v, px². Raises InputError if the readings have another number of
-    joints or are not finite.
+    Raises InputError if the readings have another number of joints or are not finite.
     """
-    scene, q = _scene(calibration, q)
-    result = np.empty((len(q), 2, len(scene.M), 2))
-    for k in range(len(q)):  # a pose at a time, which bounds what is in memory
-        common, own = changed(scene, calibration.errors, q[k : k + 1])
+    params, q = _checked(calibration, q)
+    result = np.empty((len(q), 2, len(params.M), 2))
+    for k in range(len(q)):  # a pose at a time, to bound the memory
+        common, own = pixel_changes(params, calibration.errors, q[k : k + 1])
         result[k] = ((common**2).sum(axis=-1) + (own**2).sum(axis=-1))[0]
     return result
 
 
-def changed(
-    scene: Scene, errors: Errors, q: FloatArray, images: Images | None = None
+def pixel_changes(
+    params: Parameters, errors: Errors, q: FloatArray, images: Images | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Change of all pixels (K, 2, m, 2, r) and (K, 2, m, 2, 3) by ``errors``, joints from the reference."""
-    shared, by_marker = scene.derivative(q, images)
+    """Changes of all pixels (K, 2, m, 2, r) and (K, 2, m, 2, 3) by ``errors``, joints from the reference."""
+    shared, by_marker = params.derivative(q, images)
     return shared @ errors.shared + by_marker @ errors.marker, by_marker @ errors.own
 
 
-def all_changed(scene: Scene, errors: Errors, q: FloatArray, images: Images | None = None) -> FloatArray:
-    """Change of all pixels by all ``errors``, (K, 2, m, 2, r + 3 m): for few markers."""
-    m = len(scene.M)
-    return apart(*changed(scene, errors, q, images), np.arange(m)[:, None], m)
+def dense_pixel_changes(
+    params: Parameters, errors: Errors, q: FloatArray, images: Images | None = None
+) -> FloatArray:
+    """Changes of all pixels by all ``errors``, (K, 2, m, 2, r + 3 m): for few markers."""
+    m = len(params.M)
+    return apart(*pixel_changes(params, errors, q, images), np.arange(m)[:, None], m)
 
 
 def error_factor(calibration: Calibration) -> FloatArray:
     """Factor (24 + 16 n + 4 m, r + 3 m) of the covariance of P, H_hat_0, lenses, M: for few markers.
 
-    Gauge fixed: of all errors that change images alike the least. Four rows more before M with lenses.
+    The gauge is fixed to errors of minimum norm. With lenses four more rows precede M.
     """
-    factor, free = calibration.errors.dense(), scene_of(calibration).gauge()
+    factor, free = calibration.errors.dense(), parameters_from(calibration).gauge()
     return np.asarray(factor - free @ (free.T @ factor))
 
 
 def joint_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
     """Derivative (K, 2, m, 2, n) of predicted pixels by joints (K, n), px per rad or m."""
-    scene, q = _scene(calibration, q)
-    J = scene.everywhere(q).by_joint(scene.H_hat)
-    return np.asarray(J.reshape(2, len(q), len(scene.M), *J.shape[2:]).swapaxes(0, 1))
+    params, q = _checked(calibration, q)
+    J = params.everywhere(q).by_joint(params.H_hat)
+    return np.asarray(J.reshape(2, len(q), len(params.M), *J.shape[2:]).swapaxes(0, 1))

@@ -1,7 +1,7 @@
-"""Projective kinematics, what [RH00] section 2 calls P, Ĥ, M and the plane at infinity.
+"""Projective kinematics: P, Ĥ, M and the plane at infinity of [RH00] section 2.
 
-Of an adjusted scene with its covariance, or by the paper's closed forms: one 4×4 homography a trial motion,
-equations (4), (5).
+From adjusted parameters with their covariance, or by the paper's closed forms: one 4×4 homography a trial
+motion, equations (4), (5).
 """
 
 from dataclasses import dataclass, replace
@@ -10,54 +10,62 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from projservo_cli.calibration.adjustment import moved_operators
+from projservo_cli.calibration.detections import MAX_JUDGED, ON_A_LINE, Detections, even_choice
 from projservo_cli.calibration.epipolar import reconstruct
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
-from projservo_cli.calibration.prediction import Scene
-from projservo_cli.calibration.readings import MOST_JUDGED, ON_A_LINE, Readings, even_choice
+from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.algebra import normalize_displacement
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
 
-# Least distance of the markers from their best line, in units of its own noise.
+# Minimum distance of the markers from their best line, in units of its own noise.
 _OFF_LINE = 5.0
+# Plane at infinity of the frame of the adjustment.
 _A_INF = np.array([0.0, 0.0, 0.0, 1.0])
+# Minimum number of markers common to a trial and the reference, by which a 4×4 homography is determined.
+_MIN_MARKERS = 5
+# Parallax off the best plane, in units of the pixel noise, below which a body is coplanar.
+_COPLANAR = 3.0
+# Minimum sine of the angle of a trial: near 0 and ±180° noise dominates equation (4).
+_MIN_LEVER = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Projective:
-    """A scene in its isotropic projective frame."""
+    """Parameters in their isotropic projective frame."""
 
     # depths of the points seen are positive, of unit mean square a view; a_inf @ M = 1
-    scene: Scene
+    params: Parameters
     a_inf: FloatArray  # (4,) plane at infinity
-    W: FloatArray  # (4, 4) frame change that led here
-    camera_scale: FloatArray  # (2,) factors the cameras took
+    W: FloatArray  # (4, 4) frame change from the original frame
+    camera_scale: FloatArray  # (2,) factors on the cameras
 
     @classmethod
     def of(cls, solution: Solution) -> "Projective":
-        """The adjusted scene in the isotropic projective frame of the points seen."""
-        problem, readings = solution.problem, solution.problem.readings
-        moved = solution.scene.moved(problem.q, readings.pose_of, readings.marker_of)
-        return _isotropic(solution.scene, _A_INF, moved)
+        """Transform a solution to the isotropic projective frame of the points seen."""
+        problem, detections = solution.problem, solution.problem.detections
+        moved = solution.params.moved(problem.q, detections.pose_of, detections.marker_of)
+        return _isotropic(solution.params, _A_INF, moved)
 
     def errors(self, solution: Solution, errors: Errors) -> Errors:
-        """Those of P, H_hat, k1 and k2 of both views where lenses are sought, and M, by ``Solution.errors``.
+        """Errors of P, H_hat, k1 and k2 if lenses are estimated, and M, at a noise of one pixel.
 
-        At a noise of one pixel. Raises WorkFailed where the markers cannot be told from a line.
+        errors : those of ``Solution.errors``.
+        Raises WorkFailed if the markers cannot be distinguished from a line.
         """
         back = np.linalg.inv(self.W)
         cameras = [scale * np.kron(np.eye(3), back.T) for scale in self.camera_scale]
-        joints = [(self.W @ moved @ back).reshape(-1, 16).T for moved in moved_operators(solution.scene)]
+        joints = [(self.W @ moved @ back).reshape(-1, 16).T for moved in moved_operators(solution.params)]
         lenses = np.eye(solution.problem.shared - solution.problem.joint[-1])
         by_marker = self.W[:, :3]
         shared = block_diag(*cameras, *joints, lenses) @ errors.shared
         found = Errors(shared, by_marker @ errors.marker, by_marker @ errors.own)
-        few = even_choice(len(self.scene.M), MOST_JUDGED)
-        _require_off_line(replace(self.scene, M=self.scene.M[few]), found.of(few).scaled(solution.sigma_px))
+        few = even_choice(len(self.params.M), MAX_JUDGED)
+        _require_off_line(replace(self.params, M=self.params.M[few]), found.of(few).scaled(solution.sigma_px))
         return found
 
     def defects(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Defects (n,) of [RH00] section 2: of Ĥ³ = −Ĥ or Ĥ² = 0, of no trace, of one plane at infinity."""
-        H_hat, prismatic = self.scene.H_hat, self.scene.prismatic
+        """Defects (n,) of [RH00] section 2: of Ĥ³ = −Ĥ or Ĥ² = 0, of zero trace, of one plane at infinity."""
+        H_hat, prismatic = self.params.H_hat, self.params.prismatic
         square = H_hat @ H_hat
         law = np.where(prismatic[:, None, None], square, square @ H_hat + H_hat)
         return (
@@ -67,16 +75,16 @@ class Projective:
         )
 
 
-def _isotropic(scene: Scene, a_inf: FloatArray, moved: FloatArray) -> Projective:
-    """The one projective frame in which points seen, ``moved`` (N, 4), have the identity as second moment.
+def _isotropic(params: Parameters, a_inf: FloatArray, moved: FloatArray) -> Projective:
+    """Transform to the frame in which points seen, ``moved`` (N, 4), have the identity as second moment.
 
-    The rotation that leaves free is settled by the left camera: its depth row and then its two image
-    rows are triangular, its centre lies along the fourth axis on the positive side of ``a_inf``. So
-    the frame depends on images alone: whatever frame the scene comes in, the same numbers come out.
+    The left camera fixes the remaining rotation: its depth row and then its two image rows are triangular,
+    its centre lies along the fourth axis on the positive side of ``a_inf``. So the frame depends on the
+    images alone, and the result on no original frame.
     """
-    P = scene.P
+    P = params.P
     points = moved / (moved @ a_inf)[:, None]
-    M = scene.M / (scene.M @ a_inf)[:, None]
+    M = params.M / (params.M @ a_inf)[:, None]
     L = np.linalg.cholesky(points.T @ points / len(points))
     rows = (P[0] @ L)[[2, 0, 1]]
     depth = points @ P[0, 2]
@@ -89,21 +97,21 @@ def _isotropic(scene: Scene, a_inf: FloatArray, moved: FloatArray) -> Projective
     back = L @ Q
     depths = points @ P[:, 2].T
     scale = np.sign(depths.sum(axis=0)) / np.sqrt((depths**2).mean(axis=0))
-    P, H_hat = scale[:, None, None] * (P @ back), W @ scene.H_hat @ back
-    return Projective(Scene(P, H_hat, scene.prismatic, M @ W.T, scene.lens), a_inf @ back, W, scale)
+    P, H_hat = scale[:, None, None] * (P @ back), W @ params.H_hat @ back
+    return Projective(Parameters(P, H_hat, params.prismatic, M @ W.T, params.lens), a_inf @ back, W, scale)
 
 
-def _require_off_line(scene: Scene, errors: Errors) -> None:
-    """Refuse markers that cannot be told from a line by their errors.
+def _require_off_line(params: Parameters, errors: Errors) -> None:
+    """Refuse markers that their errors do not distinguish from a line.
 
-    A line is the span of two points; the markers must be off it by several times the noise of that distance,
-    whatever frame and scale they are given: beside the gauge their scales are free.
+    A line is the span of two points. The markers must be off it by several times the noise of that distance,
+    in any frame and scale: the gauge and their scales are free.
     """
-    M, factor = scene.M, errors.dense()
+    M, factor = params.M, errors.dense()
     first, m = len(factor) - M.size, len(M)
     scales = np.vstack([np.zeros((first, m)), block_diag(*M[:, :, None])])
     # One of the directions is a sum of others: all markers scaled at once.
-    U, s, _ = np.linalg.svd(np.hstack([scene.gauge(), scales]), full_matrices=False)
+    U, s, _ = np.linalg.svd(np.hstack([params.gauge(), scales]), full_matrices=False)
     free = U[:, s > OPEN_DIRECTION * s[0]]
     markers = (factor - free @ (free.T @ factor))[first:]
     U, extent, Vt = np.linalg.svd(M, full_matrices=False)
@@ -113,84 +121,77 @@ def _require_off_line(scene: Scene, errors: Errors) -> None:
         raise WorkFailed(ON_A_LINE)
 
 
-_LEAST_MARKERS = 5
-# Parallax off the best plane, in units of the pixel noise, below which a body is coplanar.
-_COPLANAR = 3.0
-# Trials whose angle has a smaller sine are too close to 0 or ±180° for equation (4) under noise.
-_LEAST_LEVER = 1e-3
-
-
 def closed_form_operators(
-    readings: Readings, F: FloatArray, sigma_px: float
+    detections: Detections, F: FloatArray, sigma_px: float
 ) -> tuple[Projective, FloatArray, BoolArray]:
     """Projective kinematics from homographies of the trial motions, [RH00] eqs. (2), (4), (5).
 
     The operator of a joint is the mean over its trials weighted by sin² θ (or τ²), the least-squares
-    weights of the quotients in (4) and (5). With the reference joints (n,), and which markers (m,) there are.
+    weights of the quotients in (4) and (5). Returns the reference joints (n,) and a mask of markers (m,) too.
 
     Raises WorkFailed if the trials do not determine the operators: which joint, and why.
     """
-    home = readings.home()
+    home = detections.home()
     if home is None:
         raise WorkFailed(
             "the closed_form method needs single-joint trials about one reference pose, and these poses move "
             "several joints at once: use refined"
         )
-    both = readings.both
-    P, points = reconstruct(F, readings.pixels[0][both], readings.pixels[1][both])
-    M = np.full((len(readings.q), readings.marker.size, 4), np.nan)
-    M[readings.pose_of[both], readings.marker_of[both]] = points
+    both = detections.both
+    P, points = reconstruct(F, detections.pixels[0][both], detections.pixels[1][both])
+    M = np.full((len(detections.q), detections.marker.size, 4), np.nan)
+    M[detections.pose_of[both], detections.marker_of[both]] = points
     known = np.isfinite(M[..., 0])
-    if int(known[home].sum()) < _LEAST_MARKERS:
+    if int(known[home].sum()) < _MIN_MARKERS:
         raise WorkFailed(
-            f"closed_form needs {_LEAST_MARKERS} markers in both images of the reference pose, and there are "
+            f"closed_form needs {_MIN_MARKERS} markers in both images of the reference pose, and there are "
             f"{int(known[home].sum())}: use refined"
         )
     _require_space(P, M[home, known[home]], sigma_px)
-    # The depth in the left camera is positive for all points: it orients them as a_inf would.
-    trials = readings.trials(home)
-    H_hat = np.array([_mean_operator(i, rows, M, home, readings, P[0, 2]) for i, rows in enumerate(trials)])
+    # The depth in the left camera, positive for all points, orients them as a_inf would.
+    trials = detections.trials(home)
+    H_hat = np.array([_mean_operator(i, rows, M, home, detections, P[0, 2]) for i, rows in enumerate(trials)])
     a_inf = np.linalg.svd(np.hstack(list(H_hat)))[0][:, 3]
     sides = points @ a_inf
     a_inf = a_inf * np.sign(np.median(sides))
-    scene = Scene(P, H_hat, readings.prismatic, M[home, known[home]])
-    return _isotropic(scene, a_inf, points[np.abs(sides) > 1e-6]), readings.q[home], known[home]
+    params = Parameters(P, H_hat, detections.prismatic, M[home, known[home]])
+    return _isotropic(params, a_inf, points[np.abs(sides) > 1e-6]), detections.q[home], known[home]
 
 
 def _mean_operator(
-    i: int, rows: IntArray, M: FloatArray, home: int, readings: Readings, depth: FloatArray
+    i: int, rows: IntArray, M: FloatArray, home: int, detections: Detections, depth: FloatArray
 ) -> FloatArray:
     """Operator (4, 4) of joint i from its trials, the rows of M (K, m, 4) where it alone moved.
 
-    Each says (H − H⁻¹) / (2 sin θ), or / (2 τ): [RH00] eqs. (4), (5) from group to algebra, weighted by the
-    square of what it is divided by. ``depth`` (4,) is a plane that all points lie on one side of.
+    Each trial gives (H − H⁻¹) / (2 sin θ), or / (2 τ), [RH00] eqs. (4), (5) from group to algebra, with the
+    square of the divisor as weight. ``depth`` (4,) is a plane with all points on one side.
     """
     total, weights = np.zeros((4, 4)), 0.0
     refused = "record poses in which it alone moves"
     for k in rows:
         common = np.isfinite(M[[home, k], :, 0]).all(axis=0)
-        amplitude = float(readings.q[k, i] - readings.q[home, i])
-        lever = amplitude if readings.prismatic[i] else float(np.sin(amplitude))
-        if int(common.sum()) < _LEAST_MARKERS:
-            refused = f"fewer than {_LEAST_MARKERS} markers are common to a trial and the reference"
+        amplitude = float(detections.q[k, i] - detections.q[home, i])
+        lever = amplitude if detections.prismatic[i] else float(np.sin(amplitude))
+        if int(common.sum()) < _MIN_MARKERS:
+            refused = f"fewer than {_MIN_MARKERS} markers are common to a trial and the reference"
             continue
-        if not readings.prismatic[i] and abs(lever) < _LEAST_LEVER:
+        if not detections.prismatic[i] and abs(lever) < _MIN_LEVER:
             refused = f"a turn by {np.degrees(amplitude):.4g}° leaves equation (4) undefined"
             continue
         A, B = M[home, common], M[k, common]
         try:
             H = normalize_displacement(_homography(A, B), A, depth)
         except WorkFailed as error:
-            raise WorkFailed(f"joint {i + 1}, pose {readings.pose[k]}: {error}") from None
+            raise WorkFailed(f"joint {i + 1}, pose {detections.pose[k]}: {error}") from None
         total += 0.5 * lever * (H - np.linalg.inv(H))
         weights += lever**2
     if weights == 0.0:
-        raise WorkFailed(f"joint {i + 1} has no trial that can be used: {refused}")
+        raise WorkFailed(f"joint {i + 1} has no usable trial: {refused}")
     return total / weights
 
 
 def _homography(A: FloatArray, B: FloatArray) -> FloatArray:
-    """4×4 homography B ∼ H A of five or more points (m, 4) of unit norm, least squares of the cross products.
+    """4×4 homography B ∼ H A of five or more unit points (m, 4), by least squares of the cross products.
 
     Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., section 4.1, in space.
     """
@@ -203,7 +204,7 @@ def _homography(A: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def _require_space(P: FloatArray, points: FloatArray, sigma_px: float) -> None:
-    """Refuse points (m, 4) of one plane up to the noise: the right image then follows from the left one."""
+    """Refuse points (m, 4) in one plane up to the noise, where the left image determines the right one."""
     plane = np.linalg.svd(points)[2][3]
     center = np.linalg.svd(P[0])[2][3]
     on_plane = points - np.outer(points @ plane / (center @ plane), center)

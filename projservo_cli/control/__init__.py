@@ -1,4 +1,4 @@
-"""Control laws: the paper's own, that without drift, and classical ones; one contract, one if-chain.
+"""Control laws: those of the paper, one without drift, and classical ones, behind one function.
 
 Run files and tables know a law by its name, compiled code by its code in ``laws``.
 """
@@ -8,36 +8,36 @@ from projservo_cli.control.classical import blockwise, euclidean_points, stacked
 from projservo_cli.control.direct import direct_three, direct_two
 from projservo_cli.control.law import LOST, OK, Gains, Law, State, limit_speed
 from projservo_cli.geometry.jit import internal, merged
-from projservo_cli.geometry.lens import bends, straight
+from projservo_cli.geometry.lens import distorts, undistort_into
 from projservo_cli.laws import LAWS
 from projservo_cli.records import FloatArray
-from projservo_cli.task.trajectory import Reference, following, near_way, put_aim, under_way
+from projservo_cli.task.trajectory import Reference, following, near_joint_path, on_joint_path, reference_into
 
-# Share of what the images ask for in a period that corrects a way through joint space.
+# Share of the image-based command of a period that corrects a joint-space path.
 _CORRECTED = 0.2
-# In the order of their names, and as many.
+# Codes of the laws, in the order of their names.
 _DIRECT_THREE, _DIRECT_TWO, _STACKED, _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = range(len(LAWS))
 
 
 @internal
 def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
-    """Run a law on images as projective cameras would have seen them.
+    """Run a law on undistorted images; the only dispatch on its code.
 
-    The only place that tells the laws apart.
-
-    s : (2, b, 2) pixels as the cameras report them, NaN where unseen.
-    Returns status of the law; ``LOST`` for a state made for another number of markers.
+    s : (2, b, 2) pixels as the cameras report them, NaN if unseen.
+    Returns the status of the law; ``LOST`` for a state made for another number of markers.
     """
     code, model, task, gains = law
     seen = s
-    if bends(model.lens):
+    if distorts(model.lens):
         if state.straight.shape[1] != s.shape[1]:
             return LOST
-        straight(model.lens, s, state.straight)
+        undistort_into(model.lens, s, state.straight)
         seen = state.straight
     if following(task.reference):
         lead = 1.0 / (gains.gain * gains.period)
-        put_aim(model, task.reference, float(state.clock[0]), lead, state.A_aim, state.s_aim, state.q_ahead)
+        reference_into(
+            model, task.reference, float(state.clock[0]), lead, state.A_ref, state.s_ref, state.q_ahead
+        )
     if code == _DIRECT_THREE:
         status = direct_three(model, task, gains, seen, q, state)
     elif code == _DIRECT_TWO:
@@ -52,7 +52,7 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
         status = exact.exact(model, task, gains, seen, q, state)
     if following(task.reference):
         limited = code == _EXACT
-        if status != LOST and under_way(task.reference, float(state.clock[0])):
+        if status != LOST and on_joint_path(task.reference, float(state.clock[0])):
             _keep_near(task.reference, gains, q, status == OK, state)
             status, limited = OK, False
         _go_on(task.reference, gains, status, limited, state)
@@ -61,17 +61,17 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
 
 @merged
 def _keep_near(reference: Reference, gains: Gains, q: FloatArray, unique: bool, state: State) -> None:
-    """Keep the joints near a way through joint space, and within their limits, whatever the images ask for.
+    """Keep the joints near a joint-space path and within their limits.
 
-    Images correct by a share of what they ask for: near a singularity that is noise, made large.
+    Images correct by a share of the law's command, which amplifies noise near a singularity.
 
-    unique : whether the law found a joint motion; else the joints follow the way alone.
+    unique : whether the law found a joint motion; else the joints follow the path alone.
     """
     for i in range(q.shape[0]):
         step = state.q_ahead[i]
         if unique:
             step += _CORRECTED * (gains.period * state.q_dot[i] - step)
-        q_next = near_way(reference, float(state.clock[0]) + 1.0, i, q[i] + step)
+        q_next = near_joint_path(reference, float(state.clock[0]) + 1.0, i, q[i] + step)
         q_next = min(max(q_next, gains.limits.lower[i]), gains.limits.upper[i])
         state.q_dot[i] = (q_next - q[i]) / gains.period
     state.parts[0], state.blocked[0] = 0, -1
@@ -79,9 +79,9 @@ def _keep_near(reference: Reference, gains: Gains, q: FloatArray, unique: bool, 
 
 @merged
 def _go_on(reference: Reference, gains: Gains, status: int, limited: bool, state: State) -> None:
-    """Advance the plan by as much of a period as the joint-speed limit leaves of the step.
+    """Advance the plan by the share of a period that the joint-speed limit leaves of the step.
 
-    limited : whether the law kept the limit itself; it is else applied here.
+    limited : whether the law applied the limit; else this function does.
     """
     if status != OK:
         return

@@ -1,6 +1,6 @@
 """Classical image-based and position-based laws: stacked views, each view by itself, points in metres."""
 
-from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure, pseudo_inverse, put_view
+from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure, pseudo_inverse, view_into
 from projservo_cli.geometry.algebra import apply, mat, vec
 from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray, Model
@@ -18,7 +18,7 @@ def stacked(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray
     n = q.shape[0]
     rows = 2 * state.A.shape[0]
     for view in range(2):
-        put_view(model, task, s, state, view, view * rows)
+        view_into(model, task, s, state, view, view * rows)
     if not pseudo_inverse(state, 2 * rows, state.q_dot):
         return SINGULAR
     for i in range(n):
@@ -37,8 +37,8 @@ def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArr
     n = q.shape[0]
     state.q_dot[:] = 0.0
     for view in range(2):
-        # Not a constant, for which the compiler would make the function anew.
-        put_view(model, task, s, state, view, 0 * view)
+        # An expression, as the compiler would compile the function again for a constant.
+        view_into(model, task, s, state, view, 0 * view)
         rows = 2 * state.A.shape[0]
         if not pseudo_inverse(state, rows, state.work.newton):
             return SINGULAR

@@ -1,12 +1,12 @@
-"""The paper's direct control: directTHREE of translation and two rotations, directTWO of one rotation."""
+"""Direct control laws of the paper: directTHREE with translation and two rotations, directTWO with one."""
 
 from projservo_cli.control.law import (
     OK,
     SINGULAR,
     Gains,
     State,
+    joint_velocity_into,
     partitioned,
-    put_joint_velocity,
     single_rotation,
     translation_rate,
 )
@@ -47,8 +47,8 @@ def direct_two(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatAr
 
 @merged
 def _commanded(gains: Gains, state: State) -> int:
-    """Joint velocity of ``xi_dot``, and of the plan where one is followed; the status."""
-    if not put_joint_velocity(state):
+    """Convert ``xi_dot`` to the joint velocity, plus that of a plan; the status."""
+    if not joint_velocity_into(state):
         return SINGULAR
     for i in range(state.q_dot.shape[0]):
         state.q_dot[i] += state.q_ahead[i] / gains.period

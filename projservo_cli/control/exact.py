@@ -1,21 +1,21 @@
 """Direct control without drift: joint steps whose product of exponentials is the desired displacement.
 
-The paper leaves open how to keep the centre on its line when joint steps are finite. Here the
-displacement wanted for one period is solved for the joint step by Newton's method on the projective
-forward kinematics alone, [RH00] eqs. (6), (19); no metric quantity enters.
+The paper leaves open how to keep the centre on its line with finite joint steps. This law solves the desired
+displacement of one period for the joint step, by Newton's method on the projective forward kinematics alone,
+[RH00] eqs. (6), (19), without metric quantities.
 """
 
 import math
 from typing import NamedTuple
 
 from projservo_cli.control.law import (
-    MOST_PARTS,
+    MAX_PARTS,
     OK,
     SINGULAR,
     Gains,
     State,
+    joint_velocity_into,
     partitioned,
-    put_joint_velocity,
     single_rotation,
     speed_share,
     translation_rate,
@@ -27,32 +27,34 @@ from projservo_cli.geometry.mechanisms import SETTLED, Seen, reach
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
-from projservo_cli.task.trajectory import following, planned_step, through_joints, under_way
+from projservo_cli.task.trajectory import following, follows_joint_path, on_joint_path, planned_step
 
-# A joint step of one part of the continuation, rad or m: between its ends linear joint motion strays
-# by about 0.1 mm from the path of a robot of a metre's size.
+# Joint step of one part of the continuation, rad or m: linear joint motion then deviates from the path of a
+# robot of a metre's size by about 0.1 mm.
 _PART_STEP = math.radians(2.5)
+# Joint step, rad or m, below which it is round-off.
 _ROUND_OFF = 1e-13
-# Halvings of a step until its end is at a limit: below round-off of a joint reading.
+# Bisections of a step until its end is at a limit, below round-off of a joint reading.
 _HALVINGS = 48
+# Length of a part over its prediction above which it is on another kinematic branch.
 _BRANCH_FACTOR = 2.0
 
 
 class _Step(NamedTuple):
-    """Displacement of one period, which is solved for a joint step in so many equal parts."""
+    """Displacement of one period, to solve for a joint step in equal parts."""
 
-    parts: Parts  # translation and rotations that are left
+    parts: Parts  # remaining translation and rotations
     H_s: Mat4  # operator Ĥ_s of both rotations
-    tau: float
-    theta: float  # tau, theta: amplitudes of the translation and of that rotation, rad
+    tau: float  # amplitude of the translation
+    theta: float  # amplitude of the rotation Ĥ_s, rad
     sense: float  # factor that scales the joint motion q̂_s to the sense of Ĥ_s
-    ahead: float  # share of a period by which a plan is followed
-    pieces: int  # how many parts
+    ahead: float  # share of a period of the plan to follow
+    pieces: int  # number of parts
 
 
 @merged
 def _scaled(step: _Step, share: float, count: int) -> _Step:
-    """A share of the displacement."""
+    """Share of the displacement, in ``count`` parts."""
     tau, theta, ahead = share * step.tau, share * step.theta, share * step.ahead
     return _Step(
         parts=step.parts, H_s=step.H_s, tau=tau, theta=theta, sense=step.sense, ahead=ahead, pieces=count
@@ -69,28 +71,28 @@ def _desired(step: _Step, share: float) -> Mat4:
 def _first_order(step: _Step, state: State) -> float:
     """First-order joint step τ q̂_t + θ q̂_s of one period into ``state.q_dot``; its largest entry.
 
-    Where a plan is followed, the joint motion of its next period is added in the share ``ahead``. NaN
-    where the joints cannot make it.
+    With a plan it adds the share ``ahead`` of the joint motion of the next period. NaN if the joints cannot
+    make the motion.
     """
     for i in range(state.xi_dot.shape[0]):
         state.xi_dot[i] = step.tau * state.q_hat[0, i] + step.theta * step.sense * state.q_hat[3, i]
-    if not put_joint_velocity(state):
+    if not joint_velocity_into(state):
         return math.nan
-    most = 0.0
+    largest = 0.0
     for i in range(state.q_dot.shape[0]):
         state.q_dot[i] += step.ahead * state.q_ahead[i]
-        most = max(most, abs(state.q_dot[i]))
-    return most
+        largest = max(largest, abs(state.q_dot[i]))
+    return largest
 
 
 @internal
 def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: State) -> bool:
-    """Solve the displacement in equal parts, each from the one before, into ``state.path``.
+    """Solve the displacement in equal parts, each from the previous one, into ``state.path``.
 
-    The first part is predicted by the first-order step in ``state.q_dot``, the others by the part
-    before. A part more than twice as long as predicted is on another kinematic branch.
+    The first-order step in ``state.q_dot`` predicts the first part, the previous part the others. A part more
+    than twice as long as predicted is on another kinematic branch.
 
-    Returns false where a part does not settle or leaves the branch.
+    Returns false if a part does not settle or leaves the branch.
     """
     n, count = q.shape[0], step.pieces
     face = Seen(state.A, backward(model, q))
@@ -103,7 +105,7 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
             state.path[j, i] = state.path[j - 1, i] + part
             predicted += part * part
         goal = _desired(step, j / count)
-        if following(task.reference) and not through_joints(task.reference):
+        if following(task.reference) and not follows_joint_path(task.reference):
             ahead = planned_step(model, task.reference, float(state.clock[0]), step.ahead * j / count)
             goal = mul(ahead, goal)
         if not reach(model, face, goal, state.path[j], state.work, SETTLED):
@@ -119,7 +121,7 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
 
 @merged
 def _blocked_joint(q: FloatArray, q_next: FloatArray, gains: Gains) -> int:
-    """First joint that a motion from q to q_next takes beyond a limit, or farther beyond it; else −1."""
+    """First joint that a motion from q to q_next moves beyond a limit, or farther beyond it; else −1."""
     for i in range(q.shape[0]):
         if q_next[i] > max(q[i], gains.limits.upper[i]) or q_next[i] < min(q[i], gains.limits.lower[i]):
             return i
@@ -128,9 +130,9 @@ def _blocked_joint(q: FloatArray, q_next: FloatArray, gains: Gains) -> int:
 
 @merged
 def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _Step, state: State) -> float:
-    """Largest share of a step, to round-off, at which no joint passes its limit; its parts in ``state.path``.
+    """Maximum share of a step, to round-off, within the joint limits; its parts in ``state.path``.
 
-    The displacement is shortened along the path by bisection, each time solved for the joints.
+    By bisection of the displacement along the path, solved for the joints each time.
     """
     share = 0.0
     width = 0.5
@@ -158,14 +160,13 @@ def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _S
 def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
     """Joint velocity whose step moves the face by exp(λ_t τ T Ĥ_t) exp(λ_s θ_s T Ĥ_s) exactly.
 
-    The joint-speed limit shortens the amplitude along the path, by the first-order joint step, before
-    any Newton step, and a position limit ends the step on it: the path itself never changes. Long steps
-    are continued in parts of about 2.5°; where a part fails there are more of them, up to 128. Across a
-    singularity, where none of them can be solved, the first-order step is taken.
+    The joint-speed limit shortens the amplitude along the path, by the first-order joint step, before any
+    Newton step, and a position limit ends the step on it: the path itself never changes. Long steps are
+    solved in parts of about 2.5°, or if a part fails in more, up to 128. Across a singularity, where no part
+    can be solved, the law takes the first-order step.
 
-    While a plan is followed, the displacement is that of the plan in the next period after the one that
-    takes back what the face is off. Along a way through joint space the joints of the plan lead, and to first
-    order what takes that back is added.
+    With a plan, the displacement is that of the plan in the next period after the correction of the face.
+    Along a joint-space path the joints of the plan lead, and the first-order correction is added.
 
     Source: [RH00] eqs. (22), (23) as corrected, solved for the joint step through eq. (6).
     """
@@ -180,24 +181,24 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     whole = _Step(parts=parts, H_s=H_s, tau=tau, theta=theta, sense=sense, ahead=1.0, pieces=1)
     if not math.isfinite(_first_order(whole, state)):
         return SINGULAR
-    if under_way(task.reference, float(state.clock[0])):
+    if on_joint_path(task.reference, float(state.clock[0])):
         for i in range(q.shape[0]):
             state.q_dot[i] /= gains.period
         return OK
     share = speed_share(state.q_dot, gains.limits.speed, gains.period)
     step = _scaled(whole, share, 1)
-    most = _first_order(step, state)
-    count = min(MOST_PARTS, max(1, math.ceil(most / _PART_STEP)))
+    largest = _first_order(step, state)
+    count = min(MAX_PARTS, max(1, math.ceil(largest / _PART_STEP)))
     step = _scaled(step, 1.0, count)
     while not _continued(model, task, q, step, state):
-        if count == MOST_PARTS:
-            # Across a singularity the first-order step is all there is.
+        if count == MAX_PARTS:
+            # Across a singularity only the first-order step remains.
             _first_order(step, state)
             for i in range(q.shape[0]):
                 state.q_dot[i] /= gains.period
             state.share[0], state.parts[0], state.blocked[0] = share, 0, -1
             return OK
-        count = min(MOST_PARTS, 2 * count)
+        count = min(MAX_PARTS, 2 * count)
         step = _scaled(step, 1.0, count)
     state.blocked[0] = _blocked_joint(q, state.path[count], gains)
     if state.blocked[0] >= 0:

@@ -1,9 +1,9 @@
 """Contract of every control law.
 
-A compiled law is ``law(model, task, gains, s, q, state) -> status``: it sees the model, the task,
-the pixels ``s`` of the face, and after them of further markers of its body, as projective cameras would
-see them, and the joint readings ``q``, never the truth; it writes joint velocities to ``state.q_dot``
-(rad/s or m/s) and its control errors to ``state.errors``.
+A compiled law is ``law(model, task, gains, s, q, state) -> status``. Its inputs are the model, the task, the
+undistorted pixels ``s`` of the face and then of further markers of its body, and the joint readings ``q``,
+never the truth. It writes joint velocities to ``state.q_dot`` (rad/s or m/s) and control errors to
+``state.errors``.
 """
 
 import math
@@ -22,34 +22,35 @@ from projservo_cli.geometry.algebra import (
     inner,
     mat,
     mul,
-    put_vec,
     sub,
     unit,
     vec,
+    vec_into,
 )
 from projservo_cli.geometry.jit import composed, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, least_squares
 from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
-from projservo_cli.geometry.lens import straighten
+from projservo_cli.geometry.lens import undistort_pixel
 from projservo_cli.geometry.mechanisms import OWN, Span, Work, joint_motion, rotation_mechanism, workspace
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import FloatArray, IntArray, JointLimits, Model, position_limits
-from projservo_cli.task.body import SEEN, SHOWN, carry, fit_body
+from projservo_cli.task.body import ALL_VIEWS, GOAL_VIEWS, carry, fit_body
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import NO_PARTS, Parts, Split, partition
 from projservo_cli.task.trajectory import following
 from projservo_cli.task.visibility import limited_translation
 
-# Parts a law may split one step into.
-MOST_PARTS = 128
-
-# No limit, for any number of joints a configuration may have.
+# Maximum number of parts of a step.
+MAX_PARTS = 128
+# No limits, for any number of joints of a configuration.
 UNLIMITED = position_limits(np.full(64, -np.inf), np.full(64, np.inf))
-
+# Status of a law: a command.
 OK = 0
+# Status of a law: the face is not measured.
 LOST = 1
+# Status of a law: the joint motion is not unique.
 SINGULAR = 2
-
+# Indices of the control errors, named in ``ERRORS``.
 TAU, TAU_AFFINE, THETA_R, THETA_P, THETA_S = range(5)
 ERRORS = ("tau", "tau_affine", "theta_r", "theta_p", "theta_s")
 
@@ -83,50 +84,50 @@ class Gains(NamedTuple):
 
 
 class Law(NamedTuple):
-    """A built-in law, and all it knows."""
+    """A built-in law with its inputs."""
 
     code: int  # of the law
-    model: Model  # what it believes
+    model: Model  # calibrated or metric
     task: Task  # in the frame of the model
     gains: Gains
 
 
 class State(NamedTuple):
-    """Workspace of a law and what it returns."""
+    """Workspace and results of a law."""
 
     work: Work  # arrays of the kernels, the current operators among them
-    A: FloatArray
-    A_t: FloatArray
-    A_r: FloatArray  # A, A_t, A_r: (m, 4) current points, target without translation, target without both
+    A: FloatArray  # (m, 4) current points
+    A_t: FloatArray  # (m, 4) target without translation
+    A_r: FloatArray  # (m, 4) target without translation and rotation r
     q_hat: FloatArray  # (4, n) joint motions t, r, p, s; (4, 6) coordinates in the span of an arm of n ≠ 6
     q_dot: FloatArray  # (n,) joint velocity commanded, rad/s or m/s
     xi_dot: FloatArray  # (6,) the same in the coordinates of ``q_hat``; ``q_dot`` itself for six joints
     errors: FloatArray  # (5,) τ in the unit-norm scale of (8), τ in the scale of a_inf, θ_r, θ_p, θ_s in rad
-    driven: FloatArray  # (2, n) joint motions of the last rotations r and p in the sense they were driven
-    limited: FloatArray  # (1,) how often visibility limited the translation
-    # (3,) sums of squared residuals of the predicted and of the fitted body, px², and the markers used,
-    # counted once a view; NaN where the face is measured point by point
+    driven: FloatArray  # (2, n) joint motions of the last rotations r and p in their sense
+    limited: FloatArray  # (1,) number of steps in which visibility limited the translation
+    # (3,) sums of squared residuals of the predicted and of the fitted body, px², and the number of markers
+    # used, once a view; NaN if the face is measured point by point
     fit: FloatArray
-    # (1,) image error of the face where the body was measured to be, px rms per marker and view, whether the
-    # face was seen or not; NaN where it is measured point by point
+    # (1,) image error of the face at the measured pose of the body, px rms per marker and view, even if the
+    # face is not seen; NaN if it is measured point by point
     face_px: FloatArray
     normal: FloatArray  # (6, 7) workspace of the fit of the body
     path: FloatArray  # (129, n) joints at the ends of the parts of a step, the current ones first
-    # (1,) share of the amplitude left by the joint-speed limit, −1 where the law leaves the limit to the loop
+    # (1,) share of the amplitude left by the joint-speed limit, −1 if the law leaves the limit to the loop
     share: FloatArray
-    parts: IntArray  # (1,) parts of the step in ``path``; 0 where the joints go straight to the end
-    blocked: IntArray  # (1,) joint at whose limit the step was made to end, −1 for none
-    straight: FloatArray  # (2, b, 2) pixels as projective cameras would see them, where a lens bends them
-    clock: FloatArray  # (1,) periods of the plan that are done, where one is followed
-    A_aim: FloatArray  # (m, 4) the face where the plan is now
-    s_aim: FloatArray  # (2, m, 2) pixels the image-based law aims at while it follows a plan
-    q_ahead: FloatArray  # (n,) joint motion of the plan in the next period; zero where none is followed
+    parts: IntArray  # (1,) number of parts of the step in ``path``; 0 if the joints move linearly to the end
+    blocked: IntArray  # (1,) joint at whose limit the step ends, −1 for none
+    straight: FloatArray  # (2, b, 2) undistorted pixels if there is a lens
+    clock: FloatArray  # (1,) completed periods of the plan, if there is one
+    A_ref: FloatArray  # (m, 4) points of the face by the plan
+    s_ref: FloatArray  # (2, m, 2) target pixels of the image-based law by the plan
+    q_ahead: FloatArray  # (n,) joint motion of the plan in the next period; zero without a plan
 
 
 def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
-    """Fresh state for n joints, m face markers and so many observed, at least those of the face.
+    """Initial state for n joints and m face markers.
 
-    An arm of n ≠ 6 joints has a span.
+    observed : number of markers in images, m or more; span : of an arm of n ≠ 6 joints.
     """
     q_dot = np.zeros(n)
     own = len(span.H_hat) == 0
@@ -145,21 +146,21 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
         fit=np.full(3, np.nan),
         face_px=np.full(1, np.nan),
         normal=np.zeros((COORDINATES, COORDINATES + 1)),
-        path=np.zeros((MOST_PARTS + 1, n)),
+        path=np.zeros((MAX_PARTS + 1, n)),
         share=np.full(1, -1.0),
         parts=np.zeros(1, dtype=np.int64),
         blocked=np.full(1, -1, dtype=np.int64),
         straight=np.zeros((2, max(m, observed), 2)),
         clock=np.zeros(1),
-        A_aim=np.zeros((m, 4)),
-        s_aim=np.zeros((2, m, 2)),
+        A_ref=np.zeros((m, 4)),
+        s_ref=np.zeros((2, m, 2)),
         q_ahead=np.zeros(n),
     )
 
 
 @njit
 def reset(state: State) -> None:
-    """Make a state as fresh as a new one, for another run."""
+    """Reset a state to the initial one, for another run."""
     state.driven[:] = 0.0
     state.q_dot[:] = 0.0
     state.q_ahead[:] = 0.0
@@ -174,7 +175,7 @@ def reset(state: State) -> None:
 
 
 @composed
-def split_of(state: State) -> Split:
+def make_split(state: State) -> Split:
     """The arrays of a state in which the task is partitioned."""
     return Split(
         work=state.work, A=state.A, A_t=state.A_t, A_r=state.A_r, q_hat=state.q_hat, driven=state.driven
@@ -185,9 +186,7 @@ def split_of(state: State) -> Split:
 def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> bool:
     """Measure the face, with the body or point by point, and move the operators to the current joints.
 
-    Returns False where too little was seen: point by point every marker of the face must be, and have
-    a finite point.
-
+    Returns False if too little is seen; point by point every marker of the face must have a finite point.
     Source: [RH00] eq. (19) for the operators.
     """
     H = operators_at(model, q, state.work.H_hat)
@@ -204,7 +203,7 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
         found, M = triangulate(model.P, task.F, model.a_inf, s[0, k], s[1, k])
         if not found:
             return False
-        put_vec(state.A[k], M)
+        vec_into(state.A[k], M)
     return True
 
 
@@ -212,13 +211,13 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
 def _measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State) -> bool:
     """Measure the face by all markers of the body, predicted at the displacement H of the joints.
 
-    At the goal the errors of the calibration cancel between what is seen and what was shown where both
-    are fitted to the same views; others serve only where these do not determine the body.
+    At the goal the errors of the calibration cancel if the fit has the same views as that of the goal image;
+    it uses others only if these do not determine the body.
     """
     state.face_px[0] = math.nan
-    fit = fit_body(model.P, task.body, s, H, SHOWN, state.normal)
+    fit = fit_body(model.P, task.body, s, H, GOAL_VIEWS, state.normal)
     if not fit.found:
-        fit = fit_body(model.P, task.body, s, H, SEEN, state.normal)
+        fit = fit_body(model.P, task.body, s, H, ALL_VIEWS, state.normal)
     state.fit[0] = fit.before
     state.fit[1] = fit.after
     state.fit[2] = fit.views
@@ -246,31 +245,31 @@ def _predicted_error(P: FloatArray, A: FloatArray, A_star: FloatArray) -> float:
 
 
 @merged
-def _aimed(task: Task, state: State) -> Task:
-    """The task whose target is where the plan is now; the task itself where none is followed."""
+def _current_target(task: Task, state: State) -> Task:
+    """Task with the current pose of the plan as its target; the task itself without a plan."""
     if not following(task.reference):
         return task
-    return Task(task.s_star, state.A_aim, *task[2:])
+    return Task(task.s_star, state.A_ref, *task[2:])
 
 
 @internal
 def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> tuple[int, Parts]:
-    """Measure and partition the remaining task, or what is left to the place the plan has now.
+    """Measure the face and partition the remaining task, or that to the current pose of the plan.
 
-    The errors are written to the state.
+    Writes the errors to the state. Returns the status and the parts.
     """
     state.q_dot[:] = 0.0
     state.errors[:] = math.nan
     if not measure(model, task, s, q, state):
         return LOST, NO_PARTS
-    aim = _aimed(task, state)
-    parts = partition(aim, split_of(state))
+    current = _current_target(task, state)
+    parts = partition(current, make_split(state))
     if not parts.found:
         return SINGULAR, parts
-    way = sub(center_of(aim.A_star, task.center), parts.A_c)
+    offset = sub(center_of(current.A_star, task.center), parts.A_c)
     theta_s, _, _, _ = composed_angle(parts.theta_r, parts.theta_p)
     state.errors[TAU] = parts.tau
-    state.errors[TAU_AFFINE] = math.sqrt(dot(way, way))
+    state.errors[TAU_AFFINE] = math.sqrt(dot(offset, offset))
     state.errors[THETA_R] = parts.theta_r
     state.errors[THETA_P] = parts.theta_p
     state.errors[THETA_S] = theta_s
@@ -278,8 +277,8 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
 
 
 @merged
-def put_joint_velocity(state: State) -> bool:
-    """Joint velocity ``q_dot`` of the velocity ``xi_dot``; False where the joints cannot make it."""
+def joint_velocity_into(state: State) -> bool:
+    """Convert the velocity ``xi_dot`` to joint velocities ``q_dot``; False if the joints cannot make it."""
     if state.work.span.H_hat.shape[0] == 0:
         return True
     return joint_motion(state.work, state.xi_dot, state.q_dot)
@@ -287,7 +286,7 @@ def put_joint_velocity(state: State) -> bool:
 
 @internal
 def translation_rate(task: Task, gains: Gains, parts: Parts, state: State) -> float:
-    """Rate λ_t τ of the translation, its step kept within δ τ_0 of both cameras."""
+    """Rate λ_t τ of the translation, with its step within δ τ_0 of both cameras."""
     wanted = gains.gain_t * parts.tau * gains.period
     allowed = limited_translation(parts.a, parts.H_t, wanted, gains.delta, task)
     if allowed < wanted:
@@ -299,19 +298,19 @@ def translation_rate(task: Task, gains: Gains, parts: Parts, state: State) -> fl
 def _axis_direction(H_s: Mat4, a_inf: FloatArray, A_c: Vec4) -> Vec4:
     """Point at infinity on the axis of a rotation about the centre, of unit norm.
 
-    (I + Ĥ²) X is the foot of X on the axis; the four coordinate vectors X less the centre give
-    multiples of one direction, of which the longest is taken.
+    (I + Ĥ²) X is the foot of X on the axis; the four coordinate vectors X less the centre give multiples of
+    one direction, of which the longest is the most accurate.
     """
     H_s2 = mul(H_s, H_s)
     weights = vec(a_inf)
     best = (0.0, 0.0, 0.0, 0.0)
-    most = -1.0
+    largest = -1.0
     for k in range(4):
         X = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0, 1.0 if k == 3 else 0.0)
         foot = apply(H_s2, X)
         D = axpy(-weights[k], A_c, (foot[0] + X[0], foot[1] + X[1], foot[2] + X[2], foot[3] + X[3]))
-        if dot(D, D) > most:
-            most = dot(D, D)
+        if dot(D, D) > largest:
+            largest = dot(D, D)
             best = D
     return unit(best)
 
@@ -326,12 +325,12 @@ def single_rotation(
     For λ_r/λ_p = ρ ≠ 1 the rotations composed in (24) are θ_r and θ_p weighted by ρ/max(1, ρ) and
     1/max(1, ρ): each then decays at its own rate, and the axis of the single rotation changes.
 
-    ratio : ρ; state : the joint motion is written to its row s.
-    Returns found: False where the joint motion is not unique; theta_s: angle, rad; 0 where no rotation is
-    left; sense: factor that scales row s to the sense of Ĥ_s; H_s: operator Ĥ_s.
+    ratio : ρ; state : gets the joint motion in its row s.
+    Returns found: False if the joint motion is not unique; theta_s: angle, rad, 0 if no rotation remains;
+    sense: factor that scales row s to the sense of Ĥ_s; H_s: operator Ĥ_s.
     """
-    most = max(1.0, ratio)
-    theta_s, a, b, c = composed_angle(ratio / most * parts.theta_r, parts.theta_p / most)
+    largest = max(1.0, ratio)
+    theta_s, a, b, c = composed_angle(ratio / largest * parts.theta_r, parts.theta_p / largest)
     turns, H_s = composed_operator(parts.H_r, parts.H_p, a, b, c)
     if not turns:
         return True, 0.0, 0.0, H_s
@@ -344,33 +343,32 @@ def single_rotation(
 
 
 @internal
-def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, first: int) -> None:
-    """Interaction matrix and image error of one view, [RH00] eq. (7), into rows from ``first`` on."""
+def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, first: int) -> None:
+    """Write the interaction matrix and image error of one view, [RH00] eq. (7), to rows from ``first`` on."""
     system, operators = state.work.system, state.work.columns
     for i in range(operators.shape[0]):
         operator = mat(operators[i])
         for k in range(state.A.shape[0]):
-            put_vec(state.A_t[k], apply(operator, vec(state.A[k])))
+            vec_into(state.A_t[k], apply(operator, vec(state.A[k])))
             _, _, u_dot, v_dot = image_velocity(model.P[view], vec(state.A[k]), vec(state.A_t[k]))
             system.B[i, first + 2 * k] = u_dot
             system.B[i, first + 2 * k + 1] = v_dot
     for k in range(state.A.shape[0]):
         if following(task.reference):
-            u, v = float(state.s_aim[view, k, 0]), float(state.s_aim[view, k, 1])
+            u, v = float(state.s_ref[view, k, 0]), float(state.s_ref[view, k, 1])
         else:
             target = task.s_star[view, k]
-            u, v = straighten(model.lens[view], float(target[0]), float(target[1]))
+            u, v = undistort_pixel(model.lens[view], float(target[0]), float(target[1]))
         system.rhs[first + 2 * k] = s[view, k, 0] - u
         system.rhs[first + 2 * k + 1] = s[view, k, 1] - v
 
 
 @internal
 def pseudo_inverse(state: State, rows: int, q_hat: FloatArray) -> bool:
-    """Joint motion q̂ (n,) of least squares, and of least norm, of the matrix in the workspace.
+    """Joint motion q̂ (n,) of least squares and minimum norm, by the matrix in the workspace.
 
-    The matrix has a column for each of ``Work.columns``: a pseudo-inverse of the
-    product of an image Jacobian of full column rank and of coordinates of full row rank is the product of
-    both pseudo-inverses.
+    The matrix has a column for each of ``Work.columns``. The pseudo-inverse of the product of an image
+    Jacobian of full column rank and coordinates of full row rank is the product of both pseudo-inverses.
     """
     work = state.work
     if work.columns.shape[0] == q_hat.shape[0]:
@@ -382,7 +380,7 @@ def pseudo_inverse(state: State, rows: int, q_hat: FloatArray) -> bool:
 
 @merged
 def limit_speed(q_dot: FloatArray, speed: FloatArray) -> float:
-    """Scale joint velocities (n,) uniformly to the joint-speed limit; returns the share that is left."""
+    """Scale joint velocities (n,) uniformly to the joint-speed limit, and return the factor."""
     share = speed_share(q_dot, speed, 1.0)
     for i in range(q_dot.shape[0]):
         q_dot[i] *= share
@@ -391,7 +389,7 @@ def limit_speed(q_dot: FloatArray, speed: FloatArray) -> float:
 
 @merged
 def speed_share(q_step: FloatArray, speed: FloatArray, period: float) -> float:
-    """Share of the amplitude at which the first-order joint step keeps the joint-speed limit."""
+    """Share of the amplitude at which the first-order joint step is within the joint-speed limit."""
     share = 1.0
     for i in range(q_step.shape[0]):
         size = abs(q_step[i])

@@ -1,7 +1,7 @@
 """Points, planes and displacements of projective space as plain values: [RH00] eqs. (2)–(5), (13)–(15), (24).
 
-Vectors are tuples of four floats, matrices tuples of sixteen in row order: values without memory,
-which the compiler keeps in registers. Sums are written pairwise; their order is part of the result.
+Vectors are tuples of four floats, matrices tuples of sixteen in row order, values that the compiler keeps in
+registers. Sums are written pairwise; their order is part of the result.
 """
 
 import math
@@ -25,7 +25,7 @@ def vec(A: FloatArray) -> Vec4:
 
 
 @inline
-def put_vec(target: FloatArray, A: Vec4) -> None:
+def vec_into(target: FloatArray, A: Vec4) -> None:
     """Write a value into a row of an array."""
     target[0] = A[0]
     target[1] = A[1]
@@ -40,12 +40,12 @@ def mat(H: FloatArray) -> Mat4:
 
 
 @inline
-def put_mat(target: FloatArray, H: Mat4) -> None:
+def mat_into(target: FloatArray, H: Mat4) -> None:
     """Write a value into a 4×4 array."""
-    put_vec(target[0], H[0:4])
-    put_vec(target[1], H[4:8])
-    put_vec(target[2], H[8:12])
-    put_vec(target[3], H[12:16])
+    vec_into(target[0], H[0:4])
+    vec_into(target[1], H[4:8])
+    vec_into(target[2], H[8:12])
+    vec_into(target[3], H[12:16])
 
 
 @inline
@@ -165,26 +165,27 @@ def dual_pencil(A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
     """Two orthonormal vectors dual to the line through A and A + D: [RH00] eq. (3).
 
     For points they are two planes through the line, for planes two points on their intersection.
-    ``A`` and ``D`` must be independent; of four candidate directions the one farthest from both is
-    completed, so no division is by less than √½.
+    ``A`` and ``D`` must be independent. The coordinate direction farthest from both completes them, so no
+    division is by less than √½.
     """
     u = unit(A)
     v = unit(axpy(-dot(u, D), u, D))
     v = unit(axpy(-dot(u, v), u, v))
-    least = u[0] * u[0] + v[0] * v[0]
+    smallest = u[0] * u[0] + v[0] * v[0]
     e = (1.0, 0.0, 0.0, 0.0)
-    if u[1] * u[1] + v[1] * v[1] < least:
-        least = u[1] * u[1] + v[1] * v[1]
+    if u[1] * u[1] + v[1] * v[1] < smallest:
+        smallest = u[1] * u[1] + v[1] * v[1]
         e = (0.0, 1.0, 0.0, 0.0)
-    if u[2] * u[2] + v[2] * v[2] < least:
-        least = u[2] * u[2] + v[2] * v[2]
+    if u[2] * u[2] + v[2] * v[2] < smallest:
+        smallest = u[2] * u[2] + v[2] * v[2]
         e = (0.0, 0.0, 1.0, 0.0)
-    if u[3] * u[3] + v[3] * v[3] < least:
+    if u[3] * u[3] + v[3] * v[3] < smallest:
         e = (0.0, 0.0, 0.0, 1.0)
     w = unit(axpy(-dot(e, u), u, axpy(-dot(e, v), v, e)))
     return w, meet(u, v, w)
 
 
+# Identity matrix.
 IDENTITY: Mat4 = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -230,9 +231,9 @@ def exp_rotation(H_hat: FloatArray, theta: float) -> FloatArray:
 def normalize_displacement(H: FloatArray, A: FloatArray, a_inf: FloatArray) -> FloatArray:
     """Scale a 4×4 homography to a displacement with det H = 1, [RH00] eq. (2).
 
-    The determinant leaves ±H (4, 4); the sign is the one that keeps that of a_inf·A for points A (..., 4).
+    The determinant leaves ±H (4, 4); the sign keeps that of a_inf·A for points A (..., 4).
 
-    Raises WorkFailed if det H is not positive: then H is no displacement.
+    Raises WorkFailed if det H is not positive, since H is then no displacement.
     """
     determinant = float(np.linalg.det(H))
     if not determinant > 0.0:
@@ -252,7 +253,7 @@ def as_array(H: Mat4) -> FloatArray:
 
 @inline
 def twist_exponential(X: Mat4) -> Mat4:
-    """Displacement exp(X) of any twist, rotation and translation together.
+    """Displacement exp(X) of any twist, with rotation and translation.
 
     Rodrigues' formula with the cubic term, I + X + (1 − cos θ)/θ² X² + (θ − sin θ)/θ³ X³ with
     θ² = −trace(X²)/2; below θ = 1e-4 the coefficients are their series, exact to 1e-18.
@@ -288,7 +289,7 @@ def incidence_angles(p_0: float, p_s: float, p_c: float) -> tuple[bool, float, f
     θ± = atan2(p_s, p_c) ± arccos(−p_0 / √(p_s² + p_c²)), each in (−π, π]. The printed
     θ⁻ = π − θ⁺ holds only where p_c = 0.
 
-    Returns false and zeros where |p_0| exceeds the amplitude: the point never meets the plane.
+    Returns false and zeros if |p_0| exceeds the amplitude: the point never meets the plane.
     """
     amplitude = math.sqrt(p_s * p_s + p_c * p_c)
     if not abs(p_0) <= amplitude or not amplitude > 0.0:
@@ -319,7 +320,7 @@ def composed_angle(theta_r: float, theta_p: float) -> tuple[float, float, float,
 def composed_operator(H_r: Mat4, H_p: Mat4, cbh_a: float, cbh_b: float, cbh_c: float) -> tuple[bool, Mat4]:
     """Operator Ĥ_s of the single rotation equal to both, [RH00] eq. (24).
 
-    Returns false where the rotation is the identity and has no axis.
+    Returns false if the rotation is the identity, without axis.
     """
     sine = math.sqrt(cbh_a * cbh_a + cbh_b * cbh_b + cbh_c * cbh_c)
     if not sine > 0.0:
@@ -329,17 +330,17 @@ def composed_operator(H_r: Mat4, H_p: Mat4, cbh_a: float, cbh_b: float, cbh_c: f
     return True, combine(1.0 / sine, H, cbh_c / sine, bracket)
 
 
-# Forms that the joints keep up to this share of the largest change are kept.
+# Change of a quadratic form by the joints, over the largest, below which it is invariant.
 _INVARIANT = 1e-6
 
 
 def invariant_rotations(actions: FloatArray) -> FloatArray:
-    """Three rotations (3, 3, 3) of the plane at infinity, per rad, in the metric that all joints keep.
+    """Three rotations (3, 3, 3) of the plane at infinity, per rad, in the metric that all joints preserve.
 
-    The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane;
-    where few joints leave it open, the one nearest to the identity, which does as well for these joints.
+    The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane. If
+    few joints leave it open, it is the one nearest to the identity, which serves these joints as well.
 
-    Raises WorkFailed if no metric is kept.
+    Raises WorkFailed if the joints preserve no metric.
     """
     i, j = np.triu_indices(3)
     basis = np.zeros((6, 3, 3))
@@ -351,8 +352,8 @@ def invariant_rotations(actions: FloatArray) -> FloatArray:
     Q = np.einsum("s,sab->ab", kept.T @ (kept @ np.einsum("saa->s", basis)), basis)
     if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
         raise WorkFailed(
-            "the joints keep no metric of the calibrated frame: calibrate anew, or measure point by point "
-            "with control.observation: points"
+            "the joints preserve no metric of the calibrated frame: calibrate again, or measure point by "
+            "point with control.observation: points"
         )
     C = np.linalg.cholesky(Q).T
     return np.array([np.linalg.solve(C, np.cross(np.eye(3), e) @ C) for e in np.eye(3)])

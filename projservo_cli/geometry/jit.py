@@ -1,9 +1,8 @@
 """JIT compilation of the mathematics: one decorator, and a cache that never serves stale code.
 
-Numba decides whether cached machine code is fresh by the file of the function itself, so an edited
-helper in another file would go unnoticed. The cache folder therefore carries a hash of all sources
-that compiled functions may come from, by what these import; where no folder can be written, the functions
-compile anew in each process.
+Numba checks cached machine code against the file of the function alone, and would miss an edited helper in
+another file. The cache folder therefore carries a hash of the sources of all compiled functions and of their
+imports. If no folder is writable, each process compiles the functions again.
 """
 
 import hashlib
@@ -28,7 +27,7 @@ _IMPORT = re.compile(rb"^\s*from projservo_cli(?:\.([\w.]+))? import (\([^)]*\)|
 
 
 def compiled_sources(root: Path) -> dict[str, bytes]:
-    """Sources of a package, by their paths in it, that have compiled functions or are imported by such."""
+    """Sources of a package, by their paths in it, with compiled functions, and those that they import."""
     sources = {file.relative_to(root).as_posix(): file.read_bytes() for file in root.rglob("*.py")}
     found: dict[str, bytes] = {}
     due = [name for name, source in sources.items() if _DECORATED.search(source)]
@@ -41,7 +40,7 @@ def compiled_sources(root: Path) -> dict[str, bytes]:
 
 
 def _imported(source: bytes) -> Iterator[str]:
-    """Paths that imports of a source may stand for: a module, a package, a module of a package."""
+    """Yield paths that imports of a source may name: a module, a package, a module of a package."""
     for module, names in _IMPORT.findall(source):
         parts = module.decode().split(".") if module else []
         yield "/".join([*parts, "__init__.py"])
@@ -61,7 +60,7 @@ def _source_hash(root: Path) -> str:
 
 
 def cache_folder(root: Path) -> Path | None:
-    """Folder for machine code of exactly these sources, or None where nothing can be written."""
+    """Folder for machine code of exactly these sources, or None if none is writable."""
     base = os.environ.get("PROJSERVO_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
     if base is None:
         try:
@@ -78,27 +77,29 @@ def cache_folder(root: Path) -> Path | None:
     return folder
 
 
-# The compiler's settings are attributes made at run time, which its types do not list.
+# Settings of Numba, attributes made at run time that its types do not list.
 SETTINGS: Any = numba.config
+# Whether the compiler is enabled.
 COMPILED = not SETTINGS.DISABLE_JIT
+# Folder of the machine code.
 CACHE_FOLDER = cache_folder(Path(__file__).parents[1]) if COMPILED else None
 if CACHE_FOLDER is not None:
     SETTINGS.CACHE_DIR = str(CACHE_FOLDER)
-# The third level of the optimiser costs a sixth of the compilation more and gains a tenth of a step.
+# The third level of the optimiser takes a sixth more compilation time and saves a tenth of a step.
 if "NUMBA_OPT" not in os.environ:
     SETTINGS.OPT = type(SETTINGS.OPT)(2)
 
 
-# Machine code of these functions borrows the arrays of its caller and makes none: without the runtime
-# that counts references, passing a record of thirty arrays on costs no thirty locked instructions.
-# Strict arithmetic, no reordering and no contraction: every mode agrees to the bit.
+# These functions borrow the arrays of their caller and allocate none, so they need no runtime that counts
+# references, which takes a locked instruction for each of thirty arrays of a record.
+# Strict arithmetic, without reordering and contraction, makes every mode agree to the bit.
 _OPTIONS: dict[str, Any] = {
     "cache": CACHE_FOLDER is not None,
     "error_model": "numpy",
     "fastmath": False,
     "nogil": True,
     "_nrt": False,
-    "no_cfunc_wrapper": True,  # for callbacks of C code, of which there are none
+    "no_cfunc_wrapper": True,  # no C code calls back
 }
 _UNCACHED = {name: value for name, value in _OPTIONS.items() if name != "cache"}
 
@@ -111,27 +112,26 @@ def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
 class _Internal(CPUDispatcher):
     """A compiled function whose machine code takes no arguments from Python.
 
-    Python would call into nowhere; its calls go by way of a compiled caller instead, made at the first, or
-    are interpreted where the function is small.
+    The first call from Python compiles a caller for it; a small function is interpreted instead.
     """
 
     _caller: Callable[..., Any] | None = None
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call from Python; ``arguments`` and what is returned are those of the function."""
+        """Call the function from Python."""
         if "forceinline" in self.targetoptions:
             return self.py_func(*arguments)
         if self._caller is None:
-            # Kept in no cache: another process would not find it, for it is known by the function it holds.
+            # Not cached: another process could not find it, since its key is the function object.
             self._caller = numba.njit(**_UNCACHED)(lambda *values: self(*values))
         return self._caller(*arguments)
 
 
 def internal(function: Callable[_Params, _Result], **given: Any) -> Callable[_Params, _Result]:
-    """Compile a function like ``njit`` that only compiled ones call, but for tests.
+    """Compile a function that only compiled ones and tests call.
 
-    To take a record of a hundred arrays from Python would be a fifth of its compilation. Further options of
-    the compiler may be ``given``.
+    Without the interface to Python it compiles a fifth faster, for a record of a hundred arrays.
+    given : further options of the compiler.
     """
     if not COMPILED:
         return function
@@ -143,15 +143,14 @@ def internal(function: Callable[_Params, _Result], **given: Any) -> Callable[_Pa
 
 
 def allocating(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a function that makes arrays of its own, for sweeps that take milliseconds a call."""
+    """Compile a function that allocates arrays, for sweeps that take milliseconds a call."""
     return cast(Callable[_Params, _Result], numba.njit(**{**_OPTIONS, "_nrt": True})(function))
 
 
 def composed(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a function as a part of those compiled ones that call it.
+    """Compile a function as part of the compiled ones that call it.
 
-    Called from Python it is interpreted and calls compiled functions, so that a single run needs no machine
-    code but theirs.
+    Python interprets it, and it calls compiled functions, so a single run needs their machine code alone.
     """
     return register_jitable(**_UNCACHED)(function)
 
@@ -162,8 +161,8 @@ def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
 
 
 def merged(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Merge a function into its callers, of which it has few, before the compiler proper sees it.
+    """Merge a function with few callers into them, before the compiler proper sees it.
 
-    On its own it is compiled only where it is called from Python.
+    A call from Python compiles it on its own.
     """
     return cast(Callable[_Params, _Result], numba.njit(**_OPTIONS, inline="always")(function))

@@ -1,8 +1,8 @@
 """Null space (kernel vectors) and least squares of small dense matrices by Gram–Schmidt orthogonalisation.
 
 Matrices are stored by columns: row j of the array is column j of the matrix, contiguous in memory.
-All arrays are workspaces of the caller; nothing is allocated. Rows are taken four at a time, which
-the compiler turns into vector instructions without changing the order of any sum.
+All arrays are workspaces of the caller. Loops take four rows at a time, which the compiler turns into vector
+instructions without changing the order of any sum.
 """
 
 import math
@@ -13,16 +13,19 @@ import numpy as np
 from projservo_cli.geometry.jit import inline, internal, merged
 from projservo_cli.records import FloatArray, IntArray
 
-COORDINATES = 6  # of a displacement
-# A kernel is one-dimensional when the next pivot stands above round-off by this factor of the first.
+# Number of coordinates of a displacement.
+COORDINATES = 6
+# Pivot over the first above which it exceeds round-off; a kernel has one dimension if the last but one does.
 RANK_TOLERANCE = 1e-9
-# A last pivot above this share of the first is no kernel at all: noise leaves a few per cent.
+# Last pivot over the first above which there is no kernel: noise leaves a few per cent.
 _KERNEL_TOLERANCE = 0.1
-# A last pivot below this is zero to working precision: back-substitution alone gives the kernel.
+# Last pivot over the first below which it is zero to working precision and back-substitution suffices.
 _EXACT_TOLERANCE = 1e-14
+# Relative change of the gain that ends the inverse iteration; a fixed number of steps errs under noise.
 _GAIN_TOLERANCE = 1e-12
-_MOST_ITERATIONS = 100
-# A solution by normal equations, and once more with what rounding left of it.
+# Maximum number of inverse iterations.
+_MAX_ITERATIONS = 100
+# Number of solutions by normal equations; the second one corrects the round-off of the first.
 _PASSES = 2
 
 
@@ -37,7 +40,7 @@ class System(NamedTuple):
 
 
 def new_system(n: int, rows: int) -> System:
-    """Arrays for n unknowns and at most so many rows."""
+    """Arrays for n unknowns and up to ``rows`` rows."""
     width = (max(n, rows) + 3) // 4 * 4
     return System(
         B=np.zeros((n, width)),
@@ -49,15 +52,15 @@ def new_system(n: int, rows: int) -> System:
 
 
 @merged
-def put_row(target: FloatArray, source: FloatArray) -> None:
-    """Copy a row; a slice would be copied by way of memory that compiled code has none of."""
+def row_into(target: FloatArray, source: FloatArray) -> None:
+    """Copy a row; assigning a slice needs the runtime for allocations."""
     for i in range(target.shape[0]):
         target[i] = source[i]
 
 
 @inline
 def _product(x: FloatArray, y: FloatArray, rows: int) -> float:
-    """Product of two columns."""
+    """Scalar product of two columns."""
     s0 = s1 = s2 = s3 = 0.0
     for i in range(0, rows, 4):
         s0 += x[i] * y[i]
@@ -76,7 +79,7 @@ def orthogonalize(system: System, m: int, n: int, solve: bool) -> tuple[float, f
     solve : whether to leave Qᵀ rhs in ``z``; ``rhs`` is then overwritten.
     Source: Å. Björck, "Solving linear least squares problems by Gram–Schmidt orthogonalization", BIT
     7 (1967): R is as accurate as Householder's, and so is the solution with the right-hand side
-    carried as a further column. Norms are computed anew in each step instead of guarding a down-date.
+    carried as a further column. Each step computes the norms instead of guarding a down-date.
     """
     B, rhs, z, norms, pivot = system
     rows = (m + 3) // 4 * 4
@@ -143,7 +146,7 @@ def kernel_vector(system: System, m: int, x: FloatArray) -> bool:
 
     m : rows of the matrix, which is overwritten.
     x : (n,) on return the unit kernel vector; its sign is arbitrary.
-    Returns false where there is no kernel or more than one dimension of it; x is then zero.
+    Returns false if the kernel has not one dimension; x is then zero.
     """
     n = x.shape[0]
     B, _, z, _, pivot = system
@@ -158,7 +161,7 @@ def kernel_vector(system: System, m: int, x: FloatArray) -> bool:
     _normalize(z, n)
     if last > _EXACT_TOLERANCE * first:
         gain = 0.0
-        for _ in range(_MOST_ITERATIONS):
+        for _ in range(_MAX_ITERATIONS):
             for j in range(n):
                 total = z[j]
                 for i in range(j):
@@ -186,7 +189,7 @@ def _back_substitute(B: FloatArray, n: int, z: FloatArray) -> None:
 
 @inline
 def _normalize(z: FloatArray, n: int) -> float:
-    """Scale to unit norm and return the norm it had."""
+    """Scale to unit norm and return the previous norm."""
     size = 0.0
     for j in range(n):
         size += z[j] * z[j]
@@ -201,7 +204,7 @@ def _normalize(z: FloatArray, n: int) -> float:
 def least_squares(system: System, m: int, x: FloatArray) -> bool:
     """Least-squares solution x (n,) of B x = rhs, m rows of full column rank, both overwritten.
 
-    Returns false where the columns are dependent (or fewer rows than columns); x is then zero.
+    Returns false if the columns are dependent or exceed the rows; x is then zero.
     """
     n = x.shape[0]
     B, _, z, _, pivot = system
@@ -219,8 +222,8 @@ def least_squares(system: System, m: int, x: FloatArray) -> bool:
 
 
 @merged
-def least_norm(system: System, J: FloatArray, b: FloatArray, x: FloatArray) -> bool:
-    """Solution x (n,) of least norm of J x = b, for J (k, n) of full row rank; false where it has less.
+def minimum_norm(system: System, J: FloatArray, b: FloatArray, x: FloatArray) -> bool:
+    """Minimum-norm solution x (n,) of J x = b, for J (k, n) of full row rank; false if the rank is lower.
 
     With Jᵀ = Q R it is Jᵀ (J Jᵀ)⁻¹ b, J Jᵀ = Rᵀ R.
     """
@@ -256,10 +259,9 @@ def solve_normal(N: FloatArray, n: int, tolerance: float) -> bool:
 
     N : (n, n + 1) upper triangle of the matrix, and the right-hand side in the last column, which the
         solution replaces; the rest is overwritten.
-    tolerance : a pivot below this share of its diagonal entry counts as zero. The share is what of a column
-        of the least-squares problem the columns before do not explain, squared.
-    Returns false where the matrix is singular; source: G. Golub, C. Van Loan, Matrix Computations, section
-    4.1.2.
+    tolerance : a pivot below this share of its diagonal entry counts as zero. The share is the squared part
+        of a column of the least-squares problem that is independent of the columns before it.
+    Returns false if the matrix is singular. Source: G. Golub, C. Van Loan, Matrix Computations, sect. 4.1.2.
     """
     for j in range(n):
         pivot = N[j, j]

@@ -8,15 +8,15 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     as_array,
     mat,
+    mat_into,
     mul,
-    put_mat,
     rotation,
     rotation_and_inverse,
     translation,
     vec,
 )
 from projservo_cli.geometry.jit import inline, internal, merged, njit
-from projservo_cli.geometry.lens import through
+from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.records import NO_LENS, PRISMATIC, FloatArray, Model
 
 
@@ -50,7 +50,7 @@ def backward(model: Model, q: FloatArray) -> Mat4:
 
 @internal
 def forward_between(model: Model, q: FloatArray, i: int, x: float) -> Mat4:
-    """Forward kinematics, [RH00] eq. (6), at a share x of the way from row i of joints (k, n) to the next."""
+    """Forward kinematics, [RH00] eq. (6), interpolated by x from row i of joints (k, n) to the next."""
     H = IDENTITY
     for l in range(q.shape[1]):
         amount = (1.0 - x) * float(q[i, l]) + x * float(q[i + 1, l]) - float(model.q_reference[l])
@@ -62,15 +62,15 @@ def forward_between(model: Model, q: FloatArray, i: int, x: float) -> Mat4:
 def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
     """Joint operators at q, [RH00] eq. (19) with the truncated product H̄_i of (6); returns the whole product.
 
-    Each joint is undone, moved about its reference and redone: Ĥ_i(q) = H̄_i Ĥ_i⁰ H̄_i⁻¹, where the
-    joint's own factor of H̄_i commutes with Ĥ_i⁰ and is left out.
+    Ĥ_i(q) = H̄_i Ĥ_i⁰ H̄_i⁻¹ undoes the joint, moves it about its reference and redoes it. The joint's own
+    factor of H̄_i commutes with Ĥ_i⁰ and is omitted.
     """
     n = q.shape[0]
     H = IDENTITY
     H_inverse = IDENTITY
     for i in range(n):
         operator = mat(model.H_hat_0[i])
-        put_mat(H_hat[i], mul(mul(H, operator), H_inverse))
+        mat_into(H_hat[i], mul(mul(H, operator), H_inverse))
         amount = float(q[i]) - float(model.q_reference[i])
         if i == n - 1:
             H = mul(H, _joint_displacement(operator, model.joint_types[i], amount))
@@ -95,9 +95,9 @@ def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
 
 @njit
 def image_velocity(P: FloatArray, A: Vec4, D: Vec4) -> tuple[float, float, float, float]:
-    """Pixel of a point A and its velocity for one camera, of its velocity D: [RH00] eq. (7), corrected.
+    """Pixel u, v of a point A in one camera, and its velocity for a velocity D of the point.
 
-    Returns u, v (px) and their velocities. The point must not lie in the camera's principal plane.
+    [RH00] eq. (7), corrected. The point must not lie in the camera's principal plane.
     """
     m = (row(P, 0, A), row(P, 1, A), row(P, 2, A))
     d = (row(P, 0, D), row(P, 1, D), row(P, 2, D))
@@ -136,7 +136,7 @@ def project(P: FloatArray, M: FloatArray, lens: FloatArray = NO_LENS) -> FloatAr
     """Pixels (2, ..., 2) of points (..., 4) by cameras (2, 3, 4) and lenses (2, 5), [RH00] eq. (1)."""
     m = np.einsum("vij,...j->v...i", P, M)
     pixels: FloatArray = m[..., :2] / m[..., 2:]
-    return through(lens.reshape(len(lens), *(1,) * (m.ndim - 2), 5), pixels)
+    return distort_visible(lens.reshape(len(lens), *(1,) * (m.ndim - 2), 5), pixels)
 
 
 def image_jacobian(P: FloatArray, M: FloatArray, H_hat: FloatArray) -> FloatArray:

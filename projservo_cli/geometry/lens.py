@@ -1,9 +1,9 @@
-"""Radial lens distortion: between the pixels of a camera and those of its projective model.
+"""Radial lens distortion: maps between undistorted and distorted pixels.
 
 Source: D. C. Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, the
-first two radial terms. A view's lens is (5,): image centre u, v and a radius, px, then k1 and k2 in
-units of that radius; both zero means none. [RH00] knows projective cameras alone: theirs are the
-*straight* pixels, and what a camera reports is *bent*.
+first two radial terms. A view's lens is (5,): image centre u, v and a radius, px, then k1 and k2 in units of
+that radius; both zero means none. The projective cameras of [RH00] have undistorted pixels, and cameras
+report distorted ones. Beyond some radius the model may fold back; pixels there have no counterpart.
 """
 
 import math
@@ -14,28 +14,28 @@ import numpy as np
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.records import BoolArray, FloatArray
 
-FIRST = 3
-"""Where k1 stands in a lens; k2 follows."""
-
-MOST_STEPS = 50
-# A Newton step of this share of the radius is the last: the next would be its square, below round-off.
-SETTLED = 1e-9
+# Index of k1 in a lens; k2 follows.
+K1 = 3
+# Maximum number of Newton steps for an undistorted radius.
+_MAX_STEPS = 50
+# Newton step, over the radius, that is the last: the next would be its square, below round-off.
+_SETTLED = 1e-9
 
 Number = TypeVar("Number", float, FloatArray)
 
 
-def _swelling(k1: Number, k2: Number, square: Number) -> Number:
+def _factor(k1: Number, k2: Number, square: Number) -> Number:
     """Factor 1 + k1 ρ² + k2 ρ⁴ of a radius, from its square."""
     return 1.0 + square * (k1 + square * k2)
 
 
-def _swelling_rate(k1: Number, k2: Number, square: Number) -> Number:
+def _factor_rate(k1: Number, k2: Number, square: Number) -> Number:
     """Derivative k1 + 2 k2 ρ² of the factor by the square of the radius."""
     return k1 + 2.0 * (square * k2)
 
 
-def _turning(k1: float, k2: float) -> float:
-    """Square of the radius at which the bent radius ρ (1 + k1 ρ² + k2 ρ⁴) turns back, infinite for never."""
+def _fold_limit(k1: float, k2: float) -> float:
+    """Square of the radius at which ρ (1 + k1 ρ² + k2 ρ⁴) folds back, infinite if it does not."""
     inner = 9.0 * (k1 * k1) - 20.0 * k2
     if not inner >= 0.0:
         return math.inf
@@ -43,20 +43,22 @@ def _turning(k1: float, k2: float) -> float:
     return 2.0 / root if root > 0.0 else math.inf
 
 
-# The same three for the kernels, which call nothing that is not compiled.
-_compiled_factor, _compiled_rate, _compiled_limit = njit(_swelling), njit(_swelling_rate), njit(_turning)
+# Compiled versions for the kernels, which call compiled functions only.
+_compiled_factor = njit(_factor)
+_compiled_rate = njit(_factor_rate)
+_compiled_limit = njit(_fold_limit)
 
 
 @merged
-def _from_center(lens: FloatArray, factor: float, u: float, v: float) -> tuple[float, float]:
-    """Pixel whose distance from the image centre is so many times that of another."""
+def _scaled_from_center(lens: FloatArray, factor: float, u: float, v: float) -> tuple[float, float]:
+    """Scale the distance of a pixel from the image centre."""
     u0, v0 = float(lens[0]), float(lens[1])
     return u0 + factor * (u - u0), v0 + factor * (v - v0)
 
 
 @merged
-def _straight_radius(k1: float, k2: float, radius: float) -> float:
-    """Radius that bends to another, before the turn: Newton within a bracket; NaN where there is none."""
+def _undistorted_radius(k1: float, k2: float, radius: float) -> float:
+    """Undistorted radius of a distorted one, by Newton steps within a bracket; NaN if there is none."""
     low = 0.0
     limit = _compiled_limit(k1, k2)
     if limit < math.inf:
@@ -68,7 +70,7 @@ def _straight_radius(k1: float, k2: float, radius: float) -> float:
         while high * _compiled_factor(k1, k2, high * high) < radius:
             high *= 2.0
     rho = min(radius, high)
-    for _ in range(MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         square = rho * rho
         factor = _compiled_factor(k1, k2, square)
         slope = factor + 2.0 * (square * _compiled_rate(k1, k2, square))
@@ -78,15 +80,15 @@ def _straight_radius(k1: float, k2: float, radius: float) -> float:
         else:
             low = rho
         step = -excess / slope if slope > 0.0 else math.inf
-        if abs(step) <= SETTLED * radius:
+        if abs(step) <= _SETTLED * radius:
             return rho + step
         rho = rho + step if low < rho + step < high else 0.5 * (low + high)
     return math.nan
 
 
 @njit
-def straighten(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """Straight pixel of a bent one; NaN where none before the turning point is bent there."""
+def undistort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
+    """Undistort a pixel; NaN if no pixel before the fold distorts to it."""
     k1, k2 = float(lens[3]), float(lens[4])
     if k1 == 0.0 and k2 == 0.0:
         return u, v
@@ -97,11 +99,11 @@ def straighten(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
         return u, v
     if not radius < math.inf:
         return math.nan, math.nan
-    return _from_center(lens, _straight_radius(k1, k2, radius) / radius, u, v)
+    return _scaled_from_center(lens, _undistorted_radius(k1, k2, radius) / radius, u, v)
 
 
 @merged
-def bends(lens: FloatArray) -> bool:
+def distorts(lens: FloatArray) -> bool:
     """Whether any of the lenses (2, 5) distorts."""
     for view in range(lens.shape[0]):
         if float(lens[view, 3]) != 0.0 or float(lens[view, 4]) != 0.0:
@@ -110,18 +112,18 @@ def bends(lens: FloatArray) -> bool:
 
 
 @merged
-def straight(lens: FloatArray, s: FloatArray, found: FloatArray) -> None:
-    """Write the straight pixels (2, N, 2) of bent ones by the lenses (2, 5); NaN as of ``straighten``."""
+def undistort_into(lens: FloatArray, s: FloatArray, found: FloatArray) -> None:
+    """Undistort pixels (2, N, 2) by lenses (2, 5) into ``found``; NaN as for ``undistort_pixel``."""
     for view in range(s.shape[0]):
         for k in range(s.shape[1]):
-            pixel = straighten(lens[view], float(s[view, k, 0]), float(s[view, k, 1]))
+            pixel = undistort_pixel(lens[view], float(s[view, k, 0]), float(s[view, k, 1]))
             found[view, k, 0] = pixel[0]
             found[view, k, 1] = pixel[1]
 
 
 @njit
-def bend(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """Bent pixel of a straight one; NaN beyond the turning point."""
+def distort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
+    """Distort a pixel; NaN beyond the fold."""
     k1, k2 = float(lens[3]), float(lens[4])
     if k1 == 0.0 and k2 == 0.0:
         return u, v
@@ -130,7 +132,7 @@ def bend(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     square = x * x + y * y
     if not square < _compiled_limit(k1, k2):
         return math.nan, math.nan
-    return _from_center(lens, _compiled_factor(k1, k2, square), u, v)
+    return _scaled_from_center(lens, _compiled_factor(k1, k2, square), u, v)
 
 
 def _offsets(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -139,44 +141,44 @@ def _offsets(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArr
     return x, np.asarray((x**2).sum(axis=-1))
 
 
-def bent(lens: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Bent pixels (..., 2) of straight ones by lenses (..., 5): the twin of ``bend``, past the turn too."""
+def distort(lens: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Distort pixels (..., 2) by lenses (..., 5), beyond the fold too; the vectorised ``distort_pixel``."""
     _, square = _offsets(lens, pixels)
-    factor = _swelling(lens[..., 3], lens[..., 4], square)[..., None]
+    factor = _factor(lens[..., 3], lens[..., 4], square)[..., None]
     result: FloatArray = lens[..., :2] + factor * (pixels - lens[..., :2])
     return result
 
 
-def straight_views(lens: FloatArray, s: FloatArray) -> FloatArray:
-    """Straight pixels (2, N, 2) of bent ones, NaN where unseen, by lenses (2, 5); the same without a lens."""
+def undistort(lens: FloatArray, s: FloatArray) -> FloatArray:
+    """Undistort pixels (2, N, 2), NaN if unseen, by lenses (2, 5); the pixels themselves without a lens."""
     s = np.ascontiguousarray(s, dtype=np.float64)
-    if not bends(lens):
+    if not distorts(lens):
         return s
     found = np.empty_like(s)
-    straight(lens, s, found)
+    undistort_into(lens, s, found)
     return found
 
 
-def within(lens: FloatArray, pixels: FloatArray) -> BoolArray:
-    """Which straight pixels (..., 2) lie on this side of the turning point of a lens (..., 5)."""
+def before_fold(lens: FloatArray, pixels: FloatArray) -> BoolArray:
+    """Mask (...) of undistorted pixels (..., 2) before the fold of a lens (..., 5)."""
     _, square = _offsets(lens, pixels)
-    limit = np.vectorize(_turning, otypes=[np.float64])(lens[..., 3], lens[..., 4])
+    limit = np.vectorize(_fold_limit, otypes=[np.float64])(lens[..., 3], lens[..., 4])
     return np.asarray(square < limit)
 
 
-def through(lens: FloatArray, pixels: FloatArray) -> FloatArray:
-    """What cameras report of straight pixels: bent, NaN beyond the turning point; the same without a lens."""
-    if not lens[..., FIRST:].any():
+def distort_visible(lens: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Distort pixels as cameras report them, NaN beyond the fold; the pixels themselves without a lens."""
+    if not lens[..., K1:].any():
         return pixels
-    return np.where(within(lens, pixels)[..., None], bent(lens, pixels), np.nan)
+    return np.where(before_fold(lens, pixels)[..., None], distort(lens, pixels), np.nan)
 
 
-def bent_derivative(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of bent pixels by straight ones (..., 2, 2), and by k1 and k2 (..., 2, 2)."""
+def distort_derivative(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of distorted pixels by undistorted ones (..., 2, 2), and by k1 and k2 (..., 2, 2)."""
     x, square = _offsets(lens, pixels)
     k1, k2 = lens[..., 3], lens[..., 4]
-    rate = 2.0 * _swelling_rate(k1, k2, square)
+    rate = 2.0 * _factor_rate(k1, k2, square)
     by_pixel = rate[..., None, None] * (x[..., :, None] * x[..., None, :])
-    by_pixel = by_pixel + _swelling(k1, k2, square)[..., None, None] * np.eye(2)
+    by_pixel = by_pixel + _factor(k1, k2, square)[..., None, None] * np.eye(2)
     powers = np.stack([square, square**2], axis=-1)
     return by_pixel, (lens[..., 2:3] * x)[..., :, None] * powers[..., None, :]

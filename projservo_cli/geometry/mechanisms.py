@@ -1,7 +1,7 @@
-"""Visual mechanisms: one-parameter motions defined by what they leave still, [RH00] section 3.
+"""Visual mechanisms: one-parameter motions defined by the points or planes they fix, [RH00] section 3.
 
-Every mechanism is the kernel of a stack of operator velocities: a joint motion q̂ (n,), written into an
-array of the caller, and its operator Σ q̂_i Ĥ_i.
+A mechanism is the kernel of a stack of operator velocities: a joint motion q̂ (n,), in an array of the
+caller, and its operator Σ q̂_i Ĥ_i.
 """
 
 import math
@@ -21,46 +21,51 @@ from projservo_cli.geometry.algebra import (
     mat,
     mul,
     multiple,
-    put_vec,
     sub,
     vec,
+    vec_into,
 )
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kernels import (
     COORDINATES,
     System,
     kernel_vector,
-    least_norm,
     least_squares,
+    minimum_norm,
     new_system,
 )
 from projservo_cli.geometry.kinematics import joint_operators, operators_at
 from projservo_cli.records import FloatArray, Model
 
-# A kernel vector whose operator is smaller than this share of its terms moves nothing.
+# Norm of an operator, over that of its terms, below which a kernel vector moves no point.
 _NULL_MOTION = 1e-9
+# Operator returned with a failure.
 NO_OPERATOR: Mat4 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+# Maximum number of Newton steps to a displacement.
+_MAX_NEWTON_STEPS = 6
+# Newton step, rad or m, that is the last: the next would be its square, below round-off.
+SETTLED = 1e-8
 
 
 class Span(NamedTuple):
-    """Six operators that span all displacements; none where those of the joints do."""
+    """Six operators that span all displacements; none if those of the joints do."""
 
     H_hat: FloatArray  # (6, 4, 4) the operators, or (0, 4, 4)
-    dual: FloatArray  # (6, 16) by which an operator, read row by row, has its coordinates
+    dual: FloatArray  # (6, 16) maps an operator, read row by row, to its coordinates
 
 
-# Six joints span the displacements by themselves.
+# Span of six joints, whose own operators span the displacements.
 OWN = Span(np.zeros((0, 4, 4)), np.zeros((COORDINATES, 16)))
 
 
 class Work(NamedTuple):
-    """Arrays the compiled functions write to, so that nothing is allocated in a loop."""
+    """Workspaces of the compiled functions, which do not allocate."""
 
     H_hat: FloatArray  # (n, 4, 4) operators at the current joints
     system: System  # of n unknowns, or of six
     span: Span  # of an arm of n ≠ 6
-    basis: FloatArray  # operators whose sums the mechanisms are: of the span, else ``H_hat`` itself
-    # independent operators for least squares: of the span of n > 6 joints, else ``H_hat`` itself
+    basis: FloatArray  # operators that mechanisms combine: of the span, else ``H_hat`` itself
+    # independent operators for least squares: of the span if n > 6, else ``H_hat`` itself
     columns: FloatArray
     J: FloatArray  # (6, n) coordinates of the operators in the span
     xi: FloatArray  # (6,) coordinates of a displacement
@@ -92,8 +97,8 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
     a_1, a_2 = dual_pencil(A, D)
     for i in range(q_hat.shape[0]):
         operator = mat(work.basis[i])
-        put_vec(work.system.B[i, 0:4], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
-        put_vec(work.system.B[i, 4:8], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
+        vec_into(work.system.B[i, 0:4], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
+        vec_into(work.system.B[i, 4:8], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
     return _moving(work, q_hat)
 
 
@@ -102,8 +107,8 @@ def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> t
     """Revolution around the axis through two points, [RH00] eq. (9), scaled to radians."""
     for i in range(q_hat.shape[0]):
         operator = mat(work.basis[i])
-        put_vec(work.system.B[i, 0:4], apply(operator, A_1))
-        put_vec(work.system.B[i, 4:8], apply(operator, A_2))
+        vec_into(work.system.B[i, 0:4], apply(operator, A_1))
+        vec_into(work.system.B[i, 4:8], apply(operator, A_2))
     return _to_radians(work, q_hat)
 
 
@@ -112,17 +117,17 @@ def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[b
     """Revolution around a point within a plane, [RH00] eq. (10), scaled to radians."""
     for i in range(q_hat.shape[0]):
         operator = mat(work.basis[i])
-        put_vec(work.system.B[i, 0:4], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
-        put_vec(work.system.B[i, 4:8], apply(operator, A))
+        vec_into(work.system.B[i, 0:4], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
+        vec_into(work.system.B[i, 4:8], apply(operator, A))
     return _to_radians(work, q_hat)
 
 
 @internal
 def _moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
-    """Kernel vector of the eight rows of the system and its operator, refused where that moves nothing.
+    """Kernel vector of the eight rows of the system, and its operator, unless it is a null motion.
 
-    At a kinematic singularity the kernel is the null motion of the robot: joints move, the face does
-    not. Then Σ q̂_i Ĥ_i vanishes against its terms.
+    At a kinematic singularity the kernel is a null motion of the robot: joints move and the face does not.
+    Then Σ q̂_i Ĥ_i vanishes against its terms.
     """
     if not kernel_vector(work.system, 8, q_hat):
         return False, NO_OPERATOR
@@ -140,11 +145,11 @@ def _moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
 
 @internal
 def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
-    """The same with the scale ν of [RH00] eqs. (9), (10): eigenvalues ±i, which is trace(Ĥ²) = −2."""
+    """Kernel vector and operator with the scale ν of [RH00] eqs. (9), (10): trace(Ĥ²) = −2."""
     found, H = _moving(work, q_hat)
     if not found:
         return False, NO_OPERATOR
-    # Entries with dynamic indices would have to be looked up: the sum is written out.
+    # The sum is written out, since dynamic indices of a tuple need memory.
     trace = (H[0] * H[0] + H[5] * H[5]) + (H[10] * H[10] + H[15] * H[15])
     trace += 2.0 * ((H[1] * H[4] + H[2] * H[8]) + (H[3] * H[12] + H[6] * H[9]))
     trace += 2.0 * (H[7] * H[13] + H[11] * H[14])
@@ -157,13 +162,13 @@ def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     return True, multiple(nu, H)
 
 
-def span_of(model: Model, A: FloatArray) -> Span:
+def make_span(model: Model, A: FloatArray) -> Span:
     """Six operators that span the displacements of the calibrated frame; ``OWN`` for six joints.
 
-    Rotations are about the middle of the points A (m, 4), a_inf·A = 1, per rad; a unit of translation moves
-    them about as far as a rad of rotation does.
+    Rotations are about the middle of the points A (m, 4), a_inf·A = 1, per rad. A unit of translation moves
+    them about as far as a rad of rotation.
 
-    Raises WorkFailed if the joints keep no shape of the frame, as those of a wrong calibration do not.
+    Raises WorkFailed if the joints preserve no metric of the frame, as with a wrong calibration.
     """
     if len(model.q_reference) == COORDINATES:
         return OWN
@@ -191,9 +196,9 @@ def in_span(span: Span, model: Model, q: FloatArray, q_hat: FloatArray) -> Float
 def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
     """Joint motion of a displacement with coordinates ξ (6,), from the operators in ``work.H_hat``.
 
-    Of least norm with more than six joints, of least squares with fewer. False at a singularity.
+    Of minimum norm with more than six joints, by least squares with fewer. False at a singularity.
     """
-    # Not the constant, for which the compiler would make the functions called anew.
+    # A variable, as the compiler would compile the functions called again for the constant.
     n, rows = q_hat.shape[0], work.J.shape[0]
     for i in range(n):
         for a in range(COORDINATES):
@@ -207,16 +212,11 @@ def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
             for i in range(n):
                 work.system.B[i, a] = work.J[a, i]
         return least_squares(work.system, rows, q_hat)
-    return least_norm(work.system, work.J, xi, q_hat)
-
-
-_MOST_NEWTON_STEPS = 6
-# A Newton step this short, rad or m, is the last: the next would be its square, below round-off.
-SETTLED = 1e-8
+    return minimum_norm(work.system, work.J, xi, q_hat)
 
 
 class Seen(NamedTuple):
-    """A face, and where the joints were when it was seen."""
+    """A measured face and the joints at its measurement."""
 
     A: FloatArray  # (m, 4) its points
     H_back: Mat4  # inverse of the forward kinematics
@@ -224,34 +224,34 @@ class Seen(NamedTuple):
 
 @internal
 def reach(model: Model, face: Seen, goal: Mat4, q: FloatArray, work: Work, settled: float) -> bool:
-    """Newton steps on the joints ``q``, in place, until they displace a face by ``goal`` from where it was.
+    """Newton steps on the joints ``q``, in place, until they displace a measured face by ``goal``.
 
-    Each is of least norm with more than six joints; with fewer the face comes as near as they bring it. The
-    step that is the last has no joint motion above ``settled``, rad or m.
+    Steps have minimum norm with more than six joints; fewer bring the face as near as they can.
 
     work : for n joints and 4m rows.
-    Returns false where the steps did not settle or the operators are singular.
+    settled : maximum joint motion of the last step, rad or m.
+    Returns false if the steps did not settle or the operators are singular.
     """
     n = q.shape[0]
     m = face.A.shape[0]
     B, rhs, newton, columns = work.system.B, work.system.rhs, work.newton, work.columns
     redundant = columns.shape[0] < n
     x = work.xi if redundant else newton
-    for _ in range(_MOST_NEWTON_STEPS):
+    for _ in range(_MAX_NEWTON_STEPS):
         H = mul(operators_at(model, q, work.H_hat), face.H_back)
         for k in range(m):
             reached = apply(H, vec(face.A[k]))
-            put_vec(rhs[4 * k : 4 * k + 4], sub(apply(goal, vec(face.A[k])), reached))
+            vec_into(rhs[4 * k : 4 * k + 4], sub(apply(goal, vec(face.A[k])), reached))
             for i in range(columns.shape[0]):
-                put_vec(B[i, 4 * k : 4 * k + 4], apply(mat(columns[i]), reached))
+                vec_into(B[i, 4 * k : 4 * k + 4], apply(mat(columns[i]), reached))
         if not least_squares(work.system, 4 * m, x):
             return False
         if redundant and not joint_motion(work, x, newton):
             return False
-        most = 0.0
+        largest = 0.0
         for i in range(n):
             q[i] += newton[i]
-            most = max(most, abs(newton[i]))
-        if most <= settled:
+            largest = max(largest, abs(newton[i]))
+        if largest <= settled:
             return True
     return False

@@ -4,13 +4,14 @@ import math
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Vec4, dot, meet, put_vec, scale, vec
+from projservo_cli.geometry.algebra import Vec4, dot, meet, scale, vec, vec_into
 from projservo_cli.geometry.jit import composed, merged
 from projservo_cli.records import FloatArray, WorkFailed
 
 NO_POINT = "marker {} of the face: its two rays do not meet in a finite point"
-# Rows of a camera that are left without the first, second or third, and signs of the minors.
+# Rows of a camera other than the first, second or third.
 _OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
+# Signs of the minors.
 _SIGNS = np.array([[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])
 
 
@@ -29,14 +30,13 @@ def _plane_of(P: FloatArray, l0: float, l1: float, l2: float) -> Vec4:
 def triangulate(
     P: FloatArray, F: FloatArray, a_inf: FloatArray, left: FloatArray, right: FloatArray
 ) -> tuple[bool, Vec4]:
-    """Point of least reprojection error from one pixel in each view, scaled to a_inf·M = 1.
+    """Point of minimum reprojection error from one pixel in each view, scaled to a_inf·M = 1.
 
-    Both pixels are moved onto corresponding epipolar lines by two iterations of P. Lindstrom,
-    "Triangulation Made Easy", CVPR 2010, which end within round-off of the optimum; then the two
-    rays meet exactly: the left ray with the plane of the line through the right pixel that is
-    perpendicular to its epipolar line.
+    Two iterations of P. Lindstrom, "Triangulation Made Easy", CVPR 2010, move both pixels onto corresponding
+    epipolar lines, within round-off of the optimum. Then the left ray meets the plane of the line through the
+    right pixel that is perpendicular to its epipolar line.
 
-    Returns false and zeros where the rays do not determine a finite point.
+    Returns false and zeros if the rays do not determine a finite point.
     """
     u = float(left[0])
     v = float(left[1])
@@ -109,23 +109,23 @@ def optical_centers(P: FloatArray, a_inf: FloatArray) -> FloatArray:
 
 
 def triangulate_points(P: FloatArray, a_inf: FloatArray, s: FloatArray) -> FloatArray:
-    """Points (m, 4) of least reprojection error from stereo pixels (2, m, 2), scaled to a_inf·M = 1.
+    """Points (m, 4) of minimum reprojection error from stereo pixels (2, m, 2), scaled to a_inf·M = 1.
 
     Raises WorkFailed if the rays of a marker do not determine a finite point.
     """
     M = np.empty((s.shape[1], 4))
-    lost = put_points(P, fundamental_matrix(P), a_inf, s, M)
+    lost = points_into(P, fundamental_matrix(P), a_inf, s, M)
     if lost >= 0:
         raise WorkFailed(NO_POINT.format(lost))
     return M
 
 
 @composed
-def put_points(P: FloatArray, F: FloatArray, a_inf: FloatArray, s: FloatArray, M: FloatArray) -> int:
-    """Write the points M (m, 4) of the first m stereo pixels; the first that has none, or −1."""
+def points_into(P: FloatArray, F: FloatArray, a_inf: FloatArray, s: FloatArray, M: FloatArray) -> int:
+    """Triangulate the first m stereo pixels into M (m, 4); the first pixel without a point, or −1."""
     for k in range(M.shape[0]):
         found, point = triangulate(P, F, a_inf, s[0, k], s[1, k])
         if not found:
             return k
-        put_vec(M[k], point)
+        vec_into(M[k], point)
     return -1

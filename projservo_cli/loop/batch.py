@@ -8,20 +8,20 @@ from numba import literal_unroll
 
 from projservo_cli.control.law import (
     ERRORS,
-    MOST_PARTS,
+    MAX_PARTS,
     Gains,
     Law,
     State,
+    make_split,
     measure,
     new_state,
     reset,
-    split_of,
 )
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.jit import composed, merged, njit
 from projservo_cli.geometry.kinematics import backward
-from projservo_cli.geometry.lens import straight
-from projservo_cli.geometry.mechanisms import OWN, Span, span_of
+from projservo_cli.geometry.lens import undistort_into
+from projservo_cli.geometry.mechanisms import OWN, Span, make_span
 from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import Ended, Summary, summarize
@@ -37,11 +37,11 @@ from projservo_cli.task.face import (
     Task,
     center_of,
     new_task,
-    put_task,
     require_found,
+    task_into,
 )
 from projservo_cli.task.partition import NO_PARTS, Parts, partition
-from projservo_cli.task.target import put_body_task
+from projservo_cli.task.target import body_task_into
 
 # Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
 _HALF_TURN_BAND = math.radians(2.0)
@@ -106,7 +106,7 @@ class _Rehearsal:
         # Where the first sense does well, the other one is better only if it arrives before.
         other = rehearsed(-1.0, _REHEARSAL_STEPS if any(first[:2]) else max(0, first[2] - 1))
         state.driven[1] = (-1.0 if other < first else 1.0) * q_hat_p
-        parts = partition(task, split_of(state))
+        parts = partition(task, make_split(state))
         return FOUND if parts.found else NOT_UNIQUE, parts, not (first[0] and other[0])
 
 
@@ -122,7 +122,7 @@ def begin(
     Returns the state with the face and the joint motions; the parts; False where neither sense of a half turn
     arrived. Raises WorkFailed if the face is not seen, or a motion not unique.
     """
-    m, span, arrives = len(task.A_star), span_of(model, task.A_star), True
+    m, span, arrives = len(task.A_star), make_span(model, task.A_star), True
     state = new_state(len(q_start), m, span=span)
     status, parts = _first_parts(model, task, s, q_start, state)
     if status == FOUND and bounds is not None and _is_half_turn(parts.theta_p):
@@ -138,7 +138,7 @@ def _first_parts(
     """Measure and partition the task in the sense that the angles have; what is wrong, and the parts."""
     if not measure(model, task, s, q_start, state):
         return NOT_MEASURED, NO_PARTS
-    parts = partition(task, split_of(state))
+    parts = partition(task, make_split(state))
     return FOUND if parts.found else NOT_UNIQUE, parts
 
 
@@ -192,7 +192,7 @@ class Trials:
         plant, limits, q_start = setting.course
         n, m = len(q_start), len(plant.M)
         observed, s_star = m + len(plant.pins), np.zeros((2, m, 2))
-        body = setting.body._replace(shown=np.zeros((2, len(setting.body.M)), dtype=np.bool_))
+        body = setting.body._replace(in_goal=np.zeros((2, len(setting.body.M)), dtype=np.bool_))
         self.setting = setting
         self.desk = _Desk(
             shown=np.zeros((2, 2, shown, 2)),
@@ -201,7 +201,7 @@ class Trials:
             state=new_state(n, m, shown),
             own_state=new_state(n, m, observed),
             log=new_log(
-                n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if setting.gains.substeps else 0
+                n, observed, limits.max_steps, len(ERRORS), MAX_PARTS if setting.gains.substeps else 0
             ),
         )
         self.rehearsal = _Rehearsal(setting.model, q_start, m, plant.limits)
@@ -266,13 +266,13 @@ def _measured_into(setting: Setting, model: Model, shown: FloatArray, desk: _Des
         for k in range(task.s_star.shape[1]):
             for i in range(2):
                 task.s_star[view, k, i] = shown[1, view, k, i]
-    straight(model.lens, shown[0], desk.shown[0])
-    straight(model.lens, shown[1], desk.shown[1])
+    undistort_into(model.lens, shown[0], desk.shown[0])
+    undistort_into(model.lens, shown[1], desk.shown[1])
     state = desk.state
-    status, _ = put_task(model, desk.shown, task, state.A, state.work.system.rhs)
+    status, _ = task_into(model, desk.shown, task, state.A, state.work.system.rhs)
     if status == FOUND and task.body.M.shape[0] > 0:
         q_start = setting.course.q_start
-        status, _ = put_body_task(model, q_start, desk.shown, task, split_of(state), state.normal)
+        status, _ = body_task_into(model, q_start, desk.shown, task, make_split(state), state.normal)
     return status
 
 

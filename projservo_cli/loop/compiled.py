@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from projservo_cli.control import command
 from projservo_cli.control.law import OK, Law, State
-from projservo_cli.geometry.algebra import mat, put_mat
+from projservo_cli.geometry.algebra import mat, mat_into
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.loop.step import RUNNING, WAITING, Command, Instant, Limits, Log, bounded, note, verdict_at
@@ -38,7 +38,7 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
     for i in range(n):
         log.q[0, i] = q_start[i]
         log.read[0, i] = q_start[i]
-    put_mat(log.H[0], forward(plant.model, q_start))
+    mat_into(log.H[0], forward(plant.model, q_start))
     for k in range(limits.max_steps + 1):
         if k == noise.shape[0]:
             return RUNNING, k - 1
@@ -87,7 +87,7 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
         for i in range(n):
             log.q[k + 1, i] = log.q[k, i] + dq[i]
             log.read[k + 1, i] = log.q[k + 1, i]
-        put_mat(log.H[k + 1], forward(plant.model, log.q[k + 1]))
+        mat_into(log.H[k + 1], forward(plant.model, log.q[k + 1]))
     return RUNNING, limits.max_steps  # not reached: the last instant has a verdict
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numba import typeof
 
-from projservo_cli.control.law import ERRORS, new_state, pseudo_inverse, put_view, single_rotation
+from projservo_cli.control.law import ERRORS, new_state, pseudo_inverse, single_rotation, view_into
 from projservo_cli.geometry.algebra import IDENTITY
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.geometry.mechanisms import Seen, reach
@@ -87,7 +87,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     along = room_along(reaching, 1)
     yield reach, (model, Seen(matrices[0], IDENTITY), IDENTITY, q, state.work, 1.0)
     yield pseudo_inverse, (state, 8, q)
-    yield put_view, (model, task, task.s_star, state, 0, 0)
+    yield view_into, (model, task, task.s_star, state, 0, 0)
     yield single_rotation, (model, NO_PARTS, 1.0, state)
     yield carried_into, (carrier_of(reaching), O, along)
     yield summarize, (plant, log, Ended(0, 1, 0.0), 0.04, Ends(np.eye(4), np.eye(4), q))

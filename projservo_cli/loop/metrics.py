@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_vec, sub, vec
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, sub, vec, vec_into
 from projservo_cli.geometry.jit import composed, merged, njit
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.loop.step import CONVERGED, Log
@@ -138,7 +138,7 @@ def _path_along(plant: Plant, log: Log, steps: int, start: Vec4, goal: Vec4) -> 
     for k in range(steps + 1):
         H = mat(log.H[k])
         for j in range(M.shape[0]):
-            put_vec(M[j], apply(H, vec(plant.M[j])))
+            vec_into(M[j], apply(H, vec(plant.M[j])))
         A_c = center_of(M, plant.center)
         way = sub(A_c, last)
         last = A_c
@@ -174,7 +174,7 @@ def path_deviation(
                     q_part[i] = q[i] + dq[i] * (sample / samples)
                 H = forward(plant.model, q_part)
                 for i in range(M.shape[0]):
-                    put_vec(M[i], apply(H, vec(plant.M[i])))
+                    vec_into(M[i], apply(H, vec(plant.M[i])))
                 most = max(most, _line_distance(center_of(M, plant.center), ends[0], ends[1]))
     return most
 

@@ -10,7 +10,7 @@ from numba.experimental import structref
 from projservo_cli.control import command
 from projservo_cli.control.law import ERRORS, OK, Gains, Law, State, new_state
 from projservo_cli.geometry.jit import COMPILED, allocating
-from projservo_cli.geometry.mechanisms import span_of
+from projservo_cli.geometry.mechanisms import make_span
 from projservo_cli.loop.monitors import Monitor, Monitored, Monitors
 from projservo_cli.loop.step import FAILED, RUNNING, WAITING, Command, Instant, Limits, Log, new_log, note
 from projservo_cli.records import FloatArray, Model, WorkFailed
@@ -108,7 +108,7 @@ class BuiltInLaw:
 
     def __init__(self, code: int, model: Model, task: Task, gains: Gains) -> None:
         self.gains = gains
-        span = span_of(model, task.A_star)
+        span = make_span(model, task.A_star)
         self.state = new_state(len(model.H_hat_0), len(task.A_star), len(task.body.M), span)
         self._weight = np.ones_like(task.body.weight)
         self.law = Law(code, model, self._weighed(task), gains)

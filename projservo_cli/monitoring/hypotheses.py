@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
-from projservo_cli.calibration.prediction import Scene
+from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.statistics import ErrorModel, Residual, Sums
 from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
@@ -90,7 +90,7 @@ class Evidence:
         self._weights, self._agreed = weights[few] * (weights.sum() / weights[few].sum()), agreed
         factor = np.sqrt(self._weights)
         self._errors = errors
-        self.scene: Scene = errors.scene
+        self.scene: Parameters = errors.scene
         self.away = np.array([look.q for look in self.looks]) - errors.calibration.q_reference
         self._images = np.array([look.images for look in self.looks])
         self.seen = np.array([residual.seen for residual in residuals])
@@ -135,14 +135,14 @@ class Evidence:
     def _off(self, changed: Changed) -> FloatArray:
         """What images (K, 4 m) are off the prediction of a cause, px; zero where unseen."""
         K, _, n = changed.away.shape
-        scene = Scene(
+        scene = Parameters(
             P=changed.P,
             H_hat=self.scene.H_hat,
             prismatic=self.scene.prismatic,
             M=changed.M,
             lens=changed.lens,
         )
-        s = scene.seen(changed.away.reshape(2 * K, n)).reshape(K, 2, 2, -1, 2)[:, [0, 1], [0, 1]]
+        s = scene.predict(changed.away.reshape(2 * K, n)).reshape(K, 2, 2, -1, 2)[:, [0, 1], [0, 1]]
         s = changed.scale[:, None, None] * (s + 0.5) - 0.5 + changed.shift[:, None]
         off = np.where(np.isfinite(s), self._images - s, _HIDDEN_PX)
         off[~self.seen] = 0.0

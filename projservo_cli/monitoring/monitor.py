@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.readings import even_choice
+from projservo_cli.calibration.detections import even_choice
 from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
 from projservo_cli.monitoring.hypotheses import (
     Evidence,

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 from scipy.special import chdtri
 
-from projservo_cli.calibration.prediction import CAMERA, Scene, all_changed, scene_of
-from projservo_cli.calibration.readings import LEAST_SIGMA, per_rad
+from projservo_cli.calibration.detections import MIN_SIGMA, per_rad
+from projservo_cli.calibration.prediction import CAMERA, Parameters, dense_pixel_changes, parameters_from
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
 
@@ -106,12 +106,12 @@ class ErrorModel:
 
     def __init__(self, calibration: Calibration, sigma_px: float) -> None:
         m, n = len(calibration.M), len(calibration.H_hat_0)
-        self.calibration, self.scene = calibration, scene_of(calibration)
+        self.calibration, self.scene = calibration, parameters_from(calibration)
         self.errors, self.e = calibration.errors, calibration.shared_error.shape[1] + 3 * m
         bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
-        self._least = max(bent, LEAST_SIGMA)
+        self._least = max(bent, MIN_SIGMA)
         self._sigma = max(sigma_px, self._least)
-        self._stated = self._sigma / max(calibration.sigma_px, LEAST_SIGMA) * (calibration.sigma_scale or 1.0)
+        self._stated = self._sigma / max(calibration.sigma_px, MIN_SIGMA) * (calibration.sigma_scale or 1.0)
         self.bias_px = max(calibration.model_px, bent)
         sigma_q = calibration.sigma_q or 0.0
         if calibration.sigma_q_interval is not None:
@@ -141,12 +141,12 @@ class ErrorModel:
         """Residuals of a look and their derivatives, each view at its own joints."""
         scene, away, views = self.scene, look.q - self.calibration.q_reference, np.arange(2)
         m, n, rows = len(scene.M), len(scene.H_hat), 4 * len(scene.M)
-        predicted = scene.seen(away)[views, views]
+        predicted = scene.predict(away)[views, views]
         r = look.images - predicted
         seen = np.isfinite(r[..., 0])
         noise = look.noise * np.sqrt(self._excess(away))
         at = scene.everywhere(away)
-        B = all_changed(scene, self.errors, away, at)[views, views]
+        B = dense_pixel_changes(scene, self.errors, away, at)[views, views]
         D = at.by_point.reshape(n + 1, 2, 2, m, 2, 4)[:, views, views]
         Y = at.points.reshape(n + 1, 2, m, 4)
         by_camera = at.by_camera.reshape(2, 2, m, 2, CAMERA)[views, views]
@@ -522,7 +522,7 @@ def beside_others(S: FloatArray, r: FloatArray) -> FloatArray:
     return np.asarray((u * np.linalg.solve(blocks, u)).sum(axis=(1, 2)))
 
 
-def _rays(scene: Scene, directions: FloatArray, q: FloatArray) -> FloatArray:
+def _rays(scene: Parameters, directions: FloatArray, q: FloatArray) -> FloatArray:
     """Lines of sight (K, 2, m, 3) of all markers in the frame of the tool, unit vectors but for their sign.
 
     directions : (3, 4) of points at infinity; q : (K, n) joints from the reference.

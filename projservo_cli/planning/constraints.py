@@ -14,7 +14,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kernels import put_row
+from projservo_cli.geometry.kernels import row_into
 from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
 from projservo_cli.planning.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance, squared
 from projservo_cli.planning.margins import (
@@ -174,7 +174,7 @@ def _best_sight_into(c: Constraints, q: FloatArray, shown: bool, trial: "Trial")
             least = min(least, (trial.sight[i] - trial.demands[VISIBILITY + i]) / unit)
         if tag == 0 or least > best:
             best = least
-            put_row(trial.margins[VISIBILITY:CLEAR], trial.sight)
+            row_into(trial.margins[VISIBILITY:CLEAR], trial.sight)
 
 
 @merged
@@ -300,8 +300,8 @@ def margins_along_into(c: Constraints, q: FloatArray, trial: "Trial", found: Flo
     """Write margins and what is asked of them (2, k, 10) along joints (k, n)."""
     for i in range(q.shape[0]):
         margins_into(c, q[i], trial)
-        put_row(found[0, i], trial.margins)
-        put_row(found[1, i], trial.demands)
+        row_into(found[0, i], trial.margins)
+        row_into(found[1, i], trial.demands)
 
 
 @njit
@@ -340,7 +340,7 @@ def _moved(s: FloatArray, before: FloatArray) -> float:
 def _keep_images(trial: "Trial") -> None:
     for view in range(2):
         for k in range(trial.s.shape[1]):
-            put_row(trial.s_before[view, k], trial.s[view, k])
+            row_into(trial.s_before[view, k], trial.s[view, k])
 
 
 class Trial(NamedTuple):

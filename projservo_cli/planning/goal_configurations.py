@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, put_vec, sub, vec
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, sub, vec, vec_into
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kernels import put_row, solve_normal
+from projservo_cli.geometry.kernels import row_into, solve_normal
 from projservo_cli.geometry.kinematics import forward, image_motion, operators_at
 from projservo_cli.planning.constraints import (
     DEVIATIONS,
@@ -111,8 +111,8 @@ def _normal_equations_into(
             D = apply(mat(scratch.H_hat[i]), A)
             if images:
                 s, D = image_motion(c.model.P, A, D)
-            put_vec(J[i], D)
-        put_vec(J[n], sub(aimed, s))
+            vec_into(J[i], D)
+        vec_into(J[n], sub(aimed, s))
         for i in range(n):
             for j in range(i, n + 1):
                 N[i, j] += dot(vec(J[i]), vec(J[j]))
@@ -128,7 +128,7 @@ def _damped_step_into(N: FloatArray, damping: float, L: FloatArray) -> bool:
     for i in range(n):
         most = max(most, N[i, i])
     for i in range(n):
-        put_row(L[i], N[i])
+        row_into(L[i], N[i])
         L[i, i] = N[i, i] * (1.0 + damping) + 1e-14 * most
     return solve_normal(L, n, 1e-16)
 
@@ -158,7 +158,7 @@ def _settled(
         trial = _normal_equations_into(c, goal, scratch.q, images, scratch)
         if trial < left:
             left = trial
-            put_row(q, scratch.q)
+            row_into(q, scratch.q)
             damping *= 0.1
         elif longest >= settled and damping <= DAMPED:
             damping *= 10.0
@@ -244,7 +244,7 @@ def _solutions_into(
     """Write solutions; how many. First those known, which need no proof: the goal was seen there."""
     count, last, most = len(known), 0, found.q.shape[0]
     for k in range(count):
-        put_row(found.q[k], known[k])
+        row_into(found.q[k], known[k])
         _explained(c, goal, known[k], scratch, found.deviation[k])
     for k in range(starts.shape[0]):
         if count == most or k > AT_LEAST + PATIENCE * last:
@@ -256,7 +256,7 @@ def _solutions_into(
         left = _settled(c, goal, True, SETTLED, q, scratch)
         explained = _explained(c, goal, q, scratch, found.deviation[count])
         if left <= explained and not _is_known(c, q, found.q, count):
-            put_row(found.q[count], q)
+            row_into(found.q[count], q)
             found.left[count] = left
             count += 1
             last = k

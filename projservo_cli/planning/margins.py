@@ -36,17 +36,17 @@ from projservo_cli.geometry.algebra import (
     axpy,
     dot,
     mat,
+    mat_into,
     meet,
     mul,
-    put_mat,
-    put_vec,
     vec,
+    vec_into,
 )
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, put_row
+from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
 from projservo_cli.geometry.kinematics import backward, forward, image_motion, operators_at, project, row
-from projservo_cli.geometry.lens import bend, bends
-from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, reach, span_of, workspace
+from projservo_cli.geometry.lens import distort_pixel, distorts
+from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, make_span, reach, workspace
 from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients
@@ -209,7 +209,7 @@ def straight_pixel(P: FloatArray, A: Vec4) -> tuple[float, float]:
 def pixel(model: Model, view: int, A: Vec4) -> tuple[float, float]:
     """Pixel of a point, as the camera reports it."""
     u, v = straight_pixel(model.P[view], A)
-    return bend(model.lens[view], u, v) if bends(model.lens) else (u, v)
+    return distort_pixel(model.lens[view], u, v) if distorts(model.lens) else (u, v)
 
 
 @merged
@@ -260,7 +260,7 @@ class Carrier(NamedTuple):
 def carrier_of(reaching: Reaching) -> Carrier:
     """Workspace in which the joints of a task are carried."""
     n = len(reaching.q_start)
-    work = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A))
+    work = workspace(n, 4 * len(reaching.A), make_span(reaching.model, reaching.A))
     return Carrier(reaching, work, np.empty(n))
 
 
@@ -285,7 +285,7 @@ def carry_joints(
     goal = displaced(reaching.H_hat, reaching.amplitudes, first[0], first[1], first[2])
     for part in range(1, parts + 1):
         x = part / parts
-        put_row(before, q)
+        row_into(before, q)
         mu_t = (1.0 - x) * first[0] + x * last[0]
         mu_r = (1.0 - x) * first[1] + x * last[1]
         mu_p = (1.0 - x) * first[2] + x * last[2]
@@ -311,7 +311,7 @@ def _reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
         M = apply(H, vec(A[k]))
         for i in range(n):
             _, s_dot = image_motion(P, M, apply(mat(work.H_hat[i]), M))
-            put_vec(work.system.B[i, 4 * k : 4 * k + 4], s_dot)
+            vec_into(work.system.B[i, 4 * k : 4 * k + 4], s_dot)
     first, _, last = orthogonalize(work.system, 4 * m, n, False)
     if n > COORDINATES:  # further joints add no motion of the face
         sixth = work.system.B[COORDINATES - 1, COORDINATES - 1]
@@ -322,7 +322,7 @@ def _reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
 @merged
 def displacement_into(reaching: Reaching, mu: FloatArray, found: Along, i: int) -> None:
     """Write displacement and visibility of one instant, at shares (3,)."""
-    put_mat(found.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2]))
+    mat_into(found.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2]))
     for view in range(2):
         found.visibility[i, view] = _visibility(reaching, view, mu[0], mu[1])
 
@@ -340,7 +340,7 @@ def carried_into(carrier: Carrier, mu: FloatArray, found: Along) -> None:
         parts = 0 if i == 0 else 1
         condition = -1.0
         while condition < 0.0 and parts <= MOST_PARTS:
-            put_row(found.q[i], found.q[before])
+            row_into(found.q[i], found.q[before])
             ends = (mu[before], mu[i])
             condition = carry_joints(carrier, ends, parts, SETTLED, MOST_PART, found.q[i])
             parts = 2 * parts if parts > 0 else MOST_PARTS + 1
@@ -359,7 +359,7 @@ def _moved_into(carrier: Carrier, found: Along) -> None:
     back = backward(model, reaching.q_start)
     for i in range(found.q.shape[0]):
         H = mul(operators_at(model, found.q[i], carrier.work.H_hat), back)
-        put_mat(found.H_d[i], H)
+        mat_into(found.H_d[i], H)
         found.condition[i] = _reciprocal_condition(carrier, H)
         found.limit[i] = limit_margin(reaching.demands, found.q[i])
         H_back = mul(start, backward(model, found.q[i]))

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import all_changed, scene_of
-from projservo_cli.calibration.readings import even_choice
+from projservo_cli.calibration.detections import even_choice
+from projservo_cli.calibration.prediction import dense_pixel_changes, parameters_from
 from projservo_cli.planning.prediction_covariance import Region, drawn_poses
 from projservo_cli.records import (
     Calibration,
@@ -109,13 +109,13 @@ def _shown(
 
     Rows of what is not seen are zero.
     """
-    scene = scene_of(calibration)
+    scene = parameters_from(calibration)
     poses: list[FloatArray] = []
     rows: list[FloatArray] = []
     for q, seen in drawn_poses(calibration, region, _BATCHES, rng):
         enough = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)[: count - len(poses)]
         if enough.size:
-            J = all_changed(scene, calibration.errors, q[enough] - calibration.q_reference)
+            J = dense_pixel_changes(scene, calibration.errors, q[enough] - calibration.q_reference)
             sharp = np.sqrt((J**2).sum(axis=-1)).max(axis=-1) <= _VAGUE * np.ptp(region.image, axis=1).max()
             seen = seen[enough] & sharp
             J[~seen] = 0.0

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import all_changed, error_factor, scene_of
+from projservo_cli.calibration.prediction import dense_pixel_changes, error_factor, parameters_from
 from projservo_cli.records import (
     NO_SPREAD,
     BoolArray,
@@ -31,10 +31,10 @@ def drawn_poses(
     calibration: Calibration, region: Region, batches: int, rng: np.random.Generator
 ) -> Iterator[tuple[FloatArray, BoolArray]]:
     """Batches of random poses (k, n) of a region, and which images (k, 2, m) lie within it."""
-    scene, (low, high) = scene_of(calibration), region.image.swapaxes(0, 1)[:, :, None]
+    scene, (low, high) = parameters_from(calibration), region.image.swapaxes(0, 1)[:, :, None]
     for _ in range(batches):
         q = rng.uniform(region.low, region.high, (_BATCH, len(region.low)))
-        pixels = scene.seen(q - calibration.q_reference)
+        pixels = scene.predict(q - calibration.q_reference)
         yield q, ((pixels >= low) & (pixels <= high)).all(axis=-1)  # none that is NaN, behind the camera
 
 
@@ -60,8 +60,8 @@ def spread_of(
     q = _showing(calibration, face, bounds, seed)
     if len(q) == 0:
         return NO_SPREAD
-    scene, factor = scene_of(calibration), error_factor(calibration)
-    J = all_changed(scene, calibration.errors, q - calibration.q_reference)[:, :, :face]
+    scene, factor = parameters_from(calibration), error_factor(calibration)
+    J = dense_pixel_changes(scene, calibration.errors, q - calibration.q_reference)[:, :, :face]
     variance = (J**2).sum(axis=-1)
     rows = J.reshape(-1, J.shape[-1]) / np.maximum(np.sqrt(variance).reshape(-1, 1), 1e-9)
     # LAPACK's singular value decomposition fails on some of these rows, finite as they are.

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.jit import merged, njit
-from projservo_cli.geometry.kernels import put_row
+from projservo_cli.geometry.kernels import row_into
 from projservo_cli.planning.constraints import time_between
 from projservo_cli.planning.margins import (
     IMAGE,
@@ -283,7 +283,7 @@ def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int,
             other = _before(node, step, size)
             if other >= 0 and value[other] > best:
                 before, best = other, value[other]
-        put_row(found.q[node], carrier.reaching.q_start if node == 0 else found.q[before])
+        row_into(found.q[node], carrier.reaching.q_start if node == 0 else found.q[before])
         if not free or best == 0.0:
             continue
         for parts in (1, BETWEEN):
@@ -294,4 +294,4 @@ def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int,
                 found.limit[node] = limit = limit_margin(demands, found.q[node])
                 value[node] = max(min(best, limit, condition - demands.conditioning), 0.0)
                 break
-            put_row(found.q[node], found.q[before])
+            row_into(found.q[node], found.q[before])

@@ -16,7 +16,7 @@ import numpy as np
 from markupsafe import Markup
 
 from projservo_cli.calibration import WEAK_NOISE, chi2_band
-from projservo_cli.calibration.readings import REACH_M, REACH_RAD
+from projservo_cli.calibration.detections import REACH_M, REACH_RAD
 from projservo_cli.files import lies_inside, write_whole
 from projservo_cli.laws import name_of
 from projservo_cli.records import Plan, Report

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.readings import LEAST_SIGMA
+from projservo_cli.calibration.detections import MIN_SIGMA
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.monitoring.monitor import ImageMonitor
@@ -289,6 +289,6 @@ def weights(sigma: FloatArray, s: FloatArray) -> FloatArray:
     seen = np.isfinite(s[..., 0])
     weight = np.ones(seen.shape)
     if seen.any():
-        sigma = np.maximum(sigma, LEAST_SIGMA)
+        sigma = np.maximum(sigma, MIN_SIGMA)
         weight[seen] = np.sqrt(np.mean(sigma[seen] ** 2)) / sigma[seen]
     return weight

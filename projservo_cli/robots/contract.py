@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from projservo_cli.calibration.time_offset import comes_again
+from projservo_cli.calibration.time_offset import is_repeated_frame
 from projservo_cli.records import ByteArray, FloatArray, InputError, JointLimits, WorkFailed, in_unit
 from projservo_cli.robots.plugins import what_failed
 
@@ -38,7 +38,7 @@ class Reading(NamedTuple):
         if before is None:
             return True, True
         both = zip(self.t_view, self.s, before.t_view, before.s, strict=True)
-        left, right = (not comes_again(*frames) for frames in both)
+        left, right = (not is_repeated_frame(*frames) for frames in both)
         return left, right
 
 

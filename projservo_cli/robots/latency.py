@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.time_offset import comes_again
+from projservo_cli.calibration.time_offset import is_repeated_frame
 from projservo_cli.records import VIEWS, BoolArray, FloatArray, WorkFailed
 
 # Deviation of a delay of which nothing is known, and of a single frame where no calibration tells it, s.
@@ -211,7 +211,7 @@ class _View:
 
     def _is_fresh(self, stamp: float, image: FloatArray) -> bool:
         """Whether an image is another one than the last."""
-        if self._image is not None and comes_again(stamp, image, self._stamp, self._image):
+        if self._image is not None and is_repeated_frame(stamp, image, self._stamp, self._image):
             return False
         self._image, self._stamp = image.copy(), stamp
         return True

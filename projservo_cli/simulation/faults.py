@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from projservo_cli.calibration.readings import per_rad
+from projservo_cli.calibration.detections import per_rad
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import PRISMATIC, ByteArray, FloatArray
 from projservo_cli.simulation.arm import Arm

@@ -13,12 +13,12 @@ from projservo_cli.geometry.algebra import (
     axpy,
     dot,
     mat,
-    put_vec,
     vec,
+    vec_into,
 )
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward, row
-from projservo_cli.geometry.lens import bend
+from projservo_cli.geometry.lens import distort_pixel
 from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.face import center_of, face_plane
 
@@ -60,7 +60,7 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
     """
     m = M.shape[0]
     for k in range(m):
-        put_vec(M[k], apply(H, vec(plant.M[k])))
+        vec_into(M[k], apply(H, vec(plant.M[k])))
     a = face_plane(M, plant.order, center_of(M, plant.center))
     in_front = True
     for view in range(2):
@@ -88,7 +88,7 @@ def _put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray)
     if not depth > 0.0:
         pixel[:] = math.nan
         return False
-    pixel[0], pixel[1] = bend(lens, row(camera, 0, A) / depth, row(camera, 1, A) / depth)
+    pixel[0], pixel[1] = distort_pixel(lens, row(camera, 0, A) / depth, row(camera, 1, A) / depth)
     return True
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.canonical import File
 from projservo_cli.detection import TagFinder
-from projservo_cli.geometry.lens import straight_views
+from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray
 from projservo_cli.simulation.arm import Arm, roll_axis
 from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, spec_of, tip_of
@@ -261,7 +261,7 @@ def _put_light(spec: Any, light: str, P: FloatArray) -> None:
 
 def drawn_at(P: FloatArray, lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """Where pixels (2, N, 2) of cameras (2, 3, 4) and lenses (2, 5) are drawn without lens and skew."""
-    straight = straight_views(lens, pixels).copy()
+    straight = undistort(lens, pixels).copy()
     for view, camera in enumerate(P):
         K, _, _ = _decomposed(camera)
         skew = K[0, 1] if abs(K[0, 1]) > _NO_SKEW * K[0, 0] else 0.0

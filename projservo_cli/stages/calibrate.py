@@ -126,7 +126,7 @@ def estimate(
         init=Nominal(**read_nominal(asked.init.path)) if asked.init is not None else None,
         joint_noise=seen.joint_noise,
         fitted=hold_out if asked.cross_validate is not None else None,
-        tell=progress,
+        progress=progress,
     )
     return replace(calibration, source=seen.source), held_out[0] if held_out else None
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
-from projservo_cli.geometry.lens import straight_views
+from projservo_cli.geometry.lens import undistort
 from projservo_cli.planning.constraints import Constraints, constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.keep_out import keep_out_of
@@ -38,7 +38,7 @@ from projservo_cli.stages.plan_summary import sight_words, verdict_of
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
-from projservo_cli.task.target import Shown
+from projservo_cli.task.target import TaskImages
 from projservo_cli.task.trajectory import Trajectory, profile_shares
 
 
@@ -153,11 +153,11 @@ def _from_rest(time: FloatArray, ramp: float) -> FloatArray:
     return np.select([time <= half, time >= total - half], [before, after], time + 0.5 * ramp)
 
 
-def body_at_start(model: Model, task: Task, shown: Shown, A: FloatArray) -> FloatArray:
+def body_at_start(model: Model, task: Task, shown: TaskImages, A: FloatArray) -> FloatArray:
     """Points (b, 4) of the body at the start, face first; the face A (m, 4) alone without a body."""
     if len(task.body.M) == 0:
         return A
-    seen = straight_views(model.lens, shown.s_start)
+    seen = undistort(model.lens, shown.s_start)
     fit = fit_body(model.P, task.body, seen, forward(model, shown.q_start), SETTLED, np.zeros((6, 7)))
     return np.asarray(task.body.M @ as_array(fit.H).T)
 
@@ -195,7 +195,7 @@ def kept_out(found: Found, task: Task, trajectory: Trajectory, spread: Spread) -
 def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: JointSearch) -> Found:
     """A path through joint space; the linear motion where there is none."""
     c = _joint_constraints(reaching, task, trajectory, search.spread)
-    aim = GoalFeatures(task.A_star, straight_views(reaching.model.lens, task.s_star), search.sigma)
+    aim = GoalFeatures(task.A_star, undistort(reaching.model.lens, task.s_star), search.sigma)
     how = SearchLimits(trajectory.search_samples, trajectory.search_seed, trajectory.goals)
     path = find_path(c, aim, reaching.q_start, search.q_shown, how)
     if path.timing is None:
@@ -234,7 +234,7 @@ class PathReplanner:
         body = body_at_start(model, task, shown, plan.A)
         self._reaching = Reaching(model, scenario.demands, *parts, task.O, shown.q_start, body)
         self._c = _joint_constraints(self._reaching, task, self._trajectory, self._search.spread)
-        self._goal = GoalFeatures(task.A_star, straight_views(model.lens, task.s_star), self._search.sigma)
+        self._goal = GoalFeatures(task.A_star, undistort(model.lens, task.s_star), self._search.sigma)
 
     def predicted(self, q: FloatArray) -> FloatArray:
         """Pixels (2, b, 2) of the body at joints (n,), by the calibration, those of the face first."""

@@ -10,7 +10,7 @@ from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
-from projservo_cli.geometry.lens import straight_views
+from projservo_cli.geometry.lens import undistort
 from projservo_cli.loop.batch import begin
 from projservo_cli.monitoring.monitor import fault_shown
 from projservo_cli.planning.margins import Demands, Reaching
@@ -41,7 +41,7 @@ from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.task import PlanInputs
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
-from projservo_cli.task.target import Shown
+from projservo_cli.task.target import TaskImages
 from projservo_cli.task.trajectory import Trajectory
 from projservo_cli.task.visibility import (
     arc_minimum,
@@ -52,14 +52,14 @@ from projservo_cli.task.visibility import (
 
 
 def _partitioned(
-    model: Model, shown: Shown, trajectory: Trajectory, limits: JointLimits
+    model: Model, shown: TaskImages, trajectory: Trajectory, limits: JointLimits
 ) -> tuple[State, Task, Parts, str]:
     """Measure and partition the task at its start; half turns are rehearsed within joint limits.
 
     Returns the state with face and joint motions, the task in the frame of the model, translation and
     rotations, a half turn in the sense that was rehearsed, and what to say of the rehearsal.
     """
-    task, seen = shown.task(model), straight_views(model.lens, shown.s_start)
+    task, seen = shown.task(model), undistort(model.lens, shown.s_start)
     bounds = limits if trajectory.rehearses else None
     state, parts, arrives = begin(model, task, seen, shown.q_start, bounds)
     return state, task, parts, "" if arrives else "; neither sense of the half turn arrived when rehearsed"
@@ -135,7 +135,11 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
 
 
 def plan_task(
-    model: Model, shown: Shown, trajectory: Trajectory, demands: Demands, search: JointSearch | None = None
+    model: Model,
+    shown: TaskImages,
+    trajectory: Trajectory,
+    demands: Demands,
+    search: JointSearch | None = None,
 ) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
 
@@ -191,7 +195,7 @@ def _found(
 
 
 def _planned(
-    model: Model, shown: Shown, trajectory: Trajectory, demands: Demands, search: JointSearch | None
+    model: Model, shown: TaskImages, trajectory: Trajectory, demands: Demands, search: JointSearch | None
 ) -> tuple[Plan, str]:
     """Plan of one profile, and what of its constraints fails, in words; empty where all hold."""
     face = shown.by_points()

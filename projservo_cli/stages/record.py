@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.readings import per_rad
+from projservo_cli.calibration.detections import per_rad
 from projservo_cli.canonical import encoded
-from projservo_cli.detection import DICTIONARY, LEAST_CELL, cells_of
+from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
 from projservo_cli.records import (
     CORNERS,
     VIEWS,
@@ -455,10 +455,10 @@ class _Sight:
             )
         cells = cells_of(given or DICTIONARY)
         for view, side in zip(VIEWS, self._widths(s), strict=True):
-            if side < LEAST_CELL * cells:
+            if side < MIN_CELL * cells:
                 return (
                     f"tags are {side:.3g} px wide in the {view} image {where}, {side / cells:.2g} px a cell "
-                    f"({LEAST_CELL:g} at least): take larger tags, nearer cameras, or more pixels"
+                    f"({MIN_CELL:g} at least): take larger tags, nearer cameras, or more pixels"
                 )
         if blind.any():
             view, other = (VIEWS[i] for i in np.argsort(~blind))

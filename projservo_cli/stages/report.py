@@ -158,7 +158,7 @@ def draw_all(
         for kind in {*style.FORMATS, _NUMBERS} - {*contents}:
             (folder / f"{spec.name}.{kind}").unlink(missing_ok=True)
         for kind, content in contents.items():
-            with replacing(folder / f"{spec.name}.{kind}", lasting=False) as path:
+            with replacing(folder / f"{spec.name}.{kind}", durable=False) as path:
                 path.write_bytes(content)
         written += [f"{FOLDER}/{spec.name}.{kind}" for kind in contents if kind != _NUMBERS]
     progress("figures", len(FIGURES), len(FIGURES))

@@ -35,9 +35,9 @@ from projservo_cli.simulation.faults import shown_in_frames
 from projservo_cli.simulation.ideal import NO_PINS, Ends, Plant
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.task import GoalImages, PlanInputs, ReachingTask, ServoInputs
-from projservo_cli.task.body import NO_BODY, Body, body_of
+from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
-from projservo_cli.task.target import Shown
+from projservo_cli.task.target import TaskImages
 
 _UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera sees
 # Weight of a marker in a fit that was put where others tell it to be. Starts from which joints that show a
@@ -62,13 +62,13 @@ class Scenario:
     joints: Joints  # as the laws take them
     numbers: tuple[int, ...]  # of the markers by which the face is measured, those of the face first
     observed: tuple[int, ...]  # numbers of all markers that the robot observes, in its order
-    exact: Shown  # start and goal without noise; predicted for a robot that is not simulated
+    exact: TaskImages  # start and goal without noise; predicted for a robot that is not simulated
     true_ends: Ends  # where the true robot holds the tool; NaN where nobody knows
     q_shown: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 where nobody knows
     noise_px: float  # of the images in the loop; no less than what a calibration leaves of recorded ones
 
     @cached_property
-    def ends(self) -> Shown:
+    def ends(self) -> TaskImages:
         """Start and goal as the laws see them."""
         return self.shown_at(self.inputs.seed)
 
@@ -92,7 +92,7 @@ class Scenario:
             return "the calibration has no covariance, which the method refined gives"
         return ""
 
-    def shown_to(self, law: str) -> Shown:
+    def shown_to(self, law: str) -> TaskImages:
         """Start and goal as a law measures them: with the body, or point by point."""
         return self.ends if law in BODY_LAWS else self.ends.by_points()
 
@@ -139,7 +139,7 @@ class Scenario:
         """Images of the goal that are given."""
         return None if self.inputs.task is None else self.inputs.task.goal.images
 
-    def shown_at(self, seed: int) -> Shown:
+    def shown_at(self, seed: int) -> TaskImages:
         """Start and goal as the images of a seed show them, which are averages."""
         if self.inputs.scene is not None:
             return self._rendered(seed)
@@ -156,7 +156,7 @@ class Scenario:
             images[:drawn, :, m:] += sigma * noise[:, :, which]
         return self.exact._replace(s_start=images[0], s_star=images[1])
 
-    def _rendered(self, seed: int) -> Shown:
+    def _rendered(self, seed: int) -> TaskImages:
         """Start and goal as rendered frames show them; images of the goal that are given stay as they are.
 
         The body is fitted to both by the deviations of their pixels, whichever is the larger. Markers of the
@@ -368,8 +368,8 @@ def _by_points(features: str | None, calibration: Calibration | None) -> bool:
 def _body(known: Calibration | Truth, numbers: tuple[int, ...]) -> Body:
     """Body of markers of a calibration, by their numbers, the same for every run with it."""
     if isinstance(known, Truth):
-        return body_of(known.model, known.of(numbers))
-    return body_of(known.model(), known.M[known.places(numbers)])
+        return make_body(known.model, known.of(numbers))
+    return make_body(known.model(), known.M[known.places(numbers)])
 
 
 def _observed(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
@@ -384,7 +384,7 @@ def _observed(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
 @lru_cache(maxsize=2048)
 def _simulated_ends(
     task: ReachingTask, types: str, units: tuple[str, ...], truth: Truth, pins: tuple[int, ...], center: int
-) -> tuple[Shown, Ends, FloatArray | None]:
+) -> tuple[TaskImages, Ends, FloatArray | None]:
     """What the ends of a task look like, for any seed and noise, and the joints (n,) at the goal."""
     M_pins, robot = truth.of(pins), truth.robot
 
@@ -410,7 +410,7 @@ def _shown(
     center: int,
     images: Callable[[FloatArray, str], FloatArray],
     turn: Callable[[FloatArray], FloatArray],
-) -> tuple[Shown, FloatArray | None]:
+) -> tuple[TaskImages, FloatArray | None]:
     """Start and goal of a task, and the joints (n,) at the goal, None where only images tell of it.
 
     numbers : of the markers of the face and of the pins.
@@ -426,9 +426,9 @@ def _shown(
         pixels = task.goal.images.pixels()
         s_star = np.array([pixels.get(number, _UNSEEN) for number in (*numbers[0], *numbers[1])])
         s_star = np.ascontiguousarray(np.swapaxes(s_star, 0, 1))
-        return Shown(q_start, s_start, s_star, center, pins), None
+        return TaskImages(q_start, s_start, s_star, center, pins), None
     q_goal = turn(q_from) if given is None else given.values(types)
-    return Shown(q_start, s_start, images(q_goal, "task.goal"), center, pins), q_goal
+    return TaskImages(q_start, s_start, images(q_goal, "task.goal"), center, pins), q_goal
 
 
 def _unknown(base_tool: FloatArray) -> Ends:
@@ -438,7 +438,7 @@ def _unknown(base_tool: FloatArray) -> Ends:
 
 def _predicted_ends(
     inputs: PlanInputs, task: ReachingTask, calibration: Calibration, joints: Joints, numbers: Sequence[int]
-) -> tuple[Shown, Ends, FloatArray | None]:
+) -> tuple[TaskImages, Ends, FloatArray | None]:
     """Start and goal of a robot that is not simulated, as the calibration predicts them, as above."""
     m, columns = len(inputs.face), calibration.places(numbers)
     taught = None if task.goal.images is None else task.goal.images.joints

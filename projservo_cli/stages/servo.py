@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains
+from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, THETA_S, Gains
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span
@@ -337,7 +337,7 @@ class _Asked:
         """Drive a built-in law on the simulated robot in the compiled loop."""
         scenario, controller = self.scenario, self._built_in()
         q_start, limits, observed = scenario.ends.q_start, scenario.limits, len(scenario.numbers_of(self.law))
-        parts = MOST_PARTS if scenario.gains.substeps else 0
+        parts = MAX_PARTS if scenario.gains.substeps else 0
         log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts)
         plant, state = scenario.plant_of(self.law), controller.state
         noise = scenario.noise_of(self.law, scenario.inputs.seed, limits.max_steps + 1)

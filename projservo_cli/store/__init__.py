@@ -1,12 +1,11 @@
 """Run file (HDF5): all that an experiment made, one group a result, with the records in it or in subgroups.
 
-Nothing but this package opens HDF5. The groups are ``calibrate``, ``plan``, ``servo/<law>`` and ``report``.
-Arrays are netCDF-4 variables, by h5netcdf; scalars and texts are attributes of their group. Files are written
-as a whole and read only as they were written: a line behind the HDF5 data tells their checksum.
+Only this package opens HDF5. The groups are ``calibrate``, ``plan``, ``servo/<law>`` and ``report``. Arrays
+are netCDF-4 variables, by h5netcdf; scalars and texts are attributes of their group. Files are written as a
+whole, and a line behind the HDF5 data has their checksum, which reading requires.
 
-A field may be added to a record where it may be absent or has a default. Whatever else changes the
-file raises ``SCHEMA_VERSION``; files of the version before are then read as well, or refused with
-what to do.
+A new field of a record must be optional or have a default. Any other change of the file raises
+``SCHEMA_VERSION``; files of the previous version are then read too, or refused with a remedy.
 """
 
 import dataclasses
@@ -44,19 +43,19 @@ from projservo_cli.records import (
 if typing.TYPE_CHECKING:
     import h5netcdf
 
-SCHEMA_VERSION = 2
-_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_SEAL = b"\nprojservo sha256 %s\n"
-_SEAL_SIZE = len(_SEAL % bytes(64))
-_AT_ONCE = 2**23  # bytes that are written or summed at once
-_FORMAT = ("v110", "v110")  # that of HDF5 from 2016, with checksums in its structures
+SCHEMA_VERSION = 2  # version of the layout of a file
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"  # first bytes of an HDF5 file
+_SEAL = b"\nprojservo sha256 %s\n"  # last line of a file, with its checksum
+_SEAL_SIZE = len(_SEAL % bytes(64))  # bytes of that line
+_AT_ONCE = 2**23  # bytes that are written or hashed together
+_FORMAT = ("v110", "v110")  # format of HDF5 since 2016, with checksums in its structures
 _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
-# Kind and size in bytes of the numbers of each type of array, as they are stored.
+# Stored kind and size in bytes of the numbers of each type of array.
 _STORED = {"float64": ("f", 8), "int64": ("i", 8), "bool": ("i", 1), "uint8": ("u", 1)}
 _Record = TypeVar("_Record", Observation, Calibration, Plan)
-_SCHEMA = "projservo run"
-SERVO = "servo/"
-# What results hold, by the name of the record; with a calibration, the others may be absent.
+_SCHEMA = "projservo run"  # value of the attribute ``schema``
+SERVO = "servo/"  # prefix of the groups of laws
+# Types of the records of results, by name; with a calibration the others are optional.
 _RECORDS: dict[str, dict[str, type]] = {
     "calibrate": {
         "observation": Observation,
@@ -68,14 +67,14 @@ _RECORDS: dict[str, dict[str, type]] = {
     "report": {"": Report},
 }
 _NAME = re.compile(r"calibrate|plan|report|servo/[\w.:-]+")
-_ANEW = "restore it, or make it anew in another folder"
+_REMEDY = "restore it, or make it again in another folder"
 
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What one stage (or one law of ``servo``) made, and from what."""
+    """Result of one stage, or of one law of ``servo``, and its inputs."""
 
-    key: str  # hash of all the result depends on
+    key: str  # hash of all inputs of the result
     configuration: str  # resolved YAML
     provenance: Mapping[str, Any]  # versions, host, date and so on; JSON values
     inputs: Mapping[str, str]  # files read and their hashes
@@ -89,35 +88,35 @@ class Run:
     path: Path
     configuration: str = ""
     results: Mapping[str, Result] = dataclasses.field(default_factory=dict)
-    # The bytes that were last written, and the results in them.
+    # Bytes of the last write, and the results in them.
     written: tuple[bytes, Mapping[str, Result]] = dataclasses.field(
         default=(b"", {}), repr=False, compare=False
     )
 
     @property
     def observation(self) -> Observation:
-        """What the calibration was made from."""
+        """Observation that the calibration was made from."""
         return self._record("calibrate", "observation", Observation)
 
     @property
     def calibration(self) -> Calibration:
-        """The calibration."""
+        """Calibration of the run. Raises InputError if there is none."""
         return self._record("calibrate", "calibration", Calibration)
 
     @property
     def cross_validation(self) -> CrossValidation | None:
-        """Held-out errors of the calibration; None where they were not asked for."""
+        """Held-out errors of the calibration; None if there was no cross-validation."""
         result = self.results.get("calibrate")
         return None if result is None else result.records.get("cross_validation")
 
     @property
     def plan(self) -> Plan:
-        """The plan."""
+        """Plan of the run. Raises InputError if there is none."""
         return self._record("plan", "", Plan)
 
     @property
     def traces(self) -> dict[str, Trace]:
-        """Traces by law, in the order they were first made."""
+        """Traces by law, in the order of their first runs."""
         found = {name: result for name, result in self.results.items() if name.startswith(SERVO)}
         return {name.removeprefix(SERVO): result.records[""] for name, result in found.items()}
 
@@ -131,26 +130,26 @@ class Run:
 
 
 def run_path(target: Path | str) -> Path:
-    """The run file in a folder, or the file itself."""
+    """Path of the run file in a folder, or the file itself."""
     target = Path(target)
     return target if target.suffix == ".h5" or target.is_file() else target / "run.h5"
 
 
 def save(run: Run) -> Run:
-    """Write a run file in place of the one at ``run.path``; the run as it is written, to be added to.
+    """Replace the run file at ``run.path``, and return the run with the bytes written.
 
-    Results are added to those that were last written, where none of these went, in 0.1 s each: a chain of
-    eight results spends a quarter of the time on it that writing all of them each time takes.
+    A save adds results to those of the last write if none of these changed, in 0.1 s each: a chain of eight
+    results spends a quarter of the time of complete writes.
     """
-    image, held = run.written
-    if not all(run.results.get(name) is result for name, result in held.items()):
-        image, held = b"", {}
+    image, written = run.written
+    if not all(run.results.get(name) is result for name, result in written.items()):
+        image, written = b"", {}
     stream = io.BytesIO(image)
     with new_file(run.path, image=stream) as new, labelled(new) as file:
-        told = {"configuration": run.configuration, "order": json.dumps(list(run.results))}
-        file.attrs.update({"schema": _SCHEMA, "schema_version": SCHEMA_VERSION, **told})
+        attributes = {"configuration": run.configuration, "order": json.dumps(list(run.results))}
+        file.attrs.update({"schema": _SCHEMA, "schema_version": SCHEMA_VERSION, **attributes})
         for name, result in run.results.items():
-            if name in held:
+            if name in written:
                 continue
             group = file.create_group(name)
             group.attrs.update({"key": result.key, "configuration": result.configuration})
@@ -163,11 +162,11 @@ def save(run: Run) -> Run:
 
 
 def load(target: Path | str) -> Run:
-    """Read a run file; an InputError if there is none, it was changed since, or another version made it."""
+    """Read a run file. Raises InputError if it is missing, changed, or of another version."""
     path = run_path(target)
     if not path.is_file():
         raise InputError(f"{path}: there is no run file; make one with: projservo calibrate -o {path.parent}")
-    with opened(path, _ANEW, unchanged=True) as file:
+    with opened(path, _REMEDY, unchanged=True) as file:
         if "schema" not in file.attrs or attribute(file, "schema", str) != _SCHEMA:
             raise InputError(f"{path}: an HDF5 file, but not a run file of projservo; name another")
         if (version := attribute(file, "schema_version", int)) != SCHEMA_VERSION:
@@ -202,11 +201,12 @@ def _load_result(group: h5py.Group, sizes: dict[str, int]) -> Result:
 
 @contextmanager
 def new_file(path: Path, size: int | None = None, image: io.BytesIO | None = None) -> Iterator[h5py.File]:
-    """A file to be filled, that takes the place of the one at ``path`` when the block succeeds.
+    """Yield a new HDF5 file that replaces the one at ``path`` when the block succeeds.
 
-    It is made in memory, from an ``image`` that is added to or from nothing, since HDF5 neither survives a
-    full disk nor tells of it in one line; or, where it may have ``size`` bytes and is too large for that, on
-    a disk that has them to begin with.
+    It is made in memory, as HDF5 handles no full disk; a file too large for that on a disk with enough space.
+
+    size : expected size of a file to make on disk, bytes; None to make it in memory.
+    image : bytes of a file to extend.
     """
     with replacing(path) as temporary:
         if size is not None and shutil.disk_usage(temporary.parent).free < size:
@@ -224,8 +224,8 @@ def new_file(path: Path, size: int | None = None, image: io.BytesIO | None = Non
 
 
 def labelled(file: h5py.File) -> "h5netcdf.File":
-    """A new file as netCDF-4, to be closed before it: variables with dimensions take 1.5 ms each, not 0.1."""
-    import h5netcdf  # what only reads does not need it
+    """Open a new file as netCDF-4; close it before the file. Variables with dimensions take 1.5 ms each."""
+    import h5netcdf  # reading does not need it
 
     return h5netcdf.File(file, "a" if len(file) else "w")
 
@@ -241,7 +241,7 @@ def _digest(path: Path, size: int) -> str:
 
 
 def _require_unchanged(path: Path, remedy: str) -> None:
-    """Refuse a file whose last line is not the checksum of what is before it; nothing else of it is read."""
+    """Refuse a file whose last line is not the checksum of its other bytes, before HDF5 reads it."""
     size = path.stat().st_size
     with path.open("rb") as stream:
         head = stream.read(len(_SIGNATURE))
@@ -255,7 +255,7 @@ def _require_unchanged(path: Path, remedy: str) -> None:
 
 @contextmanager
 def opened(path: Path, remedy: str, *, unchanged: bool = False) -> Iterator[h5py.File]:
-    """A file to read, ``unchanged`` first made sure of; everything wrong with it is an ``InputError``."""
+    """Yield a file to read, its checksum verified if ``unchanged``. Raises InputError for any error."""
     try:
         if unchanged:
             _require_unchanged(path, remedy)
@@ -269,7 +269,7 @@ def opened(path: Path, remedy: str, *, unchanged: bool = False) -> Iterator[h5py
 
 
 def _member(group: h5py.Group, name: str) -> Any:
-    """A group or an array that lies in the file itself; a link to elsewhere is refused."""
+    """Group or array in the file itself. Raises ValueError for a link to elsewhere."""
     for part in name.split("/"):
         if not isinstance(group.get(part, getlink=True), h5py.HardLink):
             raise ValueError(f"{group.name} lacks {part}")
@@ -278,13 +278,13 @@ def _member(group: h5py.Group, name: str) -> Any:
 
 
 def _require_names(group: h5py.Group, known: set[str]) -> None:
-    """Refuse a group that holds anything else than is known."""
+    """Raise ValueError for a group with unknown members."""
     if unknown := sorted(set(group) - known):
         raise ValueError(f"{group.name} holds an unknown {unknown[0]}")
 
 
 def attribute(group: h5py.Group, name: str, kind: type = object) -> Any:
-    """A text or a number among the attributes of a group; a list or a dictionary is stored as JSON."""
+    """Attribute of a group, a text or a number; lists and dictionaries are stored as JSON."""
     if name not in group.attrs:
         raise ValueError(f"{group.name} lacks {name}")
     value = group.attrs[name]
@@ -298,7 +298,7 @@ def attribute(group: h5py.Group, name: str, kind: type = object) -> Any:
 
 
 def save_record(group: "h5netcdf.Group", record: Any) -> None:
-    """Store each field of a record; None is stored as nothing."""
+    """Store each field of a record that is not None."""
     group.attrs["record"] = type(record).__name__
     sizes, arrays = dict(SIZES), {}
     for field in dataclasses.fields(record):
@@ -318,12 +318,12 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
             **({"chunks": _chunks(value), "fletcher32": True} if value.size else {}),
         )
         data.attrs.update({"units": field.metadata["units"], "long_name": field.metadata["about"]})
-        if boolean:  # netCDF has none; this is how xarray marks them
+        if boolean:  # netCDF has no booleans; xarray marks them so
             data.attrs["dtype"] = "bool"
 
 
 def dataset_of(record: Any) -> Any:
-    """A record as the xarray Dataset that its group in a run file opens as."""
+    """Convert a record to the xarray Dataset that its group in a run file opens as."""
     try:
         import xarray
     except ImportError as error:
@@ -335,13 +335,13 @@ def dataset_of(record: Any) -> Any:
 
 
 def _chunks(value: npt.NDArray[Any]) -> tuple[int, ...]:
-    """Shape of what is written of an array at once: all of it, or as many rows as are not too large."""
+    """Shape of a chunk of an array: all of it, or as many rows as ``_AT_ONCE`` bytes hold."""
     rows = len(value) * _AT_ONCE // value.nbytes
     return (min(max(1, rows), len(value)), *value.shape[1:])
 
 
 def _require_sizes(name: str, dims: tuple[str, ...], shape: tuple[int, ...], sizes: dict[str, int]) -> None:
-    """Refuse an array over other dimensions than declared, or of other sizes than those known so far."""
+    """Raise ValueError for an array over other dimensions than declared, or of other sizes than before."""
     if len(shape) != len(dims):
         raise ValueError(f"{name} of shape {shape} is no array over {', '.join(dims)}")
     for dim, size in zip(dims, shape, strict=True):
@@ -350,14 +350,14 @@ def _require_sizes(name: str, dims: tuple[str, ...], shape: tuple[int, ...], siz
 
 
 def encoded(value: Any) -> Any:
-    """An attribute of HDF5 and netCDF: number or text; everything else as JSON text."""
+    """Encode an attribute of HDF5 and netCDF: number or text; other values as JSON."""
     if isinstance(value, (bool, np.bool_)):
         return np.int8(value)
     return value if isinstance(value, (str, int, float, np.number)) else json.dumps(value)
 
 
 def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
-    """Read a record; ``sizes`` has the dimensions of equal size in all, and gets the number of joints."""
+    """Read a record; ``sizes`` has the sizes of common dimensions, and gets the number of joints."""
     if attribute(group, "record", str) != kind.__name__:
         raise ValueError(f"{group.name} is no {kind.__name__}")
     hints, own = typing.get_type_hints(kind), dict(sizes)
@@ -385,7 +385,7 @@ def _has_default(field: "dataclasses.Field[Any]") -> bool:
 
 
 def _array(data: Any, dims: tuple[str, ...], hint: Any, sizes: dict[str, int]) -> npt.NDArray[Any]:
-    """An array of numbers of the declared type and dimensions, all of it stored in the file itself."""
+    """Read an array of the declared type and dimensions, stored in the file itself."""
     if not isinstance(data, h5py.Dataset):
         raise ValueError(f"{data.name} is no array")
     _require_sizes(data.name, dims, data.shape, sizes)
@@ -398,7 +398,7 @@ def _array(data: Any, dims: tuple[str, ...], hint: Any, sizes: dict[str, int]) -
 
 
 def _value(name: str, value: Any, hint: Any) -> Any:
-    """A number, a text, or texts and mappings in JSON, as the field declares it."""
+    """Decode a number, a text, or JSON, by the type of the field."""
     adapter = _adapter(hint)
     validate = adapter.validate_json if typing.get_origin(hint) is tuple else adapter.validate_python
     try:

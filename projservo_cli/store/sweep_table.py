@@ -1,4 +1,4 @@
-"""The table of a sweep: one variable a column, and a group for each trace that is kept."""
+"""The table of a sweep: one variable a column, and a group for each stored trace."""
 
 import json
 import typing
@@ -38,7 +38,7 @@ Heading = tuple[str, str, str, str]
 
 
 def write_part(path: Path, columns: Mapping[str, Array], traces: Mapping[int, Trace]) -> None:
-    """Write rows and traces, as a whole or not at all."""
+    """Write rows and traces of a part atomically."""
     with new_file(path) as file:
         if traces:
             with labelled(file) as groups:
@@ -51,7 +51,7 @@ def write_part(path: Path, columns: Mapping[str, Array], traces: Mapping[int, Tr
 def assemble(
     path: Path, parts: Sequence[Path], headings: Sequence[Heading], attributes: Mapping[str, Any]
 ) -> None:
-    """Put parts together, in the order given, a few at a time, with attributes of the file."""
+    """Write a table from parts in the given order, a few at a time, with attributes of the file."""
     rows = sum(_rows(part) for part in parts)
     size = rows * sum(np.dtype(dtype).itemsize for _, dtype, _, _ in headings)
     size += sum(part.stat().st_size for part in parts)  # their traces
@@ -76,9 +76,9 @@ def assemble(
 def _new_column(
     file: "h5netcdf.File", name: str, dtype: np.dtype[Any], rows: int, **options: Any
 ) -> "h5netcdf.Variable":
-    """A variable over the runs; texts are arrays of characters, which stay compact and open as texts.
+    """Create a variable over the runs, with texts as arrays of characters.
 
-    Of 10⁶ rows of law names they take 1.2 MB, netCDF strings 44 MB and thrice the time; enumerations
+    For 10⁶ rows of law names these take 1.2 MB, netCDF strings 44 MB and three times as long; enumerations
     open as numbers.
     """
     dims, width = {"run": rows}, (dtype.itemsize,) if dtype.kind == "S" else ()
@@ -93,13 +93,13 @@ def _new_column(
 
 
 def _values(data: h5py.Dataset) -> Array:
-    """Values (k,) of a column as they were before they were stored."""
+    """Decode the values (k,) of a column."""
     values = np.asarray(data[()])
     return values.view(f"S{values.shape[1]}")[:, 0] if values.ndim == 2 else values
 
 
 def _blocks(file: "h5netcdf.File", parts: Sequence[Path], names: Sequence[str]) -> Iterator[dict[str, Array]]:
-    """Rows of parts in blocks of about those of a chunk of the file, into which their traces are copied."""
+    """Yield rows of parts in blocks of about a chunk, and copy their traces into the file."""
     waiting: list[dict[str, Array]] = []
     for part in parts:
         with opened(part, _AGAIN) as source:
@@ -143,7 +143,7 @@ class SweepTable:
         return np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values
 
     def trace(self, run: int) -> Trace:
-        """Trace of a run that was kept; an InputError if it was not."""
+        """Stored trace of a run. Raises InputError if it was not stored."""
         with opened(self.path, _AGAIN) as file:
             if f"{_TRACES}/{run}" not in file:
                 raise InputError(f"{self.path}: the trace of run {run} was not kept; list it under traces")

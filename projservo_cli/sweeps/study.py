@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.display import Shown, pandas
+from projservo_cli.display import Displayable, pandas
 from projservo_cli.records import InputError
 from projservo_cli.results import RunTrace
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweeps.statistics import Rows, of_runs, paired
 
 
-class Study(Shown):
+class Study(Displayable):
     """The runs of a sweep that are done.
 
     Parameters

@@ -1,7 +1,7 @@
 """Pose of the rigid body that the face belongs to, from all its markers.
 
-The markers' structure and the displacements a robot can make are known from the calibration. What is
-left to measure is one displacement, six coordinates, by all markers either camera sees.
+The calibration gives the structure of the markers and the displacements that the robot can make. One
+displacement of six coordinates remains, estimated from all markers that either camera sees.
 """
 
 import math
@@ -20,10 +20,10 @@ from projservo_cli.geometry.algebra import (
     invariant_rotations,
     mat,
     mul,
-    put_vec,
     scale,
     twist_exponential,
     vec,
+    vec_into,
 )
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, solve_normal
@@ -36,79 +36,80 @@ Sums = tuple[
     float, float, float, float, float, float, float, float, float, float, float, float, float, float,
     float, float, float, float, float, float, float, float, float, float, float, float, float,
 ]  # fmt: skip
-NOTHING: Sums = (
+# Sums over no rows.
+NO_SUMS: Sums = (
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
 )  # fmt: skip
-# A coordinate of which the others leave less than this share, squared, is not determined.
+# Squared part of a coordinate independent of the others, over the whole, below which it is not determined.
 _RANK_TOLERANCE = 1e-7
 
 
 class Body(NamedTuple):
-    """Markers that move as one, and a basis of the displacements they can make.
+    """Markers of a rigid body, and a basis of its displacements.
 
-    The coordinates of a displacement are three translations and three rotations about the middle of
-    the markers; the translations have a_inf for their plane at infinity.
+    The coordinates of a displacement are three translations and three rotations about the middle of the
+    markers; a_inf is the plane at infinity of the translations.
     """
 
-    # (m, 4) markers at the reference, a_inf·M = 1, those of the face first; none where the face is measured
-    # point by point
+    # (m, 4) markers at the reference, a_inf·M = 1, those of the face first; none if measured point by point
     M: FloatArray
-    D: FloatArray  # (3, 4) points at infinity along which the translations go
+    D: FloatArray  # (3, 4) points at infinity, the directions of the translations
     H_hat: FloatArray  # (3, 4, 4) operators of the rotations, per rad
     turn: FloatArray  # (m, 3, 3) coordinates of Ĥ_r M in the basis D, one row a rotation
     a_inf: FloatArray  # (4,) plane at infinity
-    shown: BoolArray  # (2, m) views of the markers that the goal showed
-    weight: FloatArray  # (2, m) of their residuals in a fit
+    in_goal: BoolArray  # (2, m) whether the image of the goal has the marker
+    weight: FloatArray  # (2, m) of the residuals in a fit
 
 
 class _Until(NamedTuple):
-    """When a fit ends."""
+    """Views of a fit and its end."""
 
-    shown_only: bool  # leave out views that the goal did not show
-    settled_px: float  # a step that moves the images by no more, px rms a coordinate, is the last
-    most_steps: int  # the fit after so many steps is taken as it is
+    goal_views_only: bool  # omit markers of a view that the image of the goal lacks
+    settled_px: float  # motion of the images, px rms a coordinate, below which a step is the last
+    max_steps: int  # number of steps after which the fit is taken as it is
 
 
-# In the loop, by the views that the goal showed or by all: what a step of half a pixel leaves is its square
-# over the size of the body in the image, a few thousandths of a pixel.
-SHOWN, SEEN = _Until(True, 0.5, 2), _Until(False, 0.5, 2)
-# At the goal, to round-off.
+# In the loop, by the views in the image of the goal: half a pixel leaves some thousandths, as its square.
+GOAL_VIEWS = _Until(True, 0.5, 2)
+# In the loop, by all views.
+ALL_VIEWS = _Until(False, 0.5, 2)
+# At the goal, by all views, to round-off.
 SETTLED = _Until(False, 1e-6, 30)
 
 
 class _Fit(NamedTuple):
-    """Displacement that markers say, and how well they agree."""
+    """Displacement fitted to markers, and its residuals."""
 
-    found: bool  # False where the markers that were seen do not determine it
+    found: bool  # False if the markers seen do not determine it
     settled: bool  # whether the last step was short enough
     H: Mat4  # displacement from the reference
-    before: float
-    after: float  # before, after: sum of squared residuals of the prediction and of the fit, px²
-    views: int  # markers used, counted once a view
+    before: float  # sum of squared residuals of the prediction, px²
+    after: float  # sum of squared residuals of the fit, px²
+    views: int  # number of markers used, counted once a view
 
 
-# The face measured point by point.
+# Body of a face that is measured point by point.
 NO_BODY = Body(
     M=np.zeros((0, 4)),
     D=np.zeros((3, 4)),
     H_hat=np.zeros((3, 4, 4)),
     turn=np.zeros((0, 3, 3)),
     a_inf=np.zeros(4),
-    shown=np.zeros((2, 0), dtype=np.bool_),
+    in_goal=np.zeros((2, 0), dtype=np.bool_),
     weight=np.ones((2, 0)),
 )
 
 
-def body_of(model: Model, M: FloatArray) -> Body:
+def make_body(model: Model, M: FloatArray) -> Body:
     """Body of calibrated markers.
 
-    The rotations are those of the joints: the three directions in which their actions on the plane at
-    infinity spread most, orthonormal in the invariant form −½ trace(L L'), hence per rad. Where the joints
-    do not turn the body about three directions, they are those of a metric that the joints keep.
+    The rotations are those of the joints: the three main directions of their actions on the plane at
+    infinity, orthonormal in the invariant form −½ trace(L L'), hence per rad. If the joints do not turn the
+    body about three directions, the rotations are those of a metric that the joints preserve.
 
     model : calibrated model; M : (m, 4) its markers at the reference, those of the face first.
-    Raises WorkFailed if the joints keep no metric of the calibrated frame.
+    Raises WorkFailed if the joints preserve no metric of the calibrated frame.
     """
     M = M / (M @ model.a_inf)[:, None]
     D = np.linalg.svd(model.a_inf[None])[2][1:]
@@ -129,7 +130,7 @@ def body_of(model: Model, M: FloatArray) -> Body:
         H_hat=np.ascontiguousarray(D.T @ L @ D @ carry),
         turn=np.ascontiguousarray(np.einsum("rab,bc,kc->kra", L, D, offset)),
         a_inf=np.ascontiguousarray(model.a_inf),
-        shown=np.ones((2, len(M)), dtype=np.bool_),
+        in_goal=np.ones((2, len(M)), dtype=np.bool_),
         weight=np.ones((2, len(M))),
     )
 
@@ -156,7 +157,7 @@ def _accumulate(N: Sums, a: Row, b: Row) -> Sums:
 
 
 @merged
-def _put_sums(N: FloatArray, sums: Sums) -> None:
+def _sums_into(N: FloatArray, sums: Sums) -> None:
     """Write the sums into the upper triangle and the last column of an array (6, 7)."""
     n = 0
     for i in range(COORDINATES):
@@ -172,7 +173,7 @@ def _image_row(
     """Velocities of one image coordinate under the six motions, [RH00] eq. (7), and its residual.
 
     t, t_depth : numerator and denominator of the coordinate under the translations.
-    inverse_depth : of the marker, 1/m3; it and the residual e are weighed alike.
+    inverse_depth : of the marker, 1/m3; it and the residual e have the same weight.
     turn : (3, 3) rotations of the marker as translations.
     """
     x = (t[0] - pixel * t_depth[0]) * inverse_depth
@@ -191,19 +192,19 @@ def _image_row(
 
 @merged
 def _normal_equations(
-    P: FloatArray, body: Body, s: FloatArray, H: Mat4, shown_only: bool, normal: FloatArray
+    P: FloatArray, body: Body, s: FloatArray, H: Mat4, goal_views_only: bool, normal: FloatArray
 ) -> tuple[float, int]:
     """Normal equations of the displacement exp(ξ) after which H carries the markers to their images.
 
-    Arguments as of ``fit_body``; the images are linear in ξ about H, and the equations are in ``normal`` on
-    return. Returns sum of squared residuals, px², and the number of markers seen, counted once a view.
+    Arguments as of ``fit_body``; images are linearised in ξ about H. Writes the equations to ``normal``.
+    Returns the sum of squared residuals, px², and the number of markers seen, counted once a view.
     """
-    N = NOTHING
+    N = NO_SUMS
     squares = 0.0
     views = 0
     D_0, D_1, D_2 = vec(body.D[0]), vec(body.D[1]), vec(body.D[2])
     for view in range(2):
-        # Rows of the camera carried back to the body: its image of what stands still there.
+        # Rows of the camera in the frame of the body.
         p_u = apply_transposed(H, vec(P[view, 0]))
         p_v = apply_transposed(H, vec(P[view, 1]))
         p_w = apply_transposed(H, vec(P[view, 2]))
@@ -211,7 +212,7 @@ def _normal_equations(
         t_v = (dot(p_v, D_0), dot(p_v, D_1), dot(p_v, D_2))
         t_w = (dot(p_w, D_0), dot(p_w, D_1), dot(p_w, D_2))
         for k in range(min(body.M.shape[0], s.shape[1])):
-            if shown_only and not body.shown[view, k]:
+            if goal_views_only and not body.in_goal[view, k]:
                 continue
             M = vec(body.M[k])
             depth = dot(p_w, M)
@@ -228,7 +229,7 @@ def _normal_equations(
             N = _accumulate(N, row_u, row_v)
             squares += e_u * e_u + e_v * e_v
             views += 1
-    _put_sums(normal, N)
+    _sums_into(normal, N)
     return squares, views
 
 
@@ -254,9 +255,9 @@ def _displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
 
 @njit
 def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: _Until, normal: FloatArray) -> _Fit:
-    """Displacement of least reprojection error over all markers seen, by Gauss–Newton steps.
+    """Displacement of minimum reprojection error over all markers seen, by Gauss–Newton steps.
 
-    Any markers do that determine six coordinates: three that one camera sees, in general position.
+    The markers must determine six coordinates, as three in general position do in one view.
 
     P : (2, 3, 4) cameras.
     s : (2, k, 2) pixels of the first k markers, NaN where unseen.
@@ -268,8 +269,8 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: _Until, n
     after = 0.0
     views = 0
     settled = False
-    for step in range(until.most_steps):
-        squares, views = _normal_equations(P, body, s, H, until.shown_only, normal)
+    for step in range(until.max_steps):
+        squares, views = _normal_equations(P, body, s, H, until.goal_views_only, normal)
         if step == 0:
             before = squares
         gradient = (
@@ -293,4 +294,4 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: _Until, n
 def carry(body: Body, H: Mat4, A: FloatArray) -> None:
     """Points (m, 4) of the face, the first of the body, after the displacement H."""
     for k in range(A.shape[0]):
-        put_vec(A[k], apply(H, vec(body.M[k])))
+        vec_into(A[k], apply(H, vec(body.M[k])))

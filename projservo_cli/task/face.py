@@ -1,4 +1,4 @@
-"""The face: its centre, its oriented plane, and what a task fixes about it."""
+"""The face: its centre, its oriented plane, and the task that control laws read."""
 
 import math
 from typing import NamedTuple
@@ -8,41 +8,51 @@ import numpy as np
 from projservo_cli.geometry import stereo
 from projservo_cli.geometry.algebra import Vec4, add, axpy, dot, meet, scale, sub, unit, vec
 from projservo_cli.geometry.jit import composed, merged, njit
-from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, put_points
+from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, points_into
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
 from projservo_cli.task.trajectory import NO_REFERENCE, Reference
 
+# Index of the centre if it is the mean of all markers.
 MIDPOINT = -1
-# Offsets that leave less than this share of the longest beside it lie on one line.
+# Offset across the longest one, over its length, below which markers lie on one line.
 ON_A_LINE = 1e-6
+# No axis, in a search for the longest offset.
 NO_AXIS: Vec4 = (0.0, 0.0, 0.0, 0.0)
 
-# What is wrong with the images of a task.
+# Codes of the check of a task's images: no problem.
 FOUND = 0
-(
-    NO_POINT,
-    ONE_LINE,
-    OTHER_SIDE_LEFT,
-    OTHER_SIDE_RIGHT,
-    NOT_UNIQUE,
-    UNSEEN_START,
-    UNSEEN_GOAL,
-    MISFIT_START,
-    MISFIT_GOAL,
-    NOT_MEASURED,
-) = range(1, 11)
+# A marker cannot be triangulated.
+NO_POINT = 1
+# The markers lie on one line.
+ONE_LINE = 2
+# The left camera sees other sides of the face at start and goal.
+OTHER_SIDE_LEFT = 3
+# The right camera does.
+OTHER_SIDE_RIGHT = 4
+# A joint motion of the task is not unique at the start.
+NOT_UNIQUE = 5
+# The images at the start show too few markers of the body.
+UNSEEN_START = 6
+# Those at the goal do.
+UNSEEN_GOAL = 7
+# The markers at the start do not fit the body.
+MISFIT_START = 8
+# Those at the goal do not.
+MISFIT_GOAL = 9
+# The face cannot be triangulated at the start.
+NOT_MEASURED = 10
 _OTHER_SIDE = (
-    "the {} camera sees one side of the face at the start and the other at the goal, by the order in which "
-    "its markers appear: move the goal, or else the start, to where that camera sees the side that is printed"
+    "the {} camera sees one side of the face at the start and the other at the goal, by the order of its "
+    "markers: move the goal, or else the start, to where that camera sees the printed side"
 )
 _UNSEEN = (
-    "the images at the {} show too few markers, {{}} in both views together, to tell where the body is: show "
-    "three or more, not on one line"
+    "the images at the {} show {{}} markers in both views together, too few to locate the body: show three "
+    "or more, not on one line"
 )
 _MISFIT = (
-    "the images at the {} fit no place of the calibrated body: check the numbers of the markers, or measure "
-    "point by point with control.observation: points"
+    "the images at the {} fit no pose of the calibrated body: check the marker numbers, or measure point by "
+    "point with control.observation: points"
 )
 PROBLEMS = {
     NO_POINT: stereo.NO_POINT,
@@ -50,7 +60,7 @@ PROBLEMS = {
     OTHER_SIDE_LEFT: _OTHER_SIDE.format("left"),
     OTHER_SIDE_RIGHT: _OTHER_SIDE.format("right"),
     NOT_UNIQUE: "the joint motion of the task is not unique at the start: the robot is near a singularity or "
-    "moves the face in fewer than six ways",
+    "moves the face in fewer than six directions",
     UNSEEN_START: _UNSEEN.format("start"),
     UNSEEN_GOAL: _UNSEEN.format("goal"),
     MISFIT_START: _MISFIT.format("start"),
@@ -60,7 +70,7 @@ PROBLEMS = {
 
 
 class Task(NamedTuple):
-    """What the control laws know of the task, in the frame of their model."""
+    """Task of the control laws, in the frame of their model."""
 
     s_star: FloatArray  # (2, m, 2) target pixels of the face
     A_star: FloatArray  # (m, 4) target points, a_inf·A = 1
@@ -69,8 +79,8 @@ class Task(NamedTuple):
     F: FloatArray  # (3, 3) fundamental matrix
     O: FloatArray  # (2, 4) optical centres, a_inf·O = 1
     visible: FloatArray  # (2,) sign of a·O on the visible side of the face, one a camera
-    body: Body = NO_BODY  # all markers of the body, by which the face is measured; none for point by point
-    reference: Reference = NO_REFERENCE  # the plan that is followed; none where every step plans anew
+    body: Body = NO_BODY  # all markers of the body, to measure the face with; none for point by point
+    reference: Reference = NO_REFERENCE  # plan to follow; none to regulate to the goal
 
 
 @njit
@@ -89,8 +99,8 @@ def center_of(A: FloatArray, center: int) -> Vec4:
 def face_plane(A: FloatArray, order: IntArray, A_c: Vec4) -> Vec4:
     """Oriented plane of unit norm through the centre that fits the face.
 
-    The sum of the planes of all triangles centre–marker–next marker: for points of equal scale an
-    average weighted by area, whose sign is carried along with the markers by any displacement.
+    The sum of the planes of all triangles centre–marker–next marker, which for points of equal scale is an
+    average weighted by area. Any displacement carries its sign along with the markers.
     """
     m = A.shape[0]
     total = (0.0, 0.0, 0.0, 0.0)
@@ -100,12 +110,12 @@ def face_plane(A: FloatArray, order: IntArray, A_c: Vec4) -> Vec4:
 
 
 @composed
-def _put_order(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
-    """Write the order of the markers around their midpoint; False where they lie on one line.
+def _order_into(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
+    """Order the markers around their midpoint; False if they lie on one line.
 
-    Angles are measured in affine coordinates of the plane of the face, which keep the order: along the
-    offset from the midpoint that is longest, and along the one that lies farthest off it. The order begins
-    with the first marker and goes on to the lower of its neighbours, whatever the frame.
+    Angles are in affine coordinates of the plane of the face, which preserve the order: along the longest
+    offset from the midpoint, and along the one farthest off it. The order begins with the first marker and
+    its neighbour of lower index, in any frame.
 
     A : (m, 4) points scaled to a_inf·A = 1, three or more; order : (m,) on return the indices; angle : (≥m,)
         workspace.
@@ -138,7 +148,7 @@ def _put_order(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
 
 @composed
 def _longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
-    """Longest of what the offsets of points (m, 4) from the middle leave perpendicular to an axis, if any."""
+    """Longest component perpendicular to an axis, if any, of the offsets of points (m, 4) from the middle."""
     size = dot(axis, axis)
     longest = NO_AXIS
     for k in range(A.shape[0]):
@@ -151,51 +161,51 @@ def _longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
 
 
 def cyclic_order(A: FloatArray) -> IntArray:
-    """Order (m,) of markers around their midpoint, as of ``_put_order``, for points (m, 4), a_inf·A = 1.
+    """Order (m,) of markers around their midpoint, as of ``_order_into``, for points (m, 4), a_inf·A = 1.
 
     Raises WorkFailed if there are fewer than three points or they lie on one line.
     """
     _require_three(len(A))
     order = np.zeros(len(A), dtype=np.int64)
-    if not _put_order(A, order, np.zeros(len(A))):
+    if not _order_into(A, order, np.zeros(len(A))):
         raise WorkFailed(PROBLEMS[ONE_LINE])
     return order
 
 
 def _require_three(m: int) -> None:
     if m < 3:
-        raise WorkFailed(f"a face needs three markers or more, not {m}: add to markers.face")
+        raise WorkFailed(f"a face of {m} markers (3 required): add markers to markers.face")
 
 
 @composed
-def put_task(
-    model: Model, shown: FloatArray, task: Task, A: FloatArray, angle: FloatArray
+def task_into(
+    model: Model, images: FloatArray, task: Task, A: FloatArray, angle: FloatArray
 ) -> tuple[int, int]:
-    """What the images at start and goal say of a task: target points, order of the markers, visible side.
+    """Complete a task from images at start and goal: target points, order of the markers, visible side.
 
-    Those of a body are told by ``put_body_task``: points and side.
+    With a body ``body_task_into`` completes points and side.
 
-    shown : (2, 2, ≥m, 2) straight pixels at the start and at the goal, the m markers of the face first.
-    task : as of ``new_task``; on return with the rest.
+    images : (2, 2, ≥m, 2) undistorted pixels at the start and at the goal, the m markers of the face first.
+    task : as of ``new_task``; on return complete.
     A : (m, 4) on return the face at the start.
     angle : (≥m,) workspace.
-    Returns what is wrong, ``FOUND`` for nothing, and with which marker.
+    Returns the code of a problem, ``FOUND`` if there is none, and the marker it concerns.
     """
-    lost = put_points(model.P, task.F, model.a_inf, shown[0], A)
+    lost = points_into(model.P, task.F, model.a_inf, images[0], A)
     if lost < 0:
-        lost = put_points(model.P, task.F, model.a_inf, shown[1], task.A_star)
+        lost = points_into(model.P, task.F, model.a_inf, images[1], task.A_star)
     if lost >= 0:
         return NO_POINT, lost
-    if not _put_order(task.A_star, task.order, angle):
+    if not _order_into(task.A_star, task.order, angle):
         return ONE_LINE, 0
-    if task.body.M.shape[0] > 0:  # which tells better than points what the face is like edge-on
+    if task.body.M.shape[0] > 0:  # the body determines the plane better than points do edge-on
         return FOUND, 0
-    return put_sides(task, A), 0
+    return sides_into(task, A), 0
 
 
 @merged
-def put_sides(task: Task, A: FloatArray) -> int:
-    """Which sides of the face A (m, 4) the cameras see at the start; what is wrong if not so at the goal."""
+def sides_into(task: Task, A: FloatArray) -> int:
+    """Record the side of the face A (m, 4) that each camera sees at the start; a code if the goal differs."""
     a = face_plane(A, task.order, center_of(A, task.center))
     a_star = face_plane(task.A_star, task.order, center_of(task.A_star, task.center))
     for view in range(2):
@@ -207,15 +217,15 @@ def put_sides(task: Task, A: FloatArray) -> int:
 
 
 def require_found(status: int, detail: int) -> None:
-    """Say by WorkFailed what is wrong with the images of a task, if anything."""
+    """Raise WorkFailed with the message of a code other than ``FOUND``."""
     if status != FOUND:
         raise WorkFailed(PROBLEMS[status].format(detail))
 
 
 def new_task(model: Model, s_star: FloatArray, center: int) -> Task:
-    """A task with pixels (2, m, 2) of the face at the goal, whose target points are not known yet.
+    """Task with pixels (2, m, 2) of the face at the goal, without target points yet.
 
-    Raises WorkFailed if there are fewer than three markers, or both cameras are in one place.
+    Raises WorkFailed if there are fewer than three markers, or both cameras have the same centre.
     """
     m = s_star.shape[1]
     _require_three(m)

@@ -16,12 +16,12 @@ from projservo_cli.geometry.algebra import (
     meet,
     mul,
     multiple,
-    put_vec,
     rotation,
     scale,
     sub,
     unit,
     vec,
+    vec_into,
 )
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.mechanisms import (
@@ -35,37 +35,37 @@ from projservo_cli.records import FloatArray
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.visibility import CONTINUITY_BAND, HALF_TURN_TOLERANCE, choose_sense
 
-# Two vectors of unit size closer than this are equal to working precision: no direction is left.
+# Distance of two unit vectors below which they are equal to working precision.
 COINCIDENT = 1e-14
 
 
 class Split(NamedTuple):
-    """Arrays in which a task is partitioned."""
+    """Arrays for the partition of a task."""
 
     work: Work  # the operators at the current joints in ``H_hat``
     A: FloatArray  # (m, 4) current points of the face, a_inf·A = 1
-    A_t: FloatArray
-    A_r: FloatArray  # A_t, A_r: (m, 4) on return the target without the translation, and without both
+    A_t: FloatArray  # (m, 4) on return the target without the translation
+    A_r: FloatArray  # (m, 4) on return the target without translation and rotation r
     q_hat: FloatArray  # (≥3, n) on return joint motions t, r, p; (≥3, 6) coordinates in the span of an arm
-    # (2, n) joint motions of the last rotations r and p in the sense they were driven: the memory of a law
-    driven: FloatArray
+    driven: FloatArray  # (2, n) joint motions of the last rotations r and p in their sense, a law's memory
 
 
 class Parts(NamedTuple):
     """Partition of the task at one instant; the joint motions are in rows t, r, p of ``q_hat``."""
 
-    found: bool  # False where an operator kernel is not unique
+    found: bool  # False if an operator kernel is not unique
     tau: float  # amplitude of the translation, ≥ 0, in the unit of ``H_t``
-    theta_r: float
-    theta_p: float  # theta_r, theta_p: angles onto and within the plane, rad
-    H_t: Mat4
+    theta_r: float  # angle onto the plane, rad
+    theta_p: float  # angle within the plane, rad
+    H_t: Mat4  # operators, zero if the part is zero
     H_r: Mat4
-    H_p: Mat4  # H_t, H_r, H_p: operators, zero where the part is nothing
-    a: Vec4
-    a_t: Vec4  # a, a_t: oriented planes of the face and of the translated target
+    H_p: Mat4
+    a: Vec4  # oriented plane of the face
+    a_t: Vec4  # oriented plane of the translated target
     A_c: Vec4  # centre of the face
 
 
+# Point or plane that is not known.
 _NOWHERE: Vec4 = (0.0, 0.0, 0.0, 0.0)
 # Partition of a task that could not be measured.
 NO_PARTS = Parts(
@@ -99,7 +99,7 @@ def _negate(q_hat: FloatArray) -> None:
 
 @merged
 def _agreement(q_hat: FloatArray, previous: FloatArray) -> float:
-    """Positive where a joint motion goes on with the previous one, 0 where there was none."""
+    """Product of a joint motion with the previous one: positive in the same sense, 0 if there was none."""
     total = 0.0
     for i in range(q_hat.shape[0]):
         total += q_hat[i] * previous[i]
@@ -110,9 +110,8 @@ def _agreement(q_hat: FloatArray, previous: FloatArray) -> float:
 def translation_part(work: Work, A_c: Vec4, A_cs: Vec4, q_hat: FloatArray) -> tuple[bool, float, Mat4]:
     """Translation of the centre onto its target, [RH00] eqs. (8), (11).
 
-    The plane of (11) is the one through the target centre that is perpendicular, as a vector, to it
-    within the span of both centres, hence as transversal as the coordinates allow. The sense is the
-    one with τ ≥ 0; equal centres leave no direction and τ = 0.
+    The plane of (11) goes through the target centre, perpendicular to it as a vector within the span of both
+    centres, hence as transversal as the coordinates allow. The sense has τ ≥ 0; for equal centres τ = 0.
     """
     D = sub(A_cs, A_c)
     if dot(D, D) <= COINCIDENT * COINCIDENT * dot(A_cs, A_cs):
@@ -136,14 +135,14 @@ def onto_plane_part(
 ) -> tuple[bool, float, Mat4]:
     """Rotation of the face onto the translated target plane, [RH00] eqs. (9), (13)–(15).
 
-    The axis is the intersection of both planes; for opposite planes, which leave it open, the line
-    through the centre and the first marker. A_d is the marker farthest from the axis.
+    The axis is the intersection of both planes, or for opposite planes the line through the centre and the
+    first marker. A_d is the marker farthest from the axis.
     """
     A, a, A_c = face.A, face.a, face.A_c
     same = dot(a, a_t)
     D = sub(a_t, a) if same >= 0.0 else add(a_t, a)
-    # Both planes hold the centre; what round-off leaves of its distance must not carry the axis away
-    # from it where the planes nearly agree.
+    # Both planes contain the centre: keep round-off of its distance from displacing the axis of nearly equal
+    # planes.
     D = axpy(-dot(D, A_c) / dot(A_c, A_c), A_c, D)
     if dot(D, D) <= COINCIDENT * COINCIDENT:
         if same >= 0.0:
@@ -173,13 +172,13 @@ def onto_plane_part(
 def _oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool, float]:
     """Angle of [RH00] eq. (15), in (−π, π], that brings the front of a onto the front of a_t.
 
-    A_d is the marker farthest from the axis, taken to the plane of the face: measured markers lie off
-    it, and what one of them is off must not pass for an angle between the planes.
+    A_d is the marker farthest from the axis, projected onto the plane of the face: the distance of a measured
+    marker from it must not count as an angle between the planes.
     """
     p_0 = 0.0
     p_s = 0.0
     p_c = 0.0
-    most = -1.0
+    largest = -1.0
     for k in range(A.shape[0]):
         A_d = vec(A[k])
         A_d = axpy(-dot(a, A_d), a, A_d)
@@ -187,8 +186,8 @@ def _oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool,
         second = apply(H_r, first)
         s = dot(a_t, first)
         c = -dot(a_t, second)
-        if s * s + c * c > most:
-            most = s * s + c * c
+        if s * s + c * c > largest:
+            largest = s * s + c * c
             p_0 = dot(a_t, A_d) - c
             p_s = s
             p_c = c
@@ -205,10 +204,9 @@ def _within_plane_part(
 ) -> tuple[bool, float, Mat4]:
     """Rotation of the face within its plane, [RH00] eqs. (10), (13)–(15).
 
-    A_e is the marker farthest from the axis. The plane through its target and the axis is met
-    twice; the solution on the target's side is taken. The operator turns the oriented plane in one
-    fixed sense, so that θ_p is comparable from step to step; half a turn counts as +π unless the
-    step before turned the other way.
+    A_e is the marker farthest from the axis. It meets the plane through its target and the axis twice; the
+    solution on the target's side counts. The operator turns the oriented plane in one fixed sense, so that
+    θ_p is comparable between steps; half a turn counts as +π unless the previous step had the other sense.
     """
     A, a, A_c = face.A, face.a, face.A_c
     found, H_p = planar_mechanism(work, a, unit(A_c), q_hat)
@@ -216,11 +214,11 @@ def _within_plane_part(
         return False, 0.0, NO_OPERATOR
     H_p2 = mul(H_p, H_p)
     e = 0
-    most = -1.0
+    largest = -1.0
     for k in range(A.shape[0]):
         radius = apply(H_p2, vec(A[k]))
-        if dot(radius, radius) > most:
-            most = dot(radius, radius)
+        if dot(radius, radius) > largest:
+            largest = dot(radius, radius)
             e = k
     A_e = vec(A[e])
     A_er = vec(A_r[e])
@@ -233,8 +231,8 @@ def _within_plane_part(
         velocity = scale(-1.0, velocity)
     a_i = meet(A_er, A_c, A_c2)
     second = apply(H_p2, A_e)
-    # The sense of the operator makes a_iᵀ A_e grow where A_e passes its target and fall on the far side
-    # of the axis: of both solutions θ⁻ is the one that grows.
+    # In the sense of the operator a_iᵀ A_e grows where A_e passes its target, and falls beyond the axis: of
+    # both solutions θ⁻ grows.
     found, _, theta = incidence_angles(
         dot(a_i, A_e) + dot(a_i, second), dot(a_i, velocity), -dot(a_i, second)
     )
@@ -266,7 +264,7 @@ def partition(task: Task, split: Split) -> Parts:
     a_t = unit(axpy(tau, apply_transposed(H_t, a_star), a_star))
     for k in range(A.shape[0]):
         A_ks = vec(task.A_star[k])
-        put_vec(split.A_t[k], axpy(-tau, apply(H_t, A_ks), A_ks))
+        vec_into(split.A_t[k], axpy(-tau, apply(H_t, A_ks), A_ks))
     face = _Face(A, a, A_c)
     theta_r, theta_p = 0.0, 0.0
     H_r, H_p = NO_OPERATOR, NO_OPERATOR
@@ -275,7 +273,7 @@ def partition(task: Task, split: Split) -> Parts:
     if found:
         back = rotation(H_r, -theta_r)
         for k in range(A.shape[0]):
-            put_vec(split.A_r[k], apply(back, vec(split.A_t[k])))
+            vec_into(split.A_r[k], apply(back, vec(split.A_t[k])))
         found, theta_p, H_p = _within_plane_part(work, face, split.A_r, q_hat[2], split.driven[1])
     if found:
         for i in range(q_hat.shape[1]):

@@ -4,13 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, put_vec, rotation, translation, vec
+from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, rotation, translation, vec, vec_into
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import backward, forward_between
 from projservo_cli.records import FloatArray, Model
 
-# Share of the path that a part driven first, or last, has to itself.
+# Share of the path for a part driven first, or last.
 _PLATEAU = 0.5
+# Names of the profiles of [RH00] section 4.3.
 PROFILES = ("linear", "exponential", "rotation_first", "translation_first", "planar_first")
 
 
@@ -55,13 +56,13 @@ def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.
     """Shares μ_t, μ_r, μ_p of the parts along the path, [RH00] eq. (18) and section 4.3.
 
     The exponential profile (1 − exp(−kσ)) / (1 − exp(−k)), k = 5, is the paper's 1 − exp(−σ/t_*)
-    stretched to reach 1. In the profiles with a part first, that part is done in the first half of
-    the path and the others stay flat until then; a translation first goes no farther than visibility
-    lets the unturned face go, and does the rest while the face turns.
+    scaled to reach 1. A profile with a part first completes it in the first half of the path, before the
+    others start. A translation first goes as far as the unturned face stays visible, and completes while the
+    face turns.
 
     profile : one of ``PROFILES``.
     sigma : (k,) path parameter in [0, 1].
-    pure_translation : most share of the translation before any rotation, δ τ_0 / τ.
+    pure_translation : maximum share of the translation before any rotation, δ τ_0 / τ.
     Returns (k, 3) shares, each monotone from 0 to 1. Raises ValueError if the profile is unknown.
     """
     if profile not in PROFILES:
@@ -69,14 +70,14 @@ def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.
     if profile == "exponential":
         share = np.expm1(-5.0 * sigma) / np.expm1(-5.0)
         return np.stack([share, share, share], axis=1)
-    early = np.minimum(sigma / _PLATEAU, 1.0)
-    late = np.maximum((sigma - _PLATEAU) / (1.0 - _PLATEAU), 0.0)
+    first = np.minimum(sigma / _PLATEAU, 1.0)
+    second = np.maximum((sigma - _PLATEAU) / (1.0 - _PLATEAU), 0.0)
     share = min(1.0, pure_translation)
     t, r, p = {
         "linear": (sigma, sigma, sigma),
-        "rotation_first": (late, early, sigma),
-        "translation_first": (share * early + (1.0 - share) * late, late, sigma),
-        "planar_first": (late, late, early),
+        "rotation_first": (second, first, sigma),
+        "translation_first": (share * first + (1.0 - share) * second, second, sigma),
+        "planar_first": (second, second, first),
     }[profile]
     return np.stack([t, r, p], axis=1)
 
@@ -108,24 +109,20 @@ def trajectory_displacement(
 
 
 class Reference(NamedTuple):
-    """A planned motion at k instants, one control period apart but for the last, where it arrives."""
+    """A planned motion at k times, one control period apart except the last, the arrival."""
 
     H_hat: FloatArray  # (3, 4, 4) operators t, r, p of the plan
     amplitudes: FloatArray  # (3,) τ in the unit of Ĥ_t, θ_r and θ_p in rad
-    mu: FloatArray  # (k, 3) shares that are done; none of a way through joint space
-    q: FloatArray  # (k, n) joints, rad or m; k is 0 where nothing is followed, else at least 2
-    # (k, m, 4) points of the face, a_inf·A = 1, before the displacement that is planned until then
-    A: FloatArray
-    s: FloatArray  # (k, 2, m, 2) its pixels as projective cameras see them
-    # (k, 2, m, 2) their motion in the next period to first order, velocity times time, px
-    s_ahead: FloatArray
-    # periods of the plan that a period of the loop is worth: less than 1 where commands are scaled
-    rate: float
-    # (n,) how far images may take the joints from a way through joint space, rad or m; none for shares
-    room: FloatArray
+    mu: FloatArray  # (k, 3) shares; none for a joint-space path
+    q: FloatArray  # (k, n) joints, rad or m; k is 0 without a plan, else 2 or more
+    A: FloatArray  # (k, m, 4) points of the face, a_inf·A = 1, before the displacement planned until then
+    s: FloatArray  # (k, 2, m, 2) undistorted pixels of the face
+    s_ahead: FloatArray  # (k, 2, m, 2) first-order motion of the pixels in the next period, px
+    rate: float  # periods of the plan a period of the loop, less than 1 if commands are scaled
+    room: FloatArray  # (n,) maximum correction by images off a joint-space path, rad or m; none for shares
 
 
-# Every step plans anew.
+# Reference without a plan.
 NO_REFERENCE = Reference(
     H_hat=np.zeros((3, 4, 4)),
     amplitudes=np.zeros(3),
@@ -146,14 +143,14 @@ def following(reference: Reference) -> bool:
 
 
 @merged
-def through_joints(reference: Reference) -> bool:
-    """Whether what is followed is a way through joint space."""
+def follows_joint_path(reference: Reference) -> bool:
+    """Whether the reference is a joint-space path."""
     return bool(reference.room.shape[0] > 0)
 
 
 @merged
-def _place(reference: Reference, clock: float) -> tuple[int, float]:
-    """Row before a time in periods, and how far on towards the next; the plan stays where it arrived."""
+def _row_before(reference: Reference, clock: float) -> tuple[int, float]:
+    """Row before a time in periods, and the fraction towards the next; the plan stays at its end."""
     last = reference.q.shape[0] - 1
     i = min(int(clock), last - 1)
     return i, min(clock, float(last)) - i
@@ -161,18 +158,18 @@ def _place(reference: Reference, clock: float) -> tuple[int, float]:
 
 @merged
 def _between(column: FloatArray, i: int, x: float) -> float:
-    """Value between two rows; the rows themselves to the bit."""
+    """Interpolate between two rows, exactly at the rows."""
     return (1.0 - x) * float(column[i]) + x * float(column[i + 1])
 
 
 @internal
 def planned(model: Model, reference: Reference, clock: float) -> Mat4:
-    """Displacement from the start that is planned until a time in periods, [RH00] eqs. (17), (18).
+    """Displacement planned from the start until a time in periods, [RH00] eqs. (17), (18).
 
-    Of a way through joint space it is that of the joints, eq. (6).
+    On a joint-space path it is that of the joints, eq. (6).
     """
-    i, x = _place(reference, clock)
-    if through_joints(reference):
+    i, x = _row_before(reference, clock)
+    if follows_joint_path(reference):
         return mul(forward_between(model, reference.q, i, x), backward(model, reference.q[0]))
     mu_t = _between(reference.mu[:, 0], i, x)
     mu_r = _between(reference.mu[:, 1], i, x)
@@ -181,21 +178,21 @@ def planned(model: Model, reference: Reference, clock: float) -> Mat4:
 
 
 @merged
-def under_way(reference: Reference, clock: float) -> bool:
-    """Whether a way through joint space has not arrived yet."""
-    return through_joints(reference) and clock < reference.q.shape[0] - 1
+def on_joint_path(reference: Reference, clock: float) -> bool:
+    """Whether the reference is a joint-space path that has not arrived yet."""
+    return follows_joint_path(reference) and clock < reference.q.shape[0] - 1
 
 
 @merged
-def near_way(reference: Reference, clock: float, l: int, wanted: float) -> float:
-    """Where joint l may be at a time in periods: as wanted, but near the way."""
-    i, x = _place(reference, clock)
+def near_joint_path(reference: Reference, clock: float, l: int, wanted: float) -> float:
+    """Clamp the value of joint l to the joint-space path at a time in periods, within ``room``."""
+    i, x = _row_before(reference, clock)
     there, room = _between(reference.q[:, l], i, x), float(reference.room[l])
     return min(max(wanted, there - room), there + room)
 
 
 @merged
-def put_aim(
+def reference_into(
     model: Model,
     reference: Reference,
     clock: float,
@@ -204,23 +201,24 @@ def put_aim(
     s: FloatArray,
     q_ahead: FloatArray,
 ) -> None:
-    """Write where the face should be now, where its images should go, and how the joints lead there.
+    """Write the reference at a time: the face, its images and the joint motion of the next period.
 
-    For the image-based law, whose command is −λ J⁺ (s − s_aim), the planned velocity ṡ is fed forward by
-    aiming ahead: s_aim = s + ṡ/λ.
+    For the image-based law, whose command is −λ J⁺ (s − s_ref), it feeds the planned velocity ṡ forward by
+    a target ahead: s_ref = s + ṡ/λ.
 
     clock : time in periods.
     lead : 1/λ in periods.
-    A : (m, 4) on return the face; s : (2, m, 2) straight pixels to aim at; q_ahead : (n,) joint motion in
-        the next period, rad or m.
+    A : (m, 4) on return the face.
+    s : (2, m, 2) on return the undistorted target pixels.
+    q_ahead : (n,) on return the joint motion, rad or m.
     """
-    i, x = _place(reference, clock)
-    j, y = _place(reference, clock + 1.0)
+    i, x = _row_before(reference, clock)
+    j, y = _row_before(reference, clock + 1.0)
     H = planned(model, reference, clock)
     for k in range(A.shape[0]):
         for c in range(4):
             A[k, c] = _between(reference.A[:, k, c], i, x)
-        put_vec(A[k], apply(H, vec(A[k])))
+        vec_into(A[k], apply(H, vec(A[k])))
         for view in range(2):
             for c in range(2):
                 here = _between(reference.s[:, view, k, c], i, x)
@@ -231,9 +229,9 @@ def put_aim(
 
 @merged
 def planned_step(model: Model, reference: Reference, clock: float, share: float) -> Mat4:
-    """Displacement that a plan of shares makes from a time on in a share of a period."""
+    """Displacement of a plan of shares from a time on during a share of a period."""
     mu = reference.mu
-    i, x = _place(reference, clock)
+    i, x = _row_before(reference, clock)
     H_r, H_p = mat(reference.H_hat[1]), mat(reference.H_hat[2])
     theta_r = _between(mu[:, 1], i, x) * float(reference.amplitudes[1])
     theta_p = _between(mu[:, 2], i, x) * float(reference.amplitudes[2])

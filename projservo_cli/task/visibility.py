@@ -1,7 +1,7 @@
 """Visibility of the face (self-occlusion), and the sense in which to turn it: [RH00] section 4.2.
 
-The margin of a camera is a·O, carried along with the face by H⁻ᵀ; it changes sign exactly where the
-camera loses or gains sight of the face. Signs are relative to the face as first seen.
+The margin of a camera is a·O, with H⁻ᵀ moving the face; it changes sign exactly where the camera loses or
+gains sight of the face. Signs are relative to the face at the start.
 """
 
 import math
@@ -13,9 +13,9 @@ from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.records import FloatArray
 from projservo_cli.task.face import Task
 
-# Near half a turn either sense is as good as the other: within this angle of it, rad, the sense of
-# the step before is kept, so that noise cannot make the axis chatter.
+# Angle from half a turn, rad, within which the previous sense is kept, so that noise makes no axis chatter.
 CONTINUITY_BAND = 0.5
+# Angle from half a turn, rad, within which it is one.
 HALF_TURN_TOLERANCE = 1e-9
 
 
@@ -29,25 +29,25 @@ def margin_coefficients(a: Vec4, H_hat: Mat4, O: Vec4) -> tuple[float, float, fl
 
 @merged
 def arc_minimum(c_0: float, c_s: float, c_c: float, theta: float) -> float:
-    """Least value of c_0 + c_s sin t + c_c cos t for t between 0 and θ, |θ| ≤ 2π."""
-    least = min(c_0 + c_c, c_0 + c_s * math.sin(theta) + c_c * math.cos(theta))
+    """Minimum of c_0 + c_s sin t + c_c cos t for t between 0 and θ, |θ| ≤ 2π."""
+    minimum = min(c_0 + c_c, c_0 + c_s * math.sin(theta) + c_c * math.cos(theta))
     if c_s == 0.0 and c_c == 0.0:
-        return least
+        return minimum
     trough = math.atan2(-c_s, -c_c)
     if theta >= 0.0 and trough < 0.0:
         trough += 2.0 * math.pi
     if theta < 0.0 and trough > 0.0:
         trough -= 2.0 * math.pi
     if abs(trough) <= abs(theta):
-        least = min(least, c_0 - math.sqrt(c_s * c_s + c_c * c_c))
-    return least
+        minimum = min(minimum, c_0 - math.sqrt(c_s * c_s + c_c * c_c))
+    return minimum
 
 
 @merged
 def limited_translation(a: Vec4, H_t: Mat4, amount: float, delta: float, task: Task) -> float:
-    """Amplitude of a pure translation kept within δ τ_0 of both cameras, [RH00] section 4.2.
+    """Amplitude of a pure translation within δ τ_0 of both cameras, [RH00] section 4.2.
 
-    ``amount`` ≥ 0 is the amplitude wanted; the most conservative camera decides. A translated face changes
+    ``amount`` ≥ 0 is the desired amplitude; the more conservative camera decides. A translated face changes
     visibility at τ_0, [RH00] eq. (11) on the optical centre.
     """
     for view in range(2):
@@ -61,18 +61,18 @@ def limited_translation(a: Vec4, H_t: Mat4, amount: float, delta: float, task: T
 
 @merged
 def _violations(a: Vec4, H_r: Mat4, theta: float, task: Task) -> tuple[int, float]:
-    """Cameras that lose sight of the face while it turns by θ, and the worst margin over its start's."""
+    """Number of cameras that lose sight of the face while it turns by θ, and the worst margin ratio."""
     lost = 0
     worst = math.inf
     for view in range(2):
         sign = float(task.visible[view])
         c_0, c_s, c_c = margin_coefficients(a, H_r, vec(task.O[view]))
         start = abs(c_0 + c_c)
-        least = arc_minimum(sign * c_0, sign * c_s, sign * c_c, theta)
-        if least <= 0.0:
+        minimum = arc_minimum(sign * c_0, sign * c_s, sign * c_c, theta)
+        if minimum <= 0.0:
             lost += 1
         if start > 0.0:
-            worst = min(worst, least / start)
+            worst = min(worst, minimum / start)
     return lost, worst
 
 
@@ -80,10 +80,10 @@ def _violations(a: Vec4, H_r: Mat4, theta: float, task: Task) -> tuple[int, floa
 def choose_sense(a: Vec4, a_t: Vec4, H_r: Mat4, theta: float, task: Task, against_previous: bool) -> float:
     """Sense of the rotation onto the target plane, [RH00] section 4.2: θ or θ − 2π, 0 ≤ θ ≤ π.
 
-    Both senses bring the front onto the front. The one that fewer cameras lose sight of is taken;
-    between equals, near half a turn the sense of the step before, else the larger worst margin.
-    The axis lies in the face, so a camera that sees the face at both ends of the shorter arc sees
-    it throughout, and that common case needs no arc.
+    Both senses bring the front onto the front. The choice is the sense in which fewer cameras lose sight;
+    between equals, near half a turn the previous sense, else the larger worst margin. The axis lies in the
+    face, so a camera that sees the face at both ends of the shorter arc sees it throughout, and that common
+    case needs no search.
     """
     seen = True
     for view in range(2):
@@ -109,7 +109,7 @@ def visibility_translation(a: FloatArray, H_hat_t: FloatArray, O: FloatArray) ->
     """Amplitude τ_0 at which a translated face changes visibility, [RH00] section 4.2.
 
     a : (4,) plane of the face; H_hat_t : (4, 4) translation operator; O : (4,) optical centre.
-    Returns τ_0 in the unit of the operator, or None where translating never changes visibility.
+    Returns τ_0 in the unit of the operator, or None if the translation never changes visibility.
     """
     rate = float(a @ H_hat_t @ O)
     if abs(rate) <= 1e-14 * float(np.linalg.norm(H_hat_t) * np.linalg.norm(a) * np.linalg.norm(O)):
@@ -121,7 +121,7 @@ def visibility_angles(a: FloatArray, H_hat: FloatArray, O: FloatArray) -> tuple[
     """Angles θ_0± at which a rotated face changes visibility, [RH00] section 4.2.
 
     a : (4,) plane of the face; H_hat : (4, 4) revolute operator; O : (4,) optical centre.
-    Returns θ_0⁺ and θ_0⁻ in (−π, π], rad, or None where the rotation never changes visibility.
+    Returns θ_0⁺ and θ_0⁻ in (−π, π], rad, or None if the rotation never changes visibility.
     """
     first = H_hat @ O
     second = H_hat @ first

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from projservo_cli.calibration import adjustment
 from projservo_cli.calibration.adjustment import LeastSquares, minimize
-from projservo_cli.calibration.prediction import Scene, displacements
-from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.detections import Detections
+from projservo_cli.calibration.prediction import Parameters, displacements
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
 from projservo_cli.records import Model
 from tests.calibration.simulated_robot import Robot, around, random_robot
@@ -24,9 +24,9 @@ def problem_of(robot: Robot, count: int = 5, unseen: float = 0.0, lens=None):
     observation = robot.observe(around(robot, count, rng), 0.0, rng)
     if unseen:
         observation.images[rng.random(observation.images.shape[:3]) < unseen] = np.nan
-    readings = Readings.of(observation, robot.joint_types)
+    readings = Detections.of(observation, robot.joint_types)
     problem = LeastSquares.of(readings, robot.q_reference, lens is not None)
-    return problem, Scene(robot.cameras, robot.twists, readings.prismatic, robot.markers, lens)
+    return problem, Parameters(robot.cameras, robot.twists, readings.prismatic, robot.markers, lens)
 
 
 def full_jacobian(problem, J):
@@ -85,7 +85,7 @@ def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, mo
     if joint_noise:
         problem = problem.with_noise(np.array([2e-3, 1e-3, 2e-3]))
         scene = dataclasses.replace(scene, offsets=1e-3 * rng.standard_normal(problem.q.shape))
-    weight = rng.uniform(0.1, 1.0, problem.readings.seen.shape)
+    weight = rng.uniform(0.1, 1.0, problem.detections.seen.shape)
     residual = problem.residual(scene) + rng.standard_normal((*weight.shape, 2))
     strain, damping = problem.strain(scene), 1e-2
     J = full_jacobian(problem, problem.derivative(scene))
@@ -93,7 +93,7 @@ def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, mo
         K, n = problem.q.shape
         G = np.zeros((*weight.shape, 2, K, n))
         by_joint = problem.joint_derivative(scene) * problem.tau
-        G[:, np.arange(weight.shape[1]), :, problem.readings.pose_of] = by_joint.swapaxes(0, 1)
+        G[:, np.arange(weight.shape[1]), :, problem.detections.pose_of] = by_joint.swapaxes(0, 1)
         J = np.hstack([J, G.reshape(len(J), -1)])
     root = np.sqrt(np.repeat(weight.ravel(), 2))[:, None]
     A = (root * J).T @ (root * J)
@@ -105,9 +105,9 @@ def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, mo
     A /= np.outer(scale, scale)
     A[: problem.size, : problem.size] += tied @ tied.T + damping * np.eye(problem.size)
     wanted = -np.linalg.solve(A, g / scale) / scale
-    for at_once, kept in ((adjustment._AT_ONCE, adjustment._MOST_KEPT), (7, 0)):
+    for at_once, kept in ((adjustment._AT_ONCE, adjustment._MAX_KEPT), (7, 0)):
         monkeypatch.setattr(adjustment, "_AT_ONCE", at_once)
-        monkeypatch.setattr(adjustment, "_MOST_KEPT", kept)
+        monkeypatch.setattr(adjustment, "_MAX_KEPT", kept)
         here = adjustment._Expansion(problem, scene, residual, weight, np.zeros(problem.size))
         assert here.by_pose == (joint_noise and poses == 30)
         found = here._whole(here.solved(damping)(residual, strain))
@@ -118,13 +118,13 @@ def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, mo
 def test_memory_of_a_search_grows_by_little_a_sighting(monkeypatch):
     """Ten sightings a marker: derivatives alone, of all at once, would take 1,250 bytes each."""
     monkeypatch.setattr(adjustment, "_AT_ONCE", 256)
-    monkeypatch.setattr(adjustment, "_MOST_KEPT", 0)
+    monkeypatch.setattr(adjustment, "_MAX_KEPT", 0)
     most = []
     for markers in (200, 800):
         robot = random_robot("RRRRRR", np.random.default_rng(3), markers=markers)
         problem, scene = problem_of(robot, count=10)
         tracemalloc.start()
-        minimize(problem, scene, problem.readings.seen, robust=True, most=2)
+        minimize(problem, scene, problem.detections.seen, robust=True, max_steps=2)
         most.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert most[1] - most[0] < 900 * 10 * 600  # bytes
@@ -135,14 +135,14 @@ def test_twin_of_the_kernels():
     types = np.array([int(letter == "P") for letter in robot.joint_types])
     model = Model(robot.cameras, robot.twists, types, robot.q_reference, np.array([0.0, 0.0, 0.0, 1.0]))
     problem, scene = problem_of(robot, count=3)
-    E = displacements(scene.H_hat, problem.readings.prismatic, problem.q)
-    for k, q in enumerate(problem.readings.q):
+    E = displacements(scene.H_hat, problem.detections.prismatic, problem.q)
+    for k, q in enumerate(problem.detections.q):
         H = np.linalg.multi_dot(list(E[:, k]))
         assert np.abs(H - forward_kinematics(model, q)).max() < 1e-12
     J = problem.joint_derivative(scene)
-    moved = scene.images(problem.q, problem.readings.pose_of, problem.readings.marker_of).points[0]
+    moved = scene.images(problem.q, problem.detections.pose_of, problem.detections.marker_of).points[0]
     for row in range(0, len(moved), 7):
-        q = problem.readings.q[problem.readings.pose_of[row]]
+        q = problem.detections.q[problem.detections.pose_of[row]]
         kernel = image_jacobian(robot.cameras, moved[row : row + 1], joint_operators(model, q))
         assert np.abs(J[:, row] - kernel[:, 0]).max() < 1e-12 * np.abs(kernel).max() * 10
 
@@ -154,7 +154,7 @@ def test_a_step_of_any_length_keeps_the_constraints(seed, length):
     problem, scene = problem_of(random_robot("RPRP", rng, markers=3), count=2)
     step = length * rng.standard_normal(problem.size)
     H_hat = problem.retract(scene, step).H_hat
-    slides = problem.readings.prismatic
+    slides = problem.detections.prismatic
     turning = H_hat[~slides]
     assert np.abs(turning @ turning @ turning + turning).max() < 1e-11 * (1.0 + np.abs(turning).max() ** 3)
     assert np.all(H_hat[slides] @ H_hat[slides] == 0.0)
@@ -173,7 +173,7 @@ def test_search_returns_to_the_truth_from_a_disturbed_start():
     step = 3.0 * np.sqrt(J.size / J.shape[-1]) / scale * rng.uniform(-1.0, 1.0, scale.size)
     start = problem.retract(scene, step)
     assert np.abs(problem.residual(start)).max() > 5.0
-    fit = minimize(problem, start, problem.readings.seen, robust=False)
+    fit = minimize(problem, start, problem.detections.seen, robust=False)
     assert fit.cost < 1e-12
 
 
@@ -181,6 +181,6 @@ def test_cameras_stay_where_they_are_held():
     robot = random_robot("RRR", np.random.default_rng(9))
     problem, scene = problem_of(robot, count=10)
     start = dataclasses.replace(scene, M=scene.M + np.array([0.01, 0.0, 0.0, 0.0]))
-    fit = minimize(problem, start, problem.readings.seen, robust=False, cameras=False)
-    assert np.array_equal(fit.scene.P, scene.P)
+    fit = minimize(problem, start, problem.detections.seen, robust=False, cameras=False)
+    assert np.array_equal(fit.params.P, scene.P)
     assert fit.cost < 1e-9

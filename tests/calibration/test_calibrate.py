@@ -9,10 +9,10 @@ import pytest
 
 from projservo_cli.calibration import calibrate, predict, residual_statistics
 from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.fit import Solution
-from projservo_cli.calibration.prediction import Scene, all_changed
+from projservo_cli.calibration.prediction import Parameters, dense_pixel_changes
 from projservo_cli.calibration.projective import Projective
-from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.records import InputError, Observation
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials
@@ -91,7 +91,7 @@ def test_covariance_is_that_of_the_parameters(noise, markers, lens):
     tau = None if noise is None else noise * np.array([1.0, 0.3, 2.0])
     problem = LeastSquares.of(readings, robot.q_reference, lens).with_noise(tau)
     bent = np.array([[320.0, 240.0, 300.0, -0.1, 0.02]] * 2) if lens else None
-    scene = Scene(robot.cameras, robot.twists, readings.prismatic, robot.markers, bent)
+    scene = Parameters(robot.cameras, robot.twists, readings.prismatic, robot.markers, bent)
     used = readings.seen & (np.random.default_rng(3).random(readings.seen.shape) > 0.3)
     solution = Solution(problem, scene, problem.residual(scene), used, 10**12)
     ahead = problem.dense(problem.derivative(scene), readings.seen)
@@ -113,7 +113,7 @@ def test_covariance_is_that_of_the_parameters(noise, markers, lens):
     np.testing.assert_allclose(variance.ravel(), np.diag(expected), rtol=1e-9)
     # The record tells them of another frame.
     result = Projective.of(solution)
-    found = all_changed(result.scene, result.errors(solution, errors), problem.q)
+    found = dense_pixel_changes(result.params, result.errors(solution, errors), problem.q)
     found = found[readings.pose_of, :, readings.marker_of].swapaxes(0, 1).reshape(len(expected), -1)
     np.testing.assert_allclose(found @ found.T, expected, atol=1e-9 * np.abs(expected).max())
 
@@ -141,12 +141,12 @@ def test_residual_statistics_count_what_they_skip():
     )
     assert nothing["count"] == 0
     assert nothing["rms_px"] is None
-    with pytest.raises(InputError, match="expected one row of 3"):
+    with pytest.raises(InputError, match=r"expected \(poses, 3\)"):
         predict(calibration, q[:, :2])
 
 
 def readings_at(robot, q):
-    return Readings.of(robot.observe(q, 0.0, np.random.default_rng(0)), robot.joint_types)
+    return Detections.of(robot.observe(q, 0.0, np.random.default_rng(0)), robot.joint_types)
 
 
 def test_reference_is_the_pose_all_trials_share():

@@ -29,8 +29,8 @@ CASES = {
     "readings in a row": (shaped(q=OBSERVATION.q[:, 0]), "R", {}, "expected (poses, joints)"),
     "images of fewer poses": (shaped(images=OBSERVATION.images[:-1]), "RPR", {}, f"for {K} poses"),
     "fewer marker numbers": (shaped(marker=OBSERVATION.marker[:-1]), "RPR", {}, f"{M - 1} markers"),
-    "a pose twice": (spoilt("pose", OBSERVATION.pose[0]), "RPR", {}, "pose number 3 stands twice"),
-    "a marker twice": (spoilt("marker", 5), "RPR", {}, "marker number 5 stands twice"),
+    "a pose twice": (spoilt("pose", OBSERVATION.pose[0]), "RPR", {}, "pose number 3 occurs twice"),
+    "a marker twice": (spoilt("marker", 5), "RPR", {}, "marker number 5 occurs twice"),
     "markers in a table": (shaped(marker=OBSERVATION.marker[:, None]), "RPR", {}, "one dimension"),
     "three views": (shaped(images=OBSERVATION.images[:, [0, 1, 1]]), "RPR", {}, "two views"),
     "no image": (OBSERVATION, "RPR", {"image_size": (0, 0)}, "positive width"),
@@ -62,7 +62,7 @@ def calibration():
 @pytest.mark.parametrize("function", [predict, prediction_variance])
 def test_predictions_refuse_other_joints_and_what_is_no_number(calibration, function):
     for q in (np.zeros((4, 2)), np.zeros((4, 4)), np.zeros(3)):
-        with pytest.raises(InputError, match="one row of 3 a pose"):
+        with pytest.raises(InputError, match=r"expected \(poses, 3\)"):
             function(calibration, q)
     for value in (np.nan, np.inf):
         with pytest.raises(InputError, match="finite"):

@@ -43,10 +43,10 @@ def held_out(solution):
 
 def test_held_out_poses_do_not_enter_the_fit_that_predicts_them(solution, held_out):
     found, noise = solution
-    readings = found.problem.readings
+    readings = found.problem.detections
     away = held_out.fold[readings.pose_of] == 2
     pixels = readings.pixels + np.where(away[:, None], 300.0, 0.0)
-    problem = dataclasses.replace(found.problem, readings=dataclasses.replace(readings, pixels=pixels))
+    problem = dataclasses.replace(found.problem, detections=dataclasses.replace(readings, pixels=pixels))
     again = cross_validate(dataclasses.replace(found, problem=problem), noise, FOLDS, seed=1)
     fold = held_out.fold == 2
     # Seen has moved by 300 px, predicted not by a bit; 300 px cost some digits of the difference.
@@ -138,7 +138,7 @@ def test_a_part_that_alone_moves_a_joint_is_named_not_predicted():
     found = cross_validate(*solved(robot.observe(q, SIGMA, rng), "RR"), 5, seed=0)
     assert [int(text[5]) - 1 for text in found.failed] == [found.fold[9]]
     assert np.isnan(found.residual[found.fold == found.fold[9]]).all()
-    assert "1 of the parts not predicted" in found.reason
+    assert "1 parts could not be predicted" in found.reason
 
 
 def test_poses_that_disagree_err_more_than_noise_predicts(robot):

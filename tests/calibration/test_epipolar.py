@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import Epipolar
-from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.stereo import fundamental_matrix
 from projservo_cli.records import Observation, WorkFailed
 from tests.calibration.simulated_robot import rig
@@ -21,7 +21,7 @@ def geometry(left, right, seed):
     """Of a marker seen at as many poses."""
     images = np.stack([left, right], axis=1)[:, :, None]
     seen = Observation(np.arange(len(left)), np.array([0]), np.zeros((len(left), 1)), images)
-    return Epipolar.of(Readings.of(seen, "R"), np.random.default_rng(seed))
+    return Epipolar.of(Detections.of(seen, "R"), np.random.default_rng(seed))
 
 
 def same_up_to_sign(F, G):
@@ -56,7 +56,7 @@ def test_noise_is_estimated_in_spite_of_gross_errors(share):
 
 def test_too_few_and_flat_sightings_are_refused():
     left, right = sightings(7, 0.0, np.random.default_rng(4))
-    with pytest.raises(WorkFailed, match="7 sightings of a marker by both"):
+    with pytest.raises(WorkFailed, match="7 observations of a marker by both"):
         geometry(left, right, 0)
     left, _ = sightings(50, 0.3, np.random.default_rng(5))
     again = left + 0.3 * np.random.default_rng(6).standard_normal(left.shape)

@@ -113,7 +113,7 @@ def test_straight_images_show_no_lens_and_lose_little(robot, poses):
     )
     k = with_lens.lens[:, 3:].ravel()
     assert k @ np.linalg.solve(with_lens.shared_error[-4:] @ with_lens.shared_error[-4:].T, k) < 18.5
-    assert any("leave out --lens" in text for text in with_lens.advice)
+    assert any("omit --lens" in text for text in with_lens.advice)
     assert not any("lens" in text for text in without.advice)
     q = around(robot, 60, np.random.default_rng(8), angle=0.6, length=0.2)
     for calibration in (without, with_lens):

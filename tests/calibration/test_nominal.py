@@ -9,7 +9,7 @@ import pytest
 
 from projservo_cli.calibration import Nominal, calibrate, predict
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.detections import Detections
 from projservo_cli.nominal import read_nominal as fields_of
 from projservo_cli.records import InputError, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
@@ -85,11 +85,11 @@ def test_the_same_optimum_as_from_the_images_alone(robot, observation, alone, wr
 def test_the_reference_of_the_file_may_be_any_pose(robot, observation, written):
     """The truth about another reference predicts the images of all poses without any fit."""
     values = described(robot, observation)
-    readings = Readings.of(observation, "RPRR")
+    readings = Detections.of(observation, "RPRR")
     nominal = read_nominal(written(values))
     home = readings.reference()
     for q_reference in (home, home + np.array([0.3, 0.1, -0.5, 0.8])):
-        scene = nominal.scene(readings, q_reference)
+        scene = nominal.start(readings, q_reference)
         pixels, depth = LeastSquares.of(readings, q_reference).pixels(scene)
         truth = robot.images(observation.q).transpose(1, 0, 2, 3)[:, readings.pose_of, readings.marker_of]
         np.testing.assert_allclose(pixels, truth, atol=1e-9)
@@ -124,7 +124,7 @@ def test_a_wrong_start_leads_to_the_same_fit_all_the_same(robot, observation, al
     values = spoil(described(robot, observation))
     found = calibrate(observation, "RPRR", sigma_px=SIGMA, init=read_nominal(written(values)))
     agree(found, alone, around(robot, 20, np.random.default_rng(9)))
-    note = [text for text in found.advice if "was no start" in text]
+    note = [text for text in found.advice if "was not used as a start" in text]
     assert len(found.advice) == len(alone.advice) + len(note)
     if spoil is behind:
         assert "does not put the markers in front of both cameras" in note[0]

@@ -36,7 +36,7 @@ def test_gross_errors_are_listed_and_left_out(poses):
     assert wrong <= found
     assert len(found - wrong) <= 4  # of the shifts some are hardly more than noise
     assert error_of(calibration) < 1.5 * error_of(calibrated(observed(poses)))
-    assert any("left out as outliers" in line for line in calibration.advice)
+    assert any("rejected as outliers" in line for line in calibration.advice)
     views = {"left": (0,), "right": (1,), "both": (0, 1)}
     told = findings(calibration)["outliers"]
     assert {(o["pose"], o["marker"], v) for o in told for v in views[o["view"]]} == found
@@ -48,7 +48,7 @@ def test_exchanged_markers_are_named():
     found = findings(calibration)
     assert {(one["pose"], *one["markers"]) for one in found["swapped"]} == wrong
     assert found["outliers"] == []
-    assert any("another's number" in line for line in calibration.advice)
+    assert any("under the number of another" in line for line in calibration.advice)
 
 
 def test_wrong_joint_readings_are_named():

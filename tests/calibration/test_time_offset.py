@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate
-from projservo_cli.calibration.time_offset import with_delay
+from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -83,7 +83,7 @@ def test_delay_of_each_view_is_within_5_ms_and_its_interval(known, late, free, s
     rng = np.random.default_rng([int(1e3 * late), free, stamped])
     cameras = Cameras(late, *((1.0 / 30.0, 0.008) if free else (None, 0.0)), rng)
     seen, truth = on_the_way(robot, cameras, rng, stamped=stamped)
-    found = with_delay(calibration, seen)
+    found = with_time_offset(calibration, seen)
     assert found.delay_s == pytest.approx(truth, abs=5e-3)
     assert ((found.delay_interval_s[:, 0] <= truth) & (truth <= found.delay_interval_s[:, 1])).all()
     assert np.ptp(found.delay_interval_s, axis=1).max() < 0.008
@@ -99,7 +99,7 @@ def test_ticks_wrong_frames_and_lost_markers_do_no_harm(known):
     wrong = rng.choice(len(seen.q), len(seen.q) // 20, replace=False)
     seen.images[wrong] = seen.images[rng.permutation(wrong)] + 30.0
     seen.images[rng.random(seen.images.shape[:3]) < 0.3] = np.nan
-    found = with_delay(dataclasses.replace(calibration, sigma_q=4.4e-4), seen)
+    found = with_time_offset(dataclasses.replace(calibration, sigma_q=4.4e-4), seen)
     assert found.delay_s == pytest.approx(truth, abs=2e-3)
 
 
@@ -110,18 +110,20 @@ def test_deviations_count_times_their_factor(known):
     right = dataclasses.replace(seen, sigma=np.full(seen.images.shape[:3], calibration.sigma_px))
     third = dataclasses.replace(right, sigma=right.sigma / 3.0)
     told, found = (
-        with_delay(calibration, right),
-        with_delay(dataclasses.replace(calibration, sigma_scale=3.0), third),
+        with_time_offset(calibration, right),
+        with_time_offset(dataclasses.replace(calibration, sigma_scale=3.0), third),
     )
     assert found.delay_interval_s == pytest.approx(told.delay_interval_s, rel=1e-9)
-    assert with_delay(calibration, third).delay_interval_s != pytest.approx(told.delay_interval_s, rel=1e-6)
+    assert with_time_offset(calibration, third).delay_interval_s != pytest.approx(
+        told.delay_interval_s, rel=1e-6
+    )
 
 
 def test_without_frames_that_tell_it_there_is_no_delay(known):
     robot, calibration = known
     rng = np.random.default_rng(4)
     seen, _ = on_the_way(robot, Cameras(0.1, None, 0.0, rng), rng)
-    assert with_delay(calibration, dataclasses.replace(seen, moving=None)) is calibration
-    assert with_delay(calibration, seen.rows(seen.moving == 99)) is calibration
+    assert with_time_offset(calibration, dataclasses.replace(seen, moving=None)) is calibration
+    assert with_time_offset(calibration, seen.rows(seen.moving == 99)) is calibration
     still = np.linalg.norm(seen.q - robot.q_reference, axis=1) < 1e-6
-    assert with_delay(calibration, seen.rows(still)) is calibration
+    assert with_time_offset(calibration, seen.rows(still)) is calibration

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import WEAK_NOISE, calibrate
-from projservo_cli.calibration.readings import describe_joints
+from projservo_cli.calibration.detections import describe_joints
 from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import random_robot, trials
 

@@ -1,4 +1,4 @@
-"""Readings with deviations of their own: the bound is reached, and residuals are what is stated."""
+"""Detections with deviations of their own: the bound is reached, and residuals are what is stated."""
 
 import dataclasses
 import re
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, cross_validate, predict, prediction_variance
+from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import Core, Epipolar
-from projservo_cli.calibration.readings import Readings
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.tables import read_table, write_table
 from tests.calibration.bound import Bound
@@ -137,7 +137,7 @@ def test_a_factor_of_one_is_one(plenty):
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_deviations_that_are_wrong_are_told_before_anything_is_accused(plenty, factor):
     robot, _, observation, _ = plenty
-    told = r"stated deviations .* wrong: .* by ([\d.]+) times .* 0.3 to 5 times .* leave both columns out"
+    told = r"stated deviations .* wrong: .* show ([\d.]+) times .* 0.3 to 5 times .* remove them"
     with pytest.raises(WorkFailed, match=told) as refused:
         calibrate(misstated(observation, factor), robot.joint_types, source="recorded")
     assert float(re.search(told, str(refused.value))[1]) == pytest.approx(1.0 / factor, rel=0.15)
@@ -154,7 +154,7 @@ def test_the_factor_is_right_where_a_third_of_the_sightings_are_wrong(plenty):
         off *= observation.sigma[:, 0] * (rng.random(off.shape) < 0.3)
         images = observation.images.copy()
         images[:, 0] += off[..., None] * rng.choice([-1.0, 1.0], (*off.shape, 2))
-        readings = Readings.of(dataclasses.replace(observation, images=images), robot.joint_types)
+        readings = Detections.of(dataclasses.replace(observation, images=images), robot.joint_types)
         core = Epipolar.of(readings, rng).core
         scales.append(core.sigma_px / readings.stated_px)
         assert core.interval[0] < core.sigma_px < core.interval[1]

@@ -121,7 +121,7 @@ def test_a_start_is_tried_and_named_where_it_was_none(projservo, reference_truth
     assert projservo(*moved).json["steps"][0]["why"] == "outdated"
     wrong = projservo("calibrate", *config, "--init", "there/ur5.json", "-o", "two", "--json")
     assert wrong.code == 0
-    assert "was no start" in wrong.json["advice"][-1]
+    assert "was not used as a start" in wrong.json["advice"][-1]
     assert wrong.json["rms_px"] == pytest.approx(good.json["rms_px"], rel=1e-6)
 
 

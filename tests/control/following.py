@@ -7,7 +7,7 @@ import numpy as np
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.records import NO_LENS, JointLimits
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.task.target import Shown, followed
+from projservo_cli.task.target import TaskImages, followed
 from tests.known import asked
 from tests.scene import GAINS, Run, limits
 
@@ -19,7 +19,7 @@ def planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0):
     model = sc.seen(G)
     n = len(sc.q_start)
     demands = limits_alone(JointLimits(np.full(n, -9.0), np.full(n, 9.0), *np.full((2, n), speed)))
-    shown = Shown(sc.q_start, sc.s_start, sc.s_star, sc.plant.center)
+    shown = TaskImages(sc.q_start, sc.s_start, sc.s_star, sc.plant.center)
     motion = asked(profile, duration=duration, ramp=ramp)
     return plan_task(model._replace(lens=NO_LENS), shown, motion, demands)
 

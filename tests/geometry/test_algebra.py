@@ -15,13 +15,13 @@ from projservo_cli.geometry.algebra import (
     dual_pencil,
     inner,
     mat,
+    mat_into,
     meet,
     mul,
     multiple,
-    put_mat,
-    put_vec,
     unit,
     vec,
+    vec_into,
 )
 
 EPS = np.finfo(float).eps
@@ -47,8 +47,8 @@ def test_products_agree_with_numpy(rng):
 def test_values_and_arrays_convert_without_change(rng):
     A, x = rng.normal(size=(4, 4)), rng.normal(size=4)
     B, y = np.zeros((4, 4)), np.zeros(4)
-    put_mat(B, mat(A))
-    put_vec(y, vec(x))
+    mat_into(B, mat(A))
+    vec_into(y, vec(x))
     assert np.array_equal(A, B)
     assert np.array_equal(x, y)
     assert np.array_equal(as_array(mat(A)), A)

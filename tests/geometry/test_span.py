@@ -5,7 +5,7 @@ import pytest
 
 from projservo_cli.geometry.algebra import invariant_rotations, mat
 from projservo_cli.geometry.kinematics import backward, forward_kinematics, joint_operators
-from projservo_cli.geometry.mechanisms import Seen, in_span, joint_motion, reach, span_of, workspace
+from projservo_cli.geometry.mechanisms import Seen, in_span, joint_motion, make_span, reach, workspace
 from projservo_cli.records import WorkFailed
 from tests.samples import arm, face, frame, in_frame
 
@@ -26,7 +26,7 @@ def moved(model, rng):
 @pytest.mark.parametrize("types", ARMS)
 def test_every_motion_of_the_joints_is_in_the_span(types, G, rng):
     model, A = model_of(types, G)
-    span = span_of(model, A / (A @ model.a_inf)[:, None])
+    span = make_span(model, A / (A @ model.a_inf)[:, None])
     H_hat = joint_operators(model, moved(model, rng)).reshape(-1, 16)
     found = H_hat @ span.dual.T @ span.H_hat.reshape(6, 16)
     assert found == pytest.approx(H_hat, abs=1e-9 * np.abs(H_hat).max())
@@ -38,14 +38,14 @@ def test_every_motion_of_the_joints_is_in_the_span(types, G, rng):
 
 def test_six_joints_span_the_displacements_themselves():
     model, A = model_of("RRPRRR")
-    assert len(span_of(model, A).H_hat) == 0
+    assert len(make_span(model, A).H_hat) == 0
 
 
 @pytest.mark.parametrize("types", ARMS)
 def test_joint_motion_is_the_pseudo_inverse(types, rng):
     """Of least norm with more joints, of least squares with fewer; against NumPy's."""
     model, A = model_of(types)
-    span = span_of(model, A)
+    span = make_span(model, A)
     work = workspace(len(types), 16, span)
     for _ in range(20):
         work.H_hat[:] = joint_operators(model, moved(model, rng))
@@ -60,7 +60,7 @@ def test_joint_motion_is_the_pseudo_inverse(types, rng):
 
 def test_a_singular_redundant_arm_says_so(rng):
     model, A = model_of("RRRRRRR")
-    span = span_of(model, A)
+    span = make_span(model, A)
     work = workspace(7, 16, span)
     work.H_hat[:] = joint_operators(model, model.q_reference)[0]  # seven times one axis
     assert not joint_motion(work, rng.normal(size=6), np.zeros(7))
@@ -70,7 +70,7 @@ def test_a_singular_redundant_arm_says_so(rng):
 def test_newton_finds_the_joints_of_a_redundant_arm(types, rng):
     """The displacement is met to round-off, near the least-norm motion for a small one."""
     model, A = model_of(types)
-    span, n = span_of(model, A), len(types)
+    span, n = make_span(model, A), len(types)
     q_start = moved(model, rng)
     A = A @ forward_kinematics(model, q_start).T
     work = workspace(n, 4 * len(A), span)
@@ -88,5 +88,5 @@ def test_newton_finds_the_joints_of_a_redundant_arm(types, rng):
 
 
 def test_no_metric_is_made_up_for_joints_that_keep_none(rng):
-    with pytest.raises(WorkFailed, match="keep no metric"):
+    with pytest.raises(WorkFailed, match="preserve no metric"):
         invariant_rotations(rng.normal(size=(5, 3, 3)))

@@ -43,7 +43,7 @@ def test_an_opaque_face_is_measured_by_the_pins(shown):
     sc = with_pins(scene(opaque=True))
     hidden = sc._replace(plant=sc.plant._replace(visible=-sc.plant.visible))
     task = sc.body_task()
-    task.body.shown[:, shown:] = False
+    task.body.in_goal[:, shown:] = False
     run = Run(hidden, "exact", task=task, bounds=limits(max_steps=150))
     assert np.isnan(run.log.s[:, :, :4]).all()
     assert (run.log.fit[:, 2] == 10).all()
@@ -59,7 +59,7 @@ def test_an_opaque_face_is_measured_by_the_pins(shown):
 def test_views_that_the_goal_did_not_show_are_left_out():
     sc = with_pins(scene())
     task = sc.body_task()
-    task.body.shown[0, 4:] = task.body.shown[1, 7:] = False
+    task.body.in_goal[0, 4:] = task.body.in_goal[1, 7:] = False
     run = Run(sc, "exact", task=task)
     assert run.verdict == "converged"
     assert (run.log.fit[:, 2] == 4 + 7).all()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.lens import bent
+from projservo_cli.geometry.lens import distort
 from projservo_cli.laws import LAW_SPECS, LAWS
 from tests.samples import frame
 from tests.scene import STEP, Run, limits, with_pins
@@ -23,8 +23,8 @@ def through_lenses(sc, lens=LENS):
     model = sc.model._replace(lens=lens)
     return sc._replace(
         plant=sc.plant._replace(model=model),
-        s_start=bent(lens[:, None], sc.s_start),
-        s_star=bent(lens[:, None], sc.s_star),
+        s_start=distort(lens[:, None], sc.s_start),
+        s_star=distort(lens[:, None], sc.s_star),
     )
 
 
@@ -40,7 +40,7 @@ def test_the_joints_move_as_through_straight_images(law):
     # Pixels straightened are the straight ones to 1e-12 px; feedback does not enlarge that.
     assert lensed.log.q == pytest.approx(straight.log.q, abs=1e-9)
     # What is logged is what the cameras see.
-    assert lensed.log.s[0] == pytest.approx(bent(LENS[:, None], straight.log.s[0]), abs=1e-9)
+    assert lensed.log.s[0] == pytest.approx(distort(LENS[:, None], straight.log.s[0]), abs=1e-9)
     assert np.abs(lensed.log.s - straight.log.s).max() > 1.0
 
 

@@ -11,12 +11,12 @@ from scipy.linalg import expm
 from projservo_cli.calibration import calibrate as calibrated
 from projservo_cli.calibration import predict
 from projservo_cli.calibration.prediction import (
-    Scene,
-    all_changed,
+    Parameters,
+    dense_pixel_changes,
     displacements,
     image_points,
     moved_points,
-    scene_of,
+    parameters_from,
 )
 from projservo_cli.monitoring import statistics
 from projservo_cli.monitoring.frame_pairs import FramePair
@@ -36,7 +36,7 @@ class Arm(NamedTuple):
     """A simulated arm, and its calibration from noisy trials."""
 
     calibration: object
-    scene: Scene
+    scene: Parameters
     reference: np.ndarray
     image_size: np.ndarray
 
@@ -52,7 +52,7 @@ class Arm(NamedTuple):
         while True:
             start, end = self.reference + rng.uniform(-0.7, 0.7, (2, len(self.reference)))
             q = start + share * (end - start)
-            s = self.scene.seen(q - self.reference)
+            s = self.scene.predict(q - self.reference)
             if ((s > 0.0) & (s < self.image_size)).all():
                 return q, np.gradient(q, axis=0) / PERIOD
 
@@ -72,7 +72,7 @@ def arm():
     config = configured("ur5", f"noise.calibration_px={SIGMA}")
     truth = truth_of(config)
     model = truth.model
-    scene = Scene(model.P, model.H_hat_0, model.joint_types == 1, truth.M)
+    scene = Parameters(model.P, model.H_hat_0, model.joint_types == 1, truth.M)
     return Arm(calibrate.run(config)[1], scene, model.q_reference, truth.image_size)
 
 
@@ -106,7 +106,7 @@ def test_residuals_of_the_model_itself_set_nothing_off(arm, monkeypatch):
         rng = np.random.default_rng(seed)
         q, q_dot = arm.way(seed % 3)
         K, n = q.shape
-        J = all_changed(scene_of(calibration), calibration.errors, q - calibration.q_reference)
+        J = dense_pixel_changes(parameters_from(calibration), calibration.errors, q - calibration.q_reference)
         J = J @ rng.standard_normal(J.shape[-1])
         step = 1e-6 * np.eye(n)
         J_q = np.stack(

@@ -5,7 +5,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.task.target import Shown
+from projservo_cli.task.target import TaskImages
 from tests.configured import truth_of
 from tests.conftest import ROOT
 from tests.known import asked, known_scenario
@@ -44,7 +44,7 @@ def planned(name, task, overrides, **demands):
     q_start, q_goal = np.radians(task)
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
     wanted = known_scenario(config).demands._replace(**demands)
-    shown = Shown(q_start, s_start, s_star, truth.center)
+    shown = TaskImages(q_start, s_start, s_star, truth.center)
     return plan_task(truth.model, shown, asked("constrained"), wanted)
 
 

@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import Scene
+from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.laws import LAW_SPECS, LAWS, name_of
 from projservo_cli.records import PRISMATIC, Calibration
 from projservo_cli.report.figures import FIGURES
@@ -87,7 +87,7 @@ def filmed(trace, width, height):
 def known(config, true, model, q):
     """The record of a model known in the frame of ``projective_twin``, as if it had been fitted freely."""
     M = np.linalg.solve(studies.H_PE, true.M.T).T
-    scene = Scene(model.P, model.H_hat_0, model.joint_types == PRISMATIC, M)
+    scene = Parameters(model.P, model.H_hat_0, model.joint_types == PRISMATIC, M)
     J, own = scene.derivative(q - model.q_reference)
     own = np.einsum("kvmia,mn->kvmina", own, np.eye(len(M))).reshape(*own.shape[:-1], -1)
     J, first = np.concatenate([J, own], axis=-1), J.shape[-1]

@@ -7,7 +7,7 @@ from matplotlib.container import BarContainer
 from scipy.linalg import sqrtm
 
 from projservo_cli.calibration import predict, prediction_variance
-from projservo_cli.calibration.prediction import scene_of
+from projservo_cli.calibration.prediction import parameters_from
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.report import style
@@ -119,7 +119,7 @@ def test_held_out_errors_take_the_place_of_those_in_the_fit():
 def test_information_is_the_inverse_of_the_covariance_without_its_null_space():
     calibration = case()[2].calibration
     m, s = len(calibration.M), len(calibration.shared_error)
-    gauge = scene_of(calibration).gauge()
+    gauge = parameters_from(calibration).gauge()
     directions = np.random.default_rng(1).normal(size=(len(gauge), 6))
     basis = np.linalg.qr(np.hstack([gauge, directions]))[0][:, gauge.shape[1] :]
     factor = basis * np.sqrt([1e-6, 1e-3, 0.5, 2.0, 2.0, 4.0])

@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.task.face import MIDPOINT
-from projservo_cli.task.target import Shown
+from projservo_cli.task.target import TaskImages
 from tests.configured import truth_of
 
 CALLS = []
@@ -152,7 +152,7 @@ class DirectThree:
 
     def __init__(self, setup):
         model = setup.calibration.model()
-        task = Shown(setup.plan.q_start, setup.s_start, setup.s_star, MIDPOINT).task(model)
+        task = TaskImages(setup.plan.q_start, setup.s_start, setup.s_star, MIDPOINT).task(model)
         self.law = BuiltInLaw(0, model, task, setup.gains)
         self.law.state.driven[:] = setup.plan.rotation_sense()
 

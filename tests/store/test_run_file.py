@@ -155,7 +155,7 @@ def test_a_change_anywhere_is_noticed_before_it_is_read(path, monkeypatch):
         path.write_bytes(whole[:keep])
         message = refused(path)
         assert "cut short or changed since it was written" in message
-        assert "restore it, or make it anew in another folder" in message
+        assert "restore it, or make it again in another folder" in message
 
 
 @pytest.mark.parametrize(

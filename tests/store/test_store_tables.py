@@ -145,7 +145,7 @@ BAD_LISTS = {
     "twice": ([*LIST, "7,1,1,e,f"], ":4: pose 7 is already in line 2"),
     "one side": (["q1,left", "1,a"], ":1: give the columns left and right both"),
     "no name": (["q1,left,right", "1,a,"], ":2: an image has no name"),
-    "no rows": (["q1"], "no pose was given"),
+    "no rows": (["q1"], "add a pose a row"),
     "no joints": (["pose", "1"], ":1: .*lacks.*q1"),
 }
 

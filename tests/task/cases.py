@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from projservo_cli.control.law import new_state, split_of
+from projservo_cli.control.law import make_split, new_state
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
@@ -60,7 +60,7 @@ class Split:
         self.state.A[:] = self.A
         if memory is not None:
             self.state.driven[:] = memory
-        self.parts = partition(self.task, split_of(self.state))
+        self.parts = partition(self.task, make_split(self.state))
         self.memory = self.state.driven
         self.q_hat = self.state.q_hat[:3].copy()
         self.H_hat = [as_array(H) for H in (self.parts.H_t, self.parts.H_r, self.parts.H_p)]

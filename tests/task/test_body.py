@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.records import WorkFailed
-from projservo_cli.task.body import SEEN, SETTLED, body_of, fit_body
+from projservo_cli.task.body import ALL_VIEWS, SETTLED, fit_body, make_body
 from tests.samples import arm, displacement, frame, in_frame, pixels, poe, revolute
 
 FRAMES = [None, 1, 2]
@@ -40,14 +40,14 @@ def twist_of(body, xi):
     return np.outer(xi[:3] @ body.D, body.a_inf) + np.einsum("r,rij->ij", xi[3:], body.H_hat)
 
 
-def fitted(model, body, s, H, until=SEEN):
+def fitted(model, body, s, H, until=ALL_VIEWS):
     return fit_body(model.P, body, np.ascontiguousarray(s), mat(H), until, np.zeros((6, 7)))
 
 
 @pytest.mark.parametrize("seed", FRAMES)
 def test_the_basis_is_one_of_rigid_displacements(seed):
     model, M, G = seen_from(seed)
-    body = body_of(model, M)
+    body = make_body(model, M)
     forms = -0.5 * np.einsum("iab,jba->ij", body.H_hat, body.H_hat)
     assert forms == pytest.approx(np.eye(3), abs=1e-10)
     for k, operator in enumerate(body.H_hat):
@@ -64,7 +64,7 @@ def test_the_basis_is_one_of_rigid_displacements(seed):
 def test_a_robot_that_turns_about_one_direction_has_a_body_all_the_same():
     """What it cannot do may be counted in any metric; what it can is counted as it is."""
     parallel = np.array([revolute([0.1 * i, 0.2, 0.0], [0.0, 0.0, 1.0]) for i in range(6)])
-    body = body_of(arm()._replace(H_hat_0=parallel), markers())
+    body = make_body(arm()._replace(H_hat_0=parallel), markers())
     L = body.H_hat[:, :3, :3].reshape(3, 9)
     wanted = parallel[0, :3, :3].ravel()
     assert np.linalg.lstsq(L.T, wanted, rcond=None)[0] @ L == pytest.approx(wanted, abs=1e-12)
@@ -72,14 +72,14 @@ def test_a_robot_that_turns_about_one_direction_has_a_body_all_the_same():
 
 
 def test_joints_that_keep_no_metric_have_no_body(rng):
-    with pytest.raises(WorkFailed, match="keep no metric"):
-        body_of(arm()._replace(H_hat_0=rng.normal(size=(6, 4, 4))), markers())
+    with pytest.raises(WorkFailed, match="preserve no metric"):
+        make_body(arm()._replace(H_hat_0=rng.normal(size=(6, 4, 4))), markers())
 
 
 def test_two_directions_of_turning_imply_the_third():
     axes = [[0, 0, 1.0], [0, 1.0, 0]] * 3
     twists = np.array([revolute([0.1 * i, 0.2, 0.3 * i], axis) for i, axis in enumerate(axes)])
-    body = body_of(arm()._replace(H_hat_0=twists), markers())
+    body = make_body(arm()._replace(H_hat_0=twists), markers())
     assert body.H_hat[:, :3, :3] == pytest.approx(-np.swapaxes(body.H_hat[:, :3, :3], 1, 2), abs=1e-12)
 
 
@@ -88,7 +88,7 @@ def test_a_step_is_that_of_finite_differences(seed):
     """The weighted least-squares solution of the images' Jacobian, over the views that were seen."""
     model, M, _ = seen_from(seed)
     weight = np.random.default_rng(2).uniform(0.1, 3.0, (2, len(M)))
-    body = body_of(model, M)._replace(weight=weight)
+    body = make_body(model, M)._replace(weight=weight)
     H = poe(model, model.q_reference + 0.1)
     s = pixels(model.P, M @ poe(model, model.q_reference + 0.12).T)
     s[0, 3] = s[1, 7] = math.nan
@@ -101,7 +101,7 @@ def test_a_step_is_that_of_finite_differences(seed):
     J = np.stack([(residual(-step * x) - residual(step * x)) / (2 * step) for x in np.eye(6)], axis=1)
     e = residual(np.zeros(6))
     xi, left, _, _ = np.linalg.lstsq(J, e)
-    fit = fitted(model, body, s, H, SEEN._replace(most_steps=1))
+    fit = fitted(model, body, s, H, ALL_VIEWS._replace(max_steps=1))
     assert fit.views == 18
     assert fit.before == pytest.approx(e @ e, rel=1e-12)
     assert fit.after == pytest.approx(left[0], rel=1e-6)
@@ -113,7 +113,7 @@ def test_a_step_is_that_of_finite_differences(seed):
 def test_exact_images_give_the_exact_displacement(seed, rng):
     """From 3° and centimetres off: two steps to a ten-millionth, a few more to round-off."""
     model, M, _ = seen_from(seed)
-    body = body_of(model, M)
+    body = make_body(model, M)
     q = model.q_reference + rng.uniform(-0.3, 0.3, 6)
     H, away = poe(model, q), poe(model, q + 0.02 * rng.normal(size=6))
     s = pixels(model.P, M @ H.T)
@@ -137,7 +137,7 @@ SUBSETS = {
 @pytest.mark.parametrize("hidden", SUBSETS.values(), ids=SUBSETS)
 def test_any_sufficient_markers_do(hidden, rng):
     model, M, _ = seen_from(1)
-    body = body_of(model, M)
+    body = make_body(model, M)
     H = poe(model, model.q_reference + 0.2)
     s = pixels(model.P, M @ H.T)
     for where in hidden if isinstance(hidden[0], tuple) else [hidden]:
@@ -153,7 +153,7 @@ def test_too_few_markers_are_told():
     model, M, _ = seen_from(1)
     M = M.copy()
     M[2] = 0.5 * (M[0] + M[1])
-    body = body_of(model, M)
+    body = make_body(model, M)
     s = pixels(model.P, M)
     for seen in ([], [0], [0, 5], [0, 1, 2]):  # the last on one line
         some = np.full_like(s, math.nan)
@@ -170,7 +170,7 @@ def test_the_fit_does_not_depend_on_the_frame(rng):
     for seed in FRAMES:
         model, M, G = seen_from(seed)
         s = pixels(model.P, M @ poe(model, model.q_reference + 0.1).T) + noise
-        fit = fitted(model, body_of(model, M), s, poe(model, model.q_reference + 0.1), SETTLED)
+        fit = fitted(model, make_body(model, M), s, poe(model, model.q_reference + 0.1), SETTLED)
         found.append((np.linalg.solve(G, as_array(fit.H) @ G), fit.after))
     for moved, after in found[1:]:
         assert moved == pytest.approx(found[0][0], abs=1e-9)
@@ -180,7 +180,7 @@ def test_the_fit_does_not_depend_on_the_frame(rng):
 def draws(count, rng, prediction):
     """Errors (count, 6) of one-shot fits, their Fisher information by finite differences, and the fits."""
     model, M, _ = seen_from(None)
-    body = body_of(model, M)
+    body = make_body(model, M)
     q = model.q_reference + 0.1
     H = poe(model, q)
     clean = pixels(model.P, M @ H.T)

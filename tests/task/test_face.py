@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
-from projservo_cli.task.target import Shown
+from projservo_cli.task.target import TaskImages
 from tests.samples import arm, displacement, face, frame, in_frame, pixels
 from tests.task.cases import SQUARE, SQUARE_CENTER, turned
 
@@ -82,7 +82,7 @@ def test_plane_of_a_bent_face_is_a_compromise():
 
 
 def shown_to(model, s_start, s_star):
-    return Shown(model.q_reference, s_start, s_star, MIDPOINT).task(model)
+    return TaskImages(model.q_reference, s_start, s_star, MIDPOINT).task(model)
 
 
 def images(A, T):

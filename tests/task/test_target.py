@@ -7,9 +7,9 @@ import pytest
 
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.records import WorkFailed
-from projservo_cli.task.body import SETTLED, body_of, fit_body
+from projservo_cli.task.body import SETTLED, fit_body, make_body
 from projservo_cli.task.face import UNSEEN_GOAL, require_found
-from projservo_cli.task.target import Shown
+from projservo_cli.task.target import TaskImages
 from tests.samples import frame, pixels, poe
 from tests.scene import scene, with_pins
 
@@ -19,9 +19,9 @@ def case(G=None):
     sc = with_pins(scene())
     M = np.concatenate([sc.plant.M, sc.plant.pins])
     model = sc.seen(G)
-    body = body_of(model, M if G is None else M @ G.T)
+    body = make_body(model, M if G is None else M @ G.T)
     s = (pixels(sc.model.P, M @ poe(sc.model, q).T) for q in (sc.q_start, sc.q_goal))
-    return model, Shown(sc.q_start, *s, -1, 5, body), body.M[:4] @ poe(model, sc.q_goal).T
+    return model, TaskImages(sc.q_start, *s, -1, 5, body), body.M[:4] @ poe(model, sc.q_goal).T
 
 
 @pytest.mark.parametrize("seed", [None, 1])
@@ -30,13 +30,13 @@ def test_exact_images_give_the_exact_goal(seed):
     task = shown.task(model)
     assert task.A_star == pytest.approx(A_star, abs=1e-9)
     assert task.s_star == pytest.approx(shown.s_star[:, :4], abs=0)
-    assert task.body.shown.all()
-    assert not np.shares_memory(task.body.shown, shown.body.shown)
+    assert task.body.in_goal.all()
+    assert not np.shares_memory(task.body.in_goal, shown.body.in_goal)
     # A goal that shows the face alone is enough.
     shown.s_star[:, 4:] = math.nan
     task = shown.task(model)
     assert task.A_star == pytest.approx(A_star, abs=1e-9)
-    assert task.body.shown.tolist() == [[True] * 4 + [False] * 5] * 2
+    assert task.body.in_goal.tolist() == [[True] * 4 + [False] * 5] * 2
 
 
 def test_the_goal_is_the_least_squares_fit_to_all_that_is_seen(rng):
@@ -62,7 +62,7 @@ def test_images_of_no_body_are_refused():
 
 
 def test_too_few_markers_at_a_place_are_told():
-    with pytest.raises(WorkFailed, match="the images at the goal show too few markers, 2 in both views"):
+    with pytest.raises(WorkFailed, match="the images at the goal show 2 markers in both views"):
         require_found(UNSEEN_GOAL, 2)
 
 

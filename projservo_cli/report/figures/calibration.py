@@ -6,8 +6,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.calibration import predict, prediction_variance
-from projservo_cli.calibration.prediction import changed, error_factor, joint_derivative, scene_of
-from projservo_cli.calibration.readings import MOST_JUDGED, even_choice, per_rad
+from projservo_cli.calibration.detections import MAX_JUDGED, even_choice, per_rad
+from projservo_cli.calibration.prediction import (
+    error_factor,
+    joint_derivative,
+    parameters_from,
+    pixel_changes,
+)
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
 from projservo_cli.report import style
 from projservo_cli.report.report_data import VIEWS, Data, Fit, registered
@@ -56,7 +61,7 @@ def _data(fit: Fit) -> Data:
         "prismatic": calibration.prismatic,
         "weak": calibration.weak,
         "information": _information(calibration),
-        "parameters": np.array(len(calibration.shared_error) + calibration.M[:MOST_JUDGED].size),
+        "parameters": np.array(len(calibration.shared_error) + calibration.M[:MAX_JUDGED].size),
         "residual": residual[used].ravel(),
         "held_out": np.array(fit.held_out is not None),
         "weighed": np.array(bool(weighed)),
@@ -99,7 +104,9 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
     G = weight[..., None, None] * joint_derivative(calibration, q) * noise
     tested, variance = residual * weight[..., None], np.empty_like(residual)
     for k, of_pose in enumerate(used):
-        parts = changed(scene_of(calibration), calibration.errors, q[k : k + 1] - calibration.q_reference)
+        parts = pixel_changes(
+            parameters_from(calibration), calibration.errors, q[k : k + 1] - calibration.q_reference
+        )
         common, own = (part[0] * weight[k, ..., None, None] for part in parts)
         variance[k] = (common**2).sum(axis=-1) + (own**2).sum(axis=-1)
         U, s, _ = np.linalg.svd(G[k][of_pose].reshape(-1, len(q[k])), full_matrices=False)
@@ -169,7 +176,7 @@ def _information(calibration: Calibration) -> FloatArray:
     """
     if not calibration.has_covariance:
         return np.zeros(0)
-    few = calibration.with_markers(even_choice(len(calibration.M), MOST_JUDGED))
+    few = calibration.with_markers(even_choice(len(calibration.M), MAX_JUDGED))
     spread = np.linalg.svd(error_factor(few), compute_uv=False)[::-1] ** 2
     floor = len(spread) * np.finfo(np.float64).eps * spread[-1]
     return np.asarray(1.0 / spread[spread > floor])

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import exp_rotation
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.geometry.lens import through
+from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
@@ -192,7 +192,7 @@ def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
     for i, share in enumerate(mu):
         there = (M + share * plan.tau * moved).reshape(-1, 4)
         m = (there @ P.swapaxes(1, 2)).reshape(2, *M.shape[:3], 3)
-        u, v = np.moveaxis(through(lens[:, None, None, None], m[..., :2] / m[..., 2:]), -1, 0)
+        u, v = np.moveaxis(distort_visible(lens[:, None, None, None], m[..., :2] / m[..., 2:]), -1, 0)
         least = np.minimum(np.minimum(u + 0.5, wide - u), np.minimum(v + 0.5, high - v)).min(axis=1)
         front = (m[..., 2] * depth > 0.0).all(axis=1)
         least = np.where(front & np.isfinite(least), least, -np.inf)

@@ -1,6 +1,6 @@
-"""Readings of a calibration as flat lists, and refusals of data without motion or without two dimensions.
+"""Detections of a calibration as flat lists, and refusals of data without motion or without two dimensions.
 
-Everything here is known before any geometry: joint readings, marker numbers, pixels.
+The checks need joint readings, marker numbers and pixels, and no geometry yet.
 """
 
 import dataclasses
@@ -11,35 +11,60 @@ from scipy.special import chdtri
 
 from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Observation, WorkFailed
 
-# Two joint readings closer than this are the same reading: far below any encoder's resolution.
+# Difference, rad or m, below which two joint readings are equal: far below any encoder's resolution.
 SAME_READING = 1e-7
-# Least noise that is reckoned with, px per coordinate: exact images have round-off, and none is better.
-LEAST_SIGMA = 1e-4
+# Minimum pixel noise, px per coordinate: exact images have round-off.
+MIN_SIGMA = 1e-4
 # Median of |x| over the standard deviation of a normal variable.
 MAD = 0.6744897501960817
 # Median of the length of a two-dimensional normal vector of unit deviation.
 RAYLEIGH = 1.1774100225154747
+# Distance from the reference at which predictions are assessed, revolute joints, rad.
+REACH_RAD = 0.5
+# Distance from the reference at which predictions are assessed, prismatic joints, m.
+REACH_M = 0.15
+# Maximum trial motion to advise, in reaches.
+MAX_REACHES = 4.0
+# Minimum image motion over the range of a joint, in units of the pixel noise.
+MIN_MOTION = 5.0
+# Range of a joint without image motion, in reaches, above which it did not follow its readings.
+_STANDING = 0.1
+# Minimum range of a joint that counts as motion, rad or m.
+_MIN_SPAN = 1e-6
+# Maximum number of markers in computations that only assess a fit.
+MAX_JUDGED = 50
+# Minimum spread of a view's pixels across their main direction, in units of the noise.
+_MIN_SPREAD = 5.0
+# Ratio of both spreads above which pixels lie on a line rather than in one spot.
+_ELONGATED = 10.0
+# Share of observations, assumed wrong, that may move more than the rest while the robot stands still.
+_MAX_WRONG = 0.1
+# Probability that noise alone puts the markers of an image farther off their best line.
+_OFF_LINE_TAIL = 0.1
+ON_A_LINE = "the markers lie on one line: a turn about it shows in no image; add a marker off the line"
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
-    """Every marker seen at a pose by at least one camera, ordered by marker and then by pose."""
+class Detections:
+    """Pixels of every marker seen at a pose by at least one camera, ordered by marker and then by pose.
+
+    A row (N,) is an observation, of one marker at one pose; a detection is its pixel in one view (2, N).
+    """
 
     q: FloatArray  # (K, n) joint readings, rad or m
     prismatic: BoolArray  # (n,) whether the joint is prismatic
     pose: IntArray  # (K,) numbers of the poses
     marker: IntArray  # (m,) numbers of the markers
     pose_of: IntArray  # (N,) row of ``q``
-    marker_of: IntArray  # (N,) position in ``marker``, never falling
+    marker_of: IntArray  # (N,) index into ``marker``, never falling
     pixels: FloatArray  # (2, N, 2) px, zero where not seen
     seen: BoolArray  # (2, N) whether the view saw the marker
-    # (2, N) by which residuals are weighed: ``stated_px`` over the standard deviation of the reading, or one
-    weight: FloatArray
-    stated_px: float | None  # root mean square of the standard deviations that are stated, px, if any
+    weight: FloatArray  # (2, N) weights of residuals: ``stated_px`` over the standard deviation, or one
+    stated_px: float | None  # root mean square of the stated standard deviations, px, if any
 
     @classmethod
-    def of(cls, observation: Observation, joint_types: str) -> "Readings":
-        """What was seen at rest, flattened; one letter a joint, R or P.
+    def of(cls, observation: Observation, joint_types: str) -> "Detections":
+        """Flatten the poses at rest of an observation; one letter a joint, R or P.
 
         Raises InputError if the arrays or the letters do not fit each other, or values are not finite.
         """
@@ -58,7 +83,7 @@ class Readings:
         seen = finite[pose_of, :, marker_of].T
         weight, stated_px = np.ones(seen.shape), None
         if observation.sigma is not None and seen.any():
-            sigma = np.maximum(observation.sigma[pose_of, :, marker_of].T[seen], LEAST_SIGMA)
+            sigma = np.maximum(observation.sigma[pose_of, :, marker_of].T[seen], MIN_SIGMA)
             stated_px = float(np.sqrt(np.mean(sigma**2)))
             weight[seen] = stated_px / sigma
         present, marker_of_present = np.unique(marker_of, return_inverse=True)
@@ -75,21 +100,21 @@ class Readings:
             stated_px=stated_px,
         )
 
-    def everywhere(self, q: FloatArray, which: IntArray | None = None) -> "Readings":
-        """All markers, or some, at other joints (K, n), rad or m, as if both views had seen them at zero."""
+    def everywhere(self, q: FloatArray, which: IntArray | None = None) -> "Detections":
+        """Detections of all markers, or some, at joints (K, n), rad or m, all seen in both views at zero."""
         which = np.arange(self.marker.size) if which is None else which
         marker_of, pose_of = np.repeat(which, len(q)), np.tile(np.arange(len(q)), which.size)
         pixels, weight = np.zeros((2, marker_of.size, 2)), np.ones((2, marker_of.size))
         where = np.arange(len(q)), self.marker, pose_of, marker_of
-        return Readings(q, self.prismatic, *where, pixels, weight > 0.0, weight, None)
+        return Detections(q, self.prismatic, *where, pixels, weight > 0.0, weight, None)
 
     @property
     def both(self) -> BoolArray:
-        """(N,) whether both views saw the marker."""
+        """Mask (N,) of the observations by both views."""
         return np.asarray(np.logical_and(self.seen[0], self.seen[1]))
 
-    def rows(self, keep: BoolArray | IntArray | slice) -> "Readings":
-        """Some of the sightings (N,); the lists of poses and markers stay."""
+    def rows(self, keep: BoolArray | IntArray | slice) -> "Detections":
+        """Select observations (N,); the lists of poses and markers stay."""
         return dataclasses.replace(
             self,
             pose_of=self.pose_of[keep],
@@ -99,26 +124,26 @@ class Readings:
             weight=self.weight[:, keep],
         )
 
-    def of_poses(self, keep: BoolArray) -> "Readings":
-        """Sightings at some of the poses (K,); the lists of poses and markers stay."""
+    def of_poses(self, keep: BoolArray) -> "Detections":
+        """Select the observations at some poses (K,); the lists of poses and markers stay."""
         return self.rows(keep[self.pose_of])
 
-    def of_markers(self, keep: BoolArray) -> "Readings":
-        """Some of the markers (m,) and their sightings."""
+    def of_markers(self, keep: BoolArray) -> "Detections":
+        """Select markers (m,) and their observations."""
         left = self.rows(keep[self.marker_of])
         numbers = (np.cumsum(keep) - 1)[left.marker_of]
         return dataclasses.replace(left, marker=self.marker[keep], marker_of=numbers)
 
     def count_at(self, mask: BoolArray) -> IntArray:
-        """How many readings of a mask (2, N) each pose has, (K,)."""
+        """Number (K,) of detections in a mask (2, N) at each pose."""
         return np.bincount(self.pose_of, mask.sum(axis=0), len(self.q)).astype(np.int64)
 
     def count_of(self, mask: BoolArray) -> IntArray:
-        """How many readings of a mask (2, N) each marker has, (m,)."""
+        """Number (m,) of detections in a mask (2, N) of each marker."""
         return np.bincount(self.marker_of, mask.sum(axis=0), self.marker.size).astype(np.int64)
 
     def home(self) -> int | None:
-        """Row of q from which all others differ in at most one joint: the pose of single-joint trials."""
+        """Row of q that all others differ from in at most one joint, the reference of single-joint trials."""
         q = self.q
         candidates = np.arange(len(q))
         for row in q:
@@ -126,17 +151,17 @@ class Readings:
             candidates = candidates[changed <= 1]
         if candidates.size == 0:
             return None
-        # With trials of a single joint every row qualifies: the one in the middle moves least.
+        # With trials of a single joint every row qualifies: take the one in the middle.
         travel = [np.abs(q[candidate] - q).sum() for candidate in candidates]
         return int(candidates[np.argmin(travel)])
 
     def trials(self, home: int) -> list[IntArray]:
-        """Rows of q in which each joint differs from the reference, an array a joint."""
+        """Rows of q in which each joint differs from the reference, one array a joint."""
         moved = np.abs(self.q - self.q[home]) > SAME_READING
         return [np.flatnonzero(column) for column in moved.T]
 
     def reference(self) -> FloatArray:
-        """Joints (n,) the model is written about: the reference of trials, else the most central pose."""
+        """Reference joints (n,) of the model: the reference of trials, else the most central pose."""
         row = self.home()
         if row is None:
             span = np.ptp(self.q, axis=0)
@@ -146,7 +171,7 @@ class Readings:
 
 
 def per_block(block_of: IntArray, values: FloatArray, count: int) -> FloatArray:
-    """Sums (b, …) over the sightings of each marker, or of each pose, of values (N, …)."""
+    """Sums (b, …) of values (N, …) over the observations of each marker or of each pose."""
     sums = [np.bincount(block_of, column, count) for column in values.reshape(len(values), -1).T]
     return np.stack(sums, axis=1).astype(np.float64).reshape(count, *values.shape[1:])
 
@@ -160,7 +185,7 @@ def _require_shapes(observation: Observation) -> None:
             raise InputError(f"{name} numbers of shape {numbers.shape}: expected one dimension")
         values, count = np.unique(numbers, return_counts=True)
         if (count > 1).any():
-            raise InputError(f"{name} number {values[count > 1][0]} stands twice: number each {name} once")
+            raise InputError(f"{name} number {values[count > 1][0]} occurs twice: number each {name} once")
     K, m = len(observation.q), len(observation.marker)
     shapes = {"pose": (K,), "images": (K, 2, m, 2), "sigma": (K, 2, m), "moving": (K,), "t_q": (K,)}
     for name, shape in (shapes | {"t_view": (K, 2)}).items():
@@ -175,48 +200,34 @@ def _require_shapes(observation: Observation) -> None:
             raise InputError("sigma must be a positive number wherever a marker was seen, px")
 
 
-# Reach at which predictions are judged, rad and m.
-REACH_RAD, REACH_M = 0.5, 0.15
-# Farthest trial motion that is advised, in reaches.
-MOST_REACHES = 4.0
-# Least motion of the images over the range of a joint, in units of the pixel noise.
-LEAST_MOTION = 5.0
-# Share of the reach beyond which a joint that moves no image stands still; below, it moved too little.
-_STANDING = 0.1
-# Least range of a joint that is a motion at all, rad or m.
-_LEAST_SPAN = 1e-6
-
-
-# What only judges a fit looks at this many markers at most.
-MOST_JUDGED = 50
-
-
-def even_choice(count: int, most: int) -> IntArray:
-    """Indices of all of so many, or of no more than the most, from the first to the last in even steps."""
-    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(np.int64)
+def even_choice(count: int, max_count: int) -> IntArray:
+    """Indices below ``count``, all or ``max_count`` evenly spaced from the first to the last."""
+    if count <= max_count:
+        return np.arange(count)
+    return np.linspace(0, count - 1, max_count).round().astype(np.int64)
 
 
 def per_rad(prismatic: BoolArray) -> FloatArray:
-    """How far joints (n,) go, rad or m, that make as much of a difference as a revolute one by one rad."""
+    """Joint motions (n,), rad or m, equivalent to one rad of a revolute joint."""
     return np.where(prismatic, REACH_M / REACH_RAD, 1.0)
 
 
-def require_motion(readings: Readings) -> FloatArray:
+def require_motion(detections: Detections) -> FloatArray:
     """Range of each joint over the poses, (n,) rad or m.
 
     Raises WorkFailed if a joint never moves, fewer than three markers were seen, or there is only one pose.
     """
-    m = readings.marker.size
+    m = detections.marker.size
     if m < 3:
         what = ("no marker was", "only one marker was", "only two markers, which lie on a line, were")[m]
         raise WorkFailed(
             f"{what} seen: a rotation about a line through them shows in no image; "
             "use three or more markers that are not on one line"
         )
-    if len(readings.q) < 2:
+    if len(detections.q) < 2:
         raise WorkFailed("only one pose: trial motions of every joint are needed")
-    span: FloatArray = np.ptp(readings.q[np.unique(readings.pose_of)], axis=0)
-    for i in np.flatnonzero(span <= _LEAST_SPAN):
+    span: FloatArray = np.ptp(detections.q[np.unique(detections.pose_of)], axis=0)
+    for i in np.flatnonzero(span <= _MIN_SPAN):
         raise WorkFailed(
             f"joint {i + 1} has no trial motion: it never moves in the data; record poses in which it does"
         )
@@ -230,17 +241,18 @@ def describe_joints(
     needed: FloatArray,
     alone: FloatArray | None = None,
 ) -> tuple[str, ...]:
-    """Advice for the joints that moved too little, or never apart from the others: a line for all alike.
+    """Advice for joints that moved too little, or never apart from the others, one line for all alike.
 
-    ``which`` (k,) are they; of all joints (n,) there is the range and that of a trial motion that determines
-    them, rad or m; NaN where none does; and that over which they moved ``alone``, if known. Where there is
-    one joint only, no other is asked for.
+    which : (k,) indices of these joints.
+    span : (n,) range of each joint in the data, rad or m.
+    needed : (n,) range of a trial motion that would determine it, rad or m; NaN if none would.
+    alone : (n,) range over which it moved alone, rad or m, if known.
     """
     single = len(span) == 1
     reach = np.where(prismatic, REACH_M, REACH_RAD)
-    hopeless = ~(needed <= MOST_REACHES * reach)
+    hopeless = ~(needed <= MAX_REACHES * reach)
     apart, enough = ~hopeless & (span >= reach) & (not single), ~hopeless & (needed <= span)
-    if alone is not None:  # and yet more poses of the same kind are asked for
+    if alone is not None:  # such a joint needs more poses of the same kind
         apart &= ~(needed <= alone)
     rest, lines = np.isin(np.arange(len(span)), which), []
     elsewhere = "markers farther from its axis" if single else "trials of every joint"
@@ -263,62 +275,55 @@ def describe_joints(
         rows = np.flatnonzero(rest & alike)
         rest[rows] = False
         if rows.size:
-            moved, least = (
-                _listed([_amount(values[i], bool(prismatic[i])) for i in rows]) for values in (span, needed)
+            moved, required = (
+                _join_words([_format_motion(values[i], bool(prismatic[i])) for i in rows])
+                for values in (span, needed)
             )
-            joints = f"joint{'s' * (rows.size > 1)} {_listed([str(i + 1) for i in rows])}"
+            joints = f"joint{'s' * (rows.size > 1)} {_join_words([str(i + 1) for i in rows])}"
             it = "it" if rows.size == 1 else "each"
-            lines.append(text.format(joints=joints, moved=moved, needed=least, it=it))
+            lines.append(text.format(joints=joints, moved=moved, needed=required, it=it))
     return tuple(lines)
 
 
-def _listed(words: list[str]) -> str:
-    """Words in a row, the last after "and"."""
+def _join_words(words: list[str]) -> str:
+    """Join words by commas, the last by "and"."""
     return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
 
 def require_moved(i: int, span: float, prismatic: bool, motion_px: float, sigma_px: float) -> None:
-    """Refuse joint i whose range moves the images by no more than noise: too short, or it did not follow."""
-    if motion_px >= LEAST_MOTION * sigma_px:
+    """Refuse joint i if its range moves the images by no more than noise: too short, or it did not follow."""
+    if motion_px >= MIN_MOTION * sigma_px:
         return
     seen = (
-        f"the images by {motion_px:.3g} px, less than {LEAST_MOTION:g} times their noise of {sigma_px:.3g} px"
+        f"the images by {motion_px:.3g} px, less than {MIN_MOTION:g} times their noise of {sigma_px:.3g} px"
     )
     reach = REACH_M if prismatic else REACH_RAD
     if span < _STANDING * reach:
         advice = (
-            f"joint {i + 1} moved only {_amount(span, prismatic)}: move it at least "
-            f"{_amount(0.5 * reach, prismatic)}"
+            f"joint {i + 1} moved only {_format_motion(span, prismatic)}: move it at least "
+            f"{_format_motion(0.5 * reach, prismatic)}"
         )
         raise WorkFailed(f"too little excitation: the range of joint {i + 1} moves {seen}; {advice}")
     raise WorkFailed(
-        f"joint {i + 1} stands still: its readings range over {_amount(span, prismatic)} but move {seen}; "
-        "check that it moved and that its readings are its own, or move a marker off its axis"
+        f"joint {i + 1} stands still: its readings range over {_format_motion(span, prismatic)} but "
+        f"move {seen}; check that it moved and that its readings are its own, or move a marker off its axis"
     )
 
 
-def _amount(value: float, prismatic: bool) -> str:
-    """A joint motion in words, mm or degrees."""
+def _format_motion(value: float, prismatic: bool) -> str:
+    """Format a joint motion in mm or degrees."""
     return f"{1e3 * value:.3g} mm" if prismatic else f"{np.degrees(value):.3g}°"
 
 
-ON_A_LINE = "the markers lie on one line: a turn about it shows in no image; add a marker off the line"
-# Least spread of a view's pixels across their main direction, in units of the noise.
-_LEAST_SPREAD = 5.0
-# Ratio of both spreads beyond which pixels lie on a line rather than in one place.
-_ELONGATED = 10.0
-# Share of the sightings that may move more than the rest where the robot stands still: wrong ones.
-_MOST_WRONG = 0.1
-# Chance with which noise alone puts the markers of an image farther off their best line.
-_OFF_LINE_TAIL = 0.1
+def require_images(detections: Detections, sigma_px: float | None) -> None:
+    """Refuse images that show one spot, one line, or no motion.
 
-
-def require_images(readings: Readings, sigma_px: float | None) -> None:
-    """Refuse images that show one place, one line, or no motion: WorkFailed names the view or the joint."""
-    sigma = max(sigma_px or 0.0, LEAST_SIGMA)
-    _require_spread(readings, sigma)
-    _require_moving(readings, sigma)
-    _require_no_line(readings, sigma)
+    Raises WorkFailed naming the view or the joint.
+    """
+    sigma = max(sigma_px or 0.0, MIN_SIGMA)
+    _require_spread(detections, sigma)
+    _require_moving(detections, sigma)
+    _require_no_line(detections, sigma)
 
 
 def _spread(pixels: FloatArray) -> FloatArray:
@@ -335,13 +340,13 @@ def _spread(pixels: FloatArray) -> FloatArray:
     return np.asarray(np.median(np.abs(offset @ axes), axis=0) / MAD)
 
 
-def _require_spread(readings: Readings, sigma: float) -> None:
+def _require_spread(detections: Detections, sigma: float) -> None:
     """Refuse a view that saw nothing, or whose pixels do not spread in two directions."""
     for v, view in enumerate(("left", "right")):
-        if not readings.seen[v].any():
+        if not detections.seen[v].any():
             raise WorkFailed(f"the {view} camera saw no marker: both must see them")
-        along, across = _spread(readings.pixels[v][readings.seen[v]])
-        if across >= _LEAST_SPREAD * sigma:
+        along, across = _spread(detections.pixels[v][detections.seen[v]])
+        if across >= _MIN_SPREAD * sigma:
             continue
         if along > _ELONGATED * max(across, sigma):
             raise WorkFailed(
@@ -350,38 +355,38 @@ def _require_spread(readings: Readings, sigma: float) -> None:
             )
         raise WorkFailed(
             f"the {view} images show no more than noise: their markers spread over {along:.3g} px, "
-            f"less than {_LEAST_SPREAD:g} times the noise of {sigma:.3g} px; check the pixel columns, and "
+            f"less than {_MIN_SPREAD:g} times the noise of {sigma:.3g} px; check the pixel columns, and "
             "that the left and right pixels of a row are of one marker at one pose"
         )
 
 
-def _require_moving(readings: Readings, sigma: float) -> None:
-    """Refuse images that stand still while the readings move: all of them, or those of a joint's trials."""
-    limit = LEAST_MOTION * sigma
-    if _farthest(readings) < limit:
+def _require_moving(detections: Detections, sigma: float) -> None:
+    """Refuse images that stand still while the joint readings move: all, or those of a joint's trials."""
+    limit = MIN_MOTION * sigma
+    if _farthest(detections) < limit:
         raise WorkFailed(
             f"the images stand still within {limit:.3g} px although the joint readings move: check that the "
             "robot moved, and that images and readings belong together"
         )
-    home = readings.home()
+    home = detections.home()
     if home is None:
         return
-    for i, rows in enumerate(readings.trials(home)):
-        poses = np.zeros(len(readings.q), dtype=bool)
+    for i, rows in enumerate(detections.trials(home)):
+        poses = np.zeros(len(detections.q), dtype=bool)
         poses[np.append(rows, home)] = True
-        # A point that moves evenly along a path of length L has the variance L² / 12; noise alone has that
-        # of both coordinates.
-        square = 12.0 * _variances(*_tracks(readings.of_poses(poses))).sum(axis=1)
+        # A point that moves evenly along a path of length L has variance L² / 12; noise adds that of both
+        # coordinates.
+        square = 12.0 * _variances(*_tracks(detections.of_poses(poses))).sum(axis=1)
         path = np.sqrt(max(float(square.mean()) - 24.0 * sigma**2, 0.0)) if square.size else np.inf
-        span = float(np.ptp(readings.q[poses, i]))
-        require_moved(i, span, bool(readings.prismatic[i]), path, sigma)
+        span = float(np.ptp(detections.q[poses, i]))
+        require_moved(i, span, bool(detections.prismatic[i]), path, sigma)
 
 
-def _tracks(readings: Readings) -> tuple[FloatArray, IntArray]:
-    """Pixels (L, 2) of each marker in each view that shows it at least twice, and whose track (L,) it is."""
-    views = [np.flatnonzero(seen) for seen in readings.seen]
-    pixels = np.concatenate([readings.pixels[v, rows] for v, rows in enumerate(views)])
-    track = np.concatenate([2 * readings.marker_of[rows] + v for v, rows in enumerate(views)])
+def _tracks(detections: Detections) -> tuple[FloatArray, IntArray]:
+    """Pixels (L, 2) of each marker in each view that shows it twice or more, and their track index (L,)."""
+    views = [np.flatnonzero(seen) for seen in detections.seen]
+    pixels = np.concatenate([detections.pixels[v, rows] for v, rows in enumerate(views)])
+    track = np.concatenate([2 * detections.marker_of[rows] + v for v, rows in enumerate(views)])
     often = np.bincount(track)[track] > 1
     return pixels[often], np.unique(track[often], return_inverse=True)[1]
 
@@ -404,20 +409,20 @@ def medians(values: FloatArray, group: IntArray) -> FloatArray:
     return np.asarray(0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2]))
 
 
-def _farthest(readings: Readings) -> float:
-    """How far sightings are from the median place of their marker in their view, but for the farthest, px."""
-    pixels, track = _tracks(readings)
+def _farthest(detections: Detections) -> float:
+    """Distance of detections from the median of their track, at the quantile 1 − ``_MAX_WRONG``, px."""
+    pixels, track = _tracks(detections)
     distance = np.linalg.norm(pixels - medians(pixels, track)[track], axis=1)
-    return float(np.quantile(distance, 1.0 - _MOST_WRONG)) if distance.size else np.inf
+    return float(np.quantile(distance, 1.0 - _MAX_WRONG)) if distance.size else np.inf
 
 
-def _require_no_line(readings: Readings, sigma: float) -> None:
-    """Refuse a body whose markers lie on a line in most images, up to the noise: some are wrong."""
+def _require_no_line(detections: Detections, sigma: float) -> None:
+    """Refuse a body whose markers lie on a line, up to the noise, in most images."""
     off = []
-    for seen, places in zip(readings.seen, readings.pixels, strict=True):
+    for seen, positions in zip(detections.seen, detections.pixels, strict=True):
         rows = np.flatnonzero(seen)
-        rows = rows[np.argsort(readings.pose_of[rows], kind="stable")]
-        for pixels in np.split(places[rows], np.flatnonzero(np.diff(readings.pose_of[rows])) + 1):
+        rows = rows[np.argsort(detections.pose_of[rows], kind="stable")]
+        for pixels in np.split(positions[rows], np.flatnonzero(np.diff(detections.pose_of[rows])) + 1):
             if len(pixels) > 2:
                 across = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1]
                 off.append(across**2 > sigma**2 * chdtri(len(pixels) - 2, _OFF_LINE_TAIL))
