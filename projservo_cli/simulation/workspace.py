@@ -1,4 +1,4 @@
-"""The workspace of a simulated experiment: the true robot, rig and markers."""
+"""Ground truth (workspace) of a simulated experiment: the true robot, rig and markers."""
 
 import math
 from collections.abc import Sequence

@@ -48,7 +48,7 @@ def test_sentences_are_short(page):
 # What a maintainer searches for, and the file below the package that defines it.
 TERMS = {
     "April ?tag": "detection",
-    "backlash": "stages/simulation",
+    "backlash": "simulation/faults",
     "bundle adjustment": "calibration/adjustment",
     "checks?um|HDF5": "store/__init__",
     "cluster|Dask": "sweeps/engine",
@@ -61,8 +61,8 @@ TERMS = {
     "fault detection": "monitoring/__init__",
     "forward kinematics": "geometry/kinematics",
     "goal configuration": "planning/goal_configurations",
-    "gravity sag": "stages/simulation",
-    "ground truth": "stages/world",
+    "gravity sag": "simulation/faults",
+    "ground truth": "simulation/workspace",
     "hypothes": "monitoring/hypotheses",
     "image-based": "control/classical",
     "innovation": "monitoring/statistics",
@@ -75,7 +75,7 @@ TERMS = {
     "lens distortion": "geometry/lens",
     "locks?": "files",
     "metrics": "loop/metrics",
-    "MuJoCo": "rendered/__init__",
+    "MuJoCo": "simulation/__init__",
     "null space": "geometry/kernels",
     "observability": "calibration/quality",
     "obstacle": "planning/keep_out",
@@ -88,7 +88,7 @@ TERMS = {
     "time offset": "calibration/time_offset",
     "time parameterization": "planning/time_parameterization",
     "triangulation": "calibration/triangulation",
-    "URDF": "robots/urdf",
+    "URDF": "simulation/urdf",
     "waypoint": "planning/time_parameterization",
     "Wilson": "sweeps/statistics",
 }
