@@ -1,1 +1,1 @@
-"""Rendered cameras: a simulated robot in MuJoCo, whose images are searched for tags."""
+"""Simulated robots: ground truth, the ideal plant, faults, and cameras that MuJoCo renders."""
