@@ -112,5 +112,5 @@ def test_without_a_plan_to_follow_the_law_goes_alone_and_says_so(lost):
 def test_a_law_may_be_refused_to_go_without_a_plan(lost):
     _, calibration, planned = lost
     refusing = configured("paper", "control.without_plan=refuse")
-    with pytest.raises(WorkFailed, match=r"cannot follow the planned motion.*control\.without_plan replan"):
+    with pytest.raises(WorkFailed, match=r"cannot follow the planned motion.*control\.without_plan=replan"):
         servo.run(refusing, calibration, planned, "exact_track")
