@@ -2,7 +2,8 @@
 
 Numba checks cached machine code against the file of the function alone, and would miss an edited helper in
 another file. The cache folder therefore carries a hash of the sources of all compiled functions and of their
-imports. If no folder is writable, each process compiles the functions again.
+imports; every installation of the same sources shares it. If no folder is writable, each process compiles the
+functions again.
 """
 
 import hashlib
@@ -16,6 +17,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core.caching import UserProvidedCacheLocator
 from numba.core.registry import CPUDispatcher
 from numba.extending import register_jitable
 
@@ -81,10 +83,32 @@ def cache_folder(root: Path) -> Path | None:
 SETTINGS: Any = numba.config
 # Whether the compiler is enabled.
 COMPILED = not SETTINGS.DISABLE_JIT
+# Folder of the package.
+PACKAGE = Path(__file__).parents[1]
 # Folder of the machine code.
-CACHE_FOLDER = cache_folder(Path(__file__).parents[1]) if COMPILED else None
+CACHE_FOLDER = cache_folder(PACKAGE) if COMPILED else None
+
+
+class PlaceInPackage(UserProvidedCacheLocator):
+    """Locator of machine code by the place of its source in the package, wherever that is installed."""
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> Any:
+        """Return the locator of a function of the package, or None for Numba's own of any other."""
+        located: Any = super().from_function
+        return located(py_func, py_file) if Path(py_file).is_relative_to(PACKAGE) else None
+
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file: str) -> str:
+        """Return the folder below that of the cache."""
+        return "_".join(Path(py_file).parent.relative_to(PACKAGE).parts)
+
+
 if CACHE_FOLDER is not None:
     SETTINGS.CACHE_DIR = str(CACHE_FOLDER)
+    SETTINGS.CACHE_LOCATOR_CLASSES = (
+        f"{__name__}.{PlaceInPackage.__name__},UserProvidedCacheLocator,IPythonCacheLocator"
+    )
 # The third level of the optimiser takes a sixth more compilation time and saves a tenth of a step.
 if "NUMBA_OPT" not in os.environ:
     SETTINGS.OPT = type(SETTINGS.OPT)(2)

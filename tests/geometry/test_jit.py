@@ -108,7 +108,7 @@ def called(root, **environment):
 
 @pytest.mark.volume
 def test_installed_read_only_with_an_edit_and_without_a_home(copy):
-    """Cached from a read-only install; an edit in another file is never missed; no home, no cache."""
+    """Cached from a read-only install for all; an edit in another file is never missed; no home, no cache."""
     root = copy.rename(copy.parent / "projservo_cli")
     writable = {path: path.stat().st_mode for path in [root, *root.rglob("*")]}
     for path, mode in writable.items():
@@ -117,7 +117,8 @@ def test_installed_read_only_with_an_edit_and_without_a_home(copy):
     try:
         first = called(root, HOME=str(home))
         assert first == [[51.0, -20.0, -40.0], True, 0, 0]
-        assert called(root, HOME=str(home)) == [first[0], True, 1, 1]
+        elsewhere = shutil.copytree(root, root.parent / "elsewhere" / root.name)
+        assert called(elsewhere, HOME=str(home)) == [first[0], True, 1, 1]
     finally:
         for path, mode in writable.items():
             path.chmod(mode)
