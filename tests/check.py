@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -14,33 +15,38 @@ PYTEST = [
     *(PYTHON, "-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "--benchmark-disable"),
     "--cov=projservo_cli",
 ]
-# What is compiled, run once more without the compiler: the same bits, and lines that coverage can count.
+SPHINX = [
+    PYTHON,
+    "-m",
+    "sphinx",
+    "-q",
+    "-W",
+    "-n",
+    "--keep-going",
+    "-d",
+    "build/doctrees",
+    "docs",
+    "build/docs",
+]
+# Modules whose functions are compiled, tested once more without the compiler: the same bits, indices that
+# are looked at, and lines that coverage can count.
 MATHEMATICS = [f"tests/{folder}" for folder in ("geometry", "task", "control", "loop", "simulation")]
+NOT_COMPILED = ("--ignore-glob=*_rendered_*", "--ignore-glob=*_mujoco_*")
 WITHOUT_COMPILER = {"NUMBA_DISABLE_JIT": "1"}
 
-CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
+Check = tuple[Sequence[str | Path], dict[str, str]]
+# Each on one processor: two at a time.
+SINGLE: dict[str, Check] = {
+    "types": ([BIN / "mypy"], {}),
+    "documentation": (SPHINX, WITHOUT_COMPILER),
     "lint": ([BIN / "ruff", "check", "."], {}),
     "format": ([BIN / "ruff", "format", "--check", "."], {}),
-    "types": ([BIN / "mypy"], {}),
     "imports": ([BIN / "lint-imports"], {}),
-    "documentation": (
-        [
-            PYTHON,
-            "-m",
-            "sphinx",
-            "-q",
-            "-W",
-            "-n",
-            "--keep-going",
-            "-d",
-            "build/doctrees",
-            "docs",
-            "build/docs",
-        ],
-        WITHOUT_COMPILER,
-    ),
+}
+# Each on both processors, or timed.
+WHOLE: dict[str, Check] = {
     "mathematics without the compiler": (
-        [*PYTEST, "--cov-report=", "-m", "not volume", *MATHEMATICS],
+        [*PYTEST, "--cov-report=", "-m", "not volume", *NOT_COMPILED, *MATHEMATICS],
         WITHOUT_COMPILER,
     ),
     # The lines of both passes count.
@@ -48,30 +54,45 @@ CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
 # Forty minutes: only where it is asked for by name.
-STUDIES: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
-    "rendered": ([PYTHON, "-m", "tests.studies.rendered"], {}),
-}
+STUDIES: dict[str, Check] = {"rendered": ([PYTHON, "-m", "tests.studies.rendered"], {})}
+
+
+def run(name: str, check: Check) -> bool:
+    """Run a check, print what it says once it is over, and return whether it passed."""
+    command, environment = check
+    start = time.monotonic()
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        env={"OPENBLAS_NUM_THREADS": "1", **os.environ, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    outcome = "passed" if done.returncode == 0 else "FAILED"
+    words = " ".join(str(Path(part).name) for part in command)
+    print(
+        f"── {name}: {words}\n{done.stdout}── {name}: {outcome} in {time.monotonic() - start:.0f} s\n",
+        flush=True,
+    )
+    return done.returncode == 0
 
 
 def main(names: Sequence[str]) -> int:
     """Run the named checks, or all, and return how many failed."""
-    known = CHECKS | STUDIES
+    known = SINGLE | WHOLE | STUDIES
     unknown = [name for name in names if name not in known]
     if unknown:
         print(f"unknown check {unknown[0]!r}: choose among {', '.join(known)}", file=sys.stderr)
         return 2
-    failed = []
-    for name in names or CHECKS:
-        command, environment = known[name]
-        print(f"── {name}: {' '.join(str(Path(part).name) for part in command)}", flush=True)
-        start = time.monotonic()
-        code = subprocess.run(
-            command, cwd=ROOT, env={"OPENBLAS_NUM_THREADS": "1", **os.environ, **environment}, check=False
-        ).returncode
-        outcome = "passed" if code == 0 else "FAILED"
-        print(f"── {name}: {outcome} in {time.monotonic() - start:.0f} s\n", flush=True)
-        if code != 0:
-            failed.append(name)
+    names = names or [*SINGLE, *WHOLE]
+    passed: dict[str, bool] = {}
+    for group, processors in ((SINGLE, 2), (WHOLE | STUDIES, 1)):
+        chosen = [name for name in names if name in group]
+        with ThreadPoolExecutor(processors) as pool:
+            passed |= dict(zip(chosen, pool.map(run, chosen, [group[name] for name in chosen]), strict=True))
+    failed = [name for name, good in passed.items() if not good]
     print("all checks passed" if not failed else f"failed: {', '.join(failed)}")
     return len(failed)
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
 # In the background of a shell SIGINT is ignored, and by all children: tests of what it does need it back.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -58,14 +59,22 @@ def rng():
 
 @pytest.fixture(scope="session")
 def first_chain(tmp_path_factory):
-    """Folder of the first chain of README, made once and to be copied; with what it printed in told.txt."""
+    """Folder of the first chain of README, to be copied; with what it printed in told.txt.
+
+    It is made once for all processes that test.
+    """
     from projservo_cli import cli
 
-    folder = tmp_path_factory.mktemp("first")
-    told = io.StringIO()
-    with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
-        stages = ["calibrate", "plan", "servo", "report"]
-        code = cli.run([*stages, "-c", str(ROOT / "configs" / "paper.yaml"), "-o", str(folder)])
-    assert code == 0, told.getvalue()
-    (folder / "told.txt").write_text(told.getvalue(), encoding="utf-8")
+    base = tmp_path_factory.getbasetemp()
+    root = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder = root / "first"
+    printed = folder / "told.txt"
+    with FileLock(root / "first.lock"):
+        if not printed.exists():
+            told = io.StringIO()
+            with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+                stages = ["calibrate", "plan", "servo", "report"]
+                code = cli.run([*stages, "-c", str(ROOT / "configs" / "paper.yaml"), "-o", str(folder)])
+            assert code == 0, told.getvalue()
+            printed.write_text(told.getvalue(), encoding="utf-8")
     return folder

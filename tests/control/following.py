@@ -1,6 +1,8 @@
 """Plans of the scene in miniature, and runs that follow them."""
 
 import math
+import pickle
+from functools import cache
 
 import numpy as np
 
@@ -14,7 +16,18 @@ from tests.scene import GAINS, Run, limits
 SPEED = math.radians(30.0)
 
 
-def planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0):
+def planned(*given, **named):
+    """Plan of a scene, made once for equal arguments, since it takes seconds without the compiler; a copy."""
+    return pickle.loads(_pickled_plan(pickle.dumps((given, named))))
+
+
+@cache
+def _pickled_plan(arguments):
+    given, named = pickle.loads(arguments)
+    return pickle.dumps(_planned(*given, **named))
+
+
+def _planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0):
     """Plan of a scene in the frame of its model, at a joint-speed limit."""
     model = sc.seen(G)
     n = len(sc.q_start)
