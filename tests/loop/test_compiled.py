@@ -266,9 +266,9 @@ def test_success_is_told_of_the_truth(rng):
     q = run.log.q[:, 3]
     for limit, least, sign in (("lower", q.min(), 1.0), ("upper", -q.max(), -1.0)):
         for beside, wanted in ((0.0, 1.0), (1e-6, 0.0)):
-            bound = getattr(sc.plant, limit).copy()
+            bound = getattr(sc.plant.limits, limit).copy()
             bound[3] = sign * (least + beside)
-            assert success(**{limit: bound}) == wanted
+            assert success(limits=sc.plant.limits._replace(**{limit: bound})) == wanted
     hidden = run.log.hidden.copy()
     hidden[run.steps // 2, 1] = 1.0
     assert success(log=run.log._replace(hidden=hidden)) == 0.0

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.control import command
 from projservo_cli.equations import REGISTER
-from tests.configured import calibrate, plan, servo
+from projservo_cli.stages import calibrate, plan, servo
 
 
 def uncompiled(value):
