@@ -15,7 +15,7 @@ import argparse
 import numpy as np
 from scipy.stats import chi2, ncx2, norm
 
-from projservo_cli.monitoring.frame_pairs import Look
+from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.statistics import ErrorModel, is_same_view
 from tests.monitoring.stand_in import ARMS, seen, tool_pose
 from tests.studies.monitoring import CAMERA, SEED, calibrated, fault_of, rigs, tasks
@@ -56,7 +56,7 @@ def looks_of(rig, start, goal, fault):
         images = np.where(np.repeat([one.shown for one in shown], 4, axis=1)[..., None], pixels, np.nan)
         there = np.stack([seen(T, view, (fault,)).pixels.reshape(-1, 2) for view in (0, 1)])
         both = np.stack([q, q])
-        look = Look(still, both, 0.0 * both, still, images, np.zeros(images.shape[:2]), 0.0 * q)
+        look = FramePair(still, both, 0.0 * both, still, images, np.zeros(images.shape[:2]), 0.0 * q)
         found.append((look, there - pixels))
     return found
 
