@@ -60,6 +60,7 @@ def under(scenario, config, **more):
 def trajectory_of(**asked):
     """A motion that is asked for, else as by default."""
     values = [f"trajectory.{key}={json.dumps(x)}" for key, x in asked.items()]
+    values += ["control.mode=track"] if asked.get("keep_out") else []
     return given.trajectory_of(load_config(None, values, text="data: {table: none}"))
 
 

@@ -13,6 +13,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import projservo_cli as ps
+from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.laws import LAWS
 from projservo_cli.loop.compiled import run_compiled
 from projservo_cli.stages import bench
@@ -23,7 +24,7 @@ pytestmark = pytest.mark.volume
 
 @pytest.fixture(scope="module")
 def case():
-    return bench.Case(configured("paper"))
+    return bench.Case(servo_inputs(configured("paper")))
 
 
 @pytest.mark.parametrize("law", LAWS)

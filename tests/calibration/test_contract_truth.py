@@ -8,6 +8,7 @@ import pytest
 
 from projservo_cli.calibration import predict
 from projservo_cli.config import load_config
+from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.tables import write_table
 from tests.configured import calibrate as stage
 from tests.configured import truth_of
@@ -55,7 +56,7 @@ def test_a_simulated_run_with_garbage_for_truth_is_the_same(monkeypatch, method,
     # The garbage is garbage: its images have nothing to do with those observed.
     images = wrong.images(observation.q[0], wrong.M)
     assert np.nanmedian(np.abs(images - observation.images[0])) > 100.0
-    monkeypatch.setattr(stage, "observed", lambda *asked, progress: (observation, noise))
+    monkeypatch.setattr(calibrating, "observed", lambda *asked, progress: (observation, noise))
     same(stage.run(config)[1], calibration)
 
 

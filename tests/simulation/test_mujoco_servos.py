@@ -63,7 +63,7 @@ def described(tmp_path, servos, *overrides):
 def driven(config, q, lag_s=0.0, sag=0.0):
     """The servos of a configuration, at rest at joints."""
     truth_of(config)
-    return Physics(eyes_of(config).scene, np.array(q), lag_s, sag)
+    return Physics(eyes_of(config).rendered, np.array(q), lag_s, sag)
 
 
 def load(physics):
@@ -195,8 +195,8 @@ def test_a_real_arm_with_its_meshes(shared_data, small, drawn):
     off, sigma = np.array(seen) - truth.images(q, truth.M), np.array(sigma)[..., None]
     assert np.isfinite(sigma).sum(axis=(1, 2)).min() >= 8
     assert (np.abs(off) < 5.0 * sigma)[np.isfinite(off)].all()
-    assert eyes.scene.model.dof_armature == pytest.approx(0.1)
-    physics = Physics(eyes.scene, q, 0.0, 0.0)
+    assert eyes.rendered.model.dof_armature == pytest.approx(0.1)
+    physics = Physics(eyes.rendered, q, 0.0, 0.0)
     for _ in range(2):
         physics.follow(q, 1.0)
     stiffness = np.array([2000.0, 2000.0, 2000.0, 500.0, 500.0, 500.0])

@@ -225,7 +225,7 @@ def test_an_empty_cache_is_filled_by_one_job_before_there_are_more(tmp_path, mon
     assert not said
     assert given() == ([1, 1, 2], [(1, 2), (0, 1), *every])
     assert said == ["compiling kernels, once, before the processes start"]
-    (cache / "trial._until_rehearsal-108.py311.nbi").touch()
+    (cache / "batch._until_rehearsal-108.py311.nbi").touch()
     assert given() == ([1, 2], every)
     monkeypatch.undo()
     assert all(any(driver.CACHE_FOLDER.rglob(loop)) for loop in driver.LOOPS)
