@@ -38,7 +38,7 @@ SHARED, OWN = 2_000, 100
 CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
 SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
 # Indices of the machine code of the closed loop, by whether many runs are made in one call.
-LOOPS = ("compiled.run_compiled-*.nbi", "trial._until_rehearsal-*.nbi")
+LOOPS = ("compiled.run_compiled-*.nbi", "batch._until_rehearsal-*.nbi")
 
 
 class _Status(NamedTuple):

@@ -12,7 +12,7 @@ from projservo_cli.report.figures.joint_space import PIECES
 from projservo_cli.stages import studies
 from projservo_cli.stages.motions import JointSearch
 from projservo_cli.stages.plan import plan_task
-from tests.configured import truth_of
+from tests.configured import comparison_of, truth_of
 from tests.known import asked, configured
 from tests.report.cases import SPECS, case
 from tests.report.test_figure_drawing import drawn, require_readable
@@ -121,7 +121,7 @@ def test_the_extra_runs_of_a_report_are_made_whatever_regions_the_plan_keeps_out
     config = configured(
         "paper", "trajectory.profile=joint", "control.mode=track", "control.laws=[exact]", region
     )
-    bench = studies.comparison_of(config, material.calibration, material.plan)
+    bench = comparison_of(config, material.calibration, material.plan)
     runs = studies.run_studies(bench, (0.5,), ())
     assert runs.own["direct_three", "true", False].verdict == "converged"
     assert studies.metric_plan(bench).profile == "linear"
