@@ -43,7 +43,7 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages.external_robot import foreign_robot
-from projservo_cli.stages.record import Trials
+from projservo_cli.stages.given import Estimation, Trials
 from projservo_cli.store import load as stored_run
 from projservo_cli.store import run_path
 from projservo_cli.store.sweep_table import TABLE, SweepTable
@@ -234,7 +234,7 @@ def calibrate(
     if settings.seed is not None:
         seen = replace(seen, seed=settings.seed)
     file = None if settings.init is None else File.of(settings.init, "JSON with screws, cameras and markers")
-    asked = calibrating.Estimation(settings.method, settings.lens, file, settings.cross_validate)
+    asked = Estimation(settings.method, settings.lens, file, settings.cross_validate)
     with listening(progress) as listener:
         made = calibrating.estimate(seen, asked, progress=listener.progress)
         return ImageModel.of(*made, seen.record)

@@ -3,11 +3,13 @@
 import dataclasses
 import html
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.canonical import File
+from projservo_cli.laws import POINT_LAWS
 from projservo_cli.records import VIEWS, FloatArray, InputError
 
 _WIDTH = 100  # maximum length of a line, characters
@@ -107,3 +109,24 @@ def checked_array(
     if finite and not np.isfinite(array).all():
         raise InputError(f"{name}: holds a number that is not finite")
     return array
+
+
+class About(NamedTuple):
+    """What a page tells of a configuration."""
+
+    name: str
+    seed: int
+    recorded: bool  # whether the calibration comes from a table
+    estimates_noise: bool  # whether that of its pixels is estimated
+    joints: tuple[str | None, ...]  # names of the joints
+    required: tuple[str, ...] | None  # laws that must converge; None for all but classical ones
+    text: tuple[str | File, ...]  # all of it as YAML, of which files are parts
+
+    def requires(self, law: str) -> bool:
+        """Tell whether a law that does not converge fails the call: by default all but classical ones."""
+        return law not in POINT_LAWS if self.required is None else law in self.required
+
+    @property
+    def configuration(self) -> str:
+        """All of it as YAML."""
+        return "".join(part.path if isinstance(part, File) else part for part in self.text)

@@ -20,6 +20,7 @@ from projservo_cli.config.models import Disturbance, RenderedOptions
 from projservo_cli.config.robot import Camera, JointVector, Rig, RobotSettings
 from projservo_cli.config.task import Goal as GoalSettings
 from projservo_cli.detection import DICTIONARY
+from projservo_cli.display import About
 from projservo_cli.records import (
     CORNERS,
     NO_LENS,
@@ -29,7 +30,6 @@ from projservo_cli.records import (
     InputError,
     position_limits,
 )
-from projservo_cli.report.report_data import About
 from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Pace, Readings
 from projservo_cli.simulation import dh
 from projservo_cli.simulation.arm import Arm, twist
@@ -46,22 +46,27 @@ from projservo_cli.simulation.faults import (
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.simulation.scene import Scene, Tag, lens_of
 from projservo_cli.simulation.workspace import Truth, Turn, look_at, metric_camera
-from projservo_cli.stages.calibrate import CalibrationInputs, Estimation, SuggestionInputs, Table
-from projservo_cli.stages.record import Motions, RecordingInputs, Trials
-from projservo_cli.stages.task import (
+from projservo_cli.stages.given import (
+    CalibrationInputs,
     Contract,
     Driven,
+    Estimation,
     Goal,
     GoalImages,
     LawSettings,
+    Motions,
     PlanInputs,
     ReachingTask,
+    RecordingInputs,
     ReportInputs,
     Scenery,
     ServoInputs,
     StopSettings,
+    SuggestionInputs,
+    Table,
+    TeachInputs,
+    Trials,
 )
-from projservo_cli.stages.teach import TeachInputs
 from projservo_cli.task.face import MIDPOINT
 from projservo_cli.task.trajectory import KeptOut, Trajectory
 

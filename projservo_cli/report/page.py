@@ -17,6 +17,7 @@ from markupsafe import Markup
 
 from projservo_cli.calibration import WEAK_NOISE, chi2_band
 from projservo_cli.calibration.detections import REACH_M, REACH_RAD
+from projservo_cli.display import About
 from projservo_cli.files import lies_inside, write_whole
 from projservo_cli.laws import name_of
 from projservo_cli.records import Plan, Report
@@ -27,7 +28,6 @@ from projservo_cli.report.report_data import (
     PAGE_FILE,
     VIEW_FILE,
     VIEWS,
-    About,
     stage_object,
     title,
 )

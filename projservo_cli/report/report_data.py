@@ -8,14 +8,13 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.canonical import File
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.laws import IMAGE_TRACK, POINT_LAWS, REPLAN, TRACK, law_and_mode, title_of
+from projservo_cli.laws import IMAGE_TRACK, REPLAN, TRACK, law_and_mode, title_of
 from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
     WHY_LOST,
@@ -237,27 +236,6 @@ def curve_difference(first: FloatArray, second: FloatArray) -> FloatArray:
     """
     k = min(len(first), len(second))
     return min(np.abs(first[:k] - second[:k]), np.abs(first[:k] + second[:k]), key=np.max)
-
-
-class About(NamedTuple):
-    """What a page tells of a configuration."""
-
-    name: str
-    seed: int
-    recorded: bool  # whether the calibration comes from a table
-    estimates_noise: bool  # whether that of its pixels is estimated
-    joints: tuple[str | None, ...]  # names of the joints
-    required: tuple[str, ...] | None  # laws that must converge; None for all but classical ones
-    text: tuple[str | File, ...]  # all of it as YAML, of which files are parts
-
-    def requires(self, law: str) -> bool:
-        """Tell whether a law that does not converge fails the call: by default all but classical ones."""
-        return law not in POINT_LAWS if self.required is None else law in self.required
-
-    @property
-    def configuration(self) -> str:
-        """All of it as YAML."""
-        return "".join(part.path if isinstance(part, File) else part for part in self.text)
 
 
 def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequence[str]) -> dict[str, Any]:

@@ -1,9 +1,8 @@
 """Stage calibrate: trial motions or a recorded table in, projective kinematics out."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from projservo_cli.calibration import (
     calibrate,
     cross_validate,
 )
-from projservo_cli.canonical import File
 from projservo_cli.files import write_whole
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
@@ -22,39 +20,10 @@ from projservo_cli.planning.prediction_covariance import Region
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, Observation
 from projservo_cli.robots.settings import JointSettings
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.record import Trials, observed
+from projservo_cli.stages.given import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
+from projservo_cli.stages.record import observed
 from projservo_cli.stages.scenario import SUGGESTIONS, generator
 from projservo_cli.tables import read_table, to_csv
-
-
-class Table(NamedTuple):
-    """A recorded table, and what is known of it."""
-
-    file: File
-    joint_types: str | None  # one letter a joint, R or P; None for R
-    joint_unit: str | None  # of revolute joints, deg or rad; None for rad unless readings look like degrees
-    image_size: tuple[int, int] | None  # width and height, px, if they are known
-    noise_px: float | None  # standard deviation of a coordinate; None to estimate it
-    seed: int  # of random starts
-
-
-@dataclass(frozen=True)
-class Estimation:
-    """How a calibration is estimated from what was seen."""
-
-    method: str = "refined"  # or closed_form
-    lens: bool = False  # whether to estimate two coefficients of radial distortion a camera
-    init: File | None = None  # JSON of a robot and rig that are tried first as a start
-    cross_validate: int | None = None  # parts into which poses are divided to predict each from the others
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationInputs:
-    """What a calibration is made from."""
-
-    source: Table | Trials
-    estimation: Estimation
-    joint_noise: float | None  # rms of joint readings less true angles, rad; None for what the source tells
 
 
 def run(
@@ -134,16 +103,6 @@ def estimate(
 # The range of the recorded readings is widened at each end by this share of itself; for a robot
 # whose limits are known, the candidates' by more.
 WIDER, FARTHER = 0.15, 1.0
-
-
-class SuggestionInputs(NamedTuple):
-    """What further poses are suggested with, beside what was seen and the calibration."""
-
-    joints: JointSettings
-    image_size: tuple[int, int] | None  # width and height, px, if they are known
-    recorded: bool  # whether the robot may not go farther than it was
-    unit: str  # of revolute joints in the list
-    seed: int
 
 
 def suggest_motions(

@@ -27,8 +27,8 @@ from projservo_cli.simulation.faults import (
     robot_of,
 )
 from projservo_cli.simulation.ideal import Plant, observe
+from projservo_cli.stages.given import Contract, Driven
 from projservo_cli.stages.scenario import SERVO_NOISE, RunScenario
-from projservo_cli.stages.task import Contract, Driven
 
 # What a joint may drift, rad or m, and an image, px rms, and be called still, where its noise is less.
 _STILL, _STILL_PX = 2e-5, 0.02

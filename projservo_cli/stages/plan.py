@@ -25,6 +25,7 @@ from projservo_cli.records import (
     WorkFailed,
     in_sense,
 )
+from projservo_cli.stages.given import PlanInputs
 from projservo_cli.stages.motions import (
     Found,
     JointSearch,
@@ -38,7 +39,6 @@ from projservo_cli.stages.motions import (
 )
 from projservo_cli.stages.plan_summary import least_of, reason_of, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.task import PlanInputs
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import TaskImages

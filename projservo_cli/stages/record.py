@@ -1,6 +1,5 @@
 """Record: trial motions, what a robot shows there, and the table of it."""
 
-import hashlib
 import math
 import time
 from collections.abc import Iterator
@@ -9,12 +8,11 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
-from projservo_cli.canonical import encoded
 from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
 from projservo_cli.records import (
     CORNERS,
@@ -28,13 +26,13 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.robots.settings import Joints, JointSettings, OwnRobot, Readings
+from projservo_cli.robots.settings import Joints, OwnRobot
 from projservo_cli.simulation.faults import robot_by_itself
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import averaged, foreign_robot, simulated_robot, way_to
+from projservo_cli.stages.given import RecordingInputs, Trials
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
-from projservo_cli.stages.task import Driven
 from projservo_cli.tables import read_table, recording_of, write_table
 
 SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
@@ -45,61 +43,6 @@ _MOST_MOVING = 200  # frames on the way in a table
 # images, and look towards both cameras.
 _LEAST_SHARED = 3  # markers that both cameras see: a turn about a line through two shows in no image
 _DRAWS, _SHRINKING, _LEAST_SEEN, _LEAST_FACING = 100, 0.98, 0.75, 0.5
-
-
-class Motions(NamedTuple):
-    """Trial motions: every joint alone about a reference, then all joints at once."""
-
-    reference: Readings
-    amplitude: tuple[float, float]  # farthest trial to each side, revolute joints, rad, and prismatic ones, m
-    frames_per_joint: int
-    random_poses: int  # of all joints at once
-    # rad by which trials are spread at most, so that no reading repeats its error; 0 where none has any
-    spread: float
-    seed: int
-
-
-@dataclass(frozen=True, eq=False)
-class Trials:
-    """Trial motions, and the robot that is driven through them."""
-
-    motions: Motions
-    joints: JointSettings
-    truth: Truth | None  # robot, rig and markers as they are; None for a robot of somebody's
-    driven: Driven | None  # by the contract; None for one that stands wherever it is sent
-    noise_px: float  # standard deviation of simulated pixels
-    frames: int  # images of each pose that are averaged
-    settle_s: float  # for how long joints and images have stood still before
-
-
-@dataclass(frozen=True, eq=False)
-class RecordingInputs:
-    """What a table is recorded with."""
-
-    trials: Trials
-    numbers: tuple[int, ...]  # of the markers
-    face: tuple[int, ...]  # numbers of those that must stay visible; none where nobody says so
-    dictionary: str | None  # of the tags, where somebody says so
-    tagged: bool  # whether markers are said to be corners of tags
-    sag_deg: float  # how far a joint at rest may stay from its set-point
-
-    @property
-    def key(self) -> str:
-        """The plant, and a hash of what the pixels depend on beside the joints, which the table itself tells.
-
-        What a robot of somebody's is driven with may change while it is recorded.
-        """
-        trials, own = self.trials, self.own
-        robot = own._replace(timeout_s=0.0, open_s=0.0) if own else (trials.truth, trials.driven)
-        how = trials.motions.seed, trials.noise_px, trials.frames, trials.settle_s
-        key = hashlib.sha256(encoded((robot, how, self.numbers, self.dictionary))).hexdigest()
-        return f"{own.target if own else 'simulated'} {key[:16]}"
-
-    @property
-    def own(self) -> OwnRobot | None:
-        """The robot of somebody's that is driven."""
-        robot = self.trials.driven.robot if self.trials.driven is not None else None
-        return robot if isinstance(robot, OwnRobot) else None
 
 
 @dataclass

@@ -28,6 +28,7 @@ from projservo_cli.report.report_data import (
     Studies,
 )
 from projservo_cli.stages import Progress, silent
+from projservo_cli.stages.given import ReportInputs, Scenery
 from projservo_cli.stages.scenario import plant_of
 from projservo_cli.stages.studies import (
     LAMBDAS,
@@ -38,7 +39,6 @@ from projservo_cli.stages.studies import (
     metric_plan,
     run_studies,
 )
-from projservo_cli.stages.task import ReportInputs, Scenery
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from projservo_cli.task.face import cyclic_order

@@ -34,7 +34,7 @@ from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.faults import shown_in_frames
 from projservo_cli.simulation.ideal import NO_PINS, Ends, Plant
 from projservo_cli.simulation.workspace import Truth
-from projservo_cli.stages.task import GoalImages, PlanInputs, ReachingTask, ServoInputs
+from projservo_cli.stages.given import GoalImages, PlanInputs, ReachingTask, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 from projservo_cli.task.target import TaskImages

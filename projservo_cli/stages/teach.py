@@ -11,30 +11,18 @@ import numpy as np
 from projservo_cli.calibration import predict
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
-from projservo_cli.robots.settings import JointSettings, OwnRobot, Readings
+from projservo_cli.robots.settings import OwnRobot, Readings
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.external_robot import at_rest, averaged, foreign_robot, simulated_robot
+from projservo_cli.stages.given import Goal, GoalImages, PlanInputs, ReachingTask, TeachInputs
 from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
-from projservo_cli.stages.task import Driven, Goal, GoalImages, PlanInputs, ReachingTask
 
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
 _SLACK = 1e-3  # rad or m; by how much more than it sags a reading may change
 # From how far, rad or m, a simulated robot comes to where it is put, and how long it then rests, s.
 _BESIDE, _AT_REST_S = 0.02, 3
-
-
-@dataclass(frozen=True, eq=False)
-class TeachInputs:
-    """What a pose is taught with."""
-
-    driven: Driven
-    joints: JointSettings
-    numbers: tuple[int, ...]  # of the markers
-    noise_px: float  # standard deviation of simulated pixels
-    settle_s: float  # for how long joints and images have stood still before
-    seed: int
 
 
 @dataclass(frozen=True, eq=False)

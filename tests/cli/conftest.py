@@ -12,8 +12,7 @@ from projservo_cli import calibration, cli, files, steps
 from projservo_cli.laws import law_and_mode
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
 from projservo_cli.stages import calibrate, plan, report, servo
-from projservo_cli.stages.calibrate import CalibrationInputs, Table
-from projservo_cli.stages.task import PlanInputs, ServoInputs
+from projservo_cli.stages.given import CalibrationInputs, PlanInputs, ServoInputs, Table
 from projservo_cli.tables import read_table
 from tests.fake_records import fake
 

@@ -1,12 +1,14 @@
-"""What plans, runs and reports are given: the task, what start and goal are measured with, what drives."""
+"""What each stage is given: records of the values that it reads, of which its key is a hash."""
 
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from projservo_cli.canonical import File, encoded
+from projservo_cli.display import About
 from projservo_cli.records import FloatArray
-from projservo_cli.report.report_data import About
 from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings
 from projservo_cli.simulation.arm import Arm
 from projservo_cli.simulation.faults import Events, SimulatedRobot
@@ -15,6 +17,121 @@ from projservo_cli.simulation.workspace import Truth, Turn
 from projservo_cli.task.trajectory import Trajectory
 
 _Pixel = tuple[float, float]
+
+
+class Driven(NamedTuple):
+    """A robot of the contract and how it is driven."""
+
+    robot: SimulatedRobot | OwnRobot
+    following: Following
+    endless: bool  # whether a simulated one goes beyond its limits
+
+
+class Motions(NamedTuple):
+    """Trial motions: every joint alone about a reference, then all joints at once."""
+
+    reference: Readings
+    amplitude: tuple[float, float]  # farthest trial to each side, revolute joints, rad, and prismatic ones, m
+    frames_per_joint: int
+    random_poses: int  # of all joints at once
+    # rad by which trials are spread at most, so that no reading repeats its error; 0 where none has any
+    spread: float
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """Trial motions, and the robot that is driven through them."""
+
+    motions: Motions
+    joints: JointSettings
+    truth: Truth | None  # robot, rig and markers as they are; None for a robot of somebody's
+    driven: Driven | None  # by the contract; None for one that stands wherever it is sent
+    noise_px: float  # standard deviation of simulated pixels
+    frames: int  # images of each pose that are averaged
+    settle_s: float  # for how long joints and images have stood still before
+
+
+@dataclass(frozen=True, eq=False)
+class RecordingInputs:
+    """What a table is recorded with."""
+
+    trials: Trials
+    numbers: tuple[int, ...]  # of the markers
+    face: tuple[int, ...]  # numbers of those that must stay visible; none where nobody says so
+    dictionary: str | None  # of the tags, where somebody says so
+    tagged: bool  # whether markers are said to be corners of tags
+    sag_deg: float  # how far a joint at rest may stay from its set-point
+
+    @property
+    def key(self) -> str:
+        """The plant, and a hash of what the pixels depend on beside the joints, which the table itself tells.
+
+        What a robot of somebody's is driven with may change while it is recorded.
+        """
+        trials, own = self.trials, self.own
+        robot = own._replace(timeout_s=0.0, open_s=0.0) if own else (trials.truth, trials.driven)
+        how = trials.motions.seed, trials.noise_px, trials.frames, trials.settle_s
+        key = hashlib.sha256(encoded((robot, how, self.numbers, self.dictionary))).hexdigest()
+        return f"{own.target if own else 'simulated'} {key[:16]}"
+
+    @property
+    def own(self) -> OwnRobot | None:
+        """The robot of somebody's that is driven."""
+        robot = self.trials.driven.robot if self.trials.driven is not None else None
+        return robot if isinstance(robot, OwnRobot) else None
+
+
+class Table(NamedTuple):
+    """A recorded table, and what is known of it."""
+
+    file: File
+    joint_types: str | None  # one letter a joint, R or P; None for R
+    joint_unit: str | None  # of revolute joints, deg or rad; None for rad unless readings look like degrees
+    image_size: tuple[int, int] | None  # width and height, px, if they are known
+    noise_px: float | None  # standard deviation of a coordinate; None to estimate it
+    seed: int  # of random starts
+
+
+@dataclass(frozen=True)
+class Estimation:
+    """How a calibration is estimated from what was seen."""
+
+    method: str = "refined"  # or closed_form
+    lens: bool = False  # whether to estimate two coefficients of radial distortion a camera
+    init: File | None = None  # JSON of a robot and rig that are tried first as a start
+    cross_validate: int | None = None  # parts into which poses are divided to predict each from the others
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationInputs:
+    """What a calibration is made from."""
+
+    source: Table | Trials
+    estimation: Estimation
+    joint_noise: float | None  # rms of joint readings less true angles, rad; None for what the source tells
+
+
+class SuggestionInputs(NamedTuple):
+    """What further poses are suggested with, beside what was seen and the calibration."""
+
+    joints: JointSettings
+    image_size: tuple[int, int] | None  # width and height, px, if they are known
+    recorded: bool  # whether the robot may not go farther than it was
+    unit: str  # of revolute joints in the list
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class TeachInputs:
+    """What a pose is taught with."""
+
+    driven: Driven
+    joints: JointSettings
+    numbers: tuple[int, ...]  # of the markers
+    noise_px: float  # standard deviation of simulated pixels
+    settle_s: float  # for how long joints and images have stood still before
+    seed: int
 
 
 class GoalImages(NamedTuple):
@@ -111,14 +228,6 @@ class StopSettings(NamedTuple):
     innovation_factor: float  # of the noise, beyond which images disturb a run; 0 tests nothing
     at_joint_limit: bool
     at_border: bool  # at_joint_limit, at_border: whether they end a run
-
-
-class Driven(NamedTuple):
-    """A robot of the contract and how it is driven."""
-
-    robot: SimulatedRobot | OwnRobot
-    following: Following
-    endless: bool  # whether a simulated one goes beyond its limits
 
 
 class Contract(NamedTuple):
