@@ -156,7 +156,9 @@ def record(
             stack.enter_context(working_in(table.parent, name=f".{table.name}.lock"))
         made = recording.new_recording(given, table, motions=further, force=force)
         driven = None
-        if robot is not None and given.trials.driven is not None and given.own is not None:
+        if robot is not None:
+            assert given.trials.driven is not None
+            assert given.own is not None
             bounds = given.trials.driven.following.bounds(joints)
             driven = foreign_robot(given.own, bounds, joints.types, len(made.marker), robot)
         recording.record(given, made, driven, kept=table is not None, progress=listener.progress)

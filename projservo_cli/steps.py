@@ -15,6 +15,7 @@ from projservo_cli import provenance
 from projservo_cli.canonical import encoded
 from projservo_cli.config import Config, to_yaml
 from projservo_cli.config.inputs import (
+    Files,
     calibration_inputs,
     files_of,
     plan_inputs,
@@ -28,7 +29,7 @@ from projservo_cli.robots.source import source_hash
 from projservo_cli.store import SERVO, Result, Run
 
 # The stages in their order, and what makes the record that each is given.
-_GIVEN: dict[str, Callable[[Config, Mapping[str, str]], Any]] = {
+_GIVEN: dict[str, Callable[[Config, Files | None], Any]] = {
     "calibrate": calibration_inputs,
     "plan": plan_inputs,
     "servo": servo_inputs,
@@ -163,18 +164,19 @@ def _given(config: Config, run: Run, stages: Sequence[str]) -> _Given:
         stored[name]: digest for key, digest in stored.items() if (name := key.removesuffix(_HASH)) != key
     }
     files: dict[str, str] = {}
-    for name, file in files_of(config, gone).items():
+    read = files_of(config, gone)
+    for name, file in read.items():
         files |= {name: file.path, name + _HASH: file.sha256}
     records: dict[str, Any] = {}
     for stage in stages:
         with suppress(InputError):
-            records[stage] = _GIVEN[stage](config, gone)
+            records[stage] = _GIVEN[stage](config, read)
     return _Given(records, files)
 
 
 def given_to(stage: str, config: Config) -> Any:
     """The record that a stage is given; an InputError where a part of the configuration is missing."""
-    return _GIVEN[stage](config, {})
+    return _GIVEN[stage](config, None)
 
 
 def _needed(given: _Given, laws: Mapping[str, _Read], stages: Sequence[str]) -> Iterator[Step]:
@@ -182,10 +184,11 @@ def _needed(given: _Given, laws: Mapping[str, _Read], stages: Sequence[str]) -> 
     before: list[str] = []
     for stage in stages:
         keys, record = [], given.records.get(stage)
+        own = "" if record is None else key_of(record)
         of_files = {"": _Read(given.files if stage == "calibrate" else {})}
         for law, read in (laws if stage == "servo" else of_files).items():
             more = {"before": before, "law": law, "source": dict(read.hashed)}
-            keys.append("" if record is None else key_of(record, **more))
+            keys.append(own and key_of(own, **more))
             yield Step(stage, law, keys[-1], read.inputs, note=read.note, unkeyed=read.unkeyed, given=record)
         before = keys
 

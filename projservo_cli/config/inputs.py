@@ -19,6 +19,7 @@ from projservo_cli.config.markers import Markers
 from projservo_cli.config.models import Disturbance, RenderedOptions
 from projservo_cli.config.robot import Camera, JointVector, Rig, RobotSettings
 from projservo_cli.config.task import Goal as GoalSettings
+from projservo_cli.control.law import UNLIMITED, Gains
 from projservo_cli.detection import DICTIONARY
 from projservo_cli.display import About
 from projservo_cli.records import (
@@ -53,7 +54,6 @@ from projservo_cli.stages.given import (
     Estimation,
     Goal,
     GoalImages,
-    LawSettings,
     Motions,
     PlanInputs,
     ReachingTask,
@@ -80,12 +80,12 @@ _EXPECTED = {
     "mjcf": "a model of MuJoCo",
 }
 _Record = TypeVar("_Record", bound=tuple[Any, ...])
-Gone = Mapping[str, str]  # hashes that files had, by their paths, which stand where the files are gone
+Files = Mapping[str, File]  # that are read, by what they are; where they are not given, they are read
 
 
-def calibration_inputs(config: Config, gone: Gone | None = None) -> CalibrationInputs:
+def calibration_inputs(config: Config, files: Files | None = None) -> CalibrationInputs:
     """What a calibration is made from: a table, else trials of the simulated robot."""
-    settings, table = config.calibration, file_of(config, "table", gone)
+    settings, table = config.calibration, _file(config, "table", files)
     source: Table | Trials
     if config.data is not None and table is not None:
         data = config.data
@@ -93,9 +93,9 @@ def calibration_inputs(config: Config, gone: Gone | None = None) -> CalibrationI
         source = Table(table, config.joint_types, data.joint_unit, size, data.noise_px, _seed(config))
     else:
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
-        source = _trials(config, _truth(config, face=False), None, gone, speed_scale=1.0)
+        source = _trials(config, _truth(config, face=False), None, files, speed_scale=1.0)
     noise = None if settings.joint_noise_deg is None else float(np.radians(settings.joint_noise_deg))
-    how = Estimation(settings.method, settings.lens, file_of(config, "init", gone), settings.cross_validate)
+    how = Estimation(settings.method, settings.lens, _file(config, "init", files), settings.cross_validate)
     return CalibrationInputs(source, how, noise)
 
 
@@ -143,7 +143,7 @@ def suggestion_inputs(config: Config) -> SuggestionInputs:
     return SuggestionInputs(joints, size, config.recorded, unit or "rad", config.seed)
 
 
-def plan_inputs(config: Config, gone: Gone | None = None, *, predicted: bool = False) -> PlanInputs:
+def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool = False) -> PlanInputs:
     """What a plan is made from.
 
     predicted : whether a calibration predicts start and goal of a simulated robot, which is not described.
@@ -158,7 +158,7 @@ def plan_inputs(config: Config, gone: Gone | None = None, *, predicted: bool = F
         truth=truth_of(config) if simulated else None,
         arm=arm_of(config),
         P=None if config.rig is None else cameras_of(config.rig),
-        scene=scene_of(config, gone) if simulated else None,
+        scene=scene_of(config, files) if simulated else None,
         face=face,
         center=_center(markers),
         known=markers.known,
@@ -173,42 +173,50 @@ def plan_inputs(config: Config, gone: Gone | None = None, *, predicted: bool = F
     )
 
 
-def servo_inputs(config: Config, gone: Gone | None = None) -> ServoInputs:
+def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
     """What the run of a law is made from."""
-    plan, control, stop, plant = plan_inputs(config, gone), config.control, config.stop, config.plant
+    plan, control, stop, plant = plan_inputs(config, files), config.control, config.stop, config.plant
     assert config.markers is not None
     # A robot that is not simulated is never driven beyond a limit.
     at_limit = not plant.simulated or plant.joint_limits == "stop"
     return ServoInputs(
         plan=plan,
-        laws=_taken(LawSettings, control, period=control.period_s, substeps=control.substeps == "auto"),
+        gains=_taken(
+            Gains,
+            control,
+            period=control.period_s,
+            delta=plan.trajectory.delta,
+            limits=UNLIMITED,
+            substeps=control.substeps == "auto",
+        ),
         stop=_taken(StopSettings, stop, at_joint_limit=at_limit, at_border=plant.image_border == "stop"),
         opaque=plant.self_occlusion == "opaque",
         speed_scale=plant.speed_scale,
         searches_anew=control.searches_anew,
         refuses=control.without_plan == "refuse",
         lengths=config.markers.lengths(plan.face),
-        contract=_contract(config, plan, gone),
+        contract=_contract(config, plan, files),
     )
 
 
-def _contract(config: Config, plan: PlanInputs, gone: Gone | None) -> Contract | None:
+def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract | None:
     """How a law drives a robot of the contract; None for one that stands wherever it is sent."""
     plant = config.plant
     if plant.use is None and config.disturbance == Disturbance():
         return None
     robot: SimulatedRobot | OwnRobot = _own(config)
     if plan.truth is not None:
-        robot = _simulated(config, plan.truth, gone)
+        robot = _simulated(config, plan.truth, files)
     driven = Driven(robot, _following(config, plant.speed_scale), _endless(config))
     delay = None if plant.delay_s is None else (plant.delay_s.left, plant.delay_s.right)
     settle_s = plant.settle_s if plan.truth is None else None
     return Contract(driven, events_of(config), plant.timeout_s, delay, settle_s)
 
 
-def report_inputs(config: Config, gone: Gone | None = None) -> ReportInputs:
+def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
     """What a report is made from: all of the configuration, which its page prints, and the extra runs."""
-    about, trajectory = about_of(config, files_of(config, gone).values()), trajectory_of(config)
+    files = files_of(config) if files is None else files
+    about, trajectory = about_of(config, files.values()), trajectory_of(config)
     formats = config.report.formats
     if not config.has_task:
         return ReportInputs(about, formats, None, trajectory)
@@ -216,7 +224,7 @@ def report_inputs(config: Config, gone: Gone | None = None) -> ReportInputs:
         "control": config.control.model_copy(update={"observation": "points"}),
         "trajectory": config.trajectory.model_copy(update={"keep_out": ()}),
     }
-    extra = servo_inputs(config.idealized.model_copy(update=alone), gone)
+    extra = servo_inputs(config.idealized.model_copy(update=alone), files)
     return ReportInputs(about, formats, extra, trajectory)
 
 
@@ -254,14 +262,22 @@ def settings_of(config: Config) -> dict[str, Any]:
     return found
 
 
-def files_of(config: Config, gone: Gone | None = None) -> dict[str, File]:
-    """Files that are read, by what they are; an InputError where one cannot be read."""
-    found = {kind: file_of(config, kind, gone) for kind in _EXPECTED}
+def files_of(config: Config, gone: Mapping[str, str] | None = None) -> Files:
+    """Files that are read, by what they are; an InputError where one cannot be read.
+
+    gone : hashes that files had, by their paths, which stand where the files are gone.
+    """
+    found = {kind: _read(config, kind, gone or {}) for kind in _EXPECTED}
     return {kind: file for kind, file in found.items() if file is not None}
 
 
-def file_of(config: Config, kind: str, gone: Gone | None = None) -> File | None:
-    """The file of a kind, if the configuration names one; an InputError where it cannot be read."""
+def _file(config: Config, kind: str, files: Files | None) -> File | None:
+    """The file of a kind, if the configuration names one: of ``files``, else as it is read now."""
+    return _read(config, kind, {}) if files is None else files.get(kind)
+
+
+def _read(config: Config, kind: str, gone: Mapping[str, str]) -> File | None:
+    """Read the file of a kind, if the configuration names one; an InputError where it cannot be read."""
     rendered = config.plant.rendered is not None and config.arm is not None
     path = {
         "table": config.data.table if config.data is not None else None,
@@ -271,7 +287,7 @@ def file_of(config: Config, kind: str, gone: Gone | None = None) -> File | None:
     if path is None:
         return None
     further = files_named(path) if kind == "mjcf" else ()
-    return File.of(path, _EXPECTED[kind], (gone or {}).get(path, ""), further)
+    return File.of(path, _EXPECTED[kind], gone.get(path, ""), further)
 
 
 # Robot, rig and markers.
@@ -367,7 +383,7 @@ def _center(markers: Markers) -> int:
     return MIDPOINT if midpoint else (markers.front or ()).index(int(markers.center))
 
 
-def scene_of(config: Config, gone: Gone | None = None) -> Scene | None:
+def scene_of(config: Config, files: Files | None = None) -> Scene | None:
     """What rendered cameras see; None for cameras that see points."""
     options = config.plant.rendered
     if options is None:
@@ -375,7 +391,7 @@ def scene_of(config: Config, gone: Gone | None = None) -> Scene | None:
     assert config.arm is not None
     assert config.rig is not None
     assert config.markers is not None
-    return _scene(config.arm, config.rig, config.markers, options, file_of(config, "mjcf", gone))
+    return _scene(config.arm, config.rig, config.markers, options, _file(config, "mjcf", files))
 
 
 @lru_cache(maxsize=8)
@@ -448,9 +464,9 @@ def _own(config: Config) -> OwnRobot:
     return OwnRobot(plant.use or "", options, dictionary, plant.timeout_s, plant.open_s, size)
 
 
-def _simulated(config: Config, truth: Truth, gone: Gone | None) -> SimulatedRobot:
+def _simulated(config: Config, truth: Truth, files: Files | None) -> SimulatedRobot:
     """The simulated robot that takes time for what it does."""
-    return SimulatedRobot(truth, faults_of(config), scene_of(config, gone), config.control.period_s)
+    return SimulatedRobot(truth, faults_of(config), scene_of(config, files), config.control.period_s)
 
 
 def faults_of(config: Config) -> Faults:
@@ -496,7 +512,7 @@ def _trials(
     config: Config,
     truth: Truth | None,
     own: OwnRobot | None,
-    gone: Gone | None,
+    files: Files | None,
     *,
     speed_scale: float,
 ) -> Trials:
@@ -505,7 +521,7 @@ def _trials(
     robot: SimulatedRobot | OwnRobot | None = own
     if vector is None:
         raise InputError("trial motions need a reference: set calibration.reference or task.start")
-    faults, scene = faults_of(config), scene_of(config, gone) if own is None else None
+    faults, scene = faults_of(config), scene_of(config, files) if own is None else None
     driven = own is not None or scene is not None or faults != Faults()
     # The closed form takes joints that are told to stand still to do so.
     faultless = not driven or settings.method == "closed_form"

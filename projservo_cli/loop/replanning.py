@@ -3,7 +3,7 @@
 A path is searched again, from where the robot is, where
 
 - what is ahead would leave an image, by what both images are seen to be off their prediction;
-- the face was lost, waited for, and found again on the path back along the path;
+- the face was lost, waited for, and found again on the way back along the path;
 - the law that ends the motion is stopped by a joint limit or a singularity, or comes no nearer: the joints
   that were taken for the goal are excluded from then on.
 """

@@ -76,7 +76,7 @@ class Pairing:
         return None if one is None else self._look(one, frames)
 
     def _look(self, one: Frame, frames: list[Frame | None]) -> FramePair:
-        """FramePair of the frames of both views, at least one of them."""
+        """Pair of the frames of both views, at least one of them."""
         both = [frame or one._replace(image=np.full_like(one.image, np.nan)) for frame in frames]
         last, self._last = self._last or one, one
         self._start = one.t if self._start is None else self._start

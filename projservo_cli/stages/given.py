@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from projservo_cli.canonical import File, encoded
+from projservo_cli.control.law import Gains
 from projservo_cli.display import About
 from projservo_cli.records import FloatArray
 from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings
@@ -203,19 +204,6 @@ class PlanInputs:
     trajectory: Trajectory
 
 
-class LawSettings(NamedTuple):
-    """Gains of the laws in 1/s, and how they step."""
-
-    gain_t: float
-    gain_r: float
-    gain_p: float
-    gain_s: float
-    ratio_rp: float
-    gain: float
-    period: float  # s
-    substeps: bool
-
-
 class StopSettings(NamedTuple):
     """When a closed loop ends."""
 
@@ -245,7 +233,7 @@ class ServoInputs:
     """What the run of a law is made from, beside calibration and plan."""
 
     plan: PlanInputs  # what the plan was made from
-    laws: LawSettings
+    gains: Gains  # of the laws; limits are those of the joints
     stop: StopSettings
     opaque: bool  # whether the face hides its markers from a camera behind it
     speed_scale: float  # factor of every command

@@ -1,7 +1,7 @@
 """What plans are made and laws are run in: robot, rig, markers, start and goal, noise.
 
-A ``Scenario`` is made once from what a stage is given and a calibration; a plan is made in one. A ``Stage``
-is one with all that the run of a law takes besides.
+A ``Scenario`` is made once from what a stage is given and a calibration; a plan is made in one. A
+``RunScenario`` is one with all that the run of a law takes besides.
 """
 
 import math
@@ -318,26 +318,16 @@ def run_scenario(inputs: ServoInputs, calibration: Calibration | None = None) ->
     """Make the scenario of runs; raises as ``scenario_of``."""
     found = scenario_of(inputs.plan, calibration)
     parts = {field.name: getattr(found, field.name) for field in fields(found)}
-    laws = _gains(inputs, found.joints)
-    return RunScenario(**parts, given=inputs, gains=laws, limits=_limits(inputs, found))
+    gains = _gains(inputs, found.joints)
+    return RunScenario(**parts, given=inputs, gains=gains, limits=_limits(inputs, found))
 
 
 def _gains(inputs: ServoInputs, joints: Joints) -> Gains:
-    """Gains and limits of the laws."""
-    c, endless = inputs.laws, np.full(len(joints.types), math.inf)
-    stop = inputs.stop.at_joint_limit
-    return Gains(
-        c.gain_t,
-        c.gain_r,
-        c.gain_p,
-        c.gain_s,
-        c.ratio_rp,
-        c.gain,
-        c.period,
-        inputs.plan.trajectory.delta,
-        joints.limits if stop else joints.limits._replace(lower=-endless, upper=endless),
-        c.substeps,
-    )
+    """Gains of the laws with the limits of the joints, which end no path where a run may pass them."""
+    limits, endless = joints.limits, np.full(len(joints.types), math.inf)
+    if not inputs.stop.at_joint_limit:
+        limits = limits._replace(lower=-endless, upper=endless)
+    return inputs.gains._replace(limits=limits)
 
 
 def _limits(inputs: ServoInputs, found: Scenario) -> Limits:

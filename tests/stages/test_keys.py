@@ -14,7 +14,7 @@ import yaml
 
 from projservo_cli.canonical import decoded, encoded, files_in
 from projservo_cli.config import load_config, to_yaml
-from projservo_cli.config.inputs import calibration_inputs, plan_inputs, report_inputs, servo_inputs
+from projservo_cli.config.inputs import calibration_inputs, files_of, plan_inputs, report_inputs, servo_inputs
 from projservo_cli.records import InputError
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.stages import calibrate, plan, servo
@@ -224,9 +224,9 @@ def test_tables_and_goal_files_count_by_their_content(tmp_path):
     gone = {str(moved): given.source.file.sha256}
     content = moved.read_text(encoding="utf-8")
     moved.unlink()
-    assert key_of(calibration_inputs(elsewhere, gone)) == key
+    assert key_of(calibration_inputs(elsewhere, files_of(elsewhere, gone))) == key
     moved.write_text(content.replace("0,0,", "0,1,", 1), encoding="utf-8")
-    assert key_of(calibration_inputs(elsewhere, gone)) != key
+    assert key_of(calibration_inputs(elsewhere, files_of(elsewhere, gone))) != key
 
 
 MESH = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
