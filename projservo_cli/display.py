@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.canonical import File
-from projservo_cli.laws import POINT_LAWS
 from projservo_cli.records import VIEWS, FloatArray, InputError
 
 _WIDTH = 100  # maximum length of a line, characters
@@ -112,7 +111,7 @@ def checked_array(
 
 
 class About(NamedTuple):
-    """What a page tells of a configuration."""
+    """Configuration as pages show it."""
 
     name: str
     seed: int
@@ -121,10 +120,6 @@ class About(NamedTuple):
     joints: tuple[str | None, ...]  # names of the joints
     required: tuple[str, ...] | None  # laws that must converge; None for all but classical ones
     text: tuple[str | File, ...]  # all of it as YAML, of which files are parts
-
-    def requires(self, law: str) -> bool:
-        """Tell whether a law that does not converge fails the call: by default all but classical ones."""
-        return law not in POINT_LAWS if self.required is None else law in self.required
 
     @property
     def configuration(self) -> str:

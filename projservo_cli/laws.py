@@ -8,8 +8,11 @@ from typing import NamedTuple
 
 from projservo_cli.records import InputError
 
-REPLAN, TRACK, IMAGE_TRACK = "replan", "track", "image_track"
-POINTS, BODY = "points", "body"
+REPLAN = "replan"
+TRACK = "track"
+IMAGE_TRACK = "image_track"
+POINTS = "points"
+BODY = "body"
 
 
 class LawSpec(NamedTuple):
@@ -31,7 +34,7 @@ LAW_SPECS = {
     "exact": LawSpec("exact", (REPLAN, TRACK), BODY, paper=False),
 }
 LAWS = tuple(LAW_SPECS)
-CODES = {law: code for code, law in enumerate(LAWS)}  # by which compiled code knows them
+CODES = {law: code for code, law in enumerate(LAWS)}  # codes of the laws in compiled code
 POINT_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == POINTS)
 BODY_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == BODY)
 _NAMES = {
@@ -40,12 +43,17 @@ _NAMES = {
 
 
 def title_of(law: str) -> str:
-    """Return the title of a law; the name itself of a law of somebody else."""
+    """Return the title of a law: its name if it is not built in."""
     return LAW_SPECS[law].title if law in LAW_SPECS else law
 
 
+def must_converge(law: str, required: Sequence[str] | None) -> bool:
+    """Tell whether a law that does not converge fails the call: by default all but classical ones."""
+    return law not in POINT_LAWS if required is None else law in required
+
+
 def name_of(law: str, mode: str) -> str:
-    """Name of the run of a law in a mode: the law's own where it replans, such as ``exact_track`` else."""
+    """Return the name of the run of a law in a mode: ``exact`` where it replans, else ``exact_track``."""
     return law if mode == REPLAN else f"{law}_{mode}"
 
 

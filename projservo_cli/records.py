@@ -48,7 +48,7 @@ SIZES = {
 }
 
 
-# What to do where a robot of somebody's has no joint limits.
+# Remedy for a robot without joint limits.
 LIMITS_MISSING = "set robot.limits, such as {from_data: 0.1}, or limits in robot.dh or robot.screws"
 
 
@@ -82,9 +82,9 @@ NO_LENS = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2)
 class JointLimits(NamedTuple):
     """Limits of joints, (n,) each; infinite for none."""
 
-    lower: FloatArray
-    upper: FloatArray  # lower, upper: rad or m
-    speed: FloatArray  # most motion per second, rad/s or m/s
+    lower: FloatArray  # rad or m
+    upper: FloatArray  # rad or m
+    speed: FloatArray  # rad/s or m/s
     acceleration: FloatArray  # rad/s² or m/s²
 
 

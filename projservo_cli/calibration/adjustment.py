@@ -326,7 +326,7 @@ class _Fit:
 
 
 class _Family(NamedTuple):
-    """Parameters in blocks, one block an observation: markers, or joint offsets at a pose."""
+    """Parameters in blocks, of which an observation depends on one: markers, or joint offsets at a pose."""
 
     of: IntArray  # (N,) block of an observation
     J: FloatArray  # (2, N, 2, d) weighted derivatives by it

@@ -29,7 +29,8 @@ _SEEN = 3
 _CONSISTENT = 3.0
 # Maximum share of observations that both views agree on and a fit may reject.
 _MAX_UNEXPLAINED = 0.02
-# Minimum share of a pose's observations that a wrong motion displaces: single slanted corners err alike.
+# Minimum share of a pose's observations that a wrong motion displaces: single slanted corners err along
+# the epipolar line.
 _MIN_OF_POSE = 0.25
 # Minimum number of observations of one pose whose agreement on joints is more than chance.
 _AGREEING = 5

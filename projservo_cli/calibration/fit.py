@@ -294,8 +294,8 @@ class Expected:
         if high < _MIN_SCALE or low > _MAX_SCALE:
             raise WorkFailed(
                 f"the stated deviations of the markers are wrong: both views show {self.scale:.3g} "
-                f"times (95 %: {low:.3g} to {high:.3g}) sigma_left and sigma_right "
-                f"({_MIN_SCALE:g} to {_MAX_SCALE:g} times allowed); multiply both columns by "
+                f"times the noise of sigma_left and sigma_right (95 %: {low:.3g} to {high:.3g}; "
+                f"{_MIN_SCALE:g} to {_MAX_SCALE:g} times allowed); multiply both columns by "
                 f"{self.scale:.3g}, or remove them"
             )
 

@@ -26,7 +26,6 @@ def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
     """
     target = option.one_run("show", run, output) or Path("results", "paper")
     from projservo_cli.config import load_config
-    from projservo_cli.config.inputs import joint_names_of
     from projservo_cli.report.report_data import stage_object
     from projservo_cli.store import SERVO, load
 
@@ -34,7 +33,7 @@ def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
     config = load_config(found.path, text=found.configuration)
     laws = list(found.traces)
     stages = list(dict.fromkeys(name.split("/")[0] for name in found.results))
-    values = {stage: stage_object(stage, found, joint_names_of(config), laws) for stage in stages}
+    values = {stage: stage_object(stage, found, config.joint_names, laws) for stage in stages}
 
     def words() -> Iterator[str]:
         yield f"run: {found.path}"

@@ -392,10 +392,9 @@ def _work(call: _Call) -> int:
         call.beside["calibrate"] = _suggestions(chain, count)
     if (wanted := _extras(call.options)) and not chain.lacks("report"):
         call.beside["report"] = _made_extras(console, chain, wanted)
-    from projservo_cli.config.inputs import joint_names_of
     from projservo_cli.report.report_data import failed_object, stage_object
 
-    values, joints = {}, joint_names_of(chain.config)
+    values, joints = {}, chain.config.joint_names
     for name in chain.names:
         if name == "record":
             reason = chain.reason if chain.lacks(name) else ""
@@ -492,10 +491,11 @@ def _findings(call: _Call) -> Iterator[tuple[str, bool]]:
 
 def _of_runs(chain: Any) -> Iterator[tuple[str, bool]]:
     """A line on each run that did not converge or missed periods, and whether the call fails by it."""
-    from projservo_cli.laws import POINT_LAWS, name_of
+    from projservo_cli.laws import POINT_LAWS, must_converge, name_of
 
+    required = chain.config.control.must_converge
     for trace in (chain.run.traces[law] for law in chain.laws_done):
-        must, converged = chain.config.control.requires(trace.law), trace.verdict == "converged"
+        must, converged = must_converge(trace.law, required), trace.verdict == "converged"
         if trace.verdict == "failed" or (converged and not trace.overruns):
             continue  # what failed is the last thing that is said
         but = " must converge, but" if must and not converged else ""

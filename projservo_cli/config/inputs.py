@@ -239,15 +239,10 @@ def about_of(config: Config, read: Iterable[File] = ()) -> About:
         seed=config.seed,
         recorded=config.recorded,
         estimates_noise=config.data is not None and config.data.noise_px is None,
-        joints=joint_names_of(config),
+        joints=config.joint_names,
         required=config.control.must_converge,
         text=tuple(files.get(piece, piece) for piece in pieces),
     )
-
-
-def joint_names_of(config: Config) -> tuple[str | None, ...]:
-    """Names of the joints as far as somebody gave them some."""
-    return tuple(joint.name for joint in config.robot.joints) if config.robot is not None else ()
 
 
 def scenery_of(config: Config) -> Scenery:

@@ -33,7 +33,7 @@ from projservo_cli.config.robot import (
     are_degrees,
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
-from projservo_cli.laws import LAW_SPECS, LAWS, POINT_LAWS, REPLAN
+from projservo_cli.laws import LAW_SPECS, LAWS, REPLAN
 from projservo_cli.nominal import Number, Vector3
 from projservo_cli.records import LIMITS_MISSING, InputError
 from projservo_cli.robots import plugins
@@ -324,10 +324,6 @@ class _Control(Section):
         description="what direct laws measure with: the face's points or all visible markers; "
         "null for body where the calibration is usable",
     )
-
-    def requires(self, law: str) -> bool:
-        """Tell whether a law that does not converge fails the call: by default all but classical ones."""
-        return law not in POINT_LAWS if self.must_converge is None else law in self.must_converge
 
     def contradictions(self) -> Iterator[Finding]:
         """Gains that overshoot."""
@@ -705,6 +701,11 @@ class Settings(Root):
     def has_task(self) -> bool:
         """Whether there is a robot with a task; a recorded run may be reported on without."""
         return not self.recorded or None not in (self.arm, self.rig, self.markers, self.task)
+
+    @property
+    def joint_names(self) -> tuple[str | None, ...]:
+        """Names of the joints as far as they are given."""
+        return tuple(joint.name for joint in self.robot.joints) if self.robot is not None else ()
 
     @property
     def face_numbers(self) -> tuple[int, ...]:

@@ -106,9 +106,10 @@ class PlaceInPackage(UserProvidedCacheLocator):
 
 if CACHE_FOLDER is not None:
     SETTINGS.CACHE_DIR = str(CACHE_FOLDER)
-    SETTINGS.CACHE_LOCATOR_CLASSES = (
-        f"{__name__}.{PlaceInPackage.__name__},UserProvidedCacheLocator,IPythonCacheLocator"
-    )
+    if "NUMBA_CACHE_LOCATOR_CLASSES" not in os.environ:
+        SETTINGS.CACHE_LOCATOR_CLASSES = (
+            f"{__name__}.{PlaceInPackage.__name__},UserProvidedCacheLocator,IPythonCacheLocator"
+        )
 # The third level of the optimiser takes a sixth more compilation time and saves a tenth of a step.
 if "NUMBA_OPT" not in os.environ:
     SETTINGS.OPT = type(SETTINGS.OPT)(2)

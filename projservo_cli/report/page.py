@@ -19,7 +19,7 @@ from projservo_cli.calibration import WEAK_NOISE, chi2_band
 from projservo_cli.calibration.detections import REACH_M, REACH_RAD
 from projservo_cli.display import About
 from projservo_cli.files import lies_inside, write_whole
-from projservo_cli.laws import name_of
+from projservo_cli.laws import must_converge, name_of
 from projservo_cli.records import Plan, Report
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows
@@ -303,7 +303,7 @@ def _visibility(plan: Plan) -> dict[str, Any]:
 
 def _law(trace: dict[str, Any], about: About) -> dict[str, Any]:
     told = {"title": title(name_of(trace["law"], trace["mode"])), "words": _law_words(trace)}
-    must = about.requires(trace["law"])
+    must = must_converge(trace["law"], about.required)
     return trace | told | {"converged": trace["verdict"] == "converged", "must": must}
 
 

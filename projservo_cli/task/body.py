@@ -262,7 +262,7 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: _Until, n
     P : (2, 3, 4) cameras.
     s : (2, k, 2) pixels of the first k markers, NaN where unseen.
     H : predicted displacement from the reference.
-    until : ``SHOWN``, ``SEEN`` or ``SETTLED``.
+    until : ``GOAL_VIEWS``, ``ALL_VIEWS`` or ``SETTLED``.
     normal : (6, 7) workspace of the normal equations.
     """
     before = 0.0

@@ -79,7 +79,7 @@ NO_PARTS = Parts(
     a=_NOWHERE,
     a_t=_NOWHERE,
     A_c=_NOWHERE,
-)  # fmt: skip
+)
 
 
 class _Face(NamedTuple):
