@@ -32,7 +32,7 @@ from projservo_cli.experiment import (
     scene_of,
 )
 from projservo_cli.files import working_in
-from projservo_cli.laws import CODES, REPLAN, law_and_mode, name_of
+from projservo_cli.laws import CODES, REGULATE, law_and_mode, name_of
 from projservo_cli.observations import Observations, rows_of
 from projservo_cli.records import Calibration, InputError, JointList, Plan
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
@@ -173,7 +173,7 @@ def record(
 def calibrate(
     observations: Observations,
     *,
-    method: str = "refined",
+    method: str = "bundle_adjustment",
     lens: bool = False,
     init: str | Path | None = None,
     cross_validate: int | None = None,
@@ -189,7 +189,7 @@ def calibrate(
     Parameters
     ----------
     observations : of ``simulate``, ``record``, or of arrays and tables of yours.
-    method : ``refined`` (maximum likelihood) or ``closed_form`` (the paper's closed forms).
+    method : ``bundle_adjustment`` (maximum likelihood) or ``closed_form`` (the paper's closed forms).
     lens : whether to estimate two coefficients of radial distortion a camera.
     init : JSON file of a robot and rig known beforehand, tried first as a start.
     cross_validate : parts into which poses are divided to predict each from the others; the held-out errors
@@ -283,7 +283,7 @@ def servo(
     plan: Plan,
     law: str | Callable[[Any], Any] = "exact",
     *,
-    mode: str = REPLAN,
+    mode: str = REGULATE,
     robot: Any = None,
 ) -> RunTrace:
     """Drive a law in closed loop from the start of the task to its verdict.
@@ -293,7 +293,7 @@ def servo(
     config : of the robot that is driven, and of when a run ends.
     calibration, plan : what ``calibrate`` and ``plan`` made.
     law : the name of a law, ``module:Class``, or a class or function that makes one of its setup.
-    mode : ``replan``, ``track`` or ``image_track``.
+    mode : ``regulate``, ``track`` or ``image_track``.
     robot : an object of the contract to drive, instead of the robot of the configuration.
 
     Returns
@@ -315,7 +315,7 @@ def servo(
     if isinstance(law, str):
         name, of_name = law_and_mode(law)
         given, name = driving.Given(None, robot), law_target(name)
-        mode = mode if of_name == REPLAN else of_name
+        mode = mode if of_name == REGULATE else of_name
     else:
         given, name = driving.Given(law, robot), plugins.name_of(law)
     asked = config.replace({"control.mode": mode})

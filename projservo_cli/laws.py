@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from projservo_cli.records import InputError
 
-REPLAN = "replan"
+REGULATE = "regulate"
 TRACK = "track"
 IMAGE_TRACK = "image_track"
 POINTS = "points"
@@ -19,26 +19,26 @@ class LawSpec(NamedTuple):
     """What holds for one law wherever it is driven, stored and drawn."""
 
     title: str  # as figures write it
-    modes: tuple[str, ...]  # it follows a plan in all but ``REPLAN``
+    modes: tuple[str, ...]  # it follows a plan in all but ``REGULATE``
     features: str  # needs the ``POINTS`` of the face themselves, or can measure with the ``BODY``
     metric: bool = False  # is given the metric model
     paper: bool = True  # is one of [RH00]
 
 
 LAW_SPECS = {
-    "direct_three": LawSpec("directTHREE", (REPLAN, TRACK), BODY),
-    "direct_two": LawSpec("directTWO", (REPLAN, TRACK), BODY),
-    "stacked": LawSpec("stacked Jacobians", (REPLAN, IMAGE_TRACK), POINTS),
-    "blockwise": LawSpec("block-wise", (REPLAN,), POINTS),
-    "euclidean_points": LawSpec("Euclidean points", (REPLAN,), POINTS, metric=True),
-    "exact": LawSpec("exact", (REPLAN, TRACK), BODY, paper=False),
+    "direct_three": LawSpec("directTHREE", (REGULATE, TRACK), BODY),
+    "direct_two": LawSpec("directTWO", (REGULATE, TRACK), BODY),
+    "stacked": LawSpec("stacked Jacobians", (REGULATE, IMAGE_TRACK), POINTS),
+    "blockwise": LawSpec("block-wise", (REGULATE,), POINTS),
+    "euclidean_points": LawSpec("Euclidean points", (REGULATE,), POINTS, metric=True),
+    "exact": LawSpec("exact", (REGULATE, TRACK), BODY, paper=False),
 }
 LAWS = tuple(LAW_SPECS)
 CODES = {law: code for code, law in enumerate(LAWS)}  # codes of the laws in compiled code
 POINT_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == POINTS)
 BODY_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == BODY)
 _NAMES = {
-    f"{law}_{mode}": (law, mode) for law, spec in LAW_SPECS.items() for mode in spec.modes if mode != REPLAN
+    f"{law}_{mode}": (law, mode) for law, spec in LAW_SPECS.items() for mode in spec.modes if mode != REGULATE
 }
 
 
@@ -54,12 +54,12 @@ def must_converge(law: str, required: Sequence[str] | None) -> bool:
 
 def name_of(law: str, mode: str) -> str:
     """Return the name of the run of a law in a mode: ``exact`` where it replans, else ``exact_track``."""
-    return law if mode == REPLAN else f"{law}_{mode}"
+    return law if mode == REGULATE else f"{law}_{mode}"
 
 
 def law_and_mode(name: str) -> tuple[str, str]:
     """Law and mode of the run of a name."""
-    return _NAMES.get(name, (name, REPLAN))
+    return _NAMES.get(name, (name, REGULATE))
 
 
 def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
@@ -69,7 +69,7 @@ def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
     """
     found = []
     for law in laws:
-        own = LAW_SPECS[law].modes if law in LAW_SPECS else (REPLAN,)
+        own = LAW_SPECS[law].modes if law in LAW_SPECS else (REGULATE,)
         if not set(own) & set(modes):
             able = [other for other, spec in LAW_SPECS.items() if set(spec.modes) & set(modes)]
             raise InputError(

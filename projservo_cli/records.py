@@ -38,13 +38,13 @@ SIZES = {
     "lens_term": 5,
     "outlier_column": 3,
     "suspect_column": 2,
-    "swap_column": 3,
-    "lost_column": 2,
+    "id_switch_column": 3,
+    "rejected_marker_column": 2,
     "law": 2,
     "operators": 2,
     "limit": 2,
     "end": 2,
-    "demand": 10,
+    "margin_kind": 10,
 }
 
 
@@ -226,42 +226,45 @@ class Calibration:
     marker: IntArray = _array("marker", about="number of the marker")
     M: FloatArray = _array("marker coordinate", about="markers at the reference, a_inf @ M = 1")
     # The covariance of all these, as ``Errors`` says; of a method without one they are not finite.
-    shared_error: FloatArray = _array(
+    sqrt_cov_shared: FloatArray = _array(
         "parameter error",
         about="deviations of P.ravel(), H_hat_0.ravel() and k1, k2 of both lenses if any, by independent "
         "errors of unit variance, up to frame and scales that no image shows",
     )
-    marker_error: FloatArray = _array("marker coordinate error", about="deviations of M by the same errors")
-    own_error: FloatArray = _array(
+    sqrt_cov_marker: FloatArray = _array(
+        "marker coordinate error", about="deviations of M by the same errors"
+    )
+    sqrt_cov_own: FloatArray = _array(
         "marker coordinate own", about="deviations of each marker by three more errors of its own"
     )
     excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
-    lowest: FloatArray = _array("joint", "rad or m", "lowest joint reading in the data")
-    weak: BoolArray = _array("joint", about="joints whose operator the data hardly determine")
+    joint_min: FloatArray = _array("joint", "rad or m", "lowest joint reading in the data")
+    poorly_observable: BoolArray = _array("joint", about="joints whose operator the data hardly determine")
     operator_defect: FloatArray = _array("joint", about="norm of Ĥ³ + Ĥ (revolute) or Ĥ² (prismatic) over Ĥ")
     trace_defect: FloatArray = _array("joint", about="absolute trace of Ĥ")
     plane_defect: FloatArray = _array("joint", about="norm of a_inf @ Ĥ, a_inf of unit norm")
     prediction_noise: FloatArray = _array(
         "joint", about="noise of predicted images 0.5 rad or 0.15 m from the reference, over the pixel noise"
     )
-    merged_poses: int = _scalar(about="poses that the fit uses")
-    merged_markers: int = _scalar(about="markers that the fit uses")
+    poses_used: int = _scalar(about="poses that the fit uses")
+    markers_used: int = _scalar(about="markers that the fit uses")
     outlier: IntArray = _array(
         "outlier_row outlier_column", about="readings left out: pose, marker, view (0 left, 1 right, 2 both)"
     )
     suspect: IntArray = _array(
         "suspect_row suspect_column", about="joint readings that no image agrees with: pose, joint from 1"
     )
-    swapped: IntArray = _array(
-        "swap_row swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
+    id_switches: IntArray = _array(
+        "id_switch_row id_switch_column",
+        about="markers that changed numbers: pose, marker read, marker that it is",
     )
-    lost: IntArray | None = _array(
-        "lost_row lost_column",
+    rejected_markers: IntArray | None = _array(
+        "rejected_marker_row rejected_marker_column",
         about="markers left out whole: number, and why, an index into WHY_LOST",
         default=None,
     )
-    lost_poses: IntArray | None = _array(
-        "lost_pose", about="poses left out whole, of which no joint reading could be named", default=None
+    rejected_poses: IntArray | None = _array(
+        "rejected_pose", about="poses left out whole, of which no joint reading could be named", default=None
     )
     predicted_rms_px: float | None = _scalar(
         "px",
@@ -284,14 +287,16 @@ class Calibration:
     sigma_q_interval: FloatArray | None = _array(
         "limit", "rad", "95 % interval of sigma_q, if estimated", default=None
     )
-    ticks: bool = _scalar(about="whether sigma_q is that of encoder ticks that were counted", default=False)
-    delay_s: FloatArray | None = _array(
-        "view", "s", "instant of a joint reading less that of its image", default=None
+    encoder_counts: bool = _scalar(
+        about="whether sigma_q is that of encoder ticks that were counted", default=False
     )
-    delay_interval_s: FloatArray | None = _array(
+    time_offset_s: FloatArray | None = _array(
+        "view", "s", "time of a joint reading less that of its image", default=None
+    )
+    time_offset_interval_s: FloatArray | None = _array(
         "view limit", "s", "95 % interval of the delay", default=None
     )
-    delay_jitter_s: FloatArray | None = _array(
+    time_offset_jitter_s: FloatArray | None = _array(
         "view", "s", "deviation of single images from the delay", default=None
     )
     model_px: float = _scalar("px", "error of the model per coordinate, 0 within noise", default=0.0)
@@ -318,16 +323,19 @@ class Calibration:
     @property
     def errors(self) -> Errors:
         """How far P, H_hat_0, lenses and M are off, in this order."""
-        return Errors(self.shared_error, self.marker_error, self.own_error)
+        return Errors(self.sqrt_cov_shared, self.sqrt_cov_marker, self.sqrt_cov_own)
 
     @property
     def has_covariance(self) -> bool:
         """Whether the method says how far it is off."""
-        return bool(np.isfinite(self.shared_error).all())
+        return bool(np.isfinite(self.sqrt_cov_shared).all())
 
     def without_covariance(self) -> "Calibration":
         """The same, which takes little memory, for those who do not ask how far it is off."""
-        none = {name: getattr(self, name)[..., :0] for name in ("shared_error", "marker_error", "own_error")}
+        none = {
+            name: getattr(self, name)[..., :0]
+            for name in ("sqrt_cov_shared", "sqrt_cov_marker", "sqrt_cov_own")
+        }
         return replace(self, **none)
 
     def with_markers(self, indices: IntArray | list[int]) -> "Calibration":
@@ -337,8 +345,8 @@ class Calibration:
             self,
             marker=self.marker[indices],
             M=self.M[indices],
-            marker_error=few.marker,
-            own_error=few.own,
+            sqrt_cov_marker=few.marker,
+            sqrt_cov_own=few.own,
             corner_squares=None if self.corner_squares is None else self.corner_squares[..., indices],
         )
 
@@ -414,7 +422,7 @@ class Plan:
     profile: str = _scalar(about="which part is driven when")
     feasible: bool = _scalar(
         about="whether both cameras see the face all along; in the profile constrained, whether all "
-        "constraints hold; in the profile joint, whether a way was found"
+        "constraints hold; in the profile joint_space, whether a way was found"
     )
     reason: str = _scalar(about="what makes the plan feasible or not, in words")
     tau: float = _scalar(about="amplitude of the translation, unit-norm kernel of (8)")
@@ -430,9 +438,11 @@ class Plan:
         "cannot follow",
     )
     tau_limit: float = _scalar(about="least delta·tau_0 ahead of the face, infinite where there is none")
-    sigma: FloatArray = _array("sample", about="path parameter from 0 to 1")
+    path_parameter: FloatArray = _array("sample", about="path parameter from 0 to 1")
     time: FloatArray = _array("sample", "s", "when that is reached; NaN where there is no time")
-    mu: FloatArray = _array("sample part", about="shares of t, r, p that are done, NaN in the profile joint")
+    mu: FloatArray = _array(
+        "sample part", about="shares of t, r, p that are done, NaN in the profile joint_space"
+    )
     H_d: FloatArray = _array("sample row coordinate", about="planned displacement of the face")
     s: FloatArray = _array("sample view marker xy", "px", "predicted images of the face")
     margin: FloatArray = _array("sample view", about="visibility margin a·O, 1 at the start")
@@ -441,12 +451,14 @@ class Plan:
     )
     q: FloatArray = _array("sample joint", "rad or m", "joints that follow the motion, NaN where none can")
     joint_margin: FloatArray = _array("sample", about="least distance from a joint limit over half the range")
-    condition: FloatArray = _array("sample", about="reciprocal condition of the image Jacobian of the face")
-    least: FloatArray = _array(
+    reciprocal_condition: FloatArray = _array(
+        "sample", about="reciprocal condition of the image Jacobian of the face"
+    )
+    min_margin: FloatArray = _array(
         "constraint",
         about="smallest visibility margin, border distance in px, joint margin, reciprocal condition",
     )
-    least_mu: FloatArray = _array("constraint part", about="shares of t, r, p where that is")
+    min_margin_mu: FloatArray = _array("constraint part", about="shares of t, r, p where that is")
     s_start: FloatArray = _array("view marker xy", "px", "images at the start")
     s_star: FloatArray = _array("view marker xy", "px", "images at the goal")
     A: FloatArray = _array("marker coordinate", about="face at the start")
@@ -466,43 +478,43 @@ class Plan:
     theta_0: FloatArray = _array("view solution", "rad", "angles at which visibility changes")
     sense: FloatArray = _array("solution", "rad", "both senses of the rotation onto the plane")
     sense_margin: FloatArray = _array("solution view", about="least margin along each sense, 1 at the start")
-    goals: int | None = _scalar(
-        about="joint vectors within the limits that show the goal; none but in the profile joint",
+    n_goal_configurations: int | None = _scalar(
+        about="joint vectors within the limits that show the goal; none but in the profile joint_space",
         default=None,
     )
-    samples: int | None = _scalar(
-        about="joint vectors that the search grew towards; none but in the profile joint", default=None
+    n_search_samples: int | None = _scalar(
+        about="joint vectors that the search grew towards; none but in the profile joint_space", default=None
     )
-    goals_tried: int | None = _scalar(
-        about="how many of the goals, nearest in time, were tried; none but in the profile joint",
+    n_goals_tried: int | None = _scalar(
+        about="how many of the goals, nearest in time, were tried; none but in the profile joint_space",
         default=None,
     )
     seed: int | None = _scalar(
-        about="of the random numbers of the search; none but in the profile joint", default=None
+        about="of the random numbers of the search; none but in the profile joint_space", default=None
     )
     tree_nodes: int | None = _scalar(
         about="joint vectors of both search trees, of which the first are stored; none but in the profile "
         "joint",
         default=None,
     )
-    instead: tuple[str, ...] = _scalar(
+    rejected_profiles: tuple[str, ...] = _scalar(
         about="profiles that auto did not take, each with the reason", default=()
     )
-    lowered: tuple[str, ...] = _scalar(
+    relaxed_constraints: tuple[str, ...] = _scalar(
         about="what start and goal ask less of than the configuration, having less themselves", default=()
     )
-    validity: FloatArray | None = _array(
-        "sample demand",
-        about="in the profile joint: distance from the joint limits over that asked for; of each view least "
+    margins: FloatArray | None = _array(
+        "sample margin_kind",
+        about="in the profile joint_space: distance from the joint limits over that asked for; of each view least "
         "depth (start = 1), visibility a·O (start = 1), width of the face in px, distance from the image "
         "border less three deviations in px; distance from regions that are kept out of in px",
         default=None,
     )
-    validity_asked: FloatArray | None = _array(
-        "sample demand", about="what is asked of these, less near start and goals", default=None
+    required_margins: FloatArray | None = _array(
+        "sample margin_kind", about="what is asked of these, less near start and goals", default=None
     )
-    corner: FloatArray | None = _array(
-        "rounding end", "s", "in the profile joint: when each rounded corner begins and ends", default=None
+    blends: FloatArray | None = _array(
+        "blend end", "s", "in the profile joint_space: when each rounded corner begins and ends", default=None
     )
     tree_q: FloatArray | None = _array(
         "node joint",
@@ -524,23 +536,23 @@ class Trace:
     """One closed-loop run of one law, from the first instant to its verdict."""
 
     law: str = _scalar(about="name of the control law")
-    mode: str = _scalar(about="replan: each step plans anew; track, image_track: the plan is followed")
-    planned_s: float | None = _scalar("s", "when the followed plan arrives; none for replan")
+    mode: str = _scalar(about="regulate: each step moves to the goal by the present images; track, image_track: the plan is followed")
+    planned_s: float | None = _scalar("s", "when the followed plan arrives; none for regulate")
     verdict: str = _scalar(about="how the run ended")
     reason: str = _scalar(about="why, in a sentence")
     steps: int = _scalar(about="commands sent")
     period: float = _scalar("s", "control period")
-    observation: str = _scalar(about="how the face is measured: points or body")
+    features: str = _scalar(about="how the face is measured: points or body")
     position_error_mm: float | None = _scalar(
         "mm", "true centre to true goal at the end; of the tool where a robot tells its truth"
     )
     rotation_error_deg: float | None = _scalar("deg", "true rotation to the goal at the end")
-    translation_left: float | None = _scalar(
+    remaining_translation: float | None = _scalar(
         about="share of the translation left at the end, as the law measures it"
     )
-    rotation_left_deg: float | None = _scalar("deg", "rotation left at the end, as the law measures it")
-    self_occluded_steps_left: int = _scalar(about="instants at which the left camera is behind the face")
-    self_occluded_steps_right: int = _scalar(about="instants at which the right camera is behind the face")
+    remaining_rotation_deg: float | None = _scalar("deg", "rotation left at the end, as the law measures it")
+    self_occluded_steps_left: int = _scalar(about="times at which the left camera is behind the face")
+    self_occluded_steps_right: int = _scalar(about="times at which the right camera is behind the face")
     center_deviation_mm: float | None = _scalar(
         "mm", "largest distance of the centre from the line, between samples too"
     )
@@ -549,8 +561,8 @@ class Trace:
     )
     path_length_mm: float | None = _scalar("mm", "length of the path of the centre, from sample to sample")
     effort: float = _scalar("rad²/s or m²/s", "integral of the squared joint velocities")
-    plateau_steps: int = _scalar(
-        about="longest stretch in which stop_error falls < 1 % in each stop.plateau_steps"
+    longest_stall_steps: int = _scalar(
+        about="longest stretch in which convergence_error falls < 1 % in each stop.stall_periods"
     )
     speed_limited_steps: int = _scalar(about="commands scaled to the joint-speed limit")
     visibility_limited_steps: int = _scalar(about="commands whose translation was kept within delta·tau_0")
@@ -559,33 +571,33 @@ class Trace:
     limit_joint: int = _scalar(
         about="the joint, from 0, that passed its limit first or stopped the run at it, -1 for none"
     )
-    q: FloatArray = _array("instant joint", "rad or m", "joints")
-    s: FloatArray = _array("instant view marker xy", "px", "measured images of the face")
+    q: FloatArray = _array("time joint", "rad or m", "joints")
+    s: FloatArray = _array("time view marker xy", "px", "measured images of the face")
     s_star: FloatArray = _array("view marker xy", "px", "target images")
-    image_error: FloatArray = _array("instant", "px", "rms over markers and views")
-    stop_error: FloatArray = _array(
-        "instant",
+    image_error: FloatArray = _array("time", "px", "rms over markers and views")
+    convergence_error: FloatArray = _array(
+        "time",
         "px",
         "the same by which runs end: with the body, of the face where the body was measured to be",
     )
-    tau: FloatArray = _array("instant", about="translation error, unit-norm kernel of (8)")
-    tau_affine: FloatArray = _array("instant", about="translation error, scale fixed through a_inf")
-    theta_r: FloatArray = _array("instant", "rad", "rotation error onto the plane")
-    theta_p: FloatArray = _array("instant", "rad", "rotation error within the plane")
-    theta_s: FloatArray = _array("instant", "rad", "rotation error of both together")
+    tau: FloatArray = _array("time", about="translation error, unit-norm kernel of (8)")
+    tau_affine: FloatArray = _array("time", about="translation error, scale fixed through a_inf")
+    theta_r: FloatArray = _array("time", "rad", "rotation error onto the plane")
+    theta_p: FloatArray = _array("time", "rad", "rotation error within the plane")
+    theta_s: FloatArray = _array("time", "rad", "rotation error of both together")
     prediction_px: FloatArray = _array(
-        "instant", "px", "observed less predicted from the joints, rms per coordinate; NaN for points"
+        "time", "px", "observed less predicted from the joints, rms per coordinate; NaN for points"
     )
     fit_px: FloatArray = _array(
-        "instant", "px", "noise per coordinate that the fit of the body leaves; NaN for points"
+        "time", "px", "noise per coordinate that the fit of the body leaves; NaN for points"
     )
-    views_used: FloatArray = _array("instant", about="markers the body was fitted to, counted once a view")
+    views_used: FloatArray = _array("time", about="markers the body was fitted to, counted once a view")
     q_dot: FloatArray = _array("step joint", "rad/s or m/s", "commands after the limit")
     speed_factor: FloatArray = _array("step", about="factor of the joint-speed limit")
-    self_occluded: BoolArray = _array("instant view", about="true self-occlusion of the face")
-    pose: FloatArray = _array("instant row coordinate", "m", "true pose of the tool")
+    self_occluded: BoolArray = _array("time view", about="true self-occlusion of the face")
+    pose: FloatArray = _array("time row coordinate", "m", "true pose of the tool")
     goal_pose: FloatArray = _array("row coordinate", "m", "true goal pose, NaN if unknown")
-    center: FloatArray = _array("instant axis", "m", "true centre of the face")
+    center: FloatArray = _array("time axis", "m", "true centre of the face")
     image_error_px: float | None = _scalar(
         "px", "image_error at the end; none where the face was not seen whole", default=None
     )
@@ -600,7 +612,7 @@ class Trace:
         "behind the face and every marker of the face in both images; none where the truth is not known",
         default=None,
     )
-    searches_anew: int = _scalar(about="how often a way to the goal was searched anew", default=0)
+    replan_attempts: int = _scalar(about="how often a way to the goal was searched anew", default=0)
     unplanned: str = _scalar(
         about="why a run that was to follow the plan went without it; empty where it followed", default=""
     )
@@ -611,11 +623,11 @@ class Trace:
         about="periods that reading and thinking did not fit into; none for the ideal simulated robot",
         default=None,
     )
-    delay: FloatArray | None = _array(
-        "instant view", "s", "instant of the joint reading less that of the image, as followed", default=None
+    latency: FloatArray | None = _array(
+        "time view", "s", "time of the joint reading less that of the image, as followed", default=None
     )
-    frame_instant: IntArray | None = _array(
-        "frame", about="instants of which frames are kept; absent where the robot shows none", default=None
+    frame_index: IntArray | None = _array(
+        "frame", about="times of which frames are kept; absent where the robot shows none", default=None
     )
     frame_s: FloatArray | None = _array(
         "frame view observed xy", "px", "all that was found in them", default=None
@@ -627,7 +639,7 @@ class Trace:
         "frame_byte", about="the frames as JPEG, one after the other", default=None
     )
     q_read: FloatArray | None = _array(
-        "instant joint", "rad or m", "joint readings, where they are not the joints", default=None
+        "time joint", "rad or m", "joint readings, where they are not the joints", default=None
     )
 
 
@@ -640,21 +652,21 @@ class Report:
     """
 
     figures: tuple[str, ...] = _scalar(about="files written, relative to the folder of the run")
-    left_out: tuple[dict[str, str], ...] = _scalar(about="figures and studies left out, each with the reason")
+    omitted: tuple[dict[str, str], ...] = _scalar(about="figures and studies left out, each with the reason")
     claims: tuple[dict[str, Any], ...] = _scalar(about="claim, source, measured, criterion, holds")
     step_limit_deg: float = _scalar("deg", "joint motion per step of the limited runs")
     gain_per_step: FloatArray = _array("gain_per_step", about="share of the error taken in one step")
-    drift_mm: FloatArray = _array(
+    path_deviation_mm: FloatArray = _array(
         "law operators limit gain_per_step", "mm", "largest deviation of the centre"
     )
-    drift_at_samples_mm: FloatArray = _array(
+    path_deviation_at_samples_mm: FloatArray = _array(
         "law operators limit gain_per_step", "mm", "the same at the sampling instants"
     )
-    drift_converged: BoolArray = _array(
+    path_deviation_converged: BoolArray = _array(
         "law operators limit gain_per_step", about="whether the run converged"
     )
     period: FloatArray = _array("period", "s", "control period at the configured gains")
-    period_drift_mm: FloatArray = _array(
+    period_path_deviation_mm: FloatArray = _array(
         "law period", "mm", "largest deviation of the centre, true operators, no limit"
     )
     share: FloatArray = _array("share", about="share of the task in both sides of (22)")

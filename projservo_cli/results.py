@@ -104,7 +104,7 @@ class ImageModel(Displayable, Calibration):
         pixels = predict(self, rows)
         if not return_std:
             return pixels[0] if single else pixels
-        if not self.has_covariance or not self.shared_error.size:
+        if not self.has_covariance or not self.sqrt_cov_shared.size:
             raise InputError(f"return_std: the method {self.method} has no covariance; use refined")
         sigma = np.sqrt(prediction_variance(self, rows))
         return (pixels[0], sigma[0]) if single else (pixels, sigma)
@@ -161,7 +161,7 @@ class ImageModel(Displayable, Calibration):
         InputError
             If the method has no covariance.
         """
-        if not self.has_covariance or not self.shared_error.size:
+        if not self.has_covariance or not self.sqrt_cov_shared.size:
             raise InputError(f"covariance: the method {self.method} has none; use refined")
         factor = error_factor(self)
         return np.asarray(factor @ factor.T)
@@ -194,15 +194,15 @@ class ImageModel(Displayable, Calibration):
 
     def summary(self) -> dict[str, str]:
         """Return what there is to tell, in words, by name."""
-        weak = ", ".join(f"q{i + 1}" for i in np.flatnonzero(self.weak)) or "none"
-        left_out = len(self.outlier)
+        poorly = ", ".join(f"q{i + 1}" for i in np.flatnonzero(self.poorly_observable)) or "none"
+        rejected = len(self.outlier)
         return {
             "usable": f"{'yes' if self.usable else 'no'}: {self.reason}",
             "source": f"{self.source}, method {self.method}",
-            "joints": f"{self.joint_types}, weak: {weak}",
-            "poses": f"{self.merged_poses}",
-            "markers": f"{self.merged_markers}",
-            "left out": f"{left_out} readings",
+            "joints": f"{self.joint_types}, poorly observable: {poorly}",
+            "poses": f"{self.poses_used}",
+            "markers": f"{self.markers_used}",
+            "rejected": f"{rejected} observations",
             "residual": f"{self.rms_px:.4g} px rms per marker and view",
             "noise": f"{self.sigma_px:.4g} px per coordinate",
         }
@@ -265,7 +265,7 @@ class MotionPlan(Displayable, Plan):
             "rotation": f"{r:.4g} deg onto the plane, {p:.4g} deg within it, {s:.4g} deg together",
             "duration": "none" if self.duration is None else f"{self.duration:.4g} s",
             "nearest to failing": self.constraint,
-            "samples": str(len(self.sigma)),
+            "samples": str(len(self.path_parameter)),
         }
 
 
@@ -292,15 +292,15 @@ class RunTrace(Displayable, Trace):
         return plots.placed(plots.of_trace(self, self.face), ax)
 
     def coordinates(self) -> dict[str, Any]:
-        """Return coordinates of dimensions, by their names; ``time`` in s of every instant."""
-        time = ("instant", self.period * np.arange(len(self.q)), {"units": "s"})
+        """Return coordinates of dimensions, by their names; ``time`` in s."""
+        time = ("time", self.period * np.arange(len(self.q)), {"units": "s"})
         face = {"marker": list(self.face)} if self.face else {}
         return super().coordinates() | {"time": time} | face
 
     def summary(self) -> dict[str, str]:
         """Return what there is to tell, in words, by name."""
         found = {
-            "law": self.law if self.mode == "replan" else f"{self.law}, {self.mode}",
+            "law": self.law if self.mode == "regulate" else f"{self.law}, {self.mode}",
             "verdict": f"{self.verdict}: {self.reason}",
             "steps": f"{self.steps}, {self.steps * self.period:.4g} s",
             "image error": f"{self.image_error[-1]:.4g} px rms",

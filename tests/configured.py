@@ -89,7 +89,7 @@ def rendered_of(config):
 
 def shown_in_frames(config, truth, q, drawn):
     scene = given.scene_of(config)
-    return faults.shown_in_frames(scene, config.noise.shown_frames, q, drawn)
+    return faults.shown_in_frames(scene, config.noise.averaged_frames, q, drawn)
 
 
 def eyes_of(config):

@@ -16,19 +16,21 @@ def configured(name, *overrides):
 
 def known_scenario(config):
     """The scenario of a configuration whose face is measured point by point; nothing is calibrated."""
-    control = config.control.model_copy(update={"observation": "points"})
+    control = config.control.model_copy(update={"features": "points"})
     return scenario_of(config.model_copy(update={"control": control}))
 
 
 def asked(profile="linear", samples=101, duration=None, ramp=0.0, **more):
     """A motion that is asked for."""
-    return trajectory_of(profile=profile, samples=samples, duration_s=duration, ramp_s=ramp, **more)
+    return trajectory_of(
+        profile=profile, n_samples=samples, duration_s=duration, acceleration_time_s=ramp, **more
+    )
 
 
 def planned(scenario, model, profile="linear", samples=11, **more):
     """Plan of a scenario with a model of it."""
-    delta = scenario.inputs.trajectory.delta
-    return plan_task(model, scenario.ends, asked(profile, samples, delta=delta, **more), scenario.demands)
+    delta = scenario.inputs.trajectory.visibility_fraction
+    return plan_task(model, scenario.ends, asked(profile, samples, visibility_fraction=delta, **more), scenario.demands)
 
 
 def driven(scenario, plan, name, model, **limits):

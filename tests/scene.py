@@ -93,9 +93,9 @@ def limits(n=6, **given) -> Limits:
     """Limits that end a run only at its goal, or as given."""
     values = {
         "speed": np.full(n, math.inf),
-        "image_px": 1e-3,
+        "image_error_px": 1e-3,
         "diverged_factor": 10.0,
-        "plateau_steps": 20,
+        "stall_periods": 20,
         "max_steps": 400,
         "stop_at_joint_limit": False,
         "stop_at_border": False,

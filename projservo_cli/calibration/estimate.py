@@ -30,7 +30,7 @@ from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.geometry.lens import K1
 from projservo_cli.records import Calibration, Errors, InputError, Observation
 
-_METHODS = ("refined", "closed_form")
+_METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
 _DOUBTFUL_RATIO = 2.0
 # Maximum share of the noise that a change of one joint leaves if that joint is at fault.
@@ -63,7 +63,7 @@ def calibrate(
     observation: Observation,
     joint_types: str,
     *,
-    method: str = "refined",
+    method: str = "bundle_adjustment",
     sigma_px: float | None = None,
     source: str = "simulated",
     image_size: tuple[int, int] | None = None,
@@ -80,7 +80,7 @@ def calibrate(
     ----------
     observation : stereo images of the markers at a sequence of poses, raw px, NaN where unseen.
     joint_types : one letter a joint, R or P.
-    method : ``refined`` (maximum likelihood) or ``closed_form`` (eqs. 4, 5).
+    method : ``bundle_adjustment`` (maximum likelihood) or ``closed_form`` (eqs. 4, 5).
     sigma_px : noise per coordinate, px; None takes the root mean square of the observation's ``sigma``,
         for a recording times the common factor that both views show, else estimates it from the epipolar
         geometry. The sigma of a detection sets its weight.
@@ -88,11 +88,11 @@ def calibrate(
     image_size : width and height, px, for the start of the search; None takes the extent of the data.
     seed : seed of the random starts.
     lens : whether to estimate two coefficients of radial distortion a camera, about the image centre.
-    init : robot and rig that ``refined`` tries first as a start; a search follows if that fails.
-    joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad), for ``refined``;
+    init : robot and rig that ``bundle_adjustment`` tries first as a start; a search follows if that fails.
+    joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad), for ``bundle_adjustment``;
         None estimates it, and takes 0 unless the images show it.
-    fitted : called with the solution of ``refined`` and its noise, px, where the record is not enough.
-    progress : called with the current task of ``refined``, how much of it is done, and its total.
+    fitted : called with the solution of ``bundle_adjustment`` and its noise, px, where the record is not enough.
+    progress : called with the current task of ``bundle_adjustment``, how much of it is done, and its total.
 
     Returns
     -------
@@ -117,7 +117,7 @@ def calibrate(
         raise InputError(f"seed {seed!r}: give a whole number that is not negative")
     if joint_noise is not None and not 0.0 <= joint_noise < np.inf:
         raise InputError(f"joint noise {joint_noise!r}: give a number that is not negative, or none")
-    if lens and method != "refined":
+    if lens and method != "bundle_adjustment":
         raise InputError(
             f"calibration method {method!r} estimates no lens: choose refined, or calibrate without"
         )
@@ -148,7 +148,7 @@ def calibrate(
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
             fitted(solution, expected.noise_px(solution))
-        if method == "refined":
+        if method == "bundle_adjustment":
             result = with_time_offset(result, observation)
     return dataclasses.replace(result, source=source, seconds=seconds)
 
@@ -237,7 +237,7 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     outlier = outlier[np.lexsort(outlier.T[::-1])]
     lost = rejection_reasons(whole, kept)
     lost[:, 0] = detections.marker[lost[:, 0]]
-    return dataclasses.replace(record, outlier=outlier, lost=lost, advice=(*advice, seldom))
+    return dataclasses.replace(record, outlier=outlier, rejected_markers=lost, advice=(*advice, seldom))
 
 
 def _describe_unmoved(solution: Solution) -> str | None:
@@ -284,7 +284,7 @@ def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tupl
             return ()
         return (f"lens distortion would explain {100.0 * share:.0f} % of the squared residuals: try --lens",)
     k = calibration.lens[:, K1:].ravel()
-    of_lenses = calibration.shared_error[-k.size :]
+    of_lenses = calibration.sqrt_cov_shared[-k.size :]
     statistic = k @ np.linalg.solve(of_lenses @ of_lenses.T, k)
     if statistic < chdtri(k.size, _NO_LENS_TAIL):
         return ("the images show no lens distortion: omit --lens",)
@@ -322,7 +322,7 @@ def _record(
     suspicion : likely cause if residuals exceed pixel noise.
     Raises WorkFailed if a joint is not determined.
     """
-    method = "closed_form" if errors is None else "refined"
+    method = "closed_form" if errors is None else "bundle_adjustment"
     problem, detections, params = solution.problem, solution.problem.detections, result.params
     if errors is None:
         m, unknown = len(params.M), np.full(params.P.size + params.H_hat.size, np.nan)
@@ -360,22 +360,22 @@ def _record(
         a_inf=result.a_inf,
         marker=detections.marker,
         M=params.M,
-        shared_error=off.shared,
-        marker_error=off.marker,
-        own_error=off.own,
+        sqrt_cov_shared=off.shared,
+        sqrt_cov_marker=off.marker,
+        sqrt_cov_own=off.own,
         excitation=verdict.span,
-        lowest=detections.q[np.unique(detections.pose_of)].min(axis=0),
-        weak=verdict.noise > WEAK_NOISE,
+        joint_min=detections.q[np.unique(detections.pose_of)].min(axis=0),
+        poorly_observable=verdict.noise > WEAK_NOISE,
         operator_defect=operator_defect,
         trace_defect=trace_defect,
         plane_defect=plane_defect,
         prediction_noise=verdict.noise,
-        merged_poses=int(np.unique(detections.pose_of[used_rows]).size),
-        merged_markers=int(np.unique(detections.marker_of[used_rows]).size),
+        poses_used=int(np.unique(detections.pose_of[used_rows]).size),
+        markers_used=int(np.unique(detections.marker_of[used_rows]).size),
         outlier=outlier,
         suspect=np.stack([detections.pose[found.suspect[:, 0]], found.suspect[:, 1] + 1], axis=1),
-        lost_poses=detections.pose[found.poses],
-        swapped=np.concatenate(
+        rejected_poses=detections.pose[found.poses],
+        id_switches=np.concatenate(
             [detections.pose[found.id_switches[:, :1]], detections.marker[found.id_switches[:, 1:]]], axis=1
         ),
         predicted_rms_px=None if verdict.error is None else verdict.error[0],
@@ -383,6 +383,6 @@ def _record(
         lens=params.lens,
         sigma_q=None if joint_noise is None else joint_noise.sigma_q,
         sigma_q_interval=None if joint_noise is None else joint_noise.interval,
-        ticks=joint_noise is not None and joint_noise.ticks,
+        encoder_counts=joint_noise is not None and joint_noise.ticks,
         model_px=float(np.sqrt(over)),
     )

@@ -140,7 +140,9 @@ def with_time_offset(calibration: Calibration, observation: Observation) -> Cali
     if len(found) < len(views):
         return calibration
     mean, interval, jitter = (np.array(values) for values in zip(*found, strict=True))
-    return replace(calibration, delay_s=mean, delay_interval_s=interval, delay_jitter_s=jitter)
+    return replace(
+        calibration, time_offset_s=mean, time_offset_interval_s=interval, time_offset_jitter_s=jitter
+    )
 
 
 def _motions(q: FloatArray, moving: IntArray, t_q: FloatArray) -> dict[int, tuple[FloatArray, FloatArray]]:

@@ -160,13 +160,13 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
         )
     if value["sigma_q"] is not None:
         yield wrapped(f"joint readings: {_joint_noise(value)}", "  ")
-    if value["delay_s"] is not None:
+    if value["time_offset_s"] is not None:
         yield wrapped(f"images late by {', '.join(_delays(value))}", "  ")
-    weak = ", ".join(joint["name"] for joint in value["joints"] if joint["weak"])
-    if weak:
-        yield wrapped(f"weak joints: {weak}", "  ")
-    for text in _left_out(value):
-        yield wrapped(f"left out: {text}", "  ")
+    poorly = ", ".join(joint["name"] for joint in value["joints"] if joint["poorly_observable"])
+    if poorly:
+        yield wrapped(f"poorly observable joints: {poorly}", "  ")
+    for text in _rejected(value):
+        yield wrapped(f"rejected: {text}", "  ")
     if len(value["joints"]) == 1:
         yield wrapped(_ONE_JOINT, "  ")
     if value["predicted_rms_px"] is not None:
@@ -183,12 +183,12 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
 
 
 _ONE_JOINT = "one joint: how it moves images is known; directions and lengths in space take more joints"
-_EXAMPLES = 3  # of each kind of what was left out
+_EXAMPLES = 3  # of each kind of rejected observations
 
 
-def _left_out(value: dict[str, Any]) -> Iterator[str]:
-    """What a calibration left out: of each kind how many, and the first of them."""
-    counts = value["left_out"]
+def _rejected(value: dict[str, Any]) -> Iterator[str]:
+    """Rejected observations of a calibration: of each kind how many, and the first of them."""
+    counts = value["rejected"]
     whole = {number for numbers in counts["tracks"].values() for number in numbers}
     single = [
         f"marker {one['marker']} at pose {one['pose']}" + ("" if one["view"] == "both" else f" {one['view']}")
@@ -200,12 +200,12 @@ def _left_out(value: dict[str, Any]) -> Iterator[str]:
     for why, numbers in counts["tracks"].items():
         if numbers:
             yield _counted([str(number) for number in numbers], "marker", f", {why}")
-    if value["swapped"]:
+    if value["id_switches"]:
         swaps = [
             "{} under the number of {} at pose {}".format(*reversed(one["markers"]), one["pose"])
-            for one in value["swapped"]
+            for one in value["id_switches"]
         ]
-        yield _counted(swaps, "swapped sighting")
+        yield _counted(swaps, "ID switch")
     suspect = {one["pose"]: one["joint"] for one in value["suspect_joint_readings"]}
     if poses := counts["poses"]:
         named = [f"{pose} by joint {suspect[pose]}" if pose in suspect else str(pose) for pose in poses]
@@ -234,7 +234,11 @@ def _joint_noise(value: dict[str, Any]) -> str:
 def _delays(value: dict[str, Any]) -> Iterator[str]:
     """By how much images of each view are late, with the interval and by how much single ones differ, ms."""
     for i, view in enumerate(("left", "right")):
-        late = value["delay_s"][i], *value["delay_interval_s"][i], value["delay_jitter_s"][i]
+        late = (
+            value["time_offset_s"][i],
+            *value["time_offset_interval_s"][i],
+            value["time_offset_jitter_s"][i],
+        )
         delay, low, high, jitter = (round(1e3 * seconds, 1) + 0.0 for seconds in late)  # no -0.0
         yield f"{delay:.1f} ms {view} (95 %: {low:.1f} to {high:.1f}; single ones ± {jitter:.1f})"
 
@@ -263,24 +267,24 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
 
     feasible = "feasible" if value["feasible"] else "NOT feasible"
     yield wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}")
-    instead = [text if detailed else ": ".join(text.split(": ")[:2]) for text in value["instead"]]
-    if instead:
-        yield wrapped("; ".join(f"not {text}" for text in instead), "  ")
-    for text in value["lowered"]:
+    profiles = [text if detailed else ": ".join(text.split(": ")[:2]) for text in value["rejected_profiles"]]
+    if profiles:
+        yield wrapped("; ".join(f"not {text}" for text in profiles), "  ")
+    for text in value["relaxed_constraints"]:
         yield wrapped(text, "  ")
     if detailed:
         yield (
             "  rotation {theta_s_deg:.2f} deg = {theta_r_deg:.2f} deg onto the plane, "
             "{theta_p_deg:.2f} deg within it".format_map(value)
         )
-        least = (f"{name} {_number(value['margins'][name]['least'])}" for name in NEAREST)
-        yield f"  least: {', '.join(least)}"
+        lowest = (f"{name} {_number(value['margins'][name]['min'])}" for name in NEAREST)
+        yield f"  minimum: {', '.join(lowest)}"
         if value["duration"]:
             yield f"  duration {value['duration']:.3g} s"
-        if value["goals"] is not None:
+        if value["n_goal_configurations"] is not None:
             yield wrapped(
-                "search: {goals} joint vectors show the goal, {goals_tried} were tried; {samples} samples of "
-                "seed {seed}, {tree_nodes} joint vectors in both trees".format_map(value),
+                "search: {n_goal_configurations} goal configurations, {n_goals_tried} tried; {n_search_samples} "
+                "samples of seed {seed}, {tree_nodes} joint vectors in both trees".format_map(value),
                 "  ",
             )
 
@@ -290,9 +294,9 @@ def _of_laws(value: dict[str, Any]) -> Iterator[str]:
 
     known = any(trace["position_error_mm"] is not None for trace in value["laws"])
     keys = ("position_error_mm", "rotation_error_deg", "center_deviation_mm")
-    heads = "mm", "deg", "drift mm"
+    heads = "position mm", "rotation deg", "path deviation mm"
     if not known:
-        keys, heads = ("image_error_px", "estimated_position_error_mm", ""), ("px", "about mm", "")
+        keys, heads = ("image_error_px", "estimated_position_error_mm", ""), ("image px", "about mm", "")
     errors = "true errors" if known else "image errors"
     yield f"servo: {errors} at the end, self-occluded steps left/right"
     first, second, last = heads
@@ -324,11 +328,11 @@ def _of_report(value: dict[str, Any], detailed: bool) -> Iterator[str]:
         else:
             yield f"  - {textwrap.shorten(claim['claim'], 76, placeholder='…')}"
     reasons: dict[str, list[str]] = {}
-    for row in value["left_out"]:
+    for row in value["omitted"]:
         reasons.setdefault(row["reason"], []).append(row["what"])
     for reason, what in reasons.items():
-        left_out = f"left out: {', '.join(what)}" if detailed else f"{len(what)} left out"
-        yield wrapped(f"{left_out}: {reason}", "  ")
+        omitted = f"omitted: {', '.join(what)}" if detailed else f"{len(what)} omitted"
+        yield wrapped(f"{omitted}: {reason}", "  ")
     for name in ("page", "view", "animation"):
         if value.get(name):
             yield f"{name}: {value[name]}"

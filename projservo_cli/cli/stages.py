@@ -297,10 +297,10 @@ def _asked(
 
     given, records = _law_names(options.get("laws", ())), "record" in names
     config, stored = option.resolve(options, recording=records)
-    if options.get("suggest") is not None and config.calibration.method != "refined":
+    if options.get("suggest") is not None and config.calibration.method != "bundle_adjustment":
         raise click.UsageError(
             f"--suggest: the method {config.calibration.method} has no covariance to judge poses by; "
-            "use --set calibration.method=refined"
+            "use --set calibration.method=bundle_adjustment"
         )
     if wanted := _extras(options):
         require_extras(config, wanted)
@@ -484,7 +484,7 @@ def _findings(call: _Call) -> Iterator[tuple[str, bool]]:
         yield f"calibrate: {beside['suggestions_reason']}", True
     yield from _of_runs(chain)
     # Other profiles are those of the paper, of which the margins are only measured.
-    searched = "plan" in results and chain.run.plan.profile in ("constrained", "joint")
+    searched = "plan" in results and chain.run.plan.profile in ("constrained", "joint_space")
     if searched and not chain.run.plan.feasible:
         yield f"plan: {chain.run.plan.reason}", "plan" in chain.names
 
@@ -507,7 +507,7 @@ def _of_runs(chain: Any) -> Iterator[tuple[str, bool]]:
                 "find fewer markers"
             )
         # Classical laws lead where nothing can be expected of them, images included.
-        disturbed = trace.verdict == "disturbed" and trace.law not in POINT_LAWS
+        disturbed = trace.verdict == "fault detected" and trace.law not in POINT_LAWS
         yield said, not converged and (must or disturbed)
 
 

@@ -35,11 +35,11 @@ from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Pa
 from projservo_cli.simulation import dh
 from projservo_cli.simulation.arm import Arm, twist
 from projservo_cli.simulation.faults import (
-    Bump,
+    JointMoved,
     CameraMoved,
     Events,
     Faults,
-    FrozenJoint,
+    StuckEncoder,
     LostMarkers,
     MarkerMoved,
     SimulatedRobot,
@@ -72,7 +72,7 @@ from projservo_cli.task.trajectory import KeptOut, Trajectory
 
 _RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
 _TICKS = 4096  # in a turn of an encoder that is as coarse as any
-# Accelerations that the profile joint takes where no limit is given, deg/s² and m/s².
+# Accelerations that the profile joint_space takes where no limit is given, deg/s² and m/s².
 _ACCELERATION_DEG_S2, _ACCELERATION_M_S2 = 500.0, 2.0
 _EXPECTED = {
     "table": "a table",
@@ -109,7 +109,7 @@ def recording_inputs(config: Config) -> RecordingInputs:
     own = None if plant.simulated else _own(config)
     trials = _trials(config, truth, own, None, speed_scale=plant.speed_scale)
     # A robot that a caller brings along takes the place of the ideal plant too.
-    trials = replace(trials, frames=plant.frames, settle_s=plant.settle_s)
+    trials = replace(trials, averaged_frames=plant.averaged_frames, settle_s=plant.settle_s)
     given = plant.options.get("dictionary", markers.dictionary)
     return RecordingInputs(
         trials=trials,
@@ -117,7 +117,7 @@ def recording_inputs(config: Config) -> RecordingInputs:
         face=markers.front or (),
         dictionary=None if given is None else str(given),
         tagged=(markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None),
-        sag_deg=plant.sag_deg,
+        max_steady_state_error_deg=plant.max_steady_state_error_deg,
     )
 
 
@@ -166,9 +166,9 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         joints=joints_of(config),
         image_size=config.image_size_px,
         noise_px=config.noise.servo_px,
-        frames=config.noise.shown_frames,
-        features=config.control.observation,
-        tests_images=config.stop.innovation_factor > 0.0,
+        averaged_frames=config.noise.averaged_frames,
+        features=config.control.features,
+        tests_images=config.stop.innovation_threshold > 0.0,
         trajectory=trajectory_of(config),
     )
 
@@ -185,15 +185,15 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
             Gains,
             control,
             period=control.period_s,
-            delta=plan.trajectory.delta,
+            visibility_fraction=plan.trajectory.visibility_fraction,
             limits=UNLIMITED,
             substeps=control.substeps == "auto",
         ),
         stop=_taken(StopSettings, stop, at_joint_limit=at_limit, at_border=plant.image_border == "stop"),
         opaque=plant.self_occlusion == "opaque",
         speed_scale=plant.speed_scale,
-        searches_anew=control.searches_anew,
-        refuses=control.without_plan == "refuse",
+        max_replan_attempts=control.max_replan_attempts,
+        refuses=control.on_plan_failure == "refuse",
         lengths=config.markers.lengths(plan.face),
         contract=_contract(config, plan, files),
     )
@@ -208,7 +208,7 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
     if plan.truth is not None:
         robot = _simulated(config, plan.truth, files)
     driven = Driven(robot, _following(config, plant.speed_scale), _endless(config))
-    delay = None if plant.delay_s is None else (plant.delay_s.left, plant.delay_s.right)
+    delay = None if plant.time_offset_s is None else (plant.time_offset_s.left, plant.time_offset_s.right)
     settle_s = plant.settle_s if plan.truth is None else None
     return Contract(driven, events_of(config), plant.timeout_s, delay, settle_s)
 
@@ -221,7 +221,7 @@ def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
     if not config.has_task:
         return ReportInputs(about, formats, None, trajectory)
     alone = {
-        "control": config.control.model_copy(update={"observation": "points"}),
+        "control": config.control.model_copy(update={"features": "points"}),
         "trajectory": config.trajectory.model_copy(update={"keep_out": ()}),
     }
     extra = servo_inputs(config.idealized.model_copy(update=alone), files)
@@ -444,7 +444,13 @@ def _readings(vector: JointVector | None) -> Readings | None:
 def _following(config: Config, speed_scale: float) -> Following:
     """How commands go to a robot of the contract."""
     plant = config.plant
-    return Following(config.control.period_s, speed_scale, plant.lag_s, plant.sag_deg, plant.lead_deg)
+    return Following(
+        config.control.period_s,
+        speed_scale,
+        plant.max_servo_lag_s,
+        plant.max_steady_state_error_deg,
+        plant.max_relative_target_deg,
+    )
 
 
 def _endless(config: Config) -> bool:
@@ -470,10 +476,10 @@ def faults_of(config: Config) -> Faults:
     return _taken(
         Faults,
         given,
-        delay_s=(given.delay_s.left, given.delay_s.right),
-        sag=math.radians(given.sag_deg),
-        flex=math.radians(given.flex_deg),
-        play=math.radians(given.play_deg),
+        camera_latency_s=(given.camera_latency_s.left, given.camera_latency_s.right),
+        gravity_sag=math.radians(given.gravity_sag_deg),
+        link_deflection=math.radians(given.link_deflection_deg),
+        backlash=math.radians(given.backlash_deg),
     )
 
 
@@ -482,14 +488,16 @@ def events_of(config: Config) -> Events:
     given, found = config.disturbance, dict[str, Any]()
     if given.lost_markers is not None:
         found["lost_markers"] = _taken(LostMarkers, given.lost_markers)
-    if (bump := given.bump) is not None:
-        by = bump.by_m or 0.0 if bump.by_deg is None else math.radians(bump.by_deg)
-        found["bump"] = Bump(bump.at_step, bump.joint - 1, by, bump.read)
-    if given.frozen_joint is not None:
-        found["frozen_joint"] = _taken(FrozenJoint, given.frozen_joint, joint=given.frozen_joint.joint - 1)
+    if (moved := given.joint_moved) is not None:
+        by = moved.by_m or 0.0 if moved.by_deg is None else math.radians(moved.by_deg)
+        found["joint_moved"] = JointMoved(moved.at_step, moved.joint - 1, by, moved.encoder_slip)
+    if given.stuck_encoder is not None:
+        found["stuck_encoder"] = _taken(
+            StuckEncoder, given.stuck_encoder, joint=given.stuck_encoder.joint - 1
+        )
     if given.camera_moved is not None:
-        moved = given.camera_moved.by_view()
-        found["camera_moved"] = CameraMoved(given.camera_moved.at_step, (moved[0], moved[1]))
+        left, right = given.camera_moved.by_view()
+        found["camera_moved"] = CameraMoved(given.camera_moved.at_step, (left, right))
     if given.marker_moved is not None:
         found["marker_moved"] = _taken(MarkerMoved, given.marker_moved, by=given.marker_moved.by_m)
     return Events(**found)
@@ -528,7 +536,7 @@ def _trials(
         (float(np.radians(settings.amplitude_deg)), settings.amplitude_m),
         settings.frames_per_joint,
         poses,
-        0.0 if faultless else 2.0 * math.pi / (config.disturbance.encoder_ticks or _TICKS),
+        0.0 if faultless else 2.0 * math.pi / (config.disturbance.encoder_counts_per_turn or _TICKS),
         _seed(config),
     )
     noise, joints = config.noise.calibration_px, joints_of(config, paced=driven)
@@ -539,7 +547,7 @@ def _trials(
         robot = SimulatedRobot(truth, faults, scene, config.control.period_s)
     how = Driven(robot, _following(config, speed_scale), _endless(config))
     plant = config.plant
-    return Trials(motions, joints, truth, how, noise, plant.frames, plant.settle_s)
+    return Trials(motions, joints, truth, how, noise, plant.averaged_frames, plant.settle_s)
 
 
 def task_of(config: Config) -> ReachingTask | None:
@@ -553,10 +561,10 @@ def task_of(config: Config) -> ReachingTask | None:
 
 def _goal(goal: GoalSettings, config: Config) -> Goal:
     turn = images = None
-    if goal.turn_deg is not None:
+    if goal.roll_deg is not None:
         near = goal.perturbation
         displacement = None if near is None else (near.translation_m, near.rotation_rad)
-        turn = Turn(math.radians(goal.turn_deg), displacement)
+        turn = Turn(math.radians(goal.roll_deg), displacement)
     if (seen := goal.images) is not None:
         numbers = seen.markers or config.face_numbers
         sigma = seen.sigma_left_px, seen.sigma_right_px
@@ -571,9 +579,9 @@ def trajectory_of(config: Config) -> Trajectory:
         Trajectory,
         given,
         joint_margin=math.radians(given.joint_margin_deg),
-        search_samples=given.search.samples,
+        max_search_samples=given.search.max_samples,
         search_seed=given.search.seed,
-        keep_out=tuple(KeptOut(region.left, region.right, region.hides) for region in given.keep_out),
+        keep_out=tuple(KeptOut(region.left, region.right, region.occludes) for region in given.keep_out),
     )
 
 

@@ -33,7 +33,7 @@ from projservo_cli.config.robot import (
     are_degrees,
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
-from projservo_cli.laws import LAW_SPECS, LAWS, REPLAN
+from projservo_cli.laws import LAW_SPECS, LAWS, REGULATE
 from projservo_cli.nominal import Number, Vector3
 from projservo_cli.records import LIMITS_MISSING, InputError
 from projservo_cli.robots import plugins
@@ -49,14 +49,14 @@ class LostMarkers(Section):
     )
 
 
-class _Bump(Section):
-    """A joint knocked aside; ``read: false`` for a joint that slips on its encoder."""
+class _JointMoved(Section):
+    """A joint that is pushed aside, or slips on its encoder."""
 
-    at_step: Count = Field(description="step at which it is knocked")
+    at_step: Count = Field(description="step at which it moves")
     joint: Count = Field(description="the joint, counted from 1")
     by_deg: Number | None = Field(None, description="how far, a revolute joint")
     by_m: Number | None = Field(None, description="how far, a prismatic joint")
-    read: StrictBool = Field(True, description="whether its reading follows")
+    encoder_slip: StrictBool = Field(False, description="whether its reading stays where it was")
 
     def contradictions(self) -> Iterator[Finding]:
         """An angle and a distance, or neither."""
@@ -64,7 +64,7 @@ class _Bump(Section):
             yield (), "give exactly one of by_deg and by_m"
 
 
-class FrozenJoint(Section):
+class StuckEncoder(Section):
     """A joint whose reading stands still while it moves."""
 
     joint: Count = Field(description="the joint, counted from 1")
@@ -108,12 +108,12 @@ def _of_both(value: Any) -> Any:
 class Disturbance(Section):
     """What is wrong with the simulated robot, and what befalls it and its images."""
 
-    delay_s: Annotated[_Delays, BeforeValidator(_of_both, json_schema_input_type=NotNegative | _Delays)] = (
-        Field(
-            _Delays(),
-            description="time from the middle of an exposure to the joint readings that come with its image, "
-            "half the exposure at least; a number for both cameras, or {left, right}",
-        )
+    camera_latency_s: Annotated[
+        _Delays, BeforeValidator(_of_both, json_schema_input_type=NotNegative | _Delays)
+    ] = Field(
+        _Delays(),
+        description="time from the middle of an exposure to the joint readings that come with its image, "
+        "half the exposure at least; a number for both cameras, or {left, right}",
     )
     exposure_s: NotNegative = Field(0.0, description="time over which an image is averaged")
     jitter_s: NotNegative = Field(0.0, description="standard deviation of when single images are taken")
@@ -126,19 +126,25 @@ class Disturbance(Section):
     stamps: StrictBool = Field(
         False, description="whether images carry the middle of their exposure, each camera by its own clock"
     )
-    encoder_ticks: Count | None = Field(
+    encoder_counts_per_turn: Count | None = Field(
         None, description="steps of joint readings in a turn, or in 1.885 m of a prismatic joint"
     )
-    setpoint_ticks: StrictBool = Field(False, description="whether set-points are whole ticks too")
-    lag_s: NotNegative = Field(0.0, description="time constant with which joints follow their set-points")
-    sag_deg: NotNegative = Field(
+    quantize_setpoints: StrictBool = Field(False, description="whether set-points are whole ticks too")
+    servo_time_constant_s: NotNegative = Field(
+        0.0, description="time constant with which joints follow their set-points"
+    )
+    gravity_sag_deg: NotNegative = Field(
         0.0, description="by which gravity turns a joint off its set-point at full reach; it is read"
     )
-    flex_deg: NotNegative = Field(0.0, description="the same of a link beyond its encoder, which is not read")
-    play_deg: NotNegative = Field(0.0, description="play between each encoder and its link, from end to end")
+    link_deflection_deg: NotNegative = Field(
+        0.0, description="the same of a link beyond its encoder, which is not read"
+    )
+    backlash_deg: NotNegative = Field(
+        0.0, description="play between each encoder and its link, from end to end"
+    )
     lost_markers: LostMarkers | None = None
-    bump: _Bump | None = None
-    frozen_joint: FrozenJoint | None = None
+    joint_moved: _JointMoved | None = None
+    stuck_encoder: StuckEncoder | None = None
     camera_moved: _CameraMoved | None = None
     marker_moved: _MarkerMoved | None = None
 
@@ -146,8 +152,8 @@ class Disturbance(Section):
         """What says nothing without another key."""
         if self.frame_offset_s and self.frame_rate_hz is None:
             yield ("frame_offset_s",), "is that of cameras that run freely: set frame_rate_hz as well"
-        if self.setpoint_ticks and self.encoder_ticks is None:
-            yield ("setpoint_ticks",), "takes the ticks of encoders: set encoder_ticks as well"
+        if self.quantize_setpoints and self.encoder_counts_per_turn is None:
+            yield ("quantize_setpoints",), "takes the ticks of encoders: set encoder_counts_per_turn as well"
 
 
 def _law(name: str) -> str:
@@ -196,7 +202,7 @@ def one_or_more(value: Any) -> Any:
     return [value] if isinstance(value, str) else value
 
 
-_Mode = Literal["replan", "track", "image_track"]
+_Mode = Literal["regulate", "track", "image_track"]
 _Modes = Annotated[tuple[_Mode, ...], Field(min_length=1)]
 
 
@@ -205,7 +211,7 @@ class _Noise(Section):
 
     calibration_px: NotNegative = Field(0.5, description="in the images of trial motions")
     servo_px: NotNegative = Field(0.0, description="in the images of the closed loop")
-    shown_frames: Count = Field(
+    averaged_frames: Count = Field(
         1, description="images averaged of the start and of the goal, where the robot rests"
     )
 
@@ -213,8 +219,8 @@ class _Noise(Section):
 class _CalibrationSettings(Section):
     """Trial motions of one joint each around a reference, and the method that evaluates them."""
 
-    method: Literal["refined", "closed_form"] = Field(
-        "refined", description="bundle adjustment; the paper's closed forms"
+    method: Literal["bundle_adjustment", "closed_form"] = Field(
+        "bundle_adjustment", description="bundle adjustment; the paper's closed forms"
     )
     frames_per_joint: StrictInt = Field(
         8, ge=0, le=10_000, description="trial poses of each joint, beside the reference"
@@ -255,8 +261,8 @@ class _CalibrationSettings(Section):
     def contradictions(self) -> Iterator[Finding]:
         """What another method takes."""
         for key in ("cross_validate", "init"):
-            if getattr(self, key) is not None and self.method != "refined":
-                yield (key,), f"belongs to the method refined, not to {self.method}"
+            if getattr(self, key) is not None and self.method != "bundle_adjustment":
+                yield (key,), f"belongs to the method bundle_adjustment, not to {self.method}"
 
 
 class _Data(Section):
@@ -286,15 +292,17 @@ class _Control(Section):
         description="laws to run, each from the start; module:Class for a law of yours",
     )
     mode: Annotated[_Modes, BeforeValidator(one_or_more, json_schema_input_type=_Mode | _Modes)] = Field(
-        ("replan",),
+        ("regulate",),
         description="whether each step plans anew or the plan is followed; with a list, each law in those "
         "of the modes that it has",
     )
-    without_plan: Literal["replan", "refuse"] = Field(
-        "replan", description="whether a law that no joints could follow the plan with replans, or is not run"
+    on_plan_failure: Literal["regulate", "refuse"] = Field(
+        "regulate",
+        description="whether a law that no joints could follow the plan with replans, or is not run",
     )
-    searches_anew: Whole = Field(
-        3, description="how often a way is searched anew where one comes to nothing, profiles joint and auto"
+    max_replan_attempts: Whole = Field(
+        3,
+        description="how often a way is searched anew where one comes to nothing, profiles joint_space and auto",
     )
     must_converge: tuple[Law, ...] | None = Field(
         None,
@@ -311,15 +319,15 @@ class _Control(Section):
     joint_speed_limit_deg_s: Positive | None = Field(125.0, description="of revolute joints; null for none")
     prismatic_speed_limit_m_s: Positive | None = Field(None, description="of prismatic joints; null for none")
     joint_acceleration_limit_deg_s2: Positive | None = Field(
-        None, description="of revolute joints in the profile joint; null for 500"
+        None, description="of revolute joints in the profile joint_space_space; null for 500"
     )
     prismatic_acceleration_limit_m_s2: Positive | None = Field(
-        None, description="of prismatic joints in the profile joint; null for 2"
+        None, description="of prismatic joints in the profile joint_space_space; null for 2"
     )
     substeps: Literal["none", "auto"] = Field(
         "auto", description="whether the law exact sends long steps in parts"
     )
-    observation: Literal["points", "body"] | None = Field(
+    features: Literal["points", "body"] | None = Field(
         None,
         description="what direct laws measure with: the face's points or all visible markers; "
         "null for body where the calibration is usable",
@@ -376,22 +384,26 @@ class _PlantSettings(Section):
     options: dict[str, Plain] = Field({}, description="arguments that the class is made with")
     timeout_s: Positive = Field(1.0, description="most time an answer of the robot may take")
     open_s: Positive = Field(30.0, description="most time that opening the robot may take")
-    lead_deg: Positive | None = Field(
+    max_relative_target_deg: Positive | None = Field(
         None, description="how far a set-point may lead the reading; null for what lag and sag ask for"
     )
-    lag_s: NotNegative = Field(0.15, description="by how much the robot may lag behind its set-point")
-    sag_deg: NotNegative = Field(
+    max_servo_lag_s: NotNegative = Field(
+        0.15, description="by how much the robot may lag behind its set-point"
+    )
+    max_steady_state_error_deg: NotNegative = Field(
         1.0,
         description="how far a joint at rest may stay from its set-point; prismatic: 5 mm a degree",
     )
-    delay_s: Annotated[
+    time_offset_s: Annotated[
         _EachView | None, BeforeValidator(_of_both, json_schema_input_type=Number | _EachView | None)
     ] = Field(
         None,
         description="time from the middle of an exposure to the joint readings that come with its image; "
         "a number for both cameras, or {left, right}; null to estimate it",
     )
-    frames: StrictInt = Field(1, ge=1, le=1000, description="images of each pose that record averages")
+    averaged_frames: StrictInt = Field(
+        1, ge=1, le=1000, description="images of each pose that record averages"
+    )
     settle_s: Positive = Field(
         0.5, description="for how long joints and images have stood still before a pose is recorded"
     )
@@ -420,15 +432,17 @@ class _PlantSettings(Section):
 class _Stop(Section):
     """When a closed loop ends."""
 
-    image_px: Positive = Field(0.01, description="converged within this image error, rms")
-    noise_factor: NotNegative = Field(2.0, description="widens image_px by so many times noise.servo_px")
+    image_error_px: Positive = Field(0.01, description="converged within this image error, rms")
+    noise_factor: NotNegative = Field(
+        2.0, description="widens image_error_px by so many times noise.servo_px"
+    )
     max_steps: Count = Field(2000, description="commands after which a run ends")
     diverged_factor: Number = Field(
         10.0, gt=1, description="diverged where the image error or the distance grows so many times"
     )
-    plateau_steps: Count = Field(20, description="stands still where the error falls < 1 % in so many steps")
-    lost_steps: Whole = Field(25, description="periods for which lost markers are waited for")
-    innovation_factor: NotNegative = Field(
+    stall_periods: Count = Field(20, description="stands still where the error falls < 1 % in so many steps")
+    max_lost_periods: Whole = Field(25, description="periods for which lost markers are waited for")
+    innovation_threshold: NotNegative = Field(
         1.0,
         description="a run of a robot of yours, or of a simulated one with faults, is disturbed where images "
         "are off the prediction by more than chance and so many times the noise; 0 tests nothing",
@@ -464,8 +478,8 @@ def _limits_in_joint_space(
     plant: _PlantSettings, trajectory: Trajectory, robot: RobotSettings | None
 ) -> Iterator[Finding]:
     bounded = robot is not None and (robot.limits is not None or np.isfinite(robot.ranges).all())
-    if trajectory.profile == "joint" and not plant.simulated and not bounded:
-        yield ("robot",), f"the profile joint needs the limits of all joints: {LIMITS_MISSING}"
+    if trajectory.profile == "joint_space" and not plant.simulated and not bounded:
+        yield ("robot",), f"the profile joint_space needs the limits of all joints: {LIMITS_MISSING}"
 
 
 def _same_joints(robot: RobotSettings | None, data: _Data | None) -> Iterator[Finding]:
@@ -563,15 +577,15 @@ def _dictionary(plant: _PlantSettings, markers: Markers | None) -> Iterator[Find
 def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> Iterator[Finding]:
     if robot is None or not robot.joints:
         return
-    types, bump = robot.joint_types, disturbance.bump
-    for name, event in (("bump", bump), ("frozen_joint", disturbance.frozen_joint)):
+    types, moved = robot.joint_types, disturbance.joint_moved
+    for name, event in (("joint_moved", moved), ("stuck_encoder", disturbance.stuck_encoder)):
         if event is not None and event.joint > len(types):
             yield ("disturbance", name, "joint"), f"the robot has {len(types)} joints, counted from 1"
-    if bump is not None and bump.joint <= len(types) and not any(bump.contradictions()):
-        letter = types[bump.joint - 1]
+    if moved is not None and moved.joint <= len(types) and not any(moved.contradictions()):
+        letter = types[moved.joint - 1]
         fitting = "by_deg" if letter == "R" else "by_m"
-        if getattr(bump, fitting) is None:
-            yield ("disturbance", "bump"), f"joint {bump.joint} is of type {letter}: give {fitting}"
+        if getattr(moved, fitting) is None:
+            yield ("disturbance", "joint_moved"), f"joint {moved.joint} is of type {letter}: give {fitting}"
 
 
 def _disturbed_markers(disturbance: Disturbance, markers: Markers | None) -> Iterator[Finding]:
@@ -585,7 +599,7 @@ def _disturbed_markers(disturbance: Disturbance, markers: Markers | None) -> Ite
 
 def _plan_to_follow(control: _Control, trajectory: Trajectory) -> Iterator[Finding]:
     limits = (control.joint_speed_limit_deg_s, control.prismatic_speed_limit_m_s)
-    if any(mode != REPLAN for mode in control.mode) and {*limits, trajectory.duration_s} == {None}:
+    if any(mode != REGULATE for mode in control.mode) and {*limits, trajectory.duration_s} == {None}:
         yield (
             ("control", "mode"),
             "follows the plan in time, and nothing gives it one: set trajectory.duration_s, or a limit with "
@@ -594,10 +608,10 @@ def _plan_to_follow(control: _Control, trajectory: Trajectory) -> Iterator[Findi
 
 
 def _keeping_out(control: _Control, trajectory: Trajectory) -> Iterator[Finding]:
-    if trajectory.keep_out and REPLAN in control.mode:
+    if trajectory.keep_out and REGULATE in control.mode:
         yield (
             ("control", "mode"),
-            "replan goes its own way, and trajectory.keep_out is kept by plans: set track or image_track",
+            "regulate follows no plan, and only plans keep out of trajectory.keep_out: set track or image_track",
         )
 
 
@@ -606,8 +620,8 @@ def _speed_in_joint_space(
 ) -> Iterator[Finding]:
     types = _joint_types(robot, data)
     for letter, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
-        if trajectory.profile == "joint" and letter in types and getattr(control, key) is None:
-            yield ("control", key), "the profile joint goes as fast as joints can: give their limit"
+        if trajectory.profile == "joint_space" and letter in types and getattr(control, key) is None:
+            yield ("control", key), "the profile joint_space goes as fast as joints can: give their limit"
 
 
 _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the sections that each takes

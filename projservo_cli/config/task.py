@@ -70,22 +70,22 @@ class Goal(Section):
     """The goal: joint readings, a turn about the rig's roll axis, or the face's goal images."""
 
     joints: JointVector | None = Field(None, description="joint readings at the goal")
-    turn_deg: Number | None = Field(
+    roll_deg: Number | None = Field(
         None, ge=-360, le=360, description="turn from the start about the roll axis of the rig"
     )
     perturbation: _Perturbation | None = Field(
-        None, description="small displacement of a goal given by turn_deg, in the tool frame"
+        None, description="small displacement of a goal given by roll_deg, in the tool frame"
     )
     images: _GoalImages | None = Field(None, description="pixels of the face, recorded at the goal")
 
     def contradictions(self) -> Iterator[Finding]:
         """No goal, or several."""
-        kinds = [name for name in ("joints", "turn_deg", "images") if getattr(self, name) is not None]
+        kinds = [name for name in ("joints", "roll_deg", "images") if getattr(self, name) is not None]
         if len(kinds) != 1:
             given = f", not {' and '.join(kinds)}" if kinds else ""
-            yield (), f"give exactly one of joints, turn_deg and images{given}"
-        if self.perturbation is not None and self.turn_deg is None:
-            yield ("perturbation",), "belongs to a goal given by turn_deg"
+            yield (), f"give exactly one of joints, roll_deg and images{given}"
+        if self.perturbation is not None and self.roll_deg is None:
+            yield ("perturbation",), "belongs to a goal given by roll_deg"
 
 
 class TaskSettings(Section):
@@ -109,7 +109,7 @@ class KeptOut(Section):
 
     left: _Polygon | None = Field(None, description="corners u and v in the left image; null for none there")
     right: _Polygon | None = Field(None, description="corners u and v in the right image; null for none")
-    hides: StrictBool = Field(
+    occludes: StrictBool = Field(
         True, description="whether the obstacle may hide markers: those of the face stay beside it in both"
     )
 
@@ -149,9 +149,9 @@ def _meet(a: Vector2, b: Vector2, c: Vector2, d: Vector2) -> bool:
 
 
 class _Search(Section):
-    """How long the profile ``joint`` searches, and with which random numbers."""
+    """How long the profile ``joint_space`` searches, and with which random numbers."""
 
-    samples: Count = Field(20_000, description="joint vectors that two trees grow towards, at most")
+    max_samples: Count = Field(20_000, description="joint vectors that two trees grow towards, at most")
     seed: Whole = Field(0, description="of the random numbers; the same seed gives the same way")
 
 
@@ -169,42 +169,47 @@ class Trajectory(Section):
         "translation_first",
         "planar_first",
         "constrained",
-        "joint",
+        "joint_space",
         "auto",
     ] = Field("linear", description="which part is driven when, or a way through joint space")
-    delta: Number = Field(
+    visibility_fraction: Number = Field(
         0.9, gt=0, le=1, description="share of the translation at which visibility changes that is kept to"
     )
-    samples: StrictInt = Field(101, ge=2, le=100_001, description="points of the path that are stored")
+    n_samples: StrictInt = Field(101, ge=2, le=100_001, description="points of the path that are stored")
     duration_s: Positive | None = Field(
         None, description="time the motion is given; null for as little as the joint-speed limit lets it take"
     )
-    ramp_s: NotNegative = Field(
+    acceleration_time_s: NotNegative = Field(
         0.4, description="time in which a planned motion comes up to its pace, and to rest again at its end"
     )
     border_px: NotNegative = Field(
         5.0,
-        description="in the profiles constrained and joint: least distance of a marker from an image border",
+        description="in the profiles constrained and joint_space: least distance of a marker from an image border",
     )
-    least_condition: Number = Field(
+    min_reciprocal_condition: Number = Field(
         0.001,
         ge=0,
         lt=1,
         description="in the profile constrained: least reciprocal condition of the face's image Jacobian",
     )
-    goals: Count = Field(64, description="joints that show the goal, nearest in time, which joint tries")
+    max_goal_configurations: Count = Field(
+        64, description="joints that show the goal, nearest in time, which joint tries"
+    )
     joint_margin_deg: NotNegative = Field(
-        1.0, description="in the profile joint: least distance from a limit, revolute joints"
+        1.0, description="in the profile joint_space: least distance from a limit, revolute joints"
     )
     joint_margin_m: NotNegative = Field(
-        0.002, description="in the profile joint: least distance from a limit, prismatic joints"
+        0.002, description="in the profile joint_space: least distance from a limit, prismatic joints"
     )
-    least_face_px: NotNegative = Field(
-        8.0, description="in the profile joint: least width of the face in an image, seen ever more edge-on"
+    min_face_px: NotNegative = Field(
+        8.0,
+        description="in the profile joint_space: least width of the face in an image, seen ever more edge-on",
     )
-    search: _Search = Field(_Search(), description="how long the profile joint searches, and from which seed")
+    search: _Search = Field(
+        _Search(), description="how long the profile joint_space searches, and from which seed"
+    )
     keep_out: Annotated[tuple[KeptOut, ...], Field(max_length=100)] = Field(
         (),
-        description="outlines of obstacles, each {left: [[u, v], ...], right: [[u, v], ...], hides: true}, "
+        description="outlines of obstacles, each {left: [[u, v], ...], right: [[u, v], ...], occludes: true}, "
         "that no marker enters, nor what is between those of the face",
     )

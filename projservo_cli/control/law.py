@@ -78,7 +78,7 @@ class Gains(NamedTuple):
     ratio_rp: float
     gain: float
     period: float
-    delta: float
+    visibility_fraction: float
     limits: JointLimits = UNLIMITED
     substeps: bool = False
 
@@ -288,7 +288,7 @@ def joint_velocity_into(state: State) -> bool:
 def translation_rate(task: Task, gains: Gains, parts: Parts, state: State) -> float:
     """Rate λ_t τ of the translation, with its step within δ τ_0 of both cameras."""
     wanted = gains.gain_t * parts.tau * gains.period
-    allowed = limited_translation(parts.a, parts.H_t, wanted, gains.delta, task)
+    allowed = limited_translation(parts.a, parts.H_t, wanted, gains.visibility_fraction, task)
     if allowed < wanted:
         state.limited[0] += 1.0
     return allowed / gains.period

@@ -353,7 +353,7 @@ def invariant_rotations(actions: FloatArray) -> FloatArray:
     if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
         raise WorkFailed(
             "the joints preserve no metric of the calibrated frame: calibrate again, or measure point by "
-            "point with control.observation: points"
+            "point with control.features: points"
         )
     C = np.linalg.cholesky(Q).T
     return np.array([np.linalg.solve(C, np.cross(np.eye(3), e) @ C) for e in np.eye(3)])

@@ -49,7 +49,14 @@ _REHEARSAL_STEPS = 300
 _REHEARSAL_PX = 1.0
 _REHEARSAL_STEP = math.radians(5.0)
 _REHEARSAL = Gains(
-    gain_t=0.1, gain_r=0.1, gain_p=0.1, gain_s=0.1, ratio_rp=1.0, gain=0.1, period=1.0, delta=0.9
+    gain_t=0.1,
+    gain_r=0.1,
+    gain_p=0.1,
+    gain_s=0.1,
+    ratio_rp=1.0,
+    gain=0.1,
+    period=1.0,
+    visibility_fraction=0.9,
 )
 _DIRECT_TWO = CODES["direct_two"]
 
@@ -91,9 +98,9 @@ class _Rehearsal:
             self.state.driven[1] = sense * q_hat_p
             limits = Limits(
                 speed=step,
-                image_px=_REHEARSAL_PX,
+                image_error_px=_REHEARSAL_PX,
                 diverged_factor=math.inf,
-                plateau_steps=20,
+                stall_periods=20,
                 max_steps=most,
                 stop_at_joint_limit=False,
                 stop_at_border=False,

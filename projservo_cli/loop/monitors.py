@@ -17,7 +17,7 @@ Each is given the verdict of those before it and returns its own:
 from typing import NamedTuple, Protocol
 
 from projservo_cli.loop.step import (
-    DISTURBED,
+    FAULT_DETECTED,
     RUNNING,
     WAITING,
     Command,
@@ -69,13 +69,13 @@ class Monitors(NamedTuple):
     def of_faults(self, k: int) -> int:
         """Verdict before the law is asked: ``RUNNING`` where it may be."""
         if self.plant.disturbance:
-            return DISTURBED
+            return FAULT_DETECTED
         if not self.plant.holds:
             return RUNNING
         if k < self.limits.max_steps:
             return WAITING
         self.plant.give_up()
-        return DISTURBED
+        return FAULT_DETECTED
 
     def of_instant(self, log: Log, k: int, now: Instant) -> int:
         """Verdict of an instant at which the law was asked."""

@@ -20,7 +20,7 @@ from projservo_cli.loop.step import (
     DIVERGED,
     JOINT_LIMIT,
     MARKERS_LOST,
-    PLATEAU,
+    NO_PROGRESS,
     RUNNING,
     SINGULAR_VERDICT,
     WAITING,
@@ -102,8 +102,8 @@ class ExecutionMonitor:
     def _stalls(self, log: Log, k: int, verdict: int) -> bool:
         """Whether the law that ends the motion comes no nearer."""
         if self._stall is not None:
-            return verdict == PLATEAU and self._stall.minimum
-        window = self.limits.plateau_steps
+            return verdict == NO_PROGRESS and self._stall.minimum
+        window = self.limits.stall_periods
         still = on_plateau(log.judged, k, window) and on_plateau(log.judged, k, window // 2)
         return verdict == RUNNING and self._alone > window and still
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from projservo_cli.loop.step import (
     CONVERGED,
-    NOT_FOLLOWING,
-    PLATEAU,
+    FOLLOWING_ERROR,
+    NO_PROGRESS,
     RUNNING,
     WAITING,
     Limits,
@@ -50,8 +50,8 @@ class StallMonitor:
     def __init__(self, robot: DrivenRobot, limits: Limits) -> None:
         self._robot, self._limits = robot, limits
         known, bounds = robot.known, robot.robot.bounds
-        late = bounds.lag_s + max(0.0, float((known.delays.mean + known.delays.sigma).max()))
-        self._window = max(limits.plateau_steps, math.ceil(_TIMES_LATE * late / bounds.period))
+        late = bounds.max_servo_lag_s + max(0.0, float((known.delays.mean + known.delays.sigma).max()))
+        self._window = max(limits.stall_periods, math.ceil(_TIMES_LATE * late / bounds.period))
         self._still = np.maximum(_DEVIATIONS * known.sigma_q, _LEAST)
         self._best, self._since = math.inf, 0
         self._read: list[FloatArray] = []
@@ -95,7 +95,7 @@ class StallMonitor:
         return verdict if verdict == CONVERGED or not self._looks else WAITING
 
     def _stuck(self, now: int, verdict: int, near: bool) -> int:
-        """``PLATEAU`` or ``NOT_FOLLOWING`` where the robot makes no progress; else the verdict as it is.
+        """``NO_PROGRESS`` or ``FOLLOWING_ERROR`` where the robot makes no progress; else the verdict as it is.
 
         ``near``: whether it is so near the goal that what the law asks for may be lost in its joints.
         """
@@ -109,7 +109,7 @@ class StallMonitor:
         stays = (moved_since <= self._still) & (sent_since > _STAYS * np.maximum(sag, self._still)) | short
         if stays.any():
             self._say_who_stays(stays)
-            return NOT_FOLLOWING
+            return FOLLOWING_ERROR
         if stands and (sent <= _LEAST).all():
             self.minimum = True
             most = self._robot.robot.bounds.told(int(np.argmax(sent)), float(sent.max()), 2)
@@ -119,10 +119,10 @@ class StallMonitor:
                 if near
                 else "the law asks for no motion there, a local minimum"
             )
-            return PLATEAU
+            return NO_PROGRESS
         if (moved <= np.maximum(sag, self._still)).all() and idle >= _PATIENCE * window:
             self._say_what_holds(moved_since, sent_since)
-            return PLATEAU
+            return NO_PROGRESS
         return verdict
 
     def _say_who_stays(self, stays: BoolArray) -> None:
@@ -131,8 +131,8 @@ class StallMonitor:
         i, told = int(np.argmax(gap)), self._robot.robot.bounds.told
         self.reason = (
             f"joint {i + 1} stands at {told(i, self._read[-1][i])}, {told(i, gap[i], 3)} off its set-point: "
-            "look whether it is blocked, braked or in a protective stop, or raise plant.sag_deg or "
-            "plant.lead_deg"
+            "look whether it is blocked, braked or in a protective stop, or raise plant.max_steady_state_error_deg or "
+            "plant.max_relative_target_deg"
         )
 
     def _say_what_holds(self, moved: FloatArray, sent: FloatArray) -> None:

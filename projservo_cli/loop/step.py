@@ -4,18 +4,18 @@ Precedence of the verdicts of ``verdict_at`` at one instant, first match wins; `
 rules before and after it:
 
 1. ``behind camera``: a marker is not in front of a camera.
-2. ``left image``: a marker is outside an image and ``image_border`` is stop.
+2. ``out of view``: a marker is outside an image and ``image_border`` is stop.
 3. ``markers lost``: the law needs a marker that was not seen.
 4. ``converged``: the image error is within the tolerance.
 5. ``diverged``: the image error or the distance of the face exceeds its first value by the factor,
    or the command is not finite.
 6. ``singular``: the joint motion of the law is not unique.
-7. ``plateau``, ``max steps``: no step is left; plateau where the error fell by less than 1 % in
+7. ``no progress``, ``max steps``: no step is left; plateau where the error fell by less than 1 % in
    the last window.
 8. ``joint limit``: a joint stands at its limit, the command would take it beyond, and ``joint_limits``
    is stop. A command that would pass a limit is shortened to end there.
 
-While markers are lost the robot is held where it is for up to ``lost_steps`` periods in a row; the run
+While markers are lost the robot is held where it is for up to ``max_lost_periods`` periods in a row; the run
 goes on when they are seen again.
 """
 
@@ -32,21 +32,21 @@ from projservo_cli.simulation.ideal import Plant, inside
 
 RUNNING = -1
 WAITING = -3  # for lost markers; no verdict of a run
-BEHIND_CAMERA, LEFT_IMAGE, MARKERS_LOST, CONVERGED, DIVERGED, SINGULAR_VERDICT = range(6)
-PLATEAU, MAX_STEPS, JOINT_LIMIT, DISTURBED, FAILED, NOT_FOLLOWING = range(6, 12)
+BEHIND_CAMERA, OUT_OF_VIEW, MARKERS_LOST, CONVERGED, DIVERGED, SINGULAR_VERDICT = range(6)
+NO_PROGRESS, MAX_STEPS, JOINT_LIMIT, FAULT_DETECTED, FAILED, FOLLOWING_ERROR = range(6, 12)
 VERDICTS = (
     "behind camera",
-    "left image",
+    "out of view",
     "markers lost",
     "converged",
     "diverged",
     "singular",
-    "plateau",
+    "no progress",
     "max steps",
     "joint limit",
-    "disturbed",
+    "fault detected",
     "failed",
-    "not following",
+    "following error",
 )
 _PLATEAU_FALL = 0.01
 # Joint steps below this, rad or m, are none.
@@ -59,14 +59,14 @@ class Limits(NamedTuple):
     """When a run ends and what bounds its commands."""
 
     speed: FloatArray  # (n,) most joint motion per second, rad/s or m/s; infinite for none
-    image_px: float  # image error that counts as converged, px rms per marker and view
+    image_error_px: float  # image error that counts as converged, px rms per marker and view
     diverged_factor: float  # growth of error or distance that counts as diverged
-    plateau_steps: int  # window of the plateau test
+    stall_periods: int  # window of the plateau test
     max_steps: int  # most commands
     stop_at_joint_limit: bool
     stop_at_border: bool  # stop_at_joint_limit, stop_at_border: end the run, or only record
-    lost_steps: int = 0  # periods in a row that lost markers are waited for
-    noise_px: float = 0.0  # how much of ``image_px`` allows for noise
+    max_lost_periods: int = 0  # periods in a row that lost markers are waited for
+    noise_px: float = 0.0  # how much of ``image_error_px`` allows for noise
 
 
 class Log(NamedTuple):
@@ -182,12 +182,12 @@ def verdict_at(log: Log, k: int, now: Instant, limits: Limits) -> int:
     if math.isnan(log.begun[1]):
         log.begun[1] = log.judged[k]
     verdict = _first_cause(log, k, now, limits)
-    if verdict == MARKERS_LOST and log.begun[2] < limits.lost_steps and k < limits.max_steps:
+    if verdict == MARKERS_LOST and log.begun[2] < limits.max_lost_periods and k < limits.max_steps:
         log.begun[2] += 1.0
         return WAITING
     log.begun[2] = 0.0
     if verdict == RUNNING and k == limits.max_steps:
-        return PLATEAU if on_plateau(log.judged, k, limits.plateau_steps) else MAX_STEPS
+        return NO_PROGRESS if on_plateau(log.judged, k, limits.stall_periods) else MAX_STEPS
     return verdict
 
 
@@ -198,7 +198,7 @@ def _first_cause(log: Log, k: int, now: Instant, limits: Limits) -> int:
     if not now.in_front:
         return BEHIND_CAMERA
     if now.left and limits.stop_at_border:
-        return LEFT_IMAGE
+        return OUT_OF_VIEW
     if now.status == LOST:
         return MARKERS_LOST
     if error <= tolerance(limits, log.fit[k, 2]):
@@ -220,8 +220,8 @@ def tolerance(limits: Limits, views: float) -> float:
     the noise of their pixels; NaN where the face is measured point by point.
     """
     if not views > 0.0:
-        return limits.image_px
-    return limits.image_px - limits.noise_px * max(0.0, 1.0 - math.sqrt(3.0 / views))
+        return limits.image_error_px
+    return limits.image_error_px - limits.noise_px * max(0.0, 1.0 - math.sqrt(3.0 / views))
 
 
 @merged

@@ -37,7 +37,7 @@ def sentence(found: Explanation, calibration: Calibration) -> str:
         return f"the reading of {which} stands still while the arm moves; look at its encoder and cable"
     if kind == "late":
         ms = " and ".join(f"{1e3 * value:+.3g}" for value in theta)
-        return f"images of {side} come {ms} ms later than was taken; give plant.delay_s, or recalibrate"
+        return f"images of {side} come {ms} ms later than was taken; give plant.time_offset_s, or recalibrate"
     if kind == "sized":
         return (
             f"the image size of {side} is {theta[0]:.4g} times that of the calibration; set the size of "

@@ -107,7 +107,7 @@ class ErrorModel:
     def __init__(self, calibration: Calibration, sigma_px: float) -> None:
         m, n = len(calibration.M), len(calibration.H_hat_0)
         self.calibration, self.scene = calibration, parameters_from(calibration)
-        self.errors, self.e = calibration.errors, calibration.shared_error.shape[1] + 3 * m
+        self.errors, self.e = calibration.errors, calibration.sqrt_cov_shared.shape[1] + 3 * m
         bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
         self._least = max(bent, MIN_SIGMA)
         self._sigma = max(sigma_px, self._least)

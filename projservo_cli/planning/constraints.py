@@ -85,7 +85,7 @@ def constraints_of(
     H = forward_kinematics(model, q_start)
     sides = np.sign((A @ model.P[:, 2].T)[0])
     model = model._replace(P=np.ascontiguousarray(model.P * sides[:, None, None]))
-    steep, border = demands.least_face_px, demands.border_px
+    steep, border = demands.min_face_px, demands.border_px
     return Constraints(
         model=model,
         M=np.ascontiguousarray(A @ np.linalg.inv(H).T),
@@ -216,12 +216,12 @@ def clear_by(c: Constraints, H: Mat4, s: FloatArray) -> float:
     are so in both images, and all markers in the only image in which a region is drawn.
     """
     keep, least = c.keep_out, math.inf
-    for region in range(keep.hides.shape[0]):
+    for region in range(keep.occludes.shape[0]):
         both = keep.views[region] == BOTH
         for k in range(c.M.shape[0]):
             left, right = (s[0, k, 0], s[0, k, 1]), (s[1, k, 0], s[1, k, 1])
             first, second = clearance(keep, region, 0, left), clearance(keep, region, 1, right)
-            if not both or (keep.hides[region] == 1 and k < c.face):
+            if not both or (keep.occludes[region] == 1 and k < c.face):
                 least = min(least, first, second)
             else:
                 first = min(first, from_border(c.image_size, left[0], left[1]))

@@ -25,7 +25,7 @@ class KeepOut(NamedTuple):
     first: IntArray  # (p + 1,) the first corner of each polygon, and how many there are
     image: IntArray  # (p,) in which of both it is drawn
     region: IntArray  # (p,) of which region it is
-    hides: IntArray  # (r,) 1 where markers of the face stay outside in both images
+    occludes: IntArray  # (r,) 1 where markers of the face stay outside in both images
     views: IntArray  # (r,) the only image in which a region is drawn, or ``BOTH``
 
 
@@ -48,7 +48,7 @@ def keep_out_of(regions: Sequence[tuple[ArrayLike | None, ArrayLike | None, bool
         first=np.cumsum([0, *(len(corners) for _, _, corners in polygons)]),
         image=np.array([view for _, view, _ in polygons]),
         region=np.array([r for r, _, _ in polygons]),
-        hides=np.array([int(hides) for _, _, hides in regions]),
+        occludes=np.array([int(hides) for _, _, hides in regions]),
         views=np.array(views),
     )
 
@@ -57,7 +57,7 @@ def only(keep: KeepOut, region: int) -> KeepOut:
     """The polygons of one region alone."""
     drawn = np.where(keep.region == region, 0, -1)
     here = slice(region, region + 1)
-    return keep._replace(region=drawn, hides=keep.hides[here], views=keep.views[here])
+    return keep._replace(region=drawn, occludes=keep.occludes[here], views=keep.views[here])
 
 
 @merged

@@ -109,7 +109,7 @@ class Demands(NamedTuple):
     border_px: float  # least distance of a marker from the border of an image, px
     conditioning: float  # least reciprocal condition of the image Jacobian of the face
     keep: FloatArray  # (n,) least distance from a joint limit, rad or m, along a path through joint space
-    least_face_px: float = 0.0  # least width of the face in an image along such a path, px
+    min_face_px: float = 0.0  # least width of the face in an image along such a path, px
     # (t, 4) corners of tags, markers of the body in the order of their numbers, of which one is to be seen by
     # both cameras; none where the face is
     tags: IntArray = np.zeros((0, 4), np.int64)

@@ -66,7 +66,7 @@ def suggest(
     if not calibration.has_covariance:
         raise InputError(
             f"suggestions need a covariance, which the method {calibration.method} has not: "
-            "use --set calibration.method=refined"
+            "use --set calibration.method=bundle_adjustment"
         )
     few = calibration.with_markers(even_choice(len(calibration.M), _MOST_SHOWN))
     sigma = max(calibration.sigma_px, calibration.sigma_fitted_px)

@@ -111,7 +111,7 @@ def within_region(c: Constraints, q: FloatArray) -> int:
 
 def _nearest_region(c: Constraints, q: FloatArray) -> int:
     """Number, counted from 1, of the region that the body is deepest in, or nearest to, at joints (n,)."""
-    regions = [only(c.keep_out, r) for r in range(len(c.keep_out.hides))]
+    regions = [only(c.keep_out, r) for r in range(len(c.keep_out.occludes))]
     return 1 + int(np.argmin([margins_at(c._replace(keep_out=region), q)[0][CLEAR] for region in regions]))
 
 

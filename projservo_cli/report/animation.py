@@ -351,9 +351,9 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
                 panel.set_xlabel("u (px)" if view else "")
             shown = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
             columns.append([_Panel(*one) for one in shown])
-            if (film := films[name]) is not None and run.frame_instant is not None:
+            if (film := films[name]) is not None and run.frame_index is not None:
                 for panel, frames in zip(columns[-1], film.swapaxes(0, 1), strict=True):
-                    panel.over(frames, run.frame_instant, size)
+                    panel.over(frames, run.frame_index, size)
         looks = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
         looks["face hidden from this camera"] = _BEHIND
         style.legend_below(figure, looks, 4 if len(runs) > 2 else 2)

@@ -176,7 +176,7 @@ _SAMPLING = 1e-3
 
 def _drift_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
     """Claims of sections 5.2, 6 and 7 about drift; none where the goal pose is unknown."""
-    drift = study_numbers(studies)["drift_mm"]
+    drift = study_numbers(studies)["path_deviation_mm"]
     if not np.isfinite(drift).all():
         return
     gains = ", ".join(f"{gain:g}" for gain in studies.gains)
@@ -212,7 +212,7 @@ def _drift_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
 def _rate(studies: Studies, revolute: BoolArray) -> Iterator[_Claim]:
     """Drift over the period; the longest turn in a step says how far apart the samples can be."""
     periods = np.array(studies.periods)
-    for law, values in zip(DIRECT, study_numbers(studies)["period_drift_mm"], strict=True):
+    for law, values in zip(DIRECT, study_numbers(studies)["period_path_deviation_mm"], strict=True):
         if len(periods) < 2 or not (values > 0).all():
             continue
         order = np.polyfit(np.log(periods), np.log(values), 1)[0]
@@ -314,7 +314,7 @@ def _classical(material: Material) -> Iterator[_Claim]:
         )
     for law in ("stacked", "euclidean_points"):
         if law in material.traces:
-            yield from _escape(law, material.traces[law], material.plateau_steps)
+            yield from _escape(law, material.traces[law], material.stall_periods)
 
 
 def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
@@ -326,10 +326,10 @@ def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
         "steps in both cameras, verdict converged",
         left > 0 and right > 0 and trace.verdict == "converged",
     )
-    stretch = plateau_stretch(trace.stop_error, window)
+    stretch = plateau_stretch(trace.convergence_error, window)
     measured = "none"
     if stretch is not None:
-        level = float(trace.stop_error[stretch[0]])
+        level = float(trace.convergence_error[stretch[0]])
         measured = f"{stretch[1] - stretch[0]} steps from step {stretch[0]} at {level:.0f} px"
     yield _Claim(
         f"{title_of(law)}: stands still in a local minimum before it converges",

@@ -77,7 +77,7 @@ def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> Iterator
     for name, what, one, many in (
         ("outliers", "reading", "left out as an outlier", "left out as outliers"),
         ("suspect_joint_readings", "joint reading", "contradicts the images", "contradict the images"),
-        ("swapped", "marker", "was renumbered", "were renumbered"),
+        ("id_switches", "marker", "was renumbered", "were renumbered"),
     ):
         if count := len(found[name]):
             yield f"{count} {what}{'s' * (count > 1)} {many if count > 1 else one}."
@@ -100,8 +100,8 @@ def _worst_joint(found: Mapping[str, Any]) -> str:
     reach = f"{REACH_M:g} m" if found["joints"][worst]["type"] == "P" else f"{REACH_RAD:g} rad"
     return (
         f"Joint {worst + 1} is known worst: {reach} from the reference it adds {_short(noise)} times the "
-        f"pixel noise to predicted images; a joint is weak above {WEAK_NOISE:g}, so this one is "
-        f"{'weak' if noise > WEAK_NOISE else 'well determined'}."
+        f"pixel noise to predicted images; a joint is poorly observable above {WEAK_NOISE:g}, so this one is "
+        f"{'poorly observable' if noise > WEAK_NOISE else 'well observable'}."
     )
 
 
@@ -200,7 +200,7 @@ def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> _Vie
     found = {stage: stage_object(stage, run, about.joints, list(run.traces)) for stage in stages}
     report: Report | None = run.results["report"].records[""] if "report" in stages else None
     left_out: dict[str, list[str]] = {}
-    for entry in report.left_out if report else ():
+    for entry in report.omitted if report else ():
         left_out.setdefault(entry["reason"], []).append(entry["what"])
     return _View(
         about.name,
@@ -267,8 +267,8 @@ def _calibration(found: dict[str, Any], about: About) -> dict[str, Any]:
         ("the same, in 99 of 100 calibrations below", found["predicted_p99_px"], "px"),
         ("χ² per degree of freedom", found["chi2_per_dof"], ""),
         ("degrees of freedom", found["dof"], ""),
-        ("poses", found["merged_poses"], ""),
-        ("markers", found["merged_markers"], ""),
+        ("poses", found["poses_used"], ""),
+        ("markers", found["markers_used"], ""),
         *lens,
         *_joints_and_time(found),
         ("time", found["seconds"], "s"),
@@ -283,8 +283,10 @@ def _joints_and_time(found: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
     """How far joint readings are off and images late, where that was asked: label, number, unit."""
     if found["sigma_q"] is not None:
         yield "joint readings off by, rms", np.degrees(found["sigma_q"]), "°"
-    if found["delay_s"] is not None:
-        for view, delay, jitter in zip(VIEWS, found["delay_s"], found["delay_jitter_s"], strict=True):
+    if found["time_offset_s"] is not None:
+        for view, delay, jitter in zip(
+            VIEWS, found["time_offset_s"], found["time_offset_jitter_s"], strict=True
+        ):
             yield f"images of the {view} camera late by", 1e3 * delay, "ms"
             yield f"single images of the {view} camera differ by, rms", 1e3 * jitter, "ms"
 
@@ -294,7 +296,11 @@ def _visibility(plan: Plan) -> dict[str, Any]:
     views = []
     for v, name in enumerate(VIEWS):
         least = int(np.argmin(plan.margin[:, v]))
-        seen = {"name": name, "margin": float(plan.margin[least, v]), "sigma": float(plan.sigma[least])}
+        seen = {
+            "name": name,
+            "margin": float(plan.margin[least, v]),
+            "sigma": float(plan.path_parameter[least]),
+        }
         seen["tau_0"] = float(plan.tau_0[v] / plan.tau) if plan.tau > 0 else None
         seen["theta_0"] = np.degrees(plan.theta_0[v]).tolist()
         views.append(seen | {"sense_margins": plan.sense_margin[:, v].tolist()})
@@ -309,7 +315,7 @@ def _law(trace: dict[str, Any], about: About) -> dict[str, Any]:
 
 def _drift(report: Report) -> dict[str, Any] | None:
     """The drift table: a row for law, operators and limit, a column for each gain."""
-    if not report.drift_mm.size:
+    if not report.path_deviation_mm.size:
         return None
     rows: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in drift_rows(report):

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.laws import IMAGE_TRACK, REPLAN, TRACK, law_and_mode, title_of
+from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
     WHY_LOST,
@@ -44,8 +44,8 @@ CLAIMS_FILE = "claims.json"
 NEAREST = tuple(
     CONSTRAINTS[constraint].value for constraint in OF_MOTION
 )  # smallest along the planned motion
-LISTS = ("outliers", "suspect_joint_readings", "swapped")  # single observations that do not fit
-_COUNTS = ("merged_poses", "merged_markers")
+LISTS = ("outliers", "suspect_joint_readings", "id_switches")  # single observations that do not fit
+_COUNTS = ("poses_used", "markers_used")
 _NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")
 
 DIRECT = ("direct_three", "direct_two")
@@ -105,12 +105,12 @@ class Material(Fit):
     studies: Studies | None = None  # extra runs; None where they could not be made
     no_studies: str = ""  # why not
     trajectory: Trajectory = field(kw_only=True)  # what the plan was asked for
-    plateau_steps: int = 20  # steps in which the error of a run that stands still falls by less than 1 %
+    stall_periods: int = 20  # steps in which the error of a run that stands still falls by less than 1 %
 
     def compared(self) -> list[str]:
         """Names of the runs of laws that follow the plan, each after that in which the law plans anew."""
         modes = {name: law_and_mode(name) for name, trace in self.traces.items() if trace.steps > 0}
-        laws = [law for law, mode in modes.values() if mode != REPLAN]
+        laws = [law for law, mode in modes.values() if mode != REGULATE]
         return [name for name, (law, _) in modes.items() if law in laws]
 
     def goal_known(self) -> bool:
@@ -170,7 +170,7 @@ class _FigureSpec:
         if not self.task:
             return ""
         if self.frames and isinstance(material, Driven | Material):
-            filmed = any(trace.frame_instant is not None for trace in material.traces.values())
+            filmed = any(trace.frame_index is not None for trace in material.traces.values())
             return "" if filmed else "the robot shows no frames"
         if isinstance(material, Driven):
             return "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
@@ -185,7 +185,7 @@ class _FigureSpec:
         if self.shares and np.isnan(material.plan.mu).all():
             return "a way through joint space has no shares of translation and rotations: see figure 16"
         if self.modes and not material.compared():
-            return "no run follows the plan: set control.mode, such as [replan, track], and run servo report"
+            return "no run follows the plan: set control.mode, such as [regulate, track], and run servo report"
         if self.goal and not material.goal_known():
             return "the pose of the goal is unknown, only its images are"
         return ""
@@ -261,7 +261,7 @@ def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str
     if stage == "calibrate":
         lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *LISTS)}
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
-        return found | {"usable": False, "lens": None, "left_out": None} | numbers | lists
+        return found | {"usable": False, "lens": None, "rejected": None} | numbers | lists
     if stage == "servo":
         found["laws"] = [_scalars(run.traces[law]) for law in laws]
     return found | {"feasible": False} if stage == "plan" else found
@@ -282,7 +282,7 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
             "excitation": float(calibration.excitation[i]),
             "noise": float(calibration.prediction_noise[i]),
             "defect": float(calibration.operator_defect[i]),
-            "weak": bool(calibration.weak[i]),
+            "poorly_observable": bool(calibration.poorly_observable[i]),
         }
         for i, letter in enumerate(calibration.joint_types)
     ]
@@ -294,7 +294,13 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
             for view, (u, v, r, k1, k2) in terms
         }
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
-    more = ("sigma_q_interval", "sigma_scale_interval", "delay_s", "delay_interval_s", "delay_jitter_s")
+    more = (
+        "sigma_q_interval",
+        "sigma_scale_interval",
+        "time_offset_s",
+        "time_offset_interval_s",
+        "time_offset_jitter_s",
+    )
     own = {name: getattr(calibration, name) for name in more}
     return _scalars(calibration) | own | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 
@@ -302,12 +308,12 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
 def _plan(run: Run) -> dict[str, Any]:
     plan, found = run.plan, _scalars(run.plan)
     angles = {f"{name}_deg": math.degrees(found.pop(name)) for name in ("theta_r", "theta_p", "theta_s")}
-    nearest = zip(NEAREST, plan.least, plan.least_mu, strict=True)
+    nearest = zip(NEAREST, plan.min_margin, plan.min_margin_mu, strict=True)
     return (
         found
         | angles
         | {"tau_0": plan.tau_0, "smallest_margin": plan.margin.min(axis=0)}
-        | {"margins": {name: {"least": least, "mu": mu} for name, least, mu in nearest}}
+        | {"margins": {name: {"min": low, "mu": mu} for name, low, mu in nearest}}
     )
 
 
@@ -315,29 +321,30 @@ def findings(calibration: Calibration) -> dict[str, Any]:
     """Single observations that do not fit, and how many do, as plain lists for people and JSON.
 
     calibration : the record.
-    Returns ``outliers``, ``suspect_joint_readings``, ``swapped``, ``merged_poses``, ``merged_markers``, and
-    ``left_out`` by kind: counts of ``sightings`` and of those ``swapped``, numbers of the ``tracks``
-    (markers) left out whole by why, and of the ``poses`` left out whole.
+    Returns ``outliers``, ``suspect_joint_readings``, ``id_switches``, ``poses_used``, ``markers_used``, and
+    ``rejected`` by kind: counts of ``observations`` and of ``id_switches``, numbers of the ``tracks``
+    (markers) that are rejected as a whole by reason, and of the ``poses``.
     """
     outliers, suspects, swaps = (
-        rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.swapped)
+        rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.id_switches)
     )
-    lost, poses = (
-        [] if rows is None else rows.tolist() for rows in (calibration.lost, calibration.lost_poses)
+    rejected_tracks, rejected_poses = (
+        [] if rows is None else rows.tolist()
+        for rows in (calibration.rejected_markers, calibration.rejected_poses)
     )
-    tracks = {why: [j for j, w in lost if w == code] for code, why in enumerate(WHY_LOST)}
+    tracks = {why: [j for j, w in rejected_tracks if w == code] for code, why in enumerate(WHY_LOST)}
     whole = {j for numbers in tracks.values() for j in numbers}
-    left_out = {
-        "sightings": sum(marker not in whole for _, marker, _ in outliers),
-        "swapped": len(swaps),
+    rejected = {
+        "observations": sum(marker not in whole for _, marker, _ in outliers),
+        "id_switches": len(swaps),
         "tracks": tracks,
-        "poses": sorted({p for p, _ in suspects} | set(poses)),
+        "poses": sorted({p for p, _ in suspects} | set(rejected_poses)),
     }
     return {
         "outliers": [{"pose": p, "marker": m, "view": (*VIEWS, "both")[v]} for p, m, v in outliers],
         "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
-        "swapped": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
-        "merged_poses": calibration.merged_poses,
-        "merged_markers": calibration.merged_markers,
-        "left_out": left_out,
+        "id_switches": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
+        "poses_used": calibration.poses_used,
+        "markers_used": calibration.markers_used,
+        "rejected": rejected,
     }

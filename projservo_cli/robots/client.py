@@ -69,7 +69,7 @@ class Film:
             shots.append(_Shot(instant, s, _as_jpeg(frames)))
         whole = b"".join(one for shot in shots for one in shot.jpeg)
         return {
-            "frame_instant": np.array([shot.instant for shot in shots], dtype=np.int64),
+            "frame_index": np.array([shot.instant for shot in shots], dtype=np.int64),
             "frame_s": np.array([shot.s for shot in shots]),
             "frame_size": np.array([[len(one) for one in shot.jpeg] for shot in shots], dtype=np.int64),
             "frame_jpeg": np.frombuffer(whole, dtype=np.uint8),

@@ -51,7 +51,7 @@ class Bounds(NamedTuple):
     limits: JointLimits  # of speed with the factor of every command
     lead: FloatArray  # of a set-point before the last reading
     period: float  # of the loop, s
-    lag_s: float  # time constant with which joints follow, s
+    max_servo_lag_s: float  # time constant with which joints follow, s
     sag: FloatArray  # (n,) how far joints stay short under gravity
     units: tuple[str, ...] = ()
 

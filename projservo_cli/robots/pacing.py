@@ -42,12 +42,12 @@ class SetPoint:
         self._answered = np.where(q != self._q, self.target, self._answered)
         self._q = q.copy()
         weight = 1.0 / (1.0 + (self._behind / (_STILL * self._bounds.sag)) ** 2)
-        share = -math.expm1(-seconds / self._bounds.lag_s)
+        share = -math.expm1(-seconds / self._bounds.max_servo_lag_s)
         self._sag += share * weight * (self.target - q - self._sag)
 
     def step(self, dq: FloatArray, seconds: float) -> tuple[FloatArray, FloatArray]:
         """Go on by a joint step (n,), rad or m, in so many seconds: the set-point (n,) and its speed (n,)."""
-        bounds, lag, before, q = self._bounds, self._bounds.lag_s, self.target, self._q
+        bounds, lag, before, q = self._bounds, self._bounds.max_servo_lag_s, self.target, self._q
         target = np.clip(before + dq, *bounds.not_far_ahead(q))
         self.short = target != before + dq
         self.target = np.clip(target, *bounds.within_limits(q))

@@ -37,7 +37,7 @@ class Joints(NamedTuple):
     """What is known of the joints of a robot."""
 
     types: str  # one letter a joint, R or P
-    limits: JointLimits  # infinite where none is set; accelerations of the profile joint alone
+    limits: JointLimits  # infinite where none is set; accelerations of the profile joint_space alone
     units: tuple[str, ...]  # in which messages give readings: deg, rad or m
 
     def length_of(self, degrees: float) -> FloatArray:
@@ -85,7 +85,7 @@ class JointSettings(NamedTuple):
         """Lower and upper limits (n,), rad or m; infinite where nothing tells them."""
         if self.widened is not None and calibration is not None:
             share, span = self.widened, calibration.excitation
-            return calibration.lowest - share * span, calibration.lowest + (1.0 + share) * span
+            return calibration.joint_min - share * span, calibration.joint_min + (1.0 + share) * span
         pairs = self.ranges or ((-math.inf, math.inf),) * len(types)
         if len(pairs) != len(types):
             raise InputError(f"robot.limits.joints: give a pair for each of {len(types)} joints")
@@ -103,18 +103,20 @@ class Following(NamedTuple):
 
     period: float  # of commands, s
     speed_scale: float  # factor of every command
-    lag_s: float  # by how much joints may lag behind their set-points
-    sag_deg: float  # how far a joint at rest may stay from its set-point
-    lead_deg: float | None  # how far a set-point may lead the reading; None for what lag and sag ask for
+    max_servo_lag_s: float  # by how much joints may lag behind their set-points
+    max_steady_state_error_deg: float  # how far a joint at rest may stay from its set-point
+    max_relative_target_deg: (
+        float | None
+    )  # how far a set-point may lead the reading; None for what lag and sag ask for
 
     def bounds(self, joints: Joints) -> Bounds:
         """Return what no command may exceed, and what is taken of the servos."""
-        speed, sag = joints.limits.speed * self.speed_scale, joints.length_of(self.sag_deg)
-        lead = speed * (self.lag_s + self.period) + sag
-        if self.lead_deg is not None:
-            lead = joints.length_of(self.lead_deg)
+        speed, sag = joints.limits.speed * self.speed_scale, joints.length_of(self.max_steady_state_error_deg)
+        lead = speed * (self.max_servo_lag_s + self.period) + sag
+        if self.max_relative_target_deg is not None:
+            lead = joints.length_of(self.max_relative_target_deg)
         limits = joints.limits._replace(speed=speed)
-        return Bounds(limits, lead, self.period, self.lag_s, sag, joints.units)
+        return Bounds(limits, lead, self.period, self.max_servo_lag_s, sag, joints.units)
 
 
 class OwnRobot(NamedTuple):

@@ -34,7 +34,7 @@ _CLOCKS_S = 100.0  # how far clocks of cameras are off at most
 class Faults(NamedTuple):
     """What is wrong with a simulated robot all the time, what a calibration has to reckon with too."""
 
-    delay_s: tuple[float, float] = (
+    camera_latency_s: tuple[float, float] = (
         0.0,
         0.0,
     )  # from the middle of an exposure to the readings beside its image
@@ -43,12 +43,12 @@ class Faults(NamedTuple):
     frame_rate_hz: float | None = None  # of cameras that run freely; None for an image taken at each look
     frame_offset_s: float = 0.0  # by which the right camera's images come after the left one's
     stamps: bool = False  # whether images carry the middle of their exposure
-    encoder_ticks: int | None = None  # steps of joint readings in a turn
-    setpoint_ticks: bool = False  # whether set-points are whole ticks too
-    lag_s: float = 0.0  # time constant with which joints follow their set-points
-    sag: float = 0.0  # by which gravity turns a joint off its set-point at full reach, rad
-    flex: float = 0.0  # the same of a link beyond its encoder, rad
-    play: float = 0.0  # between each encoder and its link, from end to end, rad
+    encoder_counts_per_turn: int | None = None  # steps of joint readings in a turn
+    quantize_setpoints: bool = False  # whether set-points are whole ticks too
+    servo_time_constant_s: float = 0.0  # time constant with which joints follow their set-points
+    gravity_sag: float = 0.0  # by which gravity turns a joint off its set-point at full reach, rad
+    link_deflection: float = 0.0  # the same of a link beyond its encoder, rad
+    backlash: float = 0.0  # between each encoder and its link, from end to end, rad
 
 
 class LostMarkers(NamedTuple):
@@ -59,16 +59,16 @@ class LostMarkers(NamedTuple):
     markers: tuple[int, ...] | None
 
 
-class Bump(NamedTuple):
-    """A joint knocked aside, or one that slips on its encoder."""
+class JointMoved(NamedTuple):
+    """A joint that is pushed aside, or slips on its encoder."""
 
     at_step: int
     joint: int  # counted from 0
     by: float  # rad or m
-    read: bool  # whether its reading follows
+    encoder_slip: bool  # whether its reading stays
 
 
-class FrozenJoint(NamedTuple):
+class StuckEncoder(NamedTuple):
     """A joint whose reading stands still while it moves."""
 
     from_step: int
@@ -95,8 +95,8 @@ class Events(NamedTuple):
     """What befalls a simulated robot and its images in a run."""
 
     lost_markers: LostMarkers | None = None
-    bump: Bump | None = None
-    frozen_joint: FrozenJoint | None = None
+    joint_moved: JointMoved | None = None
+    stuck_encoder: StuckEncoder | None = None
     camera_moved: CameraMoved | None = None
     marker_moved: MarkerMoved | None = None
 
@@ -223,7 +223,7 @@ def robot_of(
     if scene is None:
         return FaultyRobot(World(truth, q_start, points, period, *drawn), faults, events)
     rendered = rendered_model(scene)
-    servos = Physics(rendered, q_start, faults.lag_s, faults.sag)
+    servos = Physics(rendered, q_start, faults.servo_time_constant_s, faults.gravity_sag)
     return FaultyRobot(World(truth, q_start, Frames(rendered), period, *drawn, servos), faults, events)
 
 
@@ -268,7 +268,7 @@ class FaultyRobot:
 
     def __init__(self, world: World, faults: Faults, events: Events) -> None:
         self.world, self._faults, self._events = world, faults, events
-        self._joints = _Joints(world, faults, events.bump)
+        self._joints = _Joints(world, faults, events.joint_moved)
         self._cameras = [_Camera(self._joints, world, faults, events, view) for view in range(2)]
         self._frozen: float | None = None
         self.taken = np.full(2, math.nan)
@@ -292,7 +292,7 @@ class FaultyRobot:
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Go to joints (n,) by the time that is due, s; where none comes then, they are held."""
         del speed
-        self._joints.go(_whole(target, self._faults.setpoint_ticks * self._joints.tick), due)
+        self._joints.go(_whole(target, self._faults.quantize_setpoints * self._joints.tick), due)
 
     def now(self) -> float:
         """Time since the opening, s."""
@@ -316,7 +316,7 @@ class FaultyRobot:
 
     def _reading(self) -> FloatArray:
         """Joint readings (n,) as encoders count them."""
-        q, frozen = _whole(self._joints.servos.motor, self._joints.tick), self._events.frozen_joint
+        q, frozen = _whole(self._joints.servos.motor, self._joints.tick), self._events.stuck_encoder
         if frozen is not None and _lasts(frozen, _step(self.now(), self.world.period)):
             self._frozen = q[frozen.joint] if self._frozen is None else self._frozen
             q[frozen.joint] = self._frozen
@@ -344,7 +344,7 @@ def _whole(q: FloatArray, tick: FloatArray) -> FloatArray:
     return np.where(coarse, tick * np.round(q / np.where(coarse, tick, 1.0)), q)
 
 
-def _lasts(event: FrozenJoint | LostMarkers, step: int) -> bool:
+def _lasts(event: StuckEncoder | LostMarkers, step: int) -> bool:
     """Whether it is so in a period."""
     return event.from_step <= step < event.from_step + (event.steps or math.inf)
 
@@ -390,17 +390,21 @@ class _Joints:
     ``tick``: (n,) of the encoders, 0 for none. All rad or m.
     """
 
-    def __init__(self, world: World, faults: Faults, bump: Bump | None) -> None:
-        self.arm, self._bump = world.truth.robot, bump
-        self._struck_at = math.inf if bump is None else bump.at_step * world.period
+    def __init__(self, world: World, faults: Faults, moved: JointMoved | None) -> None:
+        self.arm, self._moved = world.truth.robot, moved
+        self._moved_at = math.inf if moved is None else moved.at_step * world.period
         scale = per_rad(self.arm.joint_types == PRISMATIC)
-        self.tick = scale * (2.0 * math.pi / faults.encoder_ticks if faults.encoder_ticks else 0.0)
-        self._play = 0.5 * faults.play * scale
+        self.tick = scale * (
+            2.0 * math.pi / faults.encoder_counts_per_turn if faults.encoder_counts_per_turn else 0.0
+        )
+        self._play = 0.5 * faults.backlash * scale
         # What gravity costs a joint that holds the tool at full reach, rad.
-        sag, self._flex = faults.sag, faults.flex
+        sag, self._flex = faults.gravity_sag, faults.link_deflection
         self._loaded = sag > 0.0 or self._flex > 0.0
         self._reach = full_reach(self.arm) if self._loaded else 1.0
-        self.servos = world.servos or _FirstOrder(self._load, world.q_start, faults.lag_s, sag)
+        self.servos = world.servos or _FirstOrder(
+            self._load, world.q_start, faults.servo_time_constant_s, sag
+        )
         self._link = self.servos.motor.copy()  # beyond the play
         self._slip = np.zeros(len(self._link))  # beyond both
         self.times, self.links = [0.0], [self._link + self._flex * self._load(self._link)]
@@ -425,7 +429,7 @@ class _Joints:
     def _advance(self, time: float, setpoint: FloatArray) -> None:
         """To a time, s, while the set-point goes evenly to joints (n,)."""
         self.servos.follow(setpoint, time - self.times[-1])
-        if time >= self._struck_at - 1e-9:
+        if time >= self._moved_at - 1e-9:
             self._strike()
         motor = self.servos.motor
         self._link = np.clip(self._link, motor - self._play, motor + self._play)
@@ -434,11 +438,11 @@ class _Joints:
 
     def _strike(self) -> None:
         """A joint is knocked aside, or slips."""
-        assert self._bump is not None
+        assert self._moved is not None
         by = np.zeros(len(self._link))
-        by[self._bump.joint] = self._bump.by
-        self._struck_at = math.inf
-        if self._bump.read:
+        by[self._moved.joint] = self._moved.by
+        self._moved_at = math.inf
+        if not self._moved.encoder_slip:
             self.servos.strike(by)
         else:
             self._slip = by
@@ -467,7 +471,7 @@ class _Camera:
         self._joints, self._world, self._faults, self._events = joints, world, faults, events
         self._view, self._looks = view, 0
         # No frame is read before it was exposed whole.
-        self._delay = max(faults.delay_s[view], 0.5 * faults.exposure_s)
+        self._delay = max(faults.camera_latency_s[view], 0.5 * faults.exposure_s)
         self._interval = 0.0 if faults.frame_rate_hz is None else 1.0 / faults.frame_rate_hz
         self._clock = float(world.random(view, 0).uniform(-_CLOCKS_S, _CLOCKS_S))
         self._first = float(world.random(0, 0).uniform(0.0, 1.0)) * self._interval

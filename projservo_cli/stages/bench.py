@@ -48,7 +48,7 @@ class Case:
         shown, gains = scenario.exact, scenario.gains
         self.m, self.q_start, self.model, self.gains = scenario.m, shown.q_start, scenario.model, gains
         self.limits = scenario.limits._replace(
-            image_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
+            image_error_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
         )
         seen = 2, len(scenario.numbers), 2
         self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, *seen))

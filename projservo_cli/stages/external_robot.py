@@ -116,7 +116,9 @@ def way_to(
     gap = np.abs(q - robot.reading.q)
     i, sag = int(np.argmax(gap / np.maximum(bounds.sag, _STILL))), bounds.sag
     if gap[i] > max(sag[i], _STILL) or (q != robot.target).any():
-        remedy = "look what holds the robot, or whether it sags or plays so far (plant.sag_deg)"
+        remedy = (
+            "look what holds the robot, or whether it sags or plays so far (plant.max_steady_state_error_deg)"
+        )
         if gap[i] > abs(q[i] - begun[i]) + sag[i]:
             remedy = (
                 f"it went away from there, from {bounds.told(i, begun[i])}: look at its sign and unit, and "
@@ -303,7 +305,7 @@ def connected(scenario: RunScenario, law: str, given: Robot | None = None) -> Dr
         robot = simulated_robot(driven, joints, _in_the_loop(scenario, driven.robot, contract.events))
     monitor = None
     if not scenario.untested:
-        noise = scenario.given.stop.innovation_factor * scenario.noise_px
+        noise = scenario.given.stop.innovation_threshold * scenario.noise_px
         shown = np.flatnonzero(np.isin(calibration.marker, scenario.observed))
         looks = scenario.limits.max_steps + 1 + WINDOW
         monitor = ImageMonitor(calibration, noise, looks, shown, plant.image_size)
@@ -335,7 +337,7 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
         np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
         scenario.noise_px,
         scenario.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
-        _delays_of(contract.delay_s, calibration),
+        _delays_of(contract.time_offset_s, calibration),
         contract.timeout_s,
     )
 
@@ -343,12 +345,12 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
 def _delays_of(given: tuple[float, float] | None, calibration: Calibration) -> DelayPrior:
     """What is known of the delays of both views: given, calibrated, or nothing."""
     known = NOTHING_KNOWN
-    if calibration.delay_s is not None:
-        interval, jitter = calibration.delay_interval_s, calibration.delay_jitter_s
+    if calibration.time_offset_s is not None:
+        interval, jitter = calibration.time_offset_interval_s, calibration.time_offset_jitter_s
         assert interval is not None
         assert jitter is not None
         sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
-        known = DelayPrior(calibration.delay_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
+        known = DelayPrior(calibration.time_offset_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
     if given is not None:
         known = known._replace(mean=np.array(given), sigma=np.zeros(2))
     return known

@@ -49,7 +49,7 @@ class Trials:
     truth: Truth | None  # robot, rig and markers as they are; None for a robot of somebody's
     driven: Driven | None  # by the contract; None for one that stands wherever it is sent
     noise_px: float  # standard deviation of simulated pixels
-    frames: int  # images of each pose that are averaged
+    averaged_frames: int  # images of each pose that are averaged
     settle_s: float  # for how long joints and images have stood still before
 
 
@@ -62,7 +62,7 @@ class RecordingInputs:
     face: tuple[int, ...]  # numbers of those that must stay visible; none where nobody says so
     dictionary: str | None  # of the tags, where somebody says so
     tagged: bool  # whether markers are said to be corners of tags
-    sag_deg: float  # how far a joint at rest may stay from its set-point
+    max_steady_state_error_deg: float  # how far a joint at rest may stay from its set-point
 
     @property
     def key(self) -> str:
@@ -72,7 +72,7 @@ class RecordingInputs:
         """
         trials, own = self.trials, self.own
         robot = own._replace(timeout_s=0.0, open_s=0.0) if own else (trials.truth, trials.driven)
-        how = trials.motions.seed, trials.noise_px, trials.frames, trials.settle_s
+        how = trials.motions.seed, trials.noise_px, trials.averaged_frames, trials.settle_s
         key = hashlib.sha256(encoded((robot, how, self.numbers, self.dictionary))).hexdigest()
         return f"{own.target if own else 'simulated'} {key[:16]}"
 
@@ -98,7 +98,7 @@ class Table(NamedTuple):
 class Estimation:
     """How a calibration is estimated from what was seen."""
 
-    method: str = "refined"  # or closed_form
+    method: str = "bundle_adjustment"  # or closed_form
     lens: bool = False  # whether to estimate two coefficients of radial distortion a camera
     init: File | None = None  # JSON of a robot and rig that are tried first as a start
     cross_validate: int | None = None  # parts into which poses are divided to predict each from the others
@@ -198,7 +198,7 @@ class PlanInputs:
     joints: JointSettings
     image_size: tuple[int, int] | None  # width and height, px, if they are known
     noise_px: float  # standard deviation of simulated pixels
-    frames: int  # that are averaged of start and goal
+    averaged_frames: int  # that are averaged of start and goal
     features: str | None  # points, body, or None for body where the calibration is usable
     tests_images: bool  # whether images are tested against the calibration
     trajectory: Trajectory
@@ -207,13 +207,13 @@ class PlanInputs:
 class StopSettings(NamedTuple):
     """When a closed loop ends."""
 
-    image_px: float
-    noise_factor: float  # widens ``image_px`` by so many times the noise
+    image_error_px: float
+    noise_factor: float  # widens ``image_error_px`` by so many times the noise
     max_steps: int
     diverged_factor: float
-    plateau_steps: int
-    lost_steps: int
-    innovation_factor: float  # of the noise, beyond which images disturb a run; 0 tests nothing
+    stall_periods: int
+    max_lost_periods: int
+    innovation_threshold: float  # of the noise, beyond which images disturb a run; 0 tests nothing
     at_joint_limit: bool
     at_border: bool  # at_joint_limit, at_border: whether they end a run
 
@@ -224,7 +224,7 @@ class Contract(NamedTuple):
     driven: Driven
     events: Events  # that befall a simulated robot
     timeout_s: float  # most time that an answer may take
-    delay_s: tuple[float, float] | None  # of the images of both cameras; None to estimate them
+    time_offset_s: tuple[float, float] | None  # of the images of both cameras; None to estimate them
     settle_s: float | None  # for how long a robot of somebody's has stood still at the start
 
 
@@ -237,7 +237,7 @@ class ServoInputs:
     stop: StopSettings
     opaque: bool  # whether the face hides its markers from a camera behind it
     speed_scale: float  # factor of every command
-    searches_anew: int  # how often a way is searched anew where one comes to nothing
+    max_replan_attempts: int  # how often a way is searched anew where one comes to nothing
     refuses: bool  # whether a law is not run where no joints could follow the plan
     lengths: FloatArray  # (m, m) distances between the markers of the face, m; NaN where nothing tells them
     contract: Contract | None  # None for the ideal plant

@@ -56,7 +56,7 @@ class Found(NamedTuple):
 
 def coupled(reaching: Reaching, trajectory: Trajectory) -> Found:
     """Shares of translation and rotations that keep all constraints, [RH00] section 4.3."""
-    sigma = np.linspace(0.0, 1.0, trajectory.samples)
+    sigma = np.linspace(0.0, 1.0, trajectory.n_samples)
     judged = plan_path(reaching)
     motion = along_shares(judged.reaching, evenly(judged, sigma))
     if judged.holds() and not motion.holds():  # between the places that were looked at
@@ -68,7 +68,7 @@ def coupled(reaching: Reaching, trajectory: Trajectory) -> Found:
 
 def given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_translation: float) -> Found:
     """Shares of a profile of the paper; ``pure_translation`` of the translation at most before a rotation."""
-    sigma = np.linspace(0.0, 1.0, trajectory.samples)
+    sigma = np.linspace(0.0, 1.0, trajectory.n_samples)
     motion = along_shares(reaching, profile_shares(profile, sigma, pure_translation))
     speed = reaching.demands.limits.speed
     shortest = least_time(speed, motion.along.q) if np.isfinite(speed).any() else np.nan * sigma
@@ -77,7 +77,7 @@ def given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_transla
 
 
 class JointSearch(NamedTuple):
-    """What the profile ``joint`` takes beside model, images and demands."""
+    """What the profile ``joint_space`` takes beside model, images and demands."""
 
     q_shown: FloatArray  # (k, n) joints known to show the goal, rad or m
     sigma: float  # standard deviation of a coordinate of the images of the goal, px
@@ -118,7 +118,7 @@ def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> F
 
     Where nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
     """
-    duration, ramp = trajectory.duration_s, trajectory.ramp_s
+    duration, ramp = trajectory.duration_s, trajectory.acceleration_time_s
     eased = _from_rest(shortest, ramp)
     least = float(eased[-1])
     if duration is None:
@@ -196,15 +196,17 @@ def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: J
     """A path through joint space; the linear motion where there is none."""
     c = _joint_constraints(reaching, task, trajectory, search.spread)
     aim = GoalFeatures(task.A_star, undistort(reaching.model.lens, task.s_star), search.sigma)
-    how = SearchLimits(trajectory.search_samples, trajectory.search_seed, trajectory.goals)
+    how = SearchLimits(
+        trajectory.max_search_samples, trajectory.search_seed, trajectory.max_goal_configurations
+    )
     path = find_path(c, aim, reaching.q_start, search.q_shown, how)
     if path.timing is None:
         linear = given("linear", reaching, trajectory._replace(duration_s=None), 1.0)
-        q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.samples, np.nan)
+        q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.n_samples, np.nan)
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)
         return Found(linear.judged, motion, unknown, False, "", path)
-    motion = _sampled_path(reaching, path.timing, trajectory.samples)
+    motion = _sampled_path(reaching, path.timing, trajectory.n_samples)
     least = float(path.timing.time[-1])
     asked = least if trajectory.duration_s is None else trajectory.duration_s
     _require_time(asked, least)
@@ -261,12 +263,14 @@ class PathReplanner:
         full[IMAGE:CLEAR] += np.abs(off).max(axis=1)
         full[CLEAR] += np.abs(off).max()
         c = self._c._replace(full=full)
-        how = SearchLimits(asked.search_samples, asked.search_seed + self._made, asked.goals, excluded)
+        how = SearchLimits(
+            asked.max_search_samples, asked.search_seed + self._made, asked.max_goal_configurations, excluded
+        )
         start = np.clip(q, c.limits.lower, c.limits.upper)
         path = find_path(c, self._goal, start, self._search.q_shown, how)
         if path.timing is None:
             return None
-        found = _sampled_path(self._reaching, path.timing, asked.samples)
+        found = _sampled_path(self._reaching, path.timing, asked.n_samples)
         H, H_start = (forward_kinematics(self._reaching.model, q) for q in (start, plan.q_start))
         sigma, duration = np.linspace(0.0, 1.0, len(found.mu)), float(path.timing.time[-1])
         return replace(
@@ -275,7 +279,7 @@ class PathReplanner:
             A=plan.A @ (H @ np.linalg.inv(H_start)).T,
             q=found.along.q,
             mu=found.mu,
-            sigma=sigma,
+            path_parameter=sigma,
             time=duration * sigma,
             duration=duration,
         )

@@ -145,17 +145,17 @@ def plan_task(
 
     trajectory : the motion that is asked for.
     demands : what the motion must keep to; profiles of the paper are only measured against it.
-    search : what a search through joint space takes, for the profiles ``joint`` and ``auto``.
+    search : what a search through joint space takes, for the profiles ``joint_space`` and ``auto``.
     Raises WorkFailed if a marker cannot be triangulated, a motion is not unique or the joints would be too
-    fast; InputError for the profile ``joint`` where a joint has no speed limit.
+    fast; InputError for the profile ``joint_space`` where a joint has no speed limit.
     """
     if trajectory.profile != "auto":
         return _planned(model, shown, trajectory, demands, search)[0]
     before: list[str] = []
     shut = why_closed(model, demands, search)
-    for profile in ("linear", "constrained", "joint"):
+    for profile in ("linear", "constrained", "joint_space"):
         asked = trajectory._replace(profile=profile)
-        last = profile == "joint" or (profile == "constrained" and bool(shut))
+        last = profile == "joint_space" or (profile == "constrained" and bool(shut))
         try:
             plan, fails = _planned(model, shown, asked, demands, search)
         except WorkFailed as error:
@@ -164,8 +164,8 @@ def plan_task(
             before.append(f"{profile}: {error}")
             continue
         if not fails or last:
-            after = [] if profile == "joint" or not fails else [f"joint: {shut}"]
-            return replace(plan, instead=(*before, *after))
+            after = [] if profile == "joint_space" or not fails else [f"joint_space: {shut}"]
+            return replace(plan, rejected_profiles=(*before, *after))
         before.append(f"{profile}: {fails}")
     raise AssertionError(before)
 
@@ -179,10 +179,10 @@ def _found(
 ) -> Found:
     """The motion of one profile; ``tau_limit`` of the translation at most before a rotation."""
     profile = trajectory.profile
-    if profile == "joint":
+    if profile == "joint_space":
         shut = why_closed(reaching.model, reaching.demands, search)
         if search is None or shut:
-            raise InputError(f"the profile joint: {shut}")
+            raise InputError(f"the profile joint_space: {shut}")
         return joint_path(reaching, task, trajectory, search)
     if profile == "constrained":
         found = coupled(reaching, trajectory)
@@ -203,7 +203,7 @@ def _planned(
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
-    tau_limit = min((trajectory.delta * t for t in tau_0 if t > 0.0), default=math.inf)
+    tau_limit = min((trajectory.visibility_fraction * t for t in tau_0 if t > 0.0), default=math.inf)
     body = body_at_start(model, task, shown, state.A)
     reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, shown.q_start, body)
     found = _found(reaching, task, trajectory, search, tau_limit)
@@ -213,7 +213,7 @@ def _planned(
         _require_in_span(model, state.A, shown.q_start, along.s)
     sense, sense_margin = _senses(parts, task)
     holds, constraint, words = verdict_of(found.judged)
-    least, least_mu = least_of(found.judged)
+    least, min_margin_mu = least_of(found.judged)
     plan = Plan(
         profile=trajectory.profile,
         feasible=found.feasible,
@@ -225,7 +225,7 @@ def _planned(
         constraint=constraint,
         duration=float(time[-1]) if math.isfinite(time[-1]) else None,
         tau_limit=tau_limit,
-        sigma=np.linspace(0.0, 1.0, len(time)),
+        path_parameter=np.linspace(0.0, 1.0, len(time)),
         time=time,
         mu=motion.mu,
         H_d=along.H_d,
@@ -234,9 +234,9 @@ def _planned(
         border_distance=along.distance,
         q=along.q,
         joint_margin=along.limit,
-        condition=along.condition,
-        least=least,
-        least_mu=least_mu,
+        reciprocal_condition=along.condition,
+        min_margin=least,
+        min_margin_mu=min_margin_mu,
         s_start=face.s_start,
         s_star=face.s_star,
         A=state.A,

@@ -119,9 +119,9 @@ _TOLD = 2
 def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> dict[str, Any]:
     """Fields of a plan that a search came to, with joints (s, n) at times (s,); NaN where it found none."""
     told: dict[str, Any] = {
-        "goals": path.n_goals,
-        "goals_tried": len(path.goals),
-        "samples": path.draws,
+        "n_goal_configurations": path.n_goals,
+        "n_goals_tried": len(path.goals),
+        "n_search_samples": path.draws,
         "seed": seed,
         "tree_nodes": 0,
     }
@@ -130,10 +130,10 @@ def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) 
         told["tree_q"], told["tree_parent"] = _stored(path.trees)
     if path.timing is None:
         return told
-    told["validity"], told["validity_asked"] = _along(path.constraints, q)
+    told["margins"], told["required_margins"] = _along(path.constraints, q)
     took = float(path.timing.time[-1])
-    told["corner"] = _corners_of(path.timing) * (float(time[-1]) / took if took > 0.0 else 1.0)
-    told["lowered"] = tuple(_lowered(path.constraints, {"start": q[0], "goal": q[-1]}))
+    told["blends"] = _corners_of(path.timing) * (float(time[-1]) / took if took > 0.0 else 1.0)
+    told["relaxed_constraints"] = tuple(_lowered(path.constraints, {"start": q[0], "goal": q[-1]}))
     return told
 
 

@@ -215,7 +215,7 @@ def new_recording(
         return replace(recording, why="asked for by --force")
     if path.exists():
         try:
-            return _resumed(recording, joints.length_of(inputs.sag_deg) + _SLACK)
+            return _resumed(recording, joints.length_of(inputs.max_steady_state_error_deg) + _SLACK)
         except _OutdatedError:
             if not redo or (recording_of(path) or "").rpartition(" ")[0] != key.rpartition(" ")[0]:
                 raise
@@ -327,7 +327,7 @@ def observed(
     simulated = trials.driven.robot
     if not isinstance(simulated, OwnRobot) and simulated.scene is not None:
         return recording.observation(), None
-    return recording.observation(), sigma_px / math.sqrt(trials.frames) or None
+    return recording.observation(), sigma_px / math.sqrt(trials.averaged_frames) or None
 
 
 def _simulated(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> Iterator[int]:
@@ -464,7 +464,7 @@ def _recorded(
         seen = list(way_to(steered, recording.targets[pose], settle_s, "record", fit))
         fit = None
         recording.commands += len(seen)
-        recording.done[pose], squares, count = averaged(steered.reading, look, trials.frames)
+        recording.done[pose], squares, count = averaged(steered.reading, look, trials.averaged_frames)
         recording.scatter += squares.sum(), 2.0 * np.maximum(count - 1, 0).sum()
         recording.ways[pose + 1] = _moving(seen, settle_s)
         if sight is not None:

@@ -76,14 +76,14 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
     figures = draw_all(material, directory, inputs.formats, left_out, progress)
     report = Report(
         figures=tuple(figures),
-        left_out=tuple(left_out),
+        omitted=tuple(left_out),
         claims=tuple(claims),
         step_limit_deg=STEP_LIMIT_DEG,
         share=share,
         composition_mm=1e3 * distance,
         **study_numbers(studies),
     )
-    content = {"claims": report.claims, "drift": drift_rows(report), "left_out": report.left_out}
+    content = {"claims": report.claims, "drift": drift_rows(report), "omitted": report.omitted}
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
     write_whole(directory / CLAIMS_FILE, f"{text}\n")
     for name in (VIEW_FILE, ANIMATION_FILE):  # of other runs than those that are reported on now
@@ -122,7 +122,7 @@ def _material(
         run.traces,
         studies,
         "" if studies else left_out[-1]["reason"],
-        bench.scenario.limits.plateau_steps,
+        bench.scenario.limits.stall_periods,
         held_out=run.cross_validation,
         trajectory=inputs.trajectory,
     )

@@ -86,10 +86,10 @@ class Scenario:
     def untested(self) -> str:
         """Why images in the loop are not tested against the calibration; empty where they are."""
         if not self.inputs.tests_images:
-            return "stop.innovation_factor is 0"
+            return "stop.innovation_threshold is 0"
         assert self.calibration is not None
         if not self.calibration.has_covariance:
-            return "the calibration has no covariance, which the method refined gives"
+            return "the calibration has no covariance, which the method bundle_adjustment gives"
         return ""
 
     def shown_to(self, law: str) -> TaskImages:
@@ -115,8 +115,8 @@ class Scenario:
         joints, asked = self.joints, self.inputs.trajectory
         margins = asked.joint_margin_m, asked.joint_margin
         keep = np.array([margins[kind != "P"] for kind in joints.types])
-        border, condition = asked.border_px, asked.least_condition
-        face, units = asked.least_face_px, self.joints.units
+        border, condition = asked.border_px, asked.min_reciprocal_condition
+        face, units = asked.min_face_px, self.joints.units
         return Demands(joints.limits, size, border, condition, keep, face, self._tags(), units)
 
     def _tags(self) -> IntArray:
@@ -132,7 +132,7 @@ class Scenario:
         """Standard deviation of a coordinate of the face in the images of the goal, px."""
         images = self._given
         told = None if images is None else images.sigma_px(self.numbers[: self.m])
-        return self.noise_px / math.sqrt(self.inputs.frames) if told is None else told
+        return self.noise_px / math.sqrt(self.inputs.averaged_frames) if told is None else told
 
     @property
     def _given(self) -> GoalImages | None:
@@ -143,7 +143,7 @@ class Scenario:
         """Start and goal as the images of a seed show them, which are averages."""
         if self.inputs.scene is not None:
             return self._rendered(seed)
-        sigma = self.inputs.noise_px / math.sqrt(self.inputs.frames)
+        sigma = self.inputs.noise_px / math.sqrt(self.inputs.averaged_frames)
         if sigma == 0.0 or self.truth is None:
             return self.exact
         m, others = self.m, self.truth.pins
@@ -181,7 +181,7 @@ class Scenario:
         """Pixels (2, b, 2) in rendered frames at joints (n,), rad or m, and their deviations (2, b)."""
         assert self.inputs.scene is not None
         which = [self.inputs.scene.numbers.index(number) for number in self.numbers]
-        s, sigma = shown_in_frames(self.inputs.scene, self.inputs.frames, q, drawn)
+        s, sigma = shown_in_frames(self.inputs.scene, self.inputs.averaged_frames, q, drawn)
         return np.ascontiguousarray(s[:, which]), sigma[:, which]
 
     def _with_face(self, key: str, s: FloatArray, q: FloatArray | None) -> FloatArray:
@@ -336,13 +336,13 @@ def _limits(inputs: ServoInputs, found: Scenario) -> Limits:
     noise_px = stop.noise_factor * found.noise_px
     return Limits(
         found.joints.limits.speed,
-        stop.image_px + noise_px,
+        stop.image_error_px + noise_px,
         stop.diverged_factor,
-        stop.plateau_steps,
+        stop.stall_periods,
         stop.max_steps,
         stop.at_joint_limit,
         stop.at_border,
-        stop.lost_steps,
+        stop.max_lost_periods,
         noise_px,
     )
 
@@ -449,7 +449,7 @@ def _predicted_ends(
         assert task.goal.turn is not None
         if inputs.arm is None or inputs.P is None:
             raise InputError(
-                "task.goal.turn_deg needs the model of the robot and its rig: give joints or images instead"
+                "task.goal.roll_deg needs the model of the robot and its rig: give joints or images instead"
             )
         return task.goal.turn.joints(inputs.arm, inputs.P, q)
 

@@ -14,7 +14,7 @@ from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, T
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span
-from projservo_cli.laws import CODES, REPLAN, law_and_mode
+from projservo_cli.laws import CODES, REGULATE, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import MM, Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
@@ -49,7 +49,7 @@ class _Outcome:
     limited: float  # how often visibility limited the translation
     plant: Plant  # that was driven; of a robot that is not simulated what the calibration takes it for
     law: str = ""
-    mode: str = REPLAN  # law, mode: what it is a run of
+    mode: str = REGULATE  # law, mode: what it is a run of
     planned_s: float | None = None  # when the plan that it followed arrives, s
     unplanned: str = ""  # why it went without the plan that it was to follow
     anew: tuple[str, ...] = ()  # when and why a way was searched anew
@@ -79,9 +79,9 @@ class _Outcome:
         before, after, views = log.fit[:rows].T
         errors, H, read = log.errors[:rows], log.H[:rows], log.read[:rows]
         # A law that follows a plan measures what is left to where the plan is, not to the goal.
-        remaining = _left(log, steps) if self.mode == REPLAN else (None, None)
+        remaining = _left(log, steps) if self.mode == REGULATE else (None, None)
         joint = int(log.events[2])
-        stretch = plateau_stretch(log.judged[:rows], scenario.limits.plateau_steps)
+        stretch = plateau_stretch(log.judged[:rows], scenario.limits.stall_periods)
         s_star = scenario.ends.by_points().s_star
         simulated = scenario.truth is not None
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
@@ -104,20 +104,20 @@ class _Outcome:
             planned_s=self.planned_s,
             verdict=self.verdict,
             reason="; ".join([_reason(self, joint, remaining), *_told_anew(self.anew)]),
-            searches_anew=len(self.anew),
+            replan_attempts=len(self.anew),
             steps=steps,
             period=scenario.gains.period,
-            observation="points" if np.isnan(views).all() else "body",
-            translation_left=remaining[0],
-            rotation_left_deg=remaining[1],
-            plateau_steps=0 if stretch is None else stretch[1] - stretch[0],
+            features="points" if np.isnan(views).all() else "body",
+            remaining_translation=remaining[0],
+            remaining_rotation_deg=remaining[1],
+            longest_stall_steps=0 if stretch is None else stretch[1] - stretch[0],
             limit_joint=joint,
             q=log.q[:rows],
             q_read=None if np.array_equal(read, log.q[:rows]) else read,
             s=np.ascontiguousarray(log.s[:rows, :, : s_star.shape[1]]),
             s_star=s_star,
             image_error=log.error[:rows],
-            stop_error=log.judged[:rows],
+            convergence_error=log.judged[:rows],
             tau=errors[:, 0],
             tau_affine=errors[:, 1],
             theta_r=errors[:, 2],
@@ -136,7 +136,7 @@ class _Outcome:
             estimated_position_error_mm=_estimated_mm(self, views),
             untested="" if driven is None else scenario.untested,
             overruns=None if driven is None else driven.steered.overruns,
-            delay=None if driven is None else _whole(driven.delays, rows),
+            latency=None if driven is None else _whole(driven.delays, rows),
             **({} if driven is None else driven.film.told()),
         )
 
@@ -181,7 +181,7 @@ def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
         noise.append(scenario.calibration.sigma_px)
     left = _rms(run.log.fit[run.steps, 1:2], 2.0 * views[-1:] - COORDINATES)[0]
     untested = run.driven is not None and scenario.untested
-    if run.verdict in ("disturbed", "failed") or untested or left > _AGREES * max(noise):
+    if run.verdict in ("fault detected", "failed") or untested or left > _AGREES * max(noise):
         return None
     # The pair of corners that is foreshortened least tells how much of the face a pixel is.
     span = np.linalg.norm(s[:, :, None] - s[:, None], axis=3)
@@ -225,22 +225,22 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
     ]
     reasons = {
         "converged": f"image error {error:.3g} px is within {within:.3g} px",
-        "plateau": f"the robot stands still at an image error of {error:.3g} px: {run.why}"
+        "no progress": f"the robot stands still at an image error of {error:.3g} px: {run.why}"
         if run.why
         else f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
-        f"{limits.plateau_steps} steps: a local minimum",
-        "not following": f"{run.why}; {' and '.join(left)} are left",
+        f"{limits.stall_periods} steps: a local minimum",
+        "following error": f"{run.why}; {' and '.join(left)} are left",
         "max steps": f"no step left; image error {error:.3g} px was still changing",
         "diverged": f"image error {error:.3g} px (at first {first:.3g}) or the distance of the face grew "
         f"{limits.diverged_factor:g}-fold",
-        "left image": f"a face marker left an image at step {steps}",
+        "out of view": f"a face marker left an image at step {steps}",
         "behind camera": f"a face marker passed behind a camera at step {steps}",
         "markers lost": f"the law could not measure the face at step {steps}: a marker was not seen"
-        + (f", {limits.lost_steps} periods after the last that was" if limits.lost_steps else ""),
+        + (f", {limits.max_lost_periods} periods after the last that was" if limits.max_lost_periods else ""),
         "joint limit": f"joint {joint + 1} stands at its limit, {float(log.read[steps, joint]):.6g} (rad or "
         f"m), and the task would take it beyond; {' and '.join(left)} are left",
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
-        **dict.fromkeys(("disturbed", "failed"), run.why),
+        **dict.fromkeys(("fault detected", "failed"), run.why),
     }
     hindrance = ""
     if run.driven is not None and run.verdict != "converged":
@@ -287,12 +287,12 @@ def drive(
     unplanned, planned_s = "", None
     if scenario.inputs.trajectory.keep_out and not (isinstance(plan, Plan) and plan.feasible):
         raise WorkFailed("nothing is driven where trajectory.keep_out is set and the plan is not feasible")
-    if mode != REPLAN and isinstance(plan, Plan):
+    if mode != REGULATE and isinstance(plan, Plan):
         if not np.isfinite(plan.q).all() and not scenario.given.refuses:
             unplanned = f"no joints can follow the plan: {plan.reason}"
         elif plan.duration is not None:
             planned_s = plan.duration / scenario.given.speed_scale
-    asked = _Asked(scenario, plan, law, mode == REPLAN or bool(unplanned), believed, given or Given())
+    asked = _Asked(scenario, plan, law, mode == REGULATE or bool(unplanned), believed, given or Given())
     if scenario.given.contract is not None:
         run = asked.by_contract()
     elif isinstance(plan, Plan) and (not _in_compiled_loop(scenario.given, law) or asked.is_guided):
@@ -310,7 +310,7 @@ def _in_compiled_loop(inputs: ServoInputs, law: str) -> bool:
 def sense_is_enough(inputs: ServoInputs, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
-    return mode == REPLAN and _in_compiled_loop(inputs, law)
+    return mode == REGULATE and _in_compiled_loop(inputs, law)
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,7 +328,7 @@ class _Asked:
     def is_guided(self) -> bool:
         """Whether the run follows a plan which gives way to another one where it fails."""
         scenario = self.scenario
-        searched = scenario.inputs.trajectory.profile in ("joint", "auto")
+        searched = scenario.inputs.trajectory.profile in ("joint_space", "auto")
         if self.replans or self.law not in CODES or not searched:
             return False
         return not why_closed(scenario.model, scenario.demands, search_of(scenario))
@@ -388,7 +388,7 @@ class _Asked:
         scenario, execution = self.scenario, None
         if self.is_guided and isinstance(law, BuiltInLaw):
             assert isinstance(self.plan, Plan)
-            follow, searches = partial(self._task, law.law.model), scenario.given.searches_anew
+            follow, searches = partial(self._task, law.law.model), scenario.given.max_replan_attempts
             replanner = PathReplanner(scenario, self.plan)
             execution = ExecutionMonitor(law, follow, replanner, searches, scenario.limits, stall)
         code, steps, log = run_in_python(

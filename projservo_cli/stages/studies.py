@@ -126,7 +126,7 @@ def run_studies(
 def metric_plan(bench: Comparison) -> Plan:
     """The task partitioned with the true metric model, so that its operators are in metres."""
     asked, robot = bench.scenario.inputs.trajectory, bench.truth.robot
-    trajectory = asked._replace(profile="linear", samples=2, duration_s=None)
+    trajectory = asked._replace(profile="linear", n_samples=2, duration_s=None)
     shown, limits = bench.scenario.ends, limits_alone(robot.limits)
     return plan_task(bench.models["true"], shown, trajectory, limits)
 

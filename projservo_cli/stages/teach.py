@@ -178,7 +178,7 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     asked = replace(
         inputs,
         task=ReachingTask(start, None, Goal(images=taught.images)),
-        trajectory=inputs.trajectory._replace(profile="joint", keep_out=()),
+        trajectory=inputs.trajectory._replace(profile="joint_space", keep_out=()),
     )
     try:
         plan = planning.run(asked, calibration)

@@ -43,7 +43,7 @@ from projservo_cli.records import (
 if typing.TYPE_CHECKING:
     import h5netcdf
 
-SCHEMA_VERSION = 2  # version of the layout of a file
+SCHEMA_VERSION = 3  # version of the layout of a file
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"  # first bytes of an HDF5 file
 _SEAL = b"\nprojservo sha256 %s\n"  # last line of a file, with its checksum
 _SEAL_SIZE = len(_SEAL % bytes(64))  # bytes of that line
@@ -67,6 +67,7 @@ _RECORDS: dict[str, dict[str, type]] = {
     "report": {"": Report},
 }
 _NAME = re.compile(r"calibrate|plan|report|servo/[\w.:-]+")
+_OLDER = "make it again in another folder: projservo calibrate plan servo report -c FILE -o FOLDER"
 _REMEDY = "restore it, or make it again in another folder"
 
 
@@ -171,8 +172,8 @@ def load(target: Path | str) -> Run:
             raise InputError(f"{path}: an HDF5 file, but not a run file of projservo; name another")
         if (version := attribute(file, "schema_version", int)) != SCHEMA_VERSION:
             raise InputError(
-                f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}: upgrade, pip "
-                "install --upgrade projservo, or make it again: projservo calibrate plan servo report -c FILE"
+                f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}: "
+                + ("upgrade: pip install --upgrade projservo" if version > SCHEMA_VERSION else _OLDER)
             )
         names = list(dict.fromkeys(attribute(file, "order", list)))
         if unknown := [name for name in names if not _NAME.fullmatch(name)]:

@@ -52,7 +52,7 @@ _UNSEEN = (
 )
 _MISFIT = (
     "the images at the {} fit no pose of the calibrated body: check the marker numbers, or measure point by "
-    "point with control.observation: points"
+    "point with control.features: points"
 )
 PROBLEMS = {
     NO_POINT: stereo.NO_POINT,

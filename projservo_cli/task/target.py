@@ -139,7 +139,7 @@ def _period_times(plan: Plan, period: float) -> FloatArray:
     if not np.isfinite(plan.q).all():
         raise WorkFailed(
             "the joints cannot follow the planned motion to its end: choose another trajectory.profile, or "
-            "set control.without_plan=replan to drive without a plan"
+            "set control.on_plan_failure=regulate to drive without a plan"
         )
     if plan.duration is None:
         raise InputError(
@@ -160,9 +160,10 @@ def _followed_at(
     goal is corrected along the path, for points measured one by one and for images by the residual of the
     calibration there, so that both arrive at the taught goal.
     """
-    sigma = np.interp(times, plan.time, plan.sigma) if plan.time[-1] > 0.0 else np.ones(len(times))
+    sigma = np.interp(times, plan.time, plan.path_parameter) if plan.time[-1] > 0.0 else np.ones(len(times))
     mu, q = (
-        np.stack([np.interp(sigma, plan.sigma, row) for row in rows.T], axis=1) for rows in (plan.mu, plan.q)
+        np.stack([np.interp(sigma, plan.path_parameter, row) for row in rows.T], axis=1)
+        for rows in (plan.mu, plan.q)
     )
     if np.isnan(mu).any():
         mu, back = np.empty((0, 3)), np.linalg.inv(forward_kinematics(model, plan.q[0]))

@@ -20,24 +20,24 @@ class KeptOut(NamedTuple):
 
     left: tuple[tuple[float, float], ...] | None
     right: tuple[tuple[float, float], ...] | None
-    hides: bool  # whether the obstacle may hide markers: those of the face stay outside in both images
+    occludes: bool  # whether the obstacle may hide markers: those of the face stay outside in both images
 
 
 class Trajectory(NamedTuple):
     """The planned motion that is asked for, and what it keeps to."""
 
-    profile: str  # one of ``PROFILES``, ``constrained``, ``joint`` or ``auto``
-    delta: float  # share of the translation at which visibility changes that is kept to
-    samples: int  # points of the path that are stored
+    profile: str  # one of ``PROFILES``, ``constrained``, ``joint_space`` or ``auto``
+    visibility_fraction: float  # share of the translation at which visibility changes that is kept to
+    n_samples: int  # points of the path that are stored
     duration_s: float | None  # time the motion is given; None for as little as it takes
-    ramp_s: float  # time in which a motion comes up to its pace, and to rest again
+    acceleration_time_s: float  # time in which a motion comes up to its pace, and to rest again
     border_px: float  # least distance of a marker from an image border
-    least_condition: float  # least reciprocal condition of the face's image Jacobian
-    least_face_px: float  # least width of the face in an image
+    min_reciprocal_condition: float  # least reciprocal condition of the face's image Jacobian
+    min_face_px: float  # least width of the face in an image
     joint_margin: float  # least distance from a limit, revolute joints, rad
     joint_margin_m: float  # and prismatic ones
-    goals: int  # joints that show the goal which a search tries
-    search_samples: int  # joint vectors that two trees grow towards, at most
+    max_goal_configurations: int  # joints that show the goal which a search tries
+    max_search_samples: int  # joint vectors that two trees grow towards, at most
     search_seed: int
     keep_out: tuple[KeptOut, ...]
 
@@ -49,7 +49,7 @@ class Trajectory(NamedTuple):
     @property
     def needs_covariance(self) -> bool:
         """Whether a plan takes the covariance of the calibration: searches through joint space, regions."""
-        return self.profile in ("joint", "auto") or bool(self.keep_out)
+        return self.profile in ("joint_space", "auto") or bool(self.keep_out)
 
 
 def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.0) -> FloatArray:

@@ -22,7 +22,7 @@ HELD_OUT = {
 }
 # Pixels of the tables are rounded to 1e-6: their own noise is 2.9e-7 px a coordinate. The closed
 # form passes it on enlarged (6e-6 px measured), far below the 1e-3 it must reach.
-NOISE_FREE = {"refined": 2e-6, "closed_form": 5e-5}
+NOISE_FREE = {"bundle_adjustment": 2e-6, "closed_form": 5e-5}
 
 
 @pytest.fixture(autouse=True)

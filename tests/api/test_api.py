@@ -22,7 +22,7 @@ from tests.configured import calibrate
 from tests.conftest import ROOT
 
 CONFIGS = ("apart", "coupled", "hobby", "paper", "seven", "stanford", "ur5")
-LATE = {"disturbance.delay_s": 0.1, "disturbance.lag_s": 0.05}
+LATE = {"disturbance.camera_latency_s": 0.1, "disturbance.servo_time_constant_s": 0.05}
 FEW = {"calibration.frames_per_joint": 3, "calibration.random_poses": 6}
 
 
@@ -71,7 +71,7 @@ def test_a_calibration_from_python_is_that_of_the_chain(name):
 
 
 def test_joint_noise_is_estimated_where_the_chain_estimates_it():
-    config = ps.Config.load("ur5").replace({"disturbance.play_deg": 0.1})
+    config = ps.Config.load("ur5").replace({"disturbance.backlash_deg": 0.1})
     seen = ps.simulate(config)
     assert seen.joint_noise is None
     assert not seen.exact
@@ -165,7 +165,7 @@ def test_a_trace_is_that_of_the_chain_and_of_a_class_like_that_of_its_name(confi
     assert own.law == f"{__name__}:Resolved"
     assert own.verdict == "converged"
     lazy = ps.servo(config, calibration, plan, law=lambda setup: lambda s, q: 0.0 * q)
-    assert lazy.verdict == "plateau"
+    assert lazy.verdict == "no progress"
 
 
 def test_a_robot_at_hand_is_recorded_and_driven(made):
@@ -245,7 +245,7 @@ def test_a_script_is_told_of_the_guard_it_lacks_and_its_classes_work_with_one(tm
 
     lacking = answer("if True:")
     assert 'put its calls under if __name__ == "__main__":' in lacking.stderr.splitlines()[-1]
-    assert answer('if __name__ == "__main__":').stdout == "['plateau', 'plateau']\n"
+    assert answer('if __name__ == "__main__":').stdout == "['no progress', 'no progress']\n"
 
 
 def test_an_experiment_is_made_once_resumed_and_opened_again(config, tmp_path):
@@ -270,7 +270,7 @@ def test_a_law_of_a_notebook_is_never_up_to_date(config, tmp_path, monkeypatch):
 
 
 def test_what_was_finished_is_kept_where_a_stage_fails(config, tmp_path):
-    goal = {"turn_deg": None, "perturbation": None, "joints": {"joints": [9] * 6}}
+    goal = {"roll_deg": None, "perturbation": None, "joints": {"joints": [9] * 6}}
     far = config.replace({"task": {"goal": goal}})
     run = ps.Experiment(far, tmp_path / "run")
     with pytest.raises(ps.WorkFailed, match=r"plan: task.goal: joint 1 would be at 9 rad, beyond its limits"):
@@ -342,7 +342,7 @@ def test_what_makes_no_sense_is_said_in_a_sentence(config, call, message):
         (lambda c, k, p: ps.servo(ps.Config.load("stanford"), k, p), "the calibration is of joints RRRRRR"),
         (lambda c, k, p: ps.servo(c, k, p, law="exakt"), "law exakt: no such law; laws: direct_three"),
         (lambda c, k, p: ps.servo(c, k, p, law=3), "law 3: expected a name, or a class or function"),
-        (lambda c, k, p: ps.servo(c, k, p, mode="follow"), "'follow' is not one of them; valid: replan"),
+        (lambda c, k, p: ps.servo(c, k, p, mode="follow"), "'follow' is not one of them; valid: regulate"),
         (lambda c, k, p: k.predict(np.full(6, 90.0)), "joint readings: joint 1 at 90 is more than two turns"),
     ],
 )

@@ -46,5 +46,5 @@ def listed(calibration):
         (p, m, v) for p, m, view in calibration.outlier.tolist() for v in ((view,) if view < 2 else (0, 1))
     }
     return readings, *(
-        {tuple(row) for row in rows.tolist()} for rows in (calibration.swapped, calibration.suspect)
+        {tuple(row) for row in rows.tolist()} for rows in (calibration.id_switches, calibration.suspect)
     )

@@ -53,9 +53,9 @@ def test_record_follows_the_conventions():
     assert np.all(np.einsum("vc,mc->vm", calibration.P[:, 2], calibration.M) > 0.0)
     assert calibration.errors.dense().shape == (24 + 16 * n + 4 * m, 24 + 5 * 4 + 2 - 8 + 3 * m)
     assert calibration.dof == 2 * 2 * 49 * 10 - (24 + 5 * 4 + 2 + 3 * 10 - 8)
-    assert calibration.merged_poses == 49
-    assert calibration.merged_markers == 10
-    assert len(calibration.outlier) == len(calibration.suspect) == len(calibration.swapped) == 0
+    assert calibration.poses_used == 49
+    assert calibration.markers_used == 10
+    assert len(calibration.outlier) == len(calibration.suspect) == len(calibration.id_switches) == 0
     assert np.allclose(calibration.excitation, np.ptp(observation.q, axis=0))
 
 
@@ -74,7 +74,8 @@ def test_frame_does_not_depend_on_the_frame_it_comes_from():
     """The closed form comes from a projective frame, the refined one from a metric guess."""
     _, observation = noisy("RPRR", sigma=0.0)
     one, other = (
-        calibrate(observation, "RPRR", source="recorded", method=m) for m in ("refined", "closed_form")
+        calibrate(observation, "RPRR", source="recorded", method=m)
+        for m in ("bundle_adjustment", "closed_form")
     )
     for name in ("P", "H_hat_0", "M", "a_inf"):
         expected = getattr(one, name)

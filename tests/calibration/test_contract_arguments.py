@@ -74,7 +74,7 @@ def test_arguments_are_left_as_they_were():
     before = {name: value.copy() for name, value in vars(OBSERVATION).items() if value is not None}
     for name in before:
         getattr(OBSERVATION, name).setflags(write=False)
-    for method in ("refined", "closed_form"):
+    for method in ("bundle_adjustment", "closed_form"):
         calibrate(OBSERVATION, "RPR", method=method, source="recorded")
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(OBSERVATION, name), value)

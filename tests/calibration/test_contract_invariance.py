@@ -94,7 +94,7 @@ def test_seed_of_the_search(case):
         assert np.abs(predict(other, q) - predict(calibration, q)).max() <= SAME_PX
         again = calibrate(observation, robot.joint_types, source="recorded", seed=seed)
         np.testing.assert_array_equal(other.P, again.P)
-        np.testing.assert_array_equal(other.marker_error, again.marker_error)
+        np.testing.assert_array_equal(other.sqrt_cov_marker, again.sqrt_cov_marker)
 
 
 def test_last_digits_do_not_depend_on_the_hash_seed():

@@ -22,7 +22,7 @@ GARBAGE = (
     "rig.left={focal_px: [7, 900], principal_point_px: [9, 9], position_m: [-5, 2, 9], target_m: [0, 0, 1]}",
     "rig.right={focal_px: [99, 99], principal_point_px: [0, 0], position_m: [0, 30, 0], target_m: [1, 1, 1]}",
     "markers.positions_m=[" + ", ".join(f"[{i}, {i * i % 7}, {-i}]" for i in range(10)) + "]",
-    "task={start: {joints: [1, 2, 3, 4, 5, 6], unit: rad}, goal: {turn_deg: 90}}",
+    "task={start: {joints: [1, 2, 3, 4, 5, 6], unit: rad}, goal: {roll_deg: 90}}",
 )
 
 
@@ -47,7 +47,7 @@ def honest():
     return stage.run(load_config(PAPER, ()))[:2]
 
 
-@pytest.mark.parametrize(("method", "noise"), [("refined", 0.5), ("closed_form", 0.5)])
+@pytest.mark.parametrize(("method", "noise"), [("bundle_adjustment", 0.5), ("closed_form", 0.5)])
 def test_a_simulated_run_with_garbage_for_truth_is_the_same(monkeypatch, method, noise):
     settings = (f"calibration.method={method}", f"noise.calibration_px={noise}")
     observation, calibration, _ = stage.run(load_config(PAPER, settings))

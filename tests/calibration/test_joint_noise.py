@@ -96,7 +96,7 @@ def test_exact_readings_and_loud_pixels_show_no_noise_of_joints():
     plain, asked = (calibrate(seen, TYPES, source="recorded", joint_noise=given) for given in (0.0, None))
     assert (plain.sigma_q, asked.sigma_q) == (None, 0.0)
     assert asked.sigma_q_interval[0] == 0.0 < asked.sigma_q_interval[1] < SIGMA_Q
-    for name in ("P", "H_hat_0", "M", "shared_error", "own_error"):
+    for name in ("P", "H_hat_0", "M", "sqrt_cov_shared", "sqrt_cov_own"):
         np.testing.assert_array_equal(getattr(asked, name), getattr(plain, name))
     quiet = calibrate(seen, TYPES, source="recorded", sigma_px=0.7 * SIGMA, joint_noise=None)
     assert quiet.sigma_q == 0.0

@@ -55,7 +55,7 @@ def fitted(robot, bent):
 
 def test_known_distortion_is_recovered_within_its_uncertainty(fitted):
     off = (fitted.lens[:, 3:] - LENS[:, 3:]).ravel()
-    spread = fitted.shared_error[-4:] @ fitted.shared_error[-4:].T
+    spread = fitted.sqrt_cov_shared[-4:] @ fitted.sqrt_cov_shared[-4:].T
     assert np.array_equal(fitted.lens[:, :3], LENS[:, :3])
     # χ² of four degrees of freedom: beyond 18.5 once in a thousand draws.
     assert off @ np.linalg.solve(spread, off) < 18.5
@@ -112,7 +112,7 @@ def test_straight_images_show_no_lens_and_lose_little(robot, poses):
         for lens in (False, True)
     )
     k = with_lens.lens[:, 3:].ravel()
-    assert k @ np.linalg.solve(with_lens.shared_error[-4:] @ with_lens.shared_error[-4:].T, k) < 18.5
+    assert k @ np.linalg.solve(with_lens.sqrt_cov_shared[-4:] @ with_lens.sqrt_cov_shared[-4:].T, k) < 18.5
     assert any("omit --lens" in text for text in with_lens.advice)
     assert not any("lens" in text for text in without.advice)
     q = around(robot, 60, np.random.default_rng(8), angle=0.6, length=0.2)

@@ -35,7 +35,7 @@ def test_a_fifth_of_the_sightings_may_be_wrong(mistake):
 @pytest.mark.parametrize(("mistake", "why"), [("still", "still"), ("far", "still"), ("body", "other body")])
 def test_tracks_of_something_else_are_told_with_the_reason(mistake, why):
     mistaken = table(mistake, 5, 60, length=8)
-    told = findings(calibrated(mistaken))["left_out"]
+    told = findings(calibrated(mistaken))["rejected"]
     truth = np.flatnonzero((mistaken.kind == KINDS.index(mistake)).sum(axis=0) > 1)
     assert set(told["tracks"][why]) == set(truth.tolist())
     assert told["sightings"] <= 3
@@ -111,7 +111,7 @@ def axis_missed(robot, calibration):
         )
 
     # What one joint leaves open is enormous and moves no image: steps of unit length.
-    roots = calibration.shared_error[: n + 16].T
+    roots = calibration.sqrt_cov_shared[: n + 16].T
     size = np.linalg.norm(roots, axis=1)
     steps = 1e-3 * roots / size[:, None]
     slopes = [(missed(step) - missed(-step)) / 2e-3 for step in steps]
@@ -120,4 +120,4 @@ def axis_missed(robot, calibration):
 
 def test_poses_of_other_readings_are_told():
     mistaken = table("readings", 7, 60, 20, length=8, share=0.3)
-    assert findings(calibrated(mistaken))["left_out"]["poses"] == mistaken.wrong_poses.tolist()
+    assert findings(calibrated(mistaken))["rejected"]["poses"] == mistaken.wrong_poses.tolist()

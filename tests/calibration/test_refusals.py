@@ -13,7 +13,7 @@ from tests.calibration.simulated_robot import around, random_robot, trials
 
 SIGMA = 0.5
 TYPES = "RRRRRR"
-METHODS = ("refined", "closed_form")
+METHODS = ("bundle_adjustment", "closed_form")
 ROBOT = random_robot(TYPES, np.random.default_rng(1), markers=6)
 SMALL = random_robot("RRR", np.random.default_rng(1), markers=6)
 Q = trials(ROBOT, 4)
@@ -250,7 +250,7 @@ def test_the_closed_form_says_when_it_does_not_reach_the_noise():
     q = around(robot, 40, np.random.default_rng(2))
     found = {m: calibrate(observation, "RRPRRR", method=m, source="recorded") for m in METHODS}
     error = {m: np.sqrt(np.mean((predict(c, q) - robot.images(q)) ** 2)) for m, c in found.items()}
-    assert error["closed_form"] > 3.0 * error["refined"]
+    assert error["closed_form"] > 3.0 * error["bundle_adjustment"]
     assert not found["closed_form"].usable
     assert "use refined" in found["closed_form"].reason
     assert found["closed_form"].chi2_per_dof > 1.3

@@ -46,7 +46,7 @@ def test_exchanged_markers_are_named():
     observation, wrong = exchanged(observed(SOME))
     calibration = calibrated(observation)
     found = findings(calibration)
-    assert {(one["pose"], *one["markers"]) for one in found["swapped"]} == wrong
+    assert {(one["pose"], *one["markers"]) for one in found["id_switches"]} == wrong
     assert found["outliers"] == []
     assert any("under the number of another" in line for line in calibration.advice)
 
@@ -57,7 +57,7 @@ def test_wrong_joint_readings_are_named():
     found = findings(calibration)
     assert {(one["pose"], one["joint"]) for one in found["suspect_joint_readings"]} == wrong
     assert found["outliers"] == []
-    assert found["merged_poses"] == 50 - len({pose for pose, _ in wrong})
+    assert found["poses_used"] == 50 - len({pose for pose, _ in wrong})
     assert error_of(calibration) < 1.5 * error_of(calibrated(observed(SOME)))
     assert any("disagree with the images" in line for line in calibration.advice)
 

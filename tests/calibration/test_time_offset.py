@@ -84,12 +84,14 @@ def test_delay_of_each_view_is_within_5_ms_and_its_interval(known, late, free, s
     cameras = Cameras(late, *((1.0 / 30.0, 0.008) if free else (None, 0.0)), rng)
     seen, truth = on_the_way(robot, cameras, rng, stamped=stamped)
     found = with_time_offset(calibration, seen)
-    assert found.delay_s == pytest.approx(truth, abs=5e-3)
-    assert ((found.delay_interval_s[:, 0] <= truth) & (truth <= found.delay_interval_s[:, 1])).all()
-    assert np.ptp(found.delay_interval_s, axis=1).max() < 0.008
+    assert found.time_offset_s == pytest.approx(truth, abs=5e-3)
+    assert (
+        (found.time_offset_interval_s[:, 0] <= truth) & (truth <= found.time_offset_interval_s[:, 1])
+    ).all()
+    assert np.ptp(found.time_offset_interval_s, axis=1).max() < 0.008
     # Frames of cameras that run freely are up to an interval late; stamps tell by how much each is.
     deviation = np.hypot(0.008, 1.0 / 30.0 / np.sqrt(12.0)) if free and not stamped else 0.0
-    assert found.delay_jitter_s == pytest.approx(deviation, abs=2.5e-3)
+    assert found.time_offset_jitter_s == pytest.approx(deviation, abs=2.5e-3)
 
 
 def test_ticks_wrong_frames_and_lost_markers_do_no_harm(known):
@@ -100,7 +102,7 @@ def test_ticks_wrong_frames_and_lost_markers_do_no_harm(known):
     seen.images[wrong] = seen.images[rng.permutation(wrong)] + 30.0
     seen.images[rng.random(seen.images.shape[:3]) < 0.3] = np.nan
     found = with_time_offset(dataclasses.replace(calibration, sigma_q=4.4e-4), seen)
-    assert found.delay_s == pytest.approx(truth, abs=2e-3)
+    assert found.time_offset_s == pytest.approx(truth, abs=2e-3)
 
 
 def test_deviations_count_times_their_factor(known):
@@ -113,9 +115,9 @@ def test_deviations_count_times_their_factor(known):
         with_time_offset(calibration, right),
         with_time_offset(dataclasses.replace(calibration, sigma_scale=3.0), third),
     )
-    assert found.delay_interval_s == pytest.approx(told.delay_interval_s, rel=1e-9)
-    assert with_time_offset(calibration, third).delay_interval_s != pytest.approx(
-        told.delay_interval_s, rel=1e-6
+    assert found.time_offset_interval_s == pytest.approx(told.time_offset_interval_s, rel=1e-9)
+    assert with_time_offset(calibration, third).time_offset_interval_s != pytest.approx(
+        told.time_offset_interval_s, rel=1e-6
     )
 
 

@@ -41,7 +41,7 @@ def least_span(robot):
 @pytest.fixture(scope="module")
 def weak(robot):
     found = calibrated(robot, short(robot, least_span(robot)))
-    assert found.weak.tolist() == [False, True, False]
+    assert found.poorly_observable.tolist() == [False, True, False]
     return found
 
 

@@ -32,7 +32,7 @@ markers:
   face: [0, 1, 2]
 task:
   start: {joints: [0.1, 0.2], unit: rad}
-  goal: {turn_deg: 180}
+  goal: {roll_deg: 180}
 control: {laws: [direct_three, stacked]}
 """
 TABLE = "pose,marker,q1,q2,u_left,v_left,u_right,v_right\n0,0,0.1,0.2,1,2,3,4\n1,0,0.1,0.3,1,2,3,4\n"
@@ -94,7 +94,7 @@ class Stages:
         claim = {"claim": "c", "source": "s", "measured": "3 mm", "criterion": "< 4 mm", "holds": True}
         left_out = {"what": "fig_9", "reason": "no run"}
         claims = (claim, {**claim, "claim": "it is large", "measured": "1 mm", "holds": False})
-        return fake(Report, 9, figures=("figures/fig_1.svg",), claims=claims, left_out=(left_out,))
+        return fake(Report, 9, figures=("figures/fig_1.svg",), claims=claims, omitted=(left_out,))
 
 
 @dataclass

@@ -160,7 +160,7 @@ def test_what_cannot_be_taught_is_an_object_with_exit_code_1(projservo, tmp_path
 
 def test_what_is_taught_beside_a_run_is_of_its_configuration(projservo, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    config = load_config(ROOT / "configs" / "hobby.yaml", ["plant.frames=2"])
+    config = load_config(ROOT / "configs" / "hobby.yaml", ["plant.averaged_frames=2"])
     save(Run(tmp_path / "run.h5", to_yaml(config), {}))
     at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "3")
     answer = projservo("teach", tmp_path, *at, "--json")

@@ -43,21 +43,21 @@ def test_up_to_date_is_skipped_and_prints_the_same(projservo, stages):
 
 
 def test_each_law_runs_in_those_of_the_modes_that_it_has(projservo, stages):
-    modes = "control.mode=[replan, track, image_track]"
+    modes = "control.mode=[regulate, track, image_track]"
     answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--set", modes, "--json")
     assert answer.code == 0
     names = ["direct_three", "direct_three_track", "stacked", "stacked_image_track"]
     assert stages.made == ["calibrate", "plan", *names]
     assert list(load("out").traces) == names
     told = [f"{row['law']} {row['mode']}" for row in answer.json["laws"]]
-    assert told == ["direct_three replan", "direct_three track", "stacked replan", "stacked image_track"]
+    assert told == ["direct_three regulate", "direct_three track", "stacked regulate", "stacked image_track"]
 
 
 def test_a_mode_that_cannot_be_is_refused_before_anything_is_made(projservo, stages):
     track = ("-c", "tiny.yaml", "-o", "out", "--set", "control.mode=track")
     answer = projservo("servo", *track, "--law", "stacked")
     assert (answer.code, stages.made) == (2, [])
-    assert "control.mode track: stacked has no such mode, only replan and image_track" in answer.err
+    assert "control.mode track: stacked has no such mode, only regulate and image_track" in answer.err
     assert projservo("calibrate", *track).code == 0  # which does not care
 
 
@@ -65,11 +65,11 @@ def test_a_mode_that_cannot_be_is_refused_before_anything_is_made(projservo, sta
     ("change", "remade"),
     [
         ("seed=5", ALL),
-        ("task.goal.turn_deg=90", ALL[1:]),
+        ("task.goal.roll_deg=90", ALL[1:]),
         ("control.gain_t=1", ALL[2:]),
         ("control.laws=[stacked]", ["report"]),
         ("control.must_converge=[]", ["report"]),  # the page tells which must
-        ("control.mode=[replan, image_track]", ["stacked_image_track", "report"]),
+        ("control.mode=[regulate, image_track]", ["stacked_image_track", "report"]),
         ("report.formats=[png]", ["report"]),
         ("noise.servo_px=0.1", ALL[1:]),
         ("name=other", ["report"]),  # which prints it
@@ -181,8 +181,8 @@ def test_of_claims_those_that_do_not_hold_are_named_and_all_of_them_in_detail(pr
 
 CALIBRATE_KEYS = {
     *("run", "usable", "reason", "advice", "rms_px", "sigma_px", "chi2_per_dof", "seconds", "joints"),
-    *("outliers", "suspect_joint_readings", "swapped", "merged_poses", "merged_markers"),
-    "left_out",
+    *("outliers", "suspect_joint_readings", "id_switches", "poses_used", "markers_used"),
+    "rejected",
 }
 LAW_KEYS = {
     *("law", "verdict", "steps", "position_error_mm", "rotation_error_deg"),
@@ -205,11 +205,11 @@ def test_json_objects_have_the_documented_keys(projservo, stages, tmp_path):
         {"pose": 4, "marker": 2, "view": "both"},
     ]
     assert calibrate["suspect_joint_readings"] == []
-    assert (calibrate["left_out"]["sightings"], calibrate["left_out"]["poses"]) == (2, [])
-    assert calibrate["merged_poses"] == 3
+    assert (calibrate["rejected"]["observations"], calibrate["rejected"]["poses"]) == (2, [])
+    assert calibrate["poses_used"] == 3
     names = [(joint["name"], joint["type"]) for joint in calibrate["joints"]]
     assert names == [("q1", "R"), ("elbow", "R")]
-    assert set(calibrate["joints"][0]) >= {"name", "type", "excitation", "weak"}
+    assert set(calibrate["joints"][0]) >= {"name", "type", "excitation", "poorly_observable"}
     assert set(value["servo"]["laws"][0]) >= LAW_KEYS
     assert value["servo"]["laws"][0]["position_error_mm"] is None
     assert set(projservo("plan", "-o", "out", "--json").json) >= {"run", "feasible", "reason", "theta_s_deg"}
@@ -235,11 +235,11 @@ def test_what_fails_is_an_object_with_exit_code_1(projservo, stages, refused):
 def test_a_law_that_must_converge_decides_the_exit_code(projservo, stages):
     stages.verdicts = {"stacked": "diverged"}
     assert projservo("servo", "-c", "tiny.yaml", "-o", "out").code == 0
-    stages.verdicts = {"direct_three": "plateau"}
+    stages.verdicts = {"direct_three": "no progress"}
     answer = projservo("servo", "-o", "out", "--law", "direct_three", "--force", "--json")
     assert answer.code == 1
     assert "direct_three must converge, but ended in plateau" in answer.err
-    assert answer.json["laws"][0]["verdict"] == "plateau"
+    assert answer.json["laws"][0]["verdict"] == "no progress"
     assert projservo("servo", "report", "-o", "out").code == 1  # up to date, and still not converged
     assert projservo("servo", "-o", "out", "--set", "control.must_converge=[stacked]").code == 1
     stages.verdicts = {}
@@ -267,7 +267,7 @@ OWN = "tests.cli.conftest:Law"
 def test_a_named_law_must_converge_unless_it_is_classical_or_the_configuration_says_so(
     projservo, stages, law, settings, code
 ):
-    stages.verdicts = dict.fromkeys((law, f"{law}_track"), "plateau")
+    stages.verdicts = dict.fromkeys((law, f"{law}_track"), "no progress")
     sets = [word for one in settings for word in ("--set", one)]
     by_flag = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", law, *sets)
     named = projservo("servo", "-c", "tiny.yaml", "-o", "two", "--set", f"control.laws=['{law}']", *sets)

@@ -90,7 +90,10 @@ def test_a_number_left_out_takes_no_other_word_for_it(projservo, held_out):
     [
         (["--cross-validate", "1"], "--cross-validate 1: calibration.cross_validate"),
         (["--cross-validate", "26"], "there are 25 poses; choose 2 to 25 parts"),
-        (["--cross-validate", "3", "--set", "calibration.method=closed_form"], "the method refined"),
+        (
+            ["--cross-validate", "3", "--set", "calibration.method=closed_form"],
+            "the method bundle_adjustment",
+        ),
         (["--suggest", "--set", "calibration.method=closed_form"], "no covariance to judge poses by"),
         (["--init", "none.json"], "none.json: cannot be read"),
         (["--init", "bad.json"], "bad.json:1:1: not JSON"),

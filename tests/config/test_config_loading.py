@@ -29,7 +29,7 @@ markers:
 noise: {calibration_px: 1e-1}
 task:
   start: {joints: [10, 0.5], unit: deg}
-  goal: {turn_deg: 180}
+  goal: {roll_deg: 180}
 control: {joint_speed_limit_deg_s: null}
 """
 
@@ -120,7 +120,7 @@ INCONSISTENT = [
     ("control.gain_t=25", "control.gain_t", "gain · period_s is 1;"),
     ("task.goal.joints={joints: [1, 0.3], unit: deg}", "task.goal", "exactly one of"),
     ("task.goal={joints: {joints: [1, 0], unit: deg}, perturbation: {}}", "task.goal.perturbation",
-     "belongs to a goal given by turn_deg"),
+     "belongs to a goal given by roll_deg"),
     ("task.goal={images: {left: [[1, 2]], right: [[1, 2], [3, 4], [5, 6]]}}", "task.goal.images.left",
      "1 entries for 3 markers"),
     ("markers.face=[0, 1, 9]", "markers.face.2", "there is no marker 9"),
@@ -150,13 +150,13 @@ INCONSISTENT = [
     ("rig.left.target_m=[1, 0, 0]", "rig.left.target_m", "must look somewhere"),
     ("rig.right.matrix=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]", "rig.right.matrix", "singular"),
     ("data={table: t.csv, joints: RR}", "data.joints", "not the joints of the robot, RP"),
-    ("disturbance.bump={at_step: 1, joint: 1}", "disturbance.bump", "exactly one of by_deg and by_m"),
-    ("disturbance.bump={at_step: 1, joint: 2, by_deg: 1}", "disturbance.bump", "of type P: give by_m"),
-    ("disturbance.frozen_joint={joint: 3, from_step: 1}", "disturbance.frozen_joint.joint", "has 2 joints"),
+    ("disturbance.joint_moved={at_step: 1, joint: 1}", "disturbance.joint_moved", "exactly one of by_deg and by_m"),
+    ("disturbance.joint_moved={at_step: 1, joint: 2, by_deg: 1}", "disturbance.joint_moved", "of type P: give by_m"),
+    ("disturbance.stuck_encoder={joint: 3, from_step: 1}", "disturbance.stuck_encoder.joint", "has 2 joints"),
     ("disturbance.lost_markers={from_step: 1, markers: [7]}", "disturbance.lost_markers.markers.0",
      "there is no marker 7"),
     ("control.mode=track", "control.mode", "nothing gives it one"),
-    ("calibration={method: closed_form, cross_validate: 2}", "calibration.cross_validate", "method refined"),
+    ("calibration={method: closed_form, cross_validate: 2}", "calibration.cross_validate", "method bundle_adjustment"),
 ]  # fmt: skip
 
 
@@ -174,13 +174,13 @@ def test_a_contradiction_hides_no_other(good):
         good,
         f"robot.dh.tool={POSE.replace('1, 0]', '-1, 0]')}",
         "robot.dh.joints.1.limits_m=[2, 1]",
-        "task.goal.turn_deg=null",
+        "task.goal.roll_deg=null",
         "task.start.joints=[1, 1, 2]",
-        "disturbance.frozen_joint={joint: 3, from_step: 1}",
+        "disturbance.stuck_encoder={joint: 3, from_step: 1}",
         "control.gian=1",
     )
     paths = ["task.goal", "robot.dh.joints.1.limits_m", "robot.dh.tool", "task.start.joints",
-             "disturbance.frozen_joint.joint", "control.gian"]  # fmt: skip
+             "disturbance.stuck_encoder.joint", "control.gian"]  # fmt: skip
     assert [path for path in paths for line in told if f": {path}: " in line] == paths
     assert len(told) == len(paths)
 
@@ -210,7 +210,7 @@ def test_screws_are_checked(good):
 @pytest.mark.parametrize(
     ("region", "path", "message"),
     [
-        ("{hides: false}", "0", "give left, right or both"),
+        ("{occludes: false}", "0", "give left, right or both"),
         ("{left: [[0, 0], [9, 9]]}", "0.left", "needs 3 or more entries"),
         ("{left: [[0, 0], [9, 9], [9, 0], [0, 9]]}", "0.left", "from corners 1 and 3 meet"),
         ("{right: [[0, 0], [4, 4], [9, 9]]}", "0.right", "no area"),
@@ -221,9 +221,9 @@ def test_screws_are_checked(good):
 def test_polygons_of_a_region_are_simple(good, region, path, message):
     overrides = (f"trajectory.keep_out=[{region}]", "control.mode=track", "trajectory.duration_s=3")
     if not path:
-        assert load_config(good, overrides).trajectory.keep_out[0].hides
+        assert load_config(good, overrides).trajectory.keep_out[0].occludes
         (found,) = errors(good, overrides[0])
-        assert "control.mode: replan goes its own way" in found
+        assert "control.mode: regulate follows no plan" in found
         return
     (found,) = errors(good, *overrides)
     assert f" trajectory.keep_out.{path}: " in found
@@ -322,7 +322,7 @@ def test_a_configuration_made_in_python_is_checked_as_well(good):
 
 def test_limits_of_a_robot_of_yours_that_look_like_degrees_are_refused(good):
     limits = "robot={{limits: {{joints: [[{}, {}], [-100, 100]], unit: {}}}}}"
-    task = ("task.goal.turn_deg=null", "task.goal.joints={joints: [1, 0.5], unit: deg}")
+    task = ("task.goal.roll_deg=null", "task.goal.joints={joints: [1, 0.5], unit: deg}")
     data = ("data={table: t.csv, joints: RP}", *task)
     (found,) = errors(good, *data, limits.format(-110, 110, "rad"))
     assert "robot.limits.joints.0: -110 to 110 rad is more than two turns to a side: degrees? set" in found

@@ -109,14 +109,16 @@ def test_the_speed_limit_slows_the_plan_and_never_bends_the_path():
 @pytest.mark.parametrize("law", TRACKING)
 def test_every_law_arrives_about_when_it_was_planned(law):
     sc = scene()
-    run = Followed(sc, law, bounds=limits(speed=np.full(6, 1.2 * SPEED), image_px=0.5))
+    run = Followed(sc, law, bounds=limits(speed=np.full(6, 1.2 * SPEED), image_error_px=0.5))
     assert run.verdict == "converged"
     assert run.steps == pytest.approx(run.periods, abs=1.0 if law == "exact" else 8.0)
 
 
 def test_image_track_keeps_to_the_planned_images():
     sc = scene()
-    run = Followed(sc, "stacked", G=frame(1), bounds=limits(speed=np.full(6, 1.2 * SPEED), image_px=0.5))
+    run = Followed(
+        sc, "stacked", G=frame(1), bounds=limits(speed=np.full(6, 1.2 * SPEED), image_error_px=0.5)
+    )
     assert run.verdict == "converged"
     reference = tracked(sc, frame(1), run.plan).reference
     k = int(run.periods)
@@ -133,7 +135,7 @@ def test_while_markers_are_lost_the_plan_waits():
     sc = with_pins(scene())
     noise = np.zeros((401, 2, 9, 2))
     noise[5:12] = np.nan
-    bounds = limits(speed=np.full(6, SPEED), lost_steps=10)
+    bounds = limits(speed=np.full(6, SPEED), max_lost_periods=10)
     whole = Followed(sc, "exact", bounds=bounds, task=sc.body_task())
     waited = Followed(sc, "exact", bounds=bounds, task=sc.body_task(), noise=noise)
     assert (whole.verdict, waited.verdict) == ("converged", "converged")
@@ -152,7 +154,7 @@ def test_a_task_that_is_done_is_followed_at_rest():
     sc = scene(step=np.zeros(6))
     run = Followed(sc, "exact", plan=planned(sc))
     assert (run.verdict, run.steps) == ("converged", 0)
-    run = Followed(sc, "exact", plan=planned(sc), bounds=limits(max_steps=3, image_px=0.0))
+    run = Followed(sc, "exact", plan=planned(sc), bounds=limits(max_steps=3, image_error_px=0.0))
     assert run.log.q == pytest.approx(np.tile(sc.q_start, (4, 1)), abs=1e-9)
 
 
@@ -173,7 +175,7 @@ def test_a_given_duration_is_kept():
     shortest, longer = planned(sc), planned(sc, duration=4.0)
     assert longer.duration == 4.0
     assert longer.time == pytest.approx(shortest.time * 4.0 / shortest.duration, abs=1e-12)
-    assert planned(sc, duration=4.0, speed=math.inf).time == pytest.approx(4.0 * longer.sigma, abs=1e-12)
+    assert planned(sc, duration=4.0, speed=math.inf).time == pytest.approx(4.0 * longer.path_parameter, abs=1e-12)
     # At its shortest one joint is always at the limit.
     rate = np.abs(np.diff(shortest.q, axis=0)).max(axis=1) / np.diff(shortest.time)
     assert rate == pytest.approx(np.full(100, SPEED), rel=1e-9)

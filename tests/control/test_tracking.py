@@ -30,7 +30,7 @@ def test_the_centre_keeps_to_its_line_and_arrives_in_time(seed, frames):
 
     One image of the goal tells its place to 0.96 mm rms at best; sixteen to a quarter of that.
     """
-    config = configured("paper", *NOISE, f"seed={seed}", f"noise.shown_frames={frames}")
+    config = configured("paper", *NOISE, f"seed={seed}", f"noise.averaged_frames={frames}")
     _, calibration, _ = calibrate.run(config)
     planned = plan.run(config, calibration)
     trace = servo.run(config, calibration, planned, "exact_track")
@@ -45,7 +45,7 @@ def test_the_centre_keeps_to_its_line_and_arrives_in_time(seed, frames):
     # In time it is where the loop comes to rest without noise: at the goal as its images show it.
     scenario = scenario_of(config, calibration)
     scenario = under(scenario, config.idealized, exact=scenario.ends)
-    rest = driven(scenario, planned, "exact_track", None, image_px=1e-3, noise_px=0.0, max_steps=400)
+    rest = driven(scenario, planned, "exact_track", None, image_error_px=1e-3, noise_px=0.0, max_steps=400)
     assert rest.verdict == "converged"
     there = (off(trace, body, rest.pose[-1]) <= ARRIVED).all(axis=0)
     due = trace.planned_s / trace.period
@@ -111,6 +111,8 @@ def test_without_a_plan_to_follow_the_law_goes_alone_and_says_so(lost):
 
 def test_a_law_may_be_refused_to_go_without_a_plan(lost):
     _, calibration, planned = lost
-    refusing = configured("paper", "control.without_plan=refuse")
-    with pytest.raises(WorkFailed, match=r"cannot follow the planned motion.*control\.without_plan=replan"):
+    refusing = configured("paper", "control.on_plan_failure=refuse")
+    with pytest.raises(
+        WorkFailed, match=r"cannot follow the planned motion.*control\.on_plan_failure=regulate"
+    ):
         servo.run(refusing, calibration, planned, "exact_track")

@@ -140,7 +140,7 @@ def check_tutorial(folder, names, read):
 
 def check_diagnostics(folder, names, read):
     calibration = projservo_cli.load("results/spoiled").calibration
-    np.testing.assert_array_equal(calibration.weak, [False] * 4 + [True, False])
+    np.testing.assert_array_equal(calibration.poorly_observable, [False] * 4 + [True, False])
     assert len(calibration.outlier) == 8
 
 
@@ -151,8 +151,10 @@ def check_commands(folder, names, read):
     assert cli.run(["calibrate", "plan", "-o", "results/ur5", "--json"]) == 0
     found = json.loads(read())
     later = {"cross_validation", "suggestions"}  # only where they are asked for
-    assert told["calibrate"] - {"name", "type", "excitation", "weak"} - later <= set(found["calibrate"])
-    assert {"name", "type", "excitation", "weak"} <= set(found["calibrate"]["joints"][0])
+    assert told["calibrate"] - {"name", "type", "excitation", "poorly_observable"} - later <= set(
+        found["calibrate"]
+    )
+    assert {"name", "type", "excitation", "poorly_observable"} <= set(found["calibrate"]["joints"][0])
     assert told["plan"] - {"least", "mu"} <= set(found["plan"])
     assert {"least", "mu"} == set(found["plan"]["margins"]["joints"])
     assert cli.run(["record", "-c", "configs/ur5.yaml", "--output", "trials.csv", "--json"]) == 0

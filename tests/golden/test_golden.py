@@ -32,7 +32,7 @@ def test_an_array_that_moves_is_found(stored, value, kind):
 
 def test_units_and_scalars_are_compared_and_times_are_not(stored):
     old = stored(2.0, rms_px=1.0, verdict="converged", seconds=1.0, key="a")
-    new = stored(2.0, "m", rms_px=1.0, verdict="plateau", seconds=2.0, key="b")
+    new = stored(2.0, "m", rms_px=1.0, verdict="no progress", seconds=2.0, key="b")
     told = differences(old, new)
     assert [line.split(":")[0] for line in told["apart"]] == ["run/@verdict", "run/images@units"]
     assert len(told["equal"]) == 3

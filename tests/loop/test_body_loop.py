@@ -28,7 +28,7 @@ def test_without_noise_both_observations_drive_alike(law):
 def test_the_last_residual_is_that_of_the_noise(rng):
     """Per degree of freedom; the prediction adds nothing where the joints are read exactly."""
     sc = with_pins(scene())
-    bounds = limits(max_steps=120, image_px=1e-9)
+    bounds = limits(max_steps=120, image_error_px=1e-9)
     run = body_run(sc, "exact", bounds=bounds, noise=0.5 * rng.normal(size=(121, 2, 9, 2)))
     before, after, views = run.log.fit.T
     dof = 2 * views - 6

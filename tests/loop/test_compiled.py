@@ -43,13 +43,13 @@ def test_arrays_that_another_run_left_are_as_good_as_new(law, rng):
     sc, bounds = scene(), limits(max_steps=30)
     noise = 0.3 * rng.normal(size=(31, 2, 4, 2))
     noise[4:6] = math.nan  # rows of lost markers have no errors
-    fresh = Run(sc, law, bounds=bounds._replace(lost_steps=5), noise=noise)
+    fresh = Run(sc, law, bounds=bounds._replace(max_lost_periods=5), noise=noise)
     used = Run(sc, law, bounds=bounds, noise=7.0 * rng.normal(size=noise.shape))
     reset(used.state)
     built_in = Law(
         CODES[law], sc.model, sc.task(None), GAINS._replace(limits=GAINS.limits._replace(speed=bounds.speed))
     )
-    course = Course(sc.plant, bounds._replace(lost_steps=5), sc.q_start.copy())
+    course = Course(sc.plant, bounds._replace(max_lost_periods=5), sc.q_start.copy())
     verdict, steps = run_compiled(built_in, course, noise, used.state, used.full)
     assert (verdict, steps) == (fresh.code, fresh.steps)
     for name, rows in fresh.log._asdict().items():
@@ -61,9 +61,9 @@ def test_arrays_that_another_run_left_are_as_good_as_new(law, rng):
 
 def test_a_run_that_lasts_longer_than_its_noise_says_so():
     """Noise for fewer instants gives the same instants, and no verdict."""
-    whole = Run(scene(), "direct_two", bounds=limits(max_steps=30, image_px=1e-9))
+    whole = Run(scene(), "direct_two", bounds=limits(max_steps=30, image_error_px=1e-9))
     cut = Run(
-        scene(), "direct_two", bounds=limits(max_steps=30, image_px=1e-9), noise=np.zeros((12, 2, 4, 2))
+        scene(), "direct_two", bounds=limits(max_steps=30, image_error_px=1e-9), noise=np.zeros((12, 2, 4, 2))
     )
     assert (cut.code, cut.steps) == (RUNNING, 11)
     assert whole.steps == 30
@@ -76,7 +76,7 @@ def test_at_the_goal_and_next_to_it_a_run_converges(law):
     run = Run(scene(np.zeros(6)), law)
     assert (run.verdict, run.steps) == ("converged", 0)
     assert run.log.error.max() < 1e-12  # px, round-off of the joints
-    run = Run(scene(1e-7 * STEP), law, bounds=limits(image_px=1e-8))
+    run = Run(scene(1e-7 * STEP), law, bounds=limits(image_error_px=1e-8))
     assert run.verdict == "converged"
     assert run.steps < 120
 
@@ -121,7 +121,7 @@ def test_left_image():
     s_start, s_star = (sc.images(q) for q in (sc.q_start, sc.q_goal))
     sc = sc._replace(s_start=s_start, s_star=s_star)
     run = Run(sc, "direct_three", bounds=limits(stop_at_border=True))
-    assert (run.verdict, run.steps) == ("left image", first)
+    assert (run.verdict, run.steps) == ("out of view", first)
     assert run.log.events[0] == first
     told = Run(sc, "direct_three", bounds=limits(stop_at_border=False))
     assert told.verdict == "converged"
@@ -207,7 +207,7 @@ def test_visibility_limits_the_translation():
     nearer = sc.plant.M - np.array([0, 0, 0.4, 0])
     sc = sc._replace(s_star=pixels(sc.model.P, nearer))
     free, held = (
-        Run(sc, "direct_three", GAINS._replace(delta=delta, gain_r=1e-9, gain_p=1e-9), limits(max_steps=1))
+        Run(sc, "direct_three", GAINS._replace(visibility_fraction=delta, gain_r=1e-9, gain_p=1e-9), limits(max_steps=1))
         for delta in (0.9, 1e-9)
     )
     assert free.state.limited[0] == 0

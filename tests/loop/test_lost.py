@@ -30,7 +30,7 @@ def unseen(gone, steps=60):
 )
 def test_both_loops_wait_alike(gone, waits, verdict, steps):
     sc, noise = scene(), unseen(gone)
-    bounds = limits(max_steps=60, image_px=1e-12, lost_steps=waits, plateau_steps=100)
+    bounds = limits(max_steps=60, image_error_px=1e-12, max_lost_periods=waits, stall_periods=100)
     compiled = Run(sc, "direct_three", bounds=bounds, noise=noise)
     code, sent, log = in_python(sc, "direct_three", bounds, noise)
     assert (VERDICTS[code], sent) == (compiled.verdict, compiled.steps) == (verdict, steps)
@@ -39,7 +39,7 @@ def test_both_loops_wait_alike(gone, waits, verdict, steps):
 
 def test_held_joints_stand_still_and_the_run_goes_on_as_it_would_have():
     sc = scene()
-    bounds = limits(max_steps=60, image_px=1e-12, lost_steps=4, plateau_steps=100)
+    bounds = limits(max_steps=60, image_error_px=1e-12, max_lost_periods=4, stall_periods=100)
     whole = Run(sc, "direct_three", bounds=bounds, noise=unseen([]))
     held = Run(sc, "direct_three", bounds=bounds, noise=unseen(range(5, 9)))
     assert (held.log.q_dot[5:9] == 0.0).all()
@@ -80,8 +80,8 @@ def test_every_command_is_scaled():
 
 def test_a_disturbance_ends_the_run_before_any_other_verdict():
     sc = scene()
-    for bumped, verdict in ((7, "converged"), (0, "disturbed")):
-        plant, ends = Noted(sc, bumped=bumped), limits(max_steps=199, image_px=1e9)
+    for bumped, verdict in ((7, "converged"), (0, "fault detected")):
+        plant, ends = Noted(sc, bumped=bumped), limits(max_steps=199, image_error_px=1e9)
         code, steps, _ = run_in_python(Towards(sc.q_goal), plant, sc.s_star, 0.04, ends)
         assert (VERDICTS[code], steps, plant.sent) == (verdict, 0, [])
 
@@ -116,6 +116,6 @@ def test_a_law_that_waits_is_held():
     sc = scene()
     law = Towards(sc.q_goal, status=1)
     plant = Noted(sc)
-    code, steps, _ = run_in_python(law, plant, sc.s_star, 0.04, limits(max_steps=50, lost_steps=6))
+    code, steps, _ = run_in_python(law, plant, sc.s_star, 0.04, limits(max_steps=50, max_lost_periods=6))
     assert (VERDICTS[code], steps) == ("markers lost", 6)
     assert all((step == 0.0).all() and period == 0.04 for step, period in plant.sent)

@@ -53,7 +53,7 @@ def test_both_loops_are_equal_to_the_bit(law, types, rng):
 def test_both_loops_follow_a_plan_alike(law, rng):
     """With noise, a joint-speed limit that is active, and periods in which the face is lost."""
     sc, G = scene(), frame(2)
-    bounds = limits(speed=np.full(6, 0.4), max_steps=60, lost_steps=5)
+    bounds = limits(speed=np.full(6, 0.4), max_steps=60, max_lost_periods=5)
     noise = 0.3 * rng.normal(size=(61, 2, 4, 2))
     noise[7:10, 0, 1] = np.nan
     compiled = Followed(sc, law, G, bounds=bounds, noise=noise)
@@ -91,7 +91,7 @@ def same_logs(left, right, steps):
 
 
 BOUNDS = [
-    {"image_px": 1e3}, {"diverged_factor": 1e-9}, {"max_steps": 1},
+    {"image_error_px": 1e3}, {"diverged_factor": 1e-9}, {"max_steps": 1},
     {"max_steps": 25, "speed": np.full(6, 1e-6)},
     {"stop_at_joint_limit": True}, {"stop_at_border": True},
 ]  # fmt: skip

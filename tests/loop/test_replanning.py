@@ -96,7 +96,7 @@ def test_no_more_ways_are_searched_than_asked_for():
 
 def test_a_law_that_comes_no_nearer_at_the_goal_is_given_another_way():
     ways = PathReplanner()
-    watch, _, log = watched(ways, clock=20.0, plateau_steps=4)
+    watch, _, log = watched(ways, clock=20.0, stall_periods=4)
     log.judged[:] = 3.0
     verdicts = [watch.ruled(log, k, RUNNING, np.zeros(2)) for k in range(40, 46)]
     assert verdicts == [RUNNING] * 4 + [WAITING, RUNNING]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.loop.settling import StallMonitor
-from projservo_cli.loop.step import CONVERGED, NOT_FOLLOWING, PLATEAU, RUNNING, WAITING, new_log
+from projservo_cli.loop.step import CONVERGED, FOLLOWING_ERROR, NO_PROGRESS, RUNNING, WAITING, new_log
 from projservo_cli.records import JointLimits
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.latency import NOTHING_KNOWN
@@ -14,7 +14,7 @@ from tests.scene import limits
 
 PERIOD, TICK = 0.1, 1.5e-3
 BOUNDS = Bounds(JointLimits(*np.zeros((4, 2))), np.zeros(2), PERIOD, 0.15, np.full(2, 0.017), ("rad", "deg"))
-LIMITS = limits(2, image_px=1.0, max_steps=1000)
+LIMITS = limits(2, image_error_px=1.0, max_steps=1000)
 
 
 class Robot:
@@ -41,7 +41,7 @@ def judged(error, read, sent, *, short=(False, False), verdict=RUNNING, carried=
         robot.steered.target = np.array(sent(k), dtype=float)
         robot.steered.set_point.short = np.array(short)
         robot.carried_px = carried(k)
-        told = CONVERGED if log.judged[k] <= LIMITS.image_px else verdict
+        told = CONVERGED if log.judged[k] <= LIMITS.image_error_px else verdict
         ruled = stall.ruled(log, k, told, np.zeros(2))
         if ruled not in (RUNNING, WAITING):
             return ruled, stall, k
@@ -50,7 +50,7 @@ def judged(error, read, sent, *, short=(False, False), verdict=RUNNING, carried=
 
 def test_a_law_that_asks_for_nothing_is_at_a_local_minimum():
     ruled, stall, k = judged(lambda k: 30.0 + 20.0 * 0.9**k, lambda k: (0.5, 0.1), lambda k: (0.5, 0.1))
-    assert (ruled, stall.minimum) == (PLATEAU, True)
+    assert (ruled, stall.minimum) == (NO_PROGRESS, True)
     assert "a local minimum" in stall.reason
     assert k < 100
 
@@ -60,7 +60,7 @@ def test_beside_the_goal_the_joints_hide_what_is_left():
     ruled, stall, _ = judged(
         lambda k: 1.5 + (k % 7) / 7, lambda k: (TICK * (k % 2), 0.0), lambda k: (1e-4 * (k % 3), 0.0)
     )
-    assert ruled == PLATEAU
+    assert ruled == NO_PROGRESS
     assert "set-points moved by no more than 0.0002" in stall.reason
     assert "coarse readings hide what is left" in stall.reason
 
@@ -82,7 +82,7 @@ def test_a_joint_that_stays_at_the_end_of_its_lead_is_not_following():
     ruled, stall, k = judged(
         lambda k: 50.0, lambda k: (0.5, 0.1), lambda k: (0.9, min(0.1 + 0.01 * k, 0.4)), short=(True, False)
     )
-    assert ruled == NOT_FOLLOWING
+    assert ruled == FOLLOWING_ERROR
     assert stall.reason.startswith("joint 1 stands at 0.5 rad, 0.4 rad off")
     assert k < 60
 
@@ -95,7 +95,7 @@ def test_a_robot_that_gains_nothing_is_given_up_with_a_cause(read, what):
     ruled, stall, k = judged(
         lambda k: 5.0 + (k % 7) / 7, lambda k: (read(k), 0.0), lambda k: (0.2 + 0.005 * (k % 20 > 9), 0.0)
     )
-    assert (ruled, stall.minimum) == (PLATEAU, False)
+    assert (ruled, stall.minimum) == (NO_PROGRESS, False)
     assert what in stall.reason
     assert k < 300
 

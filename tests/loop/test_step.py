@@ -13,10 +13,10 @@ from projservo_cli.loop.step import (
     CONVERGED,
     DIVERGED,
     JOINT_LIMIT,
-    LEFT_IMAGE,
+    OUT_OF_VIEW,
     MARKERS_LOST,
     MAX_STEPS,
-    PLATEAU,
+    NO_PROGRESS,
     RUNNING,
     SINGULAR_VERDICT,
     VERDICTS,
@@ -34,7 +34,7 @@ from tests.scene import limits, scene
 # Each verdict with what brings it about, in the order of precedence.
 CAUSES = [
     (BEHIND_CAMERA, {"in_front": False}),
-    (LEFT_IMAGE, {"left": True}),
+    (OUT_OF_VIEW, {"left": True}),
     (MARKERS_LOST, {"status": LOST}),
     (CONVERGED, {"error": 1e-4}),
     (DIVERGED, {"distance": 21.0}),
@@ -45,7 +45,7 @@ CALM = {"in_front": True, "left": False, "distance": 1.5, "status": OK, "q_dot":
 
 def verdict(error=50.0, border_stops=True, **given):
     """Verdict at the second instant of a run that began 40 px and 2 m from its goal."""
-    log, bounds = new_log(6, 4, 9, 5), limits(stop_at_border=border_stops, image_px=0.01)
+    log, bounds = new_log(6, 4, 9, 5), limits(stop_at_border=border_stops, image_error_px=0.01)
     for k, now in ((0, {"distance": 2.0, "error": 40.0}), (1, {"error": error, **given})):
         log.judged[k] = now.pop("error")
         found = verdict_at(log, k, Instant(**{**CALM, **now}), bounds)
@@ -88,13 +88,13 @@ def test_each_way_to_diverge(cause):
 
 def test_verdicts_have_the_promised_names():
     assert set(VERDICTS) == {
-        "converged", "plateau", "diverged", "left image", "behind camera", "joint limit", "singular",
-        "max steps", "markers lost", "disturbed", "failed", "not following",
+        "converged", "no progress", "diverged", "out of view", "behind camera", "joint limit", "singular",
+        "max steps", "markers lost", "fault detected", "failed", "following error",
     }  # fmt: skip
 
 
 def test_lost_markers_are_waited_for_so_often_in_a_row():
-    log, bounds = new_log(6, 4, 9, 5), limits(lost_steps=2, max_steps=8)
+    log, bounds = new_log(6, 4, 9, 5), limits(max_lost_periods=2, max_steps=8)
     log.judged[:] = 50.0
     seen = [LOST, LOST, OK, LOST, LOST, LOST]
     found = [verdict_at(log, k, Instant(**{**CALM, "status": it}), bounds) for k, it in enumerate(seen)]
@@ -105,9 +105,14 @@ def test_lost_markers_are_waited_for_so_often_in_a_row():
 def test_plateau_is_a_fall_below_one_per_cent():
     log = new_log(6, 4, 60, 5)
     log.judged[:60] = 100 * 0.9996 ** np.arange(60)  # 0.8 % in 20 steps, 1.2 % in 30
-    for k, window, code in ((40, 20, PLATEAU), (40, 30, MAX_STEPS), (19, 20, MAX_STEPS), (20, 20, PLATEAU)):
+    for k, window, code in (
+        (40, 20, NO_PROGRESS),
+        (40, 30, MAX_STEPS),
+        (19, 20, MAX_STEPS),
+        (20, 20, NO_PROGRESS),
+    ):
         log.begun[:2] = 2.0, 100.0
-        assert verdict_at(log, k, Instant(**CALM), limits(plateau_steps=window, max_steps=k)) == code
+        assert verdict_at(log, k, Instant(**CALM), limits(stall_periods=window, max_steps=k)) == code
 
 
 def command(q_dot, q=None, share=-1.0, blocked=-1, plant=None, **given):

@@ -54,7 +54,7 @@ def test_a_camera_that_is_passed_too_closely():
     assert plan.constraint == "visibility"
     assert "visibility fails first: visibility from the left camera" in plan.reason
     assert "at mu_t 0." in plan.reason
-    assert plan.least[0] <= 0.0
+    assert plan.min_margin[0] <= 0.0
 
 
 def test_an_end_too_near_to_the_border_of_an_image():
@@ -63,7 +63,7 @@ def test_an_end_too_near_to_the_border_of_an_image():
     assert not plan.feasible
     assert plan.constraint == "image"
     assert "px from the border of the right image (5 px asked for)" in plan.reason
-    assert 0.0 < plan.least[1] < 5.0
+    assert 0.0 < plan.min_margin[1] < 5.0
     assert "image fails first" not in planned("coupled", BORDER, overrides, border_px=0.0).reason
 
 

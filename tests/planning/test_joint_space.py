@@ -1,4 +1,4 @@
-"""Plans of the profiles joint and auto, and runs that follow them to the goal."""
+"""Plans of the profiles joint_space and auto, and runs that follow them to the goal."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
@@ -25,13 +25,15 @@ COUNT = 6
 @lru_cache(maxsize=4)
 def calibrated(name):
     """A configuration with joint limits that end a run, a calibration at 0.5 px, and random tasks."""
-    config = configured(name, "plant.joint_limits=stop", "trajectory.profile=joint", "noise.servo_px=0.5")
+    config = configured(
+        name, "plant.joint_limits=stop", "trajectory.profile=joint_space", "noise.servo_px=0.5"
+    )
     truth, front = truth_of(config), np.array(config.task.start.values(config.joint_types))
     return config, calibrate.run(config)[1], random_tasks(truth, front, COUNT, np.random.default_rng(7))
 
 
 @lru_cache(maxsize=16)
-def guided(name, k, profile="joint"):
+def guided(name, k, profile="joint_space"):
     """Configuration, calibration and plan of a random task."""
     config, calibration, tasks = calibrated(name)
     start, goal = (JointVector(joints=tuple(q[k].tolist()), unit="rad") for q in tasks)
@@ -46,9 +48,9 @@ def guided(name, k, profile="joint"):
 def test_a_random_task_is_planned_and_followed_to_its_goal(name, k):
     config, calibration, plan = guided(name, k)
     assert plan.feasible
-    assert plan.profile == "joint"
+    assert plan.profile == "joint_space"
     assert "joint space leads to " in plan.reason
-    assert plan.goals >= 1
+    assert plan.n_goal_configurations >= 1
     assert np.isnan(plan.mu).all()
     assert (plan.margin > 0.0).all()
     assert (plan.border_distance > 0.0).all()
@@ -129,10 +131,10 @@ def test_auto_says_which_way_it_took_and_why_not_the_ones_before():
             _, _, plan = guided(name, k, "auto")
             taken.add(plan.profile)
             assert plan.feasible
-            before = {"linear": [], "constrained": ["linear"], "joint": ["linear", "constrained"]}
-            assert [text.split(": ")[0] for text in plan.instead] == before[plan.profile]
-            assert (plan.goals is None) == (plan.profile != "joint")
-    assert {"linear", "joint"} <= taken
+            before = {"linear": [], "constrained": ["linear"], "joint_space": ["linear", "constrained"]}
+            assert [text.split(": ")[0] for text in plan.rejected_profiles] == before[plan.profile]
+            assert (plan.n_goal_configurations is None) == (plan.profile != "joint_space")
+    assert {"linear", "joint_space"} <= taken
 
 
 def test_the_duration_is_stretched_but_never_cut():
@@ -148,13 +150,16 @@ def test_the_duration_is_stretched_but_never_cut():
 
 def test_a_joint_without_a_speed_limit_is_refused_by_its_key():
     with pytest.raises(InputError, match=r"control\.prismatic_speed_limit_m_s.*as fast as joints can"):
-        configured("stanford", "trajectory.profile=joint", "control.prismatic_speed_limit_m_s=null")
+        configured("stanford", "trajectory.profile=joint_space", "control.prismatic_speed_limit_m_s=null")
     scenario = scenario_of(configured("stanford", "control.prismatic_speed_limit_m_s=null"))
     plan = planning.plan_task(
         scenario.model, scenario.ends, asked("auto"), scenario.demands._replace(border_px=480.0)
     )
     assert not plan.feasible
-    assert plan.instead[-1] == "joint: joint 3 has no speed limit: set control.prismatic_speed_limit_m_s"
+    assert (
+        plan.rejected_profiles[-1]
+        == "joint_space: joint 3 has no speed limit: set control.prismatic_speed_limit_m_s"
+    )
 
 
 def test_no_way_is_told_and_the_law_goes_alone():
@@ -165,7 +170,7 @@ def test_no_way_is_told_and_the_law_goes_alone():
     search = planning.JointSearch(scenario.q_shown, 0.5)
     plan = planning.plan_task(scenario.model, scenario.ends, scenario.inputs.trajectory, demands, search)
     assert not plan.feasible
-    assert plan.profile == "joint"
+    assert plan.profile == "joint_space"
     assert plan.duration is None
     assert "lie beyond the joint limits" in plan.reason
     trace = servo.run(config, calibration, plan, "exact_track")
@@ -190,7 +195,7 @@ def test_a_face_that_is_lost_for_long_is_found_on_the_way_back():
     trace = servo.run(disturbed, calibration, plan, "exact_track")
     assert trace.verdict == "converged"
     assert trace.success
-    assert trace.searches_anew == 1
+    assert trace.replan_attempts == 1
     assert "seen again on the way back" in trace.reason
     assert not trace.q_dot[12 : 12 + 25].any()
     there = np.linalg.norm(trace.q[37:43] - trace.q[0], axis=1)

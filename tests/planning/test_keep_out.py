@@ -165,8 +165,8 @@ def test_a_region_in_the_way_closes_the_motions_of_the_paper_and_leaves_a_way_ar
     with pytest.raises(WorkFailed, match="nothing is driven"):
         servo.run(config, calibration, linear, "exact_track")
     config, calibration, found = drawn("auto")
-    assert (found.profile, found.feasible) == ("joint", True)
-    assert ["enters region 1" in text for text in found.instead] == [True, True]
+    assert (found.profile, found.feasible) == ("joint_space", True)
+    assert ["enters region 1" in text for text in found.rejected_profiles] == [True, True]
     trace = servo.run(config, calibration, found, "exact_track")
     assert trace.verdict == "converged"
     # The face is never within the outlines in either image, as the cameras see it.

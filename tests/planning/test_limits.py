@@ -52,7 +52,7 @@ def test_limits_from_data_are_what_they_cover_widened_by_a_share_of_it(mine):
     # Laws never pass them.
     np.testing.assert_array_equal(scenario.gains.limits.lower, scenario.joints.limits.lower)
     np.testing.assert_array_equal(
-        read_table(config.data.table, "RRRRRR", "rad").q.min(axis=0), calibration.lowest
+        read_table(config.data.table, "RRRRRR", "rad").q.min(axis=0), calibration.joint_min
     )
     found = plan.run(load_joint(config), calibration)
     assert found.feasible, found.reason
@@ -60,13 +60,17 @@ def test_limits_from_data_are_what_they_cover_widened_by_a_share_of_it(mine):
 
 
 def load_joint(config):
-    """The same with the profile joint."""
-    return config.model_copy(update={"trajectory": config.trajectory.model_copy(update={"profile": "joint"})})
+    """The same with the profile joint_space."""
+    return config.model_copy(
+        update={"trajectory": config.trajectory.model_copy(update={"profile": "joint_space"})}
+    )
 
 
 def test_limits_from_a_list(mine):
     pairs = "[[0, 360], [-180, 0], [-180, 0], [-90, 90], [0, 180], [0, 360]]"
-    config, calibration = mine(f"robot.limits={{joints: {pairs}, unit: deg}}", "trajectory.profile=joint")
+    config, calibration = mine(
+        f"robot.limits={{joints: {pairs}, unit: deg}}", "trajectory.profile=joint_space"
+    )
     lower = scenario_of(config, calibration).joints.limits.lower
     np.testing.assert_allclose(lower, np.radians([0, -180, -180, -90, 0, 0]))
     found = plan.run(config, calibration)
@@ -79,8 +83,10 @@ def test_limits_from_a_list(mine):
 
 
 def test_without_limits_the_way_through_joint_space_is_closed(mine):
-    with pytest.raises(InputError, match=r": robot: the profile joint needs the limits .* set robot\.limits"):
-        mine("trajectory.profile=joint")
+    with pytest.raises(
+        InputError, match=r": robot: the profile joint_space needs the limits .* set robot\.limits"
+    ):
+        mine("trajectory.profile=joint_space")
     # A region at the goal keeps the other profiles from it.
     config, calibration = mine("trajectory.profile=auto")
     u, v = scenario_of(config, calibration).ends.s_star[0, 0]
@@ -89,7 +95,7 @@ def test_without_limits_the_way_through_joint_space_is_closed(mine):
     found = plan.run(config, calibration)
     assert not found.feasible
     assert "the goal is within region 1" in found.reason
-    assert found.instead[-1].startswith("joint: nothing tells the limits of all joints: set robot.limits")
+    assert found.rejected_profiles[-1].startswith("joint_space: nothing tells the limits of all joints: set robot.limits")
 
 
 @pytest.mark.parametrize(

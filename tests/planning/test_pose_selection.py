@@ -110,11 +110,11 @@ def test_what_cannot_be_suggested_says_why(robot, few, region):
         suggest(calibration, observation, nowhere, region, 1, np.random.default_rng(0))
     off = calibration.errors.scaled(1e4)
     vague = dataclasses.replace(
-        calibration, shared_error=off.shared, marker_error=off.marker, own_error=off.own
+        calibration, sqrt_cov_shared=off.shared, sqrt_cov_marker=off.marker, sqrt_cov_own=off.own
     )
     with pytest.raises(WorkFailed, match="as far as the calibration can tell"):
         suggest(vague, observation, region, region, 1, np.random.default_rng(0))
-    bare = dataclasses.replace(calibration, shared_error=np.full((2, 2), np.nan), method="closed_form")
+    bare = dataclasses.replace(calibration, sqrt_cov_shared=np.full((2, 2), np.nan), method="closed_form")
     with pytest.raises(InputError, match="the method closed_form has not"):
         suggest(bare, observation, region, region, 1, np.random.default_rng(0))
 

@@ -32,7 +32,7 @@ class Judged:
         shown = TaskImages(q_start, s_start, s_star, truth.center)
         self.plan = plan = plan_task(model, shown, asked("constrained"), known_scenario(config).demands)
         fine = np.linspace(0.0, 1.0, 1001)
-        mu = np.stack([np.interp(fine, plan.sigma, column) for column in plan.mu.T], axis=1)
+        mu = np.stack([np.interp(fine, plan.path_parameter, column) for column in plan.mu.T], axis=1)
         senses = min(
             self.true.senses(),
             key=lambda pair: abs(abs(pair[0]) - abs(plan.theta_r)) + abs(abs(pair[1]) - abs(plan.theta_p)),
@@ -86,7 +86,7 @@ def test_a_planned_motion_keeps_what_it_says(name):
 def test_a_planned_motion_does_not_depend_on_the_frame(name):
     here = constrained(name)
     there = constrained(name, in_frame(case(name).truth.model, frame(2, mirrored=True)))
-    assert there.least == pytest.approx(here.least, rel=1e-2)
+    assert there.min_margin == pytest.approx(here.min_margin, rel=1e-2)
     assert there.duration == pytest.approx(here.duration, rel=1e-2)
 
 

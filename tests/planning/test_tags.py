@@ -32,7 +32,7 @@ def scenario(*overrides, calibrated=False):
         f"task.goal={{joints: {{joints: {GOAL}, unit: deg}}}}",
     ]
     tool = ("markers.positions_m=null", "markers.face=null", "markers.tags=roof")
-    config = configured("ur5", *tool, *ends, "control.observation=body", "control.mode=track", *overrides)
+    config = configured("ur5", *tool, *ends, "control.features=body", "control.mode=track", *overrides)
     return scenario_of(config, calibrate.run(config)[1] if calibrated else None)
 
 
@@ -96,7 +96,7 @@ def test_a_motion_of_the_paper_is_judged_by_the_best_tag():
     np.testing.assert_allclose(plan.border_distance, border[best], rtol=1e-6)
 
 
-@pytest.mark.parametrize("profile", ["joint", "auto"])
+@pytest.mark.parametrize("profile", ["joint_space", "auto"])
 def test_the_middle_tag_may_turn_away_where_another_stays_in_sight(profile):
     made = scenario(f"trajectory.profile={profile}")
     demands, search = limited(made), search_of(made)
@@ -114,7 +114,7 @@ def test_the_middle_tag_may_turn_away_where_another_stays_in_sight(profile):
 def test_a_run_that_sees_another_tag_alone_for_a_while_arrives():
     """The face turns away, and is lost to both cameras besides; the body is measured by the others."""
     unseen = "disturbance.lost_markers={from_step: 10, steps: 30, markers: [0, 1, 2, 3]}"
-    made = scenario("trajectory.profile=joint", "noise.servo_px=0.2", unseen, calibrated=True)
+    made = scenario("trajectory.profile=joint_space", "noise.servo_px=0.2", unseen, calibrated=True)
     plan = plan_task(made.model, made.ends, made.inputs.trajectory, limited(made), search_of(made))
     trace = drive(made, plan, "exact_track").trace()
     assert np.isnan(trace.s[10:40, :, :4]).all()

@@ -76,7 +76,7 @@ def test_what_the_fit_left_out_is_drawn_apart_and_counts_nowhere():
     fit = shifted(
         outlier=np.array([[100, number[0], 0], [101, number[1], 1], [102, number[2], 2]]),
         suspect=np.array([[103, 1]]),
-        swapped=np.array([[104, number[3], number[4]]]),
+        id_switches=np.array([[104, number[3], number[4]]]),
     )
     fit.observation.images[5, 0, 5] = np.nan  # not seen: neither used nor left out
     data = SPEC.data(fit)
@@ -118,14 +118,14 @@ def test_held_out_errors_take_the_place_of_those_in_the_fit():
 
 def test_information_is_the_inverse_of_the_covariance_without_its_null_space():
     calibration = case()[2].calibration
-    m, s = len(calibration.M), len(calibration.shared_error)
+    m, s = len(calibration.M), len(calibration.sqrt_cov_shared)
     gauge = parameters_from(calibration).gauge()
     directions = np.random.default_rng(1).normal(size=(len(gauge), 6))
     basis = np.linalg.qr(np.hstack([gauge, directions]))[0][:, gauge.shape[1] :]
     factor = basis * np.sqrt([1e-6, 1e-3, 0.5, 2.0, 2.0, 4.0])
     factor += gauge[:, :6]  # which no image shows
-    off = {"shared_error": factor[:s], "marker_error": factor[s:].reshape(m, 4, 6)}
-    values = SPEC.data(shifted(**off, own_error=np.zeros((m, 4, 3))))["information"]
+    off = {"sqrt_cov_shared": factor[:s], "sqrt_cov_marker": factor[s:].reshape(m, 4, 6)}
+    values = SPEC.data(shifted(**off, sqrt_cov_own=np.zeros((m, 4, 3))))["information"]
     # round-off of the largest eigenvalue over the smallest: 4 · 1e-16 · 200 / 1e-6
     np.testing.assert_allclose(values, [1e6, 1e3, 2.0, 0.5, 0.5, 0.25], rtol=1e-6)
 
@@ -165,7 +165,7 @@ def test_the_histogram_holds_every_residual_beside_the_normal_density(fitted):
 
 
 def test_excitation_is_in_degrees_and_metres_on_own_axes_and_weak_joints_are_hatched():
-    fit = shifted("stanford", weak=np.array([False, True, True, False, False, False]))
+    fit = shifted("stanford", poorly_observable=np.array([False, True, True, False, False, False]))
     axes = drawn(fit).axes
     left, right = axes[4], axes[6]
     revolute = [i for i, letter in enumerate(fit.calibration.joint_types) if letter == "R"]
@@ -180,8 +180,8 @@ def test_excitation_is_in_degrees_and_metres_on_own_axes_and_weak_joints_are_hat
 
 
 def test_a_method_without_covariance_says_so_in_both_panels():
-    unknown = np.full_like(case()[2].calibration.shared_error, np.nan)
-    axes = drawn(shifted(shared_error=unknown)).axes
+    unknown = np.full_like(case()[2].calibration.sqrt_cov_shared, np.nan)
+    axes = drawn(shifted(sqrt_cov_shared=unknown)).axes
     for panel in (axes[3], axes[5]):
         assert [text.get_text() for text in panel.texts] == ["the method has no covariance"]
 
@@ -198,10 +198,10 @@ def test_a_recorded_run_without_a_task_is_reported_on_with_its_calibration(tmp_p
     made = report_on(run, tmp_path)
     assert (made.figures, made.claims) == (("figures/fig13_calibration.svg",), ())
     assert (tmp_path / made.figures[0]).read_bytes().startswith(b"<?xml")
-    assert [entry["what"] for entry in made.left_out] == [
+    assert [entry["what"] for entry in made.omitted] == [
         spec.name for spec in SPECS.values() if spec.task and not spec.frames
     ]
-    assert all("task" in entry["reason"] for entry in made.left_out)
+    assert all("task" in entry["reason"] for entry in made.omitted)
 
 
 def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_their_plan(tmp_path):
@@ -214,7 +214,7 @@ def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_t
     for k in range(trace.steps + 1):
         film.show(k, np.ones((2, 3, 2)), np.full((2, 8, 16), 99, dtype=np.uint8))
     settings = {
-        "task": {"start": {"joints": [0.0] * 6, "unit": "rad"}, "goal": {"turn_deg": 9.0}},
+        "task": {"start": {"joints": [0.0] * 6, "unit": "rad"}, "goal": {"roll_deg": 9.0}},
         "markers": {"numbers": [0, 1, 2, 3], "face": [0, 1, 2]},
         "control": {"laws": ["direct_three", "exact"]},
     }
@@ -239,7 +239,7 @@ def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_t
     run.results.pop("servo/exact")
     told = report_on(run, tmp_path)
     assert told.figures == ("figures/fig13_calibration.svg", "figures/fig17_frames.svg")
-    assert {entry["reason"] for entry in told.left_out} == {
+    assert {entry["reason"] for entry in told.omitted} == {
         "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
     }
     page = (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from projservo_cli.control.law import OK
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.loop.step import PLATEAU, Instant, new_log, plateau_stretch, verdict_at
+from projservo_cli.loop.step import NO_PROGRESS, Instant, new_log, plateau_stretch, verdict_at
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.report_data import curve_difference
 from tests.report.cases import SPECS, case
@@ -126,8 +126,8 @@ def on_plateau(error, k, window):
     log = new_log(6, 4, len(error), 5)
     log.judged[: len(error)], log.begun[:2] = error, 1.0
     now = Instant(True, False, 1.0, OK, np.zeros(6))
-    bounds = limits(image_px=0.0, diverged_factor=1e9, plateau_steps=window, max_steps=k)
-    return verdict_at(log, k, now, bounds) == PLATEAU
+    bounds = limits(image_error_px=0.0, diverged_factor=1e9, stall_periods=window, max_steps=k)
+    return verdict_at(log, k, now, bounds) == NO_PROGRESS
 
 
 @given(st.lists(st.sampled_from([0.5, 0.95, 0.9999, 1.0, 1.01]), max_size=60), st.integers(1, 20))
@@ -148,12 +148,12 @@ def test_the_plateau_that_is_drawn_and_claimed_is_that_of_the_verdict():
     trace, count = material.traces["stacked"], len(judged)
     still = dataclasses.replace(
         trace,
-        stop_error=judged,
+        convergence_error=judged,
         image_error=100.0 * 0.9 ** np.arange(count),
         s=np.repeat(trace.s[:1], count, axis=0),
         self_occluded=np.zeros((count, 2), dtype=bool),
     )
-    shown = dataclasses.replace(material, traces={"stacked": still}, plateau_steps=5)
+    shown = dataclasses.replace(material, traces={"stacked": still}, stall_periods=5)
     assert SPECS["fig04_classical"].data(shown)["plateau_stacked"].tolist() == [10, 29]
     (claim,) = [c for c in claims_of(shown, np.zeros(0), np.zeros(0)) if "local minimum" in c.claim]
     assert claim.measured.startswith("19 steps from step 10 at 30 px")

@@ -111,12 +111,12 @@ def test_scene_shows_the_tool_of_the_robot_at_the_face_and_a_goal_that_is_known(
 def test_drift_table_holds_each_run_at_its_place_and_paths_run_through_the_instants():
     material = case()[2]
     numbers = study_numbers(material.studies)
-    drift, at_samples = numbers["drift_mm"], numbers["drift_at_samples_mm"]
+    drift, at_samples = numbers["path_deviation_mm"], numbers["path_deviation_at_samples_mm"]
     assert drift.shape == (2, 2, 2, len(GAINS))
     trace = material.studies.sweep["direct_two", "calibrated", True, GAINS[0]]
     assert drift[1, 1, 1, 0] == trace.center_deviation_mm
     assert at_samples[1, 1, 1, 0] == trace.center_deviation_at_samples_mm
-    assert not numbers["drift_converged"].any()  # four steps are too few
+    assert not numbers["path_deviation_converged"].any()  # four steps are too few
     path = data_of("drift", material)["path_mm_direct_two_2"]
     assert len(path) > 4 * len(trace.center)
     instants = along_line(trace.center, trace.center[0], material.goal_center(trace))

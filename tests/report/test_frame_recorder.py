@@ -50,7 +50,7 @@ def test_the_direct_law_stands_beside_the_classical_ones(frames):
 
 
 def test_the_film_lasts_as_long_as_the_longest_run_that_converged(frames):
-    slow, ends = run(80, verdict="plateau"), []
+    slow, ends = run(80, verdict="no progress"), []
     for verdict in ("converged", "diverged"):
         end = frames(2, slow=slow, quick=run(9, verdict=verdict))[-1]
         ends.append(count(end[:, : end.shape[1] // 2], animation.SEEN))

@@ -25,7 +25,7 @@ SPEC = SPECS["fig16_way"]
 def material():
     """The paper's task with a box between start and goal; the model is the true one in another frame."""
     _, bench, known = case()
-    scenario, trajectory = bench.scenario, asked("joint", 21, keep_out=[{"left": BOX, "right": BOX}])
+    scenario, trajectory = bench.scenario, asked("joint_space", 21, keep_out=[{"left": BOX, "right": BOX}])
     search = JointSearch(scenario.q_shown, 0.01)
     plan = plan_task(known.calibrated, scenario.ends, trajectory, scenario.demands, search)
     assert plan.feasible
@@ -48,7 +48,7 @@ def test_trees_grow_from_start_and_goals_where_the_true_cameras_see_them(materia
     plan = material.plan
     roots = np.flatnonzero(plan.tree_parent < 0)
     np.testing.assert_array_equal(plan.tree_q[0], plan.q_start)
-    assert len(roots) == 1 + plan.goals_tried
+    assert len(roots) == 1 + plan.n_goals_tried
     goals = seen(material, plan.tree_q[roots[1:]])
     np.testing.assert_allclose(goals, np.broadcast_to(seen(material, plan.q[-1:]), goals.shape), atol=0.5)
     assert (plan.tree_parent[roots[1] :] >= roots[1])[len(roots) - 1 :].all()
@@ -66,11 +66,11 @@ def test_curves_are_of_the_plan_and_above_what_is_asked(material, data):
     plan = material.plan
     np.testing.assert_allclose(data["center"], seen(material, plan.q), atol=1e-6)
     np.testing.assert_allclose(data["border_px"], plan.border_distance, atol=1e-6)
-    assert (plan.validity_asked <= plan.validity + 0.05).all()  # between two checks
-    low, high = plan.validity_asked.min(axis=0), plan.validity_asked.max(axis=0)
+    assert (plan.required_margins <= plan.margins + 0.05).all()  # between two checks
+    low, high = plan.required_margins.min(axis=0), plan.required_margins.max(axis=0)
     assert (low[5:7] < high[5:7]).all()  # the width of the face at start and goal
-    assert len(plan.lowered) == 2
-    for text, end, views in zip(plan.lowered, ("start", "goal"), ("left", "right"), strict=True):
+    assert len(plan.relaxed_constraints) == 2
+    for text, end, views in zip(plan.relaxed_constraints, ("start", "goal"), ("left", "right"), strict=True):
         assert text.startswith(f"asked less at the {end}: limit of joint 3 0.4")
         assert f"width of the face in the {views} image" in text
         assert text.count("instead of 8 px") == 1
@@ -78,16 +78,16 @@ def test_curves_are_of_the_plan_and_above_what_is_asked(material, data):
 
 def test_between_its_corners_the_way_is_straight(material):
     plan = material.plan
-    assert plan.corner.shape == (len(plan.corner), 2)
-    assert 0.0 < plan.corner[0, 0] < plan.corner[-1, 1] < plan.duration
+    assert plan.blends.shape == (len(plan.blends), 2)
+    assert 0.0 < plan.blends[0, 0] < plan.blends[-1, 1] < plan.duration
     step = np.diff(plan.q, axis=0)
     towards = step / np.abs(step).max(axis=1)[:, None]
     turns = np.abs(np.diff(towards, axis=0)).max(axis=1) > 1e-9
     middle = plan.time[1:-1]
-    near = [(plan.time[2:] > begin) & (plan.time[:-2] < end) for begin, end in plan.corner]
+    near = [(plan.time[2:] > begin) & (plan.time[:-2] < end) for begin, end in plan.blends]
     assert not turns[~np.any(near, axis=0)].any()
     assert all(
-        turns[(middle > begin) & (middle < end)].any() for begin, end in plan.corner if end - begin > 0.1
+        turns[(middle > begin) & (middle < end)].any() for begin, end in plan.blends if end - begin > 0.1
     )
 
 
@@ -105,7 +105,7 @@ def test_no_way_is_drawn_with_what_stood_in_it(material, monkeypatch):
     wall = [[600.0, 0.0], [610.0, 0.0], [610.0, 1023.0], [600.0, 1023.0]]
     _, bench, _ = case()
     scenario = bench.scenario
-    trajectory = asked("joint", 21, keep_out=[{"left": wall}], search={"samples": 300})
+    trajectory = asked("joint_space", 21, keep_out=[{"left": wall}], search={"max_samples": 300})
     search = JointSearch(scenario.q_shown, 0.01)
     plan = plan_task(material.calibrated, scenario.ends, trajectory, scenario.demands, search)
     assert not plan.feasible
@@ -119,7 +119,7 @@ def test_no_way_is_drawn_with_what_stood_in_it(material, monkeypatch):
 def test_the_extra_runs_of_a_report_are_made_whatever_regions_the_plan_keeps_out_of(material):
     region = f"trajectory.keep_out=[{{left: {BOX}, right: {BOX}}}]"
     config = configured(
-        "paper", "trajectory.profile=joint", "control.mode=track", "control.laws=[exact]", region
+        "paper", "trajectory.profile=joint_space", "control.mode=track", "control.laws=[exact]", region
     )
     bench = comparison_of(config, material.calibration, material.plan)
     runs = studies.run_studies(bench, (0.5,), ())

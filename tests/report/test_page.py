@@ -157,7 +157,7 @@ def test_hostile_texts_are_shown_and_not_run(run, tmp_path):
     files = ("figures/../x.svg", "javascript:alert(1)//fig01_partition.svg", "figures/fig01_partition.svg")
     trace = dataclasses.replace(run.traces["stacked"], verdict=HOSTILE, reason=HOSTILE)
     made = {"argv": ["projservo", HOSTILE], "host": HOSTILE}
-    report = {"claims": claims, "left_out": left_out, "figures": files}
+    report = {"claims": claims, "omitted": left_out, "figures": files}
     other = altered(run, tmp_path, report=report, **{"servo/stacked": Result("", "", made, {}, {"": trace})})
     configuration = run.configuration.replace("PUMA 560", "</pre><script>")
     other = dataclasses.replace(other, configuration=configuration)
@@ -189,7 +189,11 @@ def test_a_run_is_told_as_far_as_it_goes(run, tmp_path):
     missing = ("This run holds no plan.", "No law was run.", "No claim was measured.", "projservo report -o")
     assert all(part in text for part in missing)
     empty = np.zeros((2, 2, 2, 0))
-    drift = {"drift_mm": empty, "drift_at_samples_mm": empty, "drift_converged": empty.astype(bool)}
+    drift = {
+        "path_deviation_mm": empty,
+        "path_deviation_at_samples_mm": empty,
+        "path_deviation_converged": empty.astype(bool),
+    }
     recording = altered(run, tmp_path, report={"claims": (), "figures": (), **drift})
     text = words(shown(recording).text)
     assert "No drift was measured." in text
@@ -222,7 +226,7 @@ def test_numbers_for_the_eye_carry_all_their_digits(run, tmp_path):
     told = {0.0: "0", 116.0: "116", 1461.2: "1461", 12.345: "12.3", -0.5: "−0.5", 999.9: "1000", 99.99: "100"}
     told |= {2.34e-12: "2.34 × 10⁻¹²", 1.5e9: "1.5 × 10⁹", 1 / 3: "0.333"}
     values = [*told, *6 * [np.nan]]
-    page = shown(altered(run, tmp_path, report={"drift_mm": np.reshape(values, (2, 2, 2, 2))}))
+    page = shown(altered(run, tmp_path, report={"path_deviation_mm": np.reshape(values, (2, 2, 2, 2))}))
     (table,) = [table for table in page.all("table") if "in brackets at the sampling" in table.text]
     cells = [cell for cell in table.all("td") if cell.attributes.get("class") == "count"]
     for value, cell in zip(values, cells, strict=True):
@@ -258,7 +262,7 @@ def test_what_is_known_of_a_calibration_is_told(run, tmp_path):
         "Not usable: ",
         "an estimate from these images",
         "Joint 2 is known worst: 0.5 rad from the reference it adds 7.25 times",
-        "so this one is weak.",
+        "so this one is poorly observable.",
         "2 readings left out as outliers. 1 joint reading contradicts the images.",
         "Held out, in 5 parts of poses: rms 0.321 px",
         "As predicted.",

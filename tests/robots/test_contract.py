@@ -24,7 +24,13 @@ DOCUMENTED = {"my_robot": "UR5", "position": "Position", "velocity": "Velocity",
 
 def faulty():
     """An arm that is late, lags, sags and plays, with coarse encoders."""
-    wrong = ("delay_s=0.12", "encoder_ticks=4096", "lag_s=0.05", "sag_deg=0.5", "play_deg=0.5")
+    wrong = (
+        "camera_latency_s=0.12",
+        "encoder_counts_per_turn=4096",
+        "servo_time_constant_s=0.05",
+        "gravity_sag_deg=0.5",
+        "backlash_deg=0.5",
+    )
     config = load_config(CONFIG, [*(f"disturbance.{key}" for key in wrong), "disturbance.frame_rate_hz=30"])
     start = np.array([3.66, -1.68, -1.85, 0.28, 1.16, 3.53])
     return robot_by_itself(config, truth_of(config), start, 0.5, 1, 0)
@@ -65,7 +71,7 @@ def steered(robot):
 
     for name in ("open", "read", "command", "stop", "close"):
         noted(name)
-    config = load_config(CONFIG, ["plant.sag_deg=1.5"])
+    config = load_config(CONFIG, ["plant.max_steady_state_error_deg=1.5"])
     joints = joints_of(config)
     foreign = ForeignRobot(robot, "robot", 10, bounds_of(config, joints), 5.0, 5.0)
     with at_rest_after(foreign):

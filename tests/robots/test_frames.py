@@ -22,7 +22,7 @@ def test_frames_are_thinned_evenly_and_the_first_and_last_are_kept(looks):
     for k in range(looks):
         film.show(k, s + k, np.full((2, 8, 16), [[[k % 251]], [[255 - k % 251]]], dtype=np.uint8))
     told = film.told()
-    instant = told["frame_instant"]
+    instant = told["frame_index"]
     assert (instant[0], instant[-1]) == (0, looks - 1)
     assert min(looks, MOST_FRAMES // 2) <= len(instant) <= MOST_FRAMES
     ways = np.diff(instant)
@@ -77,8 +77,8 @@ def test_the_frames_of_a_run_show_what_was_found_in_them(servo):
     seeing = f"plant={{use: '{__name__}:Seeing', {OPTIONS}}}}}"
     assert servo("--set", seeing, *NEAR, "-q").code == 0
     trace = load("run").traces["direct_three"]
-    assert trace.frame_instant[0] == 0
-    assert trace.frame_instant[-1] == trace.steps
+    assert trace.frame_index[0] == 0
+    assert trace.frame_index[-1] == trace.steps
     assert trace.frame_jpeg.nbytes < 3e6
     frames = frames_of(trace)
     assert frames.shape[1:] == (2, 1024, 1280)

@@ -132,7 +132,7 @@ def test_a_robot_that_fails_ends_the_run_in_one_line(servo, fault, after, messag
 def test_a_joint_that_is_blocked_is_named_while_the_run_goes_on(servo):
     answer = servo(*faulty("blocked", 80), "--json", law="exact")
     (told,) = answer.json["laws"]
-    assert told["verdict"] == "not following"
+    assert told["verdict"] == "following error"
     assert told["overruns"] == 0
     trace = load("run").traces["exact"]
     assert trace.reason.startswith("joint 3 stands at ")
@@ -168,7 +168,7 @@ def test_a_disturbance_ends_the_run_with_what_moved(servo, fault, culprit):
     answer = servo(*faulty(fault, 100), "--json", law="exact")
     assert answer.code == 1
     (told,) = answer.json["laws"]
-    assert told["verdict"] == "disturbed"
+    assert told["verdict"] == "fault detected"
     assert culprit in told["reason"]
     assert culprit in answer.err
     started = sum(1 for call in CALLS if call == "read") - told["steps"] - 1
@@ -182,17 +182,17 @@ def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
     assert "nothing was moved, since where the robot stands images are" in answer.err
     assert commands() == []
     assert CALLS[-2:] == ["stop", "close"]
-    answer = servo(*faulty("bumped camera"), "--set", "stop.innovation_factor=0", "--json")
-    assert answer.json["laws"][0]["untested"] == "stop.innovation_factor is 0"
+    answer = servo(*faulty("bumped camera"), "--set", "stop.innovation_threshold=0", "--json")
+    assert answer.json["laws"][0]["untested"] == "stop.innovation_threshold is 0"
     assert answer.json["laws"][0]["success"] is None  # nobody knows the truth
     assert commands()
 
 
 def test_a_calibration_without_covariance_tests_nothing_and_says_so():
     inputs = SimpleNamespace(tests_images=True)
-    bare = fake(Calibration, shared_error=np.full((3, 3), np.nan))
+    bare = fake(Calibration, sqrt_cov_shared=np.full((3, 3), np.nan))
     assert "has no covariance" in Scenario.untested.fget(SimpleNamespace(inputs=inputs, calibration=bare))
-    sound = fake(Calibration, shared_error=np.eye(3))
+    sound = fake(Calibration, sqrt_cov_shared=np.eye(3))
     assert Scenario.untested.fget(SimpleNamespace(inputs=inputs, calibration=sound)) == ""
 
 
@@ -203,7 +203,7 @@ def test_lost_markers_are_waited_for(servo):
     unseen = np.isnan(trace.s).any(axis=(1, 2, 3))
     assert unseen.sum() == 9
     np.testing.assert_array_equal(trace.q_dot[unseen[:-1]], 0.0)
-    answer = servo(*faulty("lost", 80), "--set", "stop.lost_steps=7", "--json")
+    answer = servo(*faulty("lost", 80), "--set", "stop.max_lost_periods=7", "--json")
     (told,) = answer.json["laws"]
     assert (answer.code, told["verdict"]) == (1, "markers lost")
     assert "7 periods after the last that was" in told["reason"]
@@ -217,7 +217,7 @@ def test_joint_limits_end_a_run_whatever_is_configured(calibrated):
     scenario = scenario_of(config, calibration)
     gains, limits = scenario.gains, scenario.limits
     assert limits.stop_at_joint_limit
-    assert limits.image_px == 0.01 + 2.0 * calibration.sigma_fitted_px
+    assert limits.image_error_px == 0.01 + 2.0 * calibration.sigma_fitted_px
     np.testing.assert_array_equal(gains.limits.speed, np.full(6, np.radians(125.0)))
 
 
@@ -229,7 +229,7 @@ def test_a_robot_without_speed_limit_is_refused(servo):
 
 
 def test_a_law_of_others_equals_the_built_in_one_it_calls(servo):
-    points = ["--set", "control.observation=points"]
+    points = ["--set", "control.features=points"]
     assert servo("-q", *points).code == 0
     built_in = load("run").traces["direct_three"]
     assert servo("-q", *points, law=f"{HERE}:DirectThree").code == 0
@@ -301,7 +301,7 @@ def test_a_law_that_fails(servo, law, code, message):
 
 
 def test_a_law_that_waits_is_waited_for(servo):
-    answer = servo("--set", "stop.lost_steps=3", "--json", law=f"{HERE}:Silent")
+    answer = servo("--set", "stop.max_lost_periods=3", "--json", law=f"{HERE}:Silent")
     assert answer.code == 1  # a law that is named must converge
     assert "Silent must converge, but ended in markers lost: " in answer.err
     assert (answer.json["laws"][0]["verdict"], answer.json["laws"][0]["steps"]) == ("markers lost", 3)

@@ -112,15 +112,15 @@ def test_roll_axis_lies_between_the_cameras():
     assert direction == pytest.approx([-1, 0, 0], abs=1e-12)
 
 
-@pytest.mark.parametrize("turn_deg", [10, 165, 180])
-def test_the_joints_of_a_goal_hold_the_tool_there(turn_deg):
+@pytest.mark.parametrize("roll_deg", [10, 165, 180])
+def test_the_joints_of_a_goal_hold_the_tool_there(roll_deg):
     """Within the limits, and no farther away than the joints the paper's robot starts at, turned there."""
-    config = configured("paper_perturbed", f"task.goal.turn_deg={turn_deg}")
+    config = configured("paper_perturbed", f"task.goal.roll_deg={roll_deg}")
     truth, goal = truth_of(config), config.task.goal
     q_start = np.array(config.task.start.values(config.joint_types))
     q = task_of(config).goal.turn.joints(truth.robot, truth.P, q_start)
     around, direction = roll_axis(truth.P)
-    turn = displacement(math.radians(turn_deg) * direction, np.zeros(3))
+    turn = displacement(math.radians(roll_deg) * direction, np.zeros(3))
     turn[:3, 3] = around - turn[:3, :3] @ around
     nudge = displacement(np.array(goal.perturbation.rotation_rad), goal.perturbation.translation_m)
     assert truth.robot.pose(q) == pytest.approx(turn @ truth.robot.pose(q_start) @ nudge, abs=1e-9)

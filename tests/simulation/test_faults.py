@@ -17,7 +17,7 @@ PERIOD = 0.04
 M = np.array([[0.7, 0.05, 0.02, 1], [0.72, -0.05, 0.03, 1], [0.68, 0.0, -0.05, 1]])
 CAMERAS = rig() @ np.linalg.inv(displacement([0, 0, 0], [0.7, 0, -1.5]))  # 1.5 m below the tool, looking up
 WARPED = {
-    "bump": {"at_step": 6, "joint": 2, "by_deg": math.degrees(0.02)},
+    "joint_moved": {"at_step": 6, "joint": 2, "by_deg": math.degrees(0.02)},
     "camera_moved": {"at_step": 4, "view": "left", "by_px": (2.0, -1.0)},
     "marker_moved": {"at_step": 9, "marker": 1, "by_m": (0.01, 0.0, 0.0)},
     "lost_markers": {"from_step": 2, "steps": 2, "markers": (2,)},
@@ -68,7 +68,7 @@ def test_an_ideal_robot_is_where_it_was_sent_and_shows_it():
 
 
 def test_a_servo_lags_as_a_system_of_first_order_does():
-    plant, lag, pace = robot(lag_s=0.05), 0.05, np.array([0.02, -0.01]) / PERIOD
+    plant, lag, pace = robot(servo_time_constant_s=0.05), 0.05, np.array([0.02, -0.01]) / PERIOD
     q, _ = driven(plant, [*WAY, *[WAY[-1]] * 5])
     for k, row in enumerate(q, 1):
         t, end = k * PERIOD, 25 * PERIOD
@@ -82,7 +82,10 @@ def test_sag_is_read_and_flexing_is_not_in_proportion_to_the_load():
     for q in ([0.0, 0.0], [-0.5, 0.2], [-math.pi / 2, 0.0]):
         x_tool = 0.4 * math.cos(q[0]) + 0.3 * math.cos(q[0] + q[1])
         load = np.array([x_tool, 0.3 * math.cos(q[0] + q[1])]) / reach  # drooping is positive here
-        for faults, read, true in (({"sag_deg": 0.5}, load, load), ({"flex_deg": 0.5}, 0.0 * load, load)):
+        for faults, read, true in (
+            ({"gravity_sag_deg": 0.5}, load, load),
+            ({"link_deflection_deg": 0.5}, 0.0 * load, load),
+        ):
             plant = robot(q_start=q, **faults)
             told, _ = driven(plant, [q] * 10)
             assert told[-1] - q == pytest.approx(sag * read, abs=2e-4 * sag + sag**2)
@@ -90,7 +93,7 @@ def test_sag_is_read_and_flexing_is_not_in_proportion_to_the_load():
 
 
 def test_play_leaves_the_link_behind_where_the_way_turns():
-    play, plant = math.radians(0.5), robot(play_deg=0.5)
+    play, plant = math.radians(0.5), robot(backlash_deg=0.5)
     there, back = WAY, [*WAY[::-1], [0.0, 0.0]]
     q, _ = driven(plant, there)
     assert plant.truth() - q[-1] == pytest.approx(0.5 * play * np.array([-1, 1]), abs=1e-12)
@@ -102,7 +105,7 @@ def test_play_leaves_the_link_behind_where_the_way_turns():
 def test_encoders_count_ticks_and_servos_may_do_so_too():
     tick = 2 * math.pi / 4096
     for coarse in (False, True):
-        plant = robot(encoder_ticks=4096, setpoint_ticks=coarse)
+        plant = robot(encoder_counts_per_turn=4096, quantize_setpoints=coarse)
         for target, q in zip(WAY, driven(plant, WAY)[0], strict=True):
             assert q / tick == pytest.approx(np.round(q / tick), abs=1e-9)
             assert abs(q - target).max() <= 0.5 * tick + 1e-12
@@ -119,7 +122,9 @@ def along(t):
 
 @pytest.mark.parametrize("exposure", [0.0, 0.02])
 def test_images_are_late_and_averaged_over_their_exposure(exposure):
-    plant = robot(delay_s={"left": 0.1, "right": 0.033}, exposure_s=exposure, jitter_s=0.004, stamps=True)
+    plant = robot(
+        camera_latency_s={"left": 0.1, "right": 0.033}, exposure_s=exposure, jitter_s=0.004, stamps=True
+    )
     clocks = []
     for target in WAY:
         plant.command(np.array(target), np.zeros(2), plant.now() + PERIOD)
@@ -136,7 +141,7 @@ def test_images_are_late_and_averaged_over_their_exposure(exposure):
 
 
 def test_cameras_that_run_freely_show_a_frame_until_the_next_has_come():
-    plant = robot(0.5, delay_s=0.02, frame_rate_hz=30, frame_offset_s=0.016, jitter_s=0.002)
+    plant = robot(0.5, camera_latency_s=0.02, frame_rate_hz=30, frame_offset_s=0.016, jitter_s=0.002)
     taken, shown, ages = [], [], []
     for k in range(400):
         plant.command(np.array(along(0.01 * k)), np.zeros(2), plant.now() + 0.01)
@@ -170,17 +175,17 @@ def test_events_befall_the_robot_in_their_period():
 
 
 def test_a_slip_and_a_frozen_reading_are_not_read():
-    plant = robot(bump={"at_step": 5, "joint": 1, "by_deg": math.degrees(0.05), "read": False})
+    plant = robot(joint_moved={"at_step": 5, "joint": 1, "by_deg": math.degrees(0.05), "encoder_slip": True})
     q, _ = driven(plant, WAY[:8])
     assert plant.truth() - q[-1] == pytest.approx([0.05, 0.0], abs=1e-12)
-    q, _ = driven(robot(frozen_joint={"joint": 1, "from_step": 3, "steps": 4}), WAY[:10])
+    q, _ = driven(robot(stuck_encoder={"joint": 1, "from_step": 3, "steps": 4}), WAY[:10])
     assert np.array(q)[:, 0] / 0.02 == pytest.approx([1, 2, 3, 3, 3, 3, 7, 8, 9, 10])
     assert np.array(q)[:, 1] / -0.01 == pytest.approx(np.arange(1, 11))
 
 
 def test_runs_are_the_same_to_the_bit_and_other_seeds_are_others():
-    late = {"delay_s": {"left": 0.05, "right": 0.06}, "exposure_s": 0.01, "jitter_s": 0.003}
-    faults = late | {"lag_s": 0.05, "sag_deg": 0.5, "play_deg": 0.5} | WARPED
+    late = {"camera_latency_s": {"left": 0.05, "right": 0.06}, "exposure_s": 0.01, "jitter_s": 0.003}
+    faults = late | {"servo_time_constant_s": 0.05, "gravity_sag_deg": 0.5, "backlash_deg": 0.5} | WARPED
     one, two, other = (driven(robot(0.5, seed, **faults), WAY) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one[1], two[1])
     assert np.isfinite(one[1][0]).all()

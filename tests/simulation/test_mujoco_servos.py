@@ -165,7 +165,9 @@ def test_a_servo_too_weak_for_what_it_holds_is_told(tmp_path, limit):
 
 @pytest.mark.usefixtures("needs_mujoco")
 def test_what_cannot_drive_a_joint_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"disturbance.sag_deg: servos of robot.mjcf sag as they are"):
+    with pytest.raises(
+        InputError, match=r"disturbance.gravity_sag_deg: servos of robot.mjcf sag as they are"
+    ):
         driven(described(tmp_path, "position"), Q, sag=0.01)
     SERVOS["muscle"] = '<muscle name="t" joint="tilt" lengthrange="0 1"/>'
     try:
@@ -187,7 +189,7 @@ def test_a_real_arm_with_its_meshes(shared_data, small, drawn):
         f"robot={{mjcf: {file}, tip: attachment_site}}",
         f"rig.left={{{camera}, position_m: [0.4, 0.4, -0.4]}}",
         f"rig.right={{{camera}, position_m: [0.6, 0.4, -0.4]}}",
-        f"task={{start: {{joints: {q.tolist()}, unit: rad}}, goal: {{turn_deg: 10}}}}",
+        f"task={{start: {{joints: {q.tolist()}, unit: rad}}, goal: {{roll_deg: 10}}}}",
     )
     truth, eyes = drawn(config)
     looks = [eyes.look(view, q[None], None, np.random.default_rng(0)) for view in range(2)]

@@ -21,7 +21,7 @@ NORMAL, TILTED = (0.0, 0.0, 1.0), (np.sin(np.radians(15.0)), 0.0, np.cos(np.radi
 
 def turn(angle_deg, *befalls):
     """Goal turned about the roll axis of the rig."""
-    return [f"task.goal={{turn_deg: {angle_deg}}}", *befalls]
+    return [f"task.goal={{roll_deg: {angle_deg}}}", *befalls]
 
 
 def moved(angle_deg, axis=NORMAL, point=CENTER, shift=(0.0, 0.0, 0.0)):
@@ -31,12 +31,12 @@ def moved(angle_deg, axis=NORMAL, point=CENTER, shift=(0.0, 0.0, 0.0)):
     where = (
         f"{{translation_m: {(T[:3, 3] + shift).tolist()}, rotation_rad: {(angle * np.array(axis)).tolist()}}}"
     )
-    return [f"task.goal={{turn_deg: 0, perturbation: {where}}}"]
+    return [f"task.goal={{roll_deg: 0, perturbation: {where}}}"]
 
 
 WRIST = "{{joints: [10, -40, 130, 0, {}, 20], unit: deg}}"  # stretched where the fifth is at zero
-UNTESTED = "stop.innovation_factor=0"
-SLIP = "disturbance.bump={at_step: 10, joint: 2, by_deg: 3, read: false}"
+UNTESTED = "stop.innovation_threshold=0"
+SLIP = "disturbance.joint_moved={at_step: 10, joint: 2, by_deg: 3, encoder_slip: true}"
 DONE = {
     **{f"turn of {angle} deg": turn(angle) for angle in (0, 90, 170, 179.9, 180)},
     **{f"tilted turn of {angle} deg": moved(angle, TILTED, BESIDE) for angle in (90, 170, 179.9, 180)},
@@ -49,11 +49,14 @@ DONE = {
         f"task.goal={{joints: {WRIST.format(25)}}}",
     ],
     "noise of 1 px": turn(180, "noise.servo_px=1.0"),
-    "bump": turn(180, "disturbance.bump={at_step: 10, joint: 2, by_deg: 3}"),
+    "joint_moved": turn(180, "disturbance.joint_moved={at_step: 10, joint: 2, by_deg: 3}"),
     "frozen for 20 steps": turn(
-        180, "disturbance.frozen_joint={joint: 4, from_step: 10, steps: 20}", UNTESTED
+        180, "disturbance.stuck_encoder={joint: 4, from_step: 10, steps: 20}", UNTESTED
     ),
-    **{f"images {n} periods late": turn(180, f"disturbance.delay_s={0.04 * n}", UNTESTED) for n in (1, 2, 3)},
+    **{
+        f"images {n} periods late": turn(180, f"disturbance.camera_latency_s={0.04 * n}", UNTESTED)
+        for n in (1, 2, 3)
+    },
 }
 # Without noise a run ends within 0.01 px, a hundredth of a millimetre. The singular wrist stands where no
 # trial motion went: there the error of the calibration is left.
@@ -99,8 +102,8 @@ def test_the_limit_ends_the_run_at_it(driven):
     assert (trace.verdict, trace.limit_joint) == ("joint limit", 3)
     assert np.degrees(trace.q[-1, 3]) == pytest.approx(20.0, abs=1e-4)
     assert "joint 4" in trace.reason
-    assert 0 < trace.translation_left < 1
-    assert 0 < trace.rotation_left_deg < 90
+    assert 0 < trace.remaining_translation < 1
+    assert 0 < trace.remaining_rotation_deg < 90
 
 
 def test_lost_markers_are_waited_for_and_no_longer(driven):
@@ -120,22 +123,22 @@ def test_what_befalls_the_readings_is_in_the_trace(driven):
     slip = driven(turn(180, SLIP, UNTESTED))
     assert slip.verdict == "converged"
     assert np.degrees(slip.q_read - slip.q)[10:, 1] == pytest.approx(np.full(slip.steps - 9, -3.0))
-    assert driven(DONE["bump"]).q_read is None
-    frozen = driven(turn(180, "disturbance.frozen_joint={joint: 4, from_step: 10, steps: null}", UNTESTED))
-    assert (frozen.verdict, "joint 4 stands at" in frozen.reason) == ("not following", True)
+    assert driven(DONE["joint_moved"]).q_read is None
+    frozen = driven(turn(180, "disturbance.stuck_encoder={joint: 4, from_step: 10, steps: null}", UNTESTED))
+    assert (frozen.verdict, "joint 4 stands at" in frozen.reason) == ("following error", True)
     assert (frozen.q_read[10:, 3] == frozen.q[10, 3]).all()
 
 
 def test_images_that_a_disturbance_sets_off_the_calibration_are_noticed(driven):
     slip = driven(turn(180, SLIP))
-    assert (slip.verdict, slip.success) == ("disturbed", False)
+    assert (slip.verdict, slip.success) == ("fault detected", False)
     assert 10 < slip.steps < 30  # without noise a held arm shows the same image, for half a second
     moved = driven(turn(180, "disturbance.camera_moved={at_step: 12, view: right, by_px: [1.5, -1]}"))
-    assert (moved.verdict, "right camera" in moved.reason) == ("disturbed", True)
+    assert (moved.verdict, "right camera" in moved.reason) == ("fault detected", True)
     untested = driven(turn(180, "disturbance.camera_moved={at_step: 12, view: right, by_px: 3}", UNTESTED))
-    assert (untested.verdict, untested.untested) == ("converged", "stop.innovation_factor is 0")
+    assert (untested.verdict, untested.untested) == ("converged", "stop.innovation_threshold is 0")
     assert (slip.untested, driven(turn(180)).untested) == ("", "")
     assert untested.position_error_mm > 0.05  # where the shifted camera says that the goal is
     # A knock that the readings follow, and markers that nobody sees, take nothing from the calibration.
     lost = driven(turn(180, "disturbance.lost_markers={from_step: 10, steps: 2}"))
-    assert lost.verdict == driven(DONE["bump"]).verdict == "converged"
+    assert lost.verdict == driven(DONE["joint_moved"]).verdict == "converged"

@@ -8,7 +8,7 @@ from projservo_cli.records import InputError
 from tests.configured import calibrate, plan, servo, truth_of
 from tests.conftest import ROOT
 
-UNTESTED = "stop.innovation_factor=0"
+UNTESTED = "stop.innovation_threshold=0"
 
 
 def config(*overrides, name="hobby"):
@@ -49,14 +49,14 @@ def test_a_robot_that_is_struck_by_nothing_goes_as_the_ideal_one_does(driven):
 @pytest.mark.volume
 def test_the_trace_holds_the_truth(driven):
     """Of a slip, of play and of a link that flexes; and the true images where they are shown at once."""
-    slip = driven("disturbance.bump={at_step: 10, joint: 2, by_deg: 3, read: false}", UNTESTED)
+    slip = driven("disturbance.joint_moved={at_step: 10, joint: 2, by_deg: 3, encoder_slip: true}", UNTESTED)
     assert np.degrees(slip.q - slip.q_read)[10:, 1] == pytest.approx(np.full(slip.steps - 9, 3.0))
     assert np.abs(slip.s[-1] - true_images(slip)[-1]).max() < 0.5  # carried, on the way
-    loose = driven("disturbance.play_deg=0.5", "disturbance.flex_deg=0.2", UNTESTED)
+    loose = driven("disturbance.backlash_deg=0.5", "disturbance.link_deflection_deg=0.2", UNTESTED)
     off = np.degrees(np.abs(loose.q - loose.q_read))
     assert 0.2 < off.max() <= 0.25 + 0.2 + 1e-9
 
 
 def test_a_robot_of_somebody_else_is_not_disturbed():
     with pytest.raises(InputError, match="disturbs the simulated robot"):
-        config("disturbance.delay_s=0.1", "plant=my_robot:Robot")
+        config("disturbance.camera_latency_s=0.1", "plant=my_robot:Robot")

@@ -24,13 +24,21 @@ from tests.conftest import ROOT
 
 GIVEN = {"calibrate": calibration_inputs, "plan": plan_inputs, "servo": servo_inputs, "report": report_inputs}
 # Short, and with all that is random: noise in trials, loop, start and goal.
-QUICK = ("calibration.frames_per_joint=4", "stop.max_steps=12", "noise.servo_px=0.3", "trajectory.samples=11")
+QUICK = (
+    "calibration.frames_per_joint=4",
+    "stop.max_steps=12",
+    "noise.servo_px=0.3",
+    "trajectory.n_samples=11",
+)
 CASES = {
     "ideal": ("paper", ()),
     "searched": ("ur5", ("trajectory.profile=auto", "control.mode=track")),
     "faults": (
         "hobby",
-        ("disturbance.lag_s=0.05", "disturbance.bump={at_step: 4, joint: 1, by_deg: 2}"),
+        (
+            "disturbance.servo_time_constant_s=0.05",
+            "disturbance.joint_moved={at_step: 4, joint: 1, by_deg: 2}",
+        ),
     ),
 }
 LAW = "exact"
@@ -117,8 +125,8 @@ def values_of(config):
         "plant.image_border": ["stop"],
         "plant.self_occlusion": ["opaque"],
         "control.substeps": ["none"],
-        "control.observation": ["points"],
-        "control.without_plan": ["refuse"],
+        "control.features": ["points"],
+        "control.on_plan_failure": ["refuse"],
         "trajectory.profile": ["exponential", "rotation_first"],
         "report.formats": [["png"]],
         "control.laws": [["stacked"]],
@@ -168,7 +176,7 @@ KEPT = [
     ("ideal", "calibrate", "control.joint_speed_limit_deg_s=20"),
     ("ideal", "calibrate", "markers.center=0"),
     ("ideal", "servo", "control.laws=[stacked]"),
-    ("ideal", "servo", "control.mode=[replan, track]"),
+    ("ideal", "servo", "control.mode=[regulate, track]"),
     ("ideal", "servo", "control.must_converge=[]"),
     ("ideal", "servo", "plant.timeout_s=3"),
     ("ideal", "servo", "name=other"),
@@ -178,7 +186,7 @@ KEPT = [
 ]
 CHANGED = [
     ("ideal", "plan", "control.joint_speed_limit_deg_s=20"),
-    ("ideal", "plan", "stop.innovation_factor=0"),
+    ("ideal", "plan", "stop.innovation_threshold=0"),
     ("ideal", "plan", "markers.center=0"),
     ("ideal", "servo", "control.gain_t=1"),
     ("ideal", "servo", "plant.speed_scale=0.5"),

@@ -131,14 +131,14 @@ def test_the_planned_half_turn_does_not_depend_on_frame_or_scale(name):
 
 SENSES = [
     ("paper", ("noise.servo_px=0.5",)),  # half a turn, either sense of which is rehearsed
-    ("ur5", ("noise.servo_px=1", "control.observation=points")),
+    ("ur5", ("noise.servo_px=1", "control.features=points")),
     ("coupled", ("trajectory.profile=exponential",)),
 ]
 
 
 @pytest.mark.parametrize(("name", "overrides"), SENSES)
 def test_the_sense_is_that_of_the_whole_plan(name, overrides):
-    config = configured(name, "trajectory.samples=11", *overrides)
+    config = configured(name, "trajectory.n_samples=11", *overrides)
     _, calibration, _ = calibrate.run(config)
     found = rotation_sense(scenario_of(config, calibration))
     assert np.array_equal(found, planning.run(config, calibration).rotation_sense())

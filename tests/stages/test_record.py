@@ -55,7 +55,16 @@ def test_recording_then_calibrating_is_calibrating(projservo):
     assert projservo("calibrate", "-c", UR5, *recorded, "-o", "two", "-q").code == 0
     one, two = load("one").calibration, load("two").calibration
     assert (one.source, two.source) == ("simulated", "recorded")
-    for name in ("P", "H_hat_0", "M", "a_inf", "q_reference", "shared_error", "marker_error", "own_error"):
+    for name in (
+        "P",
+        "H_hat_0",
+        "M",
+        "a_inf",
+        "q_reference",
+        "sqrt_cov_shared",
+        "sqrt_cov_marker",
+        "sqrt_cov_own",
+    ):
         np.testing.assert_array_equal(getattr(two, name), getattr(one, name), err_msg=name)
 
 
@@ -251,7 +260,7 @@ REAL = {
 
 @pytest.mark.parametrize("faults", REAL.values(), ids=REAL)
 def test_a_pose_is_recorded_where_joints_and_images_have_come_to_rest(faults):
-    config = load_config(UR5, [*TEN, "plant.frames=5"])
+    config = load_config(UR5, [*TEN, "plant.averaged_frames=5"])
     recording = stage.new_recording(config, Path("t.csv"))
     robot = Arm(config, **faults)
     stage.record(config, recording, driven(config, robot))
@@ -351,7 +360,11 @@ def test_a_recorded_configuration_without_robot_says_which_key_to_set(projservo)
 
 def test_a_robot_with_faults_is_recorded_at_rest_and_on_the_way_as_calibrate_sees_it(tmp_path):
     """At rest within noise of what its true joints show; on the way 120 ms late, by the frames' own times."""
-    faults = ("disturbance.delay_s=0.12", "disturbance.encoder_ticks=4096", "disturbance.sag_deg=0.5")
+    faults = (
+        "disturbance.camera_latency_s=0.12",
+        "disturbance.encoder_counts_per_turn=4096",
+        "disturbance.gravity_sag_deg=0.5",
+    )
     config = load_config(
         CONFIGS / "hobby.yaml",
         [*faults, "calibration.frames_per_joint=2", "calibration.random_poses=2"],
@@ -380,7 +393,7 @@ def test_a_robot_with_faults_is_recorded_at_rest_and_on_the_way_as_calibrate_see
 
 ROOF = (
     "markers={tags: roof, tag_size_m: 0.3}",  # of ten
-    "task.goal={turn_deg: 10}",
+    "task.goal={roll_deg: 10}",
 )
 
 

@@ -62,7 +62,7 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
     assert record.figures == ("figures/fig01_partition.png", "figures/fig08_drift.png")
     for name in record.figures:
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
-    assert [entry["what"] for entry in record.left_out] == ["fig04_classical"]
+    assert [entry["what"] for entry in record.omitted] == ["fig04_classical"]
     assert steps[-1] == ("figures", 3, 3)
     content = json.loads((tmp_path / "claims.json").read_text(encoding="utf-8"))
     assert content["claims"] == list(record.claims)
@@ -70,7 +70,7 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
     save(dataclasses.replace(run, results={**run.results, "report": Result("k", "", {}, {}, {"": record})}))
     again = load(run.path).results["report"].records[""]
     assert again.claims == record.claims
-    np.testing.assert_array_equal(again.drift_mm, record.drift_mm)
+    np.testing.assert_array_equal(again.path_deviation_mm, record.path_deviation_mm)
 
 
 def test_a_figure_names_the_law_that_it_lacks():
@@ -133,7 +133,7 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
     assert len(record.figures) == 2
     assert not any("drift" in claim["claim"] or "nan" in claim["measured"] for claim in record.claims)
     content = json.loads((tmp_path / "claims.json").read_text(encoding="utf-8"))
-    assert all(row["drift_mm"] is None for row in content["drift"])
+    assert all(row["path_deviation_mm"] is None for row in content["drift"])
 
 
 def test_what_fails_is_named_and_its_figures_left_out(tmp_path, monkeypatch):
@@ -147,9 +147,9 @@ def test_what_fails_is_named_and_its_figures_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr(report, "metric_plan", fail)
     monkeypatch.setattr(report, "FIGURES", (SPECS["fig12_joints"],))
     record = report_on(stored(tmp_path), tmp_path)
-    assert [entry["what"] for entry in record.left_out] == ["studies", "equation (22)", "fig12_joints"]
-    assert all(entry["reason"].endswith(reason) for entry in record.left_out)
-    assert (record.figures, record.drift_mm.size, record.share.size) == ((), 0, 0)
+    assert [entry["what"] for entry in record.omitted] == ["studies", "equation (22)", "fig12_joints"]
+    assert all(entry["reason"].endswith(reason) for entry in record.omitted)
+    assert (record.figures, record.path_deviation_mm.size, record.share.size) == ((), 0, 0)
     made = dataclasses.replace(case()[2], studies=None, no_studies=reason)
     for spec in SPECS.values():
         assert (reason in spec.lacking(made)) == spec.studies
@@ -255,7 +255,7 @@ def test_claims_of_a_whole_run_with_exact_operators(name):
         "The image error does not decay exponentially",
         *(of_paper if name == "paper" else ()),
     } <= {claim.claim for claim in claims if claim.holds}
-    assert study_numbers(material.studies)["drift_converged"].all()  # converged
+    assert study_numbers(material.studies)["path_deviation_converged"].all()  # converged
 
 
 @pytest.mark.volume

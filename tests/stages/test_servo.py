@@ -57,7 +57,7 @@ def test_opaque_face_loses_its_markers():
     trace = example.trace("stacked")
     assert trace.verdict == "markers lost"
     assert trace.self_occluded[-1].any()
-    waited = example.config.stop.lost_steps
+    waited = example.config.stop.max_lost_periods
     assert not trace.self_occluded[: -1 - waited].any()
     assert (trace.q_dot[-waited:] == 0.0).all()
     assert str(trace.steps) in trace.reason
@@ -75,11 +75,11 @@ def test_joint_limit_stops_where_it_is_told_to():
     assert f"joint {trace.limit_joint + 1}" in trace.reason
     bounds = example.plant.limits.lower, example.plant.limits.upper
     assert np.abs(np.subtract(bounds, trace.q[-1]))[:, trace.limit_joint].min() < 1e-10
-    assert (trace.translation_left, trace.rotation_left_deg) == (None, None)  # it measures neither
+    assert (trace.remaining_translation, trace.remaining_rotation_deg) == (None, None)  # it measures neither
 
 
 def test_noise_widens_the_tolerance():
-    assert Case("ur5", ["noise.servo_px=0.5"]).limits.image_px == pytest.approx(0.01 + 2.0 * 0.5)
+    assert Case("ur5", ["noise.servo_px=0.5"]).limits.image_error_px == pytest.approx(0.01 + 2.0 * 0.5)
 
 
 def test_plateau_is_the_longest_stretch_without_a_fall():
@@ -110,7 +110,7 @@ def test_no_size_and_no_images_that_agree_are_no_measure():
     example = case("ur5")
     run = drive(replace(example.scenario, limits=example.limits._replace(max_steps=5)), example.plan, "exact")
     assert run.trace().estimated_position_error_mm > 0.0
-    assert replace(run, verdict="disturbed").trace().estimated_position_error_mm is None
+    assert replace(run, verdict="fault detected").trace().estimated_position_error_mm is None
     for left_px, agrees in ((0.03, True), (0.05, False)):  # of 8 markers, with 10 coordinates to spare
         fit = np.full_like(run.log.fit, np.nan)
         fit[run.steps] = 0.0, 10.0 * left_px**2, 8.0

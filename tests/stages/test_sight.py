@@ -51,14 +51,14 @@ def steady(law, sigma, observation, runs):
     if observation == "points":
         scenario = replace(scenario, numbers=scenario.numbers[:4], exact=scenario.exact.by_points())
     sense = planned.rotation_sense()
-    noise = example.config.noise.model_copy(update={"servo_px": sigma, "shown_frames": 1})
+    noise = example.config.noise.model_copy(update={"servo_px": sigma, "averaged_frames": 1})
     position, rotation, verdicts = [], [], Counter()
     for seed in range(runs):
         config = example.config.model_copy(update={"noise": noise, "seed": seed})
-        limits = {"image_px": 1e-9, "max_steps": STEPS}
+        limits = {"image_error_px": 1e-9, "max_steps": STEPS}
         trace = driven(under(scenario, config), sense, law, None, **limits)
         verdicts[trace.verdict] += 1
-        assert trace.observation == observation
+        assert trace.features == observation
         gap = 1e3 * np.linalg.norm(trace.center[TAIL:] - example.goal_center, axis=1)
         R = trace.pose[TAIL:, :3, :3]
         turned = np.swapaxes(R, 1, 2) @ example.scenario.true_ends.goal_pose[:3, :3]
@@ -78,7 +78,7 @@ def test_noise_in_the_loop_reaches_its_bound(law):
     print(f"{law}: steady state {body[0]:.3f} mm, {body[1]:.3f}°; bound {bound[0]:.3f} mm, {bound[1]:.3f}°; "
           f"points {points[0]:.3f} mm, {points[1]:.3f}°: {points[0] / body[0]:.1f} and "
           f"{points[1] / body[1]:.1f} times the body's")  # fmt: skip
-    assert set(verdicts) <= {"max steps", "plateau"}
+    assert set(verdicts) <= {"max steps", "no progress"}
     assert (body <= 1.1 * bound).all()
     # Averaging 20 views instead of 8 is worth 1.6 in position; a body 0.3 m across instead of a face of
     # 0.08 m much more in rotation.
@@ -91,7 +91,7 @@ def test_noise_in_the_loop_reaches_its_bound(law):
 def test_no_run_diverges_at_two_pixels(law):
     _, verdicts = steady(law, 2.0, "body", 50)
     assert verdicts.total() == 50
-    assert set(verdicts) <= {"max steps", "plateau"}
+    assert set(verdicts) <= {"max steps", "no progress"}
 
 
 def noisy(*overrides):
@@ -118,11 +118,11 @@ def test_the_body_is_the_default_but_for_the_laws_that_need_points():
 
 def test_a_calibration_that_is_not_usable_has_no_body_unless_one_is_asked_for():
     example, calibration, _ = calibrated()
-    points = Case("paper", ["control.observation=points"])
+    points = Case("paper", ["control.features=points"])
     assert scenario_of(points.config, calibration).exact.body is NO_BODY
     poor = replace(calibration, usable=False)
     assert scenario_of(example.config, poor).exact.body is NO_BODY
-    asked = Case("paper", ["control.observation=body"])
+    asked = Case("paper", ["control.features=body"])
     assert scenario_of(asked.config, poor).exact.body is not NO_BODY
 
 

@@ -12,7 +12,7 @@ from tests.conftest import ROOT
 
 HOBBY = ROOT / "configs" / "hobby.yaml"
 SHARP = ("noise.calibration_px=0.05", "noise.servo_px=0.05")
-PLAY = (*SHARP, "disturbance.play_deg=0.5")
+PLAY = (*SHARP, "disturbance.backlash_deg=0.5")
 AT = np.radians([20.0, -5.0, 5.0, -10.0, 80.0])
 
 
@@ -64,7 +64,7 @@ def test_with_play_a_taught_goal_is_met_where_joints_would_miss_it(calibration, 
     path.write_text(plain_yaml(teach(given, 20, AT).as_goal()), encoding="utf-8")
     asked = load_config(HOBBY, [*SHARP, f"task.goal={path}", f"task.start={path}"])
     assert asked.task.start.values("RRRRR") == pytest.approx(AT)
-    taught = config(*PLAY, f"task.goal={path}", "stop.innovation_factor=0")
+    taught = config(*PLAY, f"task.goal={path}", "stop.innovation_threshold=0")
     assert len(taught.task.goal.images.markers) == 8
     trace = servo.run(taught, calibration, plan.run(taught, calibration), "exact_track")
     assert trace.verdict == "converged"

@@ -39,21 +39,21 @@ def test_the_reference_task(reference_truth):
     assert example.scenario.true_ends.goal_pose == pytest.approx(goal, abs=0)
 
 
-@pytest.mark.parametrize("turn_deg", [180, 165])
-def test_turn_about_the_roll_axis_of_the_rig(turn_deg):
+@pytest.mark.parametrize("roll_deg", [180, 165])
+def test_turn_about_the_roll_axis_of_the_rig(roll_deg):
     """Start and goal differ by that rotation about the axis midway between the cameras."""
-    config = loaded("paper", f"task.goal.turn_deg={turn_deg}")
+    config = loaded("paper", f"task.goal.roll_deg={roll_deg}")
     truth = truth_of(config)
     shown, ends = scenario_of(config).exact, scenario_of(config).true_ends
     T = ends.goal_pose @ np.linalg.inv(truth.robot.pose(shown.q_start))
     axis = np.array([-1.0, 0, 0])  # the cameras look along −x of the base, symmetric about y = 0
     eigenvalues = np.linalg.eigvals(T[:3, :3])
-    assert np.abs(np.angle(eigenvalues)).max() == pytest.approx(abs(math.radians(turn_deg)), abs=1e-9)
+    assert np.abs(np.angle(eigenvalues)).max() == pytest.approx(abs(math.radians(roll_deg)), abs=1e-9)
     assert T[:3, :3] @ axis == pytest.approx(axis, abs=1e-9)
     on_axis = np.array([0.0, 0, 0.63, 1])
     assert T @ on_axis == pytest.approx(on_axis, abs=1e-9)
     sine = axis @ [T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]] / 2
-    assert sine == pytest.approx(math.sin(math.radians(turn_deg)), abs=1e-9)
+    assert sine == pytest.approx(math.sin(math.radians(roll_deg)), abs=1e-9)
 
 
 def test_the_benchmark_is_within_its_promised_dimensions():

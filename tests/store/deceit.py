@@ -91,11 +91,11 @@ def _huge(file: h5py.File, rng: np.random.Generator) -> None:
 def _bomb(file: h5py.File, rng: np.random.Generator) -> None:
     """As many zeros as the dimensions of a record may have, all of which agree."""
     group, size = file["calibrate/calibration"], 3_000
-    for name in ("error", "parameter", "shared_error", "marker_error"):
+    for name in ("error", "parameter", "sqrt_cov_shared", "sqrt_cov_marker"):
         del group[name]
-    group.create_dataset("shared_error", data=np.zeros((size, size)), compression=1, chunks=(size, size))
+    group.create_dataset("sqrt_cov_shared", data=np.zeros((size, size)), compression=1, chunks=(size, size))
     shape = *group["M"].shape, size
-    group.create_dataset("marker_error", data=np.zeros(shape), compression=1, chunks=shape)
+    group.create_dataset("sqrt_cov_marker", data=np.zeros(shape), compression=1, chunks=shape)
 
 
 EDITS: dict[str, Edit] = {

@@ -23,7 +23,7 @@ def result(**named):
 
 def sound_run(path, **extents):
     """A run with every record, fields of every kind with a value and without, and a run of no step."""
-    report = fake(Report, 6, figures=("a.svg",), left_out=({"what": "b", "reason": "é"},), claims=(CLAIM,))
+    report = fake(Report, 6, figures=("a.svg",), omitted=({"what": "b", "reason": "é"},), claims=(CLAIM,))
     return Run(
         Path(path),
         CONFIGURATION,

@@ -67,7 +67,7 @@ def test_xarray_shows_dimensions_units_and_coordinates(path):
         assert calibration["P"].attrs["units"] == "px"
         assert calibration["q_reference"].attrs["units"] == "rad or m"
         assert "marker" in calibration.coords
-        assert calibration["weak"].dtype == bool
+        assert calibration["poorly_observable"].dtype == bool
         assert tree["servo/direct_three"].sizes["step"] == 0
         assert tree["servo/direct_three"].attrs["law"] == "ä"
         np.testing.assert_array_equal(tree["plan"]["H_d"], plan.H_d)
@@ -122,11 +122,11 @@ def test_what_is_added_to_and_what_is_written_as_a_whole_hold_the_same(tmp_path,
                 assert_same(back[name].records[label], record)
 
 
-@pytest.mark.parametrize("name", ["sigma", "s_start"])
+@pytest.mark.parametrize("name", ["path_parameter", "s_start"])
 def test_a_record_of_other_dimensions_is_not_stored(path, name):
     run = store.load(path)
     wrong = dataclasses.replace(
-        run.plan, **{name: np.zeros((2, 2)) if name == "sigma" else np.zeros((3, 4, 2))}
+        run.plan, **{name: np.zeros((2, 2)) if name == "path_parameter" else np.zeros((3, 4, 2))}
     )
     with pytest.raises(ValueError, match=name):
         store.save(dataclasses.replace(run, results={**run.results, "plan": result(**{"": wrong})}))
@@ -161,7 +161,8 @@ def test_a_change_anywhere_is_noticed_before_it_is_read(path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"schema_version": 3}, "upgrade, pip install --upgrade projservo, or make it again: projservo cal"),
+        ({"schema_version": 4}, "schema 4, this projservo reads 3: upgrade: pip install --upgrade projservo"),
+        ({"schema_version": 2}, "schema 2, this projservo reads 3: make it again in another folder: projserv"),
         ({"schema": "something else"}, "not a run file of projservo"),
     ],
 )

@@ -4,8 +4,8 @@
 
 Runs of random tasks, guided, images 0 to 300 ms late (each camera its own) with a jitter of 8 ms, encoders of
 4,096 ticks, noise of 0.5 px; ten recordings for each line of the table, whose delays are those of its runs.
-Each task is driven undisturbed first: what ends it as ``disturbed`` is a false alarm. Then it is struck in
-the first half of that way. A fault counts as named where the run ends as ``disturbed``, before anything else,
+Each task is driven undisturbed first: what ends it as ``fault detected`` is a false alarm. Then it is struck in
+the first half of that way. A fault counts as named where the run ends as ``fault detected``, before anything else,
 for the reason expected and no other; what may mean something else as well does not count.
 """
 
@@ -29,7 +29,11 @@ LATEST_S = 0.3
 # Joints that stand still after the strike are not missed: a reading counts as frozen where its joint still
 # moves by so much, deg.
 MOVES_DEG = 5.0
-LIVELY = ("disturbance.jitter_s=0.008", "disturbance.encoder_ticks=4096", "disturbance.exposure_s=0.01")
+LIVELY = (
+    "disturbance.jitter_s=0.008",
+    "disturbance.encoder_counts_per_turn=4096",
+    "disturbance.exposure_s=0.01",
+)
 GUIDED = ("trajectory.profile=auto", "control.mode=track", "plant.joint_limits=stop")
 
 
@@ -57,7 +61,7 @@ def marker_moved(rng, at, way):
 def joint_slipped(rng, at, way):
     """A joint slips by 3 degrees on its encoder."""
     joint, by = int(rng.integers(1, way.q.shape[1] + 1)), int(rng.choice([-3, 3]))
-    key = f"disturbance.bump={{at_step: {at}, joint: {joint}, by_deg: {by}, read: false}}"
+    key = f"disturbance.joint_moved={{at_step: {at}, joint: {joint}, by_deg: {by}, encoder_slip: true}}"
     return key, rf"joint {joint} slipped by {'-' * (by < 0)}(2\.[5-9]|3|3\.[0-4]) deg"
 
 
@@ -67,7 +71,7 @@ def reading_frozen(rng, at, way):
     if not moves.any():
         return None
     joint = int(rng.choice(np.flatnonzero(moves))) + 1
-    key = f"disturbance.frozen_joint={{joint: {joint}, from_step: {at}, steps: null}}"
+    key = f"disturbance.stuck_encoder={{joint: {joint}, from_step: {at}, steps: null}}"
     return key, f"the reading of joint {joint} stands still"
 
 
@@ -120,7 +124,7 @@ def driven(job):
     given = (
         f"noise.calibration_px={noise}",
         f"noise.servo_px={noise}",
-        f"disturbance.delay_s={{left: {left}, right: {right}}}",
+        f"disturbance.camera_latency_s={{left: {left}, right: {right}}}",
         *(*LIVELY, *GUIDED),
     )
     config = configured(arm, *given)
@@ -150,7 +154,7 @@ def judged(struck, config, ends, row, calibration):
     if trace is None:
         return {"verdict": "not started", "reason": why}
     said = trace.reason.partition("predicts: ")[2]
-    named = trace.verdict == "disturbed" and bool(re.match(struck[1], said)) and "; or " not in said
+    named = trace.verdict == "fault detected" and bool(re.match(struck[1], said)) and "; or " not in said
     told = {"verdict": trace.verdict, "reason": trace.reason, "expected": struck[1], "named": named}
     return told | {"late": trace.steps - row["at"]}
 
@@ -169,7 +173,7 @@ def tell(arm, fault, rows):
         if not row["named"]:
             print(f"    {row['recording']}.{row['seed']} {row['struck']}: {row['verdict']}: {row['reason']}")
     for row in rows:
-        if row.get("quiet") == "disturbed":
+        if row.get("quiet") == "fault detected":
             print(f"    {row['recording']}.{row['seed']} undisturbed: {row['quiet_reason']}")
 
 
@@ -192,7 +196,7 @@ def main():
         tell(arm, fault, rows)
         every += rows
     quiet = [row["quiet"] for row in every if "quiet" in row]
-    false = sum(verdict == "disturbed" for verdict in quiet)
+    false = sum(verdict == "fault detected" for verdict in quiet)
     print(f"false alarms: {false} in {len(quiet)} undisturbed runs, {rate(false, len(quiet))} %")
     write_rows(given.output, every)
 

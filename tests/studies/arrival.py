@@ -38,7 +38,7 @@ from tests.studies.planning_tables import has_no_way, in_two_processes, quantile
 RECORDINGS = 10
 TAUGHT_FRAMES = 8
 BAND = 0.01
-NUMBERS = ("verdict", "steps", "overruns", "searches_anew", "reason")
+NUMBERS = ("verdict", "steps", "overruns", "replan_attempts", "reason")
 
 
 def judged(calibration, true):
@@ -51,10 +51,12 @@ def judged(calibration, true):
     if calibration.sigma_q_interval is not None:
         least, most = calibration.sigma_q_interval
         told["sigma_q_covered"] = bool(least <= sigma_q <= most)
-    if calibration.delay_s is not None:
-        off = calibration.delay_s - delay
-        told |= {"delay_s": calibration.delay_s[0], "delay_off_ms": 1e3 * float(np.abs(off).max())}
-        inside = (calibration.delay_interval_s[:, 0] <= delay) & (delay <= calibration.delay_interval_s[:, 1])
+    if calibration.time_offset_s is not None:
+        off = calibration.time_offset_s - delay
+        told |= {"delay_s": calibration.time_offset_s[0], "delay_off_ms": 1e3 * float(np.abs(off).max())}
+        inside = (calibration.time_offset_interval_s[:, 0] <= delay) & (
+            delay <= calibration.time_offset_interval_s[:, 1]
+        )
         told["delay_covered"] = float(inside.mean())
     return told
 

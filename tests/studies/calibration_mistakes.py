@@ -36,12 +36,12 @@ def left_out(mistaken, calibration):
     """Sightings (K, m) of which a view was left out, or whose pose or marker was."""
     out = np.zeros(mistaken.kind.shape, dtype=bool)
     out[calibration.outlier[:, 0], calibration.outlier[:, 1]] = True
-    for pose, *numbers in calibration.swapped:
+    for pose, *numbers in calibration.id_switches:
         out[pose, numbers[0]] = True
         # An exchange of two shows in both and is told once.
         out[pose, numbers[1]] |= mistaken.kind[pose, numbers[1]] == 1
     out[calibration.suspect[:, 0]] = True
-    out[calibration.lost_poses] = True
+    out[calibration.rejected_poses] = True
     gone = np.setdiff1d(mistaken.observation.marker, calibration.marker)
     out[:, gone] = True
     return out & (mistaken.kind >= 0)

@@ -30,10 +30,10 @@ HALF_TICK = math.pi / TICKS  # rad
 NEAR_MM, NEAR_DEG = 3.0, 1.0
 
 _EXPOSED = "disturbance.exposure_s=0.01"
-_PLAY = "disturbance.play_deg=0.5"
-_READINGS = f"disturbance.encoder_ticks={TICKS}"
+_PLAY = "disturbance.backlash_deg=0.5"
+_READINGS = f"disturbance.encoder_counts_per_turn={TICKS}"
 _SHARP = ("noise.calibration_px=0.05", "noise.servo_px=0.05")
-LATE = {f"{ms} ms late": (_EXPOSED, f"disturbance.delay_s={ms / 1000}") for ms in (0, 40, 120, 300)}
+LATE = {f"{ms} ms late": (_EXPOSED, f"disturbance.camera_latency_s={ms / 1000}") for ms in (0, 40, 120, 300)}
 FREE_RUNNING = (
     "disturbance.frame_rate_hz=30",
     "disturbance.frame_offset_s=0.016",
@@ -43,23 +43,28 @@ CONDITIONS = {
     "ideal": (),
     **LATE,
     "4,096 ticks": (_READINGS,),
-    "lag 50 ms": ("disturbance.lag_s=0.05",),
-    "sag 0.5 deg": ("disturbance.sag_deg=0.5",),
+    "lag 50 ms": ("disturbance.servo_time_constant_s=0.05",),
+    "sag 0.5 deg": ("disturbance.gravity_sag_deg=0.5",),
     "all at 120 ms": (
         *LATE["120 ms late"],
-        *(_READINGS, "disturbance.lag_s=0.05", "disturbance.sag_deg=0.5"),
+        *(_READINGS, "disturbance.servo_time_constant_s=0.05", "disturbance.gravity_sag_deg=0.5"),
     ),
     "free-running": FREE_RUNNING,
     "play, taught images": (_PLAY, *_SHARP),
     "play, goal as joints": (_PLAY, *_SHARP),
-    "set-points in ticks too": (_READINGS, "disturbance.setpoint_ticks=true"),
+    "set-points in ticks too": (_READINGS, "disturbance.quantize_setpoints=true"),
 }
 # Those of the first row of the table, and those whose recordings are judged.
 FIRST_ROW = (*LATE, "4,096 ticks", "lag 50 ms", "sag 0.5 deg", "all at 120 ms")
 RECORDED = (*FIRST_ROW, "free-running")
 TAUGHT = "play, taught images"
 # Goals are shown by eight images, as somebody who teaches them would; an arm is held at its limits.
-_GUIDED = ("noise.shown_frames=8", "trajectory.profile=auto", "control.mode=track", "plant.joint_limits=stop")
+_GUIDED = (
+    "noise.averaged_frames=8",
+    "trajectory.profile=auto",
+    "control.mode=track",
+    "plant.joint_limits=stop",
+)
 
 
 def base_of(arm, condition):

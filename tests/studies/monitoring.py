@@ -69,7 +69,7 @@ SEED, HOLD_DEG = 2029, 0.2  # of a set-point that holds the arm where it stands
 SPREAD_DEG, ROLL_DEG, INSIDE_PX, FEWEST_TAGS = 18.0, 50.0, 30.0, 3  # of tasks around the home posture
 # What a run takes before it moves and after its plan has ended, s, about; verdicts that blame nobody.
 BEFORE_S, AFTER_S = 0.6, 1.0
-BLAMELESS = ("converged", "plateau", "no progress", "max steps")
+BLAMELESS = ("converged", "no progress", "no progress", "max steps")
 AXES, SIGNS, VIEWS = (0, 1, 2), (-1, 1), ((0,), (1,), (0, 1))
 CAMERA = [
     level
@@ -270,7 +270,7 @@ def run_of(rig, task, fault=None, made=None, frames=False, seed=1):
         trace = servo.run(config, calibration, made, "exact_track")
         row |= {"verdict": trace.verdict, "steps": trace.steps, "reason": trace.reason}
         must = trace.verdict != "converged" and trace.law in (config.control.must_converge or (trace.law,))
-        row["exit"] = int(trace.verdict == "disturbed" or must)
+        row["exit"] = int(trace.verdict == "fault detected" or must)
     except WorkFailed as error:
         row |= {"verdict": "not started", "steps": 0, "reason": str(error), "exit": 1}
     row["seconds"] = round(time.monotonic() - begun, 2)
@@ -390,7 +390,7 @@ def tell(rows, before):
     for kind in KINDS:
         some = [row for row in rows if row["cell"] == "sound" and row["corners"] == kind]
         if some:
-            alarms = [r for r in some if r["verdict"] in ("disturbed", "not started")]
+            alarms = [r for r in some if r["verdict"] in ("fault detected", "not started")]
             arrived = [row for row in some if row["verdict"] == "converged"]
             print(
                 f"sound, {kind}: alarms {len(alarms)} of {len(some)}; arrived {len(arrived)}; error (mm) "

@@ -25,11 +25,11 @@ CONDITIONS = {
     "lost for 20 steps": (f"disturbance.lost_markers={{from_step: {STEP}, steps: 20}}",),
     "lost for 32 steps": (f"disturbance.lost_markers={{from_step: {STEP}, steps: 32}}",),
     "lost for ever": (f"disturbance.lost_markers={{from_step: {STEP}}}",),
-    "joint 2 knocked by 3 deg": (f"disturbance.bump={{at_step: {STEP}, joint: 2, by_deg: 3}}",),
+    "joint 2 knocked by 3 deg": (f"disturbance.joint_moved={{at_step: {STEP}, joint: 2, by_deg: 3}}",),
     "left camera moved by 2 px": (f"disturbance.camera_moved={{at_step: {STEP}, view: left, by_px: 2}}",),
     "the same, not tested": (
         f"disturbance.camera_moved={{at_step: {STEP}, view: left, by_px: 2}}",
-        "stop.innovation_factor=0",
+        "stop.innovation_threshold=0",
     ),
 }
 GUIDED = ("trajectory.profile=auto", "plant.joint_limits=stop")
@@ -48,7 +48,14 @@ def driven(job):
         except WorkFailed as error:
             rows.append(told | {"verdict": "not started", "reason": str(error)})
             continue
-        numbers = ("verdict", "success", "steps", "searches_anew", "position_error_mm", "first_beyond_limit")
+        numbers = (
+            "verdict",
+            "success",
+            "steps",
+            "replan_attempts",
+            "position_error_mm",
+            "first_beyond_limit",
+        )
         rows.append(told | {number: getattr(trace, number) for number in numbers} | {"reason": trace.reason})
     return rows
 
@@ -66,7 +73,7 @@ def main():
         print(
             f"{mine[0]['arm']}, {mine[0]['condition']}: success {rate(len(good), len(mine))} %, error (mm) "
             f"{quantiles([row['position_error_mm'] for row in good], (0.5, 0.95))}; else {dict(verdicts)}; "
-            f"searched anew {sum(row.get('searches_anew', 0) > 0 for row in mine)}; past a limit {past}"
+            f"searched anew {sum(row.get('replan_attempts', 0) > 0 for row in mine)}; past a limit {past}"
         )
     write_rows(given.output, rows)
 

@@ -165,7 +165,7 @@ def true_constraints(config, truth: Truth, task: Drawn, q):
     c = constraints_of(truth.model, A, aimed, q, demands)
     return c._replace(
         full=np.r_[0.0, c.full[1:]],
-        keep_out=keep_out_of([(region.left, region.right, region.hides) for region in task.regions]),
+        keep_out=keep_out_of([(region.left, region.right, region.occludes) for region in task.regions]),
     )
 
 
@@ -282,7 +282,7 @@ def told_of(good, count):
 
 def main(arguments):
     """Study the arms that are named, or all."""
-    profile = next((word for word in arguments if "=" not in word), "joint")
+    profile = next((word for word in arguments if "=" not in word), "joint_space")
     named = dict(word.split("=") for word in arguments if "=" in word)
     arms = {name: int(count) for name, count in named.items()} or ARMS
     good, ways, count, entered = np.sum([study(name, n, profile) for name, n in arms.items()], axis=0)

@@ -1,4 +1,4 @@
-"""Paths of the profile joint against other programs: how long they are by OMPL, how quick by toppra.
+"""Paths of the profile joint_space against other programs: how long they are by OMPL, how quick by toppra.
 
     python -m tests.studies.planning_oracle [--tasks 500] [--arms paper ur5 stanford seven] [-o ways.csv]
 
@@ -103,7 +103,7 @@ def compared(config):
     c, aim, q_start, q_goal = true_search(config, margins=True)
     acceleration = c.limits.acceleration
     seed = config.seed
-    how = SearchLimits(config.trajectory.search.samples, seed, config.trajectory.goals)
+    how = SearchLimits(config.trajectory.search.max_samples, seed, config.trajectory.max_goal_configurations)
     begin = time.process_time()
     way = find_path(c, aim, q_start, q_goal[None], how)
     row = {

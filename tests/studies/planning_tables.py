@@ -56,7 +56,7 @@ def true_search(config, *, margins=False):
     if margins:
         deg = np.radians(asked.joint_margin_deg)
         keep = np.array([asked.joint_margin_m if kind == "P" else deg for kind in joints.types])
-        demands = demands._replace(border_px=asked.border_px, least_face_px=asked.least_face_px, keep=keep)
+        demands = demands._replace(border_px=asked.border_px, min_face_px=asked.min_face_px, keep=keep)
     c = constraints_of(truth.model, A, task, q_start, demands)
     return c, GoalFeatures(task.A_star, s_star, 0.0), q_start, q_goal
 

@@ -13,7 +13,7 @@ from projservo_cli.records import WorkFailed
 from tests.configured import calibrate, plan, scenario_of
 from tests.studies.planning_tables import asked_for, quantiles, task_configs, write_rows
 
-PROFILES = ("joint", "auto")
+PROFILES = ("joint_space", "auto")
 
 
 def timed(config, calibration):

@@ -102,7 +102,7 @@ def driven(job):
 def run_of(config, calibration, law, seed):
     """One run, with its true errors at the end."""
     if law in POINT_LAWS:
-        control = config.control.model_copy(update={"mode": ("replan",)})
+        control = config.control.model_copy(update={"mode": ("regulate",)})
         stop = config.stop.model_copy(update={"max_steps": LATEST})
         config = config.model_copy(update={"control": control, "stop": stop})
     try:
@@ -170,7 +170,7 @@ def driven_to(robot, config, q):
         robot.command(sent + step * (q - sent), np.zeros(len(q)), robot.now() + period)
     robot.command(q, np.zeros(len(q)), robot.now() + 2.0)
     shown = []
-    for _ in range(config.noise.shown_frames):
+    for _ in range(config.noise.averaged_frames):
         shown.append(robot.read()[1])
         robot.command(q, np.zeros(len(q)), robot.now() + period)
     count = np.isfinite(shown).sum(axis=0)

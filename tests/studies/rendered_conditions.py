@@ -30,12 +30,16 @@ FRAMES = 2  # of each pose of a recording
 
 CONDITIONS = {
     "ideal": (),
-    "40 ms late": ("disturbance.delay_s=0.04",),
+    "40 ms late": ("disturbance.camera_latency_s=0.04",),
     "120 ms late, ticks, lag, sag": (  # servos of their own sag
-        *("disturbance.delay_s=0.12", "disturbance.exposure_s=0.01", "disturbance.encoder_ticks=4096"),
-        "disturbance.lag_s=0.05",
+        *(
+            "disturbance.camera_latency_s=0.12",
+            "disturbance.exposure_s=0.01",
+            "disturbance.encoder_counts_per_turn=4096",
+        ),
+        "disturbance.servo_time_constant_s=0.05",
     ),
-    "play, taught images": ("disturbance.play_deg=0.5",),
+    "play, taught images": ("disturbance.backlash_deg=0.5",),
     "lens": ("plant.options.k1=-0.1", "calibration.lens=true"),
     "side light": ("plant.options.light=side",),
 }
@@ -50,8 +54,13 @@ def base_of(condition):
         "rendered",
         f"robot={{mjcf: {ARM}, tip: attachment_site}}",
         *(f"calibration.reference={front}", f"task={{start: {front}, goal: {{joints: {front}}}}}"),
-        *(f"noise.shown_frames={SHOWN_FRAMES}", "trajectory.profile=auto", "plant.joint_limits=stop"),
-        *("control.laws=[exact]", "control.mode=track", f"plant.frames={FRAMES}", "plant.settle_s=0.3"),
+        *(f"noise.averaged_frames={SHOWN_FRAMES}", "trajectory.profile=auto", "plant.joint_limits=stop"),
+        *(
+            "control.laws=[exact]",
+            "control.mode=track",
+            f"plant.averaged_frames={FRAMES}",
+            "plant.settle_s=0.3",
+        ),
         *CONDITIONS[condition],
     )
 

@@ -3,7 +3,7 @@
     python -m tests.studies.verdicts [--arms ur5 hobby] [--tasks 5] [-o runs.csv]
 
 Guided runs of the first tasks by seed; what befalls a robot, does at period 10. A fault that a robot copes
-with must end in ``converged``; every other in the verdict and the words that are expected. ``plateau`` and
+with must end in ``converged``; every other in the verdict and the words that are expected. ``no progress`` and
 ``max steps`` without a cause are catch-alls, and count as wrong.
 """
 
@@ -21,9 +21,14 @@ from tests.studies.conditions import ARMS, SEEDS, task_config
 from tests.studies.planning_tables import in_two_processes, write_rows
 
 AT = 10
-GUIDED = ("trajectory.profile=auto", "control.mode=track", "plant.joint_limits=stop", "noise.shown_frames=8")
+GUIDED = (
+    "trajectory.profile=auto",
+    "control.mode=track",
+    "plant.joint_limits=stop",
+    "noise.averaged_frames=8",
+)
 NOISE = ("noise.calibration_px=0.5", "noise.servo_px=0.5")
-TICKS = "disturbance.encoder_ticks=4096"
+TICKS = "disturbance.encoder_counts_per_turn=4096"
 
 
 class Blocked(FaultyRobot):
@@ -70,22 +75,26 @@ class Delayed(FaultyRobot):
 
 # The words or verdict that are expected, keys of the configuration, and the robot.
 FAULTS = {
-    "300 ms late": ("converged", ("disturbance.delay_s=0.3",), FaultyRobot),
+    "300 ms late": ("converged", ("disturbance.camera_latency_s=0.3",), FaultyRobot),
     "30 Hz, free-running, jitter": (
         "converged",
         ("disturbance.frame_rate_hz=30", "disturbance.frame_offset_s=0.016", "disturbance.jitter_s=0.008"),
         FaultyRobot,
     ),
     "ticks": ("converged", (TICKS,), FaultyRobot),
-    "set-points in ticks": ("converged", (TICKS, "disturbance.setpoint_ticks=true"), FaultyRobot),
-    "lag 150 ms": ("converged", ("disturbance.lag_s=0.15",), FaultyRobot),
-    "sag 0.5 deg": ("converged", ("disturbance.sag_deg=0.5",), FaultyRobot),
-    "flex 0.02 deg": ("converged", ("disturbance.flex_deg=0.02",), FaultyRobot),
-    "flex 0.5 deg": ("converged|link flexes|links flex", ("disturbance.flex_deg=0.5",), FaultyRobot),
-    "play 0.5 deg": ("converged|play in the joints", ("disturbance.play_deg=0.5",), FaultyRobot),
+    "set-points in ticks": ("converged", (TICKS, "disturbance.quantize_setpoints=true"), FaultyRobot),
+    "lag 150 ms": ("converged", ("disturbance.servo_time_constant_s=0.15",), FaultyRobot),
+    "sag 0.5 deg": ("converged", ("disturbance.gravity_sag_deg=0.5",), FaultyRobot),
+    "flex 0.02 deg": ("converged", ("disturbance.link_deflection_deg=0.02",), FaultyRobot),
+    "flex 0.5 deg": (
+        "converged|link flexes|links flex",
+        ("disturbance.link_deflection_deg=0.5",),
+        FaultyRobot,
+    ),
+    "play 0.5 deg": ("converged|play in the joints", ("disturbance.backlash_deg=0.5",), FaultyRobot),
     "joint struck by 3 deg": (
         "converged",
-        (f"disturbance.bump={{at_step: {AT}, joint: 2, by_deg: 3}}",),
+        (f"disturbance.joint_moved={{at_step: {AT}, joint: 2, by_deg: 3}}",),
         FaultyRobot,
     ),
     "markers lost for 10 periods": (
@@ -100,12 +109,12 @@ FAULTS = {
     ),
     "joint slipped by 3 deg": (
         "joint 2 slipped",
-        (f"disturbance.bump={{at_step: {AT}, joint: 2, by_deg: 3, read: false}}",),
+        (f"disturbance.joint_moved={{at_step: {AT}, joint: 2, by_deg: 3, encoder_slip: true}}",),
         FaultyRobot,
     ),
     "reading frozen": (
         "the reading of joint [0-9] stands still",
-        (f"disturbance.frozen_joint={{joint: 1, from_step: {AT}}}",),
+        (f"disturbance.stuck_encoder={{joint: 1, from_step: {AT}}}",),
         FaultyRobot,
     ),
     "left camera moved by 2 px": (
@@ -130,7 +139,7 @@ def driven(job):
     arm, fault, count = job
     expected, keys, robot = FAULTS[fault]
     # Late by a millisecond at least, so that the robot is driven by the contract.
-    config = configured(arm, *NOISE, *GUIDED, "disturbance.delay_s=0.001", *keys)
+    config = configured(arm, *NOISE, *GUIDED, "disturbance.camera_latency_s=0.001", *keys)
     told = {"arm": arm, "fault": fault, "expected": expected}
     try:
         calibration = calibrate.run(config)[1]

@@ -12,7 +12,7 @@ from tests.conftest import ROOT
 
 SETTINGS = (
     *("calibration.frames_per_joint=4", "control.laws=[direct_three, stacked]", "stop.max_steps=12"),
-    *("control.must_converge=[]", "control.observation=points", "trajectory.samples=6"),
+    *("control.must_converge=[]", "control.features=points", "trajectory.n_samples=6"),
 )
 CONFIG = str(ROOT / "configs" / "paper.yaml")
 

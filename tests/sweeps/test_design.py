@@ -40,7 +40,7 @@ def test_the_grid_is_the_product_of_its_axes_and_the_last_runs_fastest():
 def test_a_value_may_take_other_keys_with_it():
     found = design(grid={"law": {"exact": {}, "exact_track": {"trajectory.profile": "auto"}}})
     profiles = [(cell.control.mode, cell.trajectory.profile) for cell in map(found.cell, range(found.cells))]
-    assert profiles == [(("replan",), "linear"), (("track",), "auto")]
+    assert profiles == [(("regulate",), "linear"), (("track",), "auto")]
     assert Design.made_of(found.recipe).cell(1) == found.cell(1)
 
 

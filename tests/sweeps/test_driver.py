@@ -233,7 +233,7 @@ def test_an_empty_cache_is_filled_by_one_job_before_there_are_more(tmp_path, mon
 
 def test_guided_runs_are_the_same_in_processes_and_made_anew(tmp_path):
     """Their plans take the covariance of the calibration, which those of other sweeps go without."""
-    guided = {"exact": {}, "exact_track": {"trajectory.profile": "joint"}}
+    guided = {"exact": {}, "exact_track": {"trajectory.profile": "joint_space"}}
     found = design(runs=3, chunk=1, calibrations=2, tasks={"random": 3}, grid={"law": guided})
     make(found, tmp_path / "one")
     make(found, tmp_path / "two", workers=2)
@@ -245,12 +245,12 @@ def test_guided_runs_are_the_same_in_processes_and_made_anew(tmp_path):
     (trace,) = load(tmp_path / "run").traces.values()
     for name in ("verdict", "steps", "success", "effort", "position_error_mm"):
         assert getattr(trace, name) == rows[name][number]
-    assert {made.shared_error.size > 0 for made in Folder(tmp_path / "one").calibrations(found).values()} == {
-        True
-    }
+    assert {
+        made.sqrt_cov_shared.size > 0 for made in Folder(tmp_path / "one").calibrations(found).values()
+    } == {True}
     plain = design(runs=3, calibrations=2)
     kept = Folder(tmp_path / "one").calibrations(plain).values()
-    assert {made.shared_error.size for made in kept} == {0}
+    assert {made.sqrt_cov_shared.size for made in kept} == {0}
 
 
 def test_a_run_made_anew_has_the_numbers_of_its_row(whole, tmp_path):

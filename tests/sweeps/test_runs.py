@@ -22,11 +22,11 @@ CASES = {
         "runs": 1,
     },
     "points": {
-        "set": {"control.observation": "points"},
+        "set": {"control.features": "points"},
         "runs": 2,
         "random": {"control.gain_s": {"uniform": [1, 3]}},
     },
-    "late images": {"set": {"disturbance.delay_s": 0.08}, "runs": 2},
+    "late images": {"set": {"disturbance.camera_latency_s": 0.08}, "runs": 2},
     "constrained": {"set": {"trajectory.profile": "constrained"}, "runs": 1, "between_samples": True},
     "python loop": {"set": {"plant.speed_scale": 0.5, "stop.max_steps": 10}, "runs": 1},
     "half turn": {"base": "paper", "runs": 2, "set": {"noise.calibration_px": 0.5}},

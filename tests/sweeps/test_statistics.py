@@ -38,7 +38,7 @@ def made(tmp_path_factory):
         "run": np.arange(count),
         "cell": cell,
         "draw": np.tile(np.arange(DRAWS), 4),
-        "verdict": np.where(arrived, b"converged", b"plateau").astype("S14"),
+        "verdict": np.where(arrived, b"converged", b"no progress").astype("S14"),
         "success": good,
         "rotation_deg": angle,
         "distance_mm": np.full(count, 100.0),

@@ -59,9 +59,9 @@ def _data(fit: Fit) -> Data:
         "chi2_per_dof": np.array(calibration.chi2_per_dof),
         "excitation": calibration.excitation,
         "prismatic": calibration.prismatic,
-        "weak": calibration.weak,
+        "weak": calibration.poorly_observable,
         "information": _information(calibration),
-        "parameters": np.array(len(calibration.shared_error) + calibration.M[:MAX_JUDGED].size),
+        "parameters": np.array(len(calibration.sqrt_cov_shared) + calibration.M[:MAX_JUDGED].size),
         "residual": residual[used].ravel(),
         "held_out": np.array(fit.held_out is not None),
         "weighed": np.array(bool(weighed)),
@@ -136,14 +136,14 @@ def _readings(calibration: Calibration, observation: Observation) -> tuple[Float
     row = {number: k for k, number in enumerate(observation.pose.tolist())}
     column = {number: j for j, number in enumerate(calibration.marker.tolist())}
     # The marker that it is was not seen there, or is left out as well: an exchange is listed once.
-    renamed = [(pose, number, _BOTH) for pose, *pair in calibration.swapped.tolist() for number in pair]
+    renamed = [(pose, number, _BOTH) for pose, *pair in calibration.id_switches.tolist() for number in pair]
     for why, places in ((2, renamed), (1, calibration.outlier.tolist())):
         for pose, number, view in places:
             if pose in row and number in column:
                 out[row[pose], slice(None) if view == _BOTH else view, column[number]] = why
     doubted = calibration.suspect[:, 0]
-    if calibration.lost_poses is not None:
-        doubted = np.append(doubted, calibration.lost_poses)
+    if calibration.rejected_poses is not None:
+        doubted = np.append(doubted, calibration.rejected_poses)
     out[np.isin(observation.pose, doubted)] = _KINDS.index("pose") + 1
     return seen, out
 

@@ -42,7 +42,7 @@ def frames_of(trace: Trace, shown: IntArray | None = None, width: int | None = N
 
 def _filmed(material: Driven | Material) -> str:
     """The run that is shown: of those with frames the first of a direct law, else the first."""
-    names = [name for name, trace in material.traces.items() if trace.frame_instant is not None]
+    names = [name for name, trace in material.traces.items() if trace.frame_index is not None]
     return next((name for name in names if name in BODY_LAWS), names[0])
 
 
@@ -50,15 +50,15 @@ def _data(material: Driven | Material) -> Data:
     """Frames of three moments, all that was found in them, the path of the face and its goal."""
     name, order = _filmed(material), cyclic_order(material.plan.A)
     trace = material.traces[name]
-    assert trace.frame_instant is not None
+    assert trace.frame_index is not None
     assert trace.frame_s is not None
-    half = np.abs(trace.image_error[trace.frame_instant] - 0.5 * trace.image_error[0])
+    half = np.abs(trace.image_error[trace.frame_index] - 0.5 * trace.image_error[0])
     shown = np.array([0, int(np.nanargmin(half)), len(half) - 1])
     frames = frames_of(trace, shown)
     assert frames is not None
     return {
         "run": np.array(f"{title(name)}, {trace.verdict}"),
-        "instant": trace.frame_instant[shown],
+        "instant": trace.frame_index[shown],
         "period_s": np.array(trace.period),
         "found": trace.frame_s[shown],
         "s": trace.s[:, :, order],

@@ -44,7 +44,7 @@ def _data_classical(material: Material) -> Data:
     for law in POINT_LAWS:
         if law in material.traces:
             trace = material.traces[law]
-            stretch = plateau_stretch(trace.stop_error, material.plateau_steps)
+            stretch = plateau_stretch(trace.convergence_error, material.stall_periods)
             result |= {
                 f"s_{law}": trace.s[:, :, order],
                 f"s_star_{law}": trace.s_star[:, order],

@@ -48,11 +48,11 @@ def _data(material: Material) -> Data:
     unit = np.where(slides, 1e3, np.degrees(1.0))
     timed = bool(np.isfinite(plan.time).all())
     name = f"{plan.profile.replace('_', ' ')} profile"
-    if plan.profile == "joint" and not plan.feasible:
+    if plan.profile == "joint_space" and not plan.feasible:
         name = "no way found, linear motion"
     result: Data = {
         "name": np.array(name),
-        **({"t_s": plan.time} if timed else {"sigma": plan.sigma}),
+        **({"t_s": plan.time} if timed else {"sigma": plan.path_parameter}),
         "s": plan.s[:, :, order],
         "s_star": plan.s_star[:, order],
         "center": np.moveaxis(project(model.P, plan.H_d @ plan.A_c, model.lens), 0, 1),
@@ -61,10 +61,10 @@ def _data(material: Material) -> Data:
         "q_deg_or_mm": plan.q * unit,
         "q_start_deg_or_mm": plan.q_start * unit,
         "limits_deg_or_mm": np.stack([material.robot.limits.lower, material.robot.limits.upper]) * unit,
-        "corner_s": np.zeros((0, 2)) if plan.corner is None else plan.corner,
+        "corner_s": np.zeros((0, 2)) if plan.blends is None else plan.blends,
         "visibility": plan.margin,
         "joints": plan.joint_margin[:, None],
-        "conditioning": (plan.condition / plan.condition[0])[:, None],
+        "conditioning": (plan.reciprocal_condition / plan.reciprocal_condition[0])[:, None],
         **_distances(plan, material.trajectory.border_px),
     }
     for i, region in enumerate(material.trajectory.keep_out):
@@ -82,15 +82,15 @@ def _data(material: Material) -> Data:
 
 def _distances(plan: Plan, border_px: float) -> Data:
     """Distances in px and what is asked of them; of a way through joint space those it was held against."""
-    if plan.validity is None or plan.validity_asked is None:
+    if plan.margins is None or plan.required_margins is None:
         seen = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
         return {"border_px": seen, "border_px_asked": np.full_like(seen, border_px)}
     found: Data = {}
     for i, count in ((IMAGE, 2), (WIDTH, 2), (CLEAR, 1)):
         name = CONSTRAINTS[i].value
-        if np.isfinite(plan.validity[:, i]).all():
+        if np.isfinite(plan.margins[:, i]).all():
             found[name], found[f"{name}_asked"] = (
-                x[:, i : i + count] for x in (plan.validity, plan.validity_asked)
+                x[:, i : i + count] for x in (plan.margins, plan.required_margins)
             )
     return found
 

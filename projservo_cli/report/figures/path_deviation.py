@@ -54,11 +54,11 @@ def study_numbers(studies: Studies | None) -> dict[str, Any]:
         by_period[DIRECT.index(law), periods.index(period)] = trace.center_deviation_mm
     return {
         "gain_per_step": np.array(gains),
-        "drift_mm": drift,
-        "drift_at_samples_mm": at_samples,
-        "drift_converged": converged,
+        "path_deviation_mm": drift,
+        "path_deviation_at_samples_mm": at_samples,
+        "path_deviation_converged": converged,
         "period": np.array(periods),
-        "period_drift_mm": by_period,
+        "period_path_deviation_mm": by_period,
     }
 
 
@@ -67,7 +67,7 @@ def _data(material: Material) -> Data:
     studies = material.extra
     result: Data = {
         "gain": np.array(studies.gains),
-        "drift_mm": study_numbers(studies)["drift_mm"],
+        "path_deviation_mm": study_numbers(studies)["path_deviation_mm"],
         "step_limit_deg": np.array(studies.step_limit_deg),
     }
     for law in DIRECT:
@@ -113,7 +113,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     gains = data["gain"]
     looks = [*(style.curve(i) for i in range(len(gains))), _LIMITED]
-    for (path_axes, most), deviation, law in zip(axes, data["drift_mm"], DIRECT, strict=True):
+    for (path_axes, most), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
         paths = [data[f"path_mm_{law}_{i}"] for i in range(len(gains) + 1)]
         least = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
         for path, look in zip(paths, looks, strict=True):
@@ -143,18 +143,21 @@ def _draw(data: Data, figure: "style.Figure") -> None:
 def drift_rows(report: Report) -> list[dict[str, Any]]:
     """The drift table as rows: law, operators, limit in deg per step or None, gain, mm, converged."""
     rows = []
-    for index in np.ndindex(report.drift_mm.shape):
+    for index in np.ndindex(report.path_deviation_mm.shape):
         law, operators, limited, gain = index
-        drift, at_samples = float(report.drift_mm[index]), float(report.drift_at_samples_mm[index])
+        drift, at_samples = (
+            float(report.path_deviation_mm[index]),
+            float(report.path_deviation_at_samples_mm[index]),
+        )
         rows.append(
             {
                 "law": DIRECT[law],
                 "operators": _OPERATORS[operators],
                 "limit_deg_per_step": report.step_limit_deg if limited else None,
                 "gain_per_step": float(report.gain_per_step[gain]),
-                "drift_mm": drift if np.isfinite(drift) else None,
-                "drift_at_samples_mm": at_samples if np.isfinite(at_samples) else None,
-                "converged": bool(report.drift_converged[index]),
+                "path_deviation_mm": drift if np.isfinite(drift) else None,
+                "path_deviation_at_samples_mm": at_samples if np.isfinite(at_samples) else None,
+                "converged": bool(report.path_deviation_converged[index]),
             }
         )
     return rows

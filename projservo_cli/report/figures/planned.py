@@ -50,7 +50,9 @@ def _data_linear(material: Material) -> Data:
 def _data_steep(material: Material) -> Data:
     """The same task with linear shares of the rotations and a steep one of the translation."""
     plan, model = material.plan, material.calibrated
-    mu = np.stack([np.minimum(plan.sigma / STEEP, 1.0), plan.sigma, plan.sigma], axis=1)
+    mu = np.stack(
+        [np.minimum(plan.path_parameter / STEEP, 1.0), plan.path_parameter, plan.path_parameter], axis=1
+    )
     amplitudes = (plan.tau, plan.theta_r, plan.theta_p)
     H_d = np.array([trajectory_displacement(plan.H_hat, amplitudes, row) for row in mu])
     s = project(model.P, plan.A @ H_d.swapaxes(1, 2), model.lens).swapaxes(0, 1)
@@ -67,7 +69,7 @@ def _rendered(material: Material, mu: FloatArray, s: FloatArray, margin: FloatAr
     plan, P = material.plan, material.plant.model.P
     points = np.array([triangulate_points(P, METRIC_A_INF, row) for row in s[:, :, cyclic_order(plan.A)]])
     return {
-        "sigma": plan.sigma,
+        "sigma": plan.path_parameter,
         "mu": mu,
         "margin": margin,
         "faces": project(middle_camera(P, material.plant.image_size)[None], points)[0],
@@ -167,9 +169,9 @@ def _data_path(material: Material) -> Data:
         "share": mu,
         "margin": np.einsum("vtc,rc->vtr", moved, planes) / (O @ plan.a)[:, None, None],
         "border_px": _border_distance(material, mu),
-        "sigma": plan.sigma,
+        "sigma": plan.path_parameter,
         "mu": plan.mu,
-        "along": np.stack([*along, plan.condition / plan.condition[0]], axis=1),
+        "along": np.stack([*along, plan.reciprocal_condition / plan.reciprocal_condition[0]], axis=1),
         "profile": np.array(plan.profile.replace("_", " ")),
     }
 
