@@ -171,18 +171,18 @@ class Observation:
     pose: IntArray = _array("pose", about="number of the pose")
     marker: IntArray = _array("marker", about="number of the marker")
     q: FloatArray = _array("pose joint", "rad or m", "joint readings")
-    images: FloatArray = _array("pose view marker xy", "px", "pixels, NaN where unseen")
+    images: FloatArray = _array("pose view marker xy", "px", "pixels, NaN if unseen")
     moving: IntArray | None = _array(
-        "pose", about="number of the motion that the pose is a moment of, 0 at rest", default=None
+        "pose", about="number of the motion during which the pose was recorded, 0 at rest", default=None
     )
-    t_q: FloatArray | None = _array("pose", "s", "when joints were read, NaN where unknown", default=None)
+    t_q: FloatArray | None = _array("pose", "s", "time of the joint readings, NaN if unknown", default=None)
     t_view: FloatArray | None = _array(
-        "pose view", "s", "stamps of both images, NaN where there are none", default=None
+        "pose view", "s", "timestamps of both images, NaN if there are none", default=None
     )
     sigma: FloatArray | None = _array(
         "pose view marker",
         "px",
-        "standard deviation of the pixels, per coordinate, NaN where unseen",
+        "standard deviation of the pixels, per coordinate, NaN if unseen",
         default=None,
     )
 
@@ -207,18 +207,18 @@ class Calibration:
     Points are scaled to ``a_inf @ M = 1``, so that the mean of points is their midpoint.
     """
 
-    method: str = _scalar(about="refined or closed_form")
+    method: str = _scalar(about="bundle_adjustment or closed_form")
     source: str = _scalar(about="simulated or recorded")
     joint_types: str = _scalar(about="one letter a joint, R or P")
-    usable: bool = _scalar(about="whether the calibration may be used for control")
-    reason: str = _scalar(about="why it is usable or not, in words")
-    advice: tuple[str, ...] = _scalar(about="what to do next, one sentence each")
+    usable: bool = _scalar(about="whether the calibration is usable for control")
+    reason: str = _scalar(about="reason why it is usable or not")
+    advice: tuple[str, ...] = _scalar(about="remedies, one sentence each")
     rms_px: float = _scalar("px", "reprojection residual, rms per marker and view (Euclidean)")
     sigma_px: float = _scalar("px", "noise per image coordinate: configured, given or estimated")
     sigma_fitted_px: float = _scalar("px", "noise per coordinate from the residuals of the fit")
     chi2_per_dof: float = _scalar(about="squared residuals over sigma_px squared, per degree of freedom")
     dof: int = _scalar(about="degrees of freedom of the fit")
-    seconds: float = _scalar("s", "time the calibration took")
+    seconds: float = _scalar("s", "computing time")
     P: FloatArray = _array("view image_row coordinate", "px", "cameras, projective frame")
     H_hat_0: FloatArray = _array("joint row coordinate", about="joint operators at the reference")
     q_reference: FloatArray = _array("joint", "rad or m", "joint reading at the reference")
@@ -228,17 +228,18 @@ class Calibration:
     # The covariance of all these, as ``Errors`` says; of a method without one they are not finite.
     sqrt_cov_shared: FloatArray = _array(
         "parameter error",
-        about="deviations of P.ravel(), H_hat_0.ravel() and k1, k2 of both lenses if any, by independent "
-        "errors of unit variance, up to frame and scales that no image shows",
+        about="square root of the covariance of P.ravel(), H_hat_0.ravel() and, if estimated, k1, k2 of "
+        "both lenses, up to the gauge",
     )
     sqrt_cov_marker: FloatArray = _array(
-        "marker coordinate error", about="deviations of M by the same errors"
+        "marker coordinate error", about="square root of the covariance of M by the same errors"
     )
     sqrt_cov_own: FloatArray = _array(
-        "marker coordinate own", about="deviations of each marker by three more errors of its own"
+        "marker coordinate own",
+        about="square root of the covariance of each marker by three errors of its own",
     )
     excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
-    joint_min: FloatArray = _array("joint", "rad or m", "lowest joint reading in the data")
+    joint_min: FloatArray = _array("joint", "rad or m", "minimum joint reading in the data")
     poorly_observable: BoolArray = _array("joint", about="joints whose operator the data hardly determine")
     operator_defect: FloatArray = _array("joint", about="norm of Ĥ³ + Ĥ (revolute) or Ĥ² (prismatic) over Ĥ")
     trace_defect: FloatArray = _array("joint", about="absolute trace of Ĥ")
@@ -246,33 +247,34 @@ class Calibration:
     prediction_noise: FloatArray = _array(
         "joint", about="noise of predicted images 0.5 rad or 0.15 m from the reference, over the pixel noise"
     )
-    poses_used: int = _scalar(about="poses that the fit uses")
-    markers_used: int = _scalar(about="markers that the fit uses")
+    poses_used: int = _scalar(about="number of poses in the fit")
+    markers_used: int = _scalar(about="number of markers in the fit")
     outlier: IntArray = _array(
-        "outlier_row outlier_column", about="readings left out: pose, marker, view (0 left, 1 right, 2 both)"
+        "outlier_row outlier_column",
+        about="rejected observations: pose, marker, view (0 left, 1 right, 2 both)",
     )
     suspect: IntArray = _array(
         "suspect_row suspect_column", about="joint readings that no image agrees with: pose, joint from 1"
     )
     id_switches: IntArray = _array(
         "id_switch_row id_switch_column",
-        about="markers that changed numbers: pose, marker read, marker that it is",
+        about="observations under a wrong marker number: pose, number read, true number",
     )
     rejected_markers: IntArray | None = _array(
         "rejected_marker_row rejected_marker_column",
-        about="markers left out whole: number, and why, an index into WHY_LOST",
+        about="rejected markers: number, and reason as an index into WHY_LOST",
         default=None,
     )
     rejected_poses: IntArray | None = _array(
-        "rejected_pose", about="poses left out whole, of which no joint reading could be named", default=None
+        "rejected_pose", about="rejected poses without one suspect joint reading", default=None
     )
     predicted_rms_px: float | None = _scalar(
         "px",
-        "expected error of images at poses of all joints within their ranges, rms per marker and view",
+        "expected error of images within the joint ranges, rms per marker and view",
         default=None,
     )
     predicted_p99_px: float | None = _scalar(
-        "px", "what that rms stays below in 99 of 100 draws of the noise", default=None
+        "px", "99th percentile of that rms over draws of the noise", default=None
     )
     lens: FloatArray | None = _array(
         "view lens_term",
@@ -281,35 +283,34 @@ class Calibration:
     )
     sigma_q: float | None = _scalar(
         "rad",
-        "rms of joint readings less true joints, prismatic × 0.3 m/rad; 0 where none shows",
+        "standard deviation of joint readings, prismatic × 0.3 m/rad; 0 if none is significant",
         default=None,
     )
     sigma_q_interval: FloatArray | None = _array(
         "limit", "rad", "95 % interval of sigma_q, if estimated", default=None
     )
-    encoder_counts: bool = _scalar(
-        about="whether sigma_q is that of encoder ticks that were counted", default=False
-    )
+    encoder_counts: bool = _scalar(about="whether sigma_q is that of encoder counts", default=False)
     time_offset_s: FloatArray | None = _array(
-        "view", "s", "time of a joint reading less that of its image", default=None
+        "view", "s", "time of a joint reading less the time of its image", default=None
     )
     time_offset_interval_s: FloatArray | None = _array(
-        "view limit", "s", "95 % interval of the delay", default=None
+        "view limit", "s", "95 % interval of the time offset", default=None
     )
     time_offset_jitter_s: FloatArray | None = _array(
-        "view", "s", "deviation of single images from the delay", default=None
+        "view", "s", "standard deviation of the time offset of single images", default=None
     )
-    model_px: float = _scalar("px", "error of the model per coordinate, 0 within noise", default=0.0)
+    model_px: float = _scalar("px", "model error per coordinate, 0 if it is within the noise", default=0.0)
     corner_squares: FloatArray | None = _array(
         "corner_pose view marker",
-        about="squared residuals over their variance, mean of both coordinates, NaN where unseen",
+        about="squared residuals over their variance, mean of both coordinates, NaN if unseen",
         default=None,
     )
     corner_q: FloatArray | None = _array(
         "corner_pose joint", "rad or m", "joint readings of corner_squares", default=None
     )
     sigma_scale: float | None = _scalar(
-        about="true deviations of pixels over those stated, if these were judged by the images", default=None
+        about="true standard deviation of pixels over the stated one, if the images determine it",
+        default=None,
     )
     sigma_scale_interval: FloatArray | None = _array(
         "limit", about="95 % interval of sigma_scale", default=None
@@ -377,26 +378,24 @@ class CrossValidation:
     Readings that the calibration leaves out as outliers do not count.
     """
 
-    folds: int = _scalar(about="parts the poses were divided into, each predicted from the others")
+    folds: int = _scalar(about="number of folds of the poses, each predicted from the others")
     seed: int = _scalar(about="seed of the division")
     unit: str = _scalar(about="poses, or configurations: poses that differ in one joint stay together")
-    failed: tuple[str, ...] = _scalar(about="parts that could not be predicted, each with the reason")
-    reason: str = _scalar(about="how the held-out error compares with the predicted one, in words")
-    count: int = _scalar(about="marker-view pairs that were predicted")
+    failed: tuple[str, ...] = _scalar(about="folds without a prediction, each with the reason")
+    reason: str = _scalar(about="comparison of the held-out error with the predicted one")
+    count: int = _scalar(about="number of predicted marker-view pairs")
     rms_px: float | None = _scalar("px", "held-out residual, root mean square")
     median_px: float | None = _scalar("px", "held-out residual, median")
     p95_px: float | None = _scalar("px", "held-out residual, 95th percentile")
     predicted_rms_px: float | None = _scalar(
-        "px", "the same root mean square from noise and covariance of each fit"
+        "px", "expected root mean square from noise and covariance of each fit"
     )
     pose: IntArray = _array("pose", about="number of the pose")
-    fold: IntArray = _array("pose", about="part of the pose, from 0")
+    fold: IntArray = _array("pose", about="fold of the pose, from 0")
     marker: IntArray = _array("marker", about="number of the marker")
-    residual: FloatArray = _array(
-        "pose view marker xy", "px", "seen minus predicted, NaN where there is none"
-    )
+    residual: FloatArray = _array("pose view marker xy", "px", "seen minus predicted, NaN if there is none")
     predicted: FloatArray = _array(
-        "pose view marker xy", "px", "deviation of the residual from noise and covariance"
+        "pose view marker xy", "px", "standard deviation of the residual from noise and covariance"
     )
 
 
@@ -419,46 +418,50 @@ class Plan:
     where they concern visibility: None is stored as NaN where a motion never changes it.
     """
 
-    profile: str = _scalar(about="which part is driven when")
+    profile: str = _scalar(about="profile of the motion")
     feasible: bool = _scalar(
         about="whether both cameras see the face all along; in the profile constrained, whether all "
-        "constraints hold; in the profile joint_space, whether a way was found"
+        "constraints hold; in the profile joint_space, whether a path was found"
     )
-    reason: str = _scalar(about="what makes the plan feasible or not, in words")
+    reason: str = _scalar(about="reason why the plan is feasible or not")
     tau: float = _scalar(about="amplitude of the translation, unit-norm kernel of (8)")
     theta_r: float = _scalar("rad", "angle onto the target plane, in the sense chosen")
     theta_p: float = _scalar("rad", "angle within the plane")
     theta_s: float = _scalar("rad", "angle of both rotations together")
     constraint: str = _scalar(
-        about="what the motion comes nearest to failing, as a share of its ends' margins"
+        about="constraint with the smallest margin, as a fraction of its margin at the ends"
     )
     duration: float | None = _scalar(
         "s",
-        "time it takes, as asked for or at the joint-speed limit; none without a limit or where joints "
-        "cannot follow",
+        "duration, as configured or at the joint-speed limit; none without a limit, or if no joints follow",
     )
-    tau_limit: float = _scalar(about="least delta·tau_0 ahead of the face, infinite where there is none")
+    tau_limit: float = _scalar(
+        about="minimum visibility_fraction·tau_0 ahead of the face, infinite if there is none"
+    )
     path_parameter: FloatArray = _array("sample", about="path parameter from 0 to 1")
-    time: FloatArray = _array("sample", "s", "when that is reached; NaN where there is no time")
+    time: FloatArray = _array("sample", "s", "time of each sample; NaN if the plan has no duration")
     mu: FloatArray = _array(
-        "sample part", about="shares of t, r, p that are done, NaN in the profile joint_space"
+        "sample part", about="fractions of t, r, p that are done, NaN in the profile joint_space"
     )
     H_d: FloatArray = _array("sample row coordinate", about="planned displacement of the face")
     s: FloatArray = _array("sample view marker xy", "px", "predicted images of the face")
     margin: FloatArray = _array("sample view", about="visibility margin a·O, 1 at the start")
     border_distance: FloatArray = _array(
-        "sample view", "px", "least distance of a marker from the image border"
+        "sample view", "px", "minimum distance of a marker from the image border"
     )
-    q: FloatArray = _array("sample joint", "rad or m", "joints that follow the motion, NaN where none can")
-    joint_margin: FloatArray = _array("sample", about="least distance from a joint limit over half the range")
+    q: FloatArray = _array("sample joint", "rad or m", "joints that follow the motion, NaN if none do")
+    joint_margin: FloatArray = _array(
+        "sample", about="minimum distance from a joint limit over half the range"
+    )
     reciprocal_condition: FloatArray = _array(
-        "sample", about="reciprocal condition of the image Jacobian of the face"
+        "sample", about="reciprocal condition number of the image Jacobian of the face"
     )
     min_margin: FloatArray = _array(
         "constraint",
-        about="smallest visibility margin, border distance in px, joint margin, reciprocal condition",
+        about="minimum of visibility margin, border distance in px, joint margin, reciprocal condition "
+        "number",
     )
-    min_margin_mu: FloatArray = _array("constraint part", about="shares of t, r, p where that is")
+    min_margin_mu: FloatArray = _array("constraint part", about="fractions of t, r, p at that minimum")
     s_start: FloatArray = _array("view marker xy", "px", "images at the start")
     s_star: FloatArray = _array("view marker xy", "px", "images at the goal")
     A: FloatArray = _array("marker coordinate", about="face at the start")
@@ -477,53 +480,60 @@ class Plan:
     tau_0: FloatArray = _array("view", about="translation at which visibility changes")
     theta_0: FloatArray = _array("view solution", "rad", "angles at which visibility changes")
     sense: FloatArray = _array("solution", "rad", "both senses of the rotation onto the plane")
-    sense_margin: FloatArray = _array("solution view", about="least margin along each sense, 1 at the start")
+    sense_margin: FloatArray = _array(
+        "solution view", about="minimum margin along each sense, 1 at the start"
+    )
     n_goal_configurations: int | None = _scalar(
-        about="joint vectors within the limits that show the goal; none but in the profile joint_space",
+        about="number of goal configurations within the limits; none but in the profile joint_space",
         default=None,
     )
     n_search_samples: int | None = _scalar(
-        about="joint vectors that the search grew towards; none but in the profile joint_space", default=None
+        about="number of samples of the search; none but in the profile joint_space", default=None
     )
     n_goals_tried: int | None = _scalar(
-        about="how many of the goals, nearest in time, were tried; none but in the profile joint_space",
+        about="number of goal configurations tried, nearest in time; none but in the profile joint_space",
         default=None,
     )
-    seed: int | None = _scalar(
-        about="of the random numbers of the search; none but in the profile joint_space", default=None
-    )
+    seed: int | None = _scalar(about="seed of the search; none but in the profile joint_space", default=None)
     tree_nodes: int | None = _scalar(
-        about="joint vectors of both search trees, of which the first are stored; none but in the profile "
-        "joint",
+        about="number of nodes of both search trees, of which the first are stored; none but in the "
+        "profile joint_space",
         default=None,
     )
     rejected_profiles: tuple[str, ...] = _scalar(
-        about="profiles that auto did not take, each with the reason", default=()
+        about="profiles that auto rejected, each with the reason", default=()
     )
     relaxed_constraints: tuple[str, ...] = _scalar(
-        about="what start and goal ask less of than the configuration, having less themselves", default=()
+        about="constraints relaxed at the start and the goal, which have smaller margins themselves",
+        default=(),
     )
     margins: FloatArray | None = _array(
         "sample margin_kind",
-        about="in the profile joint_space: distance from the joint limits over that asked for; of each view least "
-        "depth (start = 1), visibility a·O (start = 1), width of the face in px, distance from the image "
-        "border less three deviations in px; distance from regions that are kept out of in px",
+        about="in the profile joint_space: distance from the joint limits over the required one; for "
+        "each view minimum depth (start = 1), visibility a·O (start = 1), width of the face in "
+        "px, distance from the image border less three standard deviations in px; distance from "
+        "keep-out regions in px",
         default=None,
     )
     required_margins: FloatArray | None = _array(
-        "sample margin_kind", about="what is asked of these, less near start and goals", default=None
+        "sample margin_kind",
+        about="required values of these margins, smaller near start and goals",
+        default=None,
     )
     blends: FloatArray | None = _array(
-        "blend end", "s", "in the profile joint_space: when each rounded corner begins and ends", default=None
+        "blend end",
+        "s",
+        "in the profile joint_space: begin and end of each blend of a waypoint",
+        default=None,
     )
     tree_q: FloatArray | None = _array(
         "node joint",
         "rad or m",
-        "joints of the search trees: that from the start, then that from the goals",
+        "nodes of the search trees: that from the start, then that from the goals",
         default=None,
     )
     tree_parent: IntArray | None = _array(
-        "node", about="place of the joints that each is joined to, -1 at a root", default=None
+        "node", about="index of the parent of each node, -1 at a root", default=None
     )
 
     def rotation_sense(self) -> FloatArray:
@@ -536,49 +546,56 @@ class Trace:
     """One closed-loop run of one law, from the first instant to its verdict."""
 
     law: str = _scalar(about="name of the control law")
-    mode: str = _scalar(about="regulate: each step moves to the goal by the present images; track, image_track: the plan is followed")
-    planned_s: float | None = _scalar("s", "when the followed plan arrives; none for regulate")
-    verdict: str = _scalar(about="how the run ended")
-    reason: str = _scalar(about="why, in a sentence")
+    mode: str = _scalar(
+        about="regulate: each step moves to the goal by the present images; track, image_track: follow the plan"
+    )
+    planned_s: float | None = _scalar("s", "arrival of the followed plan; none for regulate")
+    verdict: str = _scalar(about="verdict of the run")
+    reason: str = _scalar(about="reason of the verdict, one sentence")
     steps: int = _scalar(about="commands sent")
     period: float = _scalar("s", "control period")
-    features: str = _scalar(about="how the face is measured: points or body")
+    features: str = _scalar(about="image features: points or body")
     position_error_mm: float | None = _scalar(
-        "mm", "true centre to true goal at the end; of the tool where a robot tells its truth"
+        "mm", "true centre to true goal at the end; of the tool if the robot reports its true pose"
     )
     rotation_error_deg: float | None = _scalar("deg", "true rotation to the goal at the end")
     remaining_translation: float | None = _scalar(
-        about="share of the translation left at the end, as the law measures it"
+        about="fraction of the translation that remains at the end, as the law measures it"
     )
-    remaining_rotation_deg: float | None = _scalar("deg", "rotation left at the end, as the law measures it")
+    remaining_rotation_deg: float | None = _scalar(
+        "deg", "rotation that remains at the end, as the law measures it"
+    )
     self_occluded_steps_left: int = _scalar(about="times at which the left camera is behind the face")
     self_occluded_steps_right: int = _scalar(about="times at which the right camera is behind the face")
     center_deviation_mm: float | None = _scalar(
-        "mm", "largest distance of the centre from the line, between samples too"
+        "mm", "maximum distance of the centre from the line, between samples too"
     )
     center_deviation_at_samples_mm: float | None = _scalar(
-        "mm", "largest distance of the centre from the line at the sampling instants"
+        "mm", "maximum distance of the centre from the line at the samples"
     )
     path_length_mm: float | None = _scalar("mm", "length of the path of the centre, from sample to sample")
     effort: float = _scalar("rad²/s or m²/s", "integral of the squared joint velocities")
     longest_stall_steps: int = _scalar(
-        about="longest stretch in which convergence_error falls < 1 % in each stop.stall_periods"
+        about="longest run of steps in which convergence_error falls < 1 % in each stop.stall_periods"
     )
     speed_limited_steps: int = _scalar(about="commands scaled to the joint-speed limit")
-    visibility_limited_steps: int = _scalar(about="commands whose translation was kept within delta·tau_0")
-    first_outside_image: int = _scalar(about="first instant with a marker outside an image, -1 for never")
-    first_beyond_limit: int = _scalar(about="first instant beyond a joint limit, -1 for never")
+    visibility_limited_steps: int = _scalar(
+        about="commands whose translation was limited to visibility_fraction·tau_0"
+    )
+    first_outside_image: int = _scalar(about="first time index with a marker outside an image, -1 for never")
+    first_beyond_limit: int = _scalar(about="first time index beyond a joint limit, -1 for never")
     limit_joint: int = _scalar(
-        about="the joint, from 0, that passed its limit first or stopped the run at it, -1 for none"
+        about="the joint, from 0, that passed its limit first or stopped the run, -1 for none"
     )
     q: FloatArray = _array("time joint", "rad or m", "joints")
     s: FloatArray = _array("time view marker xy", "px", "measured images of the face")
     s_star: FloatArray = _array("view marker xy", "px", "target images")
-    image_error: FloatArray = _array("time", "px", "rms over markers and views")
+    image_error: FloatArray = _array("time", "px", "image error of the face, rms over markers and views")
     convergence_error: FloatArray = _array(
         "time",
         "px",
-        "the same by which runs end: with the body, of the face where the body was measured to be",
+        "error that decides convergence: the image error of the face, located by the body if "
+        "features is body",
     )
     tau: FloatArray = _array("time", about="translation error, unit-norm kernel of (8)")
     tau_affine: FloatArray = _array("time", about="translation error, scale fixed through a_inf")
@@ -591,7 +608,7 @@ class Trace:
     fit_px: FloatArray = _array(
         "time", "px", "noise per coordinate that the fit of the body leaves; NaN for points"
     )
-    views_used: FloatArray = _array("time", about="markers the body was fitted to, counted once a view")
+    views_used: FloatArray = _array("time", about="markers in the fit of the body, counted once per view")
     q_dot: FloatArray = _array("step joint", "rad/s or m/s", "commands after the limit")
     speed_factor: FloatArray = _array("step", about="factor of the joint-speed limit")
     self_occluded: BoolArray = _array("time view", about="true self-occlusion of the face")
@@ -599,47 +616,47 @@ class Trace:
     goal_pose: FloatArray = _array("row coordinate", "m", "true goal pose, NaN if unknown")
     center: FloatArray = _array("time axis", "m", "true centre of the face")
     image_error_px: float | None = _scalar(
-        "px", "image_error at the end; none where the face was not seen whole", default=None
+        "px", "image_error at the end; none if a marker of the face was unseen", default=None
     )
     estimated_position_error_mm: float | None = _scalar(
         "mm",
-        "the same across the lines of sight, by the size of the face in the images; none where no size is "
-        "known, or images disagree with the calibration",
+        "estimated distance of the face from the goal across the lines of sight, by its size in "
+        "the images; none if no size is known, or images disagree with the calibration",
         default=None,
     )
     success: bool | None = _scalar(
-        about="whether it converged and at every instant, in truth, no joint was past a limit, no camera "
-        "behind the face and every marker of the face in both images; none where the truth is not known",
+        about="whether it converged and at every time, in truth, no joint was past a limit, no camera "
+        "behind the face and every marker of the face in both images; none if the truth is "
+        "unknown",
         default=None,
     )
-    replan_attempts: int = _scalar(about="how often a way to the goal was searched anew", default=0)
+    replan_attempts: int = _scalar(about="number of replanning attempts", default=0)
     unplanned: str = _scalar(
-        about="why a run that was to follow the plan went without it; empty where it followed", default=""
+        about="reason why a run in a following mode ran without the plan; empty if it followed", default=""
     )
-    untested: str = _scalar(
-        about="why the images of a robot of the contract were not tested against the calibration", default=""
-    )
+    untested: str = _scalar(about="reason why the images were not tested against the calibration", default="")
     overruns: int | None = _scalar(
-        about="periods that reading and thinking did not fit into; none for the ideal simulated robot",
+        about="number of missed periods; none for the ideal simulated robot",
         default=None,
     )
     latency: FloatArray | None = _array(
-        "time view", "s", "time of the joint reading less that of the image, as followed", default=None
+        "time view",
+        "s",
+        "time of the joint reading less the time of the image, as estimated in the run",
+        default=None,
     )
     frame_index: IntArray | None = _array(
-        "frame", about="times of which frames are kept; absent where the robot shows none", default=None
+        "frame", about="time indices of the stored frames; absent if the robot provides none", default=None
     )
     frame_s: FloatArray | None = _array(
-        "frame view observed xy", "px", "all that was found in them", default=None
+        "frame view observed xy", "px", "all markers that were found in the frames", default=None
     )
     frame_size: IntArray | None = _array(
-        "frame view", about="bytes of each frame among frame_jpeg", default=None
+        "frame view", about="bytes of each frame in frame_jpeg", default=None
     )
-    frame_jpeg: ByteArray | None = _array(
-        "frame_byte", about="the frames as JPEG, one after the other", default=None
-    )
+    frame_jpeg: ByteArray | None = _array("frame_byte", about="frames as JPEG, concatenated", default=None)
     q_read: FloatArray | None = _array(
-        "time joint", "rad or m", "joint readings, where they are not the joints", default=None
+        "time joint", "rad or m", "joint readings, if they differ from the joints", default=None
     )
 
 
@@ -652,24 +669,24 @@ class Report:
     """
 
     figures: tuple[str, ...] = _scalar(about="files written, relative to the folder of the run")
-    omitted: tuple[dict[str, str], ...] = _scalar(about="figures and studies left out, each with the reason")
+    omitted: tuple[dict[str, str], ...] = _scalar(about="omitted figures and studies, each with the reason")
     claims: tuple[dict[str, Any], ...] = _scalar(about="claim, source, measured, criterion, holds")
     step_limit_deg: float = _scalar("deg", "joint motion per step of the limited runs")
-    gain_per_step: FloatArray = _array("gain_per_step", about="share of the error taken in one step")
+    gain_per_step: FloatArray = _array("gain_per_step", about="fraction of the error corrected in one step")
     path_deviation_mm: FloatArray = _array(
-        "law operators limit gain_per_step", "mm", "largest deviation of the centre"
+        "law operators limit gain_per_step", "mm", "maximum deviation of the centre"
     )
     path_deviation_at_samples_mm: FloatArray = _array(
-        "law operators limit gain_per_step", "mm", "the same at the sampling instants"
+        "law operators limit gain_per_step", "mm", "maximum deviation of the centre at the samples"
     )
     path_deviation_converged: BoolArray = _array(
         "law operators limit gain_per_step", about="whether the run converged"
     )
     period: FloatArray = _array("period", "s", "control period at the configured gains")
     period_path_deviation_mm: FloatArray = _array(
-        "law period", "mm", "largest deviation of the centre, true operators, no limit"
+        "law period", "mm", "maximum deviation of the centre, true operators, no limit"
     )
-    share: FloatArray = _array("share", about="share of the task in both sides of (22)")
+    share: FloatArray = _array("share", about="fraction of the task in both sides of (22)")
     composition_mm: FloatArray = _array("share", "mm", "distance of the centre between both sides of (22)")
 
 

@@ -30,7 +30,9 @@ def asked(profile="linear", samples=101, duration=None, ramp=0.0, **more):
 def planned(scenario, model, profile="linear", samples=11, **more):
     """Plan of a scenario with a model of it."""
     delta = scenario.inputs.trajectory.visibility_fraction
-    return plan_task(model, scenario.ends, asked(profile, samples, visibility_fraction=delta, **more), scenario.demands)
+    return plan_task(
+        model, scenario.ends, asked(profile, samples, visibility_fraction=delta, **more), scenario.demands
+    )
 
 
 def driven(scenario, plan, name, model, **limits):

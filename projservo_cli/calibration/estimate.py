@@ -89,9 +89,9 @@ def calibrate(
     seed : seed of the random starts.
     lens : whether to estimate two coefficients of radial distortion a camera, about the image centre.
     init : robot and rig that ``bundle_adjustment`` tries first as a start; a search follows if that fails.
-    joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad), for ``bundle_adjustment``;
-        None estimates it, and takes 0 unless the images show it.
-    fitted : called with the solution of ``bundle_adjustment`` and its noise, px, where the record is not enough.
+    joint_noise : standard deviation of joint readings, rad (prismatic × 0.3 m/rad), for
+        ``bundle_adjustment``; None estimates it, and takes 0 unless the images show it.
+    fitted : called with the solution of ``bundle_adjustment`` and its noise, px.
     progress : called with the current task of ``bundle_adjustment``, how much of it is done, and its total.
 
     Returns

@@ -283,8 +283,10 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
             yield f"  duration {value['duration']:.3g} s"
         if value["n_goal_configurations"] is not None:
             yield wrapped(
-                "search: {n_goal_configurations} goal configurations, {n_goals_tried} tried; {n_search_samples} "
-                "samples of seed {seed}, {tree_nodes} joint vectors in both trees".format_map(value),
+                "search: {n_goal_configurations} goal configurations, {n_goals_tried} tried; "
+                "{n_search_samples} samples of seed {seed}, {tree_nodes} nodes of both trees".format_map(
+                    value
+                ),
                 "  ",
             )
 

@@ -35,14 +35,14 @@ from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Pa
 from projservo_cli.simulation import dh
 from projservo_cli.simulation.arm import Arm, twist
 from projservo_cli.simulation.faults import (
-    JointMoved,
     CameraMoved,
     Events,
     Faults,
-    StuckEncoder,
+    JointMoved,
     LostMarkers,
     MarkerMoved,
     SimulatedRobot,
+    StuckEncoder,
 )
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.simulation.scene import Scene, Tag, lens_of

@@ -23,9 +23,13 @@ _CORNERS = ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))  # as they are d
 class Tag(Section):
     """A tag on the tool."""
 
-    number: Whole = Field(description="of the tag in its dictionary; its corners are markers 4 t to 4 t + 3")
-    size_m: Positive = Field(description="side of its black square")
-    pose: Matrix44 = Field(description="in the frame of the tool, m: the tag looks along z, y is up on it")
+    number: Whole = Field(
+        description="number of the tag t in its dictionary; its corners are markers 4 t to 4 t + 3"
+    )
+    size_m: Positive = Field(description="side of the black square")
+    pose: Matrix44 = Field(
+        description="pose in the frame of the tool, m: the tag faces along z, y is up on it"
+    )
 
     def contradictions(self) -> Iterator[Finding]:
         """A tag that is nowhere."""
@@ -84,32 +88,30 @@ class Markers(Section):
     """Points fixed to the tool; the face is the part of them that must stay visible."""
 
     positions_m: tuple[Vector3, ...] | None = Field(
-        None, min_length=1, max_length=10_000, description="in the frame of the tool"
+        None, min_length=1, max_length=10_000, description="positions in the frame of the tool"
     )
     numbers: tuple[Whole, ...] | None = Field(
-        None, min_length=1, description="number of each marker; null for 0, 1, 2 ..."
+        None, min_length=1, description="number of each marker; null: 0, 1, 2 ..."
     )
     tags: (
         Literal["roof", "plate"] | Annotated[tuple[Tag, ...], Field(min_length=1, max_length=250)] | None
-    ) = Field(
-        None, description="tags whose corners are the markers, instead of positions_m: a tool or a list"
-    )
+    ) = Field(None, description="tags whose corners are the markers: roof, plate, or a list")
     tag_size_m: Positive | None = Field(
         None,
-        description="side of the black square of each tag of a roof or plate, null for 0.06; of each tag "
-        "whose corners numbers are",
+        description="side of the black square of each tag; null: 0.06 for a roof or a plate",
     )
     dictionary: Annotated[str, StringConstraints(min_length=1)] | None = Field(
         None,
-        description="of the tags, as OpenCV names it, null for 4X4_50; a class of yours is given it where it "
-        "takes it",
+        description="tag dictionary by its OpenCV name; null: 4X4_50; passed to a robot class that "
+        "accepts it",
     )
     face: tuple[Whole, ...] | None = Field(
         None,
         min_length=3,
-        description="numbers of those in a plane that must stay visible; null for the tag that looks forward",
+        description="numbers of the coplanar markers that must stay visible; null: the tag that faces "
+        "forward",
     )
-    center: _Center = Field("midpoint", description="of the face: midpoint, or a number")
+    center: _Center = Field("midpoint", description="centre of the face: midpoint, or the number of a marker")
 
     @property
     def all_tags(self) -> tuple[Tag, ...]:

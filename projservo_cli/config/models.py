@@ -40,23 +40,25 @@ from projservo_cli.robots import plugins
 
 
 class LostMarkers(Section):
-    """Markers that neither camera sees for a while; all of them where none is named."""
+    """Markers that both cameras lose for some steps."""
 
-    from_step: Whole = Field(description="first step at which they are unseen")
-    steps: Count | None = Field(None, description="for how many steps; null for ever")
+    from_step: Whole = Field(description="first step at which the markers are unseen")
+    steps: Count | None = Field(None, description="number of steps; null: until the end of the run")
     markers: Annotated[tuple[Whole, ...], Field(min_length=1)] | None = Field(
-        None, description="their numbers; null for all markers"
+        None, description="numbers of the markers; null: all markers"
     )
 
 
 class _JointMoved(Section):
-    """A joint that is pushed aside, or slips on its encoder."""
+    """A joint that is displaced, or slips on its encoder."""
 
-    at_step: Count = Field(description="step at which it moves")
-    joint: Count = Field(description="the joint, counted from 1")
-    by_deg: Number | None = Field(None, description="how far, a revolute joint")
-    by_m: Number | None = Field(None, description="how far, a prismatic joint")
-    encoder_slip: StrictBool = Field(False, description="whether its reading stays where it was")
+    at_step: Count = Field(description="step at which the joint moves")
+    joint: Count = Field(description="number of the joint, from 1")
+    by_deg: Number | None = Field(None, description="angle of a revolute joint")
+    by_m: Number | None = Field(None, description="distance of a prismatic joint")
+    encoder_slip: StrictBool = Field(
+        False, description="true: the link slips on its encoder, and the reading stays the same"
+    )
 
     def contradictions(self) -> Iterator[Finding]:
         """An angle and a distance, or neither."""
@@ -65,19 +67,19 @@ class _JointMoved(Section):
 
 
 class StuckEncoder(Section):
-    """A joint whose reading stands still while it moves."""
+    """An encoder whose reading stays constant while its joint moves."""
 
-    joint: Count = Field(description="the joint, counted from 1")
-    from_step: Whole = Field(description="first step at which its reading stands still")
-    steps: Count | None = Field(None, description="for how many steps; null for ever")
+    joint: Count = Field(description="number of the joint, from 1")
+    from_step: Whole = Field(description="first step of the constant reading")
+    steps: Count | None = Field(None, description="number of steps; null: until the end of the run")
 
 
 class _CameraMoved(Section):
-    """A camera that is knocked, so that all it sees is shifted."""
+    """A camera that moves, which shifts its image."""
 
-    at_step: Whole = Field(description="first step at which its image is shifted")
-    view: Literal["left", "right"] = Field(description="which camera")
-    by_px: Number | tuple[Number, Number] = Field(description="how far, along u, or along u and v")
+    at_step: Whole = Field(description="first step at which the image is shifted")
+    view: Literal["left", "right"] = Field(description="the camera that moves")
+    by_px: Number | tuple[Number, Number] = Field(description="shift of its image along u, or along u and v")
 
     def by_view(self) -> tuple[tuple[float, float], ...]:
         """How far along u and v, left and right."""
@@ -86,18 +88,18 @@ class _CameraMoved(Section):
 
 
 class _MarkerMoved(Section):
-    """A marker that is knocked aside on the tool."""
+    """A marker that moves on the tool."""
 
-    at_step: Whole = Field(description="first step at which it is elsewhere")
-    marker: Whole = Field(description="its number")
-    by_m: Vector3 = Field(description="how far, in the frame of the tool")
+    at_step: Whole = Field(description="first step at the new position")
+    marker: Whole = Field(description="number of the marker")
+    by_m: Vector3 = Field(description="displacement in the frame of the tool")
 
 
 class _Delays(Section):
-    """Delays of both cameras, s."""
+    """Latency of both cameras, s."""
 
-    left: NotNegative = Field(0.0, description="of the left camera")
-    right: NotNegative = Field(0.0, description="of the right camera")
+    left: NotNegative = Field(0.0, description="latency of the left camera")
+    right: NotNegative = Field(0.0, description="latency of the right camera")
 
 
 def _of_both(value: Any) -> Any:
@@ -106,41 +108,47 @@ def _of_both(value: Any) -> Any:
 
 
 class Disturbance(Section):
-    """What is wrong with the simulated robot, and what befalls it and its images."""
+    """Faults of the simulated robot and its cameras, permanent ones and events in a run."""
 
     camera_latency_s: Annotated[
         _Delays, BeforeValidator(_of_both, json_schema_input_type=NotNegative | _Delays)
     ] = Field(
         _Delays(),
-        description="time from the middle of an exposure to the joint readings that come with its image, "
-        "half the exposure at least; a number for both cameras, or {left, right}",
+        description="time from the middle of an exposure to the joint readings that arrive with its "
+        "image, at least half the exposure; a number for both cameras, or {left, right}",
     )
-    exposure_s: NotNegative = Field(0.0, description="time over which an image is averaged")
-    jitter_s: NotNegative = Field(0.0, description="standard deviation of when single images are taken")
+    exposure_s: NotNegative = Field(0.0, description="exposure time, over which an image is averaged")
+    jitter_s: NotNegative = Field(
+        0.0, description="standard deviation of the exposure times of single images"
+    )
     frame_rate_hz: Positive | None = Field(
-        None, description="of cameras that run freely; null for an image taken at each look"
+        None, description="frame rate of free-running cameras; null: each reading triggers an image"
     )
     frame_offset_s: Number = Field(
-        0.0, description="by which the right camera's images come after the left one's, with frame_rate_hz"
+        0.0, description="delay of the right camera behind the left one, with frame_rate_hz"
     )
     stamps: StrictBool = Field(
-        False, description="whether images carry the middle of their exposure, each camera by its own clock"
+        False, description="true: images carry the time of mid-exposure, each camera by its own clock"
     )
     encoder_counts_per_turn: Count | None = Field(
-        None, description="steps of joint readings in a turn, or in 1.885 m of a prismatic joint"
+        None,
+        description="resolution of the joint readings, counts per turn, or per 1.885 m of a prismatic "
+        "joint; null: continuous",
     )
-    quantize_setpoints: StrictBool = Field(False, description="whether set-points are whole ticks too")
+    quantize_setpoints: StrictBool = Field(
+        False, description="true: set-points are rounded to encoder counts as well"
+    )
     servo_time_constant_s: NotNegative = Field(
-        0.0, description="time constant with which joints follow their set-points"
+        0.0, description="time constant of the first-order lag of the servos"
     )
     gravity_sag_deg: NotNegative = Field(
-        0.0, description="by which gravity turns a joint off its set-point at full reach; it is read"
+        0.0, description="steady-state error under gravity at full reach; the encoders read it"
     )
     link_deflection_deg: NotNegative = Field(
-        0.0, description="the same of a link beyond its encoder, which is not read"
+        0.0, description="deflection of a link under gravity at full reach; no encoder reads it"
     )
     backlash_deg: NotNegative = Field(
-        0.0, description="play between each encoder and its link, from end to end"
+        0.0, description="backlash between each encoder and its link, from end to end"
     )
     lost_markers: LostMarkers | None = None
     joint_moved: _JointMoved | None = None
@@ -209,10 +217,12 @@ _Modes = Annotated[tuple[_Mode, ...], Field(min_length=1)]
 class _Noise(Section):
     """Standard deviation of simulated pixel noise, per coordinate."""
 
-    calibration_px: NotNegative = Field(0.5, description="in the images of trial motions")
-    servo_px: NotNegative = Field(0.0, description="in the images of the closed loop")
+    calibration_px: NotNegative = Field(0.5, description="pixel noise of the trial motions")
+    servo_px: NotNegative = Field(
+        0.0, description="pixel noise of the closed loop, and of the images of start and goal"
+    )
     averaged_frames: Count = Field(
-        1, description="images averaged of the start and of the goal, where the robot rests"
+        1, description="number of images averaged at the start and at the goal, where the robot rests"
     )
 
 
@@ -220,42 +230,45 @@ class _CalibrationSettings(Section):
     """Trial motions of one joint each around a reference, and the method that evaluates them."""
 
     method: Literal["bundle_adjustment", "closed_form"] = Field(
-        "bundle_adjustment", description="bundle adjustment; the paper's closed forms"
+        "bundle_adjustment",
+        description="bundle_adjustment: maximum likelihood; closed_form: the closed forms of the paper",
     )
     frames_per_joint: StrictInt = Field(
-        8, ge=0, le=10_000, description="trial poses of each joint, beside the reference"
+        8, ge=0, le=10_000, description="trial poses of each joint, in addition to the reference"
     )
     amplitude_deg: Number = Field(
-        30.0, ge=0, lt=180, description="farthest trial to each side, revolute joints"
+        30.0, ge=0, lt=180, description="maximum trial motion to each side, revolute joints"
     )
-    amplitude_m: NotNegative = Field(0.15, description="farthest trial to each side, prismatic joints")
+    amplitude_m: NotNegative = Field(0.15, description="maximum trial motion to each side, prismatic joints")
     reference: JointVector | None = Field(
-        None, description="joint readings at the reference pose; null for those of task.start"
+        None, description="joint readings of the reference pose; null: task.start"
     )
     cross_validate: StrictInt | None = Field(
         None,
         ge=2,
         le=10_000,
-        description="parts into which poses are divided to predict each from the others; null for none",
+        description="number of folds of the poses, each predicted from the others; null: no cross-validation",
     )
     init: Annotated[str, StringConstraints(min_length=1)] | None = Field(
-        None, description="JSON file of a robot and rig known beforehand, tried first as a start"
+        None, description="JSON file of a known robot and rig, the first initial guess of the fit"
     )
     random_poses: StrictInt | None = Field(
         None,
         ge=0,
         le=10_000,
-        description="trial poses of all joints at once, within the amplitudes, after those of single joints; "
-        "null for 12 where joints may be read or images taken with faults, 0 for the ideal plant",
+        description="trial poses of all joints at once, within the amplitudes, after those of single "
+        "joints; null: 12 if readings or images may have faults, 0 for the ideal plant",
     )
     joint_noise_deg: NotNegative | None = Field(
         None,
-        description="rms of joint readings less true angles (of prismatic joints × 0.3 m/rad); null to "
-        "estimate it, or 0 for the ideal plant",
+        description="standard deviation of joint readings (prismatic joints: × 0.3 m/rad); null: "
+        "estimated, 0 for the ideal plant",
     )
-    seed: Whole | None = Field(None, description="seed of the noise of the trials; null for that of the run")
+    seed: Whole | None = Field(
+        None, description="seed of the noise of the trial motions; null: seed of the run"
+    )
     lens: StrictBool = Field(
-        False, description="whether to estimate two coefficients of radial distortion a camera"
+        False, description="true: estimate two coefficients of radial distortion for each camera"
     )
 
     def contradictions(self) -> Iterator[Finding]:
@@ -269,68 +282,78 @@ class _Data(Section):
     """A recorded run: the observation table that stands in for simulated trial motions."""
 
     table: Annotated[str, StringConstraints(min_length=1)] = Field(
-        description="file of the table, relative to the configuration"
+        description="path of the table, relative to the configuration"
     )
     joints: Annotated[str, StringConstraints(pattern=r"^[RrPp]+$"), AfterValidator(str.upper)] | None = Field(
-        None, description="one letter a column q1 ... qN, R or P; null for those of robot, else all R"
+        None,
+        description="joint types, one letter R or P for each column q1 ... qN; null: those of robot, "
+        "else all R",
     )
     joint_unit: Literal["deg", "rad"] | None = Field(
-        None, description="unit of revolute joints; null for rad, unless readings look like degrees"
+        None,
+        description="unit of revolute joints; null: rad, and readings that look like degrees are refused",
     )
-    noise_px: Positive | None = Field(None, description="pixel noise per coordinate; null to estimate it")
+    noise_px: Positive | None = Field(None, description="pixel noise per coordinate; null: estimated")
     image_size_px: tuple[Count, Count] | None = Field(
-        None, description="width and height of the images; null for that of rig, else from the readings"
+        None, description="width and height of the images; null: those of rig, else from the observations"
     )
 
 
 class _Control(Section):
-    """The laws to run, in which modes, their gains in 1/s, and how fast the joints may move."""
+    """Control laws, their modes and gains, and the speed limits of the joints."""
 
     laws: tuple[Law, ...] = Field(
         tuple(law for law, spec in LAW_SPECS.items() if spec.paper),
         min_length=1,
-        description="laws to run, each from the start; module:Class for a law of yours",
+        description="control laws to run, each from the start; module:Class for a plug-in law",
     )
     mode: Annotated[_Modes, BeforeValidator(one_or_more, json_schema_input_type=_Mode | _Modes)] = Field(
         ("regulate",),
-        description="whether each step plans anew or the plan is followed; with a list, each law in those "
-        "of the modes that it has",
+        description="regulate: each step moves to the goal by the present images; track, image_track: "
+        "follow the plan; a list runs each law in those of the modes that it has",
     )
     on_plan_failure: Literal["regulate", "refuse"] = Field(
         "regulate",
-        description="whether a law that no joints could follow the plan with replans, or is not run",
+        description="if no joints follow the plan: regulate runs the law without it, refuse does not "
+        "run the law",
     )
     max_replan_attempts: Whole = Field(
         3,
-        description="how often a way is searched anew where one comes to nothing, profiles joint_space and auto",
+        description="maximum number of replanning attempts of a run, profiles joint_space and auto",
     )
     must_converge: tuple[Law, ...] | None = Field(
         None,
-        description="laws whose failure is that of the call, exit code 1; null for direct_three, direct_two, "
-        "exact and laws of yours",
+        description="laws that fail the call (exit code 1) if they do not converge; null: "
+        "direct_three, direct_two, exact and plug-in laws",
     )
     period_s: Positive = Field(0.04, description="control period")
     gain_t: Positive = Field(2.5, description="gain of the translation, 1/s")
     gain_r: Positive = Field(2.5, description="gain of the rotation onto the plane, 1/s")
     gain_p: Positive = Field(2.5, description="gain of the rotation within the plane, 1/s")
-    gain_s: Positive = Field(2.5, description="gain of both rotations as one, in direct_two and exact, 1/s")
-    ratio_rp: Positive = Field(1.0, description="how direct_two composes both rotations into one, λ_r/λ_p")
+    gain_s: Positive = Field(
+        2.5, description="gain of both rotations together, laws direct_two and exact, 1/s"
+    )
+    ratio_rp: Positive = Field(1.0, description="ratio λ_r/λ_p of both rotations in direct_two")
     gain: Positive = Field(2.5, description="gain of the classical laws, 1/s")
-    joint_speed_limit_deg_s: Positive | None = Field(125.0, description="of revolute joints; null for none")
-    prismatic_speed_limit_m_s: Positive | None = Field(None, description="of prismatic joints; null for none")
+    joint_speed_limit_deg_s: Positive | None = Field(
+        125.0, description="speed limit of revolute joints; null: none"
+    )
+    prismatic_speed_limit_m_s: Positive | None = Field(
+        None, description="speed limit of prismatic joints; null: none"
+    )
     joint_acceleration_limit_deg_s2: Positive | None = Field(
-        None, description="of revolute joints in the profile joint_space_space; null for 500"
+        None, description="acceleration limit of revolute joints, profile joint_space; null: 500"
     )
     prismatic_acceleration_limit_m_s2: Positive | None = Field(
-        None, description="of prismatic joints in the profile joint_space_space; null for 2"
+        None, description="acceleration limit of prismatic joints, profile joint_space; null: 2"
     )
     substeps: Literal["none", "auto"] = Field(
-        "auto", description="whether the law exact sends long steps in parts"
+        "auto", description="auto: the law exact sends long steps in parts; none: in one"
     )
     features: Literal["points", "body"] | None = Field(
         None,
-        description="what direct laws measure with: the face's points or all visible markers; "
-        "null for body where the calibration is usable",
+        description="image features of the direct laws: points of the face, or the body of all "
+        "visible markers; null: body if the calibration is usable",
     )
 
     def contradictions(self) -> Iterator[Finding]:
@@ -348,74 +371,77 @@ class _Control(Section):
 class _EachView(Section):
     """A number for each camera."""
 
-    left: Number = Field(description="of the left camera")
-    right: Number = Field(description="of the right camera")
+    left: Number = Field(description="time offset of the left camera")
+    right: Number = Field(description="time offset of the right camera")
 
 
 class RenderedOptions(Section):
-    """The options of the plant mujoco."""
+    """Options of the plant mujoco."""
 
     servo: Literal["own", "position", "velocity"] = Field(
         "own",
-        description="what moves the joints: the actuators of robot.mjcf where it has some, else position",
+        description="actuators: position or velocity servos; own: those of robot.mjcf, else position",
     )
     grey_noise: NotNegative = Field(
-        2.0, description="standard deviation of a pixel's noise, grey levels of 255"
+        2.0, description="standard deviation of the image noise, grey levels of 255"
     )
-    blur_px: NotNegative = Field(0.7, description="standard deviation by which a lens blurs")
+    blur_px: NotNegative = Field(0.7, description="standard deviation of the blur of the lens")
     k1: Number = Field(
-        0.0, gt=-1, lt=1, description="radial distortion, in units of the focal length: r (1 + k1 r²)"
+        0.0, gt=-1, lt=1, description="radial distortion r (1 + k1 r²), r in units of the focal length"
     )
-    light: Literal["soft", "side"] = Field("soft", description="from all around, or hard and from one side")
+    light: Literal["soft", "side"] = Field(
+        "soft", description="soft: from all around; side: hard light from one side"
+    )
 
 
 class _PlantSettings(Section):
-    """What is driven, and what the simulated robot does at its borders.
+    """The robot to drive, and the behaviour of a simulated one at its limits.
 
-    ``use`` names the class of a robot that is not simulated, ``options`` are what it is made with;
-    such a robot is never sent beyond its joint limits.
+    ``use`` names the class of an external robot and ``options`` its arguments. The loop never commands an
+    external robot beyond its joint limits.
     """
 
     use: PlantClass | None = Field(
         None,
-        description="class of a robot of yours, module:Class; mujoco for a simulated one before rendered "
-        "cameras; null for one that is simulated by its points",
+        description="module:Class of an external robot, or mujoco for a simulated arm with rendered "
+        "cameras; null: a simulated arm whose points are projected",
     )
-    options: dict[str, Plain] = Field({}, description="arguments that the class is made with")
-    timeout_s: Positive = Field(1.0, description="most time an answer of the robot may take")
-    open_s: Positive = Field(30.0, description="most time that opening the robot may take")
+    options: dict[str, Plain] = Field({}, description="keyword arguments of the class")
+    timeout_s: Positive = Field(1.0, description="maximum time of one answer of the robot")
+    open_s: Positive = Field(30.0, description="maximum time to open the robot")
     max_relative_target_deg: Positive | None = Field(
-        None, description="how far a set-point may lead the reading; null for what lag and sag ask for"
+        None,
+        description="maximum distance of a set-point from the reading; null: from max_servo_lag_s, "
+        "max_steady_state_error_deg and the speed limit",
     )
-    max_servo_lag_s: NotNegative = Field(
-        0.15, description="by how much the robot may lag behind its set-point"
-    )
+    max_servo_lag_s: NotNegative = Field(0.15, description="maximum lag of a joint behind its set-point")
     max_steady_state_error_deg: NotNegative = Field(
         1.0,
-        description="how far a joint at rest may stay from its set-point; prismatic: 5 mm a degree",
+        description="maximum distance of a joint at rest from its set-point; prismatic joints: 5 mm "
+        "per degree",
     )
     time_offset_s: Annotated[
         _EachView | None, BeforeValidator(_of_both, json_schema_input_type=Number | _EachView | None)
     ] = Field(
         None,
-        description="time from the middle of an exposure to the joint readings that come with its image; "
-        "a number for both cameras, or {left, right}; null to estimate it",
+        description="time from the middle of an exposure to the joint readings that arrive with its "
+        "image; a number for both cameras, or {left, right}; null: estimated",
     )
     averaged_frames: StrictInt = Field(
-        1, ge=1, le=1000, description="images of each pose that record averages"
+        1, ge=1, le=1000, description="number of images of each pose that record averages"
     )
     settle_s: Positive = Field(
-        0.5, description="for how long joints and images have stood still before a pose is recorded"
+        0.5, description="time for which joints and images rest before a pose is recorded"
     )
-    speed_scale: Number = Field(1.0, gt=0, le=1, description="factor of every command to the robot")
+    speed_scale: Number = Field(1.0, gt=0, le=1, description="factor of all commanded velocities")
     self_occlusion: Literal["transparent", "opaque"] = Field(
-        "transparent", description="whether the face hides its markers from a camera behind it"
+        "transparent", description="opaque: a camera behind the face does not see its markers"
     )
     joint_limits: Literal["report", "stop"] = Field(
-        "report", description="whether a joint limit is noted or ends the run"
+        "report", description="a joint limit is reported, or stops the run"
     )
     image_border: Literal["report", "stop"] = Field(
-        "report", description="whether a marker beyond the image is noted or ends the run"
+        "report", description="a marker outside an image is reported, or stops the run"
     )
 
     @property
@@ -430,30 +456,32 @@ class _PlantSettings(Section):
 
 
 class _Stop(Section):
-    """When a closed loop ends."""
+    """Stopping rules of the closed loop."""
 
-    image_error_px: Positive = Field(0.01, description="converged within this image error, rms")
-    noise_factor: NotNegative = Field(
-        2.0, description="widens image_error_px by so many times noise.servo_px"
-    )
-    max_steps: Count = Field(2000, description="commands after which a run ends")
+    image_error_px: Positive = Field(0.01, description="image error below which a run has converged, rms")
+    noise_factor: NotNegative = Field(2.0, description="image_error_px grows by this factor × noise.servo_px")
+    max_steps: Count = Field(2000, description="maximum number of commands")
     diverged_factor: Number = Field(
-        10.0, gt=1, description="diverged where the image error or the distance grows so many times"
+        10.0, gt=1, description="growth of the image error or the distance at which a run has diverged"
     )
-    stall_periods: Count = Field(20, description="stands still where the error falls < 1 % in so many steps")
-    max_lost_periods: Whole = Field(25, description="periods for which lost markers are waited for")
+    stall_periods: Count = Field(
+        20, description="periods in which the error must fall by 1 %, else the run makes no progress"
+    )
+    max_lost_periods: Whole = Field(
+        25, description="periods for which the robot holds while markers are lost"
+    )
     innovation_threshold: NotNegative = Field(
         1.0,
-        description="a run of a robot of yours, or of a simulated one with faults, is disturbed where images "
-        "are off the prediction by more than chance and so many times the noise; 0 tests nothing",
+        description="fault detection: a fault is an innovation beyond chance and beyond this factor × "
+        "the noise; 0: no detection",
     )
 
 
 class _ReportSettings(Section):
-    """What the report writes."""
+    """Files of the report."""
 
     formats: tuple[Literal["svg", "pdf", "png"], ...] = Field(
-        ("svg",), min_length=1, description="files of each figure; the page shows SVG, else PNG"
+        ("svg",), min_length=1, description="file formats of each figure; the page shows SVG, else PNG"
     )
 
 
@@ -611,7 +639,8 @@ def _keeping_out(control: _Control, trajectory: Trajectory) -> Iterator[Finding]
     if trajectory.keep_out and REGULATE in control.mode:
         yield (
             ("control", "mode"),
-            "regulate follows no plan, and only plans keep out of trajectory.keep_out: set track or image_track",
+            "regulate follows no plan, and only plans keep out of trajectory.keep_out: set track or "
+            "image_track",
         )
 
 
@@ -653,8 +682,8 @@ def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
 class Settings(Root):
     """Values of all sections, and what follows from them."""
 
-    name: FolderName = Field(description="of the run and its folder; by default that of the file")
-    seed: Whole = Field(0, description="of all random numbers; the same seed gives the same run")
+    name: FolderName = Field(description="name of the run and of its folder; default: name of the file")
+    seed: Whole = Field(0, description="seed of all random numbers; the same seed gives the same run")
     robot: RobotSettings | None = None
     rig: Rig | None = None
     markers: Markers | None = None

@@ -81,8 +81,8 @@ def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...
 class JointVector(Section):
     """Joint readings; ``unit`` is that of the revolute joints, prismatic ones are in metres."""
 
-    joints: tuple[Number, ...] = Field(min_length=1, description="a reading for each joint, base to tool")
-    unit: Literal["deg", "rad"] = Field(description="unit of the revolute joints")
+    joints: tuple[Number, ...] = Field(min_length=1, description="one reading per joint, base to tool")
+    unit: Literal["deg", "rad"] = Field(description="unit of the revolute joints; prismatic joints are in m")
 
     def values(self, joint_types: str) -> tuple[float, ...]:
         """Readings in rad (R) and m (P), one for each letter of ``joint_types``.
@@ -112,11 +112,11 @@ def are_degrees(low: float, high: float) -> bool:
 class _Joint(Section):
     """What joints have in common: a type, perhaps a name, perhaps limits."""
 
-    type: Literal["R", "P"] = Field(description="R revolute, P prismatic")
-    name: str | None = Field(None, description="for messages and figures")
-    limits_deg: Vector2 | None = Field(None, description="lowest and highest reading of a revolute joint")
-    limits_rad: Vector2 | None = Field(None, description="the same in rad")
-    limits_m: Vector2 | None = Field(None, description="lowest and highest reading of a prismatic joint")
+    type: Literal["R", "P"] = Field(description="R: revolute, P: prismatic")
+    name: str | None = Field(None, description="name in messages and figures")
+    limits_deg: Vector2 | None = Field(None, description="minimum and maximum reading of a revolute joint")
+    limits_rad: Vector2 | None = Field(None, description="minimum and maximum reading of a revolute joint")
+    limits_m: Vector2 | None = Field(None, description="minimum and maximum reading of a prismatic joint")
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -147,10 +147,10 @@ class _Joint(Section):
 class _DHJoint(_Joint):
     """A row of a Denavit-Hartenberg table; the joint reading adds to theta (R) or d (P)."""
 
-    theta_deg: Number = Field(0.0, description="turn about z")
-    d_m: Number = Field(0.0, description="shift along z")
-    a_m: Number = Field(0.0, description="shift along x")
-    alpha_deg: Number = Field(0.0, description="turn about x")
+    theta_deg: Number = Field(0.0, description="rotation about z")
+    d_m: Number = Field(0.0, description="translation along z")
+    a_m: Number = Field(0.0, description="translation along x")
+    alpha_deg: Number = Field(0.0, description="rotation about x")
 
 
 class _ScrewJoint(_Joint):
@@ -168,9 +168,13 @@ class _ScrewJoint(_Joint):
 class _DH(Section):
     """A Denavit-Hartenberg table, standard or modified (Craig)."""
 
-    convention: Literal["standard", "modified"] = Field("standard", description="of the table")
-    joints: tuple[_DHJoint, ...] = Field(min_length=1, max_length=64, description="rows, base to tool")
-    tool: Matrix44 = Field(_IDENTITY, description="pose of the tool in the last joint's frame, m")
+    convention: Literal["standard", "modified"] = Field(
+        "standard", description="convention of the table; modified is Craig's"
+    )
+    joints: tuple[_DHJoint, ...] = Field(
+        min_length=1, max_length=64, description="rows of the table, base to tool"
+    )
+    tool: Matrix44 = Field(_IDENTITY, description="pose of the tool in the frame of the last joint, m")
 
     def contradictions(self) -> Iterator[Finding]:
         """A tool that is nowhere."""
@@ -181,9 +185,11 @@ class _DH(Section):
 class _Screws(Section):
     """Joint screws at a reference: T(q) = Π exp(screw_i (q_i − reference_i)) · base_tool."""
 
-    reference: JointVector = Field(description="joint readings at which the screws hold")
-    base_tool: Matrix44 = Field(description="pose of the tool in the base frame there, m")
-    joints: tuple[_ScrewJoint, ...] = Field(min_length=1, max_length=64, description="screws, base to tool")
+    reference: JointVector = Field(description="joint readings of the pose in which the screws are given")
+    base_tool: Matrix44 = Field(description="pose of the tool in the base frame at the reference, m")
+    joints: tuple[_ScrewJoint, ...] = Field(
+        min_length=1, max_length=64, description="joint screws, base to tool"
+    )
 
     def contradictions(self) -> Iterator[Finding]:
         """A reading too many or too few, or a tool that is nowhere."""
@@ -196,12 +202,13 @@ class _Limits(Section):
     """Joint limits of a robot whose kinematics nobody gives: one of yours, seen in recorded data."""
 
     joints: Annotated[tuple[Vector2, ...], Field(min_length=1, max_length=64)] | None = Field(
-        None, description="lowest and highest reading of each joint, base to tool"
+        None, description="minimum and maximum reading of each joint, base to tool"
     )
     unit: Literal["deg", "rad"] | None = Field(None, description="unit of the revolute joints")
     from_data: NotNegative | None = Field(
         None,
-        description="instead: what each joint covers in the data, widened at each end by this share of it",
+        description="limits from recorded data: the range of each joint, extended at both ends by "
+        "this fraction",
     )
 
     def contradictions(self) -> Iterator[Finding]:
@@ -230,15 +237,15 @@ class RobotSettings(Section):
     Where a file is read, its screws are put beside ``mjcf`` or in place of ``urdf``.
     """
 
-    name: str = Field("", description="for figures and reports")
-    dh: _DH | None = Field(None, description="a Denavit-Hartenberg table")
-    screws: _Screws | None = Field(None, description="joint screws at a reference, instead of dh")
+    name: str = Field("", description="name in figures and reports")
+    dh: _DH | None = Field(None, description="Denavit-Hartenberg table")
+    screws: _Screws | None = Field(None, description="joint screws at a reference")
     mjcf: _File | None = Field(
-        None, description="instead: a model of MuJoCo, drawn and moved as it is by the plant mujoco"
+        None, description="path of a MuJoCo model, which the plant mujoco simulates and renders"
     )
-    urdf: _File | None = Field(None, description="instead: a URDF, of which the screws alone are taken")
-    tip: str | None = Field(None, description="body or site of mjcf, or link of urdf, that is the tool")
-    limits: _Limits | None = Field(None, description="joint limits, where neither dh nor screws are given")
+    urdf: _File | None = Field(None, description="path of a URDF, of which only the screws are read")
+    tip: str | None = Field(None, description="body or site of mjcf, or link of urdf, that carries the tool")
+    limits: _Limits | None = Field(None, description="joint limits of a robot without dh and screws")
 
     @property
     def joints(self) -> tuple[_Joint, ...]:
@@ -268,12 +275,14 @@ class RobotSettings(Section):
 class Camera(Section):
     """A pinhole camera: a 3×4 matrix from the base frame to pixels, or a look-at description."""
 
-    matrix: Matrix34 | None = Field(None, description="3×4 matrix from the base frame, m, to pixels")
+    matrix: Matrix34 | None = Field(
+        None, description="3×4 projection matrix from the base frame, m, to pixels"
+    )
     focal_px: tuple[Positive, Positive] | None = Field(None, description="focal lengths along u and v")
-    principal_point_px: Vector2 | None = Field(None, description="where the optical axis meets the image")
+    principal_point_px: Vector2 | None = Field(None, description="principal point")
     position_m: Vector3 | None = Field(None, description="optical centre in the base frame")
-    target_m: Vector3 | None = Field(None, description="point that the camera looks at")
-    up: Vector3 = Field((0.0, 0.0, 1.0), description="direction that is up in the image")
+    target_m: Vector3 | None = Field(None, description="point at which the camera looks, in the base frame")
+    up: Vector3 = Field((0.0, 0.0, 1.0), description="direction in the base frame that is up in the image")
 
     def contradictions(self) -> Iterator[Finding]:
         """Two descriptions, half a one, or one that is no camera."""
@@ -300,6 +309,6 @@ class Camera(Section):
 class Rig(Section):
     """Two cameras that look at the robot and do not move."""
 
-    image_size_px: tuple[Count, Count] = Field(description="width and height")
-    left: Camera = Field(description="the left camera")
-    right: Camera = Field(description="the right camera")
+    image_size_px: tuple[Count, Count] = Field(description="width and height of both images")
+    left: Camera = Field(description="left camera")
+    right: Camera = Field(description="right camera")

@@ -17,11 +17,11 @@ BASE, LAW = "base", "law"  # names of axes with a meaning of their own
 class _Linked(Section):
     """Several keys that take the same values together, and further keys that go with a value."""
 
-    keys: tuple[str, ...] = Field(
-        min_length=1, description="keys of the configuration, such as noise.servo_px"
+    keys: tuple[str, ...] = Field(min_length=1, description="configuration keys, such as noise.servo_px")
+    values: tuple[Plain, ...] = Field(min_length=1, description="values that all keys take in turn")
+    also: dict[str, dict[str, Plain]] = Field(
+        {}, description="further keys and their values for each of the values"
     )
-    values: tuple[Plain, ...] = Field(min_length=1, description="values that all of them take in turn")
-    also: dict[str, dict[str, Plain]] = Field({}, description="values of other keys that go with a value")
 
     def contradictions(self) -> Iterator[Finding]:
         """Keys that go with nothing."""
@@ -45,12 +45,16 @@ _Bases = Annotated[tuple[str, ...], Field(min_length=1)]
 class Distribution(Section):
     """What a value is drawn from: exactly one of the four."""
 
-    uniform: tuple[Number, Number] | None = Field(None, description="least and largest value")
-    log_uniform: tuple[Positive, Positive] | None = Field(
-        None, description="least and largest value, of which the logarithm is uniform"
+    uniform: tuple[Number, Number] | None = Field(
+        None, description="minimum and maximum of a uniform distribution"
     )
-    normal: tuple[Number, Positive] | None = Field(None, description="mean and standard deviation")
-    choice: tuple[Plain, ...] | None = Field(None, min_length=1, description="values of equal chances")
+    log_uniform: tuple[Positive, Positive] | None = Field(
+        None, description="minimum and maximum of a log-uniform distribution"
+    )
+    normal: tuple[Number, Positive] | None = Field(
+        None, description="mean and standard deviation of a normal distribution"
+    )
+    choice: tuple[Plain, ...] | None = Field(None, min_length=1, description="values of equal probability")
 
     def contradictions(self) -> Iterator[Finding]:
         """None of the four or several, or bounds upside down."""
@@ -75,30 +79,35 @@ class SweepConfig(Root):
     drawn values as run r of every other cell, so that laws are compared on equal terms.
     """
 
-    name: FolderName = Field(description="of the sweep and its folder; by default that of the file")
-    seed: Whole = Field(0, description="of all that is drawn: tasks, noise, calibrations and random values")
+    name: FolderName = Field(description="name of the sweep and of its folder; default: name of the file")
+    seed: Whole = Field(0, description="seed of tasks, noise, calibrations and random values")
     base: Annotated[_Bases, BeforeValidator(one_or_more, json_schema_input_type=_Bases | str)] = Field(
-        description="configurations (YAML) beside this file; several are an axis of the grid"
+        description="configuration files, relative to this file; several are an axis of the grid"
     )
-    set: dict[str, Plain] = Field({}, description="values that every run takes instead of those of the base")
+    set: dict[str, Plain] = Field({}, description="values that replace those of the base in every run")
     runs: Annotated[int, Field(ge=1, le=100_000_000, strict=True)] = Field(
-        100, description="runs of each cell"
+        100, description="number of runs of each cell"
     )
     grid: dict[str, _Axis] = Field(
         {},
-        description="values of each key, or of each value what goes with it; law is short for control.laws",
+        description="values of each key, or of each value the keys that change with it; law stands "
+        "for control.laws",
     )
     random: dict[str, Distribution] = Field(
-        {}, description="what the value of a key is drawn from, for each run; for each calibration where "
-        "that depends on the key"
+        {}, description="distribution of the value of a key, drawn for each run, or for each calibration "
+        "that depends on the key",
     )  # fmt: skip
-    tasks: _Tasks | None = Field(None, description="null for the task of the base")
-    calibrations: Count = Field(1, description="calibrations of a cell; run r is made with number r mod this")
-    traces: tuple[Whole, ...] = Field((), description="numbers of the runs whose whole traces are kept")
-    between_samples: Annotated[bool, Field(strict=True)] = Field(
-        False, description="whether the deviation of the path is measured between samples too, which is slow"
+    tasks: _Tasks | None = Field(None, description="random tasks; null: the task of the base")
+    calibrations: Count = Field(
+        1, description="number of calibrations of a cell; run r uses number r mod this"
     )
-    chunk: Count | None = Field(None, description="runs made and stored at a time; null for about a second's")
+    traces: tuple[Whole, ...] = Field((), description="numbers of the runs whose traces are stored")
+    between_samples: Annotated[bool, Field(strict=True)] = Field(
+        False, description="true: measure the path deviation between samples too, which is slow"
+    )
+    chunk: Count | None = Field(
+        None, description="number of runs made and stored together; null: about one second of work"
+    )
 
     def between(self, sound: Mapping[str, Any]) -> Iterator[Finding]:
         """Names and values that stand twice."""

@@ -23,7 +23,7 @@ from projservo_cli.nominal import Number, Vector3
 class _Perturbation(Section):
     """A small displacement of the goal pose, in the tool frame."""
 
-    translation_m: Vector3 = Field((0.0, 0.0, 0.0), description="along the axes of the tool")
+    translation_m: Vector3 = Field((0.0, 0.0, 0.0), description="translation along the axes of the tool")
     rotation_rad: Vector3 = Field((0.0, 0.0, 0.0), description="rotation vector in the axes of the tool")
 
 
@@ -32,19 +32,21 @@ _Deviations = tuple[NotNegative | None, ...]
 
 
 class _GoalImages(Section):
-    """Pixels of the face at the goal, perhaps of further markers, and with how sure they are."""
+    """Pixels of the face, and of further markers, at the goal, with their standard deviations."""
 
     markers: Annotated[tuple[Whole, ...], Field(min_length=1)] | None = Field(
-        None, description="numbers of the markers that pixels are of; null for those of markers.face"
+        None, description="numbers of the markers; null: markers.face"
     )
-    left: _Pixels = Field(description="u and v of each marker in the left image, px; null where unseen")
-    right: _Pixels = Field(description="u and v of each marker in the right image, px; null where unseen")
+    left: _Pixels = Field(description="u and v of each marker in the left image, px; null: unseen")
+    right: _Pixels = Field(description="u and v of each marker in the right image, px; null: unseen")
     sigma_left_px: _Deviations | None = Field(
-        None, description="standard deviation of each marker in the left image; null for noise.servo_px"
+        None, description="standard deviation of each marker in the left image; null: noise.servo_px"
     )
-    sigma_right_px: _Deviations | None = Field(None, description="the same of the right image")
+    sigma_right_px: _Deviations | None = Field(
+        None, description="standard deviation of each marker in the right image; null: noise.servo_px"
+    )
     joints: JointVector | None = Field(
-        None, description="joint readings there, of which a start is made where task.start names the file"
+        None, description="joint readings at the goal, from which task.start takes them if it names the file"
     )
 
     def pixels(self, face: Sequence[int]) -> dict[int, tuple[Vector2, Vector2]]:
@@ -67,16 +69,16 @@ class _GoalImages(Section):
 
 
 class Goal(Section):
-    """The goal: joint readings, a turn about the rig's roll axis, or the face's goal images."""
+    """The goal: joint readings, a rotation about the roll axis of the rig, or images of the face."""
 
     joints: JointVector | None = Field(None, description="joint readings at the goal")
     roll_deg: Number | None = Field(
-        None, ge=-360, le=360, description="turn from the start about the roll axis of the rig"
+        None, ge=-360, le=360, description="rotation from the start about the roll axis of the rig"
     )
     perturbation: _Perturbation | None = Field(
-        None, description="small displacement of a goal given by roll_deg, in the tool frame"
+        None, description="small displacement of a goal that roll_deg gives, in the tool frame"
     )
-    images: _GoalImages | None = Field(None, description="pixels of the face, recorded at the goal")
+    images: _GoalImages | None = Field(None, description="pixels of the face at the goal")
 
     def contradictions(self) -> Iterator[Finding]:
         """No goal, or several."""
@@ -96,7 +98,7 @@ class TaskSettings(Section):
 
     start: JointVector = Field(description="joint readings at the start")
     start_offset: JointVector | None = Field(
-        None, description="added to the start alone; the goal stays what it is without"
+        None, description="offset of the start; the goal stays that of the start without it"
     )
     goal: Goal
 
@@ -105,12 +107,14 @@ _Polygon = Annotated[tuple[Vector2, ...], Field(min_length=3, max_length=200)]
 
 
 class KeptOut(Section):
-    """What an obstacle covers in the images: simple polygons, convex or not, in pixels."""
+    """Region that an obstacle covers in the images: simple polygons, convex or not, px."""
 
-    left: _Polygon | None = Field(None, description="corners u and v in the left image; null for none there")
-    right: _Polygon | None = Field(None, description="corners u and v in the right image; null for none")
+    left: _Polygon | None = Field(None, description="corners u and v in the left image, px; null: none")
+    right: _Polygon | None = Field(None, description="corners u and v in the right image, px; null: none")
     occludes: StrictBool = Field(
-        True, description="whether the obstacle may hide markers: those of the face stay beside it in both"
+        True,
+        description="true: the obstacle may occlude markers, and those of the face stay outside in "
+        "both images",
     )
 
     def contradictions(self) -> Iterator[Finding]:
@@ -149,17 +153,17 @@ def _meet(a: Vector2, b: Vector2, c: Vector2, d: Vector2) -> bool:
 
 
 class _Search(Section):
-    """How long the profile ``joint_space`` searches, and with which random numbers."""
+    """Limits and seed of the search of the profile ``joint_space``."""
 
-    max_samples: Count = Field(20_000, description="joint vectors that two trees grow towards, at most")
-    seed: Whole = Field(0, description="of the random numbers; the same seed gives the same way")
+    max_samples: Count = Field(20_000, description="maximum number of samples of the two search trees")
+    seed: Whole = Field(0, description="seed of the search; the same seed gives the same path")
 
 
 class Trajectory(Section):
-    """How the planned motion is spread over σ in [0, 1], and what it keeps to where it is searched for.
+    """Profile of the planned motion over the path parameter in [0, 1], and its constraints.
 
-    ``joint`` leads through joint space to any joints that show the goal; ``auto`` is ``linear`` where that
-    keeps every constraint, else ``constrained``, else ``joint``.
+    ``joint_space`` plans a path through joint space to any goal configuration. ``auto`` takes ``linear`` if
+    it meets every constraint, else ``constrained``, else ``joint_space``.
     """
 
     profile: Literal[
@@ -171,45 +175,49 @@ class Trajectory(Section):
         "constrained",
         "joint_space",
         "auto",
-    ] = Field("linear", description="which part is driven when, or a way through joint space")
+    ] = Field("linear", description="order of the parts of the motion, or a path through joint space")
     visibility_fraction: Number = Field(
-        0.9, gt=0, le=1, description="share of the translation at which visibility changes that is kept to"
+        0.9,
+        gt=0,
+        le=1,
+        description="maximum translation ahead of the rotation, as a fraction of that at which "
+        "visibility changes",
     )
-    n_samples: StrictInt = Field(101, ge=2, le=100_001, description="points of the path that are stored")
+    n_samples: StrictInt = Field(101, ge=2, le=100_001, description="number of stored points of the path")
     duration_s: Positive | None = Field(
-        None, description="time the motion is given; null for as little as the joint-speed limit lets it take"
+        None, description="duration of the motion; null: the minimum within the joint-speed limit"
     )
     acceleration_time_s: NotNegative = Field(
-        0.4, description="time in which a planned motion comes up to its pace, and to rest again at its end"
+        0.4, description="time of acceleration at the start, and of deceleration at the end"
     )
     border_px: NotNegative = Field(
         5.0,
-        description="in the profiles constrained and joint_space: least distance of a marker from an image border",
+        description="minimum distance of a marker from the image border, profiles constrained and "
+        "joint_space",
     )
     min_reciprocal_condition: Number = Field(
         0.001,
         ge=0,
         lt=1,
-        description="in the profile constrained: least reciprocal condition of the face's image Jacobian",
+        description="minimum reciprocal condition number of the image Jacobian of the face, profile "
+        "constrained",
     )
     max_goal_configurations: Count = Field(
-        64, description="joints that show the goal, nearest in time, which joint tries"
+        64, description="maximum number of goal configurations, nearest in time, profile joint_space"
     )
     joint_margin_deg: NotNegative = Field(
-        1.0, description="in the profile joint_space: least distance from a limit, revolute joints"
+        1.0, description="minimum distance from a joint limit, revolute joints, profile joint_space"
     )
     joint_margin_m: NotNegative = Field(
-        0.002, description="in the profile joint_space: least distance from a limit, prismatic joints"
+        0.002, description="minimum distance from a joint limit, prismatic joints, profile joint_space"
     )
     min_face_px: NotNegative = Field(
         8.0,
-        description="in the profile joint_space: least width of the face in an image, seen ever more edge-on",
+        description="minimum width of the face in an image, profile joint_space",
     )
-    search: _Search = Field(
-        _Search(), description="how long the profile joint_space searches, and from which seed"
-    )
+    search: _Search = Field(_Search(), description="limits and seed of the search, profile joint_space")
     keep_out: Annotated[tuple[KeptOut, ...], Field(max_length=100)] = Field(
         (),
-        description="outlines of obstacles, each {left: [[u, v], ...], right: [[u, v], ...], occludes: true}, "
-        "that no marker enters, nor what is between those of the face",
+        description="outlines of obstacles, each {left: [[u, v], ...], right: [[u, v], ...], "
+        "occludes: true}, that no marker and no line between markers of the face enters",
     )

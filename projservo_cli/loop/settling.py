@@ -95,7 +95,7 @@ class StallMonitor:
         return verdict if verdict == CONVERGED or not self._looks else WAITING
 
     def _stuck(self, now: int, verdict: int, near: bool) -> int:
-        """``NO_PROGRESS`` or ``FOLLOWING_ERROR`` where the robot makes no progress; else the verdict as it is.
+        """Return ``NO_PROGRESS`` or ``FOLLOWING_ERROR`` if the robot makes no progress; else the verdict.
 
         ``near``: whether it is so near the goal that what the law asks for may be lost in its joints.
         """
@@ -131,8 +131,8 @@ class StallMonitor:
         i, told = int(np.argmax(gap)), self._robot.robot.bounds.told
         self.reason = (
             f"joint {i + 1} stands at {told(i, self._read[-1][i])}, {told(i, gap[i], 3)} off its set-point: "
-            "look whether it is blocked, braked or in a protective stop, or raise plant.max_steady_state_error_deg or "
-            "plant.max_relative_target_deg"
+            "look whether it is blocked, braked or in a protective stop, or raise "
+            "plant.max_steady_state_error_deg or plant.max_relative_target_deg"
         )
 
     def _say_what_holds(self, moved: FloatArray, sent: FloatArray) -> None:

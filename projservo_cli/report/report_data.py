@@ -185,7 +185,9 @@ class _FigureSpec:
         if self.shares and np.isnan(material.plan.mu).all():
             return "a way through joint space has no shares of translation and rotations: see figure 16"
         if self.modes and not material.compared():
-            return "no run follows the plan: set control.mode, such as [regulate, track], and run servo report"
+            return (
+                "no run follows the plan: set control.mode, such as [regulate, track], and run servo report"
+            )
         if self.goal and not material.goal_known():
             return "the pose of the goal is unknown, only its images are"
         return ""

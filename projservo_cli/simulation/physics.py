@@ -68,7 +68,7 @@ class Physics:
         }
         if sag > 0.0 and self._own:
             raise InputError(
-                "disturbance.gravity_sag_deg: servos of robot.mjcf sag as they are: leave it out, or take others, "
+                "disturbance.gravity_sag_deg: servos of robot.mjcf sag by their own gains: remove it, or set "
                 "plant.options.servo: position"
             )
         turning = arm.joint_types != PRISMATIC

@@ -52,12 +52,12 @@ NUMBERED = (
     _Column("seed", "i8", "1", "seed of the run"),
 )
 MEASURED = (
-    _text("verdict", ALL_VERDICTS, "how the run ended"),
+    _text("verdict", ALL_VERDICTS, "verdict of the run"),
     _Column(
         "success",
         "u1",
         "1",
-        "1 where it converged and at every instant, in truth, no joint was past a limit, no camera behind "
+        "1 if it converged and at every time, in truth, no joint was past a limit, no camera behind "
         "the face and every marker of the face in both images",
     ),
     _Column("usable", "i1", "1", "whether its calibration is usable"),
@@ -67,17 +67,24 @@ MEASURED = (
     _Column("position_error_mm", "f8", "mm", "true centre to true goal at the end"),
     _Column("rotation_error_deg", "f8", "deg", "true rotation to the goal at the end"),
     _Column("image_error_px", "f8", "px", "image error at the end, rms over markers and views"),
-    _Column("self_occluded_steps_left", "i8", "1", "instants at which the left camera is behind the face"),
-    _Column("self_occluded_steps_right", "i8", "1", "instants at which the right camera is behind the face"),
-    _Column("first_outside_image", "i8", "1", "first instant with a marker outside an image, -1 for never"),
-    _Column("first_beyond_limit", "i8", "1", "first instant beyond a joint limit, -1 for never"),
+    _Column("self_occluded_steps_left", "i8", "1", "times at which the left camera is behind the face"),
+    _Column("self_occluded_steps_right", "i8", "1", "times at which the right camera is behind the face"),
+    _Column(
+        "first_outside_image", "i8", "1", "first time index with a marker outside an image, -1 for never"
+    ),
+    _Column("first_beyond_limit", "i8", "1", "first time index beyond a joint limit, -1 for never"),
     _Column("speed_limited_steps", "i8", "1", "commands scaled to the joint-speed limit"),
-    _Column("visibility_limited_steps", "i8", "1", "commands whose translation was kept within delta·tau_0"),
+    _Column(
+        "visibility_limited_steps",
+        "i8",
+        "1",
+        "commands whose translation was limited to visibility_fraction·tau_0",
+    ),
     _Column("path_length_mm", "f8", "mm", "length of the path of the centre, from sample to sample"),
-    _Column("center_deviation_at_samples_mm", "f8", "mm", "largest distance of the centre from the line"),
+    _Column("center_deviation_at_samples_mm", "f8", "mm", "maximum distance of the centre from the line"),
     _Column("effort", "f8", "rad²/s or m²/s", "integral of the squared joint velocities"),
 )
-BETWEEN = _Column("center_deviation_mm", "f8", "mm", "largest distance of the centre, between samples too")
+BETWEEN = _Column("center_deviation_mm", "f8", "mm", "maximum distance of the centre, between samples too")
 
 
 def columns_of(design: Design) -> tuple[_Column, ...]:

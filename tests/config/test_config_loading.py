@@ -150,13 +150,16 @@ INCONSISTENT = [
     ("rig.left.target_m=[1, 0, 0]", "rig.left.target_m", "must look somewhere"),
     ("rig.right.matrix=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]", "rig.right.matrix", "singular"),
     ("data={table: t.csv, joints: RR}", "data.joints", "not the joints of the robot, RP"),
-    ("disturbance.joint_moved={at_step: 1, joint: 1}", "disturbance.joint_moved", "exactly one of by_deg and by_m"),
-    ("disturbance.joint_moved={at_step: 1, joint: 2, by_deg: 1}", "disturbance.joint_moved", "of type P: give by_m"),
+    ("disturbance.joint_moved={at_step: 1, joint: 1}", "disturbance.joint_moved",
+     "exactly one of by_deg and by_m"),
+    ("disturbance.joint_moved={at_step: 1, joint: 2, by_deg: 1}", "disturbance.joint_moved",
+     "of type P: give by_m"),
     ("disturbance.stuck_encoder={joint: 3, from_step: 1}", "disturbance.stuck_encoder.joint", "has 2 joints"),
     ("disturbance.lost_markers={from_step: 1, markers: [7]}", "disturbance.lost_markers.markers.0",
      "there is no marker 7"),
     ("control.mode=track", "control.mode", "nothing gives it one"),
-    ("calibration={method: closed_form, cross_validate: 2}", "calibration.cross_validate", "method bundle_adjustment"),
+    ("calibration={method: closed_form, cross_validate: 2}", "calibration.cross_validate",
+     "method bundle_adjustment"),
 ]  # fmt: skip
 
 

@@ -175,7 +175,9 @@ def test_a_given_duration_is_kept():
     shortest, longer = planned(sc), planned(sc, duration=4.0)
     assert longer.duration == 4.0
     assert longer.time == pytest.approx(shortest.time * 4.0 / shortest.duration, abs=1e-12)
-    assert planned(sc, duration=4.0, speed=math.inf).time == pytest.approx(4.0 * longer.path_parameter, abs=1e-12)
+    assert planned(sc, duration=4.0, speed=math.inf).time == pytest.approx(
+        4.0 * longer.path_parameter, abs=1e-12
+    )
     # At its shortest one joint is always at the limit.
     rate = np.abs(np.diff(shortest.q, axis=0)).max(axis=1) / np.diff(shortest.time)
     assert rate == pytest.approx(np.full(100, SPEED), rel=1e-9)

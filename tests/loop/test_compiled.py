@@ -207,7 +207,12 @@ def test_visibility_limits_the_translation():
     nearer = sc.plant.M - np.array([0, 0, 0.4, 0])
     sc = sc._replace(s_star=pixels(sc.model.P, nearer))
     free, held = (
-        Run(sc, "direct_three", GAINS._replace(visibility_fraction=delta, gain_r=1e-9, gain_p=1e-9), limits(max_steps=1))
+        Run(
+            sc,
+            "direct_three",
+            GAINS._replace(visibility_fraction=delta, gain_r=1e-9, gain_p=1e-9),
+            limits(max_steps=1),
+        )
         for delta in (0.9, 1e-9)
     )
     assert free.state.limited[0] == 0

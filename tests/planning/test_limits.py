@@ -95,7 +95,9 @@ def test_without_limits_the_way_through_joint_space_is_closed(mine):
     found = plan.run(config, calibration)
     assert not found.feasible
     assert "the goal is within region 1" in found.reason
-    assert found.rejected_profiles[-1].startswith("joint_space: nothing tells the limits of all joints: set robot.limits")
+    assert found.rejected_profiles[-1].startswith(
+        "joint_space: nothing tells the limits of all joints: set robot.limits"
+    )
 
 
 @pytest.mark.parametrize(

@@ -166,7 +166,7 @@ def test_a_servo_too_weak_for_what_it_holds_is_told(tmp_path, limit):
 @pytest.mark.usefixtures("needs_mujoco")
 def test_what_cannot_drive_a_joint_is_named(tmp_path):
     with pytest.raises(
-        InputError, match=r"disturbance.gravity_sag_deg: servos of robot.mjcf sag as they are"
+        InputError, match=r"disturbance.gravity_sag_deg: servos of robot.mjcf sag by their own gains"
     ):
         driven(described(tmp_path, "position"), Q, sag=0.01)
     SERVOS["muscle"] = '<muscle name="t" joint="tilt" lengthrange="0 1"/>'

@@ -162,7 +162,10 @@ def test_a_change_anywhere_is_noticed_before_it_is_read(path, monkeypatch):
     ("change", "message"),
     [
         ({"schema_version": 4}, "schema 4, this projservo reads 3: upgrade: pip install --upgrade projservo"),
-        ({"schema_version": 2}, "schema 2, this projservo reads 3: make it again in another folder: projserv"),
+        (
+            {"schema_version": 2},
+            "schema 2, this projservo reads 3: make it again in another folder: projserv",
+        ),
         ({"schema": "something else"}, "not a run file of projservo"),
     ],
 )

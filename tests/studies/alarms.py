@@ -4,9 +4,9 @@
 
 Runs of random tasks, guided, images 0 to 300 ms late (each camera its own) with a jitter of 8 ms, encoders of
 4,096 ticks, noise of 0.5 px; ten recordings for each line of the table, whose delays are those of its runs.
-Each task is driven undisturbed first: what ends it as ``fault detected`` is a false alarm. Then it is struck in
-the first half of that way. A fault counts as named where the run ends as ``fault detected``, before anything else,
-for the reason expected and no other; what may mean something else as well does not count.
+Each task is driven undisturbed first: a run that ends as ``fault detected`` is a false alarm. Then the fault
+occurs in the first half of that path. A fault counts as named if the run ends as ``fault detected``, before
+any other verdict, for the reason expected and no other; an ambiguous reason does not count.
 """
 
 import argparse

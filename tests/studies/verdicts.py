@@ -2,9 +2,9 @@
 
     python -m tests.studies.verdicts [--arms ur5 hobby] [--tasks 5] [-o runs.csv]
 
-Guided runs of the first tasks by seed; what befalls a robot, does at period 10. A fault that a robot copes
-with must end in ``converged``; every other in the verdict and the words that are expected. ``no progress`` and
-``max steps`` without a cause are catch-alls, and count as wrong.
+Planned runs of the first tasks by seed, with a fault at period 10. A tolerable fault must end in
+``converged``; every other in the expected verdict and words. ``no progress`` and ``max steps`` without a
+cause are catch-alls, and count as wrong.
 """
 
 import argparse
