@@ -547,7 +547,7 @@ class Trace:
 
     law: str = _scalar(about="name of the control law")
     mode: str = _scalar(
-        about="regulate: each step moves to the goal by the present images; track, image_track: follow the plan"
+        about="regulate: each step moves to the goal by the present images; track, image_track: by the plan"
     )
     planned_s: float | None = _scalar("s", "arrival of the followed plan; none for regulate")
     verdict: str = _scalar(about="verdict of the run")

@@ -1,11 +1,12 @@
 """Keep every number of what projservo ships, and compare two such sets.
 
     OPENBLAS_NUM_THREADS=1 python -m tests.golden make FOLDER [--chains NAME ...] [--keep]
-    python -m tests.golden compare OLD NEW
+    python -m tests.golden compare OLD NEW [--renamed]
 
 ``make`` runs each chain as a command of its own, stores its numbers in FOLDER/NAME.npz, and says whether they
 are those of ``hashes.json``, which ``--keep`` writes anew. Numbers agree to the bit on one machine alone.
-``compare`` ends with exit code 1 where a number is lost, or off by more than 1e-9.
+``compare`` ends with exit code 1 where a number is lost, or off by more than 1e-9; ``--renamed`` translates
+the names of OLD by ``renames.csv`` first, and counts texts in other words apart from numbers.
 """
 
 import argparse
@@ -23,6 +24,7 @@ import yaml
 
 from tests.conftest import ROOT
 from tests.golden.numbers import differences, digest_of, of_file, of_json, plain
+from tests.golden.renames import translated
 
 HASHES = Path(__file__).with_name("hashes.json")
 CONFIGS, DATA = ROOT / "configs", ROOT.parent / "shared" / "data"
@@ -129,7 +131,7 @@ def make(folder: Path, names: list[str], keep: bool) -> int:
     return int(off > 0 and not keep)
 
 
-def compare(old: Path, new: Path) -> int:
+def compare(old: Path, new: Path, renamed: bool = False) -> int:
     """Print how two folders differ; 1 where a number is lost or apart."""
     off = 0
     for path in sorted(old.glob("*.npz")):
@@ -138,7 +140,7 @@ def compare(old: Path, new: Path) -> int:
             off = 1
             continue
         with np.load(path) as before, np.load(new / path.name) as after:
-            told = differences(dict(before), dict(after))
+            told = differences(translated(before) if renamed else dict(before), dict(after))
         print(f"{path.stem}: " + ", ".join(f"{len(names)} {kind}" for kind, names in told.items()))
         for kind in ("apart", "lost", "new"):
             for line in told[kind][:LISTED]:
@@ -158,10 +160,11 @@ def main() -> None:
     comparing = verbs.add_parser("compare")
     comparing.add_argument("old", type=Path)
     comparing.add_argument("new", type=Path)
+    comparing.add_argument("--renamed", action="store_true", help="translate the names of OLD by renames.csv")
     given = parser.parse_args()
     if given.verb == "make":
         sys.exit(make(given.folder, given.chains, given.keep))
-    sys.exit(compare(given.old, given.new))
+    sys.exit(compare(given.old, given.new, given.renamed))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ PASSING = {
     *("schema_version", "CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "_NCProperties"),
 }
 PLACEHOLDER = b"This is a netCDF dimension but not a netCDF variable"
+SENTENCE = re.compile(r"\w \w+[,:;]? \w")  # texts of three words or more
 NEAR = 1e-9  # of the largest number of an array: where arithmetic was touched
 
 
@@ -79,8 +81,8 @@ def digest_of(numbers: Mapping[str, np.ndarray]) -> str:
 
 
 def differences(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
-    """Names that are ``equal`` to the bit, ``near``, ``apart``, ``lost`` and ``new``, with how far."""
-    told: dict[str, list[str]] = {kind: [] for kind in ("equal", "near", "apart", "lost", "new")}
+    """Names that are ``equal`` to the bit, ``near``, ``reworded``, ``apart``, ``lost`` and ``new``."""
+    told: dict[str, list[str]] = {kind: [] for kind in ("equal", "near", "reworded", "apart", "lost", "new")}
     for name in sorted({*old, *new}):
         if name not in new or name not in old:
             told["lost" if name in old else "new"].append(name)
@@ -88,6 +90,8 @@ def differences(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) ->
         a, b = old[name], new[name]
         if a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes():
             told["equal"].append(name)
+        elif a.dtype.kind == b.dtype.kind == "U" and SENTENCE.search(str(a)) and SENTENCE.search(str(b)):
+            told["reworded"].append(f"{name}: {a!s:.80} to {b!s:.80}")
         elif a.dtype.kind == b.dtype.kind == "f" and a.shape == b.shape:
             off = relative(a, b)
             told["near" if off <= NEAR else "apart"].append(f"{name}: by {off:.2g} of the largest")
