@@ -52,7 +52,7 @@ from projservo_cli.sweeps.engine import Engine
 from projservo_cli.sweeps.folder import Folder, run_sweep
 from projservo_cli.sweeps.study import Study
 
-_WITHOUT_TASKS = 20  # runs of a cell where no number of tasks tells it
+_WITHOUT_TASKS = 20  # default runs of a cell
 
 
 def simulate(
@@ -69,7 +69,7 @@ def simulate(
     ----------
     config : with a simulated robot: of points, with faults, or rendered by MuJoCo.
     q : (K, n) joint readings of the poses, rad or m; by default the trial motions of the configuration.
-    seed : of the noise; by default that of the trials. Poses that are given have a stream of their own, so
+    seed : of the noise; by default that of the trials. Given poses have a separate stream, so
         that they share no noise with trials.
     noise_px : standard deviation of a coordinate, px, where points are simulated; by default
         ``noise.calibration_px``.
@@ -123,24 +123,24 @@ def record(
 
     Parameters
     ----------
-    config : with ``markers`` and what bounds the motion; of a robot of yours also ``robot.limits``.
+    config : with ``markers`` and the limits of the motion; of an external robot also ``robot.limits``.
     robot : an object of the contract; by default that of ``plant.use``, or the simulated one.
     path : table (CSV) that grows as the robot goes, and from which an interrupted recording is continued.
     motions : (K, n) further poses after the trial motions, rad or m.
-    force : whether to begin anew, whatever stands in the table.
+    force : whether to start again, whatever the table holds.
     progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
 
     Returns
     -------
     Observations
-        All poses, and frames on the way for the delay of the images.
+        All poses, and frames in motion for the time offset of the images.
 
     Raises
     ------
     InputError
         When something is missing in the configuration, or the table is of another one.
     WorkFailed
-        When the robot fails, or its images show too little; what was recorded stands in the table.
+        When the robot fails, or its images show too little; the recorded poses stay in the table.
     """
     _require_config("record", config)
     asked = config if robot is None else _with_robot(config, robot)
@@ -188,15 +188,15 @@ def calibrate(
 
     Parameters
     ----------
-    observations : of ``simulate``, ``record``, or of arrays and tables of yours.
+    observations : of ``simulate``, ``record``, or of your arrays and tables.
     method : ``bundle_adjustment`` (maximum likelihood) or ``closed_form`` (the paper's closed forms).
     lens : whether to estimate two coefficients of radial distortion a camera.
     init : JSON file of a robot and rig known beforehand, tried first as a start.
     cross_validate : parts into which poses are divided to predict each from the others; the held-out errors
         are in ``cross_validation``.
     joint_noise_deg : rms of joint readings less true angles (of prismatic joints × 0.3 m/rad); by default
-        what the observations know, else estimated.
-    noise_px : standard deviation of a coordinate, px; by default what the observations know, else estimated.
+        that of the observations, else estimated.
+    noise_px : standard deviation of a coordinate, px; by default that of the observations, else estimated.
     seed : of the random starts; by default that of the observations.
     progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
 
@@ -249,8 +249,8 @@ def plan(
 
     Parameters
     ----------
-    config : whose ``trajectory`` and ``control`` say what the motion keeps to; of a robot that is not
-        described, start and goal are what the calibration predicts.
+    config : whose ``trajectory`` and ``control`` set the constraints of the motion; of a robot that is not
+        described, the calibration predicts start and goal.
     calibration : of the same robot and rig.
     q_start : (n,) joint readings at the start, rad or m; by default ``task.start``.
     goal : (n,) joint readings, (2, m, 2) pixels of ``markers.face`` in the left and the right image, or what
@@ -306,7 +306,7 @@ def servo(
     InputError
         When there is no such law or mode, or something is missing in the configuration.
     WorkFailed
-        When the run could not begin: the goal is out of reach, or what a robot sees disagrees with the
+        When the run could not begin: the goal is out of reach, or the images of a robot disagree with the
         calibration.
     """
     _require_config("servo", config, calibration)
@@ -346,7 +346,7 @@ def sweep(
     Parameters
     ----------
     config : of a simulated robot with a task.
-    laws : names, ``module:Class`` or classes; a name may tell its mode, such as ``exact_track``.
+    laws : names, ``module:Class`` or classes; a name may contain its mode, such as ``exact_track``.
     tasks : random tasks within sight of both cameras; by default that of the configuration alone.
     runs : of each cell; by default one a task, or twenty.
     calibrations : of a cell, from noisy trials; run r is made with number r mod this.
@@ -355,7 +355,7 @@ def sweep(
     seed : of all that is drawn.
     workers : processes; with more than one, laws must be importable there.
     path : folder of the sweep, which is continued there; by default all is kept in memory.
-    force : whether to begin anew, whatever is in the folder.
+    force : whether to start again, whatever the folder holds.
     progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
 
     Returns
@@ -390,7 +390,7 @@ def sweep(
     }
     design = Design(sweep_of(values), ((config.name, to_yaml(config)),))
     require_sound(design)
-    # What has no source has no key: nothing tells whether what is stored is still of it.
+    # A law without source has no key: its stored results cannot be matched to it.
     begin = force or not all(design.sources.values())
     with ExitStack() as stack:
         folder = Folder(stack.enter_context(tempfile.TemporaryDirectory()) if path is None else path)
@@ -404,7 +404,7 @@ def sweep(
 
 
 def load(path: str | Path) -> Experiment | Study:
-    """Open what is stored: a run or a sweep.
+    """Open a stored run or sweep.
 
     Parameters
     ----------
@@ -413,7 +413,7 @@ def load(path: str | Path) -> Experiment | Study:
     Returns
     -------
     Experiment or Study
-        The experiment with what was made so far, which ``make`` goes on with; no code of others that a
+        The experiment with its finished stages, which ``make`` continues; no code of others that a
         stored run names is started by it. Of a sweep, the runs that are done.
 
     Raises
@@ -431,7 +431,7 @@ def load(path: str | Path) -> Experiment | Study:
 
 
 def _require_config(what: str, config: Any, calibration: Calibration | None = None) -> None:
-    """Refuse what is no configuration, or one of another robot than a calibration, with an InputError."""
+    """Raise InputError unless a configuration is of the robot of a calibration."""
     if not isinstance(config, Config):
         raise InputError(f"{what}: config of type {type(config).__name__}: read one with Config.load")
     if calibration is None:
@@ -505,7 +505,7 @@ def _law_of_sweep(law: str | type, workers: int) -> str:
 
 
 def _require_guard(workers: int) -> None:
-    """Refuse more processes where each of them would run the script anew, and begin a sweep of its own."""
+    """Refuse more processes if each of them would run the script again, and start its own sweep."""
     script = getattr(sys.modules.get("__main__"), "__file__", None)
     if workers < 2 or script is None or not Path(script).is_file():
         return
@@ -518,9 +518,9 @@ def _require_guard(workers: int) -> None:
 
 
 def _has_guard(script: Path) -> bool:
-    """Whether a script tells being run from being imported."""
+    """Tell whether a script has a ``__main__`` guard."""
     try:
         tree = ast.parse(script.read_bytes())
     except (OSError, SyntaxError, ValueError):
-        return True  # what it is nobody can tell
+        return True  # its source is unknown
     return any(isinstance(node, ast.Name) and node.id == "__name__" for node in ast.walk(tree))

@@ -1,6 +1,6 @@
 """Canonical bytes of the records that stages read: equal bytes for equal values, and the values again.
 
-A key is a hash of these bytes, so that what a stage is given, and nothing else, decides what is outdated.
+A key is a hash of these bytes, so that the inputs of a stage alone decide whether its result is outdated.
 Files stand in them by their content.
 """
 
@@ -25,7 +25,7 @@ class File(NamedTuple):
 
     @classmethod
     def of(cls, path: str, expected: str, gone: str = "", further: Sequence[str] = ()) -> "File":
-        """Return the file at a path; an InputError with what was ``expected`` where it cannot be read.
+        """Return the file at a path; InputError with the ``expected`` file if it cannot be read.
 
         gone : hash that it had, which stands where there is no such file any more.
         further : files that it names, whose content counts too.
@@ -73,7 +73,7 @@ def _fields(record: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON, in which every mapping has one key, which says what it is of."""
+    """A value as JSON, in which every mapping has one key, its type."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, File):

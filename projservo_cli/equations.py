@@ -1,4 +1,4 @@
-"""Register of the equations of [RH00]: number, title, functions, tests, and what is misprinted.
+"""Register of the equations of [RH00]: number, title, functions, tests, and errata.
 
 Functions are dotted names, so that listing them imports nothing; a test resolves each.
 """
@@ -14,7 +14,7 @@ class _Entry:
     title: str
     functions: tuple[str, ...]  # dotted names of what implements it
     tests: tuple[str, ...]  # ``file::name`` of those that show it holds
-    erratum: str  # what is wrong in print, and what is right; empty where nothing is
+    erratum: str  # the misprint and its correction; may be empty
 
 
 def _entry(number: str, title: str, functions: str, tests: str = "", erratum: str = "") -> _Entry:

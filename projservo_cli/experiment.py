@@ -1,6 +1,6 @@
-"""An experiment from configuration to report: what is to be made, making it in order, and what came out.
+"""An experiment from configuration to report: order, resume, saving and results of its stages.
 
-A chain stops at the first failure and keeps what was made until then; whatever is up to date stands.
+A chain stops at the first failure and keeps finished results; results that are up to date stay.
 """
 
 import os
@@ -46,7 +46,7 @@ class Listener(Protocol):
 
 @dataclass(frozen=True)
 class _Caller:
-    """A caller in Python, who is shown progress and messages, and agrees to what was called."""
+    """A caller in Python, who is shown progress and messages, and confirms every call."""
 
     progress: Progress
     bar: Bar
@@ -79,11 +79,11 @@ class Chain:
     listener: Listener
     names: Sequence[str]  # of the stages
     config: Config
-    run: Run  # what is stored, with what was made since
+    run: Run  # the stored run, with results made since
     steps: Sequence[Step]
-    recording: Any = None  # what is recorded before, where the chain records
+    recording: Any = None  # the recording before the calibration, if any
     confirm: bool = False  # whether to ask before the first motion
-    in_memory: bool = False  # whether nothing is saved
+    in_memory: bool = False  # whether results stay in memory
     laws: tuple[str, ...] = field(init=False)  # names of the runs of laws that the steps make or need
     failed: str = ""  # name of the step that failed
     reason: str = ""  # why
@@ -108,7 +108,7 @@ class Chain:
         return next((step for step in self.steps if step.law and step.why), None) if moving else None
 
     def code(self) -> list[tuple[str, str]]:
-        """Kind and ``module:Class`` of what the steps would import, of laws and of a robot."""
+        """Kind and ``module:Class`` of the imports of the steps, of laws and of a robot."""
         servo = [law_and_mode(step.law)[0] for step in self.steps if step.law and step.why]
         found = dict.fromkeys(("law", law) for law in servo if law not in CODES)
         records = any(step.stage == "record" and step.why for step in self.steps)
@@ -118,7 +118,7 @@ class Chain:
         return list(found)
 
     def make(self) -> None:
-        """Make what has to be made, stop at the first failure, keep what was made until then."""
+        """Make the outdated results, stop at the first failure, keep finished results."""
         if self.failed:
             return
         self._say_compilation()
@@ -126,7 +126,7 @@ class Chain:
             self._make_steps()
 
     def reported(self, run: Run | None = None) -> Run:
-        """What a report is about: of the results before it those that the named runs of laws rest on.
+        """Return the results that a report of the named runs of laws needs.
 
         run : one that is not stored yet.
         """
@@ -149,7 +149,7 @@ class Chain:
                     self.failed, self.reason = step.name, " ".join(str(error).split())
                     return
                 if dropped:
-                    self.listener.say(f"{', '.join(dropped)}: dropped, made from what was replaced")
+                    self.listener.say(f"{', '.join(dropped)}: dropped, their inputs were replaced")
             if step.law:
                 self.laws_done += (step.law,)
                 trace = self.run.traces[step.law]
@@ -174,7 +174,7 @@ class Chain:
         return after
 
     def _made(self, step: Step, run: Run) -> tuple[Any, ...]:
-        """What a stage makes of what it is given; its module is imported when it is needed."""
+        """Return the result of a stage from its inputs; import its module on demand."""
         given, progress = step.given or given_to(step.stage, self.config), self.listener.progress
         if step.stage == "calibrate":
             from projservo_cli.stages import calibrate
@@ -194,7 +194,7 @@ class Chain:
         return (report.run(given, self.reported(run), run.path.parent, progress=progress),)
 
     def _compiling(self) -> AbstractContextManager[None]:
-        """What compiles beside the work where a calibration is made and runs are to follow."""
+        """Return the background compilation for runs that follow a calibration."""
         made = [step.stage for step in self.steps if step.why]
         if "calibrate" not in made or "servo" not in made:
             return nullcontext()
@@ -261,7 +261,7 @@ class Experiment:
         return made
 
     def make(self, *stages: str, laws: Sequence[str] = (), force: bool = False) -> "Experiment":
-        """Make stages, and those before them that they need; what is up to date stands.
+        """Make stages, and those before them that they need; results that are up to date stay.
 
         Parameters
         ----------
@@ -274,7 +274,7 @@ class Experiment:
         InputError
             When there is no such stage or law, or something cannot be made from this configuration.
         WorkFailed
-            When a stage failed; what was made before is kept. A verdict, or a calibration that is not usable,
+            When a stage failed; finished results are kept. A verdict, or a calibration that is not usable,
             raises nothing.
         """
         if wrong := [stage for stage in stages if stage not in STAGES]:
@@ -328,7 +328,7 @@ class Experiment:
 
     @property
     def configuration(self) -> str:
-        """The configuration that what is stored was last made with, as YAML."""
+        """The configuration of the last stored result, as YAML."""
         return self._run.configuration
 
     @property
@@ -338,7 +338,7 @@ class Experiment:
 
     @property
     def observation(self) -> Observation:
-        """What the calibration was made from."""
+        """Observations of the calibration."""
         self._require("calibrate")
         return self._run.observation
 
@@ -376,7 +376,7 @@ class Experiment:
         return found
 
     def _require(self, stage: str) -> None:
-        """Refuse to give what is not made yet."""
+        """Raise InputError for a missing result."""
         if stage not in self._run.results:
             place = "the experiment" if self._in_memory else self._run.path
             raise InputError(f"{place}: holds no result of {stage}; make it first: make({stage!r})")
@@ -395,7 +395,7 @@ class Experiment:
 
 
 def scene_of(config: Config, calibration: Calibration) -> Scene:
-    """What plans of a configuration are drawn in."""
+    """Return the scene of plans of a configuration."""
     joints = joints_of(config).joints(calibration.joint_types, calibration)
     size = config.image_size_px
     return Scene(

@@ -16,7 +16,7 @@ BODY = "body"
 
 
 class LawSpec(NamedTuple):
-    """What holds for one law wherever it is driven, stored and drawn."""
+    """Specification of one law for driving, storing and drawing."""
 
     title: str  # as figures write it
     modes: tuple[str, ...]  # it follows a plan in all but ``REGULATE``

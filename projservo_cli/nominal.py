@@ -1,4 +1,4 @@
-"""The file of what is believed of a robot, its rig and its markers, as a start for a calibration."""
+"""File of a nominal robot, rig and markers, as an initial guess of a calibration."""
 
 import json
 import math
@@ -22,7 +22,7 @@ _TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or mor
 
 
 def not_rigid(T: Matrix44) -> str:
-    """Why a matrix is no pose; empty where it is one."""
+    """Return the reason why a matrix is no pose; empty if it is one."""
     R = np.array(T)[:3, :3]
     if T[3] != (0, 0, 0, 1):
         return "the last row must be [0, 0, 0, 1]"
@@ -32,7 +32,7 @@ def not_rigid(T: Matrix44) -> str:
 
 
 def not_a_screw(kind: str, w: Vector3, v: Vector3) -> Iterator[tuple[str, str]]:
-    """What keeps w and v from being a screw of a joint, R or P: which of both, and why."""
+    """Yield the reasons why w and v are no screw of a joint, R or P: which of both, and why."""
     axis = "w" if kind == "R" else "v"
     length = math.hypot(*(w if kind == "R" else v))
     if abs(length - 1) > _TOLERANCE:
@@ -80,7 +80,7 @@ class _Believed(BaseModel):
 
 
 def read_nominal(path: Path | str) -> dict[str, Any]:
-    """Read what is believed of a robot, its rig and its markers: the fields of ``calibration.Nominal``.
+    """Read a nominal robot, its rig and its markers: the fields of ``calibration.Nominal``.
 
     path : JSON with ``screws`` (w and v of each joint at the reference, base frame, rad and m),
     ``q_reference`` (rad or m), ``camera_left`` and ``camera_right`` (3×4 matrices to px), ``markers_tool``

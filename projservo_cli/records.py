@@ -1,7 +1,7 @@
 """The named arrays that pass from stage to stage, and the model every kernel reads.
 
 Records hold plain arrays with documented shapes and units. ``_array`` attaches the names of the
-dimensions and the unit to a field, so that the run file can label what it stores; nothing here
+dimensions and the unit to a field, so that the run file can label its arrays; this module
 knows how it is stored.
 """
 
@@ -20,7 +20,7 @@ ByteArray = npt.NDArray[np.uint8]
 
 VIEWS = ("left", "right")
 CORNERS = 4  # of a tag: corner k of tag t is marker 4 t + k
-# Why a marker is left out whole: it stands still in the images, is of another body, slips, or hardly any
+# Reasons of rejected markers: a marker stands still in the images, is of another body, slips, or hardly any
 # of its readings fits.
 WHY_LOST = ("still", "other body", "drifting", "hardly seen")
 
@@ -53,19 +53,19 @@ LIMITS_MISSING = "set robot.limits, such as {from_data: 0.1}, or limits in robot
 
 
 def _array(dims: str, units: str = "1", about: str = "", **default: Any) -> Any:
-    """Declare an array field: the names of its dimensions, its unit and what it holds."""
+    """Declare an array field: the names of its dimensions, its unit and meaning."""
     return field(metadata={"dims": tuple(dims.split()), "units": units, "about": about}, **default)
 
 
 def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
-    """Declare a scalar or text field with its unit and what it holds."""
+    """Declare a scalar or text field with its unit and meaning."""
     return field(metadata={"units": units, "about": about}, **default)
 
 
 class InputError(ValueError):
     """Usage, configuration or data that cannot be read or make no sense (exit code 2).
 
-    The message is one line a user can act on: where, what is wrong, what to do.
+    The message is one line a user can act on: place, error and remedy.
     """
 
 
@@ -111,7 +111,7 @@ class Model(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """How far predictions err: models off the calibrated one by a deviation, each in a direction of its own.
+    """Prediction errors: models one standard deviation off the calibrated one, each in another direction.
 
     The directions are those in which the covariance of the calibration moves images most.
     """
@@ -124,14 +124,14 @@ class Spread(NamedTuple):
 
 
 class Errors(NamedTuple):
-    """How far parameters are off, by independent errors of unit variance: r all feel, three a marker alone.
+    """Errors of parameters by independent ones of unit variance: r for all, three for each marker alone.
 
     Their covariance is Λ Λᵀ + diag(own ownᵀ), with Λ of ``shared`` over ``marker``: linear in the markers.
     """
 
     shared: FloatArray  # (s, r) of parameters before those of the markers
     marker: FloatArray  # (m, d, r) of the d parameters of each marker, by the same errors
-    own: FloatArray  # (m, d, 3) and by its own, beside the others
+    own: FloatArray  # (m, d, 3) and by its separate ones
 
     def of(self, markers: IntArray | list[int]) -> "Errors":
         """Those of some markers, by their indices."""
@@ -236,7 +236,7 @@ class Calibration:
     )
     sqrt_cov_own: FloatArray = _array(
         "marker coordinate own",
-        about="square root of the covariance of each marker by three errors of its own",
+        about="square root of the covariance of each marker by three separate errors",
     )
     excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
     joint_min: FloatArray = _array("joint", "rad or m", "minimum joint reading in the data")
@@ -317,13 +317,13 @@ class Calibration:
     )
 
     def places(self, numbers: Iterable[int]) -> list[int]:
-        """Where markers stand in ``marker`` and ``M``, by their numbers; ValueError for one that does not."""
+        """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""
         known = self.marker.tolist()
         return [known.index(number) for number in numbers]
 
     @property
     def errors(self) -> Errors:
-        """How far P, H_hat_0, lenses and M are off, in this order."""
+        """Errors of P, H_hat_0, lenses and M, in this order."""
         return Errors(self.sqrt_cov_shared, self.sqrt_cov_marker, self.sqrt_cov_own)
 
     @property
@@ -662,7 +662,7 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What a report wrote, the claims of the paper against the runs, and the numbers of the extra runs.
+    """Files of a report, the claims of the paper against the runs, and the numbers of the extra runs.
 
     Laws are direct_three and direct_two, operators true and calibrated, limits none and the limit
     per step. Deviations are NaN where the goal pose is unknown.

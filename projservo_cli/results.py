@@ -34,14 +34,14 @@ def _fields_of(record: Any, kind: type) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ImageModel(Displayable, Calibration):
-    """A calibration that says where markers appear: all of its arrays, and what they are for.
+    """A calibration that predicts images: all of its arrays, with functions on them.
 
     Views are left and right, markers in the order of ``marker``, pixels are raw u and v, joint
     readings rad or m. A point that is not in front of a camera has no pixels there: NaN.
     """
 
     cross_validation: CrossValidation | None = None  # held-out errors, where they were asked for
-    observation: Observation | None = None  # what it was made from, where that is at hand
+    observation: Observation | None = None  # of the calibration, if at hand
 
     @classmethod
     def of(
@@ -58,11 +58,11 @@ class ImageModel(Displayable, Calibration):
         )
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw what the calibration leaves of the images, and what the data determine, as the report does.
+        """Draw the residuals of the calibration and the observability of the joints, as the report does.
 
         Parameters
         ----------
-        ax : axes in whose place the figure is shown; by default a figure of its own is returned.
+        ax : axes in whose place the figure is shown; by default a separate figure is returned.
 
         Raises
         ------
@@ -92,13 +92,13 @@ class ImageModel(Displayable, Calibration):
 
         Returns
         -------
-        (2, m, 2) or (K, 2, m, 2) pixels, and as many deviations where they are asked for.
+        (2, m, 2) or (K, 2, m, 2) pixels, and on request as many standard deviations.
 
         Raises
         ------
         InputError
             If the readings have another number of joints, are not finite or look like degrees, or deviations
-            are asked for of a calibration without a covariance.
+            are requested of a calibration without a covariance.
         """
         rows, single = self._rows(q)
         pixels = predict(self, rows)
@@ -193,7 +193,7 @@ class ImageModel(Displayable, Calibration):
             return np.where(ahead[..., None], pixels_of(self.P, A, self.model().lens), np.nan)
 
     def summary(self) -> dict[str, str]:
-        """Return what there is to tell, in words, by name."""
+        """Return a summary in words, by name."""
         poorly = ", ".join(f"q{i + 1}" for i in np.flatnonzero(self.poorly_observable)) or "none"
         rejected = len(self.outlier)
         return {
@@ -219,19 +219,19 @@ class ImageModel(Displayable, Calibration):
 
 
 class Scene(NamedTuple):
-    """What a plan is drawn in."""
+    """Scene of the figure of a plan."""
 
     model: Model  # as calibrated
     limits: JointLimits  # infinite where none is set
     image_size: FloatArray | None  # (2,) px; None where unknown
-    trajectory: Trajectory  # what was asked for
+    trajectory: Trajectory  # requested motion
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class MotionPlan(Displayable, Plan):
     """A plan that shows itself."""
 
-    scene: Scene | None = None  # what it is drawn in, where that is at hand
+    scene: Scene | None = None  # of its figure, if at hand
 
     @classmethod
     def of(cls, plan: Plan, scene: Scene | None = None) -> Self:
@@ -243,7 +243,7 @@ class MotionPlan(Displayable, Plan):
 
         Parameters
         ----------
-        ax : axes in whose place the figure is shown; by default a figure of its own is returned.
+        ax : axes in whose place the figure is shown; by default a separate figure is returned.
 
         Raises
         ------
@@ -257,7 +257,7 @@ class MotionPlan(Displayable, Plan):
         return plots.placed(plots.of_plan(self, self.scene), ax)
 
     def summary(self) -> dict[str, str]:
-        """Return what there is to tell, in words, by name."""
+        """Return a summary in words, by name."""
         r, p, s = (math.degrees(angle) for angle in (self.theta_r, self.theta_p, self.theta_s))
         return {
             "feasible": f"{'yes' if self.feasible else 'no'}: {self.reason}",
@@ -285,7 +285,7 @@ class RunTrace(Displayable, Trace):
 
         Parameters
         ----------
-        ax : axes in whose place the figure is shown; by default a figure of its own is returned.
+        ax : axes in whose place the figure is shown; by default a separate figure is returned.
         """
         from projservo_cli.report import plots
 
@@ -298,7 +298,7 @@ class RunTrace(Displayable, Trace):
         return super().coordinates() | {"time": time} | face
 
     def summary(self) -> dict[str, str]:
-        """Return what there is to tell, in words, by name."""
+        """Return a summary in words, by name."""
         found = {
             "law": self.law if self.mode == "regulate" else f"{self.law}, {self.mode}",
             "verdict": f"{self.verdict}: {self.reason}",

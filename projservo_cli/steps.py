@@ -1,7 +1,7 @@
 """Dependencies of stages: which results are up to date, and which must be made first.
 
 Every result carries a key: a hash of what its stage is given, and of the keys of the results that it is made
-from. Keys follow from the configuration and the files that it names, so what is to be done is known before
+from. Keys follow from the configuration and the files that it names, so the work is known before
 anything is done.
 """
 
@@ -45,11 +45,11 @@ class Step:
 
     stage: str  # name of the stage
     law: str  # name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, else empty
-    key: str  # what the key of the result will be
+    key: str  # future key of the result
     inputs: Mapping[str, str]  # files read and their hashes, and the hash of the source of a law of one's own
     why: str = ""  # why it has to be made; empty where the stored one is up to date
     note: str = ""  # what changed that does not outdate it, in words
-    unkeyed: bool = False  # whether nothing tells what its law is, so that it is never up to date
+    unkeyed: bool = False  # whether its law has no source, so that it is never up to date
     given: Any = None  # the record that the stage is given; None where it cannot be made
 
     @property
@@ -59,7 +59,7 @@ class Step:
 
     @property
     def standing(self) -> str:
-        """How a result stands that need not be made."""
+        """State of a result that is not to be made."""
         return f"up to date, though {self.note}" if self.note else "up to date"
 
 
@@ -74,7 +74,7 @@ def steps_for(
 ) -> list[Step]:
     """All results that the named stages consist of or need, in the order of making.
 
-    run : what is stored so far; possibly nothing.
+    run : the stored run, which may be empty.
     laws : instead of ``control.laws``.
     force : make the named stages even where they are up to date, and replace a recorded calibration.
     recording : why the table has to be recorded first; keys of what rests on it are not known until then.
@@ -92,7 +92,7 @@ def steps_for(
 
     steps = planned(stages, laws or config.control.laws)
     if not config.has_task and set(named) <= {"calibrate", "report"}:
-        # Of a robot without a model a report tells the runs that are up to date, and asks for no others.
+        # Of a robot without a model a report shows the runs that are up to date, and needs no others.
         lacking = {law_and_mode(step.law)[0] for step in steps if step.law and step.why}
         made = {law_and_mode(step.law)[0]: None for step in steps if step.law}.keys() - lacking
         kept = [law for law in laws or config.control.laws if law in made]
@@ -107,24 +107,24 @@ def steps_for(
 
 
 def key_of(given: Any, **more: Any) -> str:
-    """Hash of what a stage is given, and of further values: what it is made from, and by which law."""
+    """Return the hash of the inputs of a stage, and of further values: its predecessors and its law."""
     return hashlib.sha256(encoded([given, more])).hexdigest()
 
 
 class _Read(NamedTuple):
-    """What is read for a result beside the configuration and what it is made from."""
+    """Files of a result, in addition to the configuration and its predecessors."""
 
     inputs: Mapping[str, str]  # files and their hashes, and hashes of sources of laws and robots of one's own
     hashed: Mapping[str, str] = {}  # those of them that the key is of
-    note: str = ""  # what of it changed that does not outdate the result, in words
+    note: str = ""  # changes that do not outdate the result, in words
     unkeyed: bool = False  # whether the law is of a notebook or a script, whose source is in no module
 
 
 def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
-    """What is read for the run of each law, by its name: sources of the law and the robot that are one's own.
+    """Return the files of the run of each law, by its name: sources of plug-in law and robot.
 
     Where the source of a law is gone since, the stored hash stands. Another source of a robot outdates
-    nothing: what it did cannot be done again.
+    nothing: its motion cannot be repeated.
     """
     plant = "" if config.plant.simulated else config.plant.use or ""
     robot = f"source of {plant}"
@@ -148,14 +148,14 @@ def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
 
 
 class _Given(NamedTuple):
-    """What stages are given."""
+    """Inputs of stages."""
 
     records: Mapping[str, Any] = {}  # by stage; none where the configuration lacks a part of it
-    files: Mapping[str, str] = {}  # what the files that are read are, by name, and their hashes
+    files: Mapping[str, str] = {}  # hashes of the input files, by name
 
 
 def _given(config: Config, run: Run, stages: Sequence[str]) -> _Given:
-    """What each stage is given, as far as the configuration tells it; making the others says what is missing.
+    """Return the inputs of each stage that the configuration determines; making others reports missing keys.
 
     An InputError where a file cannot be read. Where a file is gone since, its stored hash stands.
     """
@@ -204,9 +204,9 @@ def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
     if step.law and stored.records[""].verdict == "failed":
         return "failed before"
     if remade:
-        return "what it is made from is made anew"
+        return "its inputs are made again"
     if step.unkeyed:
-        return "nothing tells whether its law is the same"
+        return "its law has no source to compare"
     if step.stage == "report" and missing(run):
         return "a file of it is missing"
     return "asked for by --force" if forced else ""

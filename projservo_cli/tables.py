@@ -25,7 +25,7 @@ from projservo_cli.records import FloatArray, InputError, IntArray, JointList, O
 
 _MAX_JOINTS = 64  # maximum number of joints, as in a configuration
 _MAX_COLUMNS = 10_000  # maximum number of columns
-_MAX_BYTES = 1_000_000_000  # maximum size of a table, far beyond what a calibration takes
+_MAX_BYTES = 1_000_000_000  # maximum size of a table, far beyond the size of a calibration
 _MAX_CELLS = 12_000_000  # maximum of poses × markers: mistyped pose numbers must not fill the memory
 _TWO_TURNS = 4.0 * math.pi  # rad; no joint of an arm with stops turns that far from its zero
 _PIXELS = ("u_left", "v_left", "u_right", "v_right")  # columns of pixels

@@ -178,7 +178,7 @@ class _Likelihood:
         return float(apart @ apart) > _LENIENT * quantile(variances, _CHANCE)
 
     def deviance(self, log_ratio: float) -> float:
-        """Twice the negative log-likelihood, up to a constant, at the most likely noise of pixels."""
+        """Twice the negative log-likelihood, up to a constant, at the maximum-likelihood noise of pixels."""
         try:
             left, logs = self._parts(log_ratio)
         except np.linalg.LinAlgError:  # joints that may be anywhere leave the robot undetermined
@@ -188,7 +188,7 @@ class _Likelihood:
         return float(self.dof * np.log(left) + logs)
 
     def sigma(self, log_ratio: float) -> float:
-        """Noise of pixels, px: as given, else the most likely one."""
+        """Noise of pixels, px: as given, else the maximum-likelihood one."""
         if self.given is not None:
             return self.given
         return float(np.sqrt(self._parts(log_ratio)[0] / max(self.dof, 1)))

@@ -17,7 +17,7 @@ from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.algebra import normalize_displacement
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
 
-# Minimum distance of the markers from their best line, in units of its own noise.
+# Minimum distance of the markers from their best line, in units of its noise.
 _OFF_LINE = 5.0
 # Plane at infinity of the frame of the adjustment.
 _A_INF = np.array([0.0, 0.0, 0.0, 1.0])

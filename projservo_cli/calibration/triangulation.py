@@ -207,7 +207,7 @@ def _slipped(
 ) -> BoolArray:
     """Detections (2, N) of the end of each track, in a view or both, that fits the rest worst, if it misfits.
 
-    It tests whole ends, since of two slips among five observations each hides the other. At least half of a
+    It tests whole ends, since two slips among five observations hide each other. At least half of a
     track stays. From Gram matrices of detections that count (2, N, 4, 4), and their sums (m, 4, 4).
     """
     end, count = _following(counted, marker), _following(used, marker)

@@ -1,6 +1,6 @@
 """The command ``projservo``: options in any order, messages, exit codes; no mathematics.
 
-Importing it imports click alone: commands are functions of the modules below, which import what they need
+Importing it imports click alone: commands are functions of the modules below, with their own imports
 when they run.
 """
 

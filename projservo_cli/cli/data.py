@@ -10,7 +10,7 @@ from projservo_cli.cli import options as option
 from projservo_cli.cli.group import main
 from projservo_cli.cli.output import Console, wrapped
 
-# Predictions so many times the noise away come from another robot, or from other units.
+# Prediction error over the noise that reveals another robot, or other units.
 _FAR = 20.0
 _TAUGHT = "# What both cameras saw: projservo teach. Name this file under task.goal, or task.start.\n"
 
@@ -123,7 +123,7 @@ def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: 
     if check is not None:
         far = ", ".join(f"{number} ({side}) by {px:.3g} px" for number, side, px in check.far)
         words.append(wrapped(check.reason, "  "))
-        words.append(wrapped(f"markers off what the calibration shows there: {far or 'none'}", "  "))
+        words.append(wrapped(f"markers that disagree with the calibration: {far or 'none'}", "  "))
     console.tell(value, [*words, f"set {key}: {path}"])
 
 
@@ -211,8 +211,8 @@ def _detect(
         f"detect: {{poses}} poses, {len(found.tags)} tags, {{markers}} markers",
         "  markers seen by both cameras {both}, left only {left_only}, right only {right_only}, "
         "by none {unseen}",
-        "  {unrefined} points without clean edges: less certain, or left out where something covers them",
-        "  left out: {ambiguous} tags twice in an image; images without a tag: {empty_images}",
+        "  {unrefined} points without clean edges: less certain, or rejected if occluded",
+        "  rejected: {ambiguous} tags twice in an image; images without a tag: {empty_images}",
     )
     console.tell(value, [*(text.format_map(value) for text in words), f"table: {output}"])
 

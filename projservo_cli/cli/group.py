@@ -21,8 +21,8 @@ from projservo_cli.provenance import __version__
 
 DONE, FAILED, MALFORMED, INTERRUPTED = 0, 1, 2, 130
 _COMPLETE = "_PROJSERVO_COMPLETE"
-_COMING = threading.Event()  # an interrupt that was lost and comes anew
-_LEFT_OUT = {"--suggest": "5"}  # what an option means whose number is left out
+_COMING = threading.Event()  # an interrupt that was lost and is raised again
+_LEFT_OUT = {"--suggest": "5"}  # default number of an option
 
 
 class _Stage(click.Command):
@@ -100,7 +100,7 @@ class _Group(click.Group):
         return name, command, rest
 
     def _sorted(self, ctx: click.Context, args: list[str]) -> tuple[list[str], list[str], list[str]]:
-        """Words, options with their values, and their flags, told apart by click's parser word by word."""
+        """Words, options with their values, and their flags, separated by click's parser word by word."""
         params = [*self.params, *(param for command in self.commands.values() for param in command.params)]
         options = {param.name: param for param in params if isinstance(param, click.Option)}
         every = click.Command(None, params=[*options.values()])
@@ -150,7 +150,7 @@ class _Group(click.Group):
 main = _Group(
     "projservo",
     help="Uncalibrated stereo visual servoing in projective space. The stages record, calibrate, plan, "
-    "servo and report chain in one call; each first makes what it lacks. Options may stand anywhere.",
+    "servo and report chain in one call; each first makes its missing inputs. Options may stand anywhere.",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 80},
 )
 click.version_option(__version__, message="projservo %(version)s")(main)
@@ -162,7 +162,7 @@ def _flag(option: click.Parameter) -> str:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command line; 0 done, 1 the work failed, 2 what was given makes no sense, 130 interrupted."""
+    """Run the command line; 0 done, 1 the work failed, 2 unusable input, 130 interrupted."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal without Greek letters is no reason to fail
             stream.reconfigure(errors="replace")
@@ -185,13 +185,13 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _invoked(arguments: Sequence[str]) -> int | None:
-    """What the command that is asked for returns."""
+    """Return the result of the requested command."""
     try:
         with main.make_context("projservo", list(arguments)) as context:
             code: int | None = main.invoke(context)
             return code
     except Exception:
-        if _COMING.is_set():  # what was broken off there, such as a compilation, fails before it comes
+        if _COMING.is_set():  # an interrupted step, such as a compilation, fails before it comes
             time.sleep(1.0)
         raise
 
@@ -212,7 +212,7 @@ def _failure(error: Exception, *, verbose: bool) -> int:
 
 
 def _complain(text: str, code: int) -> int:
-    """One line a finding, so that a message can be searched for and clicked on."""
+    """Write one line per finding, so that each can be searched and clicked."""
     for line in text.splitlines():
         click.echo(f"projservo: {visible(line)}", err=True)
     return code

@@ -1,4 +1,4 @@
-"""Looking at what there is: ``show``, ``compare``, ``export`` and ``equations``."""
+"""Commands that read results: ``show``, ``compare``, ``export`` and ``equations``."""
 
 import dataclasses
 import json
@@ -19,9 +19,9 @@ from projservo_cli.cli.output import Console, words_of, wrapped
 @option.output(metavar="DIR", help="The run, instead of an argument.")
 @option.told
 def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
-    """Show what a run holds and how it was made.
+    """Show the contents and the provenance of a run.
 
-    Lists the results in a run, by default of results/paper, and what they were made with; -v with every
+    Lists the results in a run, by default of results/paper, with versions and inputs; -v with every
     claim, and the configuration.
     """
     target = option.one_run("show", run, output) or Path("results", "paper")
@@ -71,7 +71,7 @@ def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: b
     """Show runs side by side on one page.
 
     Writes one page like report.html with the differences of the configurations, and calibrations, plans,
-    laws, claims and figures beside each other.
+    laws, claims and figures side by side.
     """
     if len(runs) < 2:
         raise click.UsageError("compare needs two runs or more: projservo compare RUN RUN")
@@ -93,8 +93,8 @@ def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: b
 
 @main.command("export", epilog="Example: projservo export results/ur5 -o tables")
 @click.argument("run", type=option.PATH)
-@option.output(metavar="DIR", help="Folder to write. Default: csv beside run.h5.")
-@option.force(help="Replace what is there.")
+@option.output(metavar="DIR", help="Folder to write. Default: csv, next to run.h5.")
+@option.force(help="Replace existing files.")
 @click.option("--to", type=click.Choice(["csv"]), default="csv", help="Kind of files.", expose_value=False)
 @option.told
 def _export(console: Console, *, run: Path, output: Path | None, force: bool) -> None:

@@ -25,7 +25,7 @@ _MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu"
 def _init(console: Console, *, file: Path, force: bool) -> None:
     """Write a commented configuration to start from.
 
-    Writes a configuration that runs as it is, with a comment on every key, and beside it the schema by which
+    Writes a configuration that runs as it is, with a comment on every key, and next to it the schema by which
     editors complete and check it.
     """
     from projservo_cli.config.schema import json_schema, starter
@@ -73,10 +73,10 @@ def _as_text(schema: dict[str, Any]) -> str:
 @main.command("doctor", epilog="Example: projservo doctor --json")
 @option.told
 def _doctor(console: Console) -> int:
-    """Say what is installed and where things go.
+    """Report installed packages and the folders in use.
 
     Lists versions, extras, whether the kernels are compiled, and the folder of results. Exit code 1 when
-    something is missing that every run needs.
+    a required part is missing.
     """
     packages, extras = _requirements()
     missing = [name for name, version in packages.items() if version is None]
@@ -140,7 +140,7 @@ def _found(value: dict[str, Any]) -> Iterator[str]:
     elif not kernels["jit"]:
         told = "not compiled at all: NUMBA_DISABLE_JIT is set"
     elif kernels["cache"] is None:
-        told = "compiled anew in every run: no folder can be written; set PROJSERVO_CACHE_DIR"
+        told = "compiled again in every run: no folder can be written; set PROJSERVO_CACHE_DIR"
     elif not kernels["compiled"]:
         told = f"to be compiled by the first run, once, into {kernels['cache']}"
     else:
@@ -172,7 +172,7 @@ def _bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> No
 
 
 def _timed(result: dict[str, Any], machine: dict[str, Any]) -> Iterator[str]:
-    yield f"{'':32}   least µs  median µs   quartiles µs      of one SVD"
+    yield f"{'':32}   min µs    median µs   quartiles µs      of one SVD"
     for name, times in result["times_us"].items():
         spread = f"{times['lower']:.2f} to {times['upper']:.2f}"
         numbers = f"{times['least']:10.2f} {times['median']:10.2f}   {spread:16}"

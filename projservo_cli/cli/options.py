@@ -21,7 +21,7 @@ _Function = Callable[..., Any]
 
 PATH = click.Path(path_type=Path)
 _RESULTS = Path("results")
-_TRIALS = "trials.csv"  # beside a run: the table of a recording that was told no other place
+_TRIALS = "trials.csv"  # in the folder of a run: the default table of a recording
 _KEYS = {  # that options stand for
     "data": "data.table",
     "joints": "data.joints",
@@ -32,7 +32,7 @@ _KEYS = {  # that options stand for
     "lens": "calibration.lens",
 }
 
-# Options of which each command says for itself what they do.
+# Options that each command describes for itself.
 configuration = functools.partial(click.option, "-c", "--config", metavar="FILE", type=click.Path())
 output = functools.partial(click.option, "-o", "--output", type=PATH)
 force = functools.partial(click.option, "--force", is_flag=True)
@@ -74,7 +74,7 @@ confirm = click.option(
 def told(function: _Function) -> _Function:
     """Give a command its console, made of ``--json``, ``-q`` and ``-v``, which all commands take.
 
-    What a robot or a law of a user prints meanwhile goes to standard error: it is not what was asked for.
+    What a robot or a law of a user prints meanwhile goes to standard error: it is not a result.
     """
 
     @click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
@@ -121,7 +121,7 @@ def of_stages(function: _Function) -> _Function:
 
 
 def require_new(path: Path, *, force: bool) -> None:
-    """Refuse to replace what is there without ``--force``."""
+    """Refuse to replace existing files without ``--force``."""
     if path.exists() and not force:
         raise click.UsageError(f"{path}: exists already; choose another, or replace it with --force")
 
@@ -173,7 +173,7 @@ def calibration_of(run: Path | None, config: "Config") -> "Calibration | None":
 def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Config", "Run"]:
     """The configuration with all overrides, and the run as stored so far.
 
-    A table beside the run, or the one that a ``recording`` puts there, is that of the configuration unless
+    A table next to the run, or the one that a ``recording`` puts there, is that of the configuration unless
     it names another.
     """
     from projservo_cli.config import Override, load_config, to_yaml

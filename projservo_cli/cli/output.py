@@ -56,7 +56,7 @@ def _plain(value: Any) -> Any:
 
 
 class Console:
-    """What the user wants to see, and a progress bar where someone can watch it."""
+    """Messages at the level of the user, and a progress bar in a terminal."""
 
     def __init__(self, *, quiet: bool = False, verbose: bool = False, as_json: bool = False) -> None:
         self.quiet = quiet
@@ -119,7 +119,7 @@ class Console:
 
 def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> Iterator[str]:
     """Lines on the object of a stage or the report of a ``sweep``; ``detailed`` with claims and margins."""
-    if "failed" in value:  # the reason is told with the exit code
+    if "failed" in value:  # the reason is printed with the exit code
         yield f"{stage}: {'failed' if value['failed'].split('/')[0] == stage else 'not made'}"
     elif stage == "record":
         yield from _of_recording(value)
@@ -213,18 +213,16 @@ def _rejected(value: dict[str, Any]) -> Iterator[str]:
 
 
 def _counted(found: Sequence[str], kind: str, what: str = "") -> str:
-    """How many of a kind there are, with the first of them."""
+    """Count a kind, with its first examples."""
     more = ", …" if len(found) > _EXAMPLES else ""
     return f"{len(found)} {kind}{'s' * (len(found) > 1)}{what} ({', '.join(found[:_EXAMPLES])}{more})"
 
 
 def _joint_noise(value: dict[str, Any]) -> str:
-    """How far joint readings are off, in degrees (of prismatic joints × 0.3 m/rad)."""
+    """Describe the noise of joint readings, in degrees (prismatic joints × 0.3 m/rad)."""
     sigma, interval = math.degrees(value["sigma_q"]), value["sigma_q_interval"]
     if interval is None:
-        return (
-            f"off by {sigma:.3g}° rms, as given" if sigma else "their noise explains nothing of what is left"
-        )
+        return f"off by {sigma:.3g}° rms, as given" if sigma else "their noise explains none of the residual"
     low, high = (math.degrees(end) for end in interval)
     if sigma == 0.0:
         return f"no noise shows (95 %: below {high:.2g}°)"
@@ -251,7 +249,7 @@ def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:
     revolute = [joint["type"] == "R" for joint in value["joints"]]
     names = "".join(f"{f'q{i} ' + ('deg' if turns else 'mm'):>9}" for i, turns in enumerate(revolute, 1))
     now = math.sqrt(rows[0]["variance_before"])
-    yield f"  poses to add, as the way from a recorded one; predicted error {now:.3g} px now"
+    yield f"  poses to add, as offsets from a recorded one; predicted error {now:.3g} px now"
     yield f"  {'from pose':>9}{names}{'then px':>9}"
     for row in rows:
         way = (math.degrees(d) if turns else 1e3 * d for d, turns in zip(row["delta"], revolute, strict=True))
@@ -302,13 +300,14 @@ def _of_laws(value: dict[str, Any]) -> Iterator[str]:
     errors = "true errors" if known else "image errors"
     yield f"servo: {errors} at the end, self-occluded steps left/right"
     first, second, last = heads
-    yield f"  {'law':<20}{'verdict':<13}{'steps':>6}{first:>9}{second:>9}{'occluded':>11}{last:>10}".rstrip()
+    titles = f"  {'law':<20}{'verdict':<15}{'steps':>5}{first:>13}{second:>14}{'occluded':>10}{last:>19}"
+    yield titles.rstrip()
     for trace in value["laws"]:
         first, second, last = (_number(trace[key]) if key else "" for key in keys)
         yield (
-            f"  {name_of(trace['law'], trace['mode']):<20}{trace['verdict']:<13}{trace['steps']:>6}"
-            f"{first:>9}{second:>9}"
-            f"{trace['self_occluded_steps_left']:>6}/{trace['self_occluded_steps_right']:<4}{last:>10}"
+            f"  {name_of(trace['law'], trace['mode']):<20}{trace['verdict']:<15}{trace['steps']:>5}"
+            f"{first:>13}{second:>14}"
+            f"{trace['self_occluded_steps_left']:>6}/{trace['self_occluded_steps_right']:<3}{last:>19}"
         ).rstrip()
     for name, said in _NOTES.items():
         for reason in dict.fromkeys(trace[name] for trace in value["laws"] if trace[name]):

@@ -37,7 +37,7 @@ def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -
 @option.joint_unit
 @option.speed_scale
 @option.confirm
-@option.force(help="Begin anew, whatever stands in the table.")
+@option.force(help="Start again, whatever the table holds.")
 @option.dry_run
 @option.told
 @click.pass_obj
@@ -49,10 +49,10 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     see into an observation table for calibrate.
 
     The table grows as the robot goes. After an interruption the same command continues it; a table of another
-    configuration is refused, unless --force begins anew.
+    configuration is refused, unless --force starts again.
 
     Before other stages, as in projservo record calibrate, -o is the run, and the table is data.table, else
-    trials.csv beside the run; a recording of another configuration of the same plant is made anew.
+    trials.csv next to the run; a recording of another configuration of the same plant is made again.
     """
     if options["joint_unit"] is not None and options["motions"] is None:
         raise click.UsageError("--joint-unit is that of --motions, which is not given")
@@ -92,7 +92,7 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
 
 
 def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> str:
-    """Record what is pending, and say how far it is where that is interrupted; why it failed, if it did."""
+    """Record the pending poses, and report the progress on an interrupt; return the reason of a failure."""
     from projservo_cli.config.inputs import recording_inputs
     from projservo_cli.records import WorkFailed
     from projservo_cli.stages.record import record
@@ -131,7 +131,7 @@ def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> s
     "--suggest",
     metavar="[N]",
     type=click.IntRange(1, 100),
-    help="Suggest N further poses to record, the most telling first; 5 without N.",
+    help="Suggest N further poses to record, the most informative first; 5 without N.",
 )
 @option.of_stages
 def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
@@ -164,7 +164,7 @@ def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
     metavar="NAME",
     multiple=True,
     shell_complete=_laws,
-    help="This law, or law of yours (module:Class), instead of control.laws. Repeatable.",
+    help="This law, or plug-in law (module:Class), instead of control.laws. Repeatable.",
 )
 @option.speed_scale
 @option.confirm
@@ -172,7 +172,7 @@ def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
     "--from",
     "origin",
     metavar="SWEEP:INDEX",
-    help="The run of that number of a sweep, made anew as a run of its own.",
+    help="The run of that number of a sweep, repeated as a separate run.",
 )
 @option.of_stages
 def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
@@ -180,9 +180,9 @@ def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
 
     Runs each law of control.laws (or of --law) to its verdict, and says why one did not converge. Calibrates
     and plans first where needed. Exit code 1 when a law of control.must_converge does not converge: by
-    default direct_three, direct_two, exact and laws of yours.
+    default direct_three, direct_two, exact and plug-in laws.
 
-    With --set plant=module:Class (or plant in the configuration) a robot of yours takes the place of the
+    With --set plant=module:Class (or plant in the configuration) an external robot takes the place of the
     simulated one. It is driven to the start of the task and from there by each law, and stopped on every way
     out.
     """
@@ -203,7 +203,7 @@ def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **op
     """Draw the figures and check the paper's claims.
 
     Writes into the folder of the run: the figures, each with its numbers as CSV; the table of claims; and
-    report.html, one page that tells it all and needs no other file. Makes every stage before it where needed.
+    report.html, one page that needs no other file. Makes every missing stage before it.
 
     --view adds view.html, a 3D view of robot, rig, face and paths with a time slider, which needs no network;
     it needs pip install '.[view]' and a robot described in metres. --animation adds animation.gif,
@@ -220,7 +220,7 @@ def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **op
 
 @dataclass
 class _Call:
-    """One call of stages: its chain, the options that it was given, and what it tells besides."""
+    """One call of stages: its chain, its options, and its messages."""
 
     console: Console
     options: Mapping[str, Any]
@@ -229,7 +229,7 @@ class _Call:
 
 
 def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) -> int:
-    """Make the named stages and what they lack; the exit code."""
+    """Make the named stages and their missing inputs; return the exit code."""
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
     from projservo_cli.experiment import FIGURES
@@ -247,14 +247,14 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
         tidy(folder, FIGURES)
         return _work(call)
     with working_in(folder, FIGURES):
-        if chain.recording is None:  # anew, since another process may have written the run until now
+        if chain.recording is None:  # again, since another process may have written the run until now
             return _work(_asked(console, names, options))
         with option.writing(chain.recording.path):
             return _work(_recorded(_asked(console, names, options)))
 
 
 def _recorded(call: _Call) -> _Call:
-    """Record what is to be recorded; what is to be done with the table."""
+    """Record the pending poses; return the action for the table."""
     chain = call.chain
     recording, why = chain.recording, chain.recording.why
     if why:
@@ -267,7 +267,7 @@ def _recorded(call: _Call) -> _Call:
 
 
 def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
-    """What there is to record into the table that a calibration is made from."""
+    """Return the pending recording of the table of a calibration."""
     from projservo_cli.config.inputs import recording_inputs
     from projservo_cli.records import InputError
     from projservo_cli.stages.record import new_recording
@@ -288,7 +288,7 @@ def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
 def _asked(
     console: Console, names: Sequence[str], options: Mapping[str, Any], recording: Any = None
 ) -> _Call:
-    """What is to be done, by the configuration and what the run holds; refused where it must not be.
+    """Return the actions, by the configuration and the run; refuse forbidden ones.
 
     recording : where it was made just now.
     """
@@ -334,12 +334,12 @@ def require_extras(config: Any, wanted: Sequence[str]) -> None:
         except InputError as error:
             raise InputError(
                 "--view: images alone give a robot only up to a projective frame, which has no metres to "
-                f"draw; {error}, or use --animation, which shows what the cameras saw"
+                f"draw; {error}, or use --animation, which shows the images"
             ) from error
 
 
 def _extras(options: Mapping[str, Any]) -> list[str]:
-    """What a report is to have beside its page."""
+    """Return the files that a report has in addition to its page."""
     return [name for name in ("view", "animation") if options.get(name)]
 
 
@@ -357,7 +357,7 @@ def _law_names(names: Sequence[str]) -> tuple[str, ...]:
 def _require_named(chain: Any, options: Mapping[str, Any]) -> None:
     """Refuse to move a robot that no stage asks for, or to start code that only a stored run names.
 
-    A run file may come from anybody: what is stored in it is shown and compared, never imported. Classes
+    A run file may come from anybody: its contents are shown and compared, never imported. Classes
     that are named are imported, so that what cannot be found is known before any work.
     """
     from projservo_cli.config import Override
@@ -384,7 +384,7 @@ def _require_named(chain: Any, options: Mapping[str, Any]) -> None:
 
 
 def _work(call: _Call) -> int:
-    """Make what has to be made, and tell what came out; the exit code."""
+    """Make the outdated stages and print their results; return the exit code."""
     console, chain = call.console, call.chain
     _announce(console, chain)
     chain.make()
@@ -416,7 +416,7 @@ def _work(call: _Call) -> int:
 
 
 def _announce(console: Console, chain: Any) -> None:
-    """Say in one line for each reason what will be made, and what is up to date."""
+    """Print the stages to make by reason, and those up to date."""
     reasons: dict[str, list[str]] = {}
     for step in chain.steps:
         if step.stage == "record" and len(chain.recording.done) > chain.recording.found:
@@ -430,7 +430,7 @@ def _announce(console: Console, chain: Any) -> None:
 
 
 def _suggestions(chain: Any, count: int) -> dict[str, Any]:
-    """Further poses for the calibration, as JSON values; the list of them is written beside the run."""
+    """Further poses for the calibration, as JSON values; their list is written next to the run."""
     from projservo_cli.config.inputs import suggestion_inputs
     from projservo_cli.records import WorkFailed
     from projservo_cli.stages.calibrate import suggest_motions
@@ -451,7 +451,7 @@ def _suggestions(chain: Any, count: int) -> dict[str, Any]:
 
 
 def _made_extras(console: Console, chain: Any, wanted: Sequence[str]) -> dict[str, Path]:
-    """Write what is wanted, and the page anew, which links to it; the paths by name."""
+    """Write the requested files, and the page with links to them; return the paths by name."""
     from projservo_cli.config.inputs import about_of, scenery_of
     from projservo_cli.report.page import write_page
     from projservo_cli.stages import report as reporting
@@ -470,7 +470,7 @@ def _made_extras(console: Console, chain: Any, wanted: Sequence[str]) -> dict[st
 
 
 def _findings(call: _Call) -> Iterator[tuple[str, bool]]:
-    """What is not as it was asked for, and whether that ends the call with exit code 1."""
+    """Return the failures of the call, and whether they end it with exit code 1."""
     chain = call.chain
     if chain.failed:
         yield from _of_runs(chain)
@@ -497,7 +497,7 @@ def _of_runs(chain: Any) -> Iterator[tuple[str, bool]]:
     for trace in (chain.run.traces[law] for law in chain.laws_done):
         must, converged = must_converge(trace.law, required), trace.verdict == "converged"
         if trace.verdict == "failed" or (converged and not trace.overruns):
-            continue  # what failed is the last thing that is said
+            continue  # failures are printed last
         but = " must converge, but" if must and not converged else ""
         reason = " ".join(trace.reason.split())
         said = f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"

@@ -14,7 +14,7 @@ from projservo_cli.cli.output import Console
 @option.configuration(help="Configuration of the sweep (YAML).", required=True)
 @option.override
 @option.output(metavar="DIR", help="Folder of the sweep. Default: results/<name of the sweep>.")
-@option.force(help="Begin anew, whatever is in the folder.")
+@option.force(help="Start again, whatever the folder holds.")
 @option.dry_run
 @option.threads(help="Processes. Default: all processors.")
 @click.option(
@@ -38,8 +38,8 @@ def _sweep(
 
     Makes the runs of a sweep (configs/sweep_noise.yaml shows one) in parts that are stored as they are done,
     and assembles them to one table, sweep.h5, which xarray.open_dataset reads. Interrupted or killed, the
-    same command goes on where it was. What a run does depends on its number alone: projservo servo --from
-    SWEEP:INDEX makes any of them anew.
+    same command goes on where it was. A run depends on its number alone: projservo servo --from
+    SWEEP:INDEX repeats any of them.
 
     projservo report SWEEP writes statistics and figures. With --scheduler the workers of a Dask cluster do
     the work; it needs pip install '.[cluster]' here and there.

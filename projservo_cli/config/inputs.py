@@ -1,6 +1,6 @@
 """From a configuration to what each stage is given: the values that it reads, and no others.
 
-Every function returns a record, of which the key of the result is a hash. What is resolved here, units,
+Every function returns a record, of which the key of the result is a hash. It resolves units,
 defaults that depend on other values and descriptions of robot and rig, is resolved nowhere below.
 """
 
@@ -80,11 +80,11 @@ _EXPECTED = {
     "mjcf": "a model of MuJoCo",
 }
 _Record = TypeVar("_Record", bound=tuple[Any, ...])
-Files = Mapping[str, File]  # that are read, by what they are; where they are not given, they are read
+Files = Mapping[str, File]  # by their roles; read from disk if not given
 
 
 def calibration_inputs(config: Config, files: Files | None = None) -> CalibrationInputs:
-    """What a calibration is made from: a table, else trials of the simulated robot."""
+    """Return the inputs of a calibration: a table, else trials of the simulated robot."""
     settings, table = config.calibration, _file(config, "table", files)
     source: Table | Trials
     if config.data is not None and table is not None:
@@ -100,7 +100,7 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
 
 
 def recording_inputs(config: Config) -> RecordingInputs:
-    """What a table is recorded with."""
+    """Return the inputs of a recording."""
     markers, plant = config.markers, config.plant
     numbers = markers.known if markers is not None else None
     truth = _truth(config, face=False) if plant.simulated else None
@@ -122,7 +122,7 @@ def recording_inputs(config: Config) -> RecordingInputs:
 
 
 def teach_inputs(config: Config) -> TeachInputs:
-    """What a pose is taught with."""
+    """Return the inputs of teaching a pose."""
     numbers = config.markers.known if config.markers is not None else None
     if numbers is None:
         raise InputError("teach needs to know which markers the robot observes: set markers.numbers")
@@ -137,14 +137,14 @@ def teach_inputs(config: Config) -> TeachInputs:
 
 
 def suggestion_inputs(config: Config) -> SuggestionInputs:
-    """What further poses are suggested with."""
+    """Return the inputs of a suggestion of further poses."""
     unit = config.data.joint_unit if config.data is not None else None
     joints, size = joints_of(config), config.image_size_px
     return SuggestionInputs(joints, size, config.recorded, unit or "rad", config.seed)
 
 
 def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool = False) -> PlanInputs:
-    """What a plan is made from.
+    """Return the inputs of a plan.
 
     predicted : whether a calibration predicts start and goal of a simulated robot, which is not described.
     """
@@ -174,7 +174,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
 
 
 def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
-    """What the run of a law is made from."""
+    """Return the inputs of the run of a law."""
     plan, control, stop, plant = plan_inputs(config, files), config.control, config.stop, config.plant
     assert config.markers is not None
     # A robot that is not simulated is never driven beyond a limit.
@@ -200,7 +200,7 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
 
 
 def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract | None:
-    """How a law drives a robot of the contract; None for one that stands wherever it is sent."""
+    """Return the settings of a robot of the contract; None for the ideal plant."""
     plant = config.plant
     if plant.use is None and config.disturbance == Disturbance():
         return None
@@ -214,7 +214,7 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
 
 
 def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
-    """What a report is made from: all of the configuration, which its page prints, and the extra runs."""
+    """Return the inputs of a report: the whole configuration, which its page prints, and the extra runs."""
     files = files_of(config) if files is None else files
     about, trajectory = about_of(config, files.values()), trajectory_of(config)
     formats = config.report.formats
@@ -229,7 +229,7 @@ def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
 
 
 def about_of(config: Config, read: Iterable[File] = ()) -> About:
-    """What a page tells of a configuration, in whose text files that are read may lie anywhere."""
+    """Return the part of a configuration for the page; paths of its files may change."""
     files = {file.path: file for file in read}
     pieces = [to_yaml(config)]
     if files:
@@ -246,7 +246,7 @@ def about_of(config: Config, read: Iterable[File] = ()) -> About:
 
 
 def scenery_of(config: Config) -> Scenery:
-    """What runs are shown in; an InputError where robot, rig and markers are not described."""
+    """Return the scene of runs; InputError if robot, rig and markers are not described."""
     opaque = config.plant.self_occlusion == "opaque"
     return Scenery(config.name, truth_of(config), opaque, config.plant.simulated)
 
@@ -258,7 +258,7 @@ def settings_of(config: Config) -> dict[str, Any]:
 
 
 def files_of(config: Config, gone: Mapping[str, str] | None = None) -> Files:
-    """Files that are read, by what they are; an InputError where one cannot be read.
+    """Read the input files, by their roles; InputError if one cannot be read.
 
     gone : hashes that files had, by their paths, which stand where the files are gone.
     """
@@ -291,7 +291,7 @@ def _read(config: Config, kind: str, gone: Mapping[str, str]) -> File | None:
 def truth_of(config: Config) -> Truth:
     """Robot, rig and markers as they are; an InputError where a part of it is missing.
 
-    The same object for the same values, by which what is worked out of it is kept.
+    The same values give the same object, so that derived results are kept.
     """
     return _truth(config, face=True)
 
@@ -379,7 +379,7 @@ def _center(markers: Markers) -> int:
 
 
 def scene_of(config: Config, files: Files | None = None) -> Scene | None:
-    """What rendered cameras see; None for cameras that see points."""
+    """Return the scene of rendered cameras; None for cameras that see points."""
     options = config.plant.rendered
     if options is None:
         return None
@@ -442,7 +442,7 @@ def _readings(vector: JointVector | None) -> Readings | None:
 
 
 def _following(config: Config, speed_scale: float) -> Following:
-    """How commands go to a robot of the contract."""
+    """Return the settings of commands to a robot of the contract."""
     plant = config.plant
     return Following(
         config.control.period_s,
@@ -466,12 +466,12 @@ def _own(config: Config) -> OwnRobot:
 
 
 def _simulated(config: Config, truth: Truth, files: Files | None) -> SimulatedRobot:
-    """The simulated robot that takes time for what it does."""
+    """Return the simulated robot with time and faults."""
     return SimulatedRobot(truth, faults_of(config), scene_of(config, files), config.control.period_s)
 
 
 def faults_of(config: Config) -> Faults:
-    """What is wrong with the simulated robot all the time."""
+    """Return the permanent faults of the simulated robot."""
     given = config.disturbance
     return _taken(
         Faults,
@@ -484,7 +484,7 @@ def faults_of(config: Config) -> Faults:
 
 
 def events_of(config: Config) -> Events:
-    """What befalls the simulated robot in a run."""
+    """Return the events of the simulated robot in a run."""
     given, found = config.disturbance, dict[str, Any]()
     if given.lost_markers is not None:
         found["lost_markers"] = _taken(LostMarkers, given.lost_markers)
@@ -526,7 +526,7 @@ def _trials(
         raise InputError("trial motions need a reference: set calibration.reference or task.start")
     faults, scene = faults_of(config), scene_of(config, files) if own is None else None
     driven = own is not None or scene is not None or faults != Faults()
-    # The closed form takes joints that are told to stand still to do so.
+    # The closed form assumes that joints without a command stand still.
     faultless = not driven or settings.method == "closed_form"
     poses = settings.random_poses
     if poses is None:
@@ -573,7 +573,7 @@ def _goal(goal: GoalSettings, config: Config) -> Goal:
 
 
 def trajectory_of(config: Config) -> Trajectory:
-    """The planned motion that is asked for."""
+    """Return the requested motion."""
     given = config.trajectory
     return _taken(
         Trajectory,

@@ -61,7 +61,7 @@ _Path = tuple[str | int, ...]
 _MAX_BYTES = 1_000_000
 _MAX_VALUES = 50_000  # aliases counted as often as they are used
 _MAX_DEPTH = 32
-_MOST_LINES = 50  # that are told of what is wrong
+_MOST_LINES = 50  # of error messages
 _STANDARD = "tag:yaml.org,2002:"
 _Model = TypeVar("_Model", bound=Root)
 
@@ -77,7 +77,7 @@ class _Loader(_Parser):
 
 _Loader.yaml_implicit_resolvers = {}
 
-# Plain text that means something else, and what it means.
+# Plain text with another meaning in YAML, and that meaning.
 _CORE: tuple[tuple[re.Pattern[str], Callable[[str], Any]], ...] = (
     (re.compile(r"~|null|Null|NULL|"), lambda text: None),
     (re.compile(r"true|True|TRUE|false|False|FALSE"), lambda text: text.lower() == "true"),
@@ -88,12 +88,12 @@ _CORE: tuple[tuple[re.Pattern[str], Callable[[str], Any]], ...] = (
 
 
 class _Document:
-    """A parsed YAML text: plain values, where each stands, and what was wrong with the text."""
+    """A parsed YAML text: plain values, their places, and the errors of the text."""
 
     def __init__(self, text: str, name: str) -> None:
         self.name = name
         self.places: dict[_Path, str] = {}
-        self.problems: list[tuple[_Path, str, str]] = []  # path, what is wrong, place if no path leads to it
+        self.problems: list[tuple[_Path, str, str]] = []  # path, error, place if no path leads to it
         self.values: Any = None
         self._count = 0
         try:
@@ -165,7 +165,7 @@ class _Document:
         return values
 
     def override(self, change: "Override") -> None:
-        """Set a value that comes from elsewhere, making the mappings on the way to it."""
+        """Set a value that comes from elsewhere, creating the mappings above it."""
         path, value, flag = change.path, change.value, change.flag
         holder: Any = self.values
         for i, step in enumerate(path):
@@ -186,7 +186,7 @@ class _Document:
         return None
 
     def place(self, path: _Path) -> str:
-        """Where ``path`` stands, or the nearest mapping or list around it."""
+        """Return the place of ``path``, or of the nearest mapping or list around it."""
         while path and path not in self.places:
             path = path[:-1]
         return self.places.get(path, self.name)
@@ -210,7 +210,7 @@ def _position(place: str) -> tuple[float, float]:
 
 
 def _require_bounded(text: str) -> None:
-    """Refuse what is nested too deep before nodes are made of it, which recurses in C."""
+    """Refuse deep nesting before nodes are made, which recurses in C."""
     depth = 0
     for event in yaml.parse(text, Loader=_Loader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
@@ -446,7 +446,7 @@ def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
 
 
 def _fill_in_arm(document: _Document) -> None:
-    """Put the screws of the joints beside the name of an MJCF, or in place of that of a URDF."""
+    """Add the screws of the joints to the name of an MJCF, or replace that of a URDF by them."""
     robot = document.values.get("robot")
     for kind in ("mjcf", "urdf") if isinstance(robot, dict) else ():
         file, tip = robot.get(kind), robot.get("tip")
@@ -465,7 +465,7 @@ def _fill_in_arm(document: _Document) -> None:
 
 
 def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> None:
-    """Put what was taught in place of the names of files that hold it, relative to the configuration.
+    """Replace the names of taught files, relative to the configuration, by their contents.
 
     While it is being taught, a goal whose file is missing is the start, and without a start there is no task.
     """
@@ -488,12 +488,12 @@ def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> 
         if taught.problems or not isinstance(images, dict):
             raise InputError(f"{where}: {path}: is no file that projservo teach wrote")
         if key == "start" and not images.get("joints"):
-            raise InputError(f"{where}: {path}: tells no joints to start from")
+            raise InputError(f"{where}: {path}: has no joints to start from")
         task[key] = images["joints"] if key == "start" else taught.values
 
 
 def _check_options(document: _Document) -> None:
-    """Note what is wrong with the options of a plant that is not a class of somebody's."""
+    """Note errors in the options of a built-in plant."""
     plant = document.values.get("plant")
     if not isinstance(plant, dict) or plant.get("use") != RENDERED:
         return
@@ -505,7 +505,7 @@ def _check_options(document: _Document) -> None:
 
 
 def _translated(model: type[BaseModel], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:
-    """What pydantic found, in words."""
+    """Return the findings of pydantic, in words."""
     places = [error["loc"] for error in errors]
     for error, place in list(zip(errors, places, strict=True))[:_MOST]:
         if error["type"] == CONTRADICTIONS:

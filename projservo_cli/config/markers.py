@@ -136,7 +136,7 @@ class Markers(Section):
 
     @property
     def known(self) -> tuple[int, ...] | None:
-        """Numbers of all markers, in the order of ``points``; None where a table will tell."""
+        """Numbers of all markers, in the order of ``points``; None if a table has them."""
         if self.tags is not None:
             return tuple(CORNERS * tag.number + k for tag in self.all_tags for k in range(CORNERS))
         if self.numbers is None and self.positions_m is not None:
@@ -155,7 +155,7 @@ class Markers(Section):
         return known[first : first + CORNERS]
 
     def lengths(self, numbers: Sequence[int]) -> FloatArray:
-        """Distances (k, k) between markers of some numbers, m; NaN where nothing tells them."""
+        """Distances (k, k) between markers of some numbers, m; NaN if unknown."""
         X, tag = np.full((len(numbers), 3), np.nan), np.zeros(len(numbers))
         if self.points is not None:
             known = self.known or ()

@@ -82,7 +82,7 @@ class _CameraMoved(Section):
     by_px: Number | tuple[Number, Number] = Field(description="shift of its image along u, or along u and v")
 
     def by_view(self) -> tuple[tuple[float, float], ...]:
-        """How far along u and v, left and right."""
+        """Return the shift along u and v, left and right."""
         given = self.by_px if isinstance(self.by_px, tuple) else (self.by_px, 0.0)
         return tuple(given if self.view == view else (0.0, 0.0) for view in ("left", "right"))
 
@@ -157,7 +157,7 @@ class Disturbance(Section):
     marker_moved: _MarkerMoved | None = None
 
     def contradictions(self) -> Iterator[Finding]:
-        """What says nothing without another key."""
+        """Yield keys without effect because another is missing."""
         if self.frame_offset_s and self.frame_rate_hz is None:
             yield ("frame_offset_s",), "is that of cameras that run freely: set frame_rate_hz as well"
         if self.quantize_setpoints and self.encoder_counts_per_turn is None:
@@ -272,7 +272,7 @@ class _CalibrationSettings(Section):
     )
 
     def contradictions(self) -> Iterator[Finding]:
-        """What another method takes."""
+        """Yield keys of another method."""
         for key in ("cross_validate", "init"):
             if getattr(self, key) is not None and self.method != "bundle_adjustment":
                 yield (key,), f"belongs to the method bundle_adjustment, not to {self.method}"
@@ -496,7 +496,7 @@ FolderName = Annotated[str, StringConstraints(max_length=100), AfterValidator(_f
 
 
 def _joint_types(robot: RobotSettings | None, data: _Data | None) -> str:
-    """One letter a joint, R or P; empty where only the table tells how many there are."""
+    """One letter a joint, R or P; empty if only the table has their number."""
     if data is not None and data.joints is not None:
         return data.joints
     return robot.joint_types if robot is not None else ""
@@ -583,7 +583,7 @@ def _simulated_alone(disturbance: Disturbance, plant: _PlantSettings) -> Iterato
 
 
 def _rendered(plant: _PlantSettings, noise: _Noise, markers: Markers | None) -> Iterator[Finding]:
-    """What means something else, or nothing, where images are rendered."""
+    """Yield keys without effect for rendered images."""
     if plant.use != RENDERED:
         return
     for key in ("calibration_px", "servo_px"):
@@ -597,7 +597,7 @@ def _rendered(plant: _PlantSettings, noise: _Noise, markers: Markers | None) -> 
 
 
 def _dictionary(plant: _PlantSettings, markers: Markers | None) -> Iterator[Finding]:
-    """A dictionary of tags that is said twice."""
+    """Yield a dictionary of tags that is given twice."""
     if markers is not None and markers.dictionary is not None and "dictionary" in plant.options:
         yield ("markers", "dictionary"), "plant.options gives the class its dictionary as well; keep one"
 
@@ -664,7 +664,7 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
 
 
 def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
-    """What a simulated run needs."""
+    """Yield the missing parts of a simulated run."""
     reason = "is missing; a simulated run needs it"
     for key in ("robot", "rig"):
         if sections.get(key, "broken") is None:
@@ -699,7 +699,7 @@ class Settings(Root):
     report: _ReportSettings = _ReportSettings()
 
     def between(self, sound: Mapping[str, Any]) -> Iterator[Finding]:
-        """What a simulated run lacks, and what does not fit together between sections."""
+        """Yield the missing parts of a simulated run, and contradictions between sections."""
         if sound.get("data", "broken") is None:
             yield from _missing(sound)
         for rule, wanted in _RULES.items():
@@ -725,7 +725,7 @@ class Settings(Root):
 
     @property
     def joint_types(self) -> str | None:
-        """One letter a joint, R or P; None where only the table tells how many there are."""
+        """One letter a joint, R or P; None if only the table has their number."""
         return _joint_types(self.robot, self.data) or None
 
     @property
@@ -735,7 +735,7 @@ class Settings(Root):
 
     @property
     def idealized(self) -> Self:
-        """That of the simulated robot without noise and disturbances in the loop."""
+        """Configuration of the simulated robot without noise and faults in the loop."""
         noise = self.noise.model_copy(update={"servo_px": 0.0})
         plant = self.plant.model_copy(update={"use": None, "options": {}})
         return self.model_copy(update={"noise": noise, "plant": plant, "disturbance": Disturbance()})
@@ -752,7 +752,7 @@ class Settings(Root):
 
     @property
     def face_numbers(self) -> tuple[int, ...]:
-        """Numbers of the face markers; an InputError where nothing tells them."""
+        """Numbers of the face markers; InputError if they are unknown."""
         if self.markers is None or self.markers.front is None:
             raise InputError(
                 "this stage needs to know the face: set markers.face to three marker numbers or more"

@@ -1,4 +1,4 @@
-"""The robot, its rig and its markers, in metric terms: what a simulation takes as true."""
+"""The robot, its rig and its markers, in metric terms: the truth of a simulation."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -24,7 +24,7 @@ Whole = Annotated[int, Strict(), Field(ge=0, le=2**63 - 1)]
 Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
 _File = Annotated[str, StringConstraints(min_length=1)]
 Vector2 = tuple[Number, Number]
-# The path from a section to a value in it, and what is wrong with that value.
+# The path from a section to a value in it, and the error of that value.
 Finding = tuple[tuple[str | int, ...], str]
 CONTRADICTIONS = "contradictions"  # type of the error that holds them
 
@@ -42,7 +42,7 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def contradictions(self) -> Iterable[Finding]:
-        """What does not fit together in this section, of which each value is right by itself."""
+        """Yield the contradictions of this section, each value of which is valid by itself."""
         return ()
 
 
@@ -61,7 +61,7 @@ class Root(Section):
         return self
 
     def between(self, sound: Mapping[str, Any]) -> Iterable[Finding]:
-        """What does not fit together between values by key."""
+        """Yield contradictions between values by key."""
         return ()
 
 
@@ -110,7 +110,7 @@ def are_degrees(low: float, high: float) -> bool:
 
 
 class _Joint(Section):
-    """What joints have in common: a type, perhaps a name, perhaps limits."""
+    """Common keys of joints: a type, optional name and limits."""
 
     type: Literal["R", "P"] = Field(description="R: revolute, P: prismatic")
     name: str | None = Field(None, description="name in messages and figures")
@@ -199,7 +199,7 @@ class _Screws(Section):
 
 
 class _Limits(Section):
-    """Joint limits of a robot whose kinematics nobody gives: one of yours, seen in recorded data."""
+    """Joint limits of a robot without kinematics in the configuration."""
 
     joints: Annotated[tuple[Vector2, ...], Field(min_length=1, max_length=64)] | None = Field(
         None, description="minimum and maximum reading of each joint, base to tool"
@@ -232,9 +232,9 @@ class _Limits(Section):
 
 
 class RobotSettings(Section):
-    """A serial arm, given by a DH table, by screws or in a file; of one of yours perhaps its limits alone.
+    """A serial arm, given by a DH table, by screws or in a file; limits alone for an external robot.
 
-    Where a file is read, its screws are put beside ``mjcf`` or in place of ``urdf``.
+    The screws of a file are added to ``mjcf``, or replace ``urdf``.
     """
 
     name: str = Field("", description="name in figures and reports")
@@ -264,10 +264,10 @@ class RobotSettings(Section):
         return tuple(joint.limits for joint in self.joints)
 
     def contradictions(self) -> Iterator[Finding]:
-        """Nothing, or more than one of what tells joints and limits; a file without a tip."""
+        """Yield missing or several descriptions of joints and limits; a file without a tip."""
         screws = None if self.mjcf is not None else self.screws  # those of the file
         if (self.dh, screws, self.mjcf, self.urdf, self.limits).count(None) != 4:
-            yield (), "give exactly one of dh, screws, mjcf, urdf and, for a robot of yours, limits"
+            yield (), "give exactly one of dh, screws, mjcf, urdf and, for an external robot, limits"
         if (self.tip is None) != (self.mjcf is None and self.urdf is None):
             yield ("tip",), "names the body of mjcf, or the link of urdf, that holds the tool: give both"
 

@@ -18,12 +18,12 @@ _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def json_schema() -> dict[str, Any]:
-    """The schema of a configuration file; what must hold between values, only loading it tells."""
+    """Return the schema of a configuration file, without the rules between values."""
     schema = _schema(Config)
     keys = schema["properties"]
     keys["plant"] = {  # the short forms of plant.use
         "anyOf": [keys["plant"], {"type": "string"}],
-        "description": "What is driven; mujoco or module:Class is short for plant.use.",
+        "description": "The robot; mujoco or module:Class is short for plant.use.",
     }
     keys["law"] = {  # and of control.laws
         **schema["$defs"]["Control"]["properties"]["laws"]["items"],
@@ -85,7 +85,7 @@ def starter() -> str:
 
 
 def _settings(name: str, example: str) -> Iterator[str]:
-    """Lines of a section: each key under what it means, behind a # where it shows its default."""
+    """Lines of a section: each key under its description, behind a # if it shows its default."""
     section = Config.model_fields[name].default
     schema = type(section).model_json_schema()
     defaults = {key: _flow(value) for key, value in section.model_dump(mode="json").items()}

@@ -1,4 +1,4 @@
-"""The configuration of a sweep: what is run how often, over which values."""
+"""The configuration of a sweep: the runs, their number and values."""
 
 import json
 import pathlib
@@ -11,7 +11,7 @@ from projservo_cli.config.models import FolderName, Plain, one_or_more
 from projservo_cli.config.robot import Count, Finding, Positive, Root, Section, Whole
 from projservo_cli.nominal import Number
 
-BASE, LAW = "base", "law"  # names of axes with a meaning of their own
+BASE, LAW = "base", "law"  # names of axes with a special meaning
 
 
 class _Linked(Section):
@@ -30,7 +30,7 @@ class _Linked(Section):
 
 
 def _axis(value: Any) -> Any:
-    """Values are those of the key of the name of the axis; a mapping tells what goes with each."""
+    """Values are those of the key of the name of the axis; a mapping adds further keys to each."""
     if isinstance(value, dict) and not {*_Linked.model_fields} & {*value}:
         return {"keys": [""], "values": list(value), "also": value}
     return {"keys": [""], "values": value} if isinstance(value, list) else value
@@ -43,7 +43,7 @@ _Bases = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
 class Distribution(Section):
-    """What a value is drawn from: exactly one of the four."""
+    """Distribution of a value: exactly one of the four."""
 
     uniform: tuple[Number, Number] | None = Field(
         None, description="minimum and maximum of a uniform distribution"
@@ -63,7 +63,7 @@ class Distribution(Section):
             yield (), "give exactly one of uniform, log_uniform, normal and choice"
         for name, value in given:
             if name in ("uniform", "log_uniform") and not value[0] < value[1]:
-                yield (), f"{name} needs a least value below the largest"
+                yield (), f"{name} needs a minimum below the maximum"
 
 
 class _Tasks(Section):

@@ -56,14 +56,14 @@ class _GoalImages(Section):
         return {number: (left or unseen, right or unseen) for number, left, right in each}
 
     def deviations(self, numbers: Sequence[int], face: Sequence[int]) -> list[list[float]]:
-        """Standard deviation of markers in the left and in the right image, px; NaN where it is not told."""
+        """Standard deviation of markers in the left and in the right image, px; NaN if unknown."""
         own = list(self.markers or face)
         sides = [side or (None,) * len(own) for side in (self.sigma_left_px, self.sigma_right_px)]
         told = [dict(zip(own, side, strict=True)) for side in sides]
         return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in told]
 
     def sigma_px(self, face: Sequence[int]) -> float | None:
-        """Standard deviation of a coordinate of the markers of the face, rms; None where it is not told."""
+        """Standard deviation of a coordinate of the markers of the face, rms; None if unknown."""
         told = [sigma**2 for side in self.deviations(face, face) for sigma in side]
         return None if any(map(math.isnan, told)) else math.sqrt(sum(told) / len(told))
 
@@ -120,14 +120,14 @@ class KeptOut(Section):
     def contradictions(self) -> Iterator[Finding]:
         """No polygon, or one that is none."""
         if self.left is None and self.right is None:
-            yield (), "give left, right or both: the corners of what the obstacle covers there"
+            yield (), "give left, right or both: the corners of the region that the obstacle covers there"
         for side, corners in (("left", self.left), ("right", self.right)):
             if corners is not None and (what := _not_simple(corners)):
                 yield (side,), what
 
 
 def _not_simple(corners: Sequence[Vector2]) -> str:
-    """Why corners are not those of a polygon that somebody drew; empty where they are."""
+    """Return the reason why corners are no simple polygon; empty if they are one."""
     edges = list(zip(corners, (*corners[1:], corners[0]), strict=True))
     for (i, first), (j, second) in combinations(enumerate(edges), 2):
         if 1 < j - i < len(edges) - 1 and _meet(*first, *second):

@@ -80,9 +80,9 @@ class _Rehearsal:
         self.log = new_log(n, m, _REHEARSAL_STEPS, len(ERRORS))
 
     def better(self, task: Task, state: State) -> tuple[int, Parts, bool]:
-        """A partitioned task in the better sense: what is wrong, its parts, and whether it arrives."""
+        """A partitioned task in the better sense: its verdict, its parts, and whether it arrives."""
         model = self.model
-        # Cameras have no sign of their own; the plant tells front from back by positive depths.
+        # Cameras have no sign of their own; the plant distinguishes front and back by positive depths.
         depth = model.P[:, 2] @ np.array(center_of(state.A, MIDPOINT))
         seen = model._replace(P=model.P * np.sign(depth)[:, None, None])
         M = np.ascontiguousarray(state.A @ as_array(backward(model, self.q_start)).T)
@@ -142,7 +142,7 @@ def begin(
 def _first_parts(
     model: Model, task: Task, s: FloatArray, q_start: FloatArray, state: State
 ) -> tuple[int, Parts]:
-    """Measure and partition the task in the sense that the angles have; what is wrong, and the parts."""
+    """Measure and partition the task in the sense of the angles; return the verdict and the parts."""
     if not measure(model, task, s, q_start, state):
         return NOT_MEASURED, NO_PARTS
     parts = partition(task, make_split(state))
@@ -168,7 +168,7 @@ class Setting(NamedTuple):
 
     code: int  # of the law
     model: Model  # calibrated, by which the task is partitioned
-    believed: Model  # what the law believes, the same or the metric one
+    believed: Model  # model of the law, the same or the metric one
     body: Body  # with which the task is measured; none for point by point
     shares_task: bool  # whether the law measures the task in the same way; it else does point by point
     rehearse: bool  # whether half turns are rehearsed
@@ -182,7 +182,7 @@ class _Desk(NamedTuple):
 
     shown: FloatArray  # (2, 2, b, 2) straight pixels of the images at the start and at the goal
     task: Task
-    own_task: Task  # task, own_task: as it is partitioned, and as a law sees it that measures in another way
+    own_task: Task  # task, own_task: as partitioned, and as a law with other features sees it
     state: State
     own_state: State  # state, own_state: of the partition and of the law
     log: Log  # of the run
@@ -238,7 +238,7 @@ def _until_rehearsal(
     A call takes as long as a tenth of a run to hand its arguments over, and all of it with the lock of the
     interpreter held: hence many runs a call.
 
-    opened : what is wrong with the first run, which was opened; else ``_NOT_OPENED``.
+    opened : verdict of the first run, which was opened; else ``_NOT_OPENED``.
     """
     for made in range(len(shown)):
         status = opened
@@ -252,7 +252,7 @@ def _until_rehearsal(
 
 @merged
 def _open(setting: Setting, shown: FloatArray, desk: _Desk) -> tuple[int, float]:
-    """Measure and partition a task, and measure it as the law will; what is wrong, and the angle θ_p, rad."""
+    """Measure and partition a task, also as the law measures it; the verdict and the angle θ_p, rad."""
     reset(desk.own_state)
     if not setting.shares_task:
         status = _measured_into(setting, setting.believed, shown, desk, desk.own_task)
@@ -268,7 +268,7 @@ def _open(setting: Setting, shown: FloatArray, desk: _Desk) -> tuple[int, float]
 
 @composed
 def _measured_into(setting: Setting, model: Model, shown: FloatArray, desk: _Desk, task: Task) -> int:
-    """Measure a task from images (2, 2, b, 2) at its start and goal, px; what is wrong."""
+    """Measure a task from images (2, 2, b, 2) at its start and goal, px; return the verdict."""
     for view in range(2):
         for k in range(task.s_star.shape[1]):
             for i in range(2):

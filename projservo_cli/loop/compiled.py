@@ -14,7 +14,7 @@ from projservo_cli.simulation.ideal import Plant, observe, rig_distance
 
 
 class Course(NamedTuple):
-    """What a law is driven on."""
+    """State of a run."""
 
     plant: Plant
     limits: Limits
@@ -28,7 +28,7 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
     noise : (k, 2, m + p, 2) added to the true pixels of the first k instants, px.
     state, log : of this run alone; the log is filled up to the last instant, whatever it held before.
     Returns verdict: code of the verdict; ``RUNNING`` where the noise ended before the run, which needs more
-    of it to be made anew; steps: commands sent; the log has one instant more.
+    of it to be redrawn; steps: commands sent; the log has one instant more.
     """
     plant, limits, q_start = course
     n = q_start.shape[0]
@@ -93,7 +93,7 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
 
 @merged
 def _begin_row(log: Log, k: int) -> None:
-    """Make the row of an instant say that nothing was measured nor commanded."""
+    """Mark the row of a time as without measurement and command."""
     for i in range(log.errors.shape[1]):
         log.errors[k, i] = math.nan
     for i in range(log.fit.shape[1]):

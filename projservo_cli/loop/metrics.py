@@ -17,7 +17,7 @@ SUBSAMPLES = 50  # points of a joint step at which the deviation between samples
 
 
 class Ended(NamedTuple):
-    """How a run ended."""
+    """End of a run."""
 
     verdict: int
     steps: int  # commands sent
@@ -43,7 +43,7 @@ class Summary(NamedTuple):
     rotation_deg: float
     distance_mm: float
     position_error_mm: float
-    rotation_error_deg: float  # position_error_mm, rotation_error_deg: what is left of both at the end
+    rotation_error_deg: float  # position_error_mm, rotation_error_deg: errors at the end
     path_length_mm: float  # of the centre, from sample to sample
     center_deviation_at_samples_mm: float  # largest distance of the centre from its line
 

@@ -5,7 +5,7 @@ Each is given the verdict of those before it and returns its own:
 1. the fault monitor holds the robot where images contradict the calibration, and ends the run once it is
    known why, before the law is asked;
 2. ``verdict_at``, which alone rules over the compiled loop too;
-3. the stall monitor, of a robot that need not follow what it is sent: it has ``converged`` once it stands,
+3. the stall monitor, of a robot that may lag behind its set-points: it has ``converged`` once it stands,
    and makes no progress where it stands still away from the goal;
 4. the execution monitor, of a plan that gives way to another one: it replans instead of ending the run;
 5. the fault monitor again: nothing ends while it is not known what images mean;
@@ -32,9 +32,9 @@ from projservo_cli.simulation.ideal import Plant
 
 
 class Monitored(Protocol):
-    """What the fault monitor asks of a plant."""
+    """Interface of a plant for the fault monitor."""
 
-    plant: Plant  # the truth, or what the calibration takes for it: image size, joint limits
+    plant: Plant  # the truth, or its calibrated model: image size, joint limits
     # why the run cannot go on, the images no longer agree with the calibration or something failed; empty
     # where it can
     disturbance: str
@@ -45,17 +45,17 @@ class Monitored(Protocol):
 
     @property
     def pending(self) -> bool:
-        """Whether images disagreed and nothing has cleared that yet."""
+        """Tell whether images disagreed and have not agreed since."""
 
     def give_up(self) -> None:
-        """Say what is wrong as far as it is known, where there is no time for more looks."""
+        """Return the most likely fault without further frames."""
 
 
 class Monitor(Protocol):
-    """What rules over the verdict of an instant, and may write another joint velocity (n,)."""
+    """Interface of a monitor, which may change the verdict and the joint velocity (n,)."""
 
     def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
-        """Return what becomes of the verdict."""
+        """Return the new verdict."""
 
 
 class Monitors(NamedTuple):

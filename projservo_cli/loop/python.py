@@ -22,7 +22,7 @@ from projservo_cli.task.face import Task
 if TYPE_CHECKING or not COMPILED:
 
     class _Bound(NamedTuple):
-        """What a law works on."""
+        """Scratch memory of a law."""
 
         law: Law
         state: State
@@ -31,17 +31,17 @@ else:
 
     @structref.register
     class _BoundType(types.StructRef):
-        """The compiler's type of what a law works on."""
+        """Compiler type of the scratch memory of a law."""
 
     class _Bound(structref.StructRefProxy):
-        """What a law works on, held by compiled code."""
+        """Scratch memory of a law, held by compiled code."""
 
     structref.define_proxy(_Bound, _BoundType, ("law", "state"))
 
 
 @allocating
 def _bind(law: Law, state: State) -> Any:
-    """What a law works on; changes of its arrays are seen, here and there."""
+    """Scratch memory of a law, whose arrays are shared."""
     return _Bound(law, state)
 
 
@@ -51,7 +51,7 @@ def _bound_command(bound: Any, s: FloatArray, q: FloatArray) -> int:
     return command(bound.law, s, q, bound.state)
 
 
-# What a law may have beside, and what holds where it has not: the share of the amplitude that its own
+# Optional attributes of a law and their defaults: the fraction of the amplitude that its own
 # joint-speed limit left, negative where the limit is up to the loop; what fitting a body left, and the image
 # error (px) of the face by which the run is judged; the joint at whose limit it ended a step, or −1; joints
 # (parts + 1, n) between the parts in which it wants a step sent.
@@ -65,7 +65,7 @@ OPTIONAL: dict[str, tuple[float, ...]] = {
 
 
 class LoopLaw(Protocol):
-    """What the Python loop asks of a law; it may also have those of ``OPTIONAL``."""
+    """Interface of a law for the Python loop; it may also have the attributes of ``OPTIONAL``."""
 
     errors: FloatArray
 
@@ -77,7 +77,7 @@ class LoopLaw(Protocol):
 
 
 class _LoopPlant(Monitored, Protocol):
-    """What the Python loop asks of a plant."""
+    """Interface of a plant for the Python loop."""
 
     q: FloatArray  # (n,) joints as they are, or as they were read
     H: FloatArray  # (4, 4) displacement of the face from the reference
@@ -159,7 +159,7 @@ def run_in_python(
 
     plant : any; it is stopped however the run ends.
     s_star : (2, m, 2) target pixels; period : control period, s; scale : factor of every command.
-    stall : of a robot that need not follow what it is sent; execution : of a plan that gives way to another.
+    stall : of a robot that may lag behind its set-points; execution : of a plan that another may replace.
     Returns verdict, steps, log: as of the compiled loop, to the bit for the built-in laws. Raises InputError
     if the law has an attribute that is a misspelt one of ``OPTIONAL``; WorkFailed if the plant or the law
     fails before the first instant is complete.
@@ -234,5 +234,5 @@ def _send(
 
 
 def _optional(law: LoopLaw, name: str) -> Any:
-    """What a law says of its last step beside the command."""
+    """Report of a law on its last step, in addition to the command."""
     return getattr(law, name, OPTIONAL[name])

@@ -2,8 +2,8 @@
 
 A path is searched again, from where the robot is, where
 
-- what is ahead would leave an image, by what both images are seen to be off their prediction;
-- the face was lost, waited for, and found again on the way back along the path;
+- the path ahead would leave an image, by the offset of both images from their prediction;
+- the face was lost, and seen again on the path backwards;
 - the law that ends the motion is stopped by a joint limit or a singularity, or comes no nearer: the joints
   that were taken for the goal are excluded from then on.
 """
@@ -31,7 +31,7 @@ from projservo_cli.loop.step import (
 from projservo_cli.records import FloatArray, Plan
 from projservo_cli.task.face import Task
 
-# The path ahead is looked at every so many periods, by the mean of what images were off in the last ones.
+# Periods between checks of the path ahead, by the mean offset of the images in the last ones.
 EVERY, LAST = 10, 5
 # What stops a law.
 STOPPED = {JOINT_LIMIT: "a joint limit", SINGULAR_VERDICT: "a singularity", DIVERGED: "growing errors"}
@@ -56,7 +56,7 @@ class ExecutionMonitor:
     law : that is driven, on a plan; follow : the task with a plan as the law is given it.
     replanner : of paths to the goal; searches : how often one may be searched again.
     limits : of the run.
-    stall : monitor of a robot that need not follow what it is sent; None for one that does.
+    stall : monitor of a robot that may lag behind its set-points; None for one that does not.
     ``attempts``: why a path was searched again each time, and when, in words.
     """
 
@@ -78,7 +78,7 @@ class ExecutionMonitor:
         self._alone = 0  # instants since the law is without a plan
 
     def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
-        """Return what becomes of the verdict of an instant; the way back is written to the velocity (n,)."""
+        """Return the new verdict; write the velocity (n,) of the path backwards."""
         if k == self.limits.max_steps or verdict == CONVERGED:
             return verdict
         if verdict == MARKERS_LOST or (verdict == WAITING and self._goes_back):
@@ -87,7 +87,7 @@ class ExecutionMonitor:
             return verdict
         if self._goes_back and verdict == RUNNING:
             self._goes_back = False
-            return self._replanned(log, k, verdict, "the face was lost, and seen again on the way back")
+            return self._replanned(log, k, verdict, "the face was lost, and seen again on the path backwards")
         path, clock = self.law.law.task.reference.q, float(self.law.state.clock[0])
         if clock < len(path) - 1:
             if verdict == DIVERGED and np.isfinite(q_dot).all():
@@ -108,17 +108,17 @@ class ExecutionMonitor:
         return verdict == RUNNING and self._alone > window and still
 
     def _on_the_way(self, log: Log, k: int, verdict: int, ahead: FloatArray) -> int:
-        """What becomes of a verdict with joints (s, n) ahead."""
+        """Return the new verdict with joints (s, n) ahead."""
         self._alone = 0
         if verdict in STOPPED:
-            return self._replanned(log, k, verdict, f"{STOPPED[verdict]} on the way")
+            return self._replanned(log, k, verdict, f"{STOPPED[verdict]} on the path")
         looks = verdict == RUNNING and k % EVERY == 0 and self.left > 0
         if looks and self._leaves_image(log, k, ahead):
-            return self._replanned(log, k, verdict, "what is ahead would leave an image")
+            return self._replanned(log, k, verdict, "the path ahead would leave an image")
         return verdict
 
     def _replanned(self, log: Log, k: int, verdict: int, why: str) -> int:
-        """Hold the robot and follow another way, if there is one; else the verdict stays."""
+        """Hold the robot and follow another path, if there is one; else keep the verdict."""
         if not self.left:
             return verdict
         self.left -= 1
@@ -147,7 +147,7 @@ class ExecutionMonitor:
         return RUNNING
 
     def _off(self, log: Log, k: int) -> FloatArray:
-        """What both images (2, 2) were off their prediction in the last instants, px; 0 where unseen."""
+        """Return the offset (2, 2) of both images from their prediction, px; 0 if unseen."""
         rows = slice(max(0, k + 1 - LAST), k + 1)
         predicted = np.array([self.replanner.predicted(q) for q in log.read[rows]])
         b = min(log.s.shape[2], predicted.shape[2])

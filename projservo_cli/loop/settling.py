@@ -1,7 +1,7 @@
 """Settling: whether a robot has arrived, or is stalled away from its goal, judged while it runs.
 
-A robot that need not follow what it is sent has arrived once it stands. Joints that lag or sag, and images
-that are late, show at the goal what they have not shown on the way.
+A robot that may lag behind its set-points has arrived once it stands. Joints that lag or sag, and images
+with latency, show their errors at the goal only.
 """
 
 import math
@@ -23,28 +23,28 @@ from projservo_cli.robots.client import DrivenRobot
 
 # Share of the tolerance that a robot which stands may still move.
 _SETTLED = 0.5
-# At the goal, which one noisy look may show too soon, the law goes on for so many periods; then the robot is
-# held until it stands. It is moved again where the error is beyond so many tolerances, or beyond one at so
-# many looks in a row.
+# At the goal, which one noisy frame may show too soon, the law goes on for these periods; then the robot is
+# held until it stands. It moves again if the error is beyond these tolerances, or beyond one in these
+# consecutive frames.
 _MORE, _GROWN, _LOOKS = 15, 3.0, 5
-# Progress is an image error that falls by this share below its least so far.
+# Progress is an image error that falls by this fraction below its minimum so far.
 _FALL = 0.01
-# Joints stand that move by less than so many deviations of their readings, or than this, rad or m; set-points
-# do by the latter.
+# Joints stand if they move by less than these deviations of their readings, or than this, rad or m; their
+# set-points do by the latter.
 _DEVIATIONS, _LEAST = 4.0, 3e-4
-# A joint does not follow that stays while its set-point moves by so many times its sag.
+# A joint does not follow if it stays while its set-point moves by this multiple of its sag.
 _STAYS = 2.0
 # Windows without progress after which a robot that moves to and fro is given up.
 _PATIENCE = 8
-# A window lasts so many times as long as images and servos are late.
+# A window lasts this multiple of the latency of images and servos.
 _TIMES_LATE = 4.0
 
 
 class StallMonitor:
-    """Monitor of a robot that need not follow what it is sent.
+    """Monitor of a robot that may lag behind its set-points.
 
-    robot : what is driven; limits : of the run.
-    ``reason``: what holds the robot, once that was found. ``minimum``: whether that is the law alone.
+    robot : the robot; limits : of the run.
+    ``reason``: cause of the stall, once found. ``minimum``: whether it is a local minimum of the law.
     """
 
     def __init__(self, robot: DrivenRobot, limits: Limits) -> None:
@@ -61,14 +61,14 @@ class StallMonitor:
         self.reason, self.minimum = "", False
 
     def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
-        """Return what becomes of the verdict of an instant; it is not asked while the arm is held."""
+        """Return the new verdict; it is not asked while the arm is held."""
         del q_dot
         steered, now = self._robot.steered, len(self._read)
         self._read.append(steered.reading.q)
         self._sent.append(steered.target)
         self._short.append(steered.set_point.short)
         error = float(log.judged[k])
-        # What the law has left, and what is still to come: the sag that is not yet learnt, too.
+        # Remaining error of the law, and the sag that is not yet learnt.
         left = error + self._robot.carried_px
         if left < (1.0 - _FALL) * self._best:
             self._best, self._since = left, now
@@ -97,7 +97,7 @@ class StallMonitor:
     def _stuck(self, now: int, verdict: int, near: bool) -> int:
         """Return ``NO_PROGRESS`` or ``FOLLOWING_ERROR`` if the robot makes no progress; else the verdict.
 
-        ``near``: whether it is so near the goal that what the law asks for may be lost in its joints.
+        ``near``: whether it is so near the goal that its joints may not resolve the command.
         """
         idle, window = now - self._since, self._window
         if idle < window:
@@ -115,7 +115,7 @@ class StallMonitor:
             most = self._robot.robot.bounds.told(int(np.argmax(sent)), float(sent.max()), 2)
             self.reason = (
                 f"set-points moved by no more than {most}: play in the joints, coarse set-points or coarse "
-                "readings hide what is left"
+                "readings hide the rest"
                 if near
                 else "the law asks for no motion there, a local minimum"
             )
@@ -136,7 +136,7 @@ class StallMonitor:
         )
 
     def _say_what_holds(self, moved: FloatArray, sent: FloatArray) -> None:
-        """What a robot that moves to and fro without coming nearer is held by."""
+        """Return the cause of a robot that oscillates without coming nearer."""
         i, told = int(np.argmax(sent / self._still)), self._robot.robot.bounds.told
         amounts = f"{told(i, sent[i], 3)}, its readings by {told(i, moved[i], 3)}"
         what = f"set-points of joint {i + 1} moved by {amounts}"

@@ -10,7 +10,7 @@ rules before and after it:
 5. ``diverged``: the image error or the distance of the face exceeds its first value by the factor,
    or the command is not finite.
 6. ``singular``: the joint motion of the law is not unique.
-7. ``no progress``, ``max steps``: no step is left; plateau where the error fell by less than 1 % in
+7. ``no progress``, ``max steps``: no step is left; no progress if the error fell by less than 1 % in
    the last window.
 8. ``joint limit``: a joint stands at its limit, the command would take it beyond, and ``joint_limits``
    is stop. A command that would pass a limit is shortened to end there.
@@ -65,15 +65,15 @@ class Limits(NamedTuple):
     max_steps: int  # most commands
     stop_at_joint_limit: bool
     stop_at_border: bool  # stop_at_joint_limit, stop_at_border: end the run, or only record
-    max_lost_periods: int = 0  # periods in a row that lost markers are waited for
+    max_lost_periods: int = 0  # maximum consecutive periods with lost markers
     noise_px: float = 0.0  # how much of ``image_error_px`` allows for noise
 
 
 class Log(NamedTuple):
-    """What a run records at each instant; one row more than commands."""
+    """Log of a run; one row more than commands."""
 
     q: FloatArray  # (k, n) true joints, rad or m
-    read: FloatArray  # (k, n) joint readings, which is what the law is given
+    read: FloatArray  # (k, n) joint readings, the input of the law
     H: FloatArray  # (k, 4, 4) true displacement of the face from the reference
     s: FloatArray  # (k, 2, m, 2) measured pixels of the face and, after them, of the pins
     hidden: FloatArray  # (k, 2) 1 where a view is self-occluded
@@ -165,13 +165,13 @@ def _outside(s: FloatArray, m: int, image_size: FloatArray) -> bool:
 
 
 class Instant(NamedTuple):
-    """What the verdict of an instant depends on beside its row of the log, before its command."""
+    """Inputs of a verdict in addition to a row of the log, before its command."""
 
     in_front: bool  # whether every face marker is in front of both cameras; the law is asked only then
     left: bool  # whether a face marker lies outside an image
     distance: float  # of the face from the rig, m
     status: int  # of the law
-    q_dot: FloatArray  # (n,) what it asks for, rad/s or m/s
+    q_dot: FloatArray  # (n,) the command, rad/s or m/s
 
 
 @merged
@@ -253,10 +253,10 @@ def plateau_stretch(errors: FloatArray, window: int) -> tuple[int, int] | None:
 
 
 class Command(NamedTuple):
-    """What a law asks for in a period."""
+    """Command of a law in a period."""
 
     q_dot: FloatArray  # (n,) joint velocity, rad/s or m/s; bounded in place
-    share: float  # what the law's own joint-speed limit left of the amplitude, negative if it keeps none
+    share: float  # fraction of the amplitude within the law's own joint-speed limit, negative without one
     blocked: int  # joint at whose limit the law ended its step, or −1
     period: float  # control period, s
     scale: float  # factor of every command

@@ -3,7 +3,7 @@
 The margins are those of ``planning.margins``. Of a tool with several tags visibility, width and image are
 those of the tag that keeps them best.
 
-Joints are valid where each margin is above what is asked for, and that is no more than a share of what start
+Joints are valid if each margin is above the required one, which is at most a fraction of those of start
 and goal have themselves, rising to its full value within ``RISE`` of them.
 """
 
@@ -33,7 +33,7 @@ from projservo_cli.planning.margins import (
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, JointLimits, Model, Spread
 from projservo_cli.task.face import Task, center_of, face_plane
 
-# Of what start and goal have themselves, so much is asked for there.
+# Required fraction of the margins of start and goal near them.
 SHARE = 0.5
 # Motion, s at the speed limits, from start or goal within which demands rise to their full value.
 RISE = 0.5
@@ -42,14 +42,14 @@ FINE_PX = 4.0
 FINE_STEP = 0.2
 # So many standard deviations a prediction may be off.
 DEVIATIONS = 3.0
-# No marker of the body is off by so many times as much as the face was at most.
+# Maximum error of a marker of the body, over the maximum error of the face.
 FAR_OFF = 5.0
-# Half the length, px, of the shortest pieces of a segment that are told apart at a region.
+# Half the length, px, of the shortest pieces of a segment that are checked at a region.
 PIECE = 0.5
 
 
 class Constraints(NamedTuple):
-    """What joints are held against, in the frame of the calibrated model."""
+    """Constraints of joints, in the frame of the calibrated model."""
 
     model: Model  # its cameras scaled so that markers in front have a positive third coordinate
     M: FloatArray  # (b, 4) markers of the body at the reference, those of the face first
@@ -57,13 +57,13 @@ class Constraints(NamedTuple):
     tags: IntArray  # (t, k) markers of the face, or of tags, of which one is to be in sight
     a: FloatArray  # (t, 4) their planes at the reference
     O: FloatArray  # (2, 4) optical centres, a·O = 1 of the face at the start
-    depth: FloatArray  # (2,) least third coordinate of a marker at the start
+    depth: FloatArray  # (2,) minimum third coordinate of a marker at the start
     limits: JointLimits  # of the joints
     image_size: FloatArray  # (2,) px; infinite where an image has no border
     keep: FloatArray  # (n,) distance from a limit that counts as margin one, rad or m
     full: FloatArray  # (10,) margins asked for
-    ends: FloatArray  # (k, n) start and goals, near which less is asked for
-    end_demands: FloatArray  # (k, 10) what is asked for there
+    ends: FloatArray  # (k, n) start and goals, near which constraints are relaxed
+    end_demands: FloatArray  # (k, 10) required margins there
     spread: Spread = NO_SPREAD
     keep_out: KeepOut = NO_KEEP_OUT
 
@@ -76,7 +76,7 @@ def constraints_of(
     demands: Demands,
     keep_out: KeepOut = NO_KEEP_OUT,
 ) -> Constraints:
-    """What joints are held against, of a task whose points (b, 4) are given at the start, face first.
+    """Return the constraints of a task whose points (b, 4) are given at the start, face first.
 
     Signs are those at the start: [RH00] section 4.2 carries them along.
     """
@@ -164,7 +164,7 @@ def _sight_into(c: Constraints, tag: int, back: Mat4, shown: bool, s: FloatArray
 
 @internal
 def _best_sight_into(c: Constraints, q: FloatArray, shown: bool, trial: "Trial") -> None:
-    """Write side, width and border of the tag whose least excess over what is asked for is largest."""
+    """Write side, width and border of the tag whose minimum excess over the required margin is largest."""
     best, back = -math.inf, backward(c.model, q)
     for tag in range(c.tags.shape[0]):
         _sight_into(c, tag, back, shown, trial.s, trial.sight)
@@ -212,7 +212,7 @@ def most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
 def clear_by(c: Constraints, H: Mat4, s: FloatArray) -> float:
     """Least distance, px, of the displaced body with images s (2, b, 2) from regions that are kept out of.
 
-    A point is clear where one camera sees it beside a region. Markers of a face that the obstacle may hide
+    A point is clear if one camera sees it outside a region. Markers of a face that the obstacle may hide
     are so in both images, and all markers in the only image in which a region is drawn.
     """
     keep, least = c.keep_out, math.inf
@@ -239,7 +239,7 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
     """Least distance, px, of a segment from a region of both images, as above; never too large.
 
     Pieces of it, of the segment in space and so the same in both images, are halved until their images are
-    short, or short beside the distance of their middles and on the same side of what is asked for: a distance
+    short, or short against the distance of their middles and on one side of the required margin: a distance
     changes by no more than the path.
     """
     least, done, step = math.inf, 0.0, 1.0
@@ -274,7 +274,7 @@ def combined(x: float, A: Vec4, B: Vec4) -> Vec4:
 
 @njit
 def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
-    """Write margins, what is asked of them, and images at joints (n,), rad or m."""
+    """Write margins, required margins, and images at joints (n,), rad or m."""
     margins, s = trial.margins, trial.s
     demands_into(c, q, trial.demands)
     _limits_into(c, q, margins)
@@ -282,7 +282,7 @@ def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
     shown = _images_into(c, H, s, margins)
     _best_sight_into(c, q, shown, trial)
     margins[CLEAR] = clear_by(c, H, s) if shown else -math.inf
-    # What a prediction is off, at most or, where that may tell, there.
+    # Error of a prediction: its maximum or, if that could decide, its value there.
     left = right = most = c.spread.most
     anywhere = FAR_OFF * most
     room = min(margins[IMAGE] - c.full[IMAGE], margins[IMAGE + 1] - c.full[IMAGE + 1])
@@ -297,7 +297,7 @@ def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
 
 @njit
 def margins_along_into(c: Constraints, q: FloatArray, trial: "Trial", found: FloatArray) -> None:
-    """Write margins and what is asked of them (2, k, 10) along joints (k, n)."""
+    """Write margins and required margins (2, k, 10) along joints (k, n)."""
     for i in range(q.shape[0]):
         margins_into(c, q[i], trial)
         row_into(found[0, i], trial.margins)
@@ -306,7 +306,7 @@ def margins_along_into(c: Constraints, q: FloatArray, trial: "Trial", found: Flo
 
 @njit
 def demands_into(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
-    """Write what is asked for (10,) at joints (n,): the full margins, or less near start and goals."""
+    """Write the required margins (10,) at joints (n,): the full ones, or less near start and goals."""
     for i in range(MARGINS):
         demands[i] = c.full[i]
     for e in range(c.ends.shape[0]):
@@ -371,7 +371,7 @@ def new_trial(n: int, b: int) -> Trial:
 
 @internal
 def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
-    """Whether joints keep all that is asked for; what fails is counted, the images are written."""
+    """Tell whether joints keep all margins; count failures, write the images."""
     margins_into(c, q, trial)
     for i in range(MARGINS):
         if not trial.margins[i] > trial.demands[i]:

@@ -2,7 +2,7 @@
 
 The points of the face are first brought to where they are at the goal, in the coordinates of the calibrated
 frame scaled to a_inf·A = 1, which is well behaved from everywhere; then its images, which have the last word.
-For an arm of more joints than the face has freedoms what is found is a sample of a continuum.
+For an arm of more joints than the face has freedoms the solutions are a sample of a continuum.
 """
 
 import math
@@ -39,22 +39,22 @@ NEAR, SETTLED = 1e-3, 1e-7
 STRIDE = 0.7
 # Noise that is allowed for where none is known, px.
 LEAST_SIGMA = 0.2
-# What a solution may leave of the images, px, as a multiple of the least.
+# Maximum residual of a solution, px, as a multiple of the minimum.
 MUCH = 2.0
 DISTINCT = math.radians(1.0)
-# A joint of a solution that deviates more than this, rad or m, is near a singularity: what the model reaches
+# A joint of a solution that deviates more than this, rad or m, is near a singularity: the reach of the model
 # there the robot may not. No solution is taken to be nearer to a limit than that by its deviation alone.
 DEFINITE = 0.05
 REDUNDANT = 0.01
-# Variance of joints that the images do not tell, rad² or m².
+# Variance of joints that the images do not determine, rad² or m².
 UNTOLD = 1e6
 # Rank, s, from which on goals are unsure.
 UNSURE = 1e3
 ROUND_OFF = 1e-9
-# Starts; the search for further goals ends early once so many times the starts until the last new one, and
+# Starts; the search for further goals ends early if this multiple of the starts until the last new one, and
 # ``AT_LEAST``, have found none.
 STARTS, PATIENCE, AT_LEAST = 400, 3, 40
-# So many whole turns to both sides of the nearest are goals of their own.
+# Whole turns to both sides of the nearest goal that are separate goals.
 TURNS = 2
 # Solutions of an arm of more joints than six.
 SAMPLED = 96
@@ -63,7 +63,7 @@ SHOWN, HIDDEN, BLOCKED = range(3)
 
 
 class GoalFeatures(NamedTuple):
-    """What the goal shows."""
+    """Images of the goal."""
 
     A_star: FloatArray  # (m, 4) face at the goal, a_inf·A = 1
     s_star: FloatArray  # (2, m, 2) its images as projective cameras see them, px
@@ -83,7 +83,7 @@ class Scratch(NamedTuple):
 
     H_hat: FloatArray  # (n, 4, 4) operators at the joints
     N: FloatArray  # (n, n + 1) normal equations, right-hand side in the last column
-    J: FloatArray  # (m, n + 1, 4) derivatives of points, or their images, by the joints; last what is left
+    J: FloatArray  # (m, n + 1, 4) derivatives of points, or their images, by the joints; last the residual
     L: FloatArray  # (n, n + 1) damped and solved
     q: FloatArray  # (n,) trial
 
@@ -137,7 +137,7 @@ def _damped_step_into(N: FloatArray, damping: float, L: FloatArray) -> bool:
 def _settled(
     c: Constraints, goal: GoalFeatures, images: bool, settled: float, q: FloatArray, scratch: Scratch
 ) -> float:
-    """Bring the joints to the least squares of points or images by damped Newton steps; what is left.
+    """Minimize squared errors of points or images by damped Newton steps; return the residual.
 
     K. Levenberg, Quarterly of Applied Mathematics 2, 1944; scaled as by D. Marquardt, SIAM Journal 11, 1963.
     """
@@ -180,10 +180,10 @@ def _seen(P: FloatArray, H: Mat4, M: FloatArray) -> Vec4:
 def _explained(
     c: Constraints, goal: GoalFeatures, q: FloatArray, scratch: Scratch, deviation: FloatArray
 ) -> float:
-    """Sum of squares, px², that noise and calibration explain of what is left at joints that show the goal.
+    """Return the sum of squared residuals, px², that noise and calibration explain at a goal configuration.
 
     Of each way in which the calibration may be off, what no motion of the joints makes up for. The motion
-    that makes up for the rest, and for noise, is what the joints may be off: its standard deviation (n,), rad
+    that makes up for the rest, and for noise, is the error of the joints: its standard deviation (n,), rad
     or m, is written; ``REDUNDANT`` of an arm of more joints than six, which can move them at will.
     """
     n = q.shape[0]
@@ -314,10 +314,10 @@ def _rank(
 def goals_of(
     c: Constraints, goal: GoalFeatures, start: FloatArray, known: FloatArray, starts: FloatArray
 ) -> tuple[FloatArray, FloatArray, tuple[int, int, int]]:
-    """Joints (g, n) that show the goal, and their rank (g,), the least first.
+    """Return goal configurations (g, n) and their rank (g,), the smallest first.
 
     Rank is the time from the start, s, or ``UNSURE`` and more. A solution that leaves much more than the best
-    is a local minimum beside it.
+    is a local minimum next to it.
 
     start : (n,) joints at the start; known : (l, n) joints at which the goal was shown.
     starts : (k, n) from which solutions are sought, those known first; overwritten.

@@ -1,7 +1,7 @@
 """Regions of both images that the body keeps out of: polygons that somebody drew around an obstacle.
 
 A point in space lies in front of, behind or in an obstacle where both cameras show it within the outline;
-where one camera sees it beside the outline, it is beside the obstacle. No metre is needed for that.
+if one camera sees it outside the outline, it is outside the obstacle. This needs no metric.
 """
 
 import math

@@ -1,15 +1,15 @@
 """Constraints of a planned motion, by name and in words, and the margins of a motion along shares or joints.
 
 Each margin is a number, positive where its constraint holds. Of joints (n,), as ``planning.constraints``
-writes them, less what a prediction may be off:
+writes them, less the error of a prediction:
 
-- joints: the least distance of a joint from its limits over the margin asked for;
-- front: the least third coordinate of P·M of a marker over that at the start: [RH00] section 4.2 carries
+- joints: the minimum distance of a joint from its limits over the required margin;
+- front: the minimum third coordinate of P·M of a marker over that at the start: [RH00] section 4.2 carries
   the sign, which nothing else fixes in projective space;
 - visibility: a·O of the face and a camera over its value at the start, carried by the dual motion H⁻ᵀ;
-- width: the least width of the image of the face, px, for an angle means nothing in projective space;
-- image: the least distance of a marker of the face from the border of an image, px;
-- clear: the least distance from a region that is kept out of, px: of all markers, and of all points between
+- width: the minimum width of the image of the face, px, for an angle means nothing in projective space;
+- image: the minimum distance of a marker of the face from the border of an image, px;
+- clear: the minimum distance from a keep-out region, px: of all markers, and of all points between
   those of the face.
 
 Of a motion of the face, the worse camera counts, and
@@ -20,7 +20,7 @@ Of a motion of the face, the worse camera counts, and
 - conditioning: reciprocal condition of the image Jacobian less ``conditioning``.
 
 No path betters the margins of its ends. A planner therefore counts in shares of them, one scale a
-constraint: the smallest share of an instant is 1 where nothing is nearer than at the worse of both
+constraint: the smallest ratio is 1 if no sample is nearer than the worse of both
 ends, and 0 where a constraint is about to fail.
 """
 
@@ -64,7 +64,7 @@ class Words(NamedTuple):
     name: str
     value: str
     stops: str  # names what stops a search
-    asked: str  # names what is asked of it
+    asked: str  # names its required value
 
 
 CONSTRAINTS = {
@@ -87,7 +87,7 @@ OF_MOTION = (VISIBILITY, IMAGE, JOINTS, CONDITIONING)
 
 
 def constraint_at(column: int) -> tuple[Words, int]:
-    """Return what a margin of joints is of, and of which view where each camera has its own."""
+    """Return the words of a margin, and its view if each camera has its own."""
     first = max(first for first in CONSTRAINTS if first <= column)
     return CONSTRAINTS[first], column - first
 
@@ -102,18 +102,18 @@ MOST_PARTS = 256
 
 
 class Demands(NamedTuple):
-    """What a planned motion must keep to."""
+    """Constraints of a planned motion."""
 
     limits: JointLimits  # of the joints
     image_size: FloatArray  # (2,) width and height of both images, px; infinite where an image has no border
-    border_px: float  # least distance of a marker from the border of an image, px
-    conditioning: float  # least reciprocal condition of the image Jacobian of the face
-    keep: FloatArray  # (n,) least distance from a joint limit, rad or m, along a path through joint space
-    min_face_px: float = 0.0  # least width of the face in an image along such a path, px
+    border_px: float  # minimum distance of a marker from the border of an image, px
+    conditioning: float  # minimum reciprocal condition number of the image Jacobian of the face
+    keep: FloatArray  # (n,) minimum distance from a joint limit, rad or m, along a path through joint space
+    min_face_px: float = 0.0  # minimum width of the face in an image along such a path, px
     # (t, 4) corners of tags, markers of the body in the order of their numbers, of which one is to be seen by
     # both cameras; none where the face is
     tags: IntArray = np.zeros((0, 4), np.int64)
-    units: tuple[str, ...] = ()  # of each joint, as it is told: deg, rad or m
+    units: tuple[str, ...] = ()  # of each joint in messages: deg, rad or m
 
 
 def limits_alone(limits: JointLimits) -> Demands:
@@ -131,7 +131,7 @@ class Reaching(NamedTuple):
     """A partitioned task as the planner sees it."""
 
     model: Model  # calibrated model; a_inf·M keeps its scale under all displacements
-    demands: Demands  # what the motion must keep to
+    demands: Demands  # constraints of the motion
     H_hat: FloatArray  # (3, 4, 4) operators t, r, p
     amplitudes: FloatArray  # (3,) τ in the unit of Ĥ_t, θ_r and θ_p in rad
     A: FloatArray  # (m, 4) face at the start
@@ -144,12 +144,12 @@ class Reaching(NamedTuple):
 
 
 class Along(NamedTuple):
-    """What is along a motion, at s instants."""
+    """Quantities along a motion, at s samples."""
 
     H_d: FloatArray  # (s, 4, 4) displacement of the face
     s: FloatArray  # (s, 2, m, 2) its images, px
     visibility: FloatArray  # (s, 2) margins a·O, 1 at the start
-    # (s, 2) least distance of a marker from the image border, px; ``BEHIND`` where none shows it
+    # (s, 2) minimum distance of a marker from the image border, px; ``BEHIND`` where none shows it
     distance: FloatArray
     q: FloatArray  # (s, n) joints, rad or m; NaN from where they cannot follow
     limit: FloatArray  # (s,) margins of the joint limits, NaN likewise
@@ -159,7 +159,7 @@ class Along(NamedTuple):
 
 
 def room_along(reaching: Reaching, count: int) -> Along:
-    """Room for what is along a motion, at so many instants."""
+    """Return empty arrays for a number of samples of a motion."""
     m, n = len(reaching.A), len(reaching.q_start)
     shapes = (4, 4), (2, m, 2), (2,), (2,), (n,), (), (), (4,)
     return Along(*(np.full((count, *shape), np.nan) for shape in shapes))
@@ -170,7 +170,7 @@ class Motion(NamedTuple):
 
     reaching: Reaching  # the task, in the senses of both rotations that were chosen
     mu: FloatArray  # (s, 3) shares; NaN of a path through joint space
-    along: Along  # what is along it
+    along: Along  # quantities along it
 
     def shares(self) -> FloatArray:
         """Each margin (s, 4) over that at the worse of both ends, or over 1 where that is not positive."""
@@ -239,7 +239,7 @@ def joint_margin(demands: Demands, q: FloatArray, i: int) -> float:
 
 @merged
 def limit_margin(demands: Demands, q: FloatArray) -> float:
-    """The least margin of the limits of joints q (n,)."""
+    """Return the minimum margin of the limits of joints q (n,)."""
     least = 1.0
     for i in range(q.shape[0]):
         least = min(least, joint_margin(demands, q, i))
@@ -250,7 +250,7 @@ _Ends = tuple[FloatArray, FloatArray]
 
 
 class Carrier(NamedTuple):
-    """What carries the joints along a path."""
+    """State that carries the joints along a path."""
 
     reaching: Reaching  # the task
     work: Work  # workspace of n joints and 4m rows
@@ -377,7 +377,7 @@ def along_shares(reaching: Reaching, mu: FloatArray, q: FloatArray | None = None
 
 
 def along_joints(reaching: Reaching, q: FloatArray) -> Motion:
-    """The motion of joints (s, n), displaced as the forward kinematics tell, [RH00] eq. (6)."""
+    """Return the motion of joints (s, n) by the forward kinematics, [RH00] eq. (6)."""
     found = room_along(reaching, len(q))
     found.q[:] = q
     _moved_into(carrier_of(reaching), found)
@@ -417,7 +417,7 @@ def tag_planes(tags: IntArray, body: FloatArray, m: int, a: FloatArray) -> Float
     """Oriented planes (t, 4) of tags (t, 4) of a body (b, 4), one on the face, its first m markers.
 
     All tags have their corners in the same sense, as seen from their front: planes through corners have the
-    sign that they have for the face, and a size that lets a·O of one be told beside that of another.
+    sign that they have for the face, and a scale that makes a·O of tags comparable.
 
     a : (4,) plane of the face.
     """

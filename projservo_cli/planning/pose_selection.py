@@ -18,7 +18,7 @@ from projservo_cli.records import (
 # Poses drawn to choose from, and to judge by; batches before giving up.
 _CANDIDATES, _TARGETS = 300, 150
 _BATCHES = 20
-# Markers that both views must see at a pose for it to tell the joints.
+# Markers that both views must see at a pose that determines the joints.
 _LEAST_SEEN = 3
 # Markers that suggestions are judged by, at most.
 _MOST_SHOWN = 25
@@ -50,12 +50,12 @@ def suggest(
 
     V-optimality, the mean variance over a region, taken greedily over random candidates: A. C.
     Atkinson, A. N. Donev, R. D. Tobias, "Optimum Experimental Designs, with SAS", 2007, chapter 10.
-    With Λ Λᵀ the covariance, C the derivative of what a pose would show and T that of the targets,
+    With Λ Λᵀ the covariance, C the derivative of the images of a pose and T that of the targets,
     both times Λ, the pose leaves tr T (I + Cᵀ C / σ²)⁻¹ Tᵀ. Markers count as seen where they are
     predicted within the image; of many markers some stand for all.
 
     calibration : with its covariance.
-    observation : what it was made from.
+    observation : the observations of the calibration.
     candidates : region of the poses to choose from.
     targets : region of the poses that are to be predicted well.
     count : poses to suggest.
@@ -84,7 +84,7 @@ def suggest(
         gain = np.trace(np.linalg.solve(inner, C @ gram @ np.swapaxes(C, 1, 2)), axis1=1, axis2=2)
         best = int(np.argmax(np.where(left, gain, -np.inf)))
         left[best] = False
-        # What is left of Λ after the pose: its product with the root of (I + Cᵀ C)⁻¹.
+        # Λ after the pose: its product with the root of (I + Cᵀ C)⁻¹.
         root = np.linalg.inv(np.linalg.cholesky(np.eye(C.shape[2]) + C[best].T @ C[best])).T
         C, gram = C @ root, root.T @ gram @ root
         after = float(np.trace(gram)) / coordinates
@@ -105,9 +105,9 @@ def suggest(
 def _shown(
     calibration: Calibration, region: Region, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Random poses (k, n) that show enough markers, and the derivative (k, 4 m, r) of what they show.
+    """Draw random poses (k, n) that show enough markers; with the derivative (k, 4 m, r) of their images.
 
-    Rows of what is not seen are zero.
+    Rows of unseen markers are zero.
     """
     scene = parameters_from(calibration)
     poses: list[FloatArray] = []
@@ -127,6 +127,6 @@ def _shown(
     if not poses:
         raise WorkFailed(
             f"no further pose to suggest: none within the joint ranges shows {_LEAST_SEEN} markers to both "
-            "cameras as far as the calibration can tell; make it better with single-joint trials first"
+            "cameras by this calibration; improve it with single-joint trials first"
         )
     return np.array(poses), np.array(rows)

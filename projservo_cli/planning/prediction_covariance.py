@@ -1,4 +1,4 @@
-"""Covariance of predictions among joints drawn at random: a few directions that a planner tells apart."""
+"""Covariance of predictions among joints drawn at random: a few principal directions for a planner."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ _BATCH = 1500  # poses drawn at once
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where poses may lie and markers be seen."""
+    """Domain of the poses and of the images."""
 
     low: FloatArray
     high: FloatArray  # low, high: (n,) joint readings between which candidates are drawn, rad or m
@@ -40,7 +40,7 @@ def drawn_poses(
 
 # Lower and upper limits of n joints, rad or m, and width and height of both images, px.
 _Bounds = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
-# Directions of the covariance that are told apart; joints at which they are looked for, and batches of them.
+# Number of principal directions; of joints at which they are computed, and batches of them.
 _DIRECTIONS, _LOOKED_AT, _MOST_BATCHES = 8, 150, 40
 
 
@@ -48,10 +48,10 @@ _DIRECTIONS, _LOOKED_AT, _MOST_BATCHES = 8, 150, 40
 def spread_of(
     calibration: Calibration, indices: tuple[int, ...], face: int, bounds: _Bounds, seed: int
 ) -> Spread:
-    """How far predictions err, of markers by their indices, those of the face first.
+    """Return the prediction errors of markers by their indices, those of the face first.
 
     The directions are those that move the images of the face most, among joints drawn at random that show it;
-    what they leave is taken to be the same everywhere. None without a covariance. It takes 20 ms, once
+    the rest is taken as constant. None without a covariance. It takes 20 ms, once
     for all tasks of a calibration.
     """
     if not calibration.has_covariance:

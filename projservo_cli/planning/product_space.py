@@ -1,6 +1,6 @@
 """A motion that keeps its distance from everything that must not happen: [RH00] section 4.3.
 
-The coupled constraint of the paper on μ_t and μ_r, for both cameras, beside the image borders, the
+The coupled constraint of the paper on μ_t and μ_r, for both cameras, with the image borders, the
 joint limits and the conditioning of the operators. Of all monotone paths from (0, 0, 0) to (1, 1, 1)
 on a lattice of shares μ_t, μ_r, μ_p the one whose smallest share of ``guidance.margins`` is largest is
 taken, among equals the quickest.
@@ -94,7 +94,7 @@ def plan_path(reaching: Reaching) -> Motion:
                 continue
             lattice = _in_view(reaching._replace(amplitudes=amplitudes), size)
             best = max(best, (lattice.worth, lattice.nodes.reaching, size), key=lambda found: found[0])
-            if lattice.worth > good:  # no joints make up for what is not in view
+            if lattice.worth > good:  # no joints can compensate a loss of view
                 lattice = _with_joints(lattice)
                 paths += [_quickest(lattice)] if lattice.worth > good else []
                 good = max(good, EQUALLY * lattice.worth)
@@ -139,7 +139,7 @@ class _Lattice(NamedTuple):
         return np.asarray(shares[:, slice(None) if self.follows else VIEWS].min(axis=1))
 
     def moved(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
-        """What takes time along a motion in the lattice (s, n), and its speeds (n,)."""
+        """Return the duration terms along a motion in the lattice (s, n), and its speeds (n,)."""
         speed = motion.reaching.demands.limits.speed
         if not self.follows:
             return motion.mu, np.ones(3)
@@ -211,7 +211,7 @@ def widest(shares: FloatArray) -> FloatArray:
 
 
 def shortest(free: BoolArray, q: FloatArray, speed: FloatArray) -> IntArray:
-    """Nodes (k,) of the monotone path through free ones that takes the least time, first to last.
+    """Nodes (k,) of the monotone path through free ones of minimum time, first to last.
 
     free : (size³,) whether a path may pass a node.
     q : (size³, n) joints at the nodes, rad or m.
@@ -249,7 +249,7 @@ def _widest_into(shares: FloatArray, size: int, value: FloatArray) -> None:
 def _shortest_into(
     free: BoolArray, q: FloatArray, speed: FloatArray, size: int, cost: FloatArray, came: IntArray
 ) -> None:
-    """Write the least time (size³,) up to each node, infinite where none leads there, and where from."""
+    """Write the minimum time (size³,) to each node, infinite if it is unreachable, and its predecessor."""
     for node in range(q.shape[0]):
         cost[node] = 0.0 if node == 0 else math.inf
         for step in range(1, 8):
@@ -272,7 +272,7 @@ def _displacements_into(reaching: Reaching, mu: FloatArray, found: Along) -> Non
 def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int, found: Along) -> None:
     """Write joints, limit and condition at those nodes (size³,) whose value is positive.
 
-    Each is continued from the best before it: the values become the least margin of both on the path there,
+    Each is continued from the best before it: the values become the minimum margin of both on the path there,
     zero where the joints cannot follow within both.
     """
     demands = carrier.reaching.demands

@@ -1,8 +1,8 @@
 """Path in joint space to a goal configuration: straight, or by RRT-Connect; or the reason for none.
 
-J. Kuffner, S. LaValle, "RRT-Connect: an efficient approach to single-query path planning", ICRA 2000. What is
-found is shortened, rounded and timed. Random numbers are those of a seed and drawn before the trees grow: a
-path is the same to the bit whoever searches beside.
+J. Kuffner, S. LaValle, "RRT-Connect: an efficient approach to single-query path planning", ICRA 2000. It is
+shortened, blended and timed. Random numbers are those of a seed and drawn before the trees grow: a
+path is the same to the bit on any number of processors.
 """
 
 import math
@@ -33,13 +33,13 @@ REACH = 0.8
 LEAST = 1e-9
 # Draws that the trees are given at a time.
 CHUNK = 250
-# Paths that are looked for by trees, and draws after which no further one is begun.
+# Number of paths of the search, and draws after which no further one begins.
 WAYS, FURTHER = 2, 300
 # A straight line that takes so much longer than to the nearest goal is held against what trees find.
 LONGER = 1.2
 SHORTENINGS = 60
 ROUND_OFF = 1e-9
-# Goals within so much of excluded joints, rad or m, are excluded too.
+# Goals within this distance of excluded joints, rad or m, are excluded too.
 NEARBY = 0.1
 
 
@@ -52,7 +52,7 @@ class Tree(NamedTuple):
 
 
 class SearchLimits(NamedTuple):
-    """How long is searched, and with which random numbers."""
+    """Limits and seed of a search."""
 
     max_samples: int = 20_000
     seed: int = 0
@@ -61,7 +61,7 @@ class SearchLimits(NamedTuple):
 
 
 class JointPath(NamedTuple):
-    """What a search came to."""
+    """Result of a search."""
 
     goals: FloatArray  # (g, n) joints that show the goal, nearest in time first
     n_goals: int  # how many there are, kept or not
@@ -86,7 +86,7 @@ def may_start(clearance: FloatArray) -> bool:
 def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
     """Constraints that ask of joints (k, n), and near them, for no more than a share of what those have.
 
-    What they show was seen there, so that a deviation of the prediction takes nothing from it.
+    Their images were measured, so that no deviation of a prediction reduces their margins.
     """
     demands = np.array([margins_at(c, q)[0] for q in ends])
     seen = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
@@ -274,7 +274,7 @@ def _extended(c: Constraints, tree: Tree, q: FloatArray, trial: Trial) -> tuple[
             there[i] = q[i] if share == 1.0 else here[i] + share * (q[i] - here[i])
         got = reached(c, here, there, trial)
         if got < 1.0:
-            # What was reached before a check failed is valid, but too near a border to grow from.
+            # The part before a failed check is valid, but too near a border to grow from.
             got *= 0.5
             if got * share * time <= 0.05:
                 return node, False
@@ -317,7 +317,7 @@ def _branch(tree: Tree, node: int) -> FloatArray:
 
 
 def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
-    """What is left of a path (k, n) when straight paths cut it short: first between drawn places on it."""
+    """Shorten a path (k, n) by straight segments, first between random places on it."""
     time = least_time(c.limits.speed, path)
     for ends in np.sort(rng.random((SHORTENINGS, 2)), axis=1):
         if len(path) <= 2:

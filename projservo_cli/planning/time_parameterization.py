@@ -76,9 +76,9 @@ def _parabola(corner: FloatArray, slopes: FloatArray, size: float, x: FloatArray
 
 
 def _rounding(c: Constraints, corner: FloatArray, slopes: FloatArray, size: float, trial: Trial) -> float:
-    """How far from a corner (n,), s, its largest valid rounding begins and ends: ``size`` at most.
+    """Return the distance from a waypoint (n,), s, of its largest valid blend: ``size`` at most.
 
-    The least that is tried leaves the corner by less than what lies between two checks.
+    The smallest blend leaves the waypoint by less than the distance of two checks.
     """
     x = np.linspace(0.0, 1.0, CHORDS + 1)[:, None]
     for _ in range(HALVINGS):

@@ -1,1 +1,1 @@
-"""What a run says: figures, claims, the page, the 3D view and the animation."""
+"""Report of a run: figures, claims, the page, the 3D view and the animation."""

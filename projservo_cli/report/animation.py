@@ -34,7 +34,7 @@ _LOWER = 0.15  # that it looks below the middle, where the names of the axes are
 _PAD = 0.03  # around all that is shown, as a share of it
 FRAME_MS, LAST_MS = 80, 2000  # what each frame of view and animation lasts, and the last of the animation
 _TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
-# What is wider than high needs more distance where the page is narrow.
+# A scene that is wider than high needs more distance on a narrow page.
 _NEARER = """
 const plot = document.getElementById("{plot_id}");
 const far = Math.min(3, Math.max(1, 1050 / plot.clientWidth));
@@ -71,7 +71,7 @@ class _Driven(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """What stands still in the view, in m in the frame of the robot's base, and the runs by name."""
+    """Static parts of the view, in m in the base frame, and the runs by name."""
 
     cameras: FloatArray  # (2, 5, 3) optical centre and image corners of both viewing pyramids
     start: FloatArray  # (m, 3) corners of the face
@@ -86,7 +86,7 @@ class _Motion(NamedTuple):
 def motion_of(
     robot: Arm, plant: Plant, markers: FloatArray, plan: Plan, traces: Mapping[str, Trace]
 ) -> _Motion:
-    """What the view shows of runs with a step at least; ``markers`` (p, 4) at the robot's reference, m."""
+    """Return the view of runs with at least one step; ``markers`` (p, 4) at the robot's reference, m."""
     face = plant.M[plant.order]
     start = (face @ forward_kinematics(plant.model, plan.q_start).T)[:, :3]
     goals = [trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all()]
@@ -101,7 +101,7 @@ def motion_of(
 def _instants(q: FloatArray) -> IntArray:
     """At most ``MOST_INSTANTS`` instants of the joints q (t, n), the first and the last among them.
 
-    They are spread half over the time, half over the way of the joints: no end of a run is passed over.
+    They are spread half over the time, half over the path of the joints: no end of a run is skipped.
     """
     if len(q) <= MOST_INSTANTS:
         return np.arange(len(q))
@@ -139,7 +139,7 @@ def plotly() -> Any:
 
 
 def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
-    """Write the view of a run of a name beside its report; ``known`` says where the picture comes from."""
+    """Write the view of a run next to its report; ``known`` names the source of the picture."""
     scene = _figure(motion).to_html(
         full_html=False,
         include_plotlyjs=True,
@@ -197,7 +197,7 @@ def _figure(motion: _Motion) -> Any:
 
 
 def _scene(motion: _Motion, reach: Mapping[str, list[float]]) -> dict[str, Any]:
-    """Axes of equal scales, seen from beside the way from the face to the cameras."""
+    """Axes of equal scales, seen from the side of the line from the face to the cameras."""
     axis = {"gridcolor": style.PALE, "showbackground": False}
     towards = motion.cameras[:, 0].mean(axis=0) - motion.start.mean(axis=0)
     azimuth = float(np.arctan2(towards[1], towards[0])) - np.radians(58.0)
@@ -221,7 +221,7 @@ def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
 
 
 def _slider(run: _Driven, own: list[str]) -> dict[str, Any]:
-    """A step for each instant; what it is labelled with stands above the slider."""
+    """A step for each instant; its label stands above the slider."""
     steps = []
     for frame, seconds, hidden in zip(own, run.seconds, run.hidden, strict=True):
         views = " and ".join(name for name, behind in zip(VIEWS, hidden, strict=True) if behind)
@@ -285,7 +285,7 @@ SEEN, HIDDEN = style.GREEN, style.ORANGE
 _PATH: style.Look = {"color": SEEN, "linewidth": 0.9}
 _BEHIND: style.Look = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
 _PANEL, _LEAST_WIDTH = 2.3, 4.0  # inches across one panel, and across the legend
-_COLORS, _NEAR_WHITE = 128, 240  # beside greys, which frames need
+_COLORS, _NEAR_WHITE = 128, 240  # in addition to greys, which frames need
 _FILM_WIDTH = 320  # px, of which a panel shows most
 
 
@@ -296,7 +296,7 @@ def write_animation(
     size: Sequence[float] | None,
     progress: Callable[[str, int, int], None],
 ) -> None:
-    """Write the animation of runs that moved as GIF: the first direct law beside the classical ones.
+    """Write the animation of runs as GIF: the first direct law and the classical ones side by side.
 
     ``order`` are the markers around the face, ``size`` is that of the images in px; where it is not known,
     the animation shows what reaches around all that was seen. Where the runs have frames, these are shown.
@@ -377,7 +377,7 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
 
 
 class _Panel:
-    """What moves in the image of one camera under one law: paths (t, m, 2) and a face, hidden (t,) or not."""
+    """Moving parts of one image under one law: paths (t, m, 2) and a face, hidden (t,) or not."""
 
     def __init__(self, axes: Any, s: FloatArray, hidden: BoolArray) -> None:
         self.axes, self.s, self.hidden = axes, s, hidden

@@ -1,4 +1,4 @@
-"""What the paper claims about its method and what the runs say; no verdict is fixed beforehand."""
+"""Claims of the paper about its method against the runs; no verdict is fixed beforehand."""
 
 import math
 from collections.abc import Iterator
@@ -146,7 +146,7 @@ def _scale(material: Material, trace: Trace) -> Iterator[_Claim]:
 
 
 def _image_error(trace: Trace, factor: float) -> Iterator[_Claim]:
-    """Whether image errors decay by a factor a step, and whether they rise above the least before."""
+    """Tell whether image errors decay by a factor per step, and whether they rise above their minimum."""
     e = trace.s - trace.s_star
     decay = factor ** np.arange(len(e))
     off = float(np.abs(e - e[0] * decay[:, None, None, None]).max())
@@ -347,14 +347,14 @@ def _planned(material: Material) -> _Claim:
     return _Claim(
         "The planned trajectory avoids self-occlusion",
         "sections 4.3 and 6, Figs. 5 and 6",
-        f"least margin {plan.margin.min():.3f} of the start's; ends {miss:.2g} px from the goal images",
+        f"minimum margin {plan.margin.min():.3f} (1 at the start); ends {miss:.2g} px from the goal images",
         "margin positive in both cameras all along",
         bool(plan.margin.min() > 0),
     )
 
 
 def _direct(material: Material) -> Iterator[_Claim]:
-    """Claims of sections 4.2 and 6 about what the cameras see under direct control."""
+    """Yield the claims of sections 4.2 and 6 about visibility under direct control."""
     traces = {law: material.traces[law] for law in DIRECT if law in material.traces}
     if traces:
         counts = [

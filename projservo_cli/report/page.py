@@ -75,7 +75,7 @@ def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> Iterator
         )
     yield _worst_joint(found)
     for name, what, one, many in (
-        ("outliers", "reading", "left out as an outlier", "left out as outliers"),
+        ("outliers", "reading", "rejected as an outlier", "rejected as outliers"),
         ("suspect_joint_readings", "joint reading", "contradicts the images", "contradict the images"),
         ("id_switches", "marker", "was renumbered", "were renumbered"),
     ):
@@ -167,23 +167,23 @@ def _drawing(path: Path, kind: str, alt: str) -> Markup | None:
     return Markup('<img src="data:{};base64,{}" alt="{}">').format(_TYPES[kind], data, alt)
 
 
-# What may lie beside the page, and what the page calls it.
+# Files next to the page, and their labels.
 _EXTRAS = {VIEW_FILE: "3D view with a time slider", ANIMATION_FILE: "animation of both camera images (GIF)"}
-# What made a run: key in the provenance, and what the page calls it.
+# Key in the provenance, and its label on the page.
 _MADE = {"date": "date", "argv": "command", "projservo": "projservo", "git_commit": "commit"}
 _MADE |= {"host": "host", "system": "system", "cpu": "processor"}
 _VERSIONS = ("python", "numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
 
 
 class _View(NamedTuple):
-    """One run as the page shows it; what it lacks is empty or None."""
+    """One run on the page; missing parts are empty or None."""
 
     name: str
     folder: str  # that of the run, relative to the page
     configuration: str
     made: list[tuple[str, str]]  # property and value of what made it
-    extras: list[tuple[str, str]]  # label and path of what lies beside the page
-    calibration: dict[str, Any] | None  # the stages by their plain values, and what only the page tells
+    extras: list[tuple[str, str]]  # label and path of files next to the page
+    calibration: dict[str, Any] | None  # the stages by their plain values, and values for the page alone
     plan: dict[str, Any] | None
     laws: list[dict[str, Any]]
     reported: bool
@@ -194,7 +194,7 @@ class _View(NamedTuple):
 
 
 def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> _View:
-    """What the page shows of a run in a ``folder``; ``prefix`` sets its names off from those of others."""
+    """Return the page's data of a run in a ``folder``; ``prefix`` precedes its names."""
     beside = run.path.parent
     stages = {name.split("/")[0] for name in run.results}
     found = {stage: stage_object(stage, run, about.joints, list(run.traces)) for stage in stages}
@@ -220,7 +220,7 @@ def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> _Vie
 
 
 def _made(run: Run, about: About) -> Iterator[tuple[str, str]]:
-    """What was run, from what and with what; a value that stages differ in stands with its stages."""
+    """Return the provenance of a run; a value that stages differ in stands with its stages."""
     yield "configuration", f"{about.name}, {'recorded' if about.recorded else 'simulated'}"
     yield "seed", str(about.seed)
     inputs = {key: text for result in run.results.values() for key, text in result.inputs.items()}
@@ -280,7 +280,7 @@ def _calibration(found: dict[str, Any], about: About) -> dict[str, Any]:
 
 
 def _joints_and_time(found: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
-    """How far joint readings are off and images late, where that was asked: label, number, unit."""
+    """Yield the joint noise and the time offsets, if estimated: label, number, unit."""
     if found["sigma_q"] is not None:
         yield "joint readings off by, rms", np.degrees(found["sigma_q"]), "°"
     if found["time_offset_s"] is not None:
@@ -292,7 +292,7 @@ def _joints_and_time(found: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
 
 
 def _visibility(plan: Plan) -> dict[str, Any]:
-    """Where each camera sees the face least, and where that changes; both senses of the rotation."""
+    """Return the minimum visibility of each camera and its changes; both senses of the rotation."""
     views = []
     for v, name in enumerate(VIEWS):
         least = int(np.argmin(plan.margin[:, v]))
@@ -343,7 +343,7 @@ def _leaves(path: str, value: Any) -> Iterator[tuple[str, str]]:
 
 
 def _side_by_side(columns: Iterable[Iterable[Any]], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
-    """What several runs have, by a key: an entry for each run, None where it has none."""
+    """Return the entries of several runs by a key: one for each run, None if it has none."""
     columns = list(columns)
     rows: dict[Any, list[Any]] = {}
     for k, column in enumerate(columns):

@@ -1,6 +1,6 @@
-"""What a run holds, for those who tell of it: plain values of each stage, and what figures show.
+"""Data of a report: plain values of each stage, and the inputs of figures.
 
-Words, JSON and the page are told from the plain values; figures and claims are made from records of the
+Terminal output, JSON and the page use the plain values; figures and claims are made from records of the
 run, the truth behind it, and numbers read off both.
 """
 
@@ -61,7 +61,7 @@ def title(name: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Studies:
-    """Closed-loop runs beside those of the run file, all without noise.
+    """Closed-loop runs that are not in the run file, all without noise.
 
     Operators are ``true`` (metric), ``twin`` (the same in a projective frame) or ``calibrated``.
     """
@@ -77,10 +77,10 @@ class Studies:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What the figures of a calibration show; a recorded run may hold no more."""
+    """Data of the figures of a calibration; a recorded run may have no more."""
 
     calibration: Calibration  # the calibration
-    observation: Observation  # what it was made from
+    observation: Observation  # of the calibration
     held_out: CrossValidation | None = field(default=None, kw_only=True)  # its cross-validation, if any
 
 
@@ -104,11 +104,11 @@ class Material(Fit):
     traces: Mapping[str, Trace] = field(default_factory=dict)  # runs of the laws by name
     studies: Studies | None = None  # extra runs; None where they could not be made
     no_studies: str = ""  # why not
-    trajectory: Trajectory = field(kw_only=True)  # what the plan was asked for
+    trajectory: Trajectory = field(kw_only=True)  # requested motion of the plan
     stall_periods: int = 20  # steps in which the error of a run that stands still falls by less than 1 %
 
     def compared(self) -> list[str]:
-        """Names of the runs of laws that follow the plan, each after that in which the law plans anew."""
+        """Names of the runs of laws that follow the plan, each after that in which the law regulates."""
         modes = {name: law_and_mode(name) for name, trace in self.traces.items() if trace.steps > 0}
         laws = [law for law, mode in modes.values() if mode != REGULATE]
         return [name for name, (law, _) in modes.items() if law in laws]
@@ -147,10 +147,10 @@ class Material(Fit):
 
 @dataclass(frozen=True)
 class _FigureSpec:
-    """One figure, and what it needs."""
+    """One figure and its requirements."""
 
     name: str  # of its files
-    title: str  # what it shows, in a phrase
+    title: str  # title, in a phrase
     paper: str  # the figure of the paper it follows, and its section
     data: Callable[[Any], Data]  # from a ``Material``; from a ``Fit`` where it needs no task
     draw: Callable[[Data, "Figure"], None]
@@ -162,11 +162,11 @@ class _FigureSpec:
     shares: bool = False  # whether it shows shares of translation and rotations
     modes: bool = False  # whether it compares runs that follow the plan with others
     goal: bool = False  # whether it needs a known goal pose
-    frames: bool = False  # whether it shows frames; where no robot has any, nothing is left out
-    task: bool = True  # whether it needs a task; without, a calibration and what it was made from will do
+    frames: bool = False  # whether it shows frames; it is not omitted if no robot has any
+    task: bool = True  # whether it needs a task; else a calibration with its observations is enough
 
     def lacking(self, material: Fit) -> str:
-        """Why the figure cannot be drawn; empty where it can."""
+        """Return the reason why the figure cannot be drawn; empty if it can."""
         if not self.task:
             return ""
         if self.frames and isinstance(material, Driven | Material):
@@ -183,7 +183,7 @@ class _FigureSpec:
         if self.studies and material.studies is None:
             return f"the extra runs could not be made: {material.no_studies}"
         if self.shares and np.isnan(material.plan.mu).all():
-            return "a way through joint space has no shares of translation and rotations: see figure 16"
+            return "a joint-space path has no fractions of translation and rotations: see figure 16"
         if self.modes and not material.compared():
             return (
                 "no run follows the plan: set control.mode, such as [regulate, track], and run servo report"
@@ -193,7 +193,7 @@ class _FigureSpec:
         return ""
 
     def partly(self, material: Fit) -> str:
-        """What a figure that can be drawn is without; empty where it is whole."""
+        """Return the missing part of a figure that can be drawn; empty if it is complete."""
         missing = self._without_run(material) if isinstance(material, Material) else []
         return f"without {', '.join(missing)}: no run of it with a step to show" if missing else ""
 
@@ -208,7 +208,7 @@ _Draw = Callable[[Data, "Figure"], None]
 def registered(
     name: str, title: str, paper: str, data: Callable[[Any], Data], **needs: Any
 ) -> Callable[[_Draw], _Draw]:
-    """Decorator that registers what a function draws as a figure; arguments are those of ``_FigureSpec``."""
+    """Decorator that registers a drawing function as a figure; arguments are those of ``_FigureSpec``."""
 
     def register(draw: _Draw) -> _Draw:
         REGISTER[name] = _FigureSpec(name, title, paper, data, draw, **needs)
@@ -258,7 +258,7 @@ def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequen
 
 
 def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str]) -> dict[str, Any]:
-    """The JSON object of a stage that could not be made, or lacks what it needs."""
+    """Return the JSON object of a stage that failed, or lacks its inputs."""
     found: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
     if stage == "calibrate":
         lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *LISTS)}

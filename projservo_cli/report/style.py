@@ -47,7 +47,7 @@ _RC: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 8.0,
     "axes.titlesize": 8.5,
-    "axes.titley": 1.0,  # fixed; looking for what is in its way takes a fifth of the arrangement
+    "axes.titley": 1.0,  # fixed; its automatic placement takes a fifth of the layout
     "axes.labelsize": 8.0,
     "xtick.labelsize": 8.0,
     "ytick.labelsize": 8.0,
@@ -87,7 +87,7 @@ def styled() -> Iterator[None]:
         yield
 
 
-HALF_LABEL = 0.16  # in, half of what a pixel of four digits takes below an axis
+HALF_LABEL = 0.16  # in, half the width of a label of four digits
 
 
 def drawn(draw: Callable[[Any, "Figure"], None], data: Any, height: float, width: float = WIDTH) -> "Figure":
@@ -191,7 +191,7 @@ def image_axes(axes: "Axes", title: str, pixels: FloatArray, margin: float = 0.0
 
 
 def aspect(pixels: FloatArray, least: float = 0.3, most: float = 1.1) -> float:
-    """Height over width of what a panel shows of pixels (…, 2), within bounds fit for print."""
+    """Return height over width of the pixels (…, 2) of a panel, within bounds for print."""
     points = pixels.reshape(-1, 2)
     size = np.ptp(points[np.isfinite(points).all(axis=1)], axis=0)
     return float(np.clip(size[1] / max(size[0], 1.0), least, most))
@@ -237,10 +237,10 @@ def face(axes: "Axes", corners: FloatArray, look: Look, *, fill: bool = False) -
 
 
 def paths(axes: "Axes", points: FloatArray, look: Look) -> None:
-    """Draw the ways (k, m, 2) of m points; NaN is a gap."""
+    """Draw the paths (k, m, 2) of m points; NaN is a gap."""
     axes.plot(points[..., 0], points[..., 1], **look)
 
 
 def hidden_paths(axes: "Axes", points: FloatArray, hidden: BoolArray, look: Look) -> None:
-    """Mark those stretches of the ways (k, m, 2) of m points at whose instants (k,) they are hidden."""
+    """Mark those stretches of the paths (k, m, 2) of m points at whose instants (k,) they are hidden."""
     paths(axes, np.where(hidden[:, None, None], points, np.nan), {"solid_capstyle": "butt"} | look)

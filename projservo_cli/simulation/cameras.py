@@ -15,7 +15,7 @@ _STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
 class Frames:
     """Both cameras of a scene, which a thread opens, looks with and closes.
 
-    ``rendered``: what they see. ``last``: (2, height, width) the last frames of both, as they were searched.
+    ``rendered``: their scene. ``last``: (2, height, width) the last frames of both.
     """
 
     borders = True
@@ -80,13 +80,13 @@ class Frames:
         return pixels, sigma
 
     def _drawn(self, view: int, q: FloatArray) -> ByteArray:
-        """Grey values (height, width) of what a camera sees at joints (n,), without blur and noise."""
+        """Return the grey values (height, width) of a camera at joints (n,), without blur and noise."""
         mj = mujoco()
         self._data.qpos[self.rendered.places] = q
         mj.mj_kinematics(self._model, self._data)
         mj.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, CAMERAS[view], self._shown)
-        # Tags, what holds them and light have no colour: green alone stands for grey.
+        # Tags, their holder and light have no colour: green alone stands for grey.
         fine, cv = np.ascontiguousarray(self._renderer.render()[..., 1]), self._finder.cv
         if self._maps is not None:
             fine = cv.remap(fine, *self._maps[view], cv.INTER_LANCZOS4)
@@ -100,7 +100,7 @@ class Frames:
             self._model.geom_pos[list(plate)] += self.rendered.tool @ moved[1]
 
     def _mapped(self, P: FloatArray) -> list[tuple[FloatArray, FloatArray]] | None:
-        """Where each finer pixel of a frame is in what is drawn, u and v of each view, in finer pixels."""
+        """Return the places of finer pixels of a frame in the drawing, u and v of each view."""
         width, height = FINER * self._scene.size[0], FINER * self._scene.size[1]
         offset = 0.5 * (FINER - 1)  # centres of pixels have whole coordinates
         u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))

@@ -32,15 +32,15 @@ _CLOCKS_S = 100.0  # how far clocks of cameras are off at most
 
 
 class Faults(NamedTuple):
-    """What is wrong with a simulated robot all the time, what a calibration has to reckon with too."""
+    """Permanent faults of a simulated robot, which a calibration has to model too."""
 
     camera_latency_s: tuple[float, float] = (
         0.0,
         0.0,
-    )  # from the middle of an exposure to the readings beside its image
+    )  # from the middle of an exposure to the readings that arrive with its image
     exposure_s: float = 0.0  # over which an image is averaged
     jitter_s: float = 0.0  # standard deviation of when single images are taken
-    frame_rate_hz: float | None = None  # of cameras that run freely; None for an image taken at each look
+    frame_rate_hz: float | None = None  # of cameras that run freely; None for an image per reading
     frame_offset_s: float = 0.0  # by which the right camera's images come after the left one's
     stamps: bool = False  # whether images carry the middle of their exposure
     encoder_counts_per_turn: int | None = None  # steps of joint readings in a turn
@@ -92,7 +92,7 @@ class MarkerMoved(NamedTuple):
 
 
 class Events(NamedTuple):
-    """What befalls a simulated robot and its images in a run."""
+    """Events of a simulated robot and its images in a run."""
 
     lost_markers: LostMarkers | None = None
     joint_moved: JointMoved | None = None
@@ -102,7 +102,7 @@ class Events(NamedTuple):
 
 
 class SimulatedRobot(NamedTuple):
-    """A simulated robot that takes time for what it does."""
+    """A simulated robot with time and faults."""
 
     truth: Truth
     faults: Faults
@@ -121,12 +121,12 @@ class _Eyes(Protocol):
         """Make ready to look, in the thread that looks."""
 
     def close(self) -> None:
-        """Let go of what was made ready."""
+        """Release the cameras."""
 
     def look(
         self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Pixels (m, 2) in a frame of a view, NaN where unseen, and their deviations (m,), px, if told.
+        """Pixels (m, 2) in a frame of a view, NaN where unseen, and their deviations (m,), px, if known.
 
         q : (k, n) joints at instants of its exposure, rad or m.
         moved : number of a marker that was moved, and by how much in the frame of the tool, (3,) m.
@@ -162,7 +162,7 @@ class Points(NamedTuple):
 
 
 class _Servos(Protocol):
-    """What moves the joints.
+    """Servos of the joints.
 
     ``setpoint``: (n,) where they are sent, rad or m.
     """
@@ -171,7 +171,7 @@ class _Servos(Protocol):
 
     @property
     def motor(self) -> FloatArray:
-        """Where the encoders are (n,), rad or m."""
+        """Return the positions of the encoders (n,), rad or m."""
 
     def follow(self, setpoint: FloatArray, seconds: float) -> None:
         """Let so much time pass, s, while the set-point goes evenly to joints (n,), rad or m."""
@@ -181,7 +181,7 @@ class _Servos(Protocol):
 
 
 class World(NamedTuple):
-    """A simulated robot and its rig while nothing is wrong."""
+    """A simulated robot and its rig without faults."""
 
     truth: Truth
     q_start: FloatArray  # (n,) first readings, rad or m
@@ -204,7 +204,7 @@ def _random(*key: int) -> np.random.Generator:
 def robot_by_itself(
     robot: SimulatedRobot, q_start: FloatArray, sigma_px: float, drawn: tuple[int, int]
 ) -> "FaultyRobot":
-    """The simulated robot at joints (n,), rad or m, that nothing befalls and whose images have borders.
+    """Return the simulated robot at joints (n,), rad or m, without events, whose images have borders.
 
     drawn : seed, and stream of its random numbers.
     """
@@ -261,8 +261,8 @@ def _looked(
 class FaultyRobot:
     """A simulated robot of the contract.
 
-    world : the robot and its rig; faults : what is wrong with it; events : what befalls it.
-    ``taken``: (2,) when both frames of the last look were taken, s, which no robot knows.
+    world : the robot and its rig; faults : permanent ones; events : those of the run.
+    ``taken``: (2,) true exposure times of the last frames, s, which no robot knows.
     ``frames``: (2, height, width) the last frames of rendered cameras; None of others.
     """
 
@@ -324,7 +324,7 @@ class FaultyRobot:
 
 
 def full_reach(arm: Arm) -> float:
-    """Longest lever that a joint has to the tool, m: the most found in postures drawn within the limits."""
+    """Return the longest lever of a joint to the tool, m: the maximum over random postures."""
     rng = np.random.default_rng(0)
     low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
     postures = rng.uniform(low, high, (_POSTURES, len(low)))
@@ -355,7 +355,7 @@ def _step(time: float, period: float) -> int:
 
 
 class _FirstOrder:
-    """Servos that follow with a lag of first order, less what the load of the tool costs them."""
+    """Servos that follow with a lag of first order, with sag under the load of the tool."""
 
     def __init__(
         self, load: Callable[[FloatArray], FloatArray], q: FloatArray, lag_s: float, sag: float
@@ -461,11 +461,11 @@ class _Frame(NamedTuple):
     middle: float  # of its exposure, s
     stamp: float  # the same by the clock of the camera
     pixels: FloatArray  # (m, 2), NaN where unseen
-    sigma: FloatArray | None  # (m,) their deviations, px, if they are told
+    sigma: FloatArray | None  # (m,) their deviations, px, if they are known
 
 
 class _Camera:
-    """One of both cameras, which runs freely or takes a frame at each look."""
+    """One of both cameras, which runs freely or takes a frame per reading."""
 
     def __init__(self, joints: _Joints, world: World, faults: Faults, events: Events, view: int) -> None:
         self._joints, self._world, self._faults, self._events = joints, world, faults, events
@@ -522,6 +522,6 @@ class _Camera:
 
 
 def hindrance_of(robot: object) -> str:
-    """What keeps an arm from where it is sent, where its simulation tells; else empty."""
+    """Return the obstruction of an arm, if its simulation knows one; else empty."""
     servos = robot.world.servos if isinstance(robot, FaultyRobot) else None
     return servos.hindrance if isinstance(servos, Physics) else ""

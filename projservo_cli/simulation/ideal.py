@@ -26,7 +26,7 @@ NO_PINS = np.zeros((0, 4))
 
 
 class Ends(NamedTuple):
-    """Where the true robot holds the tool."""
+    """True poses of the tool."""
 
     base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
     goal_pose: FloatArray  # (4, 4) pose at the goal, m; NaN where it is not known

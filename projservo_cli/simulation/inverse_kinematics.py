@@ -14,7 +14,7 @@ def inverse_kinematics(robot: Arm, goal: FloatArray, q_start: FloatArray) -> Flo
     """Joints within the limits that put the tool at a pose, as near to the start as found.
 
     Damped Newton steps on the pose from the start and from 30 seeded places within the limits; the
-    solution with the least joint motion wins. goal : (4, 4) pose of the tool, m; q_start : (n,) rad or m.
+    solution with the minimum joint motion wins. goal : (4, 4) pose of the tool, m; q_start : (n,) rad or m.
     """
     rng = np.random.default_rng(0)
     span_lower = np.maximum(robot.limits.lower, q_start - 2 * math.pi)
@@ -48,7 +48,7 @@ def _newton(robot: Arm, goal: FloatArray, q: FloatArray) -> FloatArray | None:
         tip = H_hat @ pose[:, 3]
         J = np.stack([H_hat[:, 2, 1], H_hat[:, 0, 2], H_hat[:, 1, 0], *tip.T[:3]])
         damping = 1e-9 * float(error @ error)
-        if len(q) > len(error):  # of least norm
+        if len(q) > len(error):  # of minimum norm
             step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(len(error)), error)
         else:
             step = np.linalg.solve(J.T @ J + damping * np.eye(len(q)), J.T @ error)

@@ -34,7 +34,7 @@ def mujoco() -> Any:
 
 
 def no_gl(error: BaseException) -> str:
-    """What to install where nothing can be drawn."""
+    """Return the packages to install if rendering fails."""
     told = " ".join(str(error).split())
     return (
         "MuJoCo finds no OpenGL to draw with: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri, "
@@ -125,14 +125,14 @@ def read_mjcf(path: str, tip: str) -> dict[str, Any]:
 def files_named(path: str) -> list[str]:
     """Return the files that an MJCF file names, and those that these name: parts of it, meshes, textures.
 
-    Names are relative to the folder of the model, or to one of those that its compiler is told.
+    Names are relative to the folder of the model, or to one of the folders of its compiler settings.
     """
     home, found, due = Path(path).parent, dict[str, None](), [Path(path)]
     folders = [home]
     while due:
         try:
             elements = list(ET.parse(due.pop()).getroot().iter())
-        except (OSError, ET.ParseError):  # MuJoCo says so
+        except (OSError, ET.ParseError):  # MuJoCo reports it
             continue
         told = [element.get(key) for element in elements for key in ("assetdir", "meshdir", "texturedir")]
         folders += [home / folder for folder in told if folder]

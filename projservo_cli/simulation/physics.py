@@ -31,7 +31,7 @@ class _Actuator(NamedTuple):
 
     @property
     def stiffness(self) -> float:
-        """Torque for a radian that the joint is off what it is sent, as it is driven here; 0 for a motor."""
+        """Return the torque per radian of position error of an added servo; 0 for a motor."""
         _, by_length, by_speed = self.bias
         return -(self.gear**2) * (by_length or by_speed / _LOOP_S)
 
@@ -46,10 +46,10 @@ class _Actuator(NamedTuple):
 class Physics:
     """Servos of the joints of an arm, at first at rest at joints q (n,), rad or m.
 
-    lag_s : by which what they are sent is late. sag : what gravity costs a servo of ours that is loaded most,
+    lag_s : lag of the set-points. sag : steady-state error of the added servo with the maximum load,
         rad; where it is zero, and in prismatic joints, they compensate gravity.
     ``setpoint``: (n,) where joints are sent, rad or m.
-    Raises InputError where an actuator of the file cannot be driven, or does not sag as it is told.
+    Raises InputError where an actuator of the file cannot be driven, or cannot have this sag.
     """
 
     def __init__(self, rendered: RenderedModel, q: FloatArray, lag_s: float, sag: float) -> None:
@@ -95,12 +95,12 @@ class Physics:
 
     @property
     def motor(self) -> FloatArray:
-        """Where the joints are (n,), rad or m."""
+        """Return the joints (n,), rad or m."""
         return np.array(self._data.qpos[self._places])
 
     @property
     def hindrance(self) -> str:
-        """What keeps the arm from where it is sent: what it touches, servos too weak; else empty."""
+        """Return the obstruction of the arm: contacts, saturated servos; else empty."""
         weak = " and ".join(str(i + 1) for i in self._own if self._at_end(i))
         told = (
             ("the arm touches: ", self._touching()),
@@ -123,7 +123,7 @@ class Physics:
         return any(limited and not low < value < high for limited, value, (low, high) in limits)
 
     def _touching(self) -> str:
-        """What of the arm touches what, by names of bodies; empty where nothing does."""
+        """Return the contacts of the arm, by names of bodies; empty if there are none."""
         model, pairs = self._model, dict[str, None]()
         for contact in self._data.contact:
             bodies = [int(model.geom_bodyid[geom]) for geom in contact.geom]
@@ -186,18 +186,18 @@ class Physics:
             data.ctrl[actuator.number] = wanted
 
     def _free_inertia(self) -> FloatArray:
-        """What each motor has to turn, kg m² or kg, where all other joints are free."""
+        """Return the inertia of each joint, kg m² or kg, with all other joints free."""
         units = np.eye(self._model.nv)[self._rates[self._motors]]
         solved = np.empty_like(units)
         mujoco().mj_solveM(self._model, self._data, solved, units)
         return np.asarray(1.0 / (solved * units).sum(axis=1))
 
     def _gravity(self) -> FloatArray:
-        """What gravity and motion ask of each joint (n,), N m or N, less what the file compensates."""
+        """Return the bias torque of each joint (n,), N m or N, less the compensation of the file."""
         return np.array((self._data.qfrc_bias - self._data.qfrc_gravcomp)[self._rates])
 
     def _heaviest(self, rendered: RenderedModel) -> tuple[FloatArray, float]:
-        """Most inertia (n,) of each joint, kg m² or kg, and the most gravity asks of any that turns, N m."""
+        """Return the maximum inertia (n,) of each joint, kg m² or kg, and the maximum gravity torque, N m."""
         mj, rng, arm = mujoco(), np.random.default_rng(0), rendered.scene.arm
         low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
         data, turning = rendered.begin(self._model, arm.q_reference), arm.joint_types != PRISMATIC

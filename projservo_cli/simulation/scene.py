@@ -19,7 +19,10 @@ from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, spec_of, t
 
 # Thickness of the first link of an arm and of the last, in lengths of the arm, and of none in any.
 _THICK, _THIN, _LEAST_LINK_M = 0.05, 0.03, 1e-3
-_LINK, _HOLDER = (0.75, 0.5, 0.25, 1.0), (0.3, 0.3, 0.3, 1.0)  # colours of links, and of what holds the tags
+_LINK, _HOLDER = (
+    (0.75, 0.5, 0.25, 1.0),
+    (0.3, 0.3, 0.3, 1.0),
+)  # colours of links, and of the holder of the tags
 _PLATE_M, _ROD_M = 5e-4, 4e-3  # half the thickness of a tag, and of the rod that holds it
 _TOOL_DENSITY = 500.0  # kg/m³
 _SIDES = ("front", "back")  # of a plate: the tag, and what hides it from behind
@@ -48,7 +51,7 @@ class Tag(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What rendered cameras see, and how."""
+    """Scene and settings of rendered cameras."""
 
     arm: Arm
     P: FloatArray  # (2, 3, 4) cameras, px
@@ -260,7 +263,7 @@ def _put_light(spec: Any, light: str, P: FloatArray) -> None:
 
 
 def drawn_at(P: FloatArray, lens: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Where pixels (2, N, 2) of cameras (2, 3, 4) and lenses (2, 5) are drawn without lens and skew."""
+    """Return pixels (2, N, 2) of cameras (2, 3, 4) and lenses (2, 5) in drawings without lens and skew."""
     straight = undistort(lens, pixels).copy()
     for view, camera in enumerate(P):
         K, _, _ = _decomposed(camera)
@@ -270,7 +273,7 @@ def drawn_at(P: FloatArray, lens: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def _margin(P: FloatArray, k1: float, width: int, height: int) -> int:
-    """By how much a drawing has to be wider than what a lens makes of it, px."""
+    """Return the margin of a drawing around the field of a lens, px."""
     u, v = np.linspace(0.0, width - 1.0, 65), np.linspace(0.0, height - 1.0, 65)
     sides = [(x, y) for x in u for y in v[[0, -1]]] + [(x, y) for x in u[[0, -1]] for y in v]
     drawn = drawn_at(P, lens_of(P, k1), np.array([sides, sides]))

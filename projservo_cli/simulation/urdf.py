@@ -20,7 +20,7 @@ _MOVING = {"revolute": "R", "continuous": "R", "prismatic": "P"}
 def read_urdf(path: str, tip: str, text: str) -> dict[str, Any]:
     """Screws of the joints of a URDF from its root to a link, as ``robot.screws`` takes them.
 
-    text : of the file. Raises InputError if it is no URDF, there is no such link, or a joint on the way to
+    text : of the file. Raises InputError if it is no URDF, there is no such link, or a joint on the chain to
     it is none of those that turn or slide by themselves.
     """
     try:

@@ -54,7 +54,7 @@ class Truth:
         return np.ascontiguousarray(self.M[[self.number.index(number) for number in numbers]])
 
     def ends(self, q_goal: FloatArray) -> Ends:
-        """Where the robot holds the tool at its reference and at the goal joints (n,)."""
+        """Return the poses of the tool at the reference and at the goal joints (n,)."""
         base_tool, pose = self.robot.base_tool, self.robot.pose(q_goal)
         middle = np.array(center_of(self.M_face, self.center))
         return Ends(base_tool, pose, pose @ np.linalg.solve(base_tool, middle))

@@ -1,7 +1,7 @@
-"""Speed of control steps and whole runs, beside one SVD of NumPy in the same process.
+"""Speed of control steps and whole runs, relative to one SVD of NumPy in the same process.
 
 Everything is timed in turn, round by round, in pieces of about a millisecond. Ratios are between the
-least times, which a busy machine disturbs the least.
+minimum times, which a busy machine disturbs least.
 """
 
 import itertools
@@ -96,7 +96,7 @@ def timings(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
     table = 1e6 * np.array(found).T
     quartiles = np.percentile(table, [0, 25, 50, 75], axis=1)
     rows = np.vstack([quartiles, quartiles[0] / quartiles[0, 0]]).T.tolist()
-    keys = ("least", "lower", "median", "upper", "over_svd")  # µs, and the least over that of one SVD
+    keys = ("least", "lower", "median", "upper", "over_svd")  # µs, and the minimum over that of one SVD
     times = {name: dict(zip(keys, row, strict=True)) for name, row in zip(timed, rows, strict=True)}
     return {
         "step_over_svd": max(times["direct_three"]["over_svd"], times["direct_two"]["over_svd"]),

@@ -31,7 +31,7 @@ def run(
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Calibrate from a recorded table or from simulated trial motions.
 
-    Returns what was seen, the calibration, and its held-out errors where they are asked for.
+    Returns the observations, the calibration, and its held-out errors on request.
     """
     source = inputs.source
     seen = recorded(source) if isinstance(source, Table) else simulated(source, progress=progress)
@@ -41,7 +41,7 @@ def run(
 
 
 def recorded(table: Table) -> Observations:
-    """Return what a table holds."""
+    """Return the observations of a table."""
     return Observations.of(
         read_table(table.file.path, table.joint_types, table.joint_unit),
         joint_types=table.joint_types,
@@ -54,7 +54,7 @@ def recorded(table: Table) -> Observations:
 def simulated(
     trials: Trials, q: FloatArray | None = None, seed: int | None = None, *, progress: Progress = silent
 ) -> Observations:
-    """Return what the trial motions of the simulated robot show, or poses (K, n), rad or m."""
+    """Simulate the trial motions, or poses (K, n), rad or m; the observations."""
     observation, noise_px = observed(trials, q, seed, progress=progress)
     assert trials.truth is not None
     ideal, (width, height) = trials.driven is None, trials.truth.image_size.astype(int).tolist()
@@ -74,7 +74,7 @@ def simulated(
 def estimate(
     seen: Observations, asked: Estimation, *, progress: Progress = silent
 ) -> tuple[Calibration, CrossValidation | None]:
-    """Return the calibration from what was seen, and its held-out errors if they are asked for."""
+    """Return the calibration from observations, and its held-out errors on request."""
     held_out: list[CrossValidation] = []
 
     def hold_out(solution: Solution, noise_px: float) -> None:

@@ -30,11 +30,11 @@ from projservo_cli.simulation.ideal import Plant, observe
 from projservo_cli.stages.given import Contract, Driven
 from projservo_cli.stages.scenario import SERVO_NOISE, RunScenario
 
-# What a joint may drift, rad or m, and an image, px rms, and be called still, where its noise is less.
+# Drift of a joint, rad or m, and of an image, px rms, within which both count as still.
 _STILL, _STILL_PX = 2e-5, 0.02
-_NEVER_LATE_S = 3600.0  # for what a simulated robot answers, which may be compiled first
-_LEAST = 6  # looks that tell noise from motion
-# Least deviation of a delay and of single frames, s; a 95 % interval is so many deviations wide.
+_NEVER_LATE_S = 3600.0  # for a simulated robot, whose code may be compiled first
+_LEAST = 6  # readings that separate noise from motion
+# Minimum deviation of a delay and of single frames, s; width of a 95 % interval in deviations.
 _LEAST_JITTER_S, _INTERVAL = 0.002, 3.92
 _PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
 _WAITED = 5  # looks for each image that is wanted, where the same one comes again
@@ -93,7 +93,7 @@ def way_to(
 
     what : the command it is for, in messages.
     fit : is shown the first reading, before anything moves; it raises where nothing should.
-    Yields what is read after each command. The robot has then stood still for so many s, and so have the
+    Yields the reading after each command. The robot has then stood still for so many s, and so have the
     images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest, or if
     one reads a whole turn beyond its limits.
     """
@@ -116,13 +116,11 @@ def way_to(
     gap = np.abs(q - robot.reading.q)
     i, sag = int(np.argmax(gap / np.maximum(bounds.sag, _STILL))), bounds.sag
     if gap[i] > max(sag[i], _STILL) or (q != robot.target).any():
-        remedy = (
-            "look what holds the robot, or whether it sags or plays so far (plant.max_steady_state_error_deg)"
-        )
+        remedy = "free the robot, or check its sag and backlash (plant.max_steady_state_error_deg)"
         if gap[i] > abs(q[i] - begun[i]) + sag[i]:
             remedy = (
-                f"it went away from there, from {bounds.told(i, begun[i])}: look at its sign and unit, and "
-                "whether it can hold what it carries"
+                f"it moved away from there, from {bounds.told(i, begun[i])}: check its sign and unit, and "
+                "whether it can hold its load"
             )
         if hindrance := hindrance_of(robot.robot.robot):
             remedy = f"{hindrance}: take joints that it can reach and hold"
@@ -134,7 +132,7 @@ def way_to(
 
 
 def at_rest(reading: Reading, look: Callable[[], Reading], settle_s: float, what: str) -> Iterator[Reading]:
-    """Look, a period after the other, until joints and images stand still, and yield what is read."""
+    """Read once per period until joints and images stand still, and yield each reading."""
     still, first = _Standstill(settle_s), reading.t_q
     while not still.all(reading):
         if reading.t_q > first + settle_s + _PATIENCE_S:
@@ -149,9 +147,9 @@ def at_rest(reading: Reading, look: Callable[[], Reading], settle_s: float, what
 def averaged(
     reading: Reading, look: Callable[[], Reading], wanted: int
 ) -> tuple[Reading, FloatArray, FloatArray]:
-    """The mean of looks at a robot at rest, of which each view shows so many frames, each frame once.
+    """Return the mean of readings of a robot at rest, with a number of frames of each view, each once.
 
-    Frames are weighed by the deviations they tell, if they do. Markers that most of the frames of a view do
+    Frames are weighted by their deviations, if they have any. Markers that most of the frames of a view do
     not show are NaN. Returns the mean; sums (2, m) of the squares by which pixels are off it, px²; how many
     frames (2, m) show a marker, 0 where it is NaN.
     """
@@ -170,7 +168,7 @@ def averaged(
 
 
 def _frame(reading: Reading, view: int) -> FloatArray:
-    """What a view shows: u, v and their deviation (m, 3), px, a deviation of one where none is told."""
+    """Return u, v and their deviation (m, 3), px, of a view; a deviation of one if it has none."""
     sigma = np.ones(len(reading.s[view])) if reading.sigma_px is None else reading.sigma_px[view]
     return np.column_stack([reading.s[view], sigma])
 
@@ -178,7 +176,7 @@ def _frame(reading: Reading, view: int) -> FloatArray:
 def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """Mean (m, 2) of frames (m, 3) of one view, its deviation (m,), squares (m,) off it, their count (m,).
 
-    What does not scatter from frame to frame does not average away: the share of the variance told that
+    An error without scatter from frame to frame does not average away: the share of the stated variance that
     scatters, of all markers together, becomes less.
     """
     seen, sigma = np.split(np.array(frames), [2], axis=2)
@@ -197,10 +195,10 @@ def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray,
 
 
 class _Standstill:
-    """Whether a robot has stood still for a time, s, as one look after the other shows.
+    """Tells whether a robot has stood still for a time, s, by consecutive readings.
 
     Over that time, and no fewer than six looks, the means of its thirds differ by no more than noise
-    explains, which the differences of consecutive looks tell: motion adds up, noise does not.
+    explains, from the differences of consecutive readings: motion adds up, noise does not.
 
     Source: J. von Neumann, "Distribution of the ratio of the mean square successive difference to the
     variance", Annals of Mathematical Statistics 12, 1941.
@@ -212,7 +210,7 @@ class _Standstill:
         self._q: _Rows = deque()
         self._s: tuple[_Rows, _Rows] = deque(), deque()
         self._last: Reading | None = None
-        self.moving = ""  # what is not still, in words
+        self.moving = ""  # message on the part that moves
 
     def joints(self, reading: Reading) -> bool:
         """Whether the joints have stood still up to the next reading."""
@@ -276,7 +274,7 @@ def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -
     face, others, workspace = list(truth.face), list(truth.pins), np.zeros_like(plant.M)
 
     def see(q: FloatArray, M: FloatArray) -> FloatArray:
-        """What both cameras see of markers (m, 4) at joints (n,), as the loop has it."""
+        """Return the pixels of markers (m, 4) in both views at joints (n,)."""
         s, ordered = np.zeros((2, len(M), 2)), np.zeros((2, len(M), 2))
         H = mat(truth.displacement(q))
         observe(plant._replace(M=M[face], pins=M[others]), H, workspace, ordered, np.zeros(2))
@@ -289,7 +287,7 @@ def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -
 
 
 def connected(scenario: RunScenario, law: str, given: Robot | None = None) -> DrivenRobot:
-    """The robot as the loop of a law sees it: beside its truth, or what the calibration takes it for.
+    """Return the robot as the loop of a law sees it: with its truth, or with the calibrated model.
 
     given : an object of the contract instead of one of a class.
     """
@@ -313,7 +311,7 @@ def connected(scenario: RunScenario, law: str, given: Robot | None = None) -> Dr
 
 
 def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
-    """What the calibration takes the robot and its face for."""
+    """Return the calibrated robot and its face."""
     task = scenario.ends.by_points().task(scenario.model)
     return Plant(
         scenario.model,
@@ -329,7 +327,7 @@ def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
 
 
 def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibration, law: str) -> Known:
-    """What is known of a robot and its images before a law drives it."""
+    """Return the knowledge of a robot and its images before a law drives it."""
     numbers = scenario.observed
     return Known(
         partial(predict, calibration),
@@ -343,7 +341,7 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
 
 
 def _delays_of(given: tuple[float, float] | None, calibration: Calibration) -> DelayPrior:
-    """What is known of the delays of both views: given, calibrated, or nothing."""
+    """Return the prior of the delays of both views: given, calibrated, or wide."""
     known = NOTHING_KNOWN
     if calibration.time_offset_s is not None:
         interval, jitter = calibration.time_offset_interval_s, calibration.time_offset_jitter_s

@@ -55,20 +55,20 @@ class Trials:
 
 @dataclass(frozen=True, eq=False)
 class RecordingInputs:
-    """What a table is recorded with."""
+    """Inputs of a recording."""
 
     trials: Trials
     numbers: tuple[int, ...]  # of the markers
-    face: tuple[int, ...]  # numbers of those that must stay visible; none where nobody says so
-    dictionary: str | None  # of the tags, where somebody says so
-    tagged: bool  # whether markers are said to be corners of tags
+    face: tuple[int, ...]  # numbers of the markers that must stay visible; may be empty
+    dictionary: str | None  # of the tags; None if not configured
+    tagged: bool  # whether markers are corners of tags
     max_steady_state_error_deg: float  # how far a joint at rest may stay from its set-point
 
     @property
     def key(self) -> str:
-        """The plant, and a hash of what the pixels depend on beside the joints, which the table itself tells.
+        """The plant, and a hash of the inputs of the pixels except the joints, which are in the table.
 
-        What a robot of somebody's is driven with may change while it is recorded.
+        The settings that drive an external robot may change during a recording.
         """
         trials, own = self.trials, self.own
         robot = own._replace(timeout_s=0.0, open_s=0.0) if own else (trials.truth, trials.driven)
@@ -84,7 +84,7 @@ class RecordingInputs:
 
 
 class Table(NamedTuple):
-    """A recorded table, and what is known of it."""
+    """A recorded table and its settings."""
 
     file: File
     joint_types: str | None  # one letter a joint, R or P; None for R
@@ -96,7 +96,7 @@ class Table(NamedTuple):
 
 @dataclass(frozen=True)
 class Estimation:
-    """How a calibration is estimated from what was seen."""
+    """Settings of the estimation of a calibration."""
 
     method: str = "bundle_adjustment"  # or closed_form
     lens: bool = False  # whether to estimate two coefficients of radial distortion a camera
@@ -106,15 +106,15 @@ class Estimation:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationInputs:
-    """What a calibration is made from."""
+    """Inputs of a calibration."""
 
     source: Table | Trials
     estimation: Estimation
-    joint_noise: float | None  # rms of joint readings less true angles, rad; None for what the source tells
+    joint_noise: float | None  # standard deviation of joint readings, rad; None for that of the source
 
 
 class SuggestionInputs(NamedTuple):
-    """What further poses are suggested with, beside what was seen and the calibration."""
+    """Inputs of a suggestion of further poses, except observations and calibration."""
 
     joints: JointSettings
     image_size: tuple[int, int] | None  # width and height, px, if they are known
@@ -125,7 +125,7 @@ class SuggestionInputs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TeachInputs:
-    """What a pose is taught with."""
+    """Inputs of teaching a pose."""
 
     driven: Driven
     joints: JointSettings
@@ -142,9 +142,7 @@ class GoalImages(NamedTuple):
     left: tuple[_Pixel | None, ...]
     right: tuple[_Pixel | None, ...]  # left, right: u and v of each marker, px; None where unseen
     sigma_left: tuple[float | None, ...] | None
-    sigma_right: (
-        tuple[float | None, ...] | None
-    )  # their standard deviations, px; None where they are not told
+    sigma_right: tuple[float | None, ...] | None  # their standard deviations, px; None if unknown
     joints: Readings | None  # there
 
     def pixels(self) -> dict[int, tuple[_Pixel, _Pixel]]:
@@ -154,13 +152,13 @@ class GoalImages(NamedTuple):
         return {number: (left or unseen, right or unseen) for number, left, right in each}
 
     def deviations(self, numbers: Sequence[int]) -> list[list[float]]:
-        """Standard deviation of markers in the left and in the right image, px; NaN where it is not told."""
+        """Standard deviation of markers in the left and in the right image, px; NaN if unknown."""
         sides = [side or (None,) * len(self.markers) for side in (self.sigma_left, self.sigma_right)]
         told = [dict(zip(self.markers, side, strict=True)) for side in sides]
         return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in told]
 
     def sigma_px(self, face: Sequence[int]) -> float | None:
-        """Standard deviation of a coordinate of the markers of the face, rms; None where it is not told."""
+        """Standard deviation of a coordinate of the markers of the face, rms; None if unknown."""
         told = [sigma**2 for side in self.deviations(face) for sigma in side]
         return None if any(map(math.isnan, told)) else math.sqrt(sum(told) / len(told))
 
@@ -183,7 +181,7 @@ class ReachingTask(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlanInputs:
-    """What a plan is made from, beside the calibration."""
+    """Inputs of a plan, except the calibration."""
 
     task: ReachingTask | None
     seed: int  # of the noise of start and goal
@@ -193,7 +191,7 @@ class PlanInputs:
     scene: Scene | None  # where cameras are rendered
     face: tuple[int, ...]  # numbers of the markers that must stay visible
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
-    known: tuple[int, ...] | None  # numbers of all markers; None where the calibration tells them
+    known: tuple[int, ...] | None  # numbers of all markers; None for those of the calibration
     tags: tuple[tuple[int, ...], ...]  # numbers of the corners of each tag among them
     joints: JointSettings
     image_size: tuple[int, int] | None  # width and height, px, if they are known
@@ -208,7 +206,7 @@ class StopSettings(NamedTuple):
     """When a closed loop ends."""
 
     image_error_px: float
-    noise_factor: float  # widens ``image_error_px`` by so many times the noise
+    noise_factor: float  # ``image_error_px`` grows by this factor × the noise
     max_steps: int
     diverged_factor: float
     stall_periods: int
@@ -219,10 +217,10 @@ class StopSettings(NamedTuple):
 
 
 class Contract(NamedTuple):
-    """What a run by the contract takes besides."""
+    """Further inputs of a run by the contract."""
 
     driven: Driven
-    events: Events  # that befall a simulated robot
+    events: Events  # of a simulated robot
     timeout_s: float  # most time that an answer may take
     time_offset_s: tuple[float, float] | None  # of the images of both cameras; None to estimate them
     settle_s: float | None  # for how long a robot of somebody's has stood still at the start
@@ -230,31 +228,31 @@ class Contract(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ServoInputs:
-    """What the run of a law is made from, beside calibration and plan."""
+    """Inputs of the run of a law, except calibration and plan."""
 
-    plan: PlanInputs  # what the plan was made from
+    plan: PlanInputs  # inputs of the plan
     gains: Gains  # of the laws; limits are those of the joints
     stop: StopSettings
     opaque: bool  # whether the face hides its markers from a camera behind it
     speed_scale: float  # factor of every command
-    max_replan_attempts: int  # how often a way is searched anew where one comes to nothing
+    max_replan_attempts: int  # maximum number of replanning attempts
     refuses: bool  # whether a law is not run where no joints could follow the plan
-    lengths: FloatArray  # (m, m) distances between the markers of the face, m; NaN where nothing tells them
+    lengths: FloatArray  # (m, m) distances between the markers of the face, m; NaN if unknown
     contract: Contract | None  # None for the ideal plant
 
 
 @dataclass(frozen=True, eq=False)
 class ReportInputs:
-    """What a report is made from, beside calibration, plan and runs."""
+    """Inputs of a report, except calibration, plan and runs."""
 
     about: About
     formats: tuple[str, ...]  # of the files of each figure
     extra: ServoInputs | None  # of laws by themselves on the ideal plant; None where there is no task
-    trajectory: Trajectory  # what the plan was asked for
+    trajectory: Trajectory  # requested motion of the plan
 
 
 class Scenery(NamedTuple):
-    """What runs are shown in."""
+    """Scene of the runs."""
 
     name: str  # of the configuration
     truth: Truth  # robot, rig and face as they are described

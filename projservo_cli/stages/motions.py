@@ -49,8 +49,8 @@ class Found(NamedTuple):
     motion: Motion  # as it is stored, at the instants sigma
     time: FloatArray  # (s,) when it is there, s; NaN where nothing limits the speed
     feasible: bool
-    reason: str  # feasible, reason: whether it may be followed, in words; a path tells that itself
-    path: JointPath | None = None  # through joint space, where one was looked for
+    reason: str  # feasible, reason: whether it may be followed; a path has its own reason
+    path: JointPath | None = None  # through joint space, if one was searched
     entered: str = ""  # which region it enters that is kept out of, in words
 
 
@@ -77,16 +77,16 @@ def given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_transla
 
 
 class JointSearch(NamedTuple):
-    """What the profile ``joint_space`` takes beside model, images and demands."""
+    """Inputs of the profile ``joint_space``, except model, images and demands."""
 
     q_shown: FloatArray  # (k, n) joints known to show the goal, rad or m
     sigma: float  # standard deviation of a coordinate of the images of the goal, px
     spread: Spread = NO_SPREAD  # how far predictions err
-    closed: str = ""  # why no path can be looked for, in words
+    closed: str = ""  # reason why no path can be searched
 
 
 def search_of(scenario: Scenario) -> JointSearch:
-    """What a scenario tells of a search through joint space."""
+    """Return the inputs of a search through joint space."""
     calibration, spread = scenario.calibration, NO_SPREAD
     if calibration is not None:
         numbers = scenario.numbers if len(scenario.ends.body.M) else scenario.numbers[: scenario.m]
@@ -100,12 +100,12 @@ def search_of(scenario: Scenario) -> JointSearch:
         )
     limits, closed = scenario.joints.limits, ""
     if scenario.truth is None and not (np.isfinite(limits.lower) & np.isfinite(limits.upper)).all():
-        closed = f"nothing tells the limits of all joints: {LIMITS_MISSING}"
+        closed = f"the limits of some joints are unknown: {LIMITS_MISSING}"
     return JointSearch(scenario.q_shown, scenario.goal_sigma_px, spread, closed)
 
 
 def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
-    """Why no path through joint space can be looked for, or given a time; empty where it can."""
+    """Return the reason why no path through joint space can be searched or timed; empty if it can."""
     for i in np.flatnonzero(~np.isfinite(demands.limits.speed)):
         kind = "prismatic" if model.joint_types[i] == PRISMATIC else "joint"
         unit = "m_s" if kind == "prismatic" else "deg_s"
@@ -162,12 +162,12 @@ def body_at_start(model: Model, task: Task, shown: TaskImages, A: FloatArray) ->
     return np.asarray(task.body.M @ as_array(fit.H).T)
 
 
-# What is left of the images, px, where joints are interpolated between the places that are stored.
+# Tolerance of the images, px, of joints interpolated between stored samples.
 _INTERPOLATED_PX = 0.05
 
 
 def _joint_constraints(reaching: Reaching, task: Task, trajectory: Trajectory, spread: Spread) -> Constraints:
-    """What joints are held against."""
+    """Return the constraints of the joints."""
     drawn = keep_out_of(trajectory.keep_out)
     c = constraints_of(reaching.model, reaching.body, task, reaching.q_start, reaching.demands, drawn)
     return c._replace(spread=spread)
@@ -181,12 +181,12 @@ def _entered(c: Constraints, q: FloatArray) -> str:
         if region := within_region(c, joints):
             return f"the {end} is within region {region} of trajectory.keep_out"
     last, region = first_within(c, q)
-    at = f"at sigma {last / (len(q) - 1):.2f}"
+    at = f"at path parameter {last / (len(q) - 1):.2f}"
     return f"the body enters region {region} of trajectory.keep_out {at}" if region else ""
 
 
 def kept_out(found: Found, task: Task, trajectory: Trajectory, spread: Spread) -> Found:
-    """What was found, infeasible where it enters a region that the body is kept out of."""
+    """Return the motion, infeasible if it enters a keep-out region of the body."""
     c = _joint_constraints(found.motion.reaching, task, trajectory, spread)
     entered = _entered(c, found.motion.along.q)
     return found._replace(feasible=False, reason=entered, entered=entered) if entered else found
@@ -256,7 +256,7 @@ class PathReplanner:
     def replan(self, q: FloatArray, excluded: FloatArray, off: FloatArray) -> Plan | None:
         """Plan of a path from joints (n,), off by (2, 2) px, to other goals than those excluded (k, n).
 
-        It keeps so much farther from borders and regions. Each is searched with a seed of its own.
+        It keeps that much farther from borders and regions. Each search has its own seed.
         """
         self._made += 1
         plan, asked, full = self._plan, self._trajectory, self._c.full.copy()

@@ -143,9 +143,9 @@ def plan_task(
 ) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
 
-    trajectory : the motion that is asked for.
-    demands : what the motion must keep to; profiles of the paper are only measured against it.
-    search : what a search through joint space takes, for the profiles ``joint_space`` and ``auto``.
+    trajectory : the requested motion.
+    demands : constraints of the motion; profiles of the paper are only measured against them.
+    search : inputs of a search through joint space, for the profiles ``joint_space`` and ``auto``.
     Raises WorkFailed if a marker cannot be triangulated, a motion is not unique or the joints would be too
     fast; InputError for the profile ``joint_space`` where a joint has no speed limit.
     """
@@ -197,7 +197,7 @@ def _found(
 def _planned(
     model: Model, shown: TaskImages, trajectory: Trajectory, demands: Demands, search: JointSearch | None
 ) -> tuple[Plan, str]:
-    """Plan of one profile, and what of its constraints fails, in words; empty where all hold."""
+    """Return the plan of one profile, and the constraints that fail, in words; empty if all hold."""
     face = shown.by_points()
     state, task, parts, note = _partitioned(model, shown, trajectory, demands.limits)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
@@ -272,7 +272,7 @@ def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, 
 
 
 def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:
-    """Both senses of the rotation onto the plane, and each camera's least margin along them."""
+    """Return both senses of the rotation onto the plane, and each camera's minimum margin along them."""
     other = parts.theta_r - math.copysign(2.0 * math.pi, parts.theta_r)
     senses = np.array(sorted((parts.theta_r, other), key=abs))
     margins = np.zeros((2, 2))

@@ -1,4 +1,4 @@
-"""Summary of a plan: whether it may be followed, what is nearest to failing, and what a search came to."""
+"""Summary of a plan: whether it may be followed, its smallest margin, and the result of its search."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -45,7 +45,7 @@ def verdict_of(motion: Motion) -> tuple[bool, str, str]:
 
 
 def _words(motion: Motion, constraint: int, instant: int) -> str:
-    """What one constraint says at one instant, and where that is."""
+    """One constraint at one time, with its margin."""
     found, demands = motion.along, motion.reaching.demands
     at = "at mu_t {:.2f}, mu_r {:.2f}, mu_p {:.2f}".format(*motion.mu[instant])
     if constraint == VISIBILITY:
@@ -90,17 +90,17 @@ def least_of(motion: Motion) -> tuple[FloatArray, FloatArray]:
 
 
 def sight_words(profile: str, motion: Motion) -> tuple[bool, str]:
-    """Whether both cameras see the face all along, and what says so."""
+    """Tell whether both cameras see the face all along, and give the reason."""
     margins = motion.along.visibility
     sigma = np.linspace(0.0, 1.0, len(margins))
     worst = np.unravel_index(np.argmin(margins), margins.shape)
     if margins.min() > 0.0:
         return True, (
-            f"both cameras see the face all along; least margin {margins.min():.3f} of the start's, "
-            f"{VIEWS[worst[1]]} camera at sigma {sigma[worst[0]]:.2f}"
+            f"both cameras see the face all along; minimum margin {margins.min():.3f} (1 at the start), "
+            f"{VIEWS[worst[1]]} camera at path parameter {sigma[worst[0]]:.2f}"
         )
     lost = [
-        f"{VIEWS[view]} from sigma {sigma[np.argmax(margins[:, view] <= 0)]:.2f}"
+        f"{VIEWS[view]} from path parameter {sigma[np.argmax(margins[:, view] <= 0)]:.2f}"
         for view in range(2)
         if margins[:, view].min() <= 0.0
     ]
@@ -112,7 +112,7 @@ def sight_words(profile: str, motion: Motion) -> tuple[bool, str]:
 
 # Joint vectors of each tree that are stored: those that it grew first.
 _MOST_NODES = 2_000
-# Margins that are told where no path was found: those that stopped most.
+# Number of margins in the message on a missing path: those that stopped most.
 _TOLD = 2
 
 
@@ -133,12 +133,12 @@ def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) 
     told["margins"], told["required_margins"] = _along(path.constraints, q)
     took = float(path.timing.time[-1])
     told["blends"] = _corners_of(path.timing) * (float(time[-1]) / took if took > 0.0 else 1.0)
-    told["relaxed_constraints"] = tuple(_lowered(path.constraints, {"start": q[0], "goal": q[-1]}))
+    told["relaxed_constraints"] = tuple(_relaxed(path.constraints, {"start": q[0], "goal": q[-1]}))
     return told
 
 
 def _stored(trees: tuple[Tree, Tree]) -> tuple[FloatArray, IntArray]:
-    """Joints (k, n) and parents (k,) of what is stored of two trees, one after the other."""
+    """Return joints (k, n) and parents (k,) of the stored nodes of two trees, concatenated."""
     first, second = (min(int(tree.size[0]), _MOST_NODES) for tree in trees)
     parents = trees[1].parent[:second]
     return (
@@ -148,7 +148,7 @@ def _stored(trees: tuple[Tree, Tree]) -> tuple[FloatArray, IntArray]:
 
 
 def _along(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Margins and what is asked of them, (s, 10), at joints (s, n)."""
+    """Return the margins and their required values, (s, 10), at joints (s, n)."""
     found = np.zeros((2, len(q), MARGINS))
     margins_along_into(c, np.ascontiguousarray(q), new_trial(q.shape[1], len(c.M)), found)
     return found[0], found[1]
@@ -160,32 +160,32 @@ def _corners_of(timed: TimedPath) -> FloatArray:
     return timed.time[np.flatnonzero(bent[1:] != bent[:-1])].reshape(-1, 2)
 
 
-def _lowered(c: Constraints, ends: Mapping[str, FloatArray]) -> Iterator[str]:
-    """What is asked less of at joints (n,) by name, which have less themselves; a sentence each."""
+def _relaxed(c: Constraints, ends: Mapping[str, FloatArray]) -> Iterator[str]:
+    """Yield a sentence for each end (n,), by name, whose own margins relax a constraint."""
     asked = np.empty(MARGINS)
     for name, q in ends.items():
         demands_into(c, q, asked)
-        if less := [_instead(c, q, int(i), asked[i]) for i in np.flatnonzero(asked < c.full)]:
-            yield f"asked less at the {name}: {', '.join(less)}"
+        if less := [_requirement(c, q, int(i), asked[i]) for i in np.flatnonzero(asked < c.full)]:
+            yield f"relaxed at the {name}: {', '.join(less)}"
 
 
-def _instead(c: Constraints, q: FloatArray, margin: int, asked: float) -> str:
+def _requirement(c: Constraints, q: FloatArray, margin: int, asked: float) -> str:
     words, view = constraint_at(margin)
     if margin != JOINTS:
-        return f"{words.asked.format(VIEWS[view])} {asked:.2g} px instead of {c.full[margin]:g} px"
+        return f"{words.asked.format(VIEWS[view])} {asked:.2g} px ({c.full[margin]:g} px required)"
     i = int(np.argmin(np.minimum(q - c.limits.lower, c.limits.upper - q) / c.keep))
     slides = c.model.joint_types[i] == PRISMATIC
     full, unit = (1e3 * c.keep[i], " mm") if slides else (math.degrees(c.keep[i]), "°")
-    return f"{words.asked.format(i + 1)} {asked * full:.2g}{unit} instead of {full:.3g}{unit}"
+    return f"{words.asked.format(i + 1)} {asked * full:.2g}{unit} away ({full:.3g}{unit} required)"
 
 
 def reason_of(path: JointPath) -> str:
-    """How a path through joint space leads to the goal, or why none was found, in words."""
+    """Describe the path through joint space, or the reason why none was found."""
     if path.timing is None:
         return _no_path_reason(path)
     g = int(np.abs(path.goals - path.corners[-1]).max(axis=1).argmin())
     corners = len(path.corners) - 2
-    how = "a straight way" if corners == 0 else f"a way round {corners} corner{'s' * (corners != 1)}"
+    how = "a straight path" if corners == 0 else f"a path with {corners} waypoint{'s' * (corners != 1)}"
     nearest = "the nearest" if g == 0 else f"number {g + 1}"
     some = "" if path.n_goals == len(path.goals) else f", of which the {len(path.goals)} nearest were tried"
     blocked = f"; {path.blocked} more are within a region" if path.blocked else ""
@@ -194,7 +194,7 @@ def reason_of(path: JointPath) -> str:
 
 
 def _no_path_reason(path: JointPath) -> str:
-    """Why no path was found, in words."""
+    """Return the reason why no path was found."""
     if path.region:
         return f"the start is already within region {path.region}"
     if path.solutions == 0:
@@ -219,7 +219,7 @@ def _no_path_reason(path: JointPath) -> str:
         if failed[i] > 0
     ]
     return (
-        f"no way was found to any of {len(path.goals)} joint vectors that show the goal, in {path.draws} "
+        f"no path to any of {len(path.goals)} goal configurations was found, in {path.draws} "
         f"samples; what stopped most: {', '.join(most)}"
     )
 

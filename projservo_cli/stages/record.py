@@ -1,4 +1,4 @@
-"""Record: trial motions, what a robot shows there, and the table of it."""
+"""Record: trial motions, their observations, and the table."""
 
 import math
 import time
@@ -35,9 +35,9 @@ from projservo_cli.stages.given import RecordingInputs, Trials
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
 from projservo_cli.tables import read_table, recording_of, write_table
 
-SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
+SAVE_EVERY = 1.0  # s; maximum loss by an interruption without warning
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
-_MOST_MOVING = 200  # frames on the way in a table
+_MOST_MOVING = 200  # frames in motion in a table
 
 # Draws of one pose, of which each reaches less far, and the shares of markers that must be within both
 # images, and look towards both cameras.
@@ -50,11 +50,11 @@ class _Recording:
     """A table in the making."""
 
     path: Path  # of the table
-    key: str  # the plant, and a hash of what the pixels depend on; stored with every row
+    key: str  # the plant, and a hash of the inputs of the pixels; stored with every row
     targets: FloatArray  # (K, n) joints to drive to, rad or m; the row is the number of the pose
     marker: IntArray  # (m,) numbers of the markers
     done: dict[int, Reading] = field(default_factory=dict)  # the poses that are done
-    # Frames on the way to poses that are done, by the number of the motion: that of the pose, from 1.
+    # Frames in motion towards poses that are done, by the number of the motion: that of the pose, from 1.
     ways: dict[int, list[Reading]] = field(default_factory=dict)
     found: int = 0  # how many of them an earlier call recorded
     why: str = "none yet"  # why there is something to record; empty where there is nothing
@@ -80,7 +80,7 @@ class _Recording:
 
     @property
     def told(self) -> dict[str, Any]:
-        """What became of it, as JSON values."""
+        """Summary as JSON values."""
         return {
             "table": self.path.resolve(),
             "poses": len(self.targets),
@@ -100,7 +100,7 @@ class _Recording:
     def observation(self) -> Observation:
         """All poses that are done, in their order.
 
-        Frames on the way follow, with negative numbers of poses, of the longest motions.
+        Frames in motion follow, with negative numbers of poses, of the longest motions.
         """
         rest = sorted(self.done.items())
         motions = sorted(self.ways, key=lambda k: len(self.ways[k]), reverse=True)
@@ -195,12 +195,12 @@ def new_recording(
     force: bool = False,
     redo: bool = False,
 ) -> _Recording:
-    """What there is to record, and what of it the table holds already.
+    """Return the poses to record, with those that the table holds already.
 
     path : the table; None for one that is kept in memory.
     motions : further poses after the trial motions, numbered on.
-    force : begin anew, whatever stands at ``path``; else a table of another configuration is refused.
-    redo : begin anew also where ``path`` is a recording of the same plant with another configuration.
+    force : start again, whatever ``path`` holds; else a table of another configuration is refused.
+    redo : start again also if ``path`` is a recording of the same plant with another configuration.
     """
     targets, joints, key = trial_motions(inputs.trials), inputs.trials.joints.joints(), inputs.key
     if motions is not None:
@@ -264,8 +264,8 @@ def record(
     """Record the pending poses, and keep those that are done however it ends.
 
     kept : whether the table is written.
-    robot : what is driven; None takes that of ``plant.use``, or simulates that of the configuration, which
-        stands wherever it is sent unless something is wrong with it.
+    robot : the robot to drive; None takes that of ``plant.use``, or simulates that of the configuration,
+        which follows its set-points exactly unless it has faults.
     """
     if not recording.pending:
         return
@@ -293,7 +293,7 @@ def record(
 def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> ForeignRobot | None:
     """The robot that is to be driven; None for one that need not be.
 
-    drawn : seed and stream of what is random of a simulated one.
+    drawn : seed and stream of the random numbers of a simulated one.
     """
     driven, joints = trials.driven, trials.joints.joints()
     if driven is None:
@@ -308,9 +308,9 @@ def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> 
 def observed(
     trials: Trials, q: FloatArray | None = None, seed: int | None = None, *, progress: Progress = silent
 ) -> tuple[Observation, float | None]:
-    """What the simulated robot shows, and the noise of its pixels, px, if any is known.
+    """Return the observations of the simulated robot, and the noise of its pixels, px, if known.
 
-    q : (K, n) poses, rad or m, with noise of a stream of its own; None for the trial motions.
+    q : (K, n) poses, rad or m, with a separate stream of noise; None for the trial motions.
     seed : of that noise; None for that of the trials.
     """
     truth, sigma_px = trials.truth, trials.noise_px
@@ -341,7 +341,7 @@ def _simulated(trials: Trials, recording: _Recording, drawn: tuple[int, int]) ->
 
 @dataclass(frozen=True, eq=False)
 class _Sight:
-    """Checks that a recording shows what a calibration needs, before the first motion and after each joint.
+    """Checks that a recording suffices for a calibration, before the first motion and after each joint.
 
     Messages name the place, the number and the limit: a recording of nothing takes as long as any other.
     """
@@ -350,7 +350,7 @@ class _Sight:
     recording: _Recording
 
     def before(self, robot: ForeignRobot, reading: Reading) -> None:
-        """Refuse to move where the first look, and those of a while after it, show too little."""
+        """Refuse to move if the first readings, for a while, show too few markers."""
         period, waited = robot.bounds.period, 0.0
         while wrong := self._wrong(reading.s[None], "where the robot stands"):
             if waited >= self.inputs.trials.settle_s:  # a camera may need some time for its first image
@@ -372,7 +372,7 @@ class _Sight:
         s = np.array([self.recording.done[k].s for k in group])
         if wrong := self._wrong(s, f"in the {len(s)} poses of joint {i}") or self._faceless():
             remedy = "choose another calibration.reference or a smaller calibration.amplitude_deg"
-            raise WorkFailed(f"record: {wrong}, or {remedy}; then begin anew with --force")
+            raise WorkFailed(f"record: {wrong}, or {remedy}; then start again with --force")
 
     def _faceless(self) -> str:
         """Tell which marker of the face no pose shows to both cameras so far; empty where there is none."""
@@ -416,14 +416,14 @@ class _Sight:
             half = "" if len(s) == 1 else ", half of them or more"
             return (
                 f"both cameras see only {shared} of the {total} markers {where}{half} ({_LEAST_SHARED} at "
-                "least): turn the tool towards both cameras, and look what covers it"
+                "least): turn the tool towards both cameras, and remove what occludes it"
             )
         return ""
 
     def _widths(self, s: FloatArray) -> list[float]:
         """Widest side of a tag in each view, px; infinite where markers are not known to be tags.
 
-        They are where the configuration says so, or where all markers are fours that look like tags: convex
+        They are if the configuration states it, or if all markers are fours that look like tags: convex
         and of one sense, wherever they are seen.
         """
         number = self.recording.marker
@@ -447,7 +447,7 @@ def _recorded(
 ) -> Iterator[int]:
     """Drive to one pending pose after the other and look; the number of each that was recorded.
 
-    sight : checks what is seen, as far as that is asked for.
+    sight : checks of the observations, if any.
     """
     steered, settle_s = Steered(robot), trials.settle_s
     fit = None if sight is None else partial(sight.before, robot)
@@ -473,7 +473,7 @@ def _recorded(
 
 
 def _moving(seen: list[Reading], settle_s: float) -> list[Reading]:
-    """What was read on a way before all stood still, each frame once."""
+    """Return the readings in motion before all stood still, each frame once."""
     found = []
     for before, reading in pairwise(seen):
         new = np.array(reading.new_views(before))

@@ -1,4 +1,4 @@
-"""Stage report: figures after the paper's, and its claims against what the runs measure."""
+"""Stage report: figures after the paper's, and its claims against the measured runs."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -47,14 +47,14 @@ if TYPE_CHECKING:
     from projservo_cli.store import Run
 
 FOLDER = "figures"
-_NUMBERS = "csv"  # what is drawn, beside each figure
+_NUMBERS = "csv"  # the numbers of each figure
 
 
 def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
-    """Make the extra runs, draw the figures, measure the claims and write the page that tells all.
+    """Make the extra runs, draw the figures, measure the claims and write the page.
 
     run : with calibration, plan and traces; where there is no task, with the calibration. Of a robot without
-        a model the page tells plan and runs, and figures those that need none.
+        a model the page has plan and runs, and the figures that need no model.
     directory : folder of the run; receives ``figures/``, ``claims.json`` and ``report.html``.
     """
     left_out: list[dict[str, str]] = []

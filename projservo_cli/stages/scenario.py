@@ -1,6 +1,6 @@
 """What plans are made and laws are run in: robot, rig, markers, start and goal, noise.
 
-A ``Scenario`` is made once from what a stage is given and a calibration; a plan is made in one. A
+A ``Scenario`` is made once from the inputs of a stage and a calibration; a plan is made in one. A
 ``RunScenario`` is one with all that the run of a law takes besides.
 """
 
@@ -40,7 +40,7 @@ from projservo_cli.task.face import center_of, cyclic_order, face_plane
 from projservo_cli.task.target import TaskImages
 
 _UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera sees
-# Weight of a marker in a fit that was put where others tell it to be. Starts from which joints that show a
+# Weight of a marker in a fit that is predicted from others. Starts from which joints that show a
 # goal are sought; how near they must come, and how far off it is to be behind a camera, px.
 _GUESSED, _TRIALS, _NEAR_PX, _FAR_PX = 1e-3, 60, 1.0, 1e3
 # Independent streams of random numbers, each a child of a seed.
@@ -55,7 +55,7 @@ def generator(seed: int, stream: int) -> np.random.Generator:
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """What the plan of a task is made in, and what its runs take place in."""
+    """Task, model and images of a plan and its runs."""
 
     inputs: PlanInputs
     calibration: Calibration | None  # None: laws are given the true model
@@ -63,9 +63,9 @@ class Scenario:
     numbers: tuple[int, ...]  # of the markers by which the face is measured, those of the face first
     observed: tuple[int, ...]  # numbers of all markers that the robot observes, in its order
     exact: TaskImages  # start and goal without noise; predicted for a robot that is not simulated
-    true_ends: Ends  # where the true robot holds the tool; NaN where nobody knows
-    q_shown: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 where nobody knows
-    noise_px: float  # of the images in the loop; no less than what a calibration leaves of recorded ones
+    true_ends: Ends  # true poses of the tool; NaN if unknown
+    q_shown: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 if unknown
+    noise_px: float  # of the images in the loop; at least the residual of a calibration of recorded ones
 
     @cached_property
     def ends(self) -> TaskImages:
@@ -79,12 +79,12 @@ class Scenario:
 
     @property
     def m(self) -> int:
-        """How many markers are on the face."""
+        """Return the number of markers on the face."""
         return len(self.numbers) - self.exact.pins
 
     @property
     def untested(self) -> str:
-        """Why images in the loop are not tested against the calibration; empty where they are."""
+        """Return the reason why images are not tested against the calibration; empty if they are."""
         if not self.inputs.tests_images:
             return "stop.innovation_threshold is 0"
         assert self.calibration is not None
@@ -102,7 +102,7 @@ class Scenario:
 
     @cached_property
     def model(self) -> Model:
-        """The calibrated model, or the true one where nothing is calibrated."""
+        """The calibrated model, or the true one without a calibration."""
         if self.calibration is not None:
             return self.calibration.model()
         assert self.truth is not None
@@ -110,7 +110,7 @@ class Scenario:
 
     @cached_property
     def demands(self) -> Demands:
-        """What the planned motion must keep to."""
+        """Return the constraints of the planned motion."""
         size = np.array(self.inputs.image_size or (math.inf, math.inf), dtype=np.float64)
         joints, asked = self.joints, self.inputs.trajectory
         margins = asked.joint_margin_m, asked.joint_margin
@@ -160,7 +160,7 @@ class Scenario:
         """Start and goal as rendered frames show them; images of the goal that are given stay as they are.
 
         The body is fitted to both by the deviations of their pixels, whichever is the larger. Markers of the
-        face that frames do not show are put where those that they show tell them to be.
+        face that frames do not show are predicted from those that they show.
         """
         numbers, shown, given = self.numbers, self.exact, self._given
         start, sigma = self._frames(shown.q_start, (seed, START_FRAMES))
@@ -208,7 +208,7 @@ class Scenario:
 
 @dataclass(frozen=True, eq=False)
 class RunScenario(Scenario):
-    """A scenario with what the runs of laws take besides."""
+    """A scenario with the further inputs of runs."""
 
     given: ServoInputs
     gains: Gains
@@ -260,7 +260,7 @@ def _joints_showing(
     places, seen, rng = calibration.places(numbers), np.isfinite(s), np.random.default_rng(0)
 
     def off(q: FloatArray) -> FloatArray:
-        """How far predictions are off, px; far where they are behind a camera."""
+        """Return the prediction errors, px; large behind a camera."""
         return np.asarray(np.nan_to_num(predict(calibration, q[None])[0][:, places] - s, nan=_FAR_PX)[seen])
 
     for trial in range(_TRIALS):
@@ -375,7 +375,7 @@ def _observed(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
 def _simulated_ends(
     task: ReachingTask, types: str, units: tuple[str, ...], truth: Truth, pins: tuple[int, ...], center: int
 ) -> tuple[TaskImages, Ends, FloatArray | None]:
-    """What the ends of a task look like, for any seed and noise, and the joints (n,) at the goal."""
+    """Return the images of the ends of a task, for any seed and noise, and the joints (n,) at the goal."""
     M_pins, robot = truth.of(pins), truth.robot
 
     def images(q: FloatArray, key: str) -> FloatArray:
@@ -401,7 +401,7 @@ def _shown(
     images: Callable[[FloatArray, str], FloatArray],
     turn: Callable[[FloatArray], FloatArray],
 ) -> tuple[TaskImages, FloatArray | None]:
-    """Start and goal of a task, and the joints (n,) at the goal, None where only images tell of it.
+    """Start and goal of a task, and the joints (n,) at the goal, None for a goal by images alone.
 
     numbers : of the markers of the face and of the pins.
     images : pixels (2, b, 2) at the joints (n,) of a key of the configuration.
@@ -422,7 +422,7 @@ def _shown(
 
 
 def _unknown(base_tool: FloatArray) -> Ends:
-    """Ends of a task whose goal nobody knows but by its images."""
+    """Return the ends of a task whose goal is known by its images alone."""
     return Ends(base_tool, np.full((4, 4), np.nan), np.full(4, np.nan))
 
 

@@ -45,19 +45,19 @@ class _Outcome:
     verdict: str
     why: str  # verdict, why: how it ended, and what held, disturbed or failed it, where something did
     steps: int  # commands sent
-    log: Log  # what was recorded
+    log: Log  # the recorded run
     limited: float  # how often visibility limited the translation
-    plant: Plant  # that was driven; of a robot that is not simulated what the calibration takes it for
+    plant: Plant  # that was driven; of an external robot the calibrated model
     law: str = ""
-    mode: str = REGULATE  # law, mode: what it is a run of
+    mode: str = REGULATE  # law, mode: of the run
     planned_s: float | None = None  # when the plan that it followed arrives, s
     unplanned: str = ""  # why it went without the plan that it was to follow
-    anew: tuple[str, ...] = ()  # when and why a way was searched anew
-    driven: DrivenRobot | None = None  # what was driven, where that is a robot of the contract
+    anew: tuple[str, ...] = ()  # time and reason of each replanning
+    driven: DrivenRobot | None = None  # client of a robot of the contract
 
     @cached_property
     def summary(self) -> Summary:
-        """Numbers of the run; NaN where they need a truth that nobody knows."""
+        """Numbers of the run; NaN if they need an unknown truth."""
         period, ends = self.scenario.gains.period, self.scenario.true_ends
         ended = Ended(VERDICTS.index(self.verdict), self.steps, self.limited)
         found = summarize(self.plant, self.log, ended, period, ends)
@@ -78,7 +78,7 @@ class _Outcome:
         rows = steps + 1
         before, after, views = log.fit[:rows].T
         errors, H, read = log.errors[:rows], log.H[:rows], log.read[:rows]
-        # A law that follows a plan measures what is left to where the plan is, not to the goal.
+        # A law that follows a plan measures the distance to the plan, not to the goal.
         remaining = _left(log, steps) if self.mode == REGULATE else (None, None)
         joint = int(log.events[2])
         stretch = plateau_stretch(log.judged[:rows], scenario.limits.stall_periods)
@@ -86,7 +86,7 @@ class _Outcome:
         simulated = scenario.truth is not None
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
         driven = self.driven
-        if driven is not None:  # what the log has as read is where the robot was to come to rest
+        if driven is not None:  # the log has the predicted rest of the robot instead of readings
             read = _whole(driven.readings, rows)
         told = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
         pose, goal_pose = H @ scenario.true_ends.base_tool, scenario.true_ends.goal_pose
@@ -146,15 +146,15 @@ _TOLD = [field.name for field in fields(Trace) if field.name in {*Summary._field
 
 
 def _whole(told: Sequence[FloatArray], rows: int) -> FloatArray:
-    """What was told of each instant of a run, (rows, ...); NaN where it ended before."""
+    """Return the values at each time of a run, (rows, ...); NaN after its end."""
     missing = np.full_like(told[0], np.nan)
     return np.array([*told, *[missing] * (rows - len(told))])
 
 
 def _told_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Poses (k, 4, 4) of the tool as a robot tells them, and at the goal (4, 4), m; NaN where unknown.
+    """Return poses (k, 4, 4) of the tool as a robot reports them, and at the goal (4, 4), m; NaN if unknown.
 
-    truths : the poses, or joints (k, n), which tell them where the arm is configured.
+    truths : the poses, or joints (k, n), from which a configured arm gives them.
     """
     arm, goal = scenario.inputs.arm, np.full((4, 4), np.nan)
     if arm is not None and len(scenario.q_shown):
@@ -164,14 +164,14 @@ def _told_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArray, 
     return np.array([goal * np.nan if arm is None else arm.pose(q) for q in truths]), goal
 
 
-# A body that is seen as it was calibrated fits its images to so many times their noise, px.
+# Maximum residual of a body that agrees with its calibration, over the noise, px.
 _AGREES, _LEAST_NOISE_PX = 4.0, 0.01
 
 
 def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
     """Estimate how far the face ended from the goal across the lines of sight, mm, by its size in the images.
 
-    None where nothing tells the size, or images disagree with the calibration: they are no measure then.
+    None if the size is unknown, or images disagree with the calibration.
     """
     scenario, lengths = run.scenario, run.scenario.given.lengths
     s_star = scenario.ends.by_points().s_star
@@ -183,7 +183,7 @@ def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
     untested = run.driven is not None and scenario.untested
     if run.verdict in ("fault detected", "failed") or untested or left > _AGREES * max(noise):
         return None
-    # The pair of corners that is foreshortened least tells how much of the face a pixel is.
+    # The pair of corners with the least foreshortening gives the size of a pixel on the face.
     span = np.linalg.norm(s[:, :, None] - s[:, None], axis=3)
     known = np.isfinite(lengths) & (lengths > 0.0)
     if not known.any() or not np.isfinite(s).all():
@@ -194,7 +194,7 @@ def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
 
 
 def _told_anew(anew: tuple[str, ...]) -> list[str]:
-    return [f"a way was searched anew {', '.join(anew)}"] if anew else []
+    return [f"replanned {', '.join(anew)}"] if anew else []
 
 
 def _left(log: Log, steps: int) -> tuple[float | None, float | None]:
@@ -213,7 +213,7 @@ def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
 
 
 def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | None]) -> str:
-    """Why a run ended, in a sentence."""
+    """Return the reason of the verdict, one sentence."""
     log, steps, limits = run.log, run.steps, run.scenario.limits
     error, first = float(log.judged[steps]), float(log.judged[0])
     within = tolerance(limits, float(log.fit[steps, 2]))
@@ -249,7 +249,7 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
 
 
 class Given(NamedTuple):
-    """What a caller in Python brings along, of whom no name need be looked up."""
+    """Objects that a caller in Python passes in place of names."""
 
     law: Callable[[Any], Any] | None = None  # makes a law of its setup; None for that of the name
     robot: Any = None  # an object of the contract; None for that of the configuration
@@ -261,7 +261,7 @@ def run(
     """Drive one law in one mode from the start of the task to its verdict.
 
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
-    given : what a caller brings along.
+    given : objects that a caller passes.
     Raises InputError if a part of the simulation is missing, or the plan to follow has no time; WorkFailed if
     the goal cannot be reached, or the joints cannot follow the plan and ``refuses`` is set.
     """
@@ -279,14 +279,14 @@ def drive(
     """Drive the run of a name to its verdict.
 
     plan : of the task; a built-in law that does not follow it needs but the joint motions (2, n) of its
-        rotations, which tell which way to turn.
-    believed : what the law takes for robot and rig; None for what a law of its kind is given.
+        rotations, which give the sense of the turn.
+    believed : robot and rig as the law has them; None for those that a law of its kind is given.
     Raises InputError, WorkFailed as of ``run``.
     """
     law, mode = law_and_mode(name)
     unplanned, planned_s = "", None
     if scenario.inputs.trajectory.keep_out and not (isinstance(plan, Plan) and plan.feasible):
-        raise WorkFailed("nothing is driven where trajectory.keep_out is set and the plan is not feasible")
+        raise WorkFailed("the plan is not feasible, and with trajectory.keep_out no law runs without one")
     if mode != REGULATE and isinstance(plan, Plan):
         if not np.isfinite(plan.q).all() and not scenario.given.refuses:
             unplanned = f"no joints can follow the plan: {plan.reason}"
@@ -321,8 +321,8 @@ class _Asked:
     plan: Plan | FloatArray  # of the task, or the joint motions (2, n) of its rotations where that is enough
     law: str
     replans: bool  # whether the law goes its own way instead of following the plan
-    believed: Model | None  # what the law takes for robot and rig; None for what a law of its kind is given
-    given: Given  # what a caller brings along
+    believed: Model | None  # robot and rig as the law has them; None for the default of its kind
+    given: Given  # objects that a caller passes
 
     @property
     def is_guided(self) -> bool:
@@ -355,29 +355,29 @@ class _Asked:
     def by_contract(self) -> _Outcome:
         """Drive a robot of the contract from the start of the task, where a simulated one stands.
 
-        That of ``plant.use`` is driven there. Before its first motion, what it sees must agree with the
+        That of ``plant.use`` is driven there. Before its first motion, its images must agree with the
         calibration where it stands. The robot is stopped and closed on every way out.
         """
         scenario, contract = self.scenario, self.scenario.given.contract
         assert contract is not None
         own = scenario.truth is None
         if own and (scenario.calibration is None or not scenario.calibration.usable):
-            raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
+            raise WorkFailed("the calibration is not usable, and no robot is driven with it: calibrate again")
         controller, driven = (
             self._controller(),
             external_robot.connected(scenario, self.law, self.given.robot),
         )
-        # The matrices of a look are small: a second thread costs more than it gives.
+        # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), at_rest_after(driven.robot):
             if own:
                 wrong = driven.fits()
                 if wrong:
-                    raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
+                    raise WorkFailed(f"the robot did not move, since at the start {wrong}")
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
                 for _ in external_robot.way_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
-                        raise WorkFailed(f"stopped on the way to the start, since {wrong}")
+                        raise WorkFailed(f"stopped on the path to the start, since {wrong}")
             driven.begin()
             return self._in_python(controller, driven, StallMonitor(driven, scenario.limits))
 
@@ -403,7 +403,7 @@ class _Asked:
         )
         limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
         driven = plant if isinstance(plant, DrivenRobot) else None
-        if driven is not None:  # it goes from sample to sample, whatever was asked for
+        if driven is not None:  # it moves from sample to sample, in any mode
             path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
             log = log._replace(path=path, parts=np.ones_like(log.parts))
         return _Outcome(
@@ -452,7 +452,7 @@ class _Asked:
         assert isinstance(self.plan, Plan)
         face = np.array(scenario.calibration.places(scenario.numbers[: scenario.m]))
         model, shown = ImageModel.of(scenario.calibration), (ends.s_start, ends.s_star)
-        # Its own: what a law writes to must not be what other laws are given.
+        # A copy: no law may write to the arrays of another.
         setup = copy.deepcopy(LawSetup(model, face, *shown, self.plan, gains, gains.period))
         factory = self.given.law or plugins.find("law", self.law)
         return ForeignLaw(plugins.called("law", self.law, factory, (setup,), {}), f"law {self.law}")
@@ -460,7 +460,7 @@ class _Asked:
 
 @dataclass(frozen=True, eq=False)
 class LawSetup:
-    """What a law of somebody else is made with.
+    """Inputs of a plug-in law.
 
     Attributes
     ----------

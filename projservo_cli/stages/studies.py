@@ -1,4 +1,4 @@
-"""Closed-loop runs beside those of the run file: what the figures and the claims compare."""
+"""Closed-loop runs that are not in the run file, for the comparisons of figures and claims."""
 
 import math
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ H_PE = np.array([[1.1, 0.2, -0.1, 0.3], [-0.2, 0.9, 0.2, -0.1], [0.1, -0.1, 1.2,
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What all extra runs share: the task without noise, with the configured gains."""
+    """Common setting of all extra runs: the task without noise, with the configured gains."""
 
     scenario: RunScenario  # without noise and disturbances, and without an end at a border or a joint limit
     # by operators, ``true`` (metric), ``twin`` (the same in a projective frame) and ``calibrated``
@@ -132,7 +132,7 @@ def metric_plan(bench: Comparison) -> Plan:
 
 
 def composition_error(plan: Plan, lambdas: Sequence[float] = LAMBDAS) -> FloatArray:
-    """How far both sides of [RH00] eq. (22) differ when a metric plan is taken in shares λ of τ and θ_s.
+    """Difference of both sides of [RH00] eq. (22) for a metric plan in shares λ of τ and θ_s.
 
     Returns the distance (k,) of the centre under exp(λτ Ĥ_t) exp(λθ_s Ĥ_s) and exp(λτ Ĥ_t + λθ_s Ĥ_s), m.
     Raises WorkFailed if the task has no rotation.

@@ -27,15 +27,15 @@ _BESIDE, _AT_REST_S = 0.02, 3
 
 @dataclass(frozen=True, eq=False)
 class _Taught:
-    """What the robot and its cameras tell of the pose it was moved to."""
+    """Readings of robot and cameras at the taught pose."""
 
     marker: IntArray  # (m,) numbers of the markers
     q: FloatArray  # (n,) mean of the joint readings, rad or m
     s: FloatArray  # (2, m, 2) mean of the pixels, NaN where most frames do not show a marker
-    sigma: FloatArray  # (2, m) standard deviation of a coordinate of that mean, px; NaN where nobody knows
+    sigma: FloatArray  # (2, m) standard deviation of a coordinate of that mean, px; NaN if unknown
     frames: IntArray  # (2,) how many there were of each view
     moved: FloatArray | None  # (n,) by how much joints moved when they were held again; None if never
-    bounds: Bounds  # of the robot, which tell the units of its joints
+    bounds: Bounds  # of the robot, with the units of its joints
 
     @property
     def unseen(self) -> list[tuple[int, str]]:
@@ -46,7 +46,7 @@ class _Taught:
 
     @property
     def images(self) -> GoalImages:
-        """What was seen, as the goal of a task."""
+        """Return the images as the goal of a task."""
         left, right = (
             tuple(None if math.isnan(u) else (u, v) for u, v in pixels.round(_DIGITS).tolist())
             for pixels in self.s
@@ -61,7 +61,7 @@ class _Taught:
         return GoalImages(tuple(self.marker.tolist()), left, right, sigma[0], sigma[1], readings)
 
     def as_goal(self) -> dict[str, Any]:
-        """What stands under ``task.goal`` of a configuration."""
+        """Return the section ``task.goal`` of a configuration."""
         seen = self.images
         images: dict[str, Any] = {"markers": [*seen.markers]}
         for name, pixels in zip(VIEWS, (seen.left, seen.right), strict=True):
@@ -73,9 +73,9 @@ class _Taught:
 
 
 class _Checked(NamedTuple):
-    """What a calibration says to what was taught."""
+    """Comparison of a taught pose with a calibration."""
 
-    off_px: FloatArray  # (2, m) by which markers are off what the joints that reach it, else those read, show
+    off_px: FloatArray  # (2, m) error of markers against the joints that reach it, else those read
     far: list[tuple[int, str, float]]  # markers beyond what noise explains, which view, how far, px
     reached: bool
     reason: str  # whether joints reach it, in words
@@ -90,7 +90,7 @@ def teach(
     """Look where the robot stands, and average so many frames of each camera.
 
     at : joints (n,) that a simulated robot is put to, rad or m.
-    wait : tells somebody what to do, and returns when that is done; None where nobody can be asked, so that
+    wait : asks the user to act, and returns afterwards; None without a user, so that
         the arm is not released.
     Raises InputError if ``at`` is missing or beyond a limit; WorkFailed if the robot fails.
     """
@@ -146,19 +146,19 @@ def teach(
 
 
 def _require_still(bounds: Bounds, before: FloatArray, after: FloatArray, since: str) -> None:
-    """Refuse what was seen where a joint has moved by more than it may sag; a WorkFailed names it."""
+    """Raise WorkFailed if a joint has moved by more than it may sag."""
     off, most = np.abs(after - before), bounds.sag + _SLACK
     i = int(np.argmax(off / most))
     if off[i] > most[i]:
         raise WorkFailed(
             f"teach: joint {i + 1} moved by {bounds.told(i, off[i], 3)} {since} "
-            f"({bounds.told(i, most[i], 3)} at most): take the hands away when asked to, and look "
-            "whether the arm holds what it carries; nothing was written"
+            f"({bounds.told(i, most[i], 3)} at most): take the hands away when asked to, and check "
+            "whether the arm holds its load; nothing was written"
         )
 
 
 def _put_to(inputs: TeachInputs, simulated: SimulatedRobot, q: FloatArray) -> FaultyRobot:
-    """The simulated robot at rest at joints (n,), rad or m, come to from beside, so that play tells."""
+    """Move the simulated robot to rest at joints (n,), rad or m, from one side, so that backlash shows."""
     arm, drawn = simulated.truth.robot, (inputs.seed, TAUGHT_NOISE)
     aside = generator(*drawn).choice((-_BESIDE, _BESIDE), len(q))
     beside = np.clip(q + aside, arm.limits.lower, arm.limits.upper)
@@ -169,7 +169,7 @@ def _put_to(inputs: TeachInputs, simulated: SimulatedRobot, q: FloatArray) -> Fa
 
 
 def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _Checked:
-    """Whether joints reach what was taught, by a calibration, and which markers are off what they show.
+    """Tell whether joints reach the taught pose, by a calibration, and which markers disagree.
 
     inputs : of a plan from anywhere; taught : with the whole face.
     """

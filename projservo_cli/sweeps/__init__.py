@@ -4,6 +4,6 @@ The plan of the package. ``design`` says what run number i is: an ordinary confi
 random task and drawn values depend on the number alone. ``runs`` makes a part, some hundred runs with
 consecutive numbers, and is a function of its argument alone, so that any process on any machine may call
 it. ``engine`` hands parts to threads and processes here or to a Dask cluster. ``folder`` knows from the
-files what is done, has the rest made, and makes one run anew as an ordinary run file. ``statistics`` reads
+stores finished runs, has the rest made, and repeats one run as an ordinary run file. ``statistics`` reads
 the table, and draws.
 """

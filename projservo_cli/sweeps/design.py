@@ -102,7 +102,7 @@ def _accepted(truth: Truth, poses: FloatArray, front: float) -> IntArray:
 
 
 def _changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
-    """A configuration with other values, or an InputError that calls them by what they are of."""
+    """A configuration with other values, or an InputError with their origin."""
     resolved = config.model_dump(mode="json")
     changes = [_override(what, key, value) for key, value in values.items()]
     try:
@@ -114,17 +114,17 @@ def _changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
             section[last] = change.value
         return Config.model_validate(resolved)
     except (ValueError, KeyError, IndexError, TypeError):
-        load_config(config.name, changes, text=to_yaml(config))  # says what is wrong in the user's words
+        load_config(config.name, changes, text=to_yaml(config))  # reports errors in the user's words
         raise
 
 
 def _override(what: str, key: str, value: Any) -> Override:
-    """A value as an override, which messages call by what it is of."""
+    """Return a value as an override, with its origin for messages."""
     return Override(f"{what}: {key}={json.dumps(value)}", key, value)
 
 
 def _overrides(what: str, key: str, value: Any) -> list[Override]:
-    """A value of the grid as overrides; that of a law sets its mode too where its name tells one."""
+    """A value of the grid as overrides; that of a law sets its mode too if its name has one."""
     if key != LAW:
         return [_override(what, key, value)]
     law, mode = law_and_mode(value)
@@ -135,7 +135,7 @@ def _overrides(what: str, key: str, value: Any) -> list[Override]:
 
 # Streams of the sweep's seed.
 RUNS, CALIBRATIONS, TASKS, VALUES, CALIBRATION_VALUES, PROBES = range(6)
-_PROBES = 4  # values that tell whether a calibration depends on them
+_PROBES = 4  # values that show whether a calibration depends on them
 
 
 def _sample(distribution: Distribution, rng: np.random.Generator) -> Any:
@@ -163,7 +163,7 @@ class _Axis(NamedTuple):
     also: Mapping[str, Mapping[str, Any]] = {}
 
     def changes(self, value: Any) -> Iterator[Override]:
-        """What one of the values sets."""
+        """Return the overrides of one of the values."""
         what = f"grid.{self.name}"
         for key in self.keys:
             yield from _overrides(what, key, value)
@@ -172,7 +172,7 @@ class _Axis(NamedTuple):
 
 
 class _Places(NamedTuple):
-    """Where runs stand, arrays (k,): their cells, their numbers in them, and those of what they share."""
+    """Places of runs, arrays (k,): their cells, their numbers in them, and the numbers of shared draws."""
 
     run: IntArray
     cell: IntArray
@@ -244,7 +244,7 @@ class Design:
         return cell, draw, calibration, task
 
     def placed(self, runs: IntArray) -> _Places:
-        """Where runs (k,) stand."""
+        """Return the places of runs (k,)."""
         cell, draw = np.divmod(runs, self.sweep.runs)
         tasks = self.sweep.tasks
         task = draw % tasks.random if tasks else np.full_like(draw, -1)
@@ -280,7 +280,7 @@ class Design:
 
     @lru_cache(maxsize=4096)  # noqa: B019 - a process has one design
     def calibrated(self, cell: int, calibration: int) -> Config:
-        """Configuration of a cell with the seed of a calibration and what is drawn for it."""
+        """Return the configuration of a cell with the seed and the draws of a calibration."""
         config = self.cell(cell)
         if drawn := self._drawn(CALIBRATION_VALUES, calibration):
             config = _changed(config, drawn, f"calibration {calibration}")
@@ -309,7 +309,7 @@ class Design:
 
     @property
     def _calibrations(self) -> int:
-        """How many calibrations a cell has."""
+        """Return the number of calibrations of a cell."""
         return min(self.sweep.calibrations, self.sweep.runs)
 
     @lru_cache(maxsize=64)  # noqa: B019 - a process has one design
@@ -351,14 +351,14 @@ class Design:
 
     @cached_property
     def _of_calibrations(self) -> set[str]:
-        """Keys that are drawn and that a calibration depends on, as values drawn for them tell."""
+        """Return the random keys that a calibration depends on, by probing values."""
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(PROBES,)))
         probes = [{key: _sample(one, rng) for key, one in self.sweep.random.items()} for _ in range(_PROBES)]
         found = set()
         for key, cell, probe in product(self.sweep.random, range(self.cells), probes[1:]):
             if key not in found:
                 cases = (probes[0], probes[0] | {key: probe[key]})
-                with suppress(InputError):  # a value that makes no configuration is told where it is drawn
+                with suppress(InputError):  # an invalid value is reported at its draw
                     configs = [_changed(self.cell(cell), values, "random") for values in cases]
                     first, second = (key_of(calibration_inputs(config)) for config in configs)
                     found |= {key} if first != second else set()

@@ -55,9 +55,9 @@ class Engine:
         most: int | None = None,
         threads: bool = False,
     ) -> Generator[Result, None, None]:
-        """Results of jobs as they are done, in any order; what a lost worker had is made again.
+        """Yield results of jobs as they are done, in any order; jobs of a lost worker are repeated.
 
-        No more jobs wait than keep all workers busy, and a result is let go when the next is asked for.
+        No more jobs wait than keep all workers busy, and a result is released at the next request.
 
         most : workers that the jobs are worth.
         threads : whether they seldom wait for each other; the memory is that of one process then.
@@ -124,7 +124,7 @@ class Engine:
                 process.terminate()
 
     def check(self) -> None:
-        """Raise WorkFailed where nothing can come back any more; a pool of this machine tells by itself."""
+        """Raise WorkFailed if no result can arrive; a pool of this machine raises by itself."""
 
     def close(self) -> None:
         """Leave the cluster."""
@@ -157,7 +157,7 @@ class Cluster(Engine):
                 f"{self._name}: the package distributed is missing: pip install '.[cluster]'"
             ) from error
         self.losses = (*Engine.losses, KilledWorker)
-        for name in list(logging.root.manager.loggerDict):  # what matters is said in our words
+        for name in list(logging.root.manager.loggerDict):  # projservo has its own messages
             if name.split(".")[0] in ("distributed", "tornado", "asyncio"):
                 logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
@@ -198,16 +198,16 @@ class Cluster(Engine):
 
     def check(self) -> None:
         """Raise WorkFailed where the scheduler is gone."""
-        for _ in range(20):  # a lost connection is noticed a moment after what was lost with it
+        for _ in range(20):  # a lost connection is noticed a moment after its lost jobs
             if self._client.status != "running":
                 raise WorkFailed(
-                    f"{self._name}: the connection to the scheduler is lost; what was stored "
-                    "until then is kept: start it anew and run the sweep again to continue"
+                    f"{self._name}: the connection to the scheduler is lost; results stored "
+                    "until then are kept: restart it and run the sweep again to continue"
                 )
             time.sleep(0.05)
 
     def close(self) -> None:
-        """Leave the scheduler; it drops what is not done."""
+        """Leave the scheduler, which drops pending jobs."""
         self._client.close(timeout=2.0)
 
 

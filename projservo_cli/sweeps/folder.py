@@ -1,8 +1,8 @@
-"""The folder of a sweep: what it is of, how far it is, how it is filled, and one of its runs anew.
+"""The folder of a sweep: its manifest, progress and results, and the repetition of one run.
 
 A manifest says what all else is of. While a sweep runs there is a file for each part; a part that is there
 is done, so after any end the same command goes on with the others. The table is assembled from them, and
-when it is complete they are removed. Calibrations stay, to make any run anew.
+when it is complete they are removed. Calibrations stay, to repeat any run.
 """
 
 import json
@@ -42,7 +42,7 @@ LOOPS = ("compiled.run_compiled-*.nbi", "batch._until_rehearsal-*.nbi")
 
 
 class _Status(NamedTuple):
-    """How far a sweep is: runs that are stored, and in all; ``complete`` when its parts are gone too."""
+    """Progress of a sweep: stored and total runs; ``complete`` once its parts are merged."""
 
     done: int
     total: int
@@ -51,7 +51,7 @@ class _Status(NamedTuple):
 
 
 class _Calibrated(NamedTuple):
-    """What became of the calibration of a key: records, or why there are none."""
+    """Calibration of a key: records, or the reason of a failure."""
 
     key: str
     config: Config
@@ -90,7 +90,7 @@ class Folder:
                 yield first, last
 
     def status(self, design: Design, *, force: bool = False) -> _Status:
-        """How far a sweep is; refuses a folder of another sweep or other versions unless ``force`` is set."""
+        """Return the progress of a sweep; refuse another sweep or other versions without ``force``."""
         total = design.total
         if not force and self.table.exists() and not self.manifest.exists():
             raise InputError(
@@ -105,11 +105,11 @@ class Folder:
         return _Status(total - left, total, chunk)
 
     def _chunk(self, design: Design) -> int:
-        """Runs of a part; refuses what was made of another configuration, or with versions of other bits."""
+        """Return the runs of a part; refuse those of another configuration, or of other versions."""
         manifest, now = self._read(), versions()
         if manifest["key"] != design.key:
             raise InputError(
-                f"{self.manifest}: of another configuration; choose another folder with -o, or begin anew "
+                f"{self.manifest}: of another configuration; choose another folder with -o, or start again "
                 "with --force"
             )
         made_by = manifest.get("sources", {})
@@ -117,25 +117,25 @@ class Folder:
         if changed:
             raise InputError(
                 f"{self.manifest}: the source of {', '.join(changed)} changed since; choose another folder "
-                "with -o, or begin anew with --force"
+                "with -o, or start again with --force"
             )
         made_with = manifest["provenance"]
         other = [f"{name} {made_with[name]}, now {now[name]}" for name in now if made_with[name] != now[name]]
         if other:
             raise InputError(
                 f"{self.manifest}: made with {'; '.join(other)}: a sweep is not continued with other "
-                "versions; begin anew with --force"
+                "versions; start again with --force"
             )
         return int(manifest["chunk"])
 
     def _read(self) -> dict[str, Any]:
-        """Key and recipe of the design, runs a part, and with what it is made."""
+        """Key and recipe of the design, runs a part, and versions."""
         if not self.manifest.exists():
             raise InputError(f"{self.path}: holds no sweep; make one with projservo sweep -c FILE")
         try:
             found: dict[str, Any] = json.loads(self.manifest.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise InputError(f"{self.manifest}: damaged; begin anew with --force") from error
+            raise InputError(f"{self.manifest}: damaged; start again with --force") from error
         return found
 
     def design(self) -> Design:
@@ -155,7 +155,7 @@ class Folder:
         write_whole(self.manifest, json.dumps(values))
 
     def clear(self) -> None:
-        """Remove what a sweep of another configuration left."""
+        """Remove the files of a sweep of another configuration."""
         for folder in (self.parts, self.path / "calibrations"):
             shutil.rmtree(folder, ignore_errors=True)
         for path in (self.table, self.manifest):
@@ -182,7 +182,7 @@ class Folder:
         return self.table
 
     def calibration(self, key: str) -> Path:
-        """The run file that holds a calibration, or beside which a file says why there is none."""
+        """Return the path of a calibration's run file, or of the file with the reason of its failure."""
         return self.path / "calibrations" / f"{key[:20]}.h5"
 
     def missing_calibrations(self, design: Design) -> list[tuple[str, Config]]:
@@ -194,7 +194,7 @@ class Folder:
         ]
 
     def keep_calibration(self, made: _Calibrated) -> None:
-        """Store a calibration as a run file of its own, or why there is none."""
+        """Store a calibration as a separate run file, or the reason of its failure."""
         path = self.calibration(made.key)
         if made.records is None:
             write_whole(path.with_suffix(REFUSED), made.reason + "\n")
@@ -241,7 +241,7 @@ def run_sweep(
     *,
     force: bool = False,
 ) -> _Status:
-    """Make the runs of a sweep that are not stored yet, and the table; of what was stored also at Ctrl-C."""
+    """Make the missing runs of a sweep, and the table; of the stored runs also at Ctrl-C."""
     status = folder.status(design, force=force)
     if status.complete:
         return status
@@ -298,7 +298,7 @@ def _make_parts(design: Design, folder: Folder, engine: Engine, status: _Status,
 
 
 def _shares_settings(design: Design) -> bool:
-    """Whether all runs are compiled ones, of which many differ in nothing but their images."""
+    """Tell whether all runs are compiled ones, many of which differ in their images alone."""
     tasks = design.sweep.tasks.random if design.sweep.tasks is not None else 1
     settings = math.lcm(design.sweep.calibrations, tasks)
     if design.sweep.random or settings > SETTINGS or design.sweep.runs < settings:

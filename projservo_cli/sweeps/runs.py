@@ -30,7 +30,7 @@ NONE = -1  # in columns of counts, where a run did not begin
 
 
 class _Column(NamedTuple):
-    """One column of the table: its name, NumPy type, unit and what it holds."""
+    """One column of the table: its name, NumPy type, unit and meaning."""
 
     name: str
     dtype: str
@@ -88,7 +88,7 @@ BETWEEN = _Column("center_deviation_mm", "f8", "mm", "maximum distance of the ce
 
 
 def columns_of(design: Design) -> tuple[_Column, ...]:
-    """All columns of the table of a sweep: numbers, inputs, what was measured."""
+    """All columns of the table of a sweep: numbers, inputs, measured values."""
     axes = [_input(axis.name, axis.values, "value of the grid") for axis in design.axes]
     random = design.sweep.random.items()
     drawn = [_input(key, given.choice or (0.0,), "value drawn for the run") for key, given in random]
@@ -110,7 +110,7 @@ def _shown(value: Any) -> Any:
 
 
 _Columns = dict[str, npt.NDArray[Any]]
-# What the table says of a verdict of the kernel.
+# Text of a verdict of the kernel in the table.
 _SAID = {code: name.encode() for code, name in enumerate(VERDICTS)}
 _COUNTS = tuple(column.name for column in MEASURED if column.dtype.startswith("i") and column.name in NUMBERS)
 
@@ -201,7 +201,7 @@ def _put(table: _Columns, rows: IntArray, values: Mapping[str, Any]) -> None:
 
 
 def _measured(given: ServoInputs, name: str, calibration: Calibration, seeds: IntArray) -> dict[str, Any]:
-    """What is measured of compiled runs, by column."""
+    """Return the measured values of compiled runs, by column."""
     try:
         numbers = _numbers_of(run_scenario(given, calibration), name, seeds.tolist())
     except WorkFailed:
@@ -214,7 +214,7 @@ def _measured(given: ServoInputs, name: str, calibration: Calibration, seeds: In
     return found
 
 
-# Noise is drawn for so many instants, and for so many times as many where a run is not over then.
+# Noise is drawn for this number of steps, and for this multiple if a run is longer.
 INSTANTS, FURTHER = 192, 4
 # Runs that compiled code makes in one call: their noise is a few hundred kilobytes.
 TOGETHER = 16
@@ -237,7 +237,7 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
     found = np.empty((len(seeds), len(NUMBERS)))
     for first in range(0, len(seeds), TOGETHER):
         running, instants = list(range(first, min(first + TOGETHER, len(seeds)))), INSTANTS
-        while running:  # those that outlast their noise are made anew with more
+        while running:  # those that outlast their noise are repeated with more
             drawn = min(instants, scenario.limits.max_steps + 1)
             shown = [scenario.shown_at(seeds[i]) for i in running]
             images = np.array([(ends.s_start, ends.s_star) for ends in shown])
@@ -252,7 +252,7 @@ _designs: dict[str, Design] = {}
 
 
 def _interned(design: Design) -> Design:
-    """One object for every copy of a design, so that what it has worked out is kept from part to part."""
+    """One object for every copy of a design, so that its derived results are kept from part to part."""
     if design.key not in _designs:
         _designs.clear()
         _designs[design.key] = design
@@ -277,7 +277,7 @@ def _plan(given: PlanInputs, calibration: Calibration, calibration_key: str) -> 
 def _run(
     design: Design, run: int, calibration: Calibration, *, keep: bool
 ) -> tuple[dict[str, Any], Trace | None]:
-    """What is measured of one run, by column, and its trace where it is kept."""
+    """Return the measured values of one run, by column, and its trace if it is kept."""
     config = design.config(run)
     given, name, (cell, _, number, _) = servo_inputs(config), name_of_run(config), design.numbers(run)
     try:

@@ -94,7 +94,7 @@ def of_runs(rows: Rows, these: BoolArray) -> dict[str, Any]:
 
 
 def _interval(successes: int, count: int) -> tuple[float, float]:
-    """Interval of 95 % for a share of which so many of so many were seen.
+    """Return the 95 % interval of a proportion from counts.
 
     Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
     Journal of the American Statistical Association 22 (1927), p. 209.
@@ -164,7 +164,7 @@ POINTS = 2_000  # of a curve
 
 
 def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict[str, Any], list[Path]]:
-    """Write statistics and figures of the table of a sweep beside it; the statistics and the files."""
+    """Write statistics and figures of the table of a sweep next to it; return both."""
     table, folder = SweepTable(path), path.parent
     rows = Rows(table)
     cells = [{"cell": cell, **rows.values(cell), **of_runs(rows, these)} for cell, these in rows.cells()]

@@ -26,7 +26,7 @@ class Study(Displayable):
 
     def __init__(self, table: SweepTable, names: Mapping[str, str] | None = None) -> None:
         self._rows, self._names = Rows(table), dict(names or {})
-        # In memory what is stored is gone when the caller sees it.
+        # In memory, stored files are gone when the caller sees the result.
         self._columns = {name: self._rows[name] for name in (*table.names, "self_occluded", "left_image")}
         self._columns["path_length_ratio"] = self._rows["path_length_ratio"]
         self._traces = {run: RunTrace.of(table.trace(run)) for run in table.traces}
@@ -97,7 +97,7 @@ class Study(Displayable):
         )
 
     def summary(self) -> dict[str, str]:
-        """Return what there is to tell, in words, by name."""
+        """Return a summary in words, by name."""
         cells = self.success()
         told = {"runs": f"{len(self.table['run'])} in {len(cells)} cells"}
         for cell in cells[:_SHOWN]:

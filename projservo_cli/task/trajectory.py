@@ -16,7 +16,7 @@ PROFILES = ("linear", "exponential", "rotation_first", "translation_first", "pla
 
 
 class KeptOut(NamedTuple):
-    """What an obstacle covers in the images: polygons of corners u and v, px; None for none in an image."""
+    """Region of an obstacle in the images: polygons of corners u and v, px; None for none in an image."""
 
     left: tuple[tuple[float, float], ...] | None
     right: tuple[tuple[float, float], ...] | None
@@ -24,17 +24,17 @@ class KeptOut(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """The planned motion that is asked for, and what it keeps to."""
+    """The requested motion and its constraints."""
 
     profile: str  # one of ``PROFILES``, ``constrained``, ``joint_space`` or ``auto``
     visibility_fraction: float  # share of the translation at which visibility changes that is kept to
     n_samples: int  # points of the path that are stored
     duration_s: float | None  # time the motion is given; None for as little as it takes
     acceleration_time_s: float  # time in which a motion comes up to its pace, and to rest again
-    border_px: float  # least distance of a marker from an image border
-    min_reciprocal_condition: float  # least reciprocal condition of the face's image Jacobian
-    min_face_px: float  # least width of the face in an image
-    joint_margin: float  # least distance from a limit, revolute joints, rad
+    border_px: float  # minimum distance of a marker from an image border
+    min_reciprocal_condition: float  # minimum reciprocal condition number of the face's image Jacobian
+    min_face_px: float  # minimum width of the face in an image
+    joint_margin: float  # minimum distance from a limit, revolute joints, rad
     joint_margin_m: float  # and prismatic ones
     max_goal_configurations: int  # joints that show the goal which a search tries
     max_search_samples: int  # joint vectors that two trees grow towards, at most
@@ -43,7 +43,7 @@ class Trajectory(NamedTuple):
 
     @property
     def rehearses(self) -> bool:
-        """Whether half turns are rehearsed; where shares are searched for both senses are compared."""
+        """Whether half turns are rehearsed; a search of the fractions compares both senses."""
         return self.profile not in ("constrained", "auto")
 
     @property

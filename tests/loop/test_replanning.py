@@ -112,7 +112,7 @@ def test_a_command_that_is_no_number_is_never_let_through():
     ways = PathReplanner()
     watch, _, log = watched(ways, clock=4.0)
     assert watch.ruled(log, 7, DIVERGED, np.array([0.0, np.nan])) == WAITING
-    assert watch.attempts == ["at step 7 (growing errors on the way)"]
+    assert watch.attempts == ["at step 7 (growing errors on the path)"]
     assert watch.ruled(log, 8, DIVERGED, np.array([np.inf, 0.0])) == DIVERGED
 
 

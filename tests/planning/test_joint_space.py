@@ -196,7 +196,7 @@ def test_a_face_that_is_lost_for_long_is_found_on_the_way_back():
     assert trace.verdict == "converged"
     assert trace.success
     assert trace.replan_attempts == 1
-    assert "seen again on the way back" in trace.reason
+    assert "seen again on the path backwards" in trace.reason
     assert not trace.q_dot[12 : 12 + 25].any()
     there = np.linalg.norm(trace.q[37:43] - trace.q[0], axis=1)
     assert (np.diff(there) < 0.0).all()

@@ -161,8 +161,8 @@ def drawn():
 def test_a_region_in_the_way_closes_the_motions_of_the_paper_and_leaves_a_way_around(drawn):
     config, calibration, linear = drawn("linear")
     assert not linear.feasible
-    assert "the body enters region 1 of trajectory.keep_out at sigma 0." in linear.reason
-    with pytest.raises(WorkFailed, match="nothing is driven"):
+    assert "the body enters region 1 of trajectory.keep_out at path parameter 0." in linear.reason
+    with pytest.raises(WorkFailed, match="no law runs without one"):
         servo.run(config, calibration, linear, "exact_track")
     config, calibration, found = drawn("auto")
     assert (found.profile, found.feasible) == ("joint_space", True)

@@ -96,7 +96,7 @@ def test_without_limits_the_way_through_joint_space_is_closed(mine):
     assert not found.feasible
     assert "the goal is within region 1" in found.reason
     assert found.rejected_profiles[-1].startswith(
-        "joint_space: nothing tells the limits of all joints: set robot.limits"
+        "joint_space: the limits of some joints are unknown: set robot.limits"
     )
 
 

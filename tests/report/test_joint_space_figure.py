@@ -71,7 +71,7 @@ def test_curves_are_of_the_plan_and_above_what_is_asked(material, data):
     assert (low[5:7] < high[5:7]).all()  # the width of the face at start and goal
     assert len(plan.relaxed_constraints) == 2
     for text, end, views in zip(plan.relaxed_constraints, ("start", "goal"), ("left", "right"), strict=True):
-        assert text.startswith(f"asked less at the {end}: limit of joint 3 0.4")
+        assert text.startswith(f"relaxed at the {end}: limit of joint 3 0.4")
         assert f"width of the face in the {views} image" in text
         assert text.count("instead of 8 px") == 1
 

@@ -179,7 +179,7 @@ def test_a_disturbance_ends_the_run_with_what_moved(servo, fault, culprit):
 def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
     answer = servo(*faulty("bumped camera"))
     assert answer.code == 1
-    assert "nothing was moved, since where the robot stands images are" in answer.err
+    assert "the robot did not move, since at the start images are" in answer.err
     assert commands() == []
     assert CALLS[-2:] == ["stop", "close"]
     answer = servo(*faulty("bumped camera"), "--set", "stop.innovation_threshold=0", "--json")

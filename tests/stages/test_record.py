@@ -477,13 +477,13 @@ def test_after_each_joint_what_it_showed_must_be_of_use_and_is_kept():
         return s
 
     few = r"only 2 of the 20 markers in the 3 poses of joint 2, half of them or more \(3 at least\)"
-    with pytest.raises(WorkFailed, match=f"{few}.*calibration.amplitude_deg; then begin anew with --force"):
+    with pytest.raises(WorkFailed, match=f"{few}.*calibration.amplitude_deg; then start again with --force"):
         stage.record(config, recording, driven(config, Masked(config, seen)))
     assert read_table("t.csv").at_rest.pose.tolist() == [0, 1, 2, 3, 4]
     # It does not go on until the table is begun anew.
     again, sound = stage.new_recording(config, Path("t.csv")), Masked(config, lambda q, s: s)
     assert again.found == 5
-    with pytest.raises(WorkFailed, match="begin anew"):
+    with pytest.raises(WorkFailed, match="start again"):
         stage.record(config, again, driven(config, sound))
     assert sound.sent == []
     stage.record(config, stage.new_recording(config, Path("t.csv"), force=True), driven(config, sound))

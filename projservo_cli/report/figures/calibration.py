@@ -1,4 +1,4 @@
-"""Diagnostics of a calibration: what the fit leaves of the images, and what the data determine."""
+"""Diagnostics of a calibration: residuals of the images, and observability of the joints."""
 
 from typing import Any
 
@@ -18,12 +18,12 @@ from projservo_cli.report import style
 from projservo_cli.report.report_data import VIEWS, Data, Fit, registered
 
 _BOTH = 2
-_ARROW = 0.04  # length of an arrow of the rms residual, as a share of the extent of what was seen
+_ARROW = 0.04  # length of an arrow of the rms residual, as a fraction of the extent of the observations
 _BAND = (0.025, 0.975)  # shares of χ² between which the residuals of a pose are expected
 _BINS = 40
 _RESIDUAL: style.Look = {"color": style.BLUE}
 _WEAK: style.Look = {"facecolor": style.ORANGE, "edgecolor": style.BLACK, "hatch": "////", "linewidth": 0.6}
-# Why a reading was left out: by itself, its number, its pose, or its marker as a whole.
+# Reason of a rejected observation: by itself, its number, its pose, or its marker as a whole.
 _KINDS = ("outlier", "swapped", "pose", "marker")
 _LEFT_OUT: dict[str, style.Look] = {
     "outlier": {"color": style.VERMILION, "marker": "x"},
@@ -36,7 +36,7 @@ _NAMES = {
     "outlier": "outlier",
     "swapped": "of another number",
     "pose": "of a pose in doubt",
-    "marker": "of a marker left out whole",
+    "marker": "of a rejected marker",
 }
 _LARGE, _SMALL, _MANY = 4.0, 1.5, 300  # sizes of these points, pt, and how many are many
 _MODEL: style.Look = {"color": style.BLACK, "linewidth": 1.2}
@@ -76,7 +76,7 @@ def _data(fit: Fit) -> Data:
         others = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
         result[f"seen_{view}"] = seen[:, v][used[:, v]]
         result[f"residual_{view}"] = residual[:, v][used[:, v]]
-        gone = np.maximum(left_out, 1)  # what cannot be predicted is told as outlier
+        gone = np.maximum(left_out, 1)  # a marker without a prediction counts as an outlier
         places = [seen[:, v][(read & out & (gone == i))[:, v]] for i in range(1, len(_KINDS))]
         result |= {
             f"left_out_{kind}_{view}": of_kind
@@ -92,7 +92,7 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
 
     Those of a pose, weighed where their deviations are stated, have the covariance S = σ² (I + G Gᵀ), with G
     the derivative by the joints times their noise over σ. With G = U s Vᵀ, σ S^-½ takes the share
-    1 − (1 + s²)^-½ from what lies along U. It mixes the errors that markers have of their own: of the squares
+    1 − (1 + s²)^-½ from the part along U. It mixes the separate errors of markers: of the squares
     of what comes to one of them from the others, only their sum A over all is needed.
     """
     calibration, q = fit.calibration, fit.observation.q
@@ -203,12 +203,12 @@ def _magnification(residual: FloatArray, extent: float) -> float:
 
 @registered(
     "fig13_calibration",
-    "What the calibration leaves of the images, and what the data determine",
-    "beside the paper's",
+    "Residuals of the calibration, and observability of the joints",
+    "not in the paper",
     _data,
     height=7.8,
     task=False,
-    alt="Residuals as arrows in both images; their histogram beside the noise model; rms residual "
+    alt="Residuals as arrows in both images; their histogram with the noise model; rms residual "
     "of each pose over its predicted error; range of each joint; eigenvalues of the information "
     "matrix.",
 )
@@ -224,7 +224,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     looks: dict[str, style.Look] = {
         f"residual, {data['factor']:,g} times": _RESIDUAL,
         **{
-            f"left out: {_NAMES[kind]}": {**look, "markersize": _LARGE}
+            f"rejected: {_NAMES[kind]}": {**look, "markersize": _LARGE}
             for kind, look in _LEFT_OUT.items()
             if any(len(data[f"left_out_{kind}_{view}"]) for view in VIEWS)
         },
@@ -245,12 +245,12 @@ def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
     axes.quiver(*seen.T, *arrows.T, **pixels, **heads, **_RESIDUAL)
     for kind, places in out.items():
         axes.plot(*places.T, **_LEFT_OUT[kind], markersize=_LARGE if count < _MANY else _SMALL)
-    title = f"{view}: {len(seen):,} readings, {count:,} left out"
+    title = f"{view}: {len(seen):,} readings, {count:,} rejected"
     style.image_axes(axes, title, np.concatenate([seen, seen + arrows, *out.values()]))
 
 
 def _histogram(axes: "style.Axes", data: Data) -> None:
-    """Density of the residuals beside the normal one of the noise model."""
+    """Draw the density of the residuals and the normal density of the noise model."""
     residual, sigma = data["residual"], float(data["sigma_px"])
     widest = max(4.0 * sigma, float(np.abs(residual).max(initial=0.0)))
     bins = np.linspace(-widest, widest, _BINS + 1).tolist()
@@ -263,7 +263,7 @@ def _histogram(axes: "style.Axes", data: Data) -> None:
 
 
 def _poses(axes: "style.Axes", data: Data) -> None:
-    """Residual of each pose over its predicted error, beside what the noise model leads one to expect."""
+    """Draw the residual of each pose over its predicted error, with the distribution of the noise model."""
     predicted, residual = data["pose_predicted_px"], data["pose_residual_px"]
     sigma = float(data["sigma_px"])
     held_out = bool(data["held_out"])

@@ -95,7 +95,7 @@ def _data_three(material: Material) -> Data:
 
 @registered(
     "fig10_errors_three",
-    "Control errors of directTHREE, projective beside Euclidean model",
+    "Control errors of directTHREE, projective and Euclidean model",
     "Fig. 10, section 6",
     _data_three,
     height=4.8,

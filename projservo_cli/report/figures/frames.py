@@ -1,4 +1,4 @@
-"""Figure 17: what both cameras saw at the start, on the way and at the end of a run, with what was found."""
+"""Figure 17: images of both cameras at the start, in the middle and at the end of a run, with detections."""
 
 import io
 
@@ -10,7 +10,7 @@ from projservo_cli.report import style
 from projservo_cli.report.report_data import VIEWS, Data, Driven, Material, registered, title
 from projservo_cli.task.face import cyclic_order
 
-_MOMENTS = ("start", "on the way", "end")
+_MOMENTS = ("start", "in the middle", "end")
 _HALO = 1.2  # points, by which lines over a frame are wider in white
 _FOUND: style.Look = {"color": style.ORANGE, "marker": "+", "linestyle": "none", "markersize": 4.0}
 _FACE: style.Look = {"color": style.GREEN, "linewidth": 1.2}
@@ -77,11 +77,11 @@ def with_halo(axes: "style.Axes") -> None:
 
 @registered(
     "fig17_frames",
-    "What both cameras saw at the start, on the way and at the end",
-    "beside the paper's",
+    "Images of both cameras at the start, in the middle and at the end",
+    "not in the paper",
     _data,
     frames=True,
-    alt="A row for each camera, with its image at the start, on the way and at the end of a run. Drawn over "
+    alt="A row for each camera, with its image at the start, in the middle and at the end. Drawn over "
     "them are the markers that were found, the face with the paths of its markers so far, and the goal.",
 )
 def _draw(data: Data, figure: "style.Figure") -> None:

@@ -18,7 +18,7 @@ from projservo_cli.report.report_data import (
 
 _OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
 _BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
-_PANEL_WIDTH = 2.9  # inches, of one of two panels beside one another
+_PANEL_WIDTH = 2.9  # inches, of one of two panels side by side
 _BORDER: style.Look = {"color": style.GREY, "linewidth": 0.8}
 _HIDDEN: style.Look = {"color": style.ORANGE, "linewidth": 4.0, "alpha": 0.6}
 _PATH: style.Look = {"color": style.BLACK, "linewidth": 0.9}
@@ -29,7 +29,7 @@ _SHOWN: dict[str, style.Look] = {
     "direct_three": {"color": style.GREEN, "linewidth": 1.2},
     "stacked": {"color": style.VERMILION, "linewidth": 1.1, "linestyle": (0, (4, 1.2))},
 }
-_IMAGE_WIDTH, _ERRORS_WIDTH = 3.7, 2.1  # inches, of the panels with images and of those beside them
+_IMAGE_WIDTH, _ERRORS_WIDTH = 3.7, 2.1  # inches, of the panels with images and of those next to them
 _ASPECTS = (0.45, 0.9)  # height over width of an image, within: an error panel has its height
 _PERCENT = (1e-2, 200.0)  # shown of a control error: below, noise of the calibration rules
 _BAND: style.Look = {"color": style.ORANGE, "linewidth": 5.0, "alpha": 0.55, "solid_capstyle": "butt"}
@@ -211,8 +211,8 @@ def _data_overview(material: Material) -> Data:
 
 @registered(
     "fig00_overview",
-    "One run at a look: the classical and the direct law in both images, and their errors",
-    "beside the paper's",
+    "One run at a glance: the classical and the direct law in both images, and their errors",
+    "not in the paper",
     _data_overview,
     laws=tuple(_SHOWN),
     alt="Left: paths of the markers in both camera images, from the face at the start to the goal, "

@@ -15,7 +15,7 @@ PIECES = 4  # of each edge of a tree, which is no straight line in an image
 _IMAGE_WIDTH, _ROW = 2.9, 1.5  # inches: of an image, and the height of a row of curves
 _HIGHEST = 0.8  # height of an image over its width, at most
 _NEAR_EDGE = 0.42  # distance from the middle of an image, as a share of it, from which its border shows
-_STRIP = 0.085  # of the time, that the range of a joint takes beside the curves
+_STRIP = 0.085  # of the time, that the range of a joint takes next to the curves
 _NEAR, _NEAR_PX = 1.0, 10.0  # margins and distances up to which a scale to ten times as much is linear
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")  # as text, which takes a tenth of formulas
 _SIDES: tuple[Any, Any] = ("-", (0, (4, 1.5)))  # of what both cameras have
@@ -49,7 +49,7 @@ def _data(material: Material) -> Data:
     timed = bool(np.isfinite(plan.time).all())
     name = f"{plan.profile.replace('_', ' ')} profile"
     if plan.profile == "joint_space" and not plan.feasible:
-        name = "no way found, linear motion"
+        name = "no path found, linear motion"
     result: Data = {
         "name": np.array(name),
         **({"t_s": plan.time} if timed else {"sigma": plan.path_parameter}),
@@ -81,7 +81,7 @@ def _data(material: Material) -> Data:
 
 
 def _distances(plan: Plan, border_px: float) -> Data:
-    """Distances in px and what is asked of them; of a way through joint space those it was held against."""
+    """Return distances in px and their required values; of a joint-space path those of its constraints."""
     if plan.margins is None or plan.required_margins is None:
         seen = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
         return {"border_px": seen, "border_px_asked": np.full_like(seen, border_px)}
@@ -119,14 +119,14 @@ def with_gaps(points: FloatArray) -> FloatArray:
 @registered(
     "fig16_way",
     "The planned motion in both images, its joints and its margins over time",
-    "beside the paper's, after section 4",
+    "not in the paper, after section 4",
     _data,
     alt="Above, for each camera, the paths of the markers and of the centre of the face, regions that are "
-    "kept out of, and the search trees where there are some. Below left the joints over time beside their "
-    "ranges, below right the margins and distances over time, with what is asked for.",
+    "kept out of, and the search trees, if any. Below left the joints over time with their "
+    "ranges, below right the margins and distances over time, with their required values.",
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
-    """Above the images; below left the joints, by kind, right what is held against."""
+    """Above the images; below left the joints, by kind, right the constraints."""
     slides = data["prismatic"]
     kinds: list[tuple[IntArray, str]] = [
         (np.flatnonzero(slides == kind), "mm" if kind else "deg") for kind in np.unique(slides)
@@ -181,7 +181,7 @@ def _image(axes: "style.Axes", data: Data, view: int, shown: FloatArray) -> None
 
 
 def _time(data: Data) -> tuple[FloatArray, str]:
-    """What runs to the right, (k,), and its name."""
+    """Return the abscissa (k,) and its name."""
     return (data["t_s"], "time (s)") if "t_s" in data else (data["sigma"], "path parameter σ (1)")
 
 
@@ -218,7 +218,7 @@ def _joints(axes: "style.Axes", data: Data, chosen: list[int], unit: str) -> Non
 
 
 def _curves(axes: "style.Axes", data: Data, colors: dict[str, str]) -> None:
-    """What is held against over time, solid for the left camera or both, and what is asked for."""
+    """Draw the constraints over time, solid for the left camera or both, and their required values."""
     t, name = _time(data)
     axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
     for key, color in colors.items():

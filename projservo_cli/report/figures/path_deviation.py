@@ -21,7 +21,7 @@ from projservo_cli.report.report_data import (
 _LEAST_SHARE = 0.05  # of the largest deviation of the best run, below which nothing is drawn
 _PATH_POINTS = 400
 _WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
-_WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a share of the least of them
+_WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a fraction of the smallest
 _LEAST_OF_MODES = 0.02
 _WAY, _OFF = "way along the straight line (mm)", "distance from it (mm)"
 _RESOLUTION = np.radians(1.0)  # longest joint motion, rad or m, between two points of a drawn path
@@ -37,7 +37,7 @@ _MAXIMA: dict[tuple[int, int], style.Look] = {
 
 
 def study_numbers(studies: Studies | None) -> dict[str, Any]:
-    """What a ``Report`` holds of the extra runs, NaN where the goal pose is unknown.
+    """Return the numbers of the extra runs for a ``Report``, NaN if the goal pose is unknown.
 
     Laws, operators, limits and gains are in the order of its tables.
     """
@@ -104,7 +104,7 @@ def _center_path(material: Material, trace: Trace) -> FloatArray:
     height=5.2,
     studies=True,
     goal=True,
-    alt="For directTHREE and directTWO: distance of the centre from its straight line along the way "
+    alt="For directTHREE and directTWO: distance of the centre from its straight line along the path "
     "for several gains, and the largest distance over the gain, with true and calibrated "
     "operators, with and without a limit.",
 )
@@ -176,16 +176,16 @@ def _data_modes(material: Material) -> Data:
 
 @registered(
     "fig15_modes_path",
-    "Path of the centre: planning anew in each step, and following the plan",
-    "beside the paper's, after section 4",
+    "Path of the centre: regulation in each step, and following the plan",
+    "not in the paper, after section 4",
     _data_modes,
     height=3.0,
     modes=True,
     goal=True,
-    alt="Distance of the centre from its straight line over the way along it, one curve a law and mode.",
+    alt="Distance of the centre from its straight line over the distance along it, one curve a law and mode.",
 )
 def _draw_modes(data: Data, figure: "style.Figure") -> None:
-    """Distance of the centre from its line over the way along it, one curve a run."""
+    """Draw the distance of the centre from its line over the distance along it, one curve per run."""
     axes, names = figure.subplots(), [str(name) for name in data["names"]]
     for i, name in enumerate(names):
         way, off = data[f"path_mm_{name}"].T

@@ -103,7 +103,7 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
     "The planned motion from between the cameras",
     "Fig. 5, section 6",
     _data_linear,
-    alt="The face at several moments of the planned motion, seen from between the cameras; beside "
+    alt="The face at several moments of the planned motion, seen from between the cameras; next to "
     "it the shares of translation and rotations that are done and the visibility margin of both "
     "cameras.",
 )
@@ -129,7 +129,7 @@ def _draw_planned(data: Data, figure: "style.Figure") -> None:
         shares.set_ylabel(_SHARE)
         shares.tick_params(labelbottom=False)
         margins = figure.add_subplot(grid[1, 1], sharex=shares)
-    else:  # of a way through joint space
+    else:  # of a path through joint space
         margins = figure.add_subplot(grid[:, 1])
     style.paths(image, faces, {"color": style.GREY, "linewidth": 0.6})
     shown = np.unique(np.linspace(0, len(sigma) - 1, _FACES).round().astype(int))
@@ -151,7 +151,7 @@ def _draw_planned(data: Data, figure: "style.Figure") -> None:
 
 
 def _columns(axes: "style.Axes", x: FloatArray, values: FloatArray, looks: Iterable[style.Look]) -> None:
-    """Each column of values (k, c) over x (k,), in a look of its own."""
+    """Each column of values (k, c) over x (k,), in a separate style."""
     for column, look in zip(values.T, looks, strict=True):
         axes.plot(x, column, **look)
 
@@ -206,7 +206,7 @@ def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
 @registered(
     "fig14_path",
     "Where each camera sees the face, and the planned path among it",
-    "beside the paper's, after section 4.3",
+    "not in the paper, after section 4.3",
     _data_path,
     height=6.0,
     shares=True,
