@@ -52,13 +52,13 @@ def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
 
 
 def _made(provenance: Any) -> str:
-    told = {name: str(value or "") for name, value in provenance.items()}
-    commit = told.get("git_commit", "")[:10]
-    source = f" at {commit}{' with changes' if told.get('git_dirty') else ''}" if commit else ""
-    versions = ", ".join(f"{name} {told.get(name, '?')}" for name in ("python", "numpy", "numba"))
+    values = {name: str(value or "") for name, value in provenance.items()}
+    commit = values.get("git_commit", "")[:10]
+    source = f" at {commit}{' with changes' if values.get('git_dirty') else ''}" if commit else ""
+    versions = ", ".join(f"{name} {values.get(name, '?')}" for name in ("python", "numpy", "numba"))
     return (
-        f"made {told.get('date', '?')} on {told.get('host', '?')} "
-        f"with projservo {told.get('projservo', '?')}{source}, {versions}"
+        f"made {values.get('date', '?')} on {values.get('host', '?')} "
+        f"with projservo {values.get('projservo', '?')}{source}, {versions}"
     )
 
 
@@ -129,17 +129,17 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
         for field in dataclasses.fields(record):
             if (value := getattr(record, field.name)) is None:
                 continue
-            dims, told = field.metadata.get("dims"), ""
+            dims, values = field.metadata.get("dims"), ""
             if dims is not None and np.asarray(value).dtype == np.uint8:
-                told = "left out: bytes"
+                values = "left out: bytes"
             elif dims is not None:
                 arrays[field.name] = np.asarray(value)
             elif isinstance(value, (str, float)):
-                told = str(value)
+                values = str(value)
             else:
-                told = json.dumps(value, ensure_ascii=False)
+                values = json.dumps(value, ensure_ascii=False)
             about = (field.metadata["units"], field.metadata["about"])
-            rows.append((file, field.name, " ".join(dims or ()), *about, told))
+            rows.append((file, field.name, " ".join(dims or ()), *about, values))
         tables[file] = to_csv(arrays, down=0)
     names = ("file", "field", "dimensions", "unit", "about", "value")
     tables["fields.csv"] = to_csv(dict(zip(names, np.array(rows, dtype=object).T, strict=True)))

@@ -193,12 +193,12 @@ class _Document:
 
     def refused(self) -> InputError:
         """One line a problem, flags last, otherwise in the order of the file; of very many the first."""
-        told = []
+        listed = []
         for path, what, source in self.problems:
             place = source or self.place(path)
             parts = (place, _shortened(".".join(map(str, path)), 200), _shortened(what, 1000))
-            told.append((_position(place), ": ".join(part for part in parts if part)))
-        different = list(dict.fromkeys(line for _, line in sorted(told, key=lambda item: item[0])))
+            listed.append((_position(place), ": ".join(part for part in parts if part)))
+        different = list(dict.fromkeys(line for _, line in sorted(listed, key=lambda item: item[0])))
         left = len(different) - _MOST_LINES
         more = [f"{self.name}: and {left} more"] if left > 0 else []
         return InputError("\n".join(different[:_MOST_LINES] + more))

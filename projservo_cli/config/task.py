@@ -59,13 +59,13 @@ class _GoalImages(Section):
         """Standard deviation of markers in the left and in the right image, px; NaN if unknown."""
         own = list(self.markers or face)
         sides = [side or (None,) * len(own) for side in (self.sigma_left_px, self.sigma_right_px)]
-        told = [dict(zip(own, side, strict=True)) for side in sides]
-        return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in told]
+        known = [dict(zip(own, side, strict=True)) for side in sides]
+        return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in known]
 
     def sigma_px(self, face: Sequence[int]) -> float | None:
         """Standard deviation of a coordinate of the markers of the face, rms; None if unknown."""
-        told = [sigma**2 for side in self.deviations(face, face) for sigma in side]
-        return None if any(map(math.isnan, told)) else math.sqrt(sum(told) / len(told))
+        known = [sigma**2 for side in self.deviations(face, face) for sigma in side]
+        return None if any(map(math.isnan, known)) else math.sqrt(sum(known) / len(known))
 
 
 class Goal(Section):

@@ -113,8 +113,8 @@ def _effort(log: Log, steps: int, period: float) -> float:
 @merged
 def _distance(A: Vec4, B: Vec4) -> float:
     """Distance of two metric points, m."""
-    way = sub(A, B)
-    return math.sqrt(dot(way, way))
+    distance = sub(A, B)
+    return math.sqrt(dot(distance, distance))
 
 
 @composed
@@ -133,19 +133,19 @@ def _path_along(plant: Plant, log: Log, steps: int, start: Vec4, goal: Vec4) -> 
     """Length of the true centre's path from sample to sample, and its largest distance from start–goal, m."""
     M = log.M[: plant.M.shape[0]]
     length = 0.0
-    most = 0.0
+    maximum = 0.0
     last = start
     for k in range(steps + 1):
         H = mat(log.H[k])
         for j in range(M.shape[0]):
             vec_into(M[j], apply(H, vec(plant.M[j])))
         A_c = center_of(M, plant.center)
-        way = sub(A_c, last)
+        distance = sub(A_c, last)
         last = A_c
         if k > 0:
-            length += math.sqrt(dot(way, way))
-            most = max(most, _line_distance(A_c, start, goal))
-    return length, most
+            length += math.sqrt(dot(distance, distance))
+            maximum = max(maximum, _line_distance(A_c, start, goal))
+    return length, maximum
 
 
 @njit
@@ -159,7 +159,7 @@ def path_deviation(
     ends = vec(start), vec(goal)
     n, M = log.q.shape[1], log.M[: plant.M.shape[0]]
     q, dq, q_part = log.scratch[0], log.scratch[1], log.scratch[2, :n]
-    most = 0.0
+    maximum = 0.0
     for k in range(steps):
         parts = max(1, log.parts[k])
         samples = max(1, SUBSAMPLES // parts)
@@ -175,16 +175,16 @@ def path_deviation(
                 H = forward(plant.model, q_part)
                 for i in range(M.shape[0]):
                     vec_into(M[i], apply(H, vec(plant.M[i])))
-                most = max(most, _line_distance(center_of(M, plant.center), ends[0], ends[1]))
-    return most
+                maximum = max(maximum, _line_distance(center_of(M, plant.center), ends[0], ends[1]))
+    return maximum
 
 
 @merged
 def _line_distance(A: Vec4, start: Vec4, goal: Vec4) -> float:
     """Distance of a metric point from the line through start and goal; from start where they agree."""
-    way = axpy(-1.0, start, goal)
+    distance = axpy(-1.0, start, goal)
     off = axpy(-1.0, start, A)
-    length = dot(way, way)
+    length = dot(distance, distance)
     if length > 0.0:
-        off = axpy(-dot(off, way) / length, way, off)
+        off = axpy(-dot(off, distance) / length, distance, off)
     return math.sqrt(dot(off, off))

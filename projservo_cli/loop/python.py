@@ -229,8 +229,8 @@ def _send(
     path = _optional(law, "path")
     steps = np.diff(path, axis=0) if len(path) > 2 and scale >= 1.0 and plant.takes_parts else dq[None].copy()
     for step in steps:
-        least = float(np.max(np.abs(step) / (limits.speed * scale)))
-        plant.command(step, max(period / len(steps), least))
+        minimum = float(np.max(np.abs(step) / (limits.speed * scale)))
+        plant.command(step, max(period / len(steps), minimum))
 
 
 def _optional(law: LoopLaw, name: str) -> Any:

@@ -106,10 +106,10 @@ def constraints_of(
 
 @merged
 def _limits_into(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
-    least = math.inf
+    minimum = math.inf
     for i in range(q.shape[0]):
-        least = min(least, min(q[i] - c.limits.lower[i], c.limits.upper[i] - q[i]) / c.keep[i])
-    margins[JOINTS] = least
+        minimum = min(minimum, min(q[i] - c.limits.lower[i], c.limits.upper[i] - q[i]) / c.keep[i])
+    margins[JOINTS] = minimum
 
 
 @merged
@@ -133,7 +133,7 @@ def width(s: FloatArray, which: IntArray) -> float:
 
     One of them goes through two of the points.
     """
-    least = math.inf
+    minimum = math.inf
     for i in which:
         for j in which:
             dx, dy = s[i, 0] - s[j, 0], s[i, 1] - s[j, 1]
@@ -143,37 +143,39 @@ def width(s: FloatArray, which: IntArray) -> float:
                 for k in which:
                     off = (dx * (s[k, 1] - s[j, 1]) - dy * (s[k, 0] - s[j, 0])) / length
                     low, high = min(low, off), max(high, off)
-                least = min(least, high - low)
-    return least if math.isfinite(least) else 0.0
+                minimum = min(minimum, high - low)
+    return minimum if math.isfinite(minimum) else 0.0
 
 
 @internal
-def _sight_into(c: Constraints, tag: int, back: Mat4, shown: bool, s: FloatArray, sight: FloatArray) -> None:
+def _sight_into(
+    c: Constraints, tag: int, back: Mat4, visible: bool, s: FloatArray, sight: FloatArray
+) -> None:
     """Write side, width and border (6,) of a tag; the latter by images (2, b, 2), if they are shown.
 
     back : inverse of the forward kinematics.
     """
     for view in range(2):
         sight[view] = dot(vec(c.a[tag]), apply(back, vec(c.O[view])))
-        sight[2 + view] = width(s[view], c.tags[tag]) if shown else -math.inf
-        sight[4 + view] = math.inf if shown else -math.inf
+        sight[2 + view] = width(s[view], c.tags[tag]) if visible else -math.inf
+        sight[4 + view] = math.inf if visible else -math.inf
         for k in c.tags[tag]:
             border = from_border(c.image_size, s[view, k, 0], s[view, k, 1])
             sight[4 + view] = min(sight[4 + view], border)
 
 
 @internal
-def _best_sight_into(c: Constraints, q: FloatArray, shown: bool, trial: "Trial") -> None:
+def _best_sight_into(c: Constraints, q: FloatArray, visible: bool, trial: "Trial") -> None:
     """Write side, width and border of the tag whose minimum excess over the required margin is largest."""
     best, back = -math.inf, backward(c.model, q)
     for tag in range(c.tags.shape[0]):
-        _sight_into(c, tag, back, shown, trial.s, trial.sight)
-        least = math.inf
+        _sight_into(c, tag, back, visible, trial.s, trial.sight)
+        minimum = math.inf
         for i in range(6):
             unit = 1.0 if i < 2 else FINE_PX
-            least = min(least, (trial.sight[i] - trial.demands[VISIBILITY + i]) / unit)
-        if tag == 0 or least > best:
-            best = least
+            minimum = min(minimum, (trial.sight[i] - trial.demands[VISIBILITY + i]) / unit)
+        if tag == 0 or minimum > best:
+            best = minimum
             row_into(trial.margins[VISIBILITY:CLEAR], trial.sight)
 
 
@@ -215,23 +217,23 @@ def clear_by(c: Constraints, H: Mat4, s: FloatArray) -> float:
     A point is clear if one camera sees it outside a region. Markers of a face that the obstacle may hide
     are so in both images, and all markers in the only image in which a region is drawn.
     """
-    keep, least = c.keep_out, math.inf
+    keep, minimum = c.keep_out, math.inf
     for region in range(keep.occludes.shape[0]):
         both = keep.views[region] == BOTH
         for k in range(c.M.shape[0]):
             left, right = (s[0, k, 0], s[0, k, 1]), (s[1, k, 0], s[1, k, 1])
             first, second = clearance(keep, region, 0, left), clearance(keep, region, 1, right)
             if not both or (keep.occludes[region] == 1 and k < c.face):
-                least = min(least, first, second)
+                minimum = min(minimum, first, second)
             else:
                 first = min(first, from_border(c.image_size, left[0], left[1]))
                 second = min(second, from_border(c.image_size, right[0], right[1]))
-                least = min(least, max(first, second))
+                minimum = min(minimum, max(first, second))
         for k in range(c.face if both else 0):
             A = apply(H, vec(c.M[k]))
             for l in range(k):
-                least = min(least, _clear_between(c, region, A, apply(H, vec(c.M[l]))))
-    return least
+                minimum = min(minimum, _clear_between(c, region, A, apply(H, vec(c.M[l]))))
+    return minimum
 
 
 @internal
@@ -242,7 +244,7 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
     short, or short against the distance of their middles and on one side of the required margin: a distance
     changes by no more than the path.
     """
-    least, done, step = math.inf, 0.0, 1.0
+    minimum, done, step = math.inf, 0.0, 1.0
     while done < 1.0:
         step = min(step, 1.0 - done)
         first, middle, last = (
@@ -256,14 +258,14 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
             radius = math.sqrt(max(squared(at, s), squared(at, t)))
             clear = min(clearance(c.keep_out, region, view, at), from_border(c.image_size, at[0], at[1]))
             here, along, half = max(here, clear), max(along, clear - radius), max(half, radius)
-        told = along >= c.full[CLEAR] or here < c.full[CLEAR]
-        if half > PIECE and not (told and half <= 0.5 * abs(here)):
+        decided = along >= c.full[CLEAR] or here < c.full[CLEAR]
+        if half > PIECE and not (decided and half <= 0.5 * abs(here)):
             step *= 0.5
             continue
-        least = min(least, along)
+        minimum = min(minimum, along)
         done += step
         step *= 2.0
-    return least
+    return minimum
 
 
 @merged
@@ -279,15 +281,15 @@ def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
     demands_into(c, q, trial.demands)
     _limits_into(c, q, margins)
     H = forward(c.model, q)
-    shown = _images_into(c, H, s, margins)
-    _best_sight_into(c, q, shown, trial)
-    margins[CLEAR] = clear_by(c, H, s) if shown else -math.inf
+    visible = _images_into(c, H, s, margins)
+    _best_sight_into(c, q, visible, trial)
+    margins[CLEAR] = clear_by(c, H, s) if visible else -math.inf
     # Error of a prediction: its maximum or, if that could decide, its value there.
-    left = right = most = c.spread.most
-    anywhere = FAR_OFF * most
+    left = right = maximum = c.spread.most
+    anywhere = FAR_OFF * maximum
     room = min(margins[IMAGE] - c.full[IMAGE], margins[IMAGE + 1] - c.full[IMAGE + 1])
-    near = room < DEVIATIONS * most or margins[CLEAR] - c.full[CLEAR] < DEVIATIONS * anywhere
-    if shown and most > 0.0 and near:
+    near = room < DEVIATIONS * maximum or margins[CLEAR] - c.full[CLEAR] < DEVIATIONS * anywhere
+    if visible and maximum > 0.0 and near:
         left, right = most_off(c, q, H)
         anywhere = max(left, right)
     margins[IMAGE] -= DEVIATIONS * left
@@ -319,21 +321,21 @@ def demands_into(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
 @merged
 def time_between(speed: FloatArray, q: FloatArray, r: FloatArray) -> float:
     """Time, s, of the straight path between joints at the speed limits (n,)."""
-    most = 0.0
+    maximum = 0.0
     for i in range(q.shape[0]):
-        most = max(most, abs(q[i] - r[i]) / speed[i])
-    return most
+        maximum = max(maximum, abs(q[i] - r[i]) / speed[i])
+    return maximum
 
 
 @merged
 def _moved(s: FloatArray, before: FloatArray) -> float:
     """Longest way of an image point between two views (2, b, 2), px."""
-    most = 0.0
+    maximum = 0.0
     for view in range(2):
         for k in range(s.shape[1]):
             du, dv = s[view, k, 0] - before[view, k, 0], s[view, k, 1] - before[view, k, 1]
-            most = max(most, du * du + dv * dv)
-    return math.sqrt(most)
+            maximum = max(maximum, du * du + dv * dv)
+    return math.sqrt(maximum)
 
 
 @merged
@@ -396,20 +398,20 @@ def reached(c: Constraints, start: FloatArray, end: FloatArray, trial: Trial) ->
         stride = max(stride, abs(end[i] - start[i]))
     if stride == 0.0:
         return 1.0
-    least = min(1.0, 1e-6 / stride)
-    most = FINE_STEP / stride
+    minimum = min(1.0, 1e-6 / stride)
+    maximum = FINE_STEP / stride
     valid(c, start, trial)
     _keep_images(trial)
-    done, step = 0.0, 0.25 * most
+    done, step = 0.0, 0.25 * maximum
     while done < 1.0:
-        step = min(step, most, 1.0 - done)
+        step = min(step, maximum, 1.0 - done)
         share = 1.0 if done + step >= 1.0 - 1e-12 else done + step
         for i in range(n):
             trial.q[i] = end[i] if share == 1.0 else start[i] + share * (end[i] - start[i])
         if not valid(c, trial.q, trial):
             return done
         moved = _moved(trial.s, trial.s_before)
-        if moved > FINE_PX and step > least:
+        if moved > FINE_PX and step > minimum:
             step *= max(0.25, 0.9 * FINE_PX / moved)
             continue
         _keep_images(trial)

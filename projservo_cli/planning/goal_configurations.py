@@ -124,12 +124,12 @@ def _normal_equations_into(
 def _damped_step_into(N: FloatArray, damping: float, L: FloatArray) -> bool:
     """Solve (N + damping diag N) x = b; x is left in the last column of L."""
     n = L.shape[0]
-    most = 0.0
+    maximum = 0.0
     for i in range(n):
-        most = max(most, N[i, i])
+        maximum = max(maximum, N[i, i])
     for i in range(n):
         row_into(L[i], N[i])
-        L[i, i] = N[i, i] * (1.0 + damping) + 1e-14 * most
+        L[i, i] = N[i, i] * (1.0 + damping) + 1e-14 * maximum
     return solve_normal(L, n, 1e-16)
 
 
@@ -221,13 +221,13 @@ def _explained(
 def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bool:
     """Whether joints are a solution that was found before, or whole turns of it."""
     for g in range(count):
-        most = 0.0
+        maximum = 0.0
         for i in range(q.shape[0]):
             off = q[i] - base[g, i]
             if c.model.joint_types[i] != PRISMATIC:
                 off -= 2.0 * math.pi * math.floor(off / (2.0 * math.pi) + 0.5)
-            most = max(most, abs(off))
-        if most <= DISTINCT:
+            maximum = max(maximum, abs(off))
+        if maximum <= DISTINCT:
             return True
     return False
 
@@ -242,12 +242,12 @@ def _solutions_into(
     scratch: Scratch,
 ) -> int:
     """Write solutions; how many. First those known, which need no proof: the goal was seen there."""
-    count, last, most = len(known), 0, found.q.shape[0]
+    count, last, maximum = len(known), 0, found.q.shape[0]
     for k in range(count):
         row_into(found.q[k], known[k])
         _explained(c, goal, known[k], scratch, found.deviation[k])
     for k in range(starts.shape[0]):
-        if count == most or k > AT_LEAST + PATIENCE * last:
+        if count == maximum or k > AT_LEAST + PATIENCE * last:
             break
         q = starts[k]
         _settled(c, goal, False, NEAR, q, scratch)
@@ -324,12 +324,12 @@ def goals_of(
     Also returns how many solutions there are, apart from whole turns; how many of those do not show the face
     or lie beyond the limits; how many lie within a region kept out of.
     """
-    n, most = len(start), STARTS if len(start) <= 6 else SAMPLED
-    found = Solutions(np.zeros((most, n)), np.zeros(most), np.zeros((most, n)))
+    n, maximum = len(start), STARTS if len(start) <= 6 else SAMPLED
+    found = Solutions(np.zeros((maximum, n)), np.zeros(maximum), np.zeros((maximum, n)))
     shapes = (n, 4, 4), (n, n + 1), (c.face, n + 1, 4), (n, n + 1), (n,)
     count = _solutions_into(c, goal, known, starts, found, Scratch(*(np.zeros(shape) for shape in shapes)))
-    least = max(found.left[len(known) : count].min(initial=math.inf), 4.0 * c.face * LEAST_SIGMA**2)
-    good = np.flatnonzero(found.left[:count] <= MUCH**2 * least)
+    minimum = max(found.left[len(known) : count].min(initial=math.inf), 4.0 * c.face * LEAST_SIGMA**2)
+    good = np.flatnonzero(found.left[:count] <= MUCH**2 * minimum)
     goals, ranks, met, trial = [np.zeros((0, n))], [np.zeros(0)], [0, 0, 0], new_trial(n, len(c.M))
     for k in good:
         solution, deviation, certain = found.q[k], found.deviation[k], found.left[k] == 0.0

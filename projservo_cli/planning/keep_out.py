@@ -80,14 +80,14 @@ def _away(s: Pixel, a: Pixel, b: Pixel) -> float:
 @internal
 def outside_polygon(corners: FloatArray, first: int, last: int, s: Pixel) -> float:
     """Distance of a pixel from a polygon of corners first … last − 1, px; negative within."""
-    least, within = math.inf, False
+    minimum, within = math.inf, False
     b = (float(corners[last - 1, 0]), float(corners[last - 1, 1]))
     for i in range(first, last):
         a, b = b, (float(corners[i, 0]), float(corners[i, 1]))
-        least = min(least, _away(s, a, b))
+        minimum = min(minimum, _away(s, a, b))
         if (a[1] > s[1]) != (b[1] > s[1]) and s[0] < a[0] + (s[1] - a[1]) * (b[0] - a[0]) / (b[1] - a[1]):
             within = not within
-    return -math.sqrt(least) if within else math.sqrt(least)
+    return -math.sqrt(minimum) if within else math.sqrt(minimum)
 
 
 @merged

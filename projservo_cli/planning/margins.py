@@ -240,10 +240,10 @@ def joint_margin(demands: Demands, q: FloatArray, i: int) -> float:
 @merged
 def limit_margin(demands: Demands, q: FloatArray) -> float:
     """Return the minimum margin of the limits of joints q (n,)."""
-    least = 1.0
+    minimum = 1.0
     for i in range(q.shape[0]):
-        least = min(least, joint_margin(demands, q, i))
-    return least
+        minimum = min(minimum, joint_margin(demands, q, i))
+    return minimum
 
 
 _Ends = tuple[FloatArray, FloatArray]
@@ -394,9 +394,9 @@ def measured(motion: Motion) -> Motion:
     found.s[:] = s[:, :, :m]
     # A camera has a marker before it as long as it has it on the side on which it had it at the start.
     depth = A @ model.P[:, 2].T
-    shown = np.swapaxes((M @ model.P[:, 2].T) * depth > 1e-9 * depth**2, 1, 2)
+    visible = np.swapaxes((M @ model.P[:, 2].T) * depth > 1e-9 * depth**2, 1, 2)
     border = np.minimum(s + 0.5, demands.image_size - 0.5 - s).min(axis=3)
-    border = np.where(shown & np.isfinite(border), border, BEHIND)
+    border = np.where(visible & np.isfinite(border), border, BEHIND)
     found.distance[:] = border[:, :, :m].min(axis=2)
     if len(demands.tags):
         _best_tag_into(reaching, border, found)

@@ -115,9 +115,9 @@ def _senses(amplitudes: FloatArray) -> list[FloatArray]:
 def _best_of(paths: list[Motion]) -> Motion:
     """Of the paths in view, or of all if none is, the quickest whose smallest share is as good as any."""
     paths = [path for path in paths if path.shares()[:, VIEWS].min() > 0.0] or paths
-    least = [float(path.shares().min()) for path in paths]
-    good = min(EQUALLY * max(least), max(least))
-    paths = [path for path, share in zip(paths, least, strict=True) if share >= good]
+    minimum = [float(path.shares().min()) for path in paths]
+    good = min(EQUALLY * max(minimum), max(minimum))
+    paths = [path for path, share in zip(paths, minimum, strict=True) if share >= good]
     return min(paths, key=lambda path: duration(path) if math.isfinite(duration(path)) else math.inf)
 
 
@@ -130,9 +130,9 @@ class _Lattice(NamedTuple):
     @property
     def worth(self) -> float:
         """Largest smallest share of all monotone paths."""
-        return float(widest(self.least(self.nodes))[-1])
+        return float(widest(self.minimum(self.nodes))[-1])
 
-    def least(self, motion: Motion) -> FloatArray:
+    def minimum(self, motion: Motion) -> FloatArray:
         """Smallest share (s,) along a motion in the lattice."""
         ends = self.nodes.along.margins[[0, -1]].min(axis=0)
         shares = motion.along.margins / np.where(ends > 0.0, ends, 1.0)
@@ -157,7 +157,7 @@ def _in_view(reaching: Reaching, size: int) -> _Lattice:
 def _with_joints(view: _Lattice) -> _Lattice:
     """The same with joints, in place, sought where a path in view leads."""
     reaching, mu, found = view.nodes
-    value = widest(view.least(view.nodes))
+    value = widest(view.minimum(view.nodes))
     _joints_into(carrier_of(reaching), mu, value, _size(value), found)
     joint_margins_into(reaching.demands, found)
     return _Lattice(view.nodes, True)
@@ -165,7 +165,7 @@ def _with_joints(view: _Lattice) -> _Lattice:
 
 def _quickest(lattice: _Lattice) -> Motion:
     """Quickest path among those of the largest smallest share, in straight pieces."""
-    value = widest(lattice.least(lattice.nodes))
+    value = widest(lattice.minimum(lattice.nodes))
     corners = _straightened(lattice, shortest(value >= value[-1], *lattice.moved(lattice.nodes)))
     length = np.r_[0.0, np.cumsum(np.abs(np.diff(corners, axis=0)).max(axis=1))]
     places = np.linspace(0.0, length[-1], CHECKS)
@@ -186,7 +186,7 @@ def _straightened(lattice: _Lattice, path: IntArray) -> FloatArray:
         x = np.linspace(0.0, 1.0, 2 * (j - i) + 1)[:, None]
         piece = along_shares(reaching, (1.0 - x) * mu[path[i]] + x * mu[path[j]], found.q[path[i]])
         late = least_time(speed, lattice.moved(piece)[0])[-1] > DETOUR * (time[j] - time[i]) + ROUND_OFF
-        return not late and bool(lattice.least(piece).min() >= worth - ROUND_OFF)
+        return not late and bool(lattice.minimum(piece).min() >= worth - ROUND_OFF)
 
     kept, last = [0], len(path) - 1
     while kept[-1] < last:

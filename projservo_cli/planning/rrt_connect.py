@@ -135,7 +135,7 @@ def first_within(c: Constraints, q: FloatArray) -> tuple[int, int]:
 
 def find_path(
     c: Constraints,
-    aim: GoalFeatures,
+    target: GoalFeatures,
     start: FloatArray,
     known: FloatArray,
     search: SearchLimits,
@@ -147,7 +147,7 @@ def find_path(
     """
     n, rng = len(start), np.random.default_rng(search.seed)
     starts = np.vstack([known, start[None], _drawn(c, start, STARTS, rng)])
-    every, rank, (solutions, hidden, blocked) = goals_of(c, aim, start, known, starts)
+    every, rank, (solutions, hidden, blocked) = goals_of(c, target, start, known, starts)
     goals, rank = every[: search.max_goals], rank[: search.max_goals]
     off = np.abs(goals[:, None] - search.excluded)
     far = np.all(np.max(off, axis=2, initial=0.0) > NEARBY, axis=1)

@@ -262,17 +262,17 @@ def _moving(go: Any, run: _Driven, k: int) -> tuple[Any, Any, Any]:
     fan = np.arange(1, run.face.shape[1] - 1)
     triangles = {"i": (0 * fan).tolist(), "j": fan.tolist(), "k": (fan + 1).tolist()}
     color = _HIDDEN if run.hidden[k].any() else _SEEN
-    look = {"color": color, "flatshading": True, "name": "face", "hoverinfo": "name"}
-    face = go.Mesh3d(**_places(run.face[k]), **triangles, **look)
+    line_style = {"color": color, "flatshading": True, "name": "face", "hoverinfo": "name"}
+    face = go.Mesh3d(**_places(run.face[k]), **triangles, **line_style)
     return robot, face, _line(go, run.markers[k], "markers", style.GREY)
 
 
 def _line(go: Any, points: FloatArray, name: str, color: str, width: float | None = None) -> Any:
     """A line of a width, or points where there is none."""
-    look = {"mode": "markers", "marker": {"size": 3, "color": color}}
+    line_style = {"mode": "markers", "marker": {"size": 3, "color": color}}
     if width is not None:
-        look = {"mode": "lines", "line": {"color": color, "width": width}}
-    return go.Scatter3d(**_places(points), **look, name=name, hoverinfo="name")
+        line_style = {"mode": "lines", "line": {"color": color, "width": width}}
+    return go.Scatter3d(**_places(points), **line_style, name=name, hoverinfo="name")
 
 
 def _places(points: FloatArray) -> dict[str, list[float]]:
@@ -282,8 +282,8 @@ def _places(points: FloatArray) -> dict[str, list[float]]:
 FRAMES = 60
 _MOST_COLUMNS = 4
 SEEN, HIDDEN = style.GREEN, style.ORANGE
-_PATH: style.Look = {"color": SEEN, "linewidth": 0.9}
-_BEHIND: style.Look = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
+_PATH: style.LineStyle = {"color": SEEN, "linewidth": 0.9}
+_BEHIND: style.LineStyle = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
 _PANEL, _LEAST_WIDTH = 2.3, 4.0  # inches across one panel, and across the legend
 _COLORS, _NEAR_WHITE = 128, 240  # in addition to greys, which frames need
 _FILM_WIDTH = 320  # px, of which a panel shows most
@@ -354,9 +354,9 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
             if (film := films[name]) is not None and run.frame_index is not None:
                 for panel, frames in zip(columns[-1], film.swapaxes(0, 1), strict=True):
                     panel.over(frames, run.frame_index, size)
-        looks = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
-        looks["face hidden from this camera"] = _BEHIND
-        style.legend_below(figure, looks, 4 if len(runs) > 2 else 2)
+        line_styles = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
+        line_styles["face hidden from this camera"] = _BEHIND
+        style.legend_below(figure, line_styles, 4 if len(runs) > 2 else 2)
         figure.suptitle("time 00.00 s", fontsize=9)
 
     with style.styled():
@@ -365,10 +365,10 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
             figure.suptitle(f"time {seconds:.2f} s", fontsize=9)
             for column, (name, run) in zip(columns, traces.items(), strict=True):
                 now = min(int((seconds + 1e-9) / run.period), run.steps)
-                told = f"{run.verdict}, {run.steps} steps"
+                values = f"{run.verdict}, {run.steps} steps"
                 if now < run.steps:
-                    told = f"later: {told}" if seconds == end else "running"
-                column[0].axes.set_title(f"{title(name)}\n{told}")
+                    values = f"later: {values}" if seconds == end else "running"
+                column[0].axes.set_title(f"{title(name)}\n{values}")
                 for panel in column:
                     panel.show(now)
             canvas: Any = figure.canvas
@@ -381,7 +381,9 @@ class _Panel:
 
     def __init__(self, axes: Any, s: FloatArray, hidden: BoolArray) -> None:
         self.axes, self.s, self.hidden = axes, s, hidden
-        self.behind, self.paths = ([axes.plot([], [], **look)[0] for _ in s[0]] for look in (_BEHIND, _PATH))
+        self.behind, self.paths = (
+            [axes.plot([], [], **line_style)[0] for _ in s[0]] for line_style in (_BEHIND, _PATH)
+        )
         (self.face,) = axes.fill([0.0], [0.0], linewidth=1.2, edgecolor=style.BLACK, alpha=0.9, zorder=3)
         place = {"transform": axes.transAxes, "ha": "center", "va": "bottom"}
         self.word = axes.text(0.5, 0.03, "", fontweight="bold", fontsize=8, **place)

@@ -14,7 +14,7 @@ from projservo_cli.records import PRISMATIC, BoolArray, FloatArray, Trace
 from projservo_cli.report.figures.path_deviation import study_numbers
 from projservo_cli.report.report_data import (
     DIRECT,
-    Material,
+    ReportData,
     Studies,
     along_line,
     curve_difference,
@@ -52,10 +52,10 @@ _VISIBLE_PX = 1.0  # by more than this a coordinate rises, or leaves the exponen
 _SCALE_TOLERANCE = 2.0  # within this τ agrees with the true distance, % of the start
 
 
-def _control_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
+def _control_claims(report_data: ReportData, studies: Studies) -> Iterator[_Claim]:
     """Claims of section 6 about Figs. 9 to 11."""
     for law in DIRECT:
-        yield from _exponential(material, studies, law)
+        yield from _exponential(report_data, studies, law)
     metric, twin, calibrated = (
         studies.own[DIRECT[0], kind, False] for kind in ("true", "twin", "calibrated")
     )
@@ -67,7 +67,7 @@ def _control_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
         f"at most {_MODEL_TOLERANCE_DEG:g}° with true operators",
         same <= _MODEL_TOLERANCE_DEG,
     )
-    yield from _scale(material, calibrated)
+    yield from _scale(report_data, calibrated)
     trace = studies.own[DIRECT[1], "calibrated", False]
     start, task, known = math.degrees(trace.theta_s[0]), math.nan, np.isfinite(trace.goal_pose).all()
     if known:
@@ -83,7 +83,7 @@ def _control_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
     yield from _image_error(calibrated, 1.0 - studies.gains_of_laws.gain_t * calibrated.period)
 
 
-def _exponential(material: Material, studies: Studies, law: str) -> Iterator[_Claim]:
+def _exponential(report_data: ReportData, studies: Studies, law: str) -> Iterator[_Claim]:
     """Whether the distance of the centre and the rotation decay at the gains of both, of the slowest turn.
 
     A loop that takes the share λ T of an error in each period T has the rate λ, 1/s.
@@ -94,7 +94,7 @@ def _exponential(material: Material, studies: Studies, law: str) -> Iterator[_Cl
     first = _SETTLING_STEPS + int(np.flatnonzero(trace.speed_factor < 1.0).max(initial=0))
     gain = (gains.gain_t, gains.gain_s if law == "direct_two" else min(gains.gain_r, gains.gain_p))
     curves = (
-        (material.center_distance(trace)[first:], _LEAST_DISTANCE),
+        (report_data.center_distance(trace)[first:], _LEAST_DISTANCE),
         (trace.theta_s[first:], _LEAST_ANGLE),
     )
     measured, holds = "too few settled steps", None
@@ -129,10 +129,10 @@ def _model_difference(trace: Trace, metric: Trace) -> float:
     )
 
 
-def _scale(material: Material, trace: Trace) -> Iterator[_Claim]:
+def _scale(report_data: ReportData, trace: Trace) -> Iterator[_Claim]:
     if not np.isfinite(trace.goal_pose).all() or trace.tau[0] == 0:
         return
-    distance = percent(material.center_distance(trace))
+    distance = percent(report_data.center_distance(trace))
     off = float(np.abs(percent(trace.tau) - distance).max())
     affine = float(np.abs(percent(trace.tau_affine) - distance).max())
     yield _Claim(
@@ -174,7 +174,7 @@ _EQUAL_M = 1e-9  # both sides of (22) agree where the centre is moved to within 
 _SAMPLING = 1e-3
 
 
-def _drift_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
+def _drift_claims(report_data: ReportData, studies: Studies) -> Iterator[_Claim]:
     """Claims of sections 5.2, 6 and 7 about drift; none where the goal pose is unknown."""
     drift = study_numbers(studies)["path_deviation_mm"]
     if not np.isfinite(drift).all():
@@ -205,8 +205,8 @@ def _drift_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
         "smaller largest deviation, true operators",
         own[1] < own[0],
     )
-    yield from _rate(studies, material.robot.joint_types != PRISMATIC)
-    yield _joints(material, studies.own[DIRECT[0], "true", False])
+    yield from _rate(studies, report_data.robot.joint_types != PRISMATIC)
+    yield _joints(report_data, studies.own[DIRECT[0], "true", False])
 
 
 def _rate(studies: Studies, revolute: BoolArray) -> Iterator[_Claim]:
@@ -229,11 +229,11 @@ def _rate(studies: Studies, revolute: BoolArray) -> Iterator[_Claim]:
         )
 
 
-def _joints(material: Material, trace: Trace) -> _Claim:
+def _joints(report_data: ReportData, trace: Trace) -> _Claim:
     """Second-order share of each joint in the deviation of the first step."""
-    way = material.goal_center(trace) - trace.center[0]
-    line = way / max(float(np.linalg.norm(way)), np.finfo(float).tiny)
-    H_hat = joint_operators(material.plant.model, trace.q[0])
+    distance = report_data.goal_center(trace) - trace.center[0]
+    line = distance / max(float(np.linalg.norm(distance)), np.finfo(float).tiny)
+    H_hat = joint_operators(report_data.plant.model, trace.q[0])
     joint_step = trace.q[1] - trace.q[0]
     parts = _second_order_drift(H_hat, joint_step, np.append(trace.center[0], 1.0), line)
     first = 1e3 * along_line(trace.center[1:2], trace.center[0], trace.center[0] + line)[1][0]
@@ -291,9 +291,9 @@ _SMALL_SHARE = 0.01  # of the diagonal of an image, that counts as very little
 _LEVEL_SHARE = 0.02  # of the variation of its abscissa, within which the ordinate of a level motion varies
 
 
-def _classical(material: Material) -> Iterator[_Claim]:
+def _classical(report_data: ReportData) -> Iterator[_Claim]:
     """Claims of section 6 about the classical laws that were run."""
-    trace = material.traces.get("blockwise")
+    trace = report_data.traces.get("blockwise")
     if trace is not None:
         yield _Claim(
             "The block-wise law does not converge",
@@ -302,9 +302,9 @@ def _classical(material: Material) -> Iterator[_Claim]:
             "verdict other than converged",
             trace.verdict != "converged",
         )
-        way, grown = 1e3 * material.center_distance(trace), ""
-        if np.isfinite(way).all():
-            grown = f"; centre {way[-1]:.0f} mm from the goal, {way[0]:.0f} at the start"
+        distance, grown = 1e3 * report_data.center_distance(trace), ""
+        if np.isfinite(distance).all():
+            grown = f"; centre {distance[-1]:.0f} mm from the goal, {distance[0]:.0f} at the start"
         yield _Claim(
             "The block-wise law diverges towards infinity",
             "section 6",
@@ -313,8 +313,8 @@ def _classical(material: Material) -> Iterator[_Claim]:
             trace.verdict == "diverged",
         )
     for law in ("stacked", "euclidean_points"):
-        if law in material.traces:
-            yield from _escape(law, material.traces[law], material.stall_periods)
+        if law in report_data.traces:
+            yield from _escape(law, report_data.traces[law], report_data.stall_periods)
 
 
 def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
@@ -340,9 +340,9 @@ def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
     )
 
 
-def _planned(material: Material) -> _Claim:
+def _planned(report_data: ReportData) -> _Claim:
     """The claim of sections 4.3 and 6 about the planned motion."""
-    plan = material.plan
+    plan = report_data.plan
     miss = float(np.linalg.norm(plan.s[-1] - plan.s_star, axis=-1).max())
     return _Claim(
         "The planned trajectory avoids self-occlusion",
@@ -353,9 +353,9 @@ def _planned(material: Material) -> _Claim:
     )
 
 
-def _direct(material: Material) -> Iterator[_Claim]:
+def _direct(report_data: ReportData) -> Iterator[_Claim]:
     """Yield the claims of sections 4.2 and 6 about visibility under direct control."""
-    traces = {law: material.traces[law] for law in DIRECT if law in material.traces}
+    traces = {law: report_data.traces[law] for law in DIRECT if law in report_data.traces}
     if traces:
         counts = [
             f"{title_of(law)} {trace.self_occluded_steps_left} left, {trace.self_occluded_steps_right} right"
@@ -371,7 +371,7 @@ def _direct(material: Material) -> Iterator[_Claim]:
         )
     if len(traces) == len(DIRECT):
         gap = _path_gap(*(trace.s.reshape(len(trace.s), -1, 2) for trace in traces.values()))
-        diagonal = float(np.linalg.norm(material.plant.image_size))
+        diagonal = float(np.linalg.norm(report_data.plant.image_size))
         yield _Claim(
             "The image paths of directTHREE and directTWO differ very little",
             "section 6, Fig. 7",
@@ -380,7 +380,7 @@ def _direct(material: Material) -> Iterator[_Claim]:
             gap <= _SMALL_SHARE * diagonal,
         )
     if DIRECT[0] in traces:
-        travel, variation = np.ptp(material.center_image(traces[DIRECT[0]]), axis=0).T
+        travel, variation = np.ptp(report_data.center_image(traces[DIRECT[0]]), axis=0).T
         yield _Claim(
             "The centre moves horizontally in the images: its ordinate stays constant",
             "section 6, Fig. 11",
@@ -399,23 +399,26 @@ def _path_gap(first: FloatArray, second: FloatArray) -> float:
 
 def _to_polyline(points: FloatArray, path: FloatArray) -> FloatArray:
     """Distance (k,) of points (k, 2) from a polyline (l, 2)."""
-    start, way = path[:-1], np.diff(path, axis=0)
-    if not len(way):
+    start, distance = path[:-1], np.diff(path, axis=0)
+    if not len(distance):
         return np.asarray(np.linalg.norm(points - path[0], axis=1))
-    square = np.maximum((way**2).sum(axis=1), np.finfo(float).tiny)
+    square = np.maximum((distance**2).sum(axis=1), np.finfo(float).tiny)
     offset = points[:, None] - start
-    share = np.clip((offset * way).sum(axis=2) / square, 0.0, 1.0)
-    return np.asarray(np.linalg.norm(offset - share[..., None] * way, axis=2).min(axis=1))
+    share = np.clip((offset * distance).sum(axis=2) / square, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(offset - share[..., None] * distance, axis=2).min(axis=1))
 
 
-def claims_of(material: Material, share: FloatArray, distance: FloatArray) -> list[_Claim]:
+def claims_of(report_data: ReportData, share: FloatArray, distance: FloatArray) -> list[_Claim]:
     """All claims that this run can speak about, in the order of the paper.
 
     material : records, truth and extra runs.
     share, distance : (k,) shares λ, and how far apart both sides of (22) put the centre, m; empty where that
         could not be computed.
     """
-    found = [*_classical(material), _planned(material), *_direct(material)]
-    if material.studies is not None:
-        found += [*_drift_claims(material, material.studies), *_control_claims(material, material.studies)]
+    found = [*_classical(report_data), _planned(report_data), *_direct(report_data)]
+    if report_data.studies is not None:
+        found += [
+            *_drift_claims(report_data, report_data.studies),
+            *_control_claims(report_data, report_data.studies),
+        ]
     return [*found, _composition(share, distance)] if len(share) else found

@@ -93,7 +93,7 @@ class Driven(Fit):
 
 
 @dataclass(frozen=True, eq=False)
-class Material(Fit):
+class ReportData(Fit):
     """All that the figures of a run may show."""
 
     calibrated: Model  # model the laws use
@@ -165,40 +165,42 @@ class _FigureSpec:
     frames: bool = False  # whether it shows frames; it is not omitted if no robot has any
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
 
-    def lacking(self, material: Fit) -> str:
+    def lacking(self, report_data: Fit) -> str:
         """Return the reason why the figure cannot be drawn; empty if it can."""
         if not self.task:
             return ""
-        if self.frames and isinstance(material, Driven | Material):
-            filmed = any(trace.frame_index is not None for trace in material.traces.values())
+        if self.frames and isinstance(report_data, Driven | ReportData):
+            filmed = any(trace.frame_index is not None for trace in report_data.traces.values())
             return "" if filmed else "the robot shows no frames"
-        if isinstance(material, Driven):
+        if isinstance(report_data, Driven):
             return "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
-        if not isinstance(material, Material):
+        if not isinstance(report_data, ReportData):
             return "the run holds a calibration and no task: set robot, rig, markers and task"
-        missing = self._without_run(material)
+        missing = self._without_run(report_data)
         if missing and (not self.any_law or len(missing) == len(self.laws)):
-            shown = {law: None for spec in REGISTER.values() for law in spec._without_run(material)}
+            shown = {law: None for spec in REGISTER.values() for law in spec._without_run(report_data)}
             return f"runs to compare are missing, of {', '.join(shown)}; make them: projservo servo report"
-        if self.studies and material.studies is None:
-            return f"the extra runs could not be made: {material.no_studies}"
-        if self.shares and np.isnan(material.plan.mu).all():
+        if self.studies and report_data.studies is None:
+            return f"the extra runs could not be made: {report_data.no_studies}"
+        if self.shares and np.isnan(report_data.plan.mu).all():
             return "a joint-space path has no fractions of translation and rotations: see figure 16"
-        if self.modes and not material.compared():
+        if self.modes and not report_data.compared():
             return (
                 "no run follows the plan: set control.mode, such as [regulate, track], and run servo report"
             )
-        if self.goal and not material.goal_known():
+        if self.goal and not report_data.goal_known():
             return "the pose of the goal is unknown, only its images are"
         return ""
 
-    def partly(self, material: Fit) -> str:
+    def partly(self, report_data: Fit) -> str:
         """Return the missing part of a figure that can be drawn; empty if it is complete."""
-        missing = self._without_run(material) if isinstance(material, Material) else []
+        missing = self._without_run(report_data) if isinstance(report_data, ReportData) else []
         return f"without {', '.join(missing)}: no run of it with a step to show" if missing else ""
 
-    def _without_run(self, material: Material) -> list[str]:
-        return [law for law in self.laws if law not in material.traces or material.traces[law].steps < 1]
+    def _without_run(self, report_data: ReportData) -> list[str]:
+        return [
+            law for law in self.laws if law not in report_data.traces or report_data.traces[law].steps < 1
+        ]
 
 
 REGISTER: dict[str, _FigureSpec] = {}

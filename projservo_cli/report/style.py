@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 FORMATS = ("svg", "pdf", "png")
 WIDTH = 6.9  # inches across both columns of a page
 _PNG_DPI = 200
-Look = dict[str, Any]
+LineStyle = dict[str, Any]
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 IMAGE = "image"  # label of axes that show pixels
 
@@ -40,8 +40,8 @@ _CURVES: tuple[tuple[str, Any, str], ...] = (
 )
 
 # How the face at the start and at the goal look in every figure.
-START: Look = {"color": BLACK, "linewidth": 1.4}
-GOAL: Look = {"color": BLUE, "linestyle": (0, (5, 1.5))}
+START: LineStyle = {"color": BLACK, "linewidth": 1.4}
+GOAL: LineStyle = {"color": BLUE, "linestyle": (0, (5, 1.5))}
 
 _RC: Any = {
     "font.family": "DejaVu Sans",
@@ -135,9 +135,9 @@ def _equal_scales(
     """Widen the limits u and v until a pixel is as wide as it is high in the panel as it is."""
     del position
     box = axes.get_window_extent()
-    way = np.array([u[1] - u[0], v[1] - v[0]])
-    scale = max(abs(way[0]) / box.width, abs(way[1]) / box.height)
-    half = 0.5 * scale * np.array([box.width, box.height]) * np.sign(way)
+    path = np.array([u[1] - u[0], v[1] - v[0]])
+    scale = max(abs(path[0]) / box.width, abs(path[1]) / box.height)
+    half = 0.5 * scale * np.array([box.width, box.height]) * np.sign(path)
     middle = 0.5 * np.array([sum(u), sum(v)])
     axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
@@ -154,29 +154,31 @@ def contents(figure: "Figure", formats: Sequence[str]) -> dict[str, bytes]:
     return made
 
 
-def legend_below(figure: "Figure", looks: Mapping[str, Look], columns: int) -> None:
+def legend_below(figure: "Figure", line_styles: Mapping[str, LineStyle], columns: int) -> None:
     """Put one legend for the whole figure below all axes; an entry is a line, or a patch if it has a face."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles = [
-        Patch(label=label, **look) if "facecolor" in look else Line2D([], [], label=label, **look)
-        for label, look in looks.items()
+        Patch(label=label, **line_style)
+        if "facecolor" in line_style
+        else Line2D([], [], label=label, **line_style)
+        for label, line_style in line_styles.items()
     ]
     figure.legend(handles=handles, loc="lower center", ncols=columns)
 
 
-def curve(index: int, *, marker: bool = False) -> Look:
+def curve(index: int, *, marker: bool = False) -> LineStyle:
     """Look of the curve of a number: colour, line style and, if asked for, marker.
 
     Those of a second round are thin, and their markers hollow.
     """
     again, place = divmod(index, len(_CURVES))
     color, style, symbol = _CURVES[place]
-    look = {"color": color, "linestyle": style} | ({"linewidth": 0.7} if again else {})
+    line_style = {"color": color, "linestyle": style} | ({"linewidth": 0.7} if again else {})
     if not marker:
-        return look
-    return look | {"marker": symbol} | ({"markerfacecolor": "white"} if again else {})
+        return line_style
+    return line_style | {"marker": symbol} | ({"markerfacecolor": "white"} if again else {})
 
 
 def image_axes(axes: "Axes", title: str, pixels: FloatArray, margin: float = 0.06) -> None:
@@ -190,11 +192,11 @@ def image_axes(axes: "Axes", title: str, pixels: FloatArray, margin: float = 0.0
     axes.set_ylim(high[1] + pad, low[1] - pad)
 
 
-def aspect(pixels: FloatArray, least: float = 0.3, most: float = 1.1) -> float:
+def aspect(pixels: FloatArray, lower: float = 0.3, upper: float = 1.1) -> float:
     """Return height over width of the pixels (…, 2) of a panel, within bounds for print."""
     points = pixels.reshape(-1, 2)
     size = np.ptp(points[np.isfinite(points).all(axis=1)], axis=0)
-    return float(np.clip(size[1] / max(size[0], 1.0), least, most))
+    return float(np.clip(size[1] / max(size[0], 1.0), lower, upper))
 
 
 def log_scale(axes: "Axes") -> None:
@@ -227,20 +229,20 @@ def closed(polygon: FloatArray) -> FloatArray:
     return np.concatenate([polygon, polygon[:1]])
 
 
-def face(axes: "Axes", corners: FloatArray, look: Look, *, fill: bool = False) -> None:
+def face(axes: "Axes", corners: FloatArray, line_style: LineStyle, *, fill: bool = False) -> None:
     """Draw a face from its corners (k, 2) in cyclic order; a dot marks the first."""
     loop = closed(corners)
     if fill:
         axes.fill(loop[:, 0], loop[:, 1], color=PALE, alpha=0.35, linewidth=0)
-    axes.plot(loop[:, 0], loop[:, 1], **look)
-    axes.plot(corners[:1, 0], corners[:1, 1], "o", color=look["color"], markersize=3)
+    axes.plot(loop[:, 0], loop[:, 1], **line_style)
+    axes.plot(corners[:1, 0], corners[:1, 1], "o", color=line_style["color"], markersize=3)
 
 
-def paths(axes: "Axes", points: FloatArray, look: Look) -> None:
+def paths(axes: "Axes", points: FloatArray, line_style: LineStyle) -> None:
     """Draw the paths (k, m, 2) of m points; NaN is a gap."""
-    axes.plot(points[..., 0], points[..., 1], **look)
+    axes.plot(points[..., 0], points[..., 1], **line_style)
 
 
-def hidden_paths(axes: "Axes", points: FloatArray, hidden: BoolArray, look: Look) -> None:
+def hidden_paths(axes: "Axes", points: FloatArray, hidden: BoolArray, line_style: LineStyle) -> None:
     """Mark those stretches of the paths (k, m, 2) of m points at whose instants (k,) they are hidden."""
-    paths(axes, np.where(hidden[:, None, None], points, np.nan), {"solid_capstyle": "butt"} | look)
+    paths(axes, np.where(hidden[:, None, None], points, np.nan), {"solid_capstyle": "butt"} | line_style)

@@ -283,11 +283,11 @@ class FaultyRobot:
         frames = [camera.newest(now) for camera in self._cameras]
         self.taken[:] = [frame.middle for frame in frames]
         pixels = np.stack([frame.pixels for frame in frames])
-        told = [frame.sigma for frame in frames if frame.sigma is not None]
-        if not self._faults.stamps and not told:
+        sigmas = [frame.sigma for frame in frames if frame.sigma is not None]
+        if not self._faults.stamps and not sigmas:
             return q, pixels
         stamps = (now, frames[0].stamp, frames[1].stamp) if self._faults.stamps else (None, None, None)
-        return (q, pixels, *stamps, np.stack(told)) if told else (q, pixels, *stamps)
+        return (q, pixels, *stamps, np.stack(sigmas)) if sigmas else (q, pixels, *stamps)
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Go to joints (n,) by the time that is due, s; where none comes then, they are held."""

@@ -102,11 +102,11 @@ class Physics:
     def hindrance(self) -> str:
         """Return the obstruction of the arm: contacts, saturated servos; else empty."""
         weak = " and ".join(str(i + 1) for i in self._own if self._at_end(i))
-        told = (
+        obstructions = (
             ("the arm touches: ", self._touching()),
             ("at the end of what their servos can do: joint ", weak),
         )
-        return "; ".join(said + named for said, named in told if named)
+        return "; ".join(said + named for said, named in obstructions if named)
 
     def _at_end(self, joint: int) -> bool:
         """Whether the actuator of a joint can do no more than it does."""

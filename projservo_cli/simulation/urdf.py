@@ -104,15 +104,15 @@ def _of(joint: ET.Element, tag: str, key: str, default: str, path: str) -> str:
 
 def _numbers(joint: ET.Element, tag: str, key: str, default: str, path: str) -> FloatArray:
     """The numbers in an attribute of an element of a joint."""
-    told = _of(joint, tag, key, default, path)
+    given = _of(joint, tag, key, default, path)
     try:
-        values = np.array([float(part) for part in told.split()])
+        values = np.array([float(part) for part in given.split()])
     except ValueError:
         values = np.array([math.nan])
     many = len(default.split())
     if len(values) != many or not np.isfinite(values).all():
         name = joint.get("name", "")
-        raise InputError(f"{path}: joint {name}: {key} of its {tag} is {told!r}: expected {many} numbers")
+        raise InputError(f"{path}: joint {name}: {key} of its {tag} is {given!r}: expected {many} numbers")
     return values
 
 

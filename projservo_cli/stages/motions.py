@@ -120,20 +120,20 @@ def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> F
     """
     duration, ramp = trajectory.duration_s, trajectory.acceleration_time_s
     eased = _from_rest(shortest, ramp)
-    least = float(eased[-1])
+    min_duration = float(eased[-1])
     if duration is None:
         return eased
-    _require_time(duration, least)
-    if not least > 0.0:
+    _require_time(duration, min_duration)
+    if not min_duration > 0.0:
         eased = _from_rest(sigma * duration, ramp)
     return np.asarray(eased * (duration / eased[-1]))
 
 
-def _require_time(duration: float, least: float) -> None:
-    if least > duration:
+def _require_time(duration: float, min_duration: float) -> None:
+    if min_duration > duration:
         raise WorkFailed(
-            f"trajectory.duration_s {duration:g}: the joint-speed limit lets the motion take {least:.4g} s "
-            "or more: give it longer, or null for as short as that"
+            f"trajectory.duration_s {duration:g}: the minimum within the joint-speed limit is "
+            f"{min_duration:.4g} s: set a longer one, or null for the minimum"
         )
 
 
@@ -153,12 +153,12 @@ def _from_rest(time: FloatArray, ramp: float) -> FloatArray:
     return np.select([time <= half, time >= total - half], [before, after], time + 0.5 * ramp)
 
 
-def body_at_start(model: Model, task: Task, shown: TaskImages, A: FloatArray) -> FloatArray:
+def body_at_start(model: Model, task: Task, images: TaskImages, A: FloatArray) -> FloatArray:
     """Points (b, 4) of the body at the start, face first; the face A (m, 4) alone without a body."""
     if len(task.body.M) == 0:
         return A
-    seen = undistort(model.lens, shown.s_start)
-    fit = fit_body(model.P, task.body, seen, forward(model, shown.q_start), SETTLED, np.zeros((6, 7)))
+    seen = undistort(model.lens, images.s_start)
+    fit = fit_body(model.P, task.body, seen, forward(model, images.q_start), SETTLED, np.zeros((6, 7)))
     return np.asarray(task.body.M @ as_array(fit.H).T)
 
 
@@ -207,9 +207,9 @@ def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: J
         motion = linear.motion._replace(along=still)
         return Found(linear.judged, motion, unknown, False, "", path)
     motion = _sampled_path(reaching, path.timing, trajectory.n_samples)
-    least = float(path.timing.time[-1])
-    asked = least if trajectory.duration_s is None else trajectory.duration_s
-    _require_time(asked, least)
+    min_duration = float(path.timing.time[-1])
+    asked = min_duration if trajectory.duration_s is None else trajectory.duration_s
+    _require_time(asked, min_duration)
     time = np.linspace(0.0, asked, len(motion.mu))
     return Found(motion, motion, time, True, "", path)
 
@@ -229,12 +229,12 @@ class PathReplanner:
     """Paths to the goal of a scenario, of which a plan was made."""
 
     def __init__(self, scenario: Scenario, plan: Plan) -> None:
-        model, shown, self._trajectory = scenario.model, scenario.ends, scenario.inputs.trajectory
-        task, amplitudes = shown.task(model), np.array([plan.tau, plan.theta_r, plan.theta_p])
+        model, images, self._trajectory = scenario.model, scenario.ends, scenario.inputs.trajectory
+        task, amplitudes = images.task(model), np.array([plan.tau, plan.theta_r, plan.theta_p])
         self._plan, self._search, self._made = plan, search_of(scenario), 0
         parts = plan.H_hat, amplitudes, plan.A, plan.a
-        body = body_at_start(model, task, shown, plan.A)
-        self._reaching = Reaching(model, scenario.demands, *parts, task.O, shown.q_start, body)
+        body = body_at_start(model, task, images, plan.A)
+        self._reaching = Reaching(model, scenario.demands, *parts, task.O, images.q_start, body)
         self._c = _joint_constraints(self._reaching, task, self._trajectory, self._search.spread)
         self._goal = GoalFeatures(task.A_star, undistort(model.lens, task.s_star), self._search.sigma)
 

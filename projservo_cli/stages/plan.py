@@ -37,7 +37,7 @@ from projservo_cli.stages.motions import (
     search_of,
     why_closed,
 )
-from projservo_cli.stages.plan_summary import least_of, reason_of, search_summary, verdict_of
+from projservo_cli.stages.plan_summary import minimum_of, reason_of, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
@@ -52,16 +52,16 @@ from projservo_cli.task.visibility import (
 
 
 def _partitioned(
-    model: Model, shown: TaskImages, trajectory: Trajectory, limits: JointLimits
+    model: Model, images: TaskImages, trajectory: Trajectory, limits: JointLimits
 ) -> tuple[State, Task, Parts, str]:
     """Measure and partition the task at its start; half turns are rehearsed within joint limits.
 
     Returns the state with face and joint motions, the task in the frame of the model, translation and
     rotations, a half turn in the sense that was rehearsed, and what to say of the rehearsal.
     """
-    task, seen = shown.task(model), undistort(model.lens, shown.s_start)
+    task, seen = images.task(model), undistort(model.lens, images.s_start)
     bounds = limits if trajectory.rehearses else None
-    state, parts, arrives = begin(model, task, seen, shown.q_start, bounds)
+    state, parts, arrives = begin(model, task, seen, images.q_start, bounds)
     return state, task, parts, "" if arrives else "; neither sense of the half turn arrived when rehearsed"
 
 
@@ -129,14 +129,14 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     if images is None or images.joints is None:
         return
     pixels, q = images.pixels(), images.joints.values(calibration.joint_types)
-    shown = np.swapaxes(np.array([*pixels.values()]), 0, 1)
-    if fault := fault_shown(calibration, q, np.array([*pixels]), shown, scenario.demands.image_size):
+    seen = np.swapaxes(np.array([*pixels.values()]), 0, 1)
+    if fault := fault_shown(calibration, q, np.array([*pixels]), seen, scenario.demands.image_size):
         raise WorkFailed(f"the goal was taught after a change since the calibration: {fault}; teach it again")
 
 
 def plan_task(
     model: Model,
-    shown: TaskImages,
+    images: TaskImages,
     trajectory: Trajectory,
     demands: Demands,
     search: JointSearch | None = None,
@@ -150,14 +150,14 @@ def plan_task(
     fast; InputError for the profile ``joint_space`` where a joint has no speed limit.
     """
     if trajectory.profile != "auto":
-        return _planned(model, shown, trajectory, demands, search)[0]
+        return _planned(model, images, trajectory, demands, search)[0]
     before: list[str] = []
     shut = why_closed(model, demands, search)
     for profile in ("linear", "constrained", "joint_space"):
         asked = trajectory._replace(profile=profile)
         last = profile == "joint_space" or (profile == "constrained" and bool(shut))
         try:
-            plan, fails = _planned(model, shown, asked, demands, search)
+            plan, fails = _planned(model, images, asked, demands, search)
         except WorkFailed as error:
             if last:
                 raise
@@ -195,25 +195,25 @@ def _found(
 
 
 def _planned(
-    model: Model, shown: TaskImages, trajectory: Trajectory, demands: Demands, search: JointSearch | None
+    model: Model, images: TaskImages, trajectory: Trajectory, demands: Demands, search: JointSearch | None
 ) -> tuple[Plan, str]:
     """Return the plan of one profile, and the constraints that fail, in words; empty if all hold."""
-    face = shown.by_points()
-    state, task, parts, note = _partitioned(model, shown, trajectory, demands.limits)
+    face = images.by_points()
+    state, task, parts, note = _partitioned(model, images, trajectory, demands.limits)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
     tau_limit = min((trajectory.visibility_fraction * t for t in tau_0 if t > 0.0), default=math.inf)
-    body = body_at_start(model, task, shown, state.A)
-    reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, shown.q_start, body)
+    body = body_at_start(model, task, images, state.A)
+    reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, images.q_start, body)
     found = _found(reaching, task, trajectory, search, tau_limit)
     motion, along, time, path = found.motion, found.motion.along, found.time, found.path
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
-    if len(shown.q_start) < COORDINATES and path is None:
-        _require_in_span(model, state.A, shown.q_start, along.s)
+    if len(images.q_start) < COORDINATES and path is None:
+        _require_in_span(model, state.A, images.q_start, along.s)
     sense, sense_margin = _senses(parts, task)
     holds, constraint, words = verdict_of(found.judged)
-    least, min_margin_mu = least_of(found.judged)
+    min_margin, min_margin_mu = minimum_of(found.judged)
     plan = Plan(
         profile=trajectory.profile,
         feasible=found.feasible,
@@ -235,7 +235,7 @@ def _planned(
         q=along.q,
         joint_margin=along.limit,
         reciprocal_condition=along.condition,
-        min_margin=least,
+        min_margin=min_margin,
         min_margin_mu=min_margin_mu,
         s_start=face.s_start,
         s_star=face.s_star,
@@ -244,11 +244,11 @@ def _planned(
         A_t=state.A_t,
         A_r=state.A_r,
         a=a,
-        a_star=np.array(face_plane(task.A_star, task.order, center_of(task.A_star, shown.center))),
+        a_star=np.array(face_plane(task.A_star, task.order, center_of(task.A_star, images.center))),
         a_t=np.array(parts.a_t),
         A_c=np.array(parts.A_c),
-        A_c_star=np.array(center_of(task.A_star, shown.center)),
-        q_start=shown.q_start,
+        A_c_star=np.array(center_of(task.A_star, images.center)),
+        q_start=images.q_start,
         q_hat=_joint_motions(state),
         H_hat=H_hat,
         optical_center=task.O,

@@ -81,7 +81,7 @@ def _border_words(distance: float, view: str, demands: Demands) -> str:
     )
 
 
-def least_of(motion: Motion) -> tuple[FloatArray, FloatArray]:
+def minimum_of(motion: Motion) -> tuple[FloatArray, FloatArray]:
     """Smallest value (4,) of each constraint in its own unit, and the shares (4, 3) where it is."""
     found = motion.along
     values = [found.visibility.min(axis=1), found.distance.min(axis=1), found.limit, found.condition]
@@ -118,7 +118,7 @@ _TOLD = 2
 
 def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> dict[str, Any]:
     """Fields of a plan that a search came to, with joints (s, n) at times (s,); NaN where it found none."""
-    told: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "n_goal_configurations": path.n_goals,
         "n_goals_tried": len(path.goals),
         "n_search_samples": path.draws,
@@ -126,15 +126,15 @@ def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) 
         "tree_nodes": 0,
     }
     if path.trees is not None:
-        told["tree_nodes"] = sum(int(tree.size[0]) for tree in path.trees)
-        told["tree_q"], told["tree_parent"] = _stored(path.trees)
+        summary["tree_nodes"] = sum(int(tree.size[0]) for tree in path.trees)
+        summary["tree_q"], summary["tree_parent"] = _stored(path.trees)
     if path.timing is None:
-        return told
-    told["margins"], told["required_margins"] = _along(path.constraints, q)
+        return summary
+    summary["margins"], summary["required_margins"] = _along(path.constraints, q)
     took = float(path.timing.time[-1])
-    told["blends"] = _corners_of(path.timing) * (float(time[-1]) / took if took > 0.0 else 1.0)
-    told["relaxed_constraints"] = tuple(_relaxed(path.constraints, {"start": q[0], "goal": q[-1]}))
-    return told
+    summary["blends"] = _corners_of(path.timing) * (float(time[-1]) / took if took > 0.0 else 1.0)
+    summary["relaxed_constraints"] = tuple(_relaxed(path.constraints, {"start": q[0], "goal": q[-1]}))
+    return summary
 
 
 def _stored(trees: tuple[Tree, Tree]) -> tuple[FloatArray, IntArray]:

@@ -24,7 +24,7 @@ from projservo_cli.report.report_data import (
     VIEW_FILE,
     Driven,
     Fit,
-    Material,
+    ReportData,
     Studies,
 )
 from projservo_cli.stages import Progress, silent
@@ -58,22 +58,22 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
     directory : folder of the run; receives ``figures/``, ``claims.json`` and ``report.html``.
     """
     left_out: list[dict[str, str]] = []
-    material: Fit = Fit(run.calibration, run.observation.at_rest, held_out=run.cross_validation)
+    report_data: Fit = Fit(run.calibration, run.observation.at_rest, held_out=run.cross_validation)
     studies, share, distance, claims = None, np.zeros(0), np.zeros(0), []
     if inputs.extra is not None:
         bench = comparison_of(inputs.extra, run.calibration, run.plan)
         with _unless_it_fails("studies", left_out):
             studies = run_studies(bench, progress=progress)
-        material = _material(inputs, run, bench, studies, left_out)
+        report_data = _report_data(inputs, run, bench, studies, left_out)
         with _unless_it_fails("equation (22)", left_out):
             distance = composition_error(metric_plan(bench))
             share = np.array(LAMBDAS)
-        claims = [claim._asdict() for claim in claims_of(material, share, distance)]
+        claims = [claim._asdict() for claim in claims_of(report_data, share, distance)]
     elif run.traces:
-        material = Driven(
+        report_data = Driven(
             run.calibration, run.observation.at_rest, run.plan, run.traces, held_out=run.cross_validation
         )
-    figures = draw_all(material, directory, inputs.formats, left_out, progress)
+    figures = draw_all(report_data, directory, inputs.formats, left_out, progress)
     report = Report(
         figures=tuple(figures),
         omitted=tuple(left_out),
@@ -102,16 +102,16 @@ def _unless_it_fails(what: str, left_out: list[dict[str, str]]) -> Iterator[None
         left_out.append({"what": what, "reason": " ".join(str(error).split())})
 
 
-def _material(
+def _report_data(
     inputs: ReportInputs,
     run: "Run",
     bench: Comparison,
     studies: Studies | None,
     left_out: list[dict[str, str]],
-) -> Material:
+) -> ReportData:
     """All that figures may show and claims be about."""
     truth = bench.truth
-    return Material(
+    return ReportData(
         run.calibration,
         run.observation.at_rest,
         bench.models["calibrated"],
@@ -129,7 +129,7 @@ def _material(
 
 
 def draw_all(
-    material: Fit,
+    report_data: Fit,
     directory: Path,
     formats: Sequence[str],
     left_out: list[dict[str, str]],
@@ -146,12 +146,12 @@ def draw_all(
     for done, spec in enumerate(FIGURES):
         progress("figures", done, len(FIGURES))
         contents: dict[str, bytes] = {}
-        if reason := spec.lacking(material):
+        if reason := spec.lacking(report_data):
             left_out += [] if spec.frames else [{"what": spec.name, "reason": reason}]
         else:
-            if partial := spec.partly(material):
+            if partial := spec.partly(report_data):
                 left_out.append({"what": f"{spec.name}, in part", "reason": partial})
-            data = spec.data(material)
+            data = spec.data(report_data)
             figure = style.drawn(spec.draw, data, spec.height)
             numbers = {name: values for name, values in data.items() if values.dtype != np.uint8}
             contents = {_NUMBERS: to_csv(numbers).encode(), **style.contents(figure, formats)}

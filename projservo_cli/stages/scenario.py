@@ -234,13 +234,13 @@ class RunScenario(Scenario):
         M = self.truth.of(self.numbers[self.m :]) if law in BODY_LAWS else NO_PINS
         return plant._replace(pins=M)
 
-    def noise_of(self, law: str, seed: int, instants: int) -> FloatArray:
+    def noise_of(self, law: str, seed: int, times: int) -> FloatArray:
         """Pixel noise (instants, 2, markers, 2) of a seed as a law observes it, px.
 
         It is the same for every law; fewer instants are the first of more.
         """
         numbers = self.numbers_of(law)
-        noise = np.zeros((instants, 2, len(numbers), 2))
+        noise = np.zeros((times, 2, len(numbers), 2))
         sigma = self.inputs.noise_px
         if sigma > 0.0:
             for these, stream in ((slice(self.m), SERVO_NOISE), (slice(self.m, None), PIN_NOISE)):

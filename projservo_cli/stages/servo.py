@@ -52,7 +52,7 @@ class _Outcome:
     mode: str = REGULATE  # law, mode: of the run
     planned_s: float | None = None  # when the plan that it followed arrives, s
     unplanned: str = ""  # why it went without the plan that it was to follow
-    anew: tuple[str, ...] = ()  # time and reason of each replanning
+    replannings: tuple[str, ...] = ()  # time and reason of each replanning
     driven: DrivenRobot | None = None  # client of a robot of the contract
 
     @cached_property
@@ -88,23 +88,23 @@ class _Outcome:
         driven = self.driven
         if driven is not None:  # the log has the predicted rest of the robot instead of readings
             read = _whole(driven.readings, rows)
-        told = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
+        values = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
         pose, goal_pose = H @ scenario.true_ends.base_tool, scenario.true_ends.goal_pose
         if driven is not None and driven.truths and not simulated:
-            pose, goal_pose = _told_poses(scenario, _whole(driven.truths, rows))
-            told["position_error_mm"] = MM * float(np.linalg.norm(goal_pose[:3, 3] - pose[-1, :3, 3]))
-            told["rotation_error_deg"] = math.degrees(angle_between(mat(pose[-1]), mat(goal_pose)))
-        numbers: dict[str, Any] = {n: None if math.isnan(told[n]) else told[n] for n in _TOLD}
+            pose, goal_pose = _reported_poses(scenario, _whole(driven.truths, rows))
+            values["position_error_mm"] = MM * float(np.linalg.norm(goal_pose[:3, 3] - pose[-1, :3, 3]))
+            values["rotation_error_deg"] = math.degrees(angle_between(mat(pose[-1]), mat(goal_pose)))
+        numbers: dict[str, Any] = {n: None if math.isnan(values[n]) else values[n] for n in _SUMMARY_FIELDS}
         if simulated:
-            numbers["success"] = told["success"] == 1.0
+            numbers["success"] = values["success"] == 1.0
         return Trace(
             **numbers,
             law=self.law,
             mode=self.mode,
             planned_s=self.planned_s,
             verdict=self.verdict,
-            reason="; ".join([_reason(self, joint, remaining), *_told_anew(self.anew)]),
-            replan_attempts=len(self.anew),
+            reason="; ".join([_reason(self, joint, remaining), *_replanned(self.replannings)]),
+            replan_attempts=len(self.replannings),
             steps=steps,
             period=scenario.gains.period,
             features="points" if np.isnan(views).all() else "body",
@@ -142,16 +142,18 @@ class _Outcome:
 
 
 # Numbers of a trace that are those of the summary of its run, and one more.
-_TOLD = [field.name for field in fields(Trace) if field.name in {*Summary._fields, "center_deviation_mm"}]
+_SUMMARY_FIELDS = [
+    field.name for field in fields(Trace) if field.name in {*Summary._fields, "center_deviation_mm"}
+]
 
 
-def _whole(told: Sequence[FloatArray], rows: int) -> FloatArray:
+def _whole(values: Sequence[FloatArray], rows: int) -> FloatArray:
     """Return the values at each time of a run, (rows, ...); NaN after its end."""
-    missing = np.full_like(told[0], np.nan)
-    return np.array([*told, *[missing] * (rows - len(told))])
+    missing = np.full_like(values[0], np.nan)
+    return np.array([*values, *[missing] * (rows - len(values))])
 
 
-def _told_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _reported_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return poses (k, 4, 4) of the tool as a robot reports them, and at the goal (4, 4), m; NaN if unknown.
 
     truths : the poses, or joints (k, n), from which a configured arm gives them.
@@ -193,8 +195,8 @@ def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
     return float(MM * math.sqrt(np.mean((m_per_px * off) ** 2)))
 
 
-def _told_anew(anew: tuple[str, ...]) -> list[str]:
-    return [f"replanned {', '.join(anew)}"] if anew else []
+def _replanned(replannings: tuple[str, ...]) -> list[str]:
+    return [f"replanned {', '.join(replannings)}"] if replannings else []
 
 
 def _left(log: Log, steps: int) -> tuple[float | None, float | None]:
@@ -414,7 +416,7 @@ class _Asked:
             log,
             limited,
             plant.plant,
-            anew=() if execution is None else tuple(execution.attempts),
+            replannings=() if execution is None else tuple(execution.attempts),
             driven=driven,
         )
 

@@ -99,12 +99,12 @@ class Study(Displayable):
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""
         cells = self.success()
-        told = {"runs": f"{len(self.table['run'])} in {len(cells)} cells"}
+        values = {"runs": f"{len(self.table['run'])} in {len(cells)} cells"}
         for cell in cells[:_SHOWN]:
             low, high = cell["success_interval"]
-            values = ", ".join(f"{name} {cell[name]}" for name, _ in self._rows.axes)
-            told[values] = f"{cell['success_rate']:.1%} of {cell['runs']} succeed ({low:.1%} to {high:.1%})"
-        return told | ({"more": f"{len(cells) - _SHOWN} cells"} if len(cells) > _SHOWN else {})
+            place = ", ".join(f"{name} {cell[name]}" for name, _ in self._rows.axes)
+            values[place] = f"{cell['success_rate']:.1%} of {cell['runs']} succeed ({low:.1%} to {high:.1%})"
+        return values | ({"more": f"{len(cells) - _SHOWN} cells"} if len(cells) > _SHOWN else {})
 
     def _laws(self) -> Sequence[str]:
         return next((values for name, values in self._rows.axes if name == "law"), [])

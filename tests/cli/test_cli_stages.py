@@ -169,8 +169,7 @@ def test_a_report_is_about_the_laws_and_the_configuration_of_its_call(projservo,
 def test_of_claims_those_that_do_not_hold_are_named_and_all_of_them_in_detail(projservo, reported):
     answer = projservo("report", "-o", "out")
     assert (
-        "1 of 2 claims hold; it does not hold that\n  - it is large\n  1 omitted: no run\nrun: "
-        in answer.out
+        "1 of 2 claims hold; it does not hold that\n  - it is large\n  1 omitted: no run\nrun: " in answer.out
     )
     detailed = projservo("report", "-o", "out", "-v").out
     assert "  holds: c: 3 mm\n  does not hold: it is large: 1 mm\n  omitted: fig_9: no run\n" in detailed

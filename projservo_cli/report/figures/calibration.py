@@ -21,17 +21,25 @@ _BOTH = 2
 _ARROW = 0.04  # length of an arrow of the rms residual, as a fraction of the extent of the observations
 _BAND = (0.025, 0.975)  # shares of χ² between which the residuals of a pose are expected
 _BINS = 40
-_RESIDUAL: style.Look = {"color": style.BLUE}
-_WEAK: style.Look = {"facecolor": style.ORANGE, "edgecolor": style.BLACK, "hatch": "////", "linewidth": 0.6}
+_RESIDUAL: style.LineStyle = {"color": style.BLUE}
+_WEAK: style.LineStyle = {
+    "facecolor": style.ORANGE,
+    "edgecolor": style.BLACK,
+    "hatch": "////",
+    "linewidth": 0.6,
+}
 # Reason of a rejected observation: by itself, its number, its pose, or its marker as a whole.
 _KINDS = ("outlier", "swapped", "pose", "marker")
-_LEFT_OUT: dict[str, style.Look] = {
+_LEFT_OUT: dict[str, style.LineStyle] = {
     "outlier": {"color": style.VERMILION, "marker": "x"},
     "swapped": {"color": style.ORANGE, "marker": "+"},
     "pose": {"color": style.BLACK, "marker": "1"},
     "marker": {"color": style.GREEN, "marker": "."},
 }
-_LEFT_OUT = {kind: {**look, "linestyle": "none", "markeredgewidth": 0.9} for kind, look in _LEFT_OUT.items()}
+_LEFT_OUT = {
+    kind: {**line_style, "linestyle": "none", "markeredgewidth": 0.9}
+    for kind, line_style in _LEFT_OUT.items()
+}
 _NAMES = {
     "outlier": "outlier",
     "swapped": "of another number",
@@ -39,7 +47,7 @@ _NAMES = {
     "marker": "of a rejected marker",
 }
 _LARGE, _SMALL, _MANY = 4.0, 1.5, 300  # sizes of these points, pt, and how many are many
-_MODEL: style.Look = {"color": style.BLACK, "linewidth": 1.2}
+_MODEL: style.LineStyle = {"color": style.BLACK, "linewidth": 1.2}
 
 
 def _data(fit: Fit) -> Data:
@@ -221,11 +229,11 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     _poses(panels[1, 1], data)
     _excitation(panels[2, 0], data)
     _spectrum(panels[2, 1], data)
-    looks: dict[str, style.Look] = {
+    line_styles: dict[str, style.LineStyle] = {
         f"residual, {data['factor']:,g} times": _RESIDUAL,
         **{
-            f"rejected: {_NAMES[kind]}": {**look, "markersize": _LARGE}
-            for kind, look in _LEFT_OUT.items()
+            f"rejected: {_NAMES[kind]}": {**line_style, "markersize": _LARGE}
+            for kind, line_style in _LEFT_OUT.items()
             if any(len(data[f"left_out_{kind}_{view}"]) for view in VIEWS)
         },
         "noise model": _MODEL,
@@ -233,7 +241,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         "95 % of poses in the model": {"color": style.PALE, "linewidth": 6},
         "weak joint": _WEAK,
     }
-    style.legend_below(figure, looks, 3)
+    style.legend_below(figure, line_styles, 3)
 
 
 def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
@@ -299,8 +307,8 @@ def _excitation(axes: "style.Axes", data: Data) -> None:
         (prismatic, other, 1.0, "m", style.SKY),
     ):
         for i in np.flatnonzero(chosen):
-            look = _WEAK if weak[i] else {"color": color}
-            kind.bar(i, scale * data["excitation"][i], width=0.6, **look)
+            line_style = _WEAK if weak[i] else {"color": color}
+            kind.bar(i, scale * data["excitation"][i], width=0.6, **line_style)
         if chosen.any():
             kind.set_ylabel(f"range ({unit})")
     units = [" (m)" if mixed and slides else "" for slides in prismatic]

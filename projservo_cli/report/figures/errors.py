@@ -4,20 +4,20 @@ import numpy as np
 
 from projservo_cli.records import PRISMATIC, FloatArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.report_data import Data, Material, curve_difference, percent, registered
+from projservo_cli.report.report_data import Data, ReportData, curve_difference, percent, registered
 
 _DECADES = 1e-5  # of its start, down to which an error is drawn on a logarithmic scale
-_FAINT: style.Look = {"linewidth": 0.8, "alpha": 0.55}
+_FAINT: style.LineStyle = {"linewidth": 0.8, "alpha": 0.55}
 _DOTTED = (0, (1, 1.2))
 _KERNEL = r"$\tau$, unit-norm kernel (8), "
 _WAYS = (("free", False), ("limited", True))  # without and with the limit of the joint speed
 
 
-def _data_two(material: Material) -> Data:
+def _data_two(report_data: ReportData) -> Data:
     """Errors of directTWO with calibrated operators, without and with the limit."""
-    result: Data = {"step_limit_deg": np.array(material.extra.step_limit_deg)}
+    result: Data = {"step_limit_deg": np.array(report_data.extra.step_limit_deg)}
     for name, limited in _WAYS:
-        trace = material.extra.own["direct_two", "calibrated", limited]
+        trace = report_data.extra.own["direct_two", "calibrated", limited]
         result |= {
             f"t_s_{name}": _time(trace),
             f"tau_{name}": percent(trace.tau),
@@ -44,45 +44,45 @@ def _time(trace: Trace) -> FloatArray:
 def _draw_two(data: Data, figure: "style.Figure") -> None:
     """Above τ, below θ_s; left as in the paper, right on a logarithmic scale."""
     axes = figure.subplots(2, 2, sharex=True)
-    looks: dict[str, style.Look] = {
+    line_styles: dict[str, style.LineStyle] = {
         "free": {"color": style.BLACK, "linestyle": "-"},
         "limited": {"color": style.VERMILION, "linestyle": (0, (4, 1.5))},
     }
     for (above, below), scale in zip(axes.T, ("linear", "logarithmic"), strict=True):
-        for name, look in looks.items():
+        for name, line_style in line_styles.items():
             t = data[f"t_s_{name}"]
-            above.plot(t, data[f"tau_affine_{name}"], **look)
-            above.plot(t, data[f"tau_{name}"], **look, **_FAINT)
-            below.plot(t, data[f"theta_s_deg_{name}"], **look)
+            above.plot(t, data[f"tau_affine_{name}"], **line_style)
+            above.plot(t, data[f"tau_{name}"], **line_style, **_FAINT)
+            below.plot(t, data[f"theta_s_deg_{name}"], **line_style)
         above.set(title=f"directTWO, {scale} scale", ylabel=r"$\tau$ (% of its start)")
         below.set(xlabel="time (s)", ylabel=r"$\theta_s$ (deg)")
     for panel, start in zip(axes[:, 1], (100.0, float(data["theta_s_deg_free"][0])), strict=True):
         style.log_scale(panel)
         panel.set_ylim(max(start, 1e-3) * _DECADES, max(start, 1e-3) * 3.0)
-    legend: dict[str, style.Look] = {
-        "no limit": looks["free"],
-        f"{data['step_limit_deg']:g}° per step": looks["limited"],
+    legend: dict[str, style.LineStyle] = {
+        "no limit": line_styles["free"],
+        f"{data['step_limit_deg']:g}° per step": line_styles["limited"],
         r"thin: $\tau$ of the unit-norm kernel (8)": {"color": style.BLACK, **_FAINT},
     }
     style.legend_below(figure, legend, 3)
 
 
-def _data_three(material: Material) -> Data:
+def _data_three(report_data: ReportData) -> Data:
     """Errors of directTHREE with the projective and the metric model, and the true distance.
 
     τ is normalised to 100. In the unit-norm kernel of (8) its scale changes with the joints; scaled
     through a_inf it is the true distance of the centre.
     """
-    own = material.extra.own
+    own = report_data.extra.own
     calibrated, metric, twin = (own["direct_three", kind, False] for kind in ("calibrated", "true", "twin"))
     result: Data = {
         "t_s": _time(calibrated),
         "t_s_metric": _time(metric),
         "tau": percent(calibrated.tau),
         "tau_affine": percent(calibrated.tau_affine),
-        "distance": percent(material.center_distance(calibrated)),
+        "distance": percent(report_data.center_distance(calibrated)),
         "tau_metric": percent(metric.tau),
-        "distance_metric": percent(material.center_distance(metric)),
+        "distance_metric": percent(report_data.center_distance(metric)),
     }
     for name in ("theta_r", "theta_p"):
         result[f"{name}_deg"] = np.degrees(getattr(calibrated, name))
@@ -110,16 +110,16 @@ def _draw_three(data: Data, figure: "style.Figure") -> None:
     (translation, off), (rotation, difference) = axes
     t, t_metric = data["t_s"], data["t_s_metric"]
     t_common = max(t, t_metric, key=len)
-    looks: dict[str, tuple[str, style.Look]] = {
+    line_styles: dict[str, tuple[str, style.LineStyle]] = {
         "distance": ("true distance", {"color": style.SKY, "linewidth": 3.2}),
         "tau_affine": (r"$\tau$, scale fixed through $a_\infty$", {"color": style.BLACK}),
         "tau": (_KERNEL + "projective", {"color": style.VERMILION, "linestyle": (0, (4, 1.5))}),
         "tau_metric": (_KERNEL + "Euclidean", {"color": style.BLACK, "linestyle": _DOTTED}),
     }
-    for name, (_, look) in looks.items():
-        translation.plot(t_metric if name == "tau_metric" else t, data[name], **look)
+    for name, (_, line_style) in line_styles.items():
+        translation.plot(t_metric if name == "tau_metric" else t, data[name], **line_style)
         if name in ("tau_affine", "tau"):
-            off.plot(t, np.abs(data[name] - data["distance"]), **look)
+            off.plot(t, np.abs(data[name] - data["distance"]), **line_style)
     some = {"fillstyle": "none", "markevery": max(1, len(t_metric) // 25)}
     for name, color, marker in (("theta_r", style.BLACK, "o"), ("theta_p", style.VERMILION, "s")):
         rotation.plot(t, data[f"{name}_deg"], color=color)
@@ -134,8 +134,8 @@ def _draw_three(data: Data, figure: "style.Figure") -> None:
     off.set(title="its difference from the true distance", ylabel="difference (% of the start)")
     rotation.set(title="rotation errors", xlabel="time (s)", ylabel="angle (deg)")
     difference.set(title="projective less Euclidean model", xlabel="time (s)", ylabel="difference (deg)")
-    points: style.Look = {"color": style.BLACK, "marker": "o", "linestyle": "none", "fillstyle": "none"}
-    legend = dict(looks.values()) | {
+    points: style.LineStyle = {"color": style.BLACK, "marker": "o", "linestyle": "none", "fillstyle": "none"}
+    legend = dict(line_styles.values()) | {
         r"$\theta_r$, projective model": {"color": style.BLACK},
         r"$\theta_p$, projective model": {"color": style.VERMILION},
         r"$\theta_r$, $\theta_p$, Euclidean": points,
@@ -144,13 +144,13 @@ def _draw_three(data: Data, figure: "style.Figure") -> None:
     style.legend_below(figure, legend, 2)
 
 
-def _data_joints(material: Material) -> Data:
+def _data_joints(report_data: ReportData) -> Data:
     """Joints and their steps under directTHREE with calibrated operators, in deg and in mm."""
-    prismatic = material.robot.joint_types == PRISMATIC
+    prismatic = report_data.robot.joint_types == PRISMATIC
     scale = np.where(prismatic, 1e3, np.degrees(1.0))
-    result: Data = {"prismatic": prismatic, "step_limit_deg": np.array(material.extra.step_limit_deg)}
+    result: Data = {"prismatic": prismatic, "step_limit_deg": np.array(report_data.extra.step_limit_deg)}
     for name, limited in _WAYS:
-        trace = material.extra.own["direct_three", "calibrated", limited]
+        trace = report_data.extra.own["direct_three", "calibrated", limited]
         result |= {
             f"t_s_{name}": _time(trace),
             f"q_{name}": trace.q * scale,
@@ -175,7 +175,7 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
     figure.set_figheight(1.2 + 3.6 * len(kinds))
     axes = figure.subplots(2 * len(kinds), 2, sharex=True, squeeze=False)
     limit = float(data["step_limit_deg"])
-    line: style.Look = {"color": style.GREY, "linewidth": 0.8}
+    line: style.LineStyle = {"color": style.GREY, "linewidth": 0.8}
     for column, (name, limited) in zip(axes.T, _WAYS, strict=True):
         t = data[f"t_s_{name}"]
         for joints, steps, (chosen, unit) in zip(column[::2], column[1::2], kinds, strict=True):
@@ -194,5 +194,5 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
         limits = [panel.get_ylim() for panel in row]
         for panel in row:
             panel.set_ylim(np.min(limits), np.max(limits))
-    looks = {f"$q_{i + 1}$": style.curve(i) for i in range(len(prismatic))} | {"limit": line}
-    style.legend_below(figure, looks, min(len(looks), 7))
+    line_styles = {f"$q_{i + 1}$": style.curve(i) for i in range(len(prismatic))} | {"limit": line}
+    style.legend_below(figure, line_styles, min(len(line_styles), 7))

@@ -7,14 +7,14 @@ import numpy as np
 from projservo_cli.laws import BODY_LAWS
 from projservo_cli.records import ByteArray, IntArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.report_data import VIEWS, Data, Driven, Material, registered, title
+from projservo_cli.report.report_data import VIEWS, Data, Driven, ReportData, registered, title
 from projservo_cli.task.face import cyclic_order
 
 _MOMENTS = ("start", "in the middle", "end")
 _HALO = 1.2  # points, by which lines over a frame are wider in white
-_FOUND: style.Look = {"color": style.ORANGE, "marker": "+", "linestyle": "none", "markersize": 4.0}
-_FACE: style.Look = {"color": style.GREEN, "linewidth": 1.2}
-_PATH: style.Look = {"color": style.VERMILION, "linewidth": 0.9}
+_FOUND: style.LineStyle = {"color": style.ORANGE, "marker": "+", "linestyle": "none", "markersize": 4.0}
+_FACE: style.LineStyle = {"color": style.GREEN, "linewidth": 1.2}
+_PATH: style.LineStyle = {"color": style.VERMILION, "linewidth": 0.9}
 
 
 def frames_of(trace: Trace, shown: IntArray | None = None, width: int | None = None) -> ByteArray | None:
@@ -40,16 +40,16 @@ def frames_of(trace: Trace, shown: IntArray | None = None, width: int | None = N
     return np.array(pairs)
 
 
-def _filmed(material: Driven | Material) -> str:
+def _filmed(report_data: Driven | ReportData) -> str:
     """The run that is shown: of those with frames the first of a direct law, else the first."""
-    names = [name for name, trace in material.traces.items() if trace.frame_index is not None]
+    names = [name for name, trace in report_data.traces.items() if trace.frame_index is not None]
     return next((name for name in names if name in BODY_LAWS), names[0])
 
 
-def _data(material: Driven | Material) -> Data:
+def _data(report_data: Driven | ReportData) -> Data:
     """Frames of three moments, all that was found in them, the path of the face and its goal."""
-    name, order = _filmed(material), cyclic_order(material.plan.A)
-    trace = material.traces[name]
+    name, order = _filmed(report_data), cyclic_order(report_data.plan.A)
+    trace = report_data.traces[name]
     assert trace.frame_index is not None
     assert trace.frame_s is not None
     half = np.abs(trace.image_error[trace.frame_index] - 0.5 * trace.image_error[0])
@@ -103,5 +103,5 @@ def _draw(data: Data, figure: "style.Figure") -> None:
             seconds = data["instant"][i] * float(data["period_s"])
             run = f"{data['run']}\n" if not (view or i) else ""
             panel.set_title(f"{run}{VIEWS[view]} camera, {_MOMENTS[i]}, {seconds:.2f} s")
-    looks = {"markers found": _FOUND, "face": _FACE, "path of a marker": _PATH, "goal": style.GOAL}
-    style.legend_below(figure, looks, 4)
+    line_styles = {"markers found": _FOUND, "face": _FACE, "path of a marker": _PATH, "goal": style.GOAL}
+    style.legend_below(figure, line_styles, 4)

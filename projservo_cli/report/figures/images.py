@@ -11,7 +11,7 @@ from projservo_cli.report.report_data import (
     DIRECT,
     VIEWS,
     Data,
-    Material,
+    ReportData,
     percent,
     registered,
 )
@@ -19,32 +19,36 @@ from projservo_cli.report.report_data import (
 _OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
 _BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
 _PANEL_WIDTH = 2.9  # inches, of one of two panels side by side
-_BORDER: style.Look = {"color": style.GREY, "linewidth": 0.8}
-_HIDDEN: style.Look = {"color": style.ORANGE, "linewidth": 4.0, "alpha": 0.6}
-_PATH: style.Look = {"color": style.BLACK, "linewidth": 0.9}
-_PLATEAU: style.Look = {"color": style.VERMILION, "linewidth": 2.0, "marker": "s"}
-_MARKER: style.Look = {"linewidth": 0.9, "markersize": 3.0, "linestyle": "-"}  # how it is broken says u or v
+_BORDER: style.LineStyle = {"color": style.GREY, "linewidth": 0.8}
+_HIDDEN: style.LineStyle = {"color": style.ORANGE, "linewidth": 4.0, "alpha": 0.6}
+_PATH: style.LineStyle = {"color": style.BLACK, "linewidth": 0.9}
+_PLATEAU: style.LineStyle = {"color": style.VERMILION, "linewidth": 2.0, "marker": "s"}
+_MARKER: style.LineStyle = {
+    "linewidth": 0.9,
+    "markersize": 3.0,
+    "linestyle": "-",
+}  # how it is broken says u or v
 # The overview.
-_SHOWN: dict[str, style.Look] = {
+_SHOWN: dict[str, style.LineStyle] = {
     "direct_three": {"color": style.GREEN, "linewidth": 1.2},
     "stacked": {"color": style.VERMILION, "linewidth": 1.1, "linestyle": (0, (4, 1.2))},
 }
 _IMAGE_WIDTH, _ERRORS_WIDTH = 3.7, 2.1  # inches, of the panels with images and of those next to them
 _ASPECTS = (0.45, 0.9)  # height over width of an image, within: an error panel has its height
 _PERCENT = (1e-2, 200.0)  # shown of a control error: below, noise of the calibration rules
-_BAND: style.Look = {"color": style.ORANGE, "linewidth": 5.0, "alpha": 0.55, "solid_capstyle": "butt"}
-_CENTER: style.Look = {"color": style.GREEN, "linewidth": 3.2}
+_BAND: style.LineStyle = {"color": style.ORANGE, "linewidth": 5.0, "alpha": 0.55, "solid_capstyle": "butt"}
+_CENTER: style.LineStyle = {"color": style.GREEN, "linewidth": 3.2}
 _ERRORS = (("tau_affine", r"$\tau$"), ("theta_r", r"$\theta_r$"), ("theta_p", r"$\theta_p$"))
 
 
-def _data_classical(material: Material) -> Data:
+def _data_classical(report_data: ReportData) -> Data:
     """Image paths of the classical laws that were run, with their hidden and standing stretches."""
-    result: Data = {"image_size": material.plant.image_size}
-    order = material.plant.order
+    result: Data = {"image_size": report_data.plant.image_size}
+    order = report_data.plant.order
     for law in POINT_LAWS:
-        if law in material.traces:
-            trace = material.traces[law]
-            stretch = plateau_stretch(trace.convergence_error, material.stall_periods)
+        if law in report_data.traces:
+            trace = report_data.traces[law]
+            stretch = plateau_stretch(trace.convergence_error, report_data.stall_periods)
             result |= {
                 f"s_{law}": trace.s[:, :, order],
                 f"s_star_{law}": trace.s_star[:, order],
@@ -88,13 +92,17 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
             title = f"{name} camera" if view else f"{title_of(law)}: {data[f'verdict_{law}']}"
             style.image_axes(panel, title, near_pixels(np.concatenate([s, goal[None]]), size))
             panel.plot(*style.closed(border).T, **_BORDER)
-    looks: dict[str, style.Look] = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
-    looks |= {"face hidden from this camera": _HIDDEN, "plateau of the image error": _PLATEAU}
-    looks["end of the run"] = {"color": style.BLACK, "marker": "x", "linestyle": "none"}
+    line_styles: dict[str, style.LineStyle] = {
+        "start": style.START,
+        "goal": style.GOAL,
+        "path of a marker": _PATH,
+    }
+    line_styles |= {"face hidden from this camera": _HIDDEN, "plateau of the image error": _PLATEAU}
+    line_styles["end of the run"] = {"color": style.BLACK, "marker": "x", "linestyle": "none"}
     every = np.concatenate([near_pixels(s, size) for s in shown]) / size
     if (np.abs(every - 0.5) > 0.5 - _BORDER_SHOWN).any():
-        looks["border of the image"] = _BORDER
-    style.legend_below(figure, looks, 4)
+        line_styles["border of the image"] = _BORDER
+    style.legend_below(figure, line_styles, 4)
 
 
 def near_pixels(pixels: FloatArray, size: FloatArray) -> FloatArray:
@@ -103,11 +111,11 @@ def near_pixels(pixels: FloatArray, size: FloatArray) -> FloatArray:
     return np.clip(seen, -_OUTSIDE * size, (1.0 + _OUTSIDE) * size)
 
 
-def _data_direct(material: Material) -> Data:
+def _data_direct(report_data: ReportData) -> Data:
     """Image paths of both direct laws."""
-    order = material.plant.order
-    result: Data = {f"s_{law}": material.traces[law].s[:, :, order] for law in DIRECT}
-    return result | {"s_star": material.traces[DIRECT[0]].s_star[:, order]}
+    order = report_data.plant.order
+    result: Data = {f"s_{law}": report_data.traces[law].s[:, :, order] for law in DIRECT}
+    return result | {"s_star": report_data.traces[DIRECT[0]].s_star[:, order]}
 
 
 @registered(
@@ -123,31 +131,33 @@ def _draw_direct(data: Data, figure: "style.Figure") -> None:
     runs = [data[f"s_{law}"] for law in DIRECT]
     figure.set_figheight(_PANEL_WIDTH * style.aspect(np.concatenate(runs)) + 1.05)
     axes = figure.subplots(1, 2)
-    looks: tuple[style.Look, ...] = (
+    line_styles: tuple[style.LineStyle, ...] = (
         {"color": style.BLACK, "linewidth": 1.1},
         {"color": style.VERMILION, "linewidth": 1.1, "linestyle": (0, (4, 1.5))},
     )
     for view, (panel, name) in enumerate(zip(axes, VIEWS, strict=True)):
         goal = data["s_star"][view]
-        for s, look in zip(runs, looks, strict=True):
-            style.paths(panel, s[:, view], look)
+        for s, line_style in zip(runs, line_styles, strict=True):
+            style.paths(panel, s[:, view], line_style)
         style.face(panel, runs[0][0, view], style.START, fill=True)
         style.face(panel, goal, style.GOAL)
         style.image_axes(panel, f"{name} camera", np.concatenate([goal[None], *(s[:, view] for s in runs)]))
-    legend: dict[str, style.Look] = {title_of(law): look for law, look in zip(DIRECT, looks, strict=True)}
+    legend: dict[str, style.LineStyle] = {
+        title_of(law): line_style for law, line_style in zip(DIRECT, line_styles, strict=True)
+    }
     style.legend_below(figure, legend | {"start": style.START, "goal": style.GOAL}, 4)
 
 
-def _data_errors(material: Material) -> Data:
+def _data_errors(report_data: ReportData) -> Data:
     """Image errors of the markers and of the centre under directTHREE, over time."""
-    trace = material.traces[DIRECT[0]]
-    goal = np.append(material.goal_center(trace), 1.0)
+    trace = report_data.traces[DIRECT[0]]
+    goal = np.append(report_data.goal_center(trace), 1.0)
     return {
         "t_s": trace.period * np.arange(len(trace.s)),
         "e": trace.s - trace.s_star,
-        "center_e": material.center_image(trace) - project(material.plant.model.P, goal[None])[:, 0],
+        "center_e": report_data.center_image(trace) - project(report_data.plant.model.P, goal[None])[:, 0],
         "law": np.array(title_of(trace.law)),
-        "marker": np.array(material.numbers),
+        "marker": np.array(report_data.numbers),
     }
 
 
@@ -165,39 +175,41 @@ def draw_image_errors(data: Data, figure: "style.Figure") -> None:
     """One panel a camera; u solid, v dashed, the centre thick, if it is known."""
     axes = figure.subplots(1, 2, sharey=True)
     t = data["t_s"]
-    thick: style.Look = {"color": style.GREY, "linewidth": 3.0, "alpha": 0.6}
-    thin: style.Look = {"color": style.BLACK, "linewidth": 0.9}
+    thick: style.LineStyle = {"color": style.GREY, "linewidth": 3.0, "alpha": 0.6}
+    thin: style.LineStyle = {"color": style.BLACK, "linewidth": 0.9}
     markers = [style.curve(k, marker=True) | _MARKER for k in range(len(data["marker"]))]
     for view, (panel, name) in enumerate(zip(axes, VIEWS, strict=True)):
-        for k, look in enumerate(markers):
+        for k, line_style in enumerate(markers):
             u, v = data["e"][:, view, k].T
             every = {"markevery": (k * len(t) // 60, max(1, len(t) // 12))}
-            panel.plot(t, u, **look, **every)
-            panel.plot(t, v, **look | every | {"linestyle": (0, (3, 1.2))})
+            panel.plot(t, u, **line_style, **every)
+            panel.plot(t, v, **line_style | every | {"linestyle": (0, (3, 1.2))})
         if "center_e" in data:
             u, v = data["center_e"][:, view].T
             panel.plot(t, u, **thick)
             panel.plot(t, v, linestyle=(0, (2, 1)), **thick)
         panel.set(title=f"{name} camera, {data['law']}", xlabel="time (s)")
     axes[0].set_ylabel("image error $s - s_*$ (px)")
-    looks = {f"marker {number}": look for number, look in zip(data["marker"], markers, strict=True)}
-    looks |= {"centre": thick} if "center_e" in data else {}
-    looks |= {"u": thin, "v": thin | {"linestyle": (0, (3, 1.2))}}
-    style.legend_below(figure, looks, min(len(looks), 8))
+    line_styles = {
+        f"marker {number}": line_style for number, line_style in zip(data["marker"], markers, strict=True)
+    }
+    line_styles |= {"centre": thick} if "center_e" in data else {}
+    line_styles |= {"u": thin, "v": thin | {"linestyle": (0, (3, 1.2))}}
+    style.legend_below(figure, line_styles, min(len(line_styles), 8))
 
 
-def _data_overview(material: Material) -> Data:
+def _data_overview(report_data: ReportData) -> Data:
     """Paths and image errors of the direct and the stacked law, control errors of the direct one."""
-    order = material.plant.order
-    direct = material.traces[DIRECT[0]]
+    order = report_data.plant.order
+    direct = report_data.traces[DIRECT[0]]
     result: Data = {
         "s_star": direct.s_star[:, order],
-        "center": material.center_image(direct),
+        "center": report_data.center_image(direct),
         "period_s": np.array(direct.period),
         **{f"{name}_percent": np.abs(percent(getattr(direct, name))) for name, _ in _ERRORS},
     }
     for law in _SHOWN:
-        trace = material.traces[law]
+        trace = report_data.traces[law]
         hidden = trace.self_occluded
         end = f"{trace.verdict} in {trace.steps} steps, face hidden in {hidden.any(axis=1).sum()}"
         result |= {
@@ -236,10 +248,10 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
     axes = figure.subplots(2, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
     control, image = axes[:, 1]
     for view, (panel, name) in enumerate(zip(axes[:, 0], VIEWS, strict=True)):
-        for law, look in reversed(_SHOWN.items()):
+        for law, line_style in reversed(_SHOWN.items()):
             s = data[f"s_{law}"][:, view]
             style.hidden_paths(panel, s, data[f"hidden_{law}"][:, view], _BAND)
-            style.paths(panel, s, look)
+            style.paths(panel, s, line_style)
         panel.plot(*data["center"][:, view].T, **_CENTER)
         style.face(panel, data[f"s_{DIRECT[0]}"][0, view], style.START, fill=True)
         style.face(panel, data["s_star"][view], style.GOAL)
@@ -254,16 +266,16 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
         title=f"control errors, {title_of(DIRECT[0])}", ylabel="error (% of its start)", ylim=_PERCENT
     )
     control.legend(loc="upper right")
-    for law, look in _SHOWN.items():
+    for law, line_style in _SHOWN.items():
         e, hidden = data[f"image_error_{law}"], data[f"hidden_{law}"].any(axis=1)
         t = data["period_s"] * np.arange(len(e))
         image.plot(t, np.where(hidden, e, np.nan), **_BAND)
-        image.plot(t, e, **look)
+        image.plot(t, e, **line_style)
     style.log_scale(image)
     image.set(title="image errors, both laws", ylabel="rms (px)")
     for panel in (control, image):
         panel.set_xlabel("time (s)")
-    looks = {str(data[f"verdict_{law}"]): look for law, look in _SHOWN.items()}
-    looks |= {f"centre under {title_of(DIRECT[0])}": _CENTER, "face at the start": style.START}
-    looks |= {"face at the goal": style.GOAL, "face hidden from the camera": _BAND}
-    style.legend_below(figure, looks, 2)
+    line_styles = {str(data[f"verdict_{law}"]): line_style for law, line_style in _SHOWN.items()}
+    line_styles |= {f"centre under {title_of(DIRECT[0])}": _CENTER, "face at the start": style.START}
+    line_styles |= {"face at the goal": style.GOAL, "face hidden from the camera": _BAND}
+    style.legend_below(figure, line_styles, 2)

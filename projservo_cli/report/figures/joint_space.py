@@ -9,7 +9,7 @@ from projservo_cli.planning.margins import BEHIND, CLEAR, CONSTRAINTS, IMAGE, WI
 from projservo_cli.records import PRISMATIC, FloatArray, IntArray, Plan
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import near_pixels
-from projservo_cli.report.report_data import VIEWS, Data, Material, registered
+from projservo_cli.report.report_data import VIEWS, Data, ReportData, registered
 
 PIECES = 4  # of each edge of a tree, which is no straight line in an image
 _IMAGE_WIDTH, _ROW = 2.9, 1.5  # inches: of an image, and the height of a row of curves
@@ -19,16 +19,21 @@ _STRIP = 0.085  # of the time, that the range of a joint takes next to the curve
 _NEAR, _NEAR_PX = 1.0, 10.0  # margins and distances up to which a scale to ten times as much is linear
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")  # as text, which takes a tenth of formulas
 _SIDES: tuple[Any, Any] = ("-", (0, (4, 1.5)))  # of what both cameras have
-_PATH: style.Look = {"color": style.GREY, "linewidth": 0.8}
-_CENTER: style.Look = {"color": style.GREEN, "linewidth": 1.6}
-_CORNER: style.Look = {"color": style.VERMILION, "marker": "|", "markersize": 8.0, "linestyle": "none"}
-_EDGE: style.Look = {"color": style.GREY, "linewidth": 0.8, "linestyle": (0, (1, 1))}
-_TREES: dict[str, style.Look] = {
+_PATH: style.LineStyle = {"color": style.GREY, "linewidth": 0.8}
+_CENTER: style.LineStyle = {"color": style.GREEN, "linewidth": 1.6}
+_CORNER: style.LineStyle = {"color": style.VERMILION, "marker": "|", "markersize": 8.0, "linestyle": "none"}
+_EDGE: style.LineStyle = {"color": style.GREY, "linewidth": 0.8, "linestyle": (0, (1, 1))}
+_TREES: dict[str, style.LineStyle] = {
     "start": {"color": style.SKY, "linewidth": 0.5, "alpha": 0.7},
     "goals": {"color": style.PURPLE, "linewidth": 0.5, "alpha": 0.7},
 }
-_KEPT_OUT: style.Look = {"facecolor": "none", "edgecolor": style.VERMILION, "hatch": "////", "linewidth": 0.6}
-_ASKED: style.Look = {"linewidth": 0.8, "linestyle": (0, (1, 1))}
+_KEPT_OUT: style.LineStyle = {
+    "facecolor": "none",
+    "edgecolor": style.VERMILION,
+    "hatch": "////",
+    "linewidth": 0.6,
+}
+_ASKED: style.LineStyle = {"linewidth": 0.8, "linestyle": (0, (1, 1))}
 _SHARES = {
     "visibility": ("visibility a·O (start = 1)", style.BLUE),
     "joints": ("nearest joint limit (middle = 1)", style.GREEN),
@@ -41,10 +46,10 @@ _DISTANCES = {
 }
 
 
-def _data(material: Material) -> Data:
+def _data(report_data: ReportData) -> Data:
     """Images, joints and margins along the plan; trees as lines with NaN between their edges."""
-    plan, order, model = material.plan, material.plant.order, material.calibrated
-    slides = material.robot.joint_types == PRISMATIC
+    plan, order, model = report_data.plan, report_data.plant.order, report_data.calibrated
+    slides = report_data.robot.joint_types == PRISMATIC
     unit = np.where(slides, 1e3, np.degrees(1.0))
     timed = bool(np.isfinite(plan.time).all())
     name = f"{plan.profile.replace('_', ' ')} profile"
@@ -56,18 +61,18 @@ def _data(material: Material) -> Data:
         "s": plan.s[:, :, order],
         "s_star": plan.s_star[:, order],
         "center": np.moveaxis(project(model.P, plan.H_d @ plan.A_c, model.lens), 0, 1),
-        "image_size": material.plant.image_size,
+        "image_size": report_data.plant.image_size,
         "prismatic": slides,
         "q_deg_or_mm": plan.q * unit,
         "q_start_deg_or_mm": plan.q_start * unit,
-        "limits_deg_or_mm": np.stack([material.robot.limits.lower, material.robot.limits.upper]) * unit,
+        "limits_deg_or_mm": np.stack([report_data.robot.limits.lower, report_data.robot.limits.upper]) * unit,
         "corner_s": np.zeros((0, 2)) if plan.blends is None else plan.blends,
         "visibility": plan.margin,
         "joints": plan.joint_margin[:, None],
         "conditioning": (plan.reciprocal_condition / plan.reciprocal_condition[0])[:, None],
-        **_distances(plan, material.trajectory.border_px),
+        **_distances(plan, report_data.trajectory.border_px),
     }
-    for i, region in enumerate(material.trajectory.keep_out):
+    for i, region in enumerate(report_data.trajectory.keep_out):
         for view, polygon in ((0, region.left), (1, region.right)):
             if polygon is not None:
                 result[f"kept_out_{VIEWS[view]}_{i}"] = np.array(polygon)
@@ -132,7 +137,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         (np.flatnonzero(slides == kind), "mm" if kind else "deg") for kind in np.unique(slides)
     ]
     shown = [_shown(data, view) for view in range(2)]
-    image = _IMAGE_WIDTH * style.aspect(np.concatenate(shown), most=_HIGHEST)
+    image = _IMAGE_WIDTH * style.aspect(np.concatenate(shown), upper=_HIGHEST)
     figure.set_figheight(image + 2.0 * _ROW + 1.9)
     grid = figure.add_gridspec(3, 2, height_ratios=[image, _ROW, _ROW])
     for view in range(2):
@@ -164,9 +169,9 @@ def _shown(data: Data, view: int) -> FloatArray:
 def _image(axes: "style.Axes", data: Data, view: int, shown: FloatArray) -> None:
     for name in (name for name in data if name.startswith(f"kept_out_{VIEWS[view]}")):
         axes.fill(*data[name].T, **_KEPT_OUT)
-    for name, look in _TREES.items():
+    for name, line_style in _TREES.items():
         if f"tree_{name}" in data:
-            axes.plot(*data[f"tree_{name}"][:, view].T, **look)
+            axes.plot(*data[f"tree_{name}"][:, view].T, **line_style)
     s, center = data["s"][:, view], data["center"][:, view]
     style.paths(axes, s, _PATH)
     axes.plot(*center.T, **_CENTER)
@@ -198,10 +203,12 @@ def _joints(axes: "style.Axes", data: Data, chosen: list[int], unit: str) -> Non
         axes.axvspan(begin, until, color=style.PALE, linewidth=0)
     axes.axvline(end, color=style.GREY, linewidth=0.6)
     for place, i in enumerate(chosen):
-        look = style.curve(i)
-        axes.plot(t, q[:, i], **look)
+        line_style = style.curve(i)
+        axes.plot(t, q[:, i], **line_style)
         x = end * (1.0 + _STRIP * (place + 0.7))
-        axes.plot([x, x], np.clip(limits[:, i], low - pad, high + pad), color=look["color"], linewidth=3.0)
+        axes.plot(
+            [x, x], np.clip(limits[:, i], low - pad, high + pad), color=line_style["color"], linewidth=3.0
+        )
         axes.text(
             x,
             high + 1.5 * pad,
@@ -222,33 +229,39 @@ def _curves(axes: "style.Axes", data: Data, colors: dict[str, str]) -> None:
     t, name = _time(data)
     axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
     for key, color in colors.items():
-        for suffix, looks in (("", _SIDES), ("_asked", (_ASKED["linestyle"],) * 2)):
+        for suffix, line_styles in (("", _SIDES), ("_asked", (_ASKED["linestyle"],) * 2)):
             width = 0.8 if suffix else 1.2
-            for column, look in zip(data.get(key + suffix, np.zeros((len(t), 0))).T, looks, strict=False):
-                axes.plot(t, column, color=color, linestyle=look, linewidth=width)
+            for column, line_style in zip(
+                data.get(key + suffix, np.zeros((len(t), 0))).T, line_styles, strict=False
+            ):
+                axes.plot(t, column, color=color, linestyle=line_style, linewidth=width)
     axes.set(xlabel=name)
 
 
-def _legend(data: Data) -> dict[str, style.Look]:
-    grey: style.Look = {"color": style.GREY}
-    looks: dict[str, style.Look] = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
-    looks["path of the centre"] = _CENTER
+def _legend(data: Data) -> dict[str, style.LineStyle]:
+    grey: style.LineStyle = {"color": style.GREY}
+    line_styles: dict[str, style.LineStyle] = {
+        "start": style.START,
+        "goal": style.GOAL,
+        "path of a marker": _PATH,
+    }
+    line_styles["path of the centre"] = _CENTER
     if len(data["corner_s"]):
-        looks["a rounded corner begins, ends"] = _CORNER
-    for name, look in _TREES.items():
+        line_styles["a rounded corner begins, ends"] = _CORNER
+    for name, line_style in _TREES.items():
         if f"tree_{name}" in data:
-            looks[f"tree from the {name}"] = look | {"linewidth": 1.2}
+            line_styles[f"tree from the {name}"] = line_style | {"linewidth": 1.2}
     if "nodes" in data and data["nodes"][0] < data["nodes"][1]:
-        looks["{} of {} joint vectors of trees".format(*data["nodes"])] = {"linewidth": 0}
+        line_styles["{} of {} joint vectors of trees".format(*data["nodes"])] = {"linewidth": 0}
     if any(name.startswith("kept_out") for name in data):
-        looks["kept-out region"] = _KEPT_OUT
+        line_styles["kept-out region"] = _KEPT_OUT
     for key, (label, color) in (_SHARES | _DISTANCES).items():
         if key in data:
-            looks[label] = {"color": color}
-    looks |= {
+            line_styles[label] = {"color": color}
+    line_styles |= {
         "left camera, or both": grey | {"linestyle": _SIDES[0]},
         "right camera": grey | {"linestyle": _SIDES[1]},
     }
-    looks["asked for"] = grey | _ASKED
+    line_styles["asked for"] = grey | _ASKED
     shown = np.concatenate([_shown(data, view) for view in range(2)]) / data["image_size"]
-    return looks | ({"border of the image": _EDGE} if (np.abs(shown - 0.5) > _NEAR_EDGE).any() else {})
+    return line_styles | ({"border of the image": _EDGE} if (np.abs(shown - 0.5) > _NEAR_EDGE).any() else {})

@@ -6,20 +6,20 @@ from projservo_cli.geometry.algebra import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.report_data import VIEWS, Data, Material, registered
+from projservo_cli.report.report_data import VIEWS, Data, ReportData, registered
 from projservo_cli.task.face import cyclic_order
 
 _ARC_POINTS, _SENSE_POINTS = 61, 181
-_SHIFTED: style.Look = {"color": style.VERMILION, "linestyle": (0, (1, 1))}
-_TURNED: style.Look = {"color": style.GREEN, "linestyle": (0, (5, 1.5, 1, 1.5))}
-_PATH: style.Look = {"color": style.GREY, "linewidth": 0.7}
-_AXIS: style.Look = {"color": style.BLACK, "linewidth": 0.8, "linestyle": (0, (8, 3, 1, 3))}
-_SENSES: tuple[style.Look, ...] = (
+_SHIFTED: style.LineStyle = {"color": style.VERMILION, "linestyle": (0, (1, 1))}
+_TURNED: style.LineStyle = {"color": style.GREEN, "linestyle": (0, (5, 1.5, 1, 1.5))}
+_PATH: style.LineStyle = {"color": style.GREY, "linewidth": 0.7}
+_AXIS: style.LineStyle = {"color": style.BLACK, "linewidth": 0.8, "linestyle": (0, (8, 3, 1, 3))}
+_SENSES: tuple[style.LineStyle, ...] = (
     {"color": style.BLUE, "linestyle": "-"},
     {"color": style.VERMILION, "linestyle": (0, (5, 1.5))},
 )
-_HIDDEN: style.Look = {"color": style.GREY, "linewidth": 4, "alpha": 0.5}
-_ZERO: style.Look = {"color": style.BLACK, "marker": "D", "linestyle": "none", "fillstyle": "none"}
+_HIDDEN: style.LineStyle = {"color": style.GREY, "linewidth": 4, "alpha": 0.5}
+_ZERO: style.LineStyle = {"color": style.BLACK, "marker": "D", "linestyle": "none", "fillstyle": "none"}
 _MARGIN = "margin $a\\cdot O$\n(start = 1)"
 
 
@@ -28,13 +28,13 @@ def _turned(H_hat: FloatArray, angles: FloatArray, points: FloatArray) -> FloatA
     return np.stack([points @ exp_rotation(H_hat, theta).T for theta in angles])
 
 
-def _data_partition(material: Material) -> Data:
+def _data_partition(report_data: ReportData) -> Data:
     """Images in the left camera of the face, its targets and the paths of the three parts.
 
     A_t is the goal less the translation, A_r the goal less both translation and rotation onto the
     plane, [RH00] eqs. (12), (16); all come from the calibration and the images.
     """
-    plan, model = material.plan, material.calibrated
+    plan, model = report_data.plan, report_data.calibrated
     order = cyclic_order(plan.A)
     share = np.linspace(0.0, 1.0, _ARC_POINTS)
     points = {
@@ -92,7 +92,7 @@ def _draw_partition(data: Data, figure: "style.Figure") -> None:
         style.image_axes(panel, title, np.concatenate(shown))
     arrow = {"arrowstyle": "->", "linewidth": 0.9}
     panels[0].annotate("", data["center"][1], data["center"][0], arrowprops=arrow)
-    looks = {
+    line_styles = {
         "start $A$": style.START,
         "goal $A_*$": style.GOAL,
         "goal less translation $A_t$": _SHIFTED,
@@ -100,15 +100,15 @@ def _draw_partition(data: Data, figure: "style.Figure") -> None:
         "paths of the markers": _PATH,
         r"axis of $\hat H_r$": _AXIS,
     }
-    style.legend_below(figure, looks, 3)
+    style.legend_below(figure, line_styles, 3)
 
 
-def _data_visibility(material: Material) -> Data:
+def _data_visibility(report_data: ReportData) -> Data:
     """Margins a·O of both cameras over τ and θ_r, their zeros, and the images along both senses.
 
     Margins are relative to the start, so 1 is the face as first seen and 0 a face seen edge-on.
     """
-    plan, model = material.plan, material.calibrated
+    plan, model = report_data.plan, report_data.calibrated
     O, face = plan.optical_center, plan.A[cyclic_order(plan.A)]
     start = O @ plan.a
     arcs = [np.linspace(0.0, sense, _SENSE_POINTS) for sense in plan.sense]
@@ -145,27 +145,27 @@ def _draw_visibility(data: Data, figure: "style.Figure") -> None:
     axes = figure.subplots(3, 2, height_ratios=[1.9, 1.0, 0.9])
     for view, name in enumerate(VIEWS):
         panel, images = axes[0, view], data["images"][:, :, view]
-        for s, margin, look in zip(images, data["theta_margin"][..., view], _SENSES, strict=True):
+        for s, margin, line_style in zip(images, data["theta_margin"][..., view], _SENSES, strict=True):
             style.hidden_paths(panel, s, margin <= 0.0, _HIDDEN)
-            style.paths(panel, s, look | {"linewidth": 0.9})
-            style.face(panel, s[-1], look)
+            style.paths(panel, s, line_style | {"linewidth": 0.9})
+            style.face(panel, s[-1], line_style)
         style.face(panel, images[0, 0], style.START, fill=True)
         style.image_axes(panel, f"{name} camera", images)
         _angle(axes[1, view], data, view)
         _translation(axes[2, view], data, view)
-    looks = {"face at the start": style.START}
-    for angle, look in zip(data["theta_deg"][:, -1], _SENSES, strict=True):
-        looks[rf"sense $\theta_r$ = {_signed(angle)}°"] = look
-    looks |= {"hidden from this camera": _HIDDEN, r"$\theta_0^\pm$, $\tau_0$": _ZERO}
-    looks["end of the motion"] = {"color": style.BLACK, "marker": "s", "linestyle": "none"}
-    style.legend_below(figure, looks, 3)
+    line_styles = {"face at the start": style.START}
+    for angle, line_style in zip(data["theta_deg"][:, -1], _SENSES, strict=True):
+        line_styles[rf"sense $\theta_r$ = {_signed(angle)}°"] = line_style
+    line_styles |= {"hidden from this camera": _HIDDEN, r"$\theta_0^\pm$, $\tau_0$": _ZERO}
+    line_styles["end of the motion"] = {"color": style.BLACK, "marker": "s", "linestyle": "none"}
+    style.legend_below(figure, line_styles, 3)
 
 
 def _angle(axes: "style.Axes", data: Data, view: int) -> None:
     angles, zeros = data["theta_deg"], data["theta_0_deg"][view]
-    for theta, margin, look in zip(angles, data["theta_margin"][..., view], _SENSES, strict=True):
-        _margin(axes, theta, margin, look)
-        axes.plot(theta[-1:], margin[-1:], "s", color=look["color"])
+    for theta, margin, line_style in zip(angles, data["theta_margin"][..., view], _SENSES, strict=True):
+        _margin(axes, theta, margin, line_style)
+        axes.plot(theta[-1:], margin[-1:], "s", color=line_style["color"])
     changes = " and ".join(f"{_signed(angle)}°" for angle in zeros)
     zeros = (zeros[:, None] + np.array([-360.0, 0.0, 360.0])).ravel()
     zeros = zeros[(zeros >= angles.min()) & (zeros <= angles.max())]
@@ -185,10 +185,10 @@ def _translation(axes: "style.Axes", data: Data, view: int) -> None:
     axes.set(xlim=(share[0], share[-1]), xlabel=r"translation as share of $\tau$ (1)", ylabel=_MARGIN)
 
 
-def _margin(axes: "style.Axes", x: FloatArray, margin: FloatArray, look: style.Look) -> None:
+def _margin(axes: "style.Axes", x: FloatArray, margin: FloatArray, line_style: style.LineStyle) -> None:
     """A visibility margin over the share of a motion, and where the face is hidden by it."""
     axes.plot(x, np.where(margin > 0, np.nan, margin), **_HIDDEN)
-    axes.plot(x, margin, **look)
+    axes.plot(x, margin, **line_style)
     axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
 
 

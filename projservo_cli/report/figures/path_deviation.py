@@ -11,7 +11,7 @@ from projservo_cli.report import style
 from projservo_cli.report.report_data import (
     DIRECT,
     Data,
-    Material,
+    ReportData,
     Studies,
     along_line,
     registered,
@@ -26,9 +26,9 @@ _LEAST_OF_MODES = 0.02
 _WAY, _OFF = "way along the straight line (mm)", "distance from it (mm)"
 _RESOLUTION = np.radians(1.0)  # longest joint motion, rad or m, between two points of a drawn path
 _OPERATORS = ("true", "calibrated")
-_LIMITED: style.Look = {"color": style.SKY, "linewidth": 2.4}
+_LIMITED: style.LineStyle = {"color": style.SKY, "linewidth": 2.4}
 # Largest deviations by operators and limit, both 0 or 1.
-_MAXIMA: dict[tuple[int, int], style.Look] = {
+_MAXIMA: dict[tuple[int, int], style.LineStyle] = {
     (0, 0): {"color": style.BLACK, "marker": "o"},
     (0, 1): {"color": style.BLACK, "marker": "^", "linestyle": (0, (4, 1.5))},
     (1, 0): {"color": style.VERMILION, "marker": "s", "fillstyle": "none"},
@@ -62,9 +62,9 @@ def study_numbers(studies: Studies | None) -> dict[str, Any]:
     }
 
 
-def _data(material: Material) -> Data:
+def _data(report_data: ReportData) -> Data:
     """Paths of the centre with calibrated operators, and the largest deviations of all runs."""
-    studies = material.extra
+    studies = report_data.extra
     result: Data = {
         "gain": np.array(studies.gains),
         "path_deviation_mm": study_numbers(studies)["path_deviation_mm"],
@@ -75,15 +75,15 @@ def _data(material: Material) -> Data:
         for i, (gain, limited) in enumerate(cases):
             trace = studies.sweep[law, "calibrated", limited, gain]
             whirls = np.abs(np.diff(trace.q, axis=0)).max(initial=0.0) > _WHIRL
-            points = trace.center if whirls else _center_path(material, trace)
-            way, off = along_line(points, trace.center[0], material.goal_center(trace))
+            points = trace.center if whirls else _center_path(report_data, trace)
+            way, off = along_line(points, trace.center[0], report_data.goal_center(trace))
             used = np.unique(np.linspace(0, len(points) - 1, _PATH_POINTS).round().astype(int))
             result[f"whirls_{law}_{i}"] = np.array(whirls)
             result[f"path_mm_{law}_{i}"] = 1e3 * np.stack([way, off], axis=1)[used]
     return result
 
 
-def _center_path(material: Material, trace: Trace) -> FloatArray:
+def _center_path(report_data: ReportData, trace: Trace) -> FloatArray:
     """True centre (k, 3) along a run, m, between the instants too, where the joints move linearly."""
     amount = np.abs(np.diff(trace.q, axis=0)).max(axis=1, initial=0.0)
     points = [trace.center[0]]
@@ -91,7 +91,7 @@ def _center_path(material: Material, trace: Trace) -> FloatArray:
         parts = max(1, int(np.ceil(most / _RESOLUTION)))
         for share in np.arange(1, parts) / parts:
             q = trace.q[k] + share * (trace.q[k + 1] - trace.q[k])
-            points.append((forward_kinematics(material.plant.model, q) @ material.middle)[:3])
+            points.append((forward_kinematics(report_data.plant.model, q) @ report_data.middle)[:3])
         points.append(trace.center[k + 1])
     return np.array(points)
 
@@ -112,29 +112,31 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     """One row a law: left the paths, right the largest deviation over the gain."""
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     gains = data["gain"]
-    looks = [*(style.curve(i) for i in range(len(gains))), _LIMITED]
+    line_styles = [*(style.curve(i) for i in range(len(gains))), _LIMITED]
     for (path_axes, most), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
         paths = [data[f"path_mm_{law}_{i}"] for i in range(len(gains) + 1)]
         least = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
-        for path, look in zip(paths, looks, strict=True):
-            path_axes.plot(path[:, 0], np.maximum(path[:, 1], least), **look)
+        for path, line_style in zip(paths, line_styles, strict=True):
+            path_axes.plot(path[:, 0], np.maximum(path[:, 1], least), **line_style)
         path_axes.set(title=f"{title_of(law)}: path of the centre, calibrated operators")
         path_axes.set(xlabel=_WAY, ylabel=_OFF)
         style.log_scale(path_axes)
         path_axes.set_ylim(bottom=least)
-        for (operators, limited), look in _MAXIMA.items():
+        for (operators, limited), line_style in _MAXIMA.items():
             size = 4.5 if operators else 3.0  # an empty marker shows around a full one
-            most.plot(gains, deviation[operators, limited], markersize=size, **look)
+            most.plot(gains, deviation[operators, limited], markersize=size, **line_style)
         most.set(title=f"{title_of(law)}: largest distance", xscale="log")
         most.set(xlabel="gain per step (1)", ylabel="largest distance (mm)")
         most.set_xticks(gains, [f"{gain:g}" for gain in gains])
         most.minorticks_off()
         style.log_scale(most)
     limit = f"{float(data['step_limit_deg']):g}° per step"
-    legend = {f"gain {gain:g} per step": look for gain, look in zip(gains, looks, strict=False)}
+    legend = {
+        f"gain {gain:g} per step": line_style for gain, line_style in zip(gains, line_styles, strict=False)
+    }
     legend[f"{gains.max():g} and {limit}"] = _LIMITED
-    for (operators, limited), look in _MAXIMA.items():
-        legend[f"{_OPERATORS[operators]}, {limit if limited else 'no limit'}"] = look
+    for (operators, limited), line_style in _MAXIMA.items():
+        legend[f"{_OPERATORS[operators]}, {limit if limited else 'no limit'}"] = line_style
     if any(data[f"whirls_{law}_{i}"] for law in DIRECT for i in range(len(gains) + 1)):
         legend["chords: steps over 180°"] = {"color": style.BLACK, "linewidth": 0}
     style.legend_below(figure, legend, 4)
@@ -163,13 +165,13 @@ def drift_rows(report: Report) -> list[dict[str, Any]]:
     return rows
 
 
-def _data_modes(material: Material) -> Data:
+def _data_modes(report_data: ReportData) -> Data:
     """Way along the line of the centre and distance from it at every instant, mm."""
-    names = material.compared()
+    names = report_data.compared()
     result: Data = {"names": np.array(names)}
     for name in names:
-        trace = material.traces[name]
-        way, off = along_line(trace.center, trace.center[0], material.goal_center(trace))
+        trace = report_data.traces[name]
+        way, off = along_line(trace.center, trace.center[0], report_data.goal_center(trace))
         result[f"path_mm_{name}"] = 1e3 * np.stack([way, off], axis=1)
     return result
 

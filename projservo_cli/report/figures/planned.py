@@ -11,7 +11,7 @@ from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.report_data import VIEWS, Data, Material, registered
+from projservo_cli.report.report_data import VIEWS, Data, ReportData, registered
 from projservo_cli.simulation.arm import METRIC_A_INF, roll_axis
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.trajectory import trajectory_displacement
@@ -24,16 +24,16 @@ _TICKS = 11  # points at equal steps of σ on the path
 _WIDE = 4.0  # margins beyond are drawn in powers of ten
 LABEL = 0.05  # room that the number on a contour needs, in shares
 _SIGMA, _SHARE = r"path parameter $\sigma$ (1)", r"share $\mu$ (1)"
-_SHARES: dict[str, style.Look] = {  # equal shares lie on one another: the wider shows beneath
+_SHARES: dict[str, style.LineStyle] = {  # equal shares lie on one another: the wider shows beneath
     r"$\mu_t$": {"color": style.SKY, "linewidth": 3.0},
     r"$\mu_r$": {"color": style.BLACK, "linewidth": 1.8, "linestyle": (0, (4, 2))},
     r"$\mu_p$": {"color": style.VERMILION, "linewidth": 1.0, "linestyle": (0, (1, 1))},
 }
-_REGIONS: dict[str, style.Look] = {  # hatched, so that they differ in grey too
+_REGIONS: dict[str, style.LineStyle] = {  # hatched, so that they differ in grey too
     "margin": {"facecolor": style.GREY, "hatch": ""},
     "border_px": {"facecolor": style.ORANGE, "hatch": "////"},
 }
-_MARGINS: dict[str, style.Look] = {
+_MARGINS: dict[str, style.LineStyle] = {
     "visibility": {"color": style.BLUE, "linestyle": "-"},
     "image": {"color": style.ORANGE, "linestyle": (0, (5, 1.5))},
     "joints": {"color": style.GREEN, "linestyle": (0, (4, 1, 1, 1))},
@@ -41,15 +41,15 @@ _MARGINS: dict[str, style.Look] = {
 }
 
 
-def _data_linear(material: Material) -> Data:
+def _data_linear(report_data: ReportData) -> Data:
     """The plan of the run, by default with linear shares."""
-    plan = material.plan
-    return _rendered(material, plan.mu, plan.s, plan.margin, plan.profile)
+    plan = report_data.plan
+    return _rendered(report_data, plan.mu, plan.s, plan.margin, plan.profile)
 
 
-def _data_steep(material: Material) -> Data:
+def _data_steep(report_data: ReportData) -> Data:
     """The same task with linear shares of the rotations and a steep one of the translation."""
-    plan, model = material.plan, material.calibrated
+    plan, model = report_data.plan, report_data.calibrated
     mu = np.stack(
         [np.minimum(plan.path_parameter / STEEP, 1.0), plan.path_parameter, plan.path_parameter], axis=1
     )
@@ -57,22 +57,24 @@ def _data_steep(material: Material) -> Data:
     H_d = np.array([trajectory_displacement(plan.H_hat, amplitudes, row) for row in mu])
     s = project(model.P, plan.A @ H_d.swapaxes(1, 2), model.lens).swapaxes(0, 1)
     margin = np.linalg.solve(H_d.swapaxes(1, 2), plan.a[:, None])[..., 0] @ plan.optical_center.T
-    return _rendered(material, mu, s, margin / (plan.optical_center @ plan.a), "steep translation")
+    return _rendered(report_data, mu, s, margin / (plan.optical_center @ plan.a), "steep translation")
 
 
-def _rendered(material: Material, mu: FloatArray, s: FloatArray, margin: FloatArray, profile: str) -> Data:
+def _rendered(
+    report_data: ReportData, mu: FloatArray, s: FloatArray, margin: FloatArray, profile: str
+) -> Data:
     """Pixels of the planned faces in a camera between the two.
 
     The planned stereo images come from the calibration alone; the true cameras only turn them into
     points that a third camera can see.
     """
-    plan, P = material.plan, material.plant.model.P
+    plan, P = report_data.plan, report_data.plant.model.P
     points = np.array([triangulate_points(P, METRIC_A_INF, row) for row in s[:, :, cyclic_order(plan.A)]])
     return {
         "sigma": plan.path_parameter,
         "mu": mu,
         "margin": margin,
-        "faces": project(middle_camera(P, material.plant.image_size)[None], points)[0],
+        "faces": project(middle_camera(P, report_data.plant.image_size)[None], points)[0],
         "profile": np.array(profile.replace("_", " ")),
     }
 
@@ -122,10 +124,10 @@ def _draw_planned(data: Data, figure: "style.Figure") -> None:
     figure.set_figheight(max(4.2 * style.aspect(data["faces"]) + 1.0, 3.0))
     grid = figure.add_gridspec(2, 2, width_ratios=[1.7, 1])
     faces, sigma, shared = data["faces"], data["sigma"], np.isfinite(data["mu"]).all()
-    image, looks = figure.add_subplot(grid[:, 0]), _SHARES if shared else {}
+    image, line_styles = figure.add_subplot(grid[:, 0]), _SHARES if shared else {}
     if shared:
         shares = figure.add_subplot(grid[0, 1])
-        _columns(shares, sigma, data["mu"], looks.values())
+        _columns(shares, sigma, data["mu"], line_styles.values())
         shares.set_ylabel(_SHARE)
         shares.tick_params(labelbottom=False)
         margins = figure.add_subplot(grid[1, 1], sharex=shares)
@@ -146,29 +148,31 @@ def _draw_planned(data: Data, figure: "style.Figure") -> None:
     _columns(margins, sigma, data["margin"], cameras.values())
     margins.axhline(0.0, color=style.BLACK, linewidth=0.6)
     margins.set(xlabel=_SIGMA, ylabel="margin $a\\cdot O$\n(start = 1)")
-    first: style.Look = {"color": style.BLACK, "marker": "o", "linestyle": "none"}
-    style.legend_below(figure, {**looks, **cameras, "first marker of the face": first}, 6)
+    first: style.LineStyle = {"color": style.BLACK, "marker": "o", "linestyle": "none"}
+    style.legend_below(figure, {**line_styles, **cameras, "first marker of the face": first}, 6)
 
 
-def _columns(axes: "style.Axes", x: FloatArray, values: FloatArray, looks: Iterable[style.Look]) -> None:
+def _columns(
+    axes: "style.Axes", x: FloatArray, values: FloatArray, line_styles: Iterable[style.LineStyle]
+) -> None:
     """Each column of values (k, c) over x (k,), in a separate style."""
-    for column, look in zip(values.T, looks, strict=True):
-        axes.plot(x, column, **look)
+    for column, line_style in zip(values.T, line_styles, strict=True):
+        axes.plot(x, column, **line_style)
 
 
-def _data_path(material: Material) -> Data:
+def _data_path(report_data: ReportData) -> Data:
     """Margins of both cameras over the unit square, the border distance at the best μ_p, and the path."""
-    plan = material.plan
+    plan = report_data.plan
     mu = np.linspace(0.0, 1.0, _NODES)
     O = plan.optical_center
     moved = O[:, None] - mu[:, None] * plan.tau * (O @ plan.H_hat[0].T)[:, None]
     planes = np.array([exp_rotation(plan.H_hat[1], -share * plan.theta_r).T @ plan.a for share in mu])
-    half = 0.5 * float(material.plant.image_size.min())
+    half = 0.5 * float(report_data.plant.image_size.min())
     along = (plan.margin.min(axis=1), plan.border_distance.min(axis=1) / half, plan.joint_margin)
     return {
         "share": mu,
         "margin": np.einsum("vtc,rc->vtr", moved, planes) / (O @ plan.a)[:, None, None],
-        "border_px": _border_distance(material, mu),
+        "border_px": _border_distance(report_data, mu),
         "sigma": plan.path_parameter,
         "mu": plan.mu,
         "along": np.stack([*along, plan.reciprocal_condition / plan.reciprocal_condition[0]], axis=1),
@@ -176,12 +180,12 @@ def _data_path(material: Material) -> Data:
     }
 
 
-def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
+def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
     """Least distance of a marker from the border of each image, px, where μ_p is best for both.
 
     It is (2, k, k) over the shares mu (k,) of t and of r, negative outside.
     """
-    plan, P, lens = material.plan, material.calibrated.P, material.calibrated.lens
+    plan, P, lens = report_data.plan, report_data.calibrated.P, report_data.calibrated.lens
     turns = np.linspace(0.0, 1.0, _TURNS)
     within = np.array([exp_rotation(plan.H_hat[2], share * plan.theta_p) for share in turns])
     onto = np.array([exp_rotation(plan.H_hat[1], share * plan.theta_r) for share in mu])
@@ -189,7 +193,7 @@ def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
     M = np.einsum("rij,pmj->mrpi", onto, plan.A @ np.swapaxes(within, 1, 2)).copy()
     moved = M @ plan.H_hat[0].T
     depth = np.sign(np.einsum("vc,mc->vm", P[:, 2], plan.A))[:, :, None, None]
-    wide, high = material.plant.image_size - 0.5
+    wide, high = report_data.plant.image_size - 0.5
     result = np.empty((2, len(mu), len(mu)))
     for i, share in enumerate(mu):
         there = (M + share * plan.tau * moved).reshape(-1, 4)
@@ -227,20 +231,20 @@ def _draw_path(data: Data, figure: "style.Figure") -> None:
         margins.set_yscale("symlog", linthresh=1.0)
         margins.yaxis.set_major_formatter("{x:g}")
     margins.set_ylim(bottom=min(-0.1, 1.1 * float(np.nanmin(data["along"]))))
-    region: style.Look = {"alpha": 0.6, "edgecolor": style.BLACK, "linewidth": 0.0}
-    looks: dict[str, style.Look] = {
+    region: style.LineStyle = {"alpha": 0.6, "edgecolor": style.BLACK, "linewidth": 0.0}
+    line_styles: dict[str, style.LineStyle] = {
         "hidden from this camera": region | _REGIONS["margin"],
         r"outside this image at every $\mu_p$": region | _REGIONS["border_px"],
         r"path, at tenths of $\sigma$": {"color": style.VERMILION, "marker": "o"},
     }
-    style.legend_below(figure, {**looks, **_SHARES, **_MARGINS}, 4)
+    style.legend_below(figure, {**line_styles, **_SHARES, **_MARGINS}, 4)
 
 
 def _map(axes: "style.Axes", data: Data, view: int) -> None:
     share = data["share"]
-    for name, look in _REGIONS.items():
+    for name, line_style in _REGIONS.items():
         finite = np.maximum(data[name][view], -1e6)
-        region: Any = {"colors": [look["facecolor"]], "hatches": [look["hatch"]], "alpha": 0.6}
+        region: Any = {"colors": [line_style["facecolor"]], "hatches": [line_style["hatch"]], "alpha": 0.6}
         if finite.min() < 0.0:
             axes.contourf(share, share, finite.T, levels=[-1e9, 0.0], **region)
         if finite.min() < 0.0 < finite.max():

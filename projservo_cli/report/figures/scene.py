@@ -7,21 +7,21 @@ import numpy as np
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import PRISMATIC, FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.report_data import Data, Material, registered
+from projservo_cli.report.report_data import Data, ReportData, registered
 from projservo_cli.simulation.arm import camera_center
 from projservo_cli.simulation.ideal import Plant
 from projservo_cli.task.face import center_of
 
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
-_CAMERAS: dict[str, style.Look] = {
+_CAMERAS: dict[str, style.LineStyle] = {
     "left camera": {"color": style.BLUE, "linewidth": 1.0},
     "right camera": {"color": style.ORANGE, "linewidth": 1.0},
 }
 
 
-def _data(material: Material) -> Data:
+def _data(report_data: ReportData) -> Data:
     """Joints, faces and cameras in metres; the robot at the start as a polyline through its axes."""
-    plant, robot, q = material.plant, material.robot, material.plan.q_start
+    plant, robot, q = report_data.plant, report_data.robot, report_data.plan.q_start
     start = forward_kinematics(plant.model, q)
     face = plant.M[plant.order]
     tool = (start @ robot.base_tool)[:3, 3]
@@ -31,7 +31,7 @@ def _data(material: Material) -> Data:
     }
     shown = pyramids(plant, result["face_start"])
     result |= {"cameras": shown[:, 0], "pyramids": shown}
-    goals = (trace.goal_pose for trace in material.traces.values() if np.isfinite(trace.goal_pose).all())
+    goals = (trace.goal_pose for trace in report_data.traces.values() if np.isfinite(trace.goal_pose).all())
     if (pose := next(goals, None)) is not None:
         goal = pose @ np.linalg.inv(robot.base_tool)
         result["face_goal"] = (face @ goal.T)[:, :3]
@@ -87,21 +87,21 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
     axes.patch.set_visible(False)
     axes.computed_zorder = False
-    robot: style.Look = {"color": style.BLACK, "linewidth": 2.0, "marker": "o", "markersize": 4}
+    robot: style.LineStyle = {"color": style.BLACK, "linewidth": 2.0, "marker": "o", "markersize": 4}
     axes.plot(*data["robot"].T, **robot)
-    for (center, *corners), look in zip(data["pyramids"], _CAMERAS.values(), strict=True):
-        axes.plot(*style.closed(np.stack(corners)).T, **look)
+    for (center, *corners), line_style in zip(data["pyramids"], _CAMERAS.values(), strict=True):
+        axes.plot(*style.closed(np.stack(corners)).T, **line_style)
         for corner in corners:
-            axes.plot(*np.stack([center, corner]).T, **look)
+            axes.plot(*np.stack([center, corner]).T, **line_style)
     axes.plot(*style.closed(data["face_start"]).T, **style.START)
-    looks = {"robot at the start": robot, "face at the start": style.START}
+    line_styles = {"robot at the start": robot, "face at the start": style.START}
     shown = [data["robot"], data["pyramids"].reshape(-1, 3), data["face_start"]]
     if "face_goal" in data:
-        goal: style.Look = {"color": style.VERMILION, "linestyle": (0, (3, 1))}
+        goal: style.LineStyle = {"color": style.VERMILION, "linestyle": (0, (3, 1))}
         axes.plot(*style.closed(data["face_goal"]).T, **goal)
-        line: style.Look = {"color": style.GREY, "linestyle": (0, (1, 1))}
+        line: style.LineStyle = {"color": style.GREY, "linestyle": (0, (1, 1))}
         axes.plot(*data["line"].T, **line)
-        looks |= {"face at the goal": goal, "straight line of the centre": line}
+        line_styles |= {"face at the goal": goal, "straight line of the centre": line}
         shown.append(data["face_goal"])
     points = np.concatenate(shown)
     low, high = points.min(axis=0), points.max(axis=0)
@@ -116,7 +116,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     towards = data["cameras"].mean(axis=0) - points.mean(axis=0)  # from the side of the rig
     axes.view_init(elev=22, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62)
     figure.set_layout_engine()
-    style.legend_below(figure, looks | _CAMERAS, 3)
+    style.legend_below(figure, line_styles | _CAMERAS, 3)
     _fit(axes, figure, extent)
 
 
