@@ -34,8 +34,8 @@ def run_file() -> Iterator[str]:
     for group, record in GROUPS.items():
         about = (record.__doc__ or "").split("\n\n")[0]
         yield from (f"## {text(group)}", "", text(about), "")
-        yield from table(("attribute", "type", "unit", "what it is"), fields(record, arrays=False))
-        yield from table(("array", "dimensions", "unit", "what it is"), fields(record, arrays=True))
+        yield from table(("attribute", "type", "unit", "meaning"), fields(record, arrays=False))
+        yield from table(("array", "dimensions", "unit", "meaning"), fields(record, arrays=True))
 
 
 def fields(record: type, *, arrays: bool) -> Iterator[tuple[str, ...]]:
@@ -100,7 +100,7 @@ def sweep_columns() -> Iterator[str]:
     """The columns that the table of every sweep has, and the one that it may have."""
     kinds = {"f": "number", "i": "whole number", "u": "whole number", "S": "text"}
     yield from table(
-        ("column", "value", "unit", "what it is"),
+        ("column", "value", "unit", "meaning"),
         (
             (
                 f"`{column.name}`",

@@ -78,7 +78,7 @@ def told(function: _Function) -> _Function:
     """
 
     @click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
-    @click.option("-q", "--quiet", is_flag=True, help="Print nothing but errors and what --json prints.")
+    @click.option("-q", "--quiet", is_flag=True, help="Print errors only, and the object of --json.")
     @click.option("-v", "--verbose", is_flag=True, help="Say more; show tracebacks.")
     @functools.wraps(function)
     def command(*arguments: Any, as_json: bool, quiet: bool, verbose: bool, **values: Any) -> Any:

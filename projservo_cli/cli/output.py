@@ -150,7 +150,7 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
     for text in value["advice"]:
         yield wrapped(f"advice: {text}", "  ")
     yield (
-        f"  residual {value['rms_px']:.4g} px rms, sigma {value['sigma_px']:.4g} px, "
+        f"  residual {value['rms_px']:.4g} px rms a point, sigma {value['sigma_px']:.4g} px a coordinate, "
         f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s"
     )
     for view, terms in (value["lens"] or {}).items():  # at the radius of the view, half the image size
@@ -161,7 +161,7 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
     if value["sigma_q"] is not None:
         yield wrapped(f"joint readings: {_joint_noise(value)}", "  ")
     if value["time_offset_s"] is not None:
-        yield wrapped(f"images late by {', '.join(_delays(value))}", "  ")
+        yield wrapped(f"time offset {', '.join(_time_offsets(value))}", "  ")
     poorly = ", ".join(joint["name"] for joint in value["joints"] if joint["poorly_observable"])
     if poorly:
         yield wrapped(f"poorly observable joints: {poorly}", "  ")
@@ -229,16 +229,16 @@ def _joint_noise(value: dict[str, Any]) -> str:
     return f"off by {sigma:.3g}° rms (95 %: {low:.3g}° to {high:.3g}°)"
 
 
-def _delays(value: dict[str, Any]) -> Iterator[str]:
-    """By how much images of each view are late, with the interval and by how much single ones differ, ms."""
+def _time_offsets(value: dict[str, Any]) -> Iterator[str]:
+    """Time offset of each view, with its interval and its jitter, ms."""
     for i, view in enumerate(("left", "right")):
-        late = (
+        offset = (
             value["time_offset_s"][i],
             *value["time_offset_interval_s"][i],
             value["time_offset_jitter_s"][i],
         )
-        delay, low, high, jitter = (round(1e3 * seconds, 1) + 0.0 for seconds in late)  # no -0.0
-        yield f"{delay:.1f} ms {view} (95 %: {low:.1f} to {high:.1f}; single ones ± {jitter:.1f})"
+        delay, low, high, jitter = (round(1e3 * seconds, 1) + 0.0 for seconds in offset)  # no -0.0
+        yield f"{delay:.1f} ms {view} (95 %: {low:.1f} to {high:.1f}; jitter {jitter:.1f})"
 
 
 def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:

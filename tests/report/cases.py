@@ -9,7 +9,7 @@ from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.laws import LAW_SPECS, LAWS, name_of
 from projservo_cli.records import PRISMATIC, Calibration
 from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.report_data import Material
+from projservo_cli.report.report_data import ReportData
 from projservo_cli.robots.client import Film
 from projservo_cli.stages import studies
 from tests.configured import record
@@ -57,7 +57,7 @@ def case(name="paper", steps=SHORT, whole=False):
     return (
         config,
         bench,
-        Material(
+        ReportData(
             calibration,
             observation,
             model,
