@@ -316,15 +316,15 @@ def _made_truth(described: RobotSettings, rig: Rig, markers: Markers, k1: float,
     assert numbers is not None
     points = np.c_[markers.points, np.ones(len(numbers))]
     return Truth(
-        robot,
-        P,
-        points @ robot.base_tool.T,
-        numbers,
-        tuple(numbers.index(number) for number in markers.front or ()) if face else (),
-        _center(markers),
-        np.array(rig.image_size_px, dtype=np.float64),
-        lens_of(P, k1) if k1 else NO_LENS,
-        np.zeros(3) if markers.normals is None else markers.normals @ robot.base_tool[:3, :3].T,
+        robot=robot,
+        P=P,
+        M=points @ robot.base_tool.T,
+        number=numbers,
+        face=tuple(numbers.index(number) for number in markers.front or ()) if face else (),
+        center=_center(markers),
+        image_size=np.array(rig.image_size_px, dtype=np.float64),
+        lens=lens_of(P, k1) if k1 else NO_LENS,
+        normals=np.zeros(3) if markers.normals is None else markers.normals @ robot.base_tool[:3, :3].T,
     )
 
 
@@ -541,13 +541,29 @@ def _trials(
     )
     noise, joints = config.noise.calibration_px, joints_of(config, paced=driven)
     if not driven:
-        return Trials(motions, joints, truth, None, noise, 1, 0.0)
+        return Trials(
+            motions=motions,
+            joints=joints,
+            truth=truth,
+            driven=None,
+            noise_px=noise,
+            averaged_frames=1,
+            settle_s=0.0,
+        )
     if robot is None:
         assert truth is not None
         robot = SimulatedRobot(truth, faults, scene, config.control.period_s)
     how = Driven(robot, _following(config, speed_scale), _endless(config))
     plant = config.plant
-    return Trials(motions, joints, truth, how, noise, plant.averaged_frames, plant.settle_s)
+    return Trials(
+        motions=motions,
+        joints=joints,
+        truth=truth,
+        driven=how,
+        noise_px=noise,
+        averaged_frames=plant.averaged_frames,
+        settle_s=plant.settle_s,
+    )
 
 
 def task_of(config: Config) -> ReachingTask | None:

@@ -314,15 +314,15 @@ def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
     """Return the calibrated robot and its face."""
     task = scenario.ends.by_points().task(scenario.model)
     return Plant(
-        scenario.model,
-        np.ascontiguousarray(calibration.M[calibration.places(scenario.numbers[: scenario.m])]),
-        task.order,
-        task.center,
-        task.O,
-        task.visible,
-        scenario.demands.image_size,
-        scenario.joints.limits,
-        False,
+        model=scenario.model,
+        M=np.ascontiguousarray(calibration.M[calibration.places(scenario.numbers[: scenario.m])]),
+        order=task.order,
+        center=task.center,
+        O=task.O,
+        visible=task.visible,
+        image_size=scenario.demands.image_size,
+        limits=scenario.joints.limits,
+        opaque=False,
     )
 
 
@@ -330,13 +330,13 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
     """Return the knowledge of a robot and its images before a law drives it."""
     numbers = scenario.observed
     return Known(
-        partial(predict, calibration),
-        np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
-        np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
-        scenario.noise_px,
-        scenario.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
-        _delays_of(contract.time_offset_s, calibration),
-        contract.timeout_s,
+        predicted=partial(predict, calibration),
+        shown=np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
+        order=np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
+        sigma_px=scenario.noise_px,
+        sigma_q=scenario.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
+        delays=_delays_of(contract.time_offset_s, calibration),
+        timeout_s=contract.timeout_s,
     )
 
 

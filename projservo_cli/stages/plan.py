@@ -205,7 +205,17 @@ def _planned(
     tau_0, theta_0 = _changes(a, H_hat, task)
     tau_limit = min((trajectory.visibility_fraction * t for t in tau_0 if t > 0.0), default=math.inf)
     body = body_at_start(model, task, images, state.A)
-    reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, images.q_start, body)
+    reaching = Reaching(
+        model=model,
+        demands=demands,
+        H_hat=H_hat,
+        amplitudes=amplitudes,
+        A=state.A,
+        a=a,
+        O=task.O,
+        q_start=images.q_start,
+        body=body,
+    )
     found = _found(reaching, task, trajectory, search, tau_limit)
     motion, along, time, path = found.motion, found.motion.along, found.time, found.path
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)

@@ -111,14 +111,14 @@ class _Recording:
         timed = np.isfinite([reading.t_q for reading in rows]).any()
         sigma = [reading.sigma_px for reading in rows if reading.sigma_px is not None]
         return Observation(
-            np.array(pose, dtype=np.int64),
-            self.marker,
-            np.array([reading.q for reading in rows]),
-            np.array([reading.s for reading in rows]),
-            np.array(moving, dtype=np.int64) if way else None,
-            np.array([reading.t_q for reading in rows]) if timed else None,
-            np.array([reading.t_view for reading in rows]) if timed else None,
-            np.array(sigma) if len(sigma) == len(rows) else None,
+            pose=np.array(pose, dtype=np.int64),
+            marker=self.marker,
+            q=np.array([reading.q for reading in rows]),
+            images=np.array([reading.s for reading in rows]),
+            moving=np.array(moving, dtype=np.int64) if way else None,
+            t_q=np.array([reading.t_q for reading in rows]) if timed else None,
+            t_view=np.array([reading.t_view for reading in rows]) if timed else None,
+            sigma=np.array(sigma) if len(sigma) == len(rows) else None,
         )
 
 

@@ -112,17 +112,17 @@ def _report_data(
     """All that figures may show and claims be about."""
     truth = bench.truth
     return ReportData(
-        run.calibration,
-        run.observation.at_rest,
-        bench.models["calibrated"],
-        truth.robot,
-        bench.scenario.plant_of("direct_three"),
-        run.plan,
-        tuple(truth.number[i] for i in truth.face),
-        run.traces,
-        studies,
-        "" if studies else left_out[-1]["reason"],
-        bench.scenario.limits.stall_periods,
+        calibration=run.calibration,
+        observation=run.observation.at_rest,
+        calibrated=bench.models["calibrated"],
+        robot=truth.robot,
+        plant=bench.scenario.plant_of("direct_three"),
+        plan=run.plan,
+        numbers=tuple(truth.number[i] for i in truth.face),
+        traces=run.traces,
+        studies=studies,
+        no_studies="" if studies else left_out[-1]["reason"],
+        stall_periods=bench.scenario.limits.stall_periods,
         held_out=run.cross_validation,
         trajectory=inputs.trajectory,
     )

@@ -117,7 +117,16 @@ class Scenario:
         keep = np.array([margins[kind != "P"] for kind in joints.types])
         border, condition = asked.border_px, asked.min_reciprocal_condition
         face, units = asked.min_face_px, self.joints.units
-        return Demands(joints.limits, size, border, condition, keep, face, self._tags(), units)
+        return Demands(
+            limits=joints.limits,
+            image_size=size,
+            border_px=border,
+            conditioning=condition,
+            keep=keep,
+            min_face_px=face,
+            tags=self._tags(),
+            units=units,
+        )
 
     def _tags(self) -> IntArray:
         """Corners (t, 4) of tags among the markers; none for tools of which no tag is on the face."""
@@ -302,15 +311,15 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
         assert calibration is not None
         exact, ends, q_goal = _predicted_ends(inputs, task, calibration, joints, (*face, *pins))
     return Scenario(
-        inputs,
-        calibration,
-        joints,
-        (*face, *pins),
-        observed,
-        exact._replace(body=body),
-        ends,
-        np.empty((0, len(joints.types))) if q_goal is None else q_goal[None],
-        sigma_px,
+        inputs=inputs,
+        calibration=calibration,
+        joints=joints,
+        numbers=(*face, *pins),
+        observed=observed,
+        exact=exact._replace(body=body),
+        true_ends=ends,
+        q_shown=np.empty((0, len(joints.types))) if q_goal is None else q_goal[None],
+        noise_px=sigma_px,
     )
 
 
@@ -335,15 +344,15 @@ def _limits(inputs: ServoInputs, found: Scenario) -> Limits:
     stop = inputs.stop
     noise_px = stop.noise_factor * found.noise_px
     return Limits(
-        found.joints.limits.speed,
-        stop.image_error_px + noise_px,
-        stop.diverged_factor,
-        stop.stall_periods,
-        stop.max_steps,
-        stop.at_joint_limit,
-        stop.at_border,
-        stop.max_lost_periods,
-        noise_px,
+        speed=found.joints.limits.speed,
+        image_error_px=stop.image_error_px + noise_px,
+        diverged_factor=stop.diverged_factor,
+        stall_periods=stop.stall_periods,
+        max_steps=stop.max_steps,
+        stop_at_joint_limit=stop.at_joint_limit,
+        stop_at_border=stop.at_border,
+        max_lost_periods=stop.max_lost_periods,
+        noise_px=noise_px,
     )
 
 
@@ -480,13 +489,13 @@ def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
             "turn the face towards both"
         )
     return Plant(
-        truth.model,
-        M,
-        order,
-        truth.center,
-        O,
-        np.where(sides > 0.0, 1.0, -1.0),
-        truth.image_size,
-        truth.robot.limits,
-        opaque,
+        model=truth.model,
+        M=M,
+        order=order,
+        center=truth.center,
+        O=O,
+        visible=np.where(sides > 0.0, 1.0, -1.0),
+        image_size=truth.image_size,
+        limits=truth.robot.limits,
+        opaque=opaque,
     )

@@ -345,7 +345,15 @@ class _Asked:
         noise = scenario.noise_of(self.law, scenario.inputs.seed, limits.max_steps + 1)
         course = Course(plant, limits, q_start.copy())
         code, steps = run_compiled(controller.law, course, noise, state, log)
-        return _Outcome(scenario, VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
+        return _Outcome(
+            scenario=scenario,
+            verdict=VERDICTS[code],
+            why="",
+            steps=steps,
+            log=log,
+            limited=float(state.limited[0]),
+            plant=plant,
+        )
 
     def simulated(self) -> _Outcome:
         """Drive a law on the simulated robot without a fault in the Python loop."""
@@ -409,13 +417,13 @@ class _Asked:
             path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
             log = log._replace(path=path, parts=np.ones_like(log.parts))
         return _Outcome(
-            scenario,
-            VERDICTS[code],
-            plant.disturbance or ("" if stall is None else stall.reason),
-            steps,
-            log,
-            limited,
-            plant.plant,
+            scenario=scenario,
+            verdict=VERDICTS[code],
+            why=plant.disturbance or ("" if stall is None else stall.reason),
+            steps=steps,
+            log=log,
+            limited=limited,
+            plant=plant.plant,
             replannings=() if execution is None else tuple(execution.attempts),
             driven=driven,
         )

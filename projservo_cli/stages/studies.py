@@ -120,7 +120,15 @@ def run_studies(
         made[case] = bench.run(case[0], operators, chosen, limited=limited)
     progress("studies", len(cases), len(cases))
     sweep, by_model, rate = ({c: trace for c, trace in made.items() if len(c) == n} for n in (4, 3, 2))
-    return Studies(tuple(gains), tuple(periods), own, STEP_LIMIT_DEG, sweep, by_model, rate)
+    return Studies(
+        gains=tuple(gains),
+        periods=tuple(periods),
+        gains_of_laws=own,
+        step_limit_deg=STEP_LIMIT_DEG,
+        sweep=sweep,
+        own=by_model,
+        rate=rate,
+    )
 
 
 def metric_plan(bench: Comparison) -> Plan:

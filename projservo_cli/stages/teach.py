@@ -135,13 +135,13 @@ def teach(
     sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
     sigma = sigma if mean.sigma_px is None else mean.sigma_px
     return _Taught(
-        np.array(inputs.numbers, dtype=np.int64),
-        mean.q,
-        mean.s,
-        np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan),
-        count.max(axis=1),
-        None if moved is None else mean.q - moved,
-        robot.bounds,
+        marker=np.array(inputs.numbers, dtype=np.int64),
+        q=mean.q,
+        s=mean.s,
+        sigma=np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan),
+        frames=count.max(axis=1),
+        moved=None if moved is None else mean.q - moved,
+        bounds=robot.bounds,
     )
 
 
