@@ -267,14 +267,18 @@ class Experiment:
         ----------
         stages : of ``calibrate``, ``plan``, ``servo`` and ``report``, in their order.
         laws : instead of ``control.laws``: names or ``module:Class``.
-        force : whether named stages are made even where they are up to date.
+        force : whether named stages are made even if they are up to date.
+
+        Returns
+        -------
+        This experiment.
 
         Raises
         ------
         InputError
-            When there is no such stage or law, or something cannot be made from this configuration.
+            If there is no such stage or law, or the configuration lacks a key of a stage.
         WorkFailed
-            When a stage failed; finished results are kept. A verdict, or a calibration that is not usable,
+            If a stage failed; finished results are kept. A verdict, or a calibration that is not usable,
             raises nothing.
         """
         if wrong := [stage for stage in stages if stage not in STAGES]:

@@ -105,7 +105,7 @@ class ImageModel(Displayable, Calibration):
         if not return_std:
             return pixels[0] if single else pixels
         if not self.has_covariance or not self.sqrt_cov_shared.size:
-            raise InputError(f"return_std: the method {self.method} has no covariance; use refined")
+            raise InputError(f"return_std: the method {self.method} has no covariance; use bundle_adjustment")
         sigma = np.sqrt(prediction_variance(self, rows))
         return (pixels[0], sigma[0]) if single else (pixels, sigma)
 
@@ -151,10 +151,10 @@ class ImageModel(Displayable, Calibration):
         return residual_statistics(self, observation)
 
     def covariance(self) -> FloatArray:
-        """Covariance of P, H_hat_0, lenses (k1, k2 of both, if estimated) and M, each raveled, in this order.
+        """Return the covariance of P, H_hat_0, lenses (k1, k2 of both, if estimated) and M, each raveled.
 
-        Of all errors that change images alike it has the smallest: frame and scales, which no image shows,
-        vary by nothing. For many markers it is large: (24 + 16 n + 4 m)² numbers.
+        Frame and scales, which no image shows, are fixed: of all errors that change images alike it has the
+        smallest. For many markers it is large: (24 + 16 n + 4 m)² numbers.
 
         Raises
         ------
@@ -162,7 +162,7 @@ class ImageModel(Displayable, Calibration):
             If the method has no covariance.
         """
         if not self.has_covariance or not self.sqrt_cov_shared.size:
-            raise InputError(f"covariance: the method {self.method} has none; use refined")
+            raise InputError(f"covariance: the method {self.method} has none; use bundle_adjustment")
         factor = error_factor(self)
         return np.asarray(factor @ factor.T)
 

@@ -119,7 +119,7 @@ def calibrate(
         raise InputError(f"joint noise {joint_noise!r}: give a number that is not negative, or none")
     if lens and method != "bundle_adjustment":
         raise InputError(
-            f"calibration method {method!r} estimates no lens: choose refined, or calibrate without"
+            f"calibration method {method!r} estimates no lens: choose bundle_adjustment, or calibrate without"
         )
     begin = time.perf_counter()
     solution = None

@@ -135,7 +135,7 @@ def closed_form_operators(
     if home is None:
         raise WorkFailed(
             "the closed_form method needs single-joint trials about one reference pose, and these poses move "
-            "several joints at once: use refined"
+            "several joints at once: use bundle_adjustment"
         )
     both = detections.both
     P, points = reconstruct(F, detections.pixels[0][both], detections.pixels[1][both])
@@ -145,7 +145,7 @@ def closed_form_operators(
     if int(known[home].sum()) < _MIN_MARKERS:
         raise WorkFailed(
             f"closed_form needs {_MIN_MARKERS} markers in both images of the reference pose, and there are "
-            f"{int(known[home].sum())}: use refined"
+            f"{int(known[home].sum())}: use bundle_adjustment"
         )
     _require_space(P, M[home, known[home]], sigma_px)
     # The depth in the left camera, positive for all points, orients them as a_inf would.
@@ -213,5 +213,5 @@ def _require_space(P: FloatArray, points: FloatArray, sigma_px: float) -> None:
     if float(np.sqrt((parallax**2).mean())) < _COPLANAR * sigma_px:
         raise WorkFailed(
             "the markers lie in one plane: a plane's motion does not determine a 4×4 homography; "
-            "use refined, or move a marker off the plane"
+            "use bundle_adjustment, or move a marker off the plane"
         )

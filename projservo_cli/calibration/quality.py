@@ -243,7 +243,9 @@ def assess(
     if errors is None and warned:
         # A method for comparison returns its result all the same.
         short = f"the closed_form method explains the images only to {found}"
-        return Assessment(span, noise, error, False, f"{short}, {share:.3g} times {wanted}: use refined", ())
+        return Assessment(
+            span, noise, error, False, f"{short}, {share:.3g} times {wanted}: use bundle_adjustment", ()
+        )
     reason = f"residuals of {found} agree with {wanted}"
     if warned:
         reason = f"more than pixel noise is left: residuals of {found} are {share:.3g} times {wanted}"

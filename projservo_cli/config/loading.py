@@ -269,10 +269,14 @@ class Config(Settings):
         ----------
         path : the YAML file, or the name of a shipped configuration, such as ``ur5``.
 
+        Returns
+        -------
+        The configuration, with absolute paths.
+
         Raises
         ------
         InputError
-            With a line ``file:line:column: key: what`` for each thing that is wrong.
+            With a line ``file:line:column: key: message`` for each error.
         """
         return load_config(shipped(path))
 
@@ -304,7 +308,7 @@ def load_config(
     overrides : ``a.b=v`` as for ``--set``, applied in order.
     text : its content, where it is already at hand; ``path`` then only names it in messages.
     teaching : a goal or a start whose file does not exist yet is still to be taught, and left out.
-    Raises InputError, one line ``file:line:column: path: what`` for each thing that is wrong.
+    Raises InputError, one line ``file:line:column: key: message`` for each error.
     """
     changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
     if path is not None and text is None:

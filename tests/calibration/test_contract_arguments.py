@@ -35,7 +35,7 @@ CASES = {
     "three views": (shaped(images=OBSERVATION.images[:, [0, 1, 1]]), "RPR", {}, "two views"),
     "no image": (OBSERVATION, "RPR", {"image_size": (0, 0)}, "positive width"),
     "negative seed": (OBSERVATION, "RPR", {"seed": -1}, "seed -1"),
-    "method": (OBSERVATION, "RPR", {"method": "best"}, "refined, closed_form"),
+    "method": (OBSERVATION, "RPR", {"method": "best"}, "bundle_adjustment, closed_form"),
     "source": (OBSERVATION, "RPR", {"source": "dreamt"}, "simulated or recorded"),
     "no noise": (OBSERVATION, "RPR", {"sigma_px": 0.0}, "positive"),
     "too few letters": (OBSERVATION, "RP", {}, "3 letters"),

@@ -252,6 +252,6 @@ def test_the_closed_form_says_when_it_does_not_reach_the_noise():
     error = {m: np.sqrt(np.mean((predict(c, q) - robot.images(q)) ** 2)) for m, c in found.items()}
     assert error["closed_form"] > 3.0 * error["bundle_adjustment"]
     assert not found["closed_form"].usable
-    assert "use refined" in found["closed_form"].reason
+    assert "use bundle_adjustment" in found["closed_form"].reason
     assert found["closed_form"].chi2_per_dof > 1.3
     assert found["closed_form"].predicted_rms_px is found["closed_form"].predicted_p99_px is None

@@ -2,11 +2,13 @@
 
 import dataclasses
 import importlib
+import inspect
 import re
 
 import pytest
 
 from docs.generate import generated, keys, python, regions, regions_of
+from docs.generate.python import INTERFACE
 from projservo_cli import records
 from projservo_cli.cli import main
 from projservo_cli.config import Config
@@ -130,3 +132,30 @@ def test_the_mathematics_is_where_the_page_says():
     assert len(names) > 20
     for name in names:
         assert resolved(name) is not None
+
+
+SECTION = re.compile(r"^(\w[\w ]*)\n-+$", re.MULTILINE)
+
+
+def interface_functions():
+    """Functions and methods of the documented Python interface by their names."""
+    for item, members in INTERFACE.items():
+        if inspect.isfunction(item):
+            yield item.__name__, item
+        for name in members:
+            function = inspect.unwrap(getattr(item, name))
+            if callable(function):
+                yield f"{item.__name__}.{name}", function
+
+
+@pytest.mark.parametrize(("name", "function"), [*interface_functions()])
+def test_sections_of_a_docstring_name_every_argument_and_the_result(name, function):
+    doc = inspect.getdoc(function)
+    parts = SECTION.split(doc)
+    sections = dict(zip(parts[1::2], parts[2::2], strict=True))
+    entries = re.findall(r"^(\S.*?)(?: : |$)", sections.get("Parameters", ""), re.MULTILINE)
+    documented = {part.strip().lstrip("*") for entry in entries for part in entry.split(",")}
+    signature = inspect.signature(function)
+    assert set(signature.parameters) - {"self", "cls"} <= documented
+    returns = signature.return_annotation not in (None, "None", inspect.Signature.empty)
+    assert not returns or {"Returns", "Yields"} & {*sections} or doc.startswith(("Return", "Draw"))
