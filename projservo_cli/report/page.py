@@ -75,7 +75,7 @@ def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> Iterator
         )
     yield _worst_joint(found)
     for name, what, one, many in (
-        ("outliers", "reading", "rejected as an outlier", "rejected as outliers"),
+        ("outliers", "observation", "rejected as an outlier", "rejected as outliers"),
         ("suspect_joint_readings", "joint reading", "contradicts the images", "contradict the images"),
         ("id_switches", "marker", "was renumbered", "were renumbered"),
     ):

@@ -52,7 +52,7 @@ def test_residuals_are_seen_minus_predicted_where_they_were_seen():
     for v, view in enumerate(("left", "right")):
         np.testing.assert_allclose(data[f"residual_{view}"], np.tile(SHIFT_PX[v], (490, 1)), atol=1e-9)
         np.testing.assert_array_equal(data[f"seen_{view}"], fit.observation.images[:, v].reshape(-1, 2))
-        assert data[f"left_out_outlier_{view}"].shape == (0, 2)
+        assert data[f"rejected_outlier_{view}"].shape == (0, 2)
     # rms over both views and coordinates: (0.09 + 0.16 + 0.01 + 0.04) / 4
     np.testing.assert_allclose(data["pose_residual_px"], np.sqrt(0.075), rtol=1e-9)
     assert set(data["pose_coordinates"]) == {40}
@@ -65,13 +65,13 @@ def test_markers_are_matched_by_number_and_unknown_ones_left_out():
     marker = np.append(fit.observation.marker[order], 77)
     other = Fit(fit.calibration, dataclasses.replace(fit.observation, marker=marker, images=images))
     expected = SPEC.data(fit) | dict.fromkeys(
-        ("left_out_marker_left", "left_out_marker_right"), np.full((49, 2), 7.0)
+        ("rejected_marker_left", "rejected_marker_right"), np.full((49, 2), 7.0)
     )
     for name, values in SPEC.data(other).items():
         np.testing.assert_array_equal(values, expected[name], err_msg=name)
 
 
-def test_what_the_fit_left_out_is_drawn_apart_and_counts_nowhere():
+def test_what_the_fit_rejected_is_drawn_apart_and_counts_nowhere():
     number = case()[2].calibration.marker
     fit = shifted(
         outlier=np.array([[100, number[0], 0], [101, number[1], 1], [102, number[2], 2]]),
@@ -82,12 +82,12 @@ def test_what_the_fit_left_out_is_drawn_apart_and_counts_nowhere():
     data = SPEC.data(fit)
     # left: one of its own, one of both, two exchanged, a pose of ten; likewise right
     for view in ("left", "right"):
-        count = [len(data[f"left_out_{kind}_{view}"]) for kind in ("outlier", "swapped", "pose", "marker")]
+        count = [len(data[f"rejected_{kind}_{view}"]) for kind in ("outlier", "id_switch", "pose", "marker")]
         assert count == [2, 2, 10, 0]
     assert [len(data[f"seen_{view}"]) for view in ("left", "right")] == [490 - 15, 490 - 14]
     images = fit.observation.images
-    assert (data["left_out_outlier_left"] == images[0, 0, 0]).all(axis=1).any()
-    assert not (data["left_out_outlier_right"] == images[0, 1, 0]).all(axis=1).any()
+    assert (data["rejected_outlier_left"] == images[0, 0, 0]).all(axis=1).any()
+    assert not (data["rejected_outlier_right"] == images[0, 1, 0]).all(axis=1).any()
     assert len(data["pose_residual_px"]) == 48  # the pose in doubt has none
     np.testing.assert_array_equal(data["pose_coordinates"][:5], [38, 38, 36, 32, 38])
 

@@ -29,10 +29,10 @@ _WEAK: style.LineStyle = {
     "linewidth": 0.6,
 }
 # Reason of a rejected observation: by itself, its number, its pose, or its marker as a whole.
-_KINDS = ("outlier", "swapped", "pose", "marker")
+_KINDS = ("outlier", "id_switch", "pose", "marker")
 _LEFT_OUT: dict[str, style.LineStyle] = {
     "outlier": {"color": style.VERMILION, "marker": "x"},
-    "swapped": {"color": style.ORANGE, "marker": "+"},
+    "id_switch": {"color": style.ORANGE, "marker": "+"},
     "pose": {"color": style.BLACK, "marker": "1"},
     "marker": {"color": style.GREEN, "marker": "."},
 }
@@ -42,7 +42,7 @@ _LEFT_OUT = {
 }
 _NAMES = {
     "outlier": "outlier",
-    "swapped": "of another number",
+    "id_switch": "under another number",
     "pose": "of a pose in doubt",
     "marker": "of a rejected marker",
 }
@@ -54,9 +54,9 @@ def _data(fit: Fit) -> Data:
     """Residuals, noise model, predicted error of each pose, excitation and information of a fit."""
     calibration, observation = fit.calibration, fit.observation
     predicted = predict(calibration, observation.q)
-    seen, left_out = _readings(calibration, observation)
+    seen, rejected = _observed(calibration, observation)
     read: BoolArray = np.all(np.isfinite(seen), axis=-1)
-    out = (left_out > 0) | ~np.isfinite(predicted).all(axis=-1)
+    out = (rejected > 0) | ~np.isfinite(predicted).all(axis=-1)
     used = read & ~out
     residual, variance = seen - predicted, prediction_variance(calibration, observation.q)
     weighed = calibration.sigma_q or observation.sigma is not None
@@ -84,10 +84,10 @@ def _data(fit: Fit) -> Data:
         others = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
         result[f"seen_{view}"] = seen[:, v][used[:, v]]
         result[f"residual_{view}"] = residual[:, v][used[:, v]]
-        gone = np.maximum(left_out, 1)  # a marker without a prediction counts as an outlier
+        gone = np.maximum(rejected, 1)  # a marker without a prediction counts as an outlier
         places = [seen[:, v][(read & out & (gone == i))[:, v]] for i in range(1, len(_KINDS))]
         result |= {
-            f"left_out_{kind}_{view}": of_kind
+            f"rejected_{kind}_{view}": of_kind
             for kind, of_kind in zip(_KINDS, (*places, others), strict=True)
         }
     extent = max(float(np.ptp(seen[:, v][read[:, v]], axis=0).max()) for v in (0, 1))
@@ -134,7 +134,7 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
     return tested, variance
 
 
-def _readings(calibration: Calibration, observation: Observation) -> tuple[FloatArray, IntArray]:
+def _observed(calibration: Calibration, observation: Observation) -> tuple[FloatArray, IntArray]:
     """Pixels (K, 2, m, 2) of the calibrated markers, and why the fit left them out (K, 2, m), 0 for not.
 
     Those are outliers (1), markers that were read under another number (2), and poses in doubt (3).
@@ -165,7 +165,7 @@ def _columns(calibration: Calibration, observation: Observation) -> list[int]:
 def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
     """Predicted and actual error (L,) of each pose with a reading, rms per coordinate, and their number.
 
-    Of the readings ``used`` (K, 2, m), with residual (K, 2, m, 2), px, and variance of the prediction, px².
+    Of the observations ``used`` (K, 2, m), with residual (K, 2, m, 2), px, and variance of the prediction, px².
     """
     poses = used.any(axis=(1, 2))
     count = 2 * used.sum(axis=(1, 2))[poses]
@@ -234,7 +234,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         **{
             f"rejected: {_NAMES[kind]}": {**line_style, "markersize": _LARGE}
             for kind, line_style in _LEFT_OUT.items()
-            if any(len(data[f"left_out_{kind}_{view}"]) for view in VIEWS)
+            if any(len(data[f"rejected_{kind}_{view}"]) for view in VIEWS)
         },
         "noise model": _MODEL,
         "residual of a pose": {"color": style.BLUE, "marker": "o", "linestyle": "none"},
@@ -245,7 +245,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
 
 
 def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
-    seen, out = data[f"seen_{view}"], {kind: data[f"left_out_{kind}_{view}"] for kind in _KINDS}
+    seen, out = data[f"seen_{view}"], {kind: data[f"rejected_{kind}_{view}"] for kind in _KINDS}
     count = sum(map(len, out.values()))
     arrows = float(data["factor"]) * data[f"residual_{view}"]
     pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
@@ -253,7 +253,7 @@ def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
     axes.quiver(*seen.T, *arrows.T, **pixels, **heads, **_RESIDUAL)
     for kind, places in out.items():
         axes.plot(*places.T, **_LEFT_OUT[kind], markersize=_LARGE if count < _MANY else _SMALL)
-    title = f"{view}: {len(seen):,} readings, {count:,} rejected"
+    title = f"{view}: {len(seen):,} observations, {count:,} rejected"
     style.image_axes(axes, title, np.concatenate([seen, seen + arrows, *out.values()]))
 
 
