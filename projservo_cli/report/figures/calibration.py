@@ -163,9 +163,9 @@ def _columns(calibration: Calibration, observation: Observation) -> list[int]:
 
 
 def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
-    """Predicted and actual error (L,) of each pose with a reading, rms per coordinate, and their number.
+    """Predicted and actual error (L,) of each pose with observations, rms per coordinate, and their number.
 
-    Of the observations ``used`` (K, 2, m), with residual (K, 2, m, 2), px, and variance of the prediction, px².
+    used : (K, 2, m) observations; residual : (K, 2, m, 2), px; variance : of the predictions, px².
     """
     poses = used.any(axis=(1, 2))
     count = 2 * used.sum(axis=(1, 2))[poses]
