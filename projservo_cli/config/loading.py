@@ -66,9 +66,9 @@ _STANDARD = "tag:yaml.org,2002:"
 _Model = TypeVar("_Model", bound=Root)
 
 
-def _shortened(text: str, most: int = 80) -> str:
+def _shortened(text: str, max_length: int = 80) -> str:
     """A text for a message, cut where it is long."""
-    return text if len(text) <= most else text[: most - 1] + "…"
+    return text if len(text) <= max_length else text[: max_length - 1] + "…"
 
 
 class _Loader(_Parser):
@@ -92,7 +92,7 @@ class _Document:
 
     def __init__(self, text: str, name: str) -> None:
         self.name = name
-        self.places: dict[_Path, str] = {}
+        self.positions: dict[_Path, str] = {}
         self.problems: list[tuple[_Path, str, str]] = []  # path, error, place if no path leads to it
         self.values: Any = None
         self._count = 0
@@ -129,7 +129,7 @@ class _Document:
             raise _UnfitError(f"more than {_MAX_VALUES} values, aliases expanded")
         if len(path) > _MAX_DEPTH:
             raise _UnfitError(f"nested more than {_MAX_DEPTH} levels deep, or an alias holds itself")
-        self.places.setdefault(path, self._place(node.start_mark))
+        self.positions.setdefault(path, self._place(node.start_mark))
         if node.tag not in {_STANDARD + kind for kind in ("map", "seq", "str")}:
             tag = _shortened(node.tag.replace(_STANDARD, "!!"))
             self.wrong(path, f"the tag {tag} is not allowed; plain values only", self._place(node.start_mark))
@@ -155,12 +155,12 @@ class _Document:
             if not isinstance(key_node, yaml.ScalarNode):
                 self.wrong(path, "a key must be plain text", place)
             elif key in values:
-                first = self.places[(*path, key)].removeprefix(f"{self.name}:")
+                first = self.positions[(*path, key)].removeprefix(f"{self.name}:")
                 self.wrong(
                     (*path, key), f"the key stands here a second time (first at {first}); keep one", place
                 )
             else:
-                self.places[(*path, key)] = place
+                self.positions[(*path, key)] = place
                 values[key] = self._value(value_node, (*path, key))
         return values
 
@@ -180,16 +180,16 @@ class _Document:
                 return self.wrong(here, what, flag)
             if here == path or (isinstance(holder, dict) and holder.get(key) is None):
                 holder[key] = value if here == path else {}
-                places = {known: at for known, at in self.places.items() if known[: len(here)] != here}
-                self.places = {**places, here: flag}
+                positions = {known: at for known, at in self.positions.items() if known[: len(here)] != here}
+                self.positions = {**positions, here: flag}
             holder = holder[key]
         return None
 
     def place(self, path: _Path) -> str:
         """Return the place of ``path``, or of the nearest mapping or list around it."""
-        while path and path not in self.places:
+        while path and path not in self.positions:
             path = path[:-1]
-        return self.places.get(path, self.name)
+        return self.positions.get(path, self.name)
 
     def refused(self) -> InputError:
         """One line a problem, flags last, otherwise in the order of the file; of very many the first."""
@@ -510,12 +510,12 @@ def _check_options(document: _Document) -> None:
 
 def _translated(model: type[BaseModel], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:
     """Return the findings of pydantic, in words."""
-    places = [error["loc"] for error in errors]
-    for error, place in list(zip(errors, places, strict=True))[:_MOST]:
+    positions = [error["loc"] for error in errors]
+    for error, place in list(zip(errors, positions, strict=True))[:_MOST]:
         if error["type"] == CONTRADICTIONS:
             yield from error["ctx"]["found"]
             continue
-        inside = any(len(other) > len(place) and other[: len(place)] == place for other in places)
+        inside = any(len(other) > len(place) and other[: len(place)] == place for other in positions)
         if not (inside and error["type"] == "too_short"):  # a list counts only its valid entries
             yield place, _phrase(model, error)
 
@@ -529,16 +529,16 @@ def _phrase(model: type[BaseModel], error: ErrorDetails) -> str:
             return "control.laws is set as well; keep one" if both else "must be the name of one law"
         return f"unknown key; {_nearest(path[-1], _keys_at(model, path[:-1]))}"
     if kind == "string_pattern_mismatch":
-        return f"{_shown(given)} must be letters R and P, one a joint"
+        return f"{_displayed(given)} must be letters R and P, one a joint"
     if kind == "literal_error":
         valid = [option.strip("'") for option in context["expected"].replace(" or ", ", ").split(", ")]
-        return f"{_shown(given)} is not one of them; {_nearest(given, valid)}"
+        return f"{_displayed(given)} is not one of them; {_nearest(given, valid)}"
     phrase = _PHRASES.get(kind, error["msg"]).format(**context)
     plain = isinstance(given, (str, int, float)) or given is None
-    return f"{phrase}, not {_shown(given)}" if plain and kind != "missing" else phrase
+    return f"{phrase}, not {_displayed(given)}" if plain and kind != "missing" else phrase
 
 
-def _shown(value: Any) -> str:
+def _displayed(value: Any) -> str:
     """A value as it would stand in YAML, _shortened."""
     return _shortened(json.dumps(value) if value is None or isinstance(value, bool) else repr(value), 40)
 

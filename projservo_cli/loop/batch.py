@@ -92,7 +92,7 @@ class _Rehearsal:
         step = np.full(len(self.q_start), _REHEARSAL_STEP)
         q_hat_p = state.q_hat[2].copy()
 
-        def rehearsed(sense: float, most: int) -> tuple[bool, bool, int]:
+        def simulated(sense: float, max_steps: int) -> tuple[bool, bool, int]:
             """Whether a sense fails to arrive, whether it passes a joint limit, and in how many steps."""
             reset(self.state)
             self.state.driven[1] = sense * q_hat_p
@@ -101,7 +101,7 @@ class _Rehearsal:
                 image_error_px=_REHEARSAL_PX,
                 diverged_factor=math.inf,
                 stall_periods=20,
-                max_steps=most,
+                max_steps=max_steps,
                 stop_at_joint_limit=False,
                 stop_at_border=False,
             )
@@ -109,9 +109,9 @@ class _Rehearsal:
             verdict, steps = run_compiled(law, course, self.noise, self.state, self.log)
             return verdict != CONVERGED, bool(self.log.events[1] >= 0.0), steps
 
-        first = rehearsed(1.0, _REHEARSAL_STEPS)
+        first = simulated(1.0, _REHEARSAL_STEPS)
         # Where the first sense does well, the other one is better only if it arrives before.
-        other = rehearsed(-1.0, _REHEARSAL_STEPS if any(first[:2]) else max(0, first[2] - 1))
+        other = simulated(-1.0, _REHEARSAL_STEPS if any(first[:2]) else max(0, first[2] - 1))
         state.driven[1] = (-1.0 if other < first else 1.0) * q_hat_p
         parts = partition(task, make_split(state))
         return FOUND if parts.found else NOT_UNIQUE, parts, not (first[0] and other[0])
@@ -180,7 +180,7 @@ class Setting(NamedTuple):
 class _Desk(NamedTuple):
     """Workspace in which the task of a run is measured, and the run driven."""
 
-    shown: FloatArray  # (2, 2, b, 2) straight pixels of the images at the start and at the goal
+    images: FloatArray  # (2, 2, b, 2) straight pixels of the images at the start and at the goal
     task: Task
     own_task: Task  # task, own_task: as partitioned, and as a law with other features sees it
     state: State
@@ -195,17 +195,17 @@ class Trials:
     Raises WorkFailed if the face has fewer than three markers.
     """
 
-    def __init__(self, setting: Setting, shown: int) -> None:
+    def __init__(self, setting: Setting, images: int) -> None:
         plant, limits, q_start = setting.course
         n, m = len(q_start), len(plant.M)
         observed, s_star = m + len(plant.pins), np.zeros((2, m, 2))
         body = setting.body._replace(in_goal=np.zeros((2, len(setting.body.M)), dtype=np.bool_))
         self.setting = setting
         self.desk = _Desk(
-            shown=np.zeros((2, 2, shown, 2)),
+            images=np.zeros((2, 2, images, 2)),
             task=new_task(setting.model, s_star, plant.center)._replace(body=body),
             own_task=new_task(setting.believed, s_star, plant.center),
-            state=new_state(n, m, shown),
+            state=new_state(n, m, images),
             own_state=new_state(n, m, observed),
             log=new_log(
                 n, observed, limits.max_steps, len(ERRORS), MAX_PARTS if setting.gains.substeps else 0
@@ -213,25 +213,25 @@ class Trials:
         )
         self.rehearsal = _Rehearsal(setting.model, q_start, m, plant.limits)
 
-    def numbers(self, shown: FloatArray, noise: FloatArray) -> FloatArray:
+    def numbers(self, images: FloatArray, noise: FloatArray) -> FloatArray:
         """Measure the task, partition it, drive the law to its verdict and sum up: (r, ``NUMBERS``).
 
         shown : (r, 2, 2, b, 2) images of each run at the start and at the goal, the face first, px.
         noise : (r, k, 2, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
             short.
         """
-        numbers = np.full((len(shown), len(NUMBERS)), math.nan)
+        numbers = np.full((len(images), len(NUMBERS)), math.nan)
         at, made, opened = self.desk, 0, _NOT_OPENED
-        while made < len(shown):
-            made += _until_rehearsal(self.setting, shown[made:], noise[made:], at, opened, numbers[made:])
-            if made < len(shown):
+        while made < len(images):
+            made += _until_rehearsal(self.setting, images[made:], noise[made:], at, opened, numbers[made:])
+            if made < len(images):
                 opened, _, _ = self.rehearsal.better(at.task, at.state)
         return numbers
 
 
 @njit
 def _until_rehearsal(
-    setting: Setting, shown: FloatArray, noise: FloatArray, desk: _Desk, opened: int, numbers: FloatArray
+    setting: Setting, images: FloatArray, noise: FloatArray, desk: _Desk, opened: int, numbers: FloatArray
 ) -> int:
     """Runs up to one whose half turn is to be rehearsed, and how many; that one is opened.
 
@@ -240,46 +240,46 @@ def _until_rehearsal(
 
     opened : verdict of the first run, which was opened; else ``_NOT_OPENED``.
     """
-    for made in range(len(shown)):
+    for made in range(len(images)):
         status = opened
         if made > 0 or opened == _NOT_OPENED:
-            status, theta_p = _open(setting, shown[made], desk)
+            status, theta_p = _open(setting, images[made], desk)
             if status == FOUND and setting.rehearse and _is_half_turn(theta_p):
                 return made
         _drive(setting, status, noise[made], desk, numbers[made])
-    return len(shown)
+    return len(images)
 
 
 @merged
-def _open(setting: Setting, shown: FloatArray, desk: _Desk) -> tuple[int, float]:
+def _open(setting: Setting, images: FloatArray, desk: _Desk) -> tuple[int, float]:
     """Measure and partition a task, also as the law measures it; the verdict and the angle θ_p, rad."""
     reset(desk.own_state)
     if not setting.shares_task:
-        status = _measured_into(setting, setting.believed, shown, desk, desk.own_task)
+        status = _measured_into(setting, setting.believed, images, desk, desk.own_task)
         if status != FOUND:
             return status, 0.0
-    status = _measured_into(setting, setting.model, shown, desk, desk.task)
+    status = _measured_into(setting, setting.model, images, desk, desk.task)
     if status != FOUND:
         return status, 0.0
     reset(desk.state)
-    status, parts = _first_parts(setting.model, desk.task, desk.shown[0], setting.course.q_start, desk.state)
+    status, parts = _first_parts(setting.model, desk.task, desk.images[0], setting.course.q_start, desk.state)
     return status, parts.theta_p
 
 
 @composed
-def _measured_into(setting: Setting, model: Model, shown: FloatArray, desk: _Desk, task: Task) -> int:
+def _measured_into(setting: Setting, model: Model, images: FloatArray, desk: _Desk, task: Task) -> int:
     """Measure a task from images (2, 2, b, 2) at its start and goal, px; return the verdict."""
     for view in range(2):
         for k in range(task.s_star.shape[1]):
             for i in range(2):
-                task.s_star[view, k, i] = shown[1, view, k, i]
-    undistort_into(model.lens, shown[0], desk.shown[0])
-    undistort_into(model.lens, shown[1], desk.shown[1])
+                task.s_star[view, k, i] = images[1, view, k, i]
+    undistort_into(model.lens, images[0], desk.images[0])
+    undistort_into(model.lens, images[1], desk.images[1])
     state = desk.state
-    status, _ = task_into(model, desk.shown, task, state.A, state.work.system.rhs)
+    status, _ = task_into(model, desk.images, task, state.A, state.work.system.rhs)
     if status == FOUND and task.body.M.shape[0] > 0:
         q_start = setting.course.q_start
-        status, _ = body_task_into(model, q_start, desk.shown, task, make_split(state), state.normal)
+        status, _ = body_task_into(model, q_start, desk.images, task, make_split(state), state.normal)
     return status
 
 

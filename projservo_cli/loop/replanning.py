@@ -92,7 +92,7 @@ class ExecutionMonitor:
         if clock < len(path) - 1:
             if verdict == DIVERGED and np.isfinite(q_dot).all():
                 verdict = RUNNING  # a path may lead away from the goal
-            return self._on_the_way(log, k, verdict, path[int(clock) :])
+            return self._on_path(log, k, verdict, path[int(clock) :])
         self._alone += 1
         if verdict not in STOPPED and not self._stalls(log, k, verdict):
             return verdict
@@ -107,13 +107,13 @@ class ExecutionMonitor:
         still = on_plateau(log.judged, k, window) and on_plateau(log.judged, k, window // 2)
         return verdict == RUNNING and self._alone > window and still
 
-    def _on_the_way(self, log: Log, k: int, verdict: int, ahead: FloatArray) -> int:
+    def _on_path(self, log: Log, k: int, verdict: int, ahead: FloatArray) -> int:
         """Return the new verdict with joints (s, n) ahead."""
         self._alone = 0
         if verdict in STOPPED:
             return self._replanned(log, k, verdict, f"{STOPPED[verdict]} on the path")
-        looks = verdict == RUNNING and k % EVERY == 0 and self.left > 0
-        if looks and self._leaves_image(log, k, ahead):
+        checks = verdict == RUNNING and k % EVERY == 0 and self.left > 0
+        if checks and self._leaves_image(log, k, ahead):
             return self._replanned(log, k, verdict, "the path ahead would leave an image")
         return verdict
 

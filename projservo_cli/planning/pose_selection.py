@@ -70,8 +70,8 @@ def suggest(
         )
     few = calibration.with_markers(even_choice(len(calibration.M), _MOST_SHOWN))
     sigma = max(calibration.sigma_px, calibration.sigma_fitted_px)
-    _, T = _shown(few, targets, _TARGETS, rng)
-    q, C = _shown(few, candidates, _CANDIDATES, rng)
+    _, T = _visible_poses(few, targets, _TARGETS, rng)
+    q, C = _visible_poses(few, candidates, _CANDIDATES, rng)
     coordinates = np.count_nonzero(T.any(axis=2))
     rows = T.reshape(-1, T.shape[2])
     gram = rows.T @ rows
@@ -102,7 +102,7 @@ def suggest(
     return tuple(found)
 
 
-def _shown(
+def _visible_poses(
     calibration: Calibration, region: Region, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Draw random poses (k, n) that show enough markers; with the derivative (k, 4 m, r) of their images.

@@ -32,7 +32,7 @@ from projservo_cli.planning.margins import (
     measured,
     room_along,
 )
-from projservo_cli.planning.time_parameterization import least_time
+from projservo_cli.planning.time_parameterization import minimum_time
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 # Values of each share; the second where no path stays in view on the first.
@@ -58,7 +58,7 @@ VIEWS = [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]
 def duration(motion: Motion) -> float:
     """Time a motion takes at the joint-speed limit, s; NaN where nothing limits or joints cannot follow."""
     speed = motion.reaching.demands.limits.speed
-    return float(least_time(speed, motion.along.q)[-1]) if np.isfinite(speed).any() else math.nan
+    return float(minimum_time(speed, motion.along.q)[-1]) if np.isfinite(speed).any() else math.nan
 
 
 def evenly(motion: Motion, sigma: FloatArray) -> FloatArray:
@@ -66,9 +66,9 @@ def evenly(motion: Motion, sigma: FloatArray) -> FloatArray:
 
     Where the joints cannot follow or nothing moves, of the length of the path in shares.
     """
-    time = least_time(motion.reaching.demands.limits.speed, motion.along.q)
+    time = minimum_time(motion.reaching.demands.limits.speed, motion.along.q)
     if not time[-1] > 0.0:
-        time = least_time(np.ones(3), motion.mu)
+        time = minimum_time(np.ones(3), motion.mu)
     mu = np.stack([np.interp(sigma * time[-1], time, column) for column in motion.mu.T], axis=1)
     mu[sigma <= 0.0], mu[sigma >= 1.0] = motion.mu[0], motion.mu[-1]
     return mu
@@ -168,8 +168,8 @@ def _quickest(lattice: _Lattice) -> Motion:
     value = widest(lattice.minimum(lattice.nodes))
     corners = _straightened(lattice, shortest(value >= value[-1], *lattice.moved(lattice.nodes)))
     length = np.r_[0.0, np.cumsum(np.abs(np.diff(corners, axis=0)).max(axis=1))]
-    places = np.linspace(0.0, length[-1], CHECKS)
-    mu = np.stack([np.interp(places, length, column) for column in corners.T], axis=1)
+    positions = np.linspace(0.0, length[-1], CHECKS)
+    mu = np.stack([np.interp(positions, length, column) for column in corners.T], axis=1)
     return along_shares(lattice.nodes.reaching, mu)
 
 
@@ -179,14 +179,14 @@ def _straightened(lattice: _Lattice, path: IntArray) -> FloatArray:
     A piece is as long as bisection finds one whose shares are as good and that takes no longer.
     """
     (reaching, mu, found), (q, speed) = lattice.nodes, lattice.moved(lattice.nodes)
-    worth, time = lattice.worth, least_time(speed, q[path])
+    worth, time = lattice.worth, minimum_time(speed, q[path])
 
     def serves(i: int, j: int) -> bool:
         """Whether the piece from one node of the path to another does."""
         x = np.linspace(0.0, 1.0, 2 * (j - i) + 1)[:, None]
         piece = along_shares(reaching, (1.0 - x) * mu[path[i]] + x * mu[path[j]], found.q[path[i]])
-        late = least_time(speed, lattice.moved(piece)[0])[-1] > DETOUR * (time[j] - time[i]) + ROUND_OFF
-        return not late and bool(lattice.minimum(piece).min() >= worth - ROUND_OFF)
+        detour = minimum_time(speed, lattice.moved(piece)[0])[-1] > DETOUR * (time[j] - time[i]) + ROUND_OFF
+        return not detour and bool(lattice.minimum(piece).min() >= worth - ROUND_OFF)
 
     kept, last = [0], len(path) - 1
     while kept[-1] < last:

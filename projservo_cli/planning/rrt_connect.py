@@ -24,7 +24,7 @@ from projservo_cli.planning.constraints import (
 from projservo_cli.planning.goal_configurations import STARTS, UNSURE, GoalFeatures, goals_of
 from projservo_cli.planning.keep_out import only
 from projservo_cli.planning.margins import CLEAR, FRONT, IMAGE, JOINTS
-from projservo_cli.planning.time_parameterization import TimedPath, least_time, time_parameterized
+from projservo_cli.planning.time_parameterization import TimedPath, minimum_time, time_parameterized
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, JointLimits
 
 # Longest edge of a tree, s at the speed limits.
@@ -173,8 +173,10 @@ def find_path(
     path = path._replace(constraints=c)
     sure = goals[rank < UNSURE]
     for asked in (sure, goals) if 0 < len(sure) < len(goals) else (goals,):
-        most = search.max_samples - path.draws if asked is goals else min(search.max_samples // 2, FURTHER)
-        best, draws, trees = _shortest(c, start, asked, most, rng, trial)
+        max_draws = (
+            search.max_samples - path.draws if asked is goals else min(search.max_samples // 2, FURTHER)
+        )
+        best, draws, trees = _shortest(c, start, asked, max_draws, rng, trial)
         path = path._replace(draws=path.draws + draws, trees=trees)
         if len(best) > 0:
             return path._replace(corners=best, timing=time_parameterized(c, best, trial))
@@ -189,7 +191,12 @@ def _drawn(c: Constraints, start: FloatArray, count: int, rng: np.random.Generat
 
 
 def _shortest(
-    c: Constraints, start: FloatArray, goals: FloatArray, most: int, rng: np.random.Generator, trial: Trial
+    c: Constraints,
+    start: FloatArray,
+    goals: FloatArray,
+    max_draws: int,
+    rng: np.random.Generator,
+    trial: Trial,
 ) -> tuple[FloatArray, int, tuple[Tree, Tree] | None]:
     """The shortest path (k, n) that was found to any of the goals (g, n), in so many draws of joints.
 
@@ -200,31 +207,36 @@ def _shortest(
     straight = next((goal for goal in goals if reached(c, start, goal, trial) == 1.0), None)
     if straight is not None:
         best = np.stack([start, straight])
-        shortest = least_time(c.limits.speed, best)[-1]
+        shortest = minimum_time(c.limits.speed, best)[-1]
     trees: tuple[Tree, Tree] | None = None
     if not shortest <= LONGER * (np.abs(goals - start) / c.limits.speed).max(axis=1).min():
         for _ in range(WAYS):
-            left = (most if math.isinf(shortest) else FURTHER) - draws
+            left = (max_draws if math.isinf(shortest) else FURTHER) - draws
             if left <= 0:
                 break
             found, used, grown = _by_trees(c, start, goals, left, rng, trial)
             draws, trees = draws + used, trees or grown
             if found is not None:
                 found = _shortened(c, found, rng, trial)
-                if (time := least_time(c.limits.speed, found)[-1]) < shortest:
+                if (time := minimum_time(c.limits.speed, found)[-1]) < shortest:
                     best, shortest, trees = found, time, grown
     return best, draws, trees
 
 
 def _by_trees(
-    c: Constraints, start: FloatArray, goals: FloatArray, most: int, rng: np.random.Generator, trial: Trial
+    c: Constraints,
+    start: FloatArray,
+    goals: FloatArray,
+    max_draws: int,
+    rng: np.random.Generator,
+    trial: Trial,
 ) -> tuple[FloatArray | None, int, tuple[Tree, Tree]]:
     """A path of corners (k, n), None where none was found; how many draws it took; the trees."""
-    nodes = min(most, 100_000) * 4 + len(goals)
+    nodes = min(max_draws, 100_000) * 4 + len(goals)
     trees = _new_tree(nodes, start[None]), _new_tree(nodes, goals)
     draws = 0
-    while draws < most:
-        chunk = _drawn(c, start, min(CHUNK, most - draws), rng)
+    while draws < max_draws:
+        chunk = _drawn(c, start, min(CHUNK, max_draws - draws), rng)
         first, last, used = _grow(c, trees, chunk, trial)
         draws += used
         if first >= 0:
@@ -234,9 +246,9 @@ def _by_trees(
     return None, draws, trees
 
 
-def _new_tree(most: int, roots: FloatArray) -> Tree:
+def _new_tree(max_draws: int, roots: FloatArray) -> Tree:
     """A tree of roots (r, n) with room for so many nodes."""
-    q = np.empty((max(most, len(roots)), roots.shape[1]))
+    q = np.empty((max(max_draws, len(roots)), roots.shape[1]))
     q[: len(roots)] = roots
     return Tree(q, np.full(len(q), -1), np.array([len(roots)]))
 
@@ -246,13 +258,13 @@ def _nearest(c: Constraints, tree: Tree, q: FloatArray) -> int:
     best, nearest = math.inf, 0
     n = q.shape[0]
     for k in range(tree.size[0]):
-        most = 0.0
+        max_draws = 0.0
         for i in range(n):
-            most = max(most, abs(tree.q[k, i] - q[i]) / c.limits.speed[i])
-            if most >= best:
+            max_draws = max(max_draws, abs(tree.q[k, i] - q[i]) / c.limits.speed[i])
+            if max_draws >= best:
                 break
-        if most < best:
-            best, nearest = most, k
+        if max_draws < best:
+            best, nearest = max_draws, k
     return nearest
 
 
@@ -318,7 +330,7 @@ def _branch(tree: Tree, node: int) -> FloatArray:
 
 def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
     """Shorten a path (k, n) by straight segments, first between random places on it."""
-    time = least_time(c.limits.speed, path)
+    time = minimum_time(c.limits.speed, path)
     for ends in np.sort(rng.random((SHORTENINGS, 2)), axis=1):
         if len(path) <= 2:
             return path
@@ -327,9 +339,9 @@ def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial
         if i == j:  # on one straight piece
             continue
         new = np.stack([np.interp((low, high), time, column) for column in path.T], axis=1)
-        if least_time(c.limits.speed, new)[-1] < high - low and reached(c, new[0], new[1], trial) == 1.0:
+        if minimum_time(c.limits.speed, new)[-1] < high - low and reached(c, new[0], new[1], trial) == 1.0:
             path = np.vstack([path[: i + 1], new, path[j + 1 :]])
-            time = least_time(c.limits.speed, path)
+            time = minimum_time(c.limits.speed, path)
     k = 1
     while k < len(path) - 1:
         if reached(c, path[k - 1], path[k + 1], trial) == 1.0:

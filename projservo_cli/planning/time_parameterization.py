@@ -41,7 +41,7 @@ class TimedPath(NamedTuple):
     time: FloatArray  # (k,) s
 
 
-def least_time(speed: FloatArray, q: FloatArray) -> FloatArray:
+def minimum_time(speed: FloatArray, q: FloatArray) -> FloatArray:
     """Time (s,) at which joints q (s, n) are reached where one is always at its speed limit (n,), s.
 
     Where nothing limits, the motion of the joint that moves most.
@@ -58,7 +58,7 @@ def time_parameterized(c: Constraints, path: FloatArray, trial: Trial) -> TimedP
         return TimedPath(
             s=np.array([0.0, 1.0]), q=path + still, dq=still, ddq=still[:1], x=np.zeros(2), time=np.zeros(2)
         )
-    times = np.diff(least_time(c.limits.speed, path))
+    times = np.diff(minimum_time(c.limits.speed, path))
     slopes = np.diff(path, axis=0) / times[:, None]
     sizes = np.zeros(len(path))
     for k in range(1, len(path) - 1):
@@ -66,7 +66,7 @@ def time_parameterized(c: Constraints, path: FloatArray, trial: Trial) -> TimedP
     timed = _on_grid(path, times, slopes, sizes)
     with np.errstate(divide="ignore", over="ignore"):
         timed.x[:] = ((ROOM * c.limits.speed / np.abs(timed.dq)) ** 2).min(axis=1)
-    _pace_into(timed, ROOM * c.limits.acceleration)
+    _speeds_into(timed, ROOM * c.limits.acceleration)
     return timed
 
 
@@ -125,19 +125,21 @@ def _narrowed(slope: float, offset: float, bound: float, low: float, high: float
 
 
 @internal
-def _accelerations(timed: TimedPath, i: int, x: float, ahead: float, most: FloatArray) -> tuple[float, float]:
+def _accelerations(
+    timed: TimedPath, i: int, x: float, ahead: float, maximum: FloatArray
+) -> tuple[float, float]:
     """Accelerations d²s/dt² that interval i allows at a pace x, to end at no more than that ahead."""
     step = timed.s[i + 1] - timed.s[i]
     low, high = -x / (2.0 * step), (ahead - x) / (2.0 * step)
-    for j in range(most.shape[0]):
+    for j in range(maximum.shape[0]):
         curve = timed.ddq[i, j]
-        low, high = _narrowed(timed.dq[i, j], curve * x, most[j], low, high)
-        low, high = _narrowed(timed.dq[i + 1, j] + 2.0 * step * curve, curve * x, most[j], low, high)
+        low, high = _narrowed(timed.dq[i, j], curve * x, maximum[j], low, high)
+        low, high = _narrowed(timed.dq[i + 1, j] + 2.0 * step * curve, curve * x, maximum[j], low, high)
     return low, high
 
 
 @njit
-def _pace_into(timed: TimedPath, acceleration: FloatArray) -> None:
+def _speeds_into(timed: TimedPath, acceleration: FloatArray) -> None:
     """Write the quickest pace from rest to rest within accelerations (n,), and its times.
 
     The pace is as quick as speeds allow yet.

@@ -98,7 +98,7 @@ def motion_of(
     return _Motion(pyramids(plant, start), start, goal, planned, trees, runs)
 
 
-def _instants(q: FloatArray) -> IntArray:
+def _sample_times(q: FloatArray) -> IntArray:
     """At most ``MOST_INSTANTS`` instants of the joints q (t, n), the first and the last among them.
 
     They are spread half over the time, half over the path of the joints: no end of a run is skipped.
@@ -106,21 +106,23 @@ def _instants(q: FloatArray) -> IntArray:
     if len(q) <= MOST_INSTANTS:
         return np.arange(len(q))
     even = np.linspace(0.0, 1.0, len(q))
-    way = np.append(0.0, np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1)))
-    done = 0.5 * (even + (way / way[-1] if way[-1] > 0.0 else even))
+    distance = np.append(0.0, np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1)))
+    done = 0.5 * (even + (distance / distance[-1] if distance[-1] > 0.0 else even))
     marks = np.linspace(0.0, 1.0, MOST_INSTANTS)
     return np.unique(np.minimum(np.searchsorted(done, marks), len(q) - 1))
 
 
 def _driven(robot: Arm, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
-    shown, places = _instants(trace.q), []
-    for q in trace.q[shown]:
+    selected, positions = _sample_times(trace.q), []
+    for q in trace.q[selected]:
         H = forward_kinematics(plant.model, q)
         polyline = skeleton(joint_operators(plant.model, q), robot.joint_types, (H @ robot.base_tool)[:3, 3])
-        places.append((polyline, (plant.M[plant.order] @ H.T)[:, :3], (markers @ H.T)[:, :3]))
-    moved = (np.stack(kind) for kind in zip(*places, strict=True))
+        positions.append((polyline, (plant.M[plant.order] @ H.T)[:, :3], (markers @ H.T)[:, :3]))
+    moved = (np.stack(kind) for kind in zip(*positions, strict=True))
     verdict, path = f"{trace.verdict}, {trace.steps} steps", _centers(plant, trace.q)
-    return _Driven(verdict, trace.period * shown.astype(np.float64), trace.self_occluded[shown], path, *moved)
+    return _Driven(
+        verdict, trace.period * selected.astype(np.float64), trace.self_occluded[selected], path, *moved
+    )
 
 
 def _centers(plant: Plant, q: FloatArray) -> FloatArray:
@@ -167,14 +169,14 @@ def _figure(motion: _Motion) -> Any:
         for trace in (*moving[0], _line(go, run.path, "driven path", style.GREEN, width=5)):
             trace.visible = number == 0  # a list of all runs chooses another
             traces.append(trace)
-        shown = [True] * still + [k // 4 == number for k in range(4 * len(motion.runs))]
+        selected = [True] * still + [k // 4 == number for k in range(4 * len(motion.runs))]
         buttons = [
             {"label": "▶ play", "method": "animate", "args": [own, _PLAYING]},
             {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
         ]
         changed: dict[str, Any] = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": buttons}
         changed |= {f"scene.{axis}axis.range": limits for axis, limits in _extent(motion, run).items()}
-        menu.append({"label": title(name), "method": "update", "args": [{"visible": shown}, changed]})
+        menu.append({"label": title(name), "method": "update", "args": [{"visible": selected}, changed]})
     first: dict[str, Any] = menu[0]["args"][1]
     buttons = first["updatemenus[1].buttons"]
     left = {"x": 0.0, "xanchor": "left"}
@@ -213,8 +215,8 @@ def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
     points = [motion.cameras, motion.start, run.robot, run.markers, run.path, motion.planned]
     points += [] if motion.goal is None else [motion.goal]
     points += [tree[np.isfinite(tree[:, 0])] for tree in motion.trees]
-    shown = np.concatenate([some.reshape(-1, 3) for some in points])
-    low, high = shown.min(axis=0), shown.max(axis=0)
+    selected = np.concatenate([some.reshape(-1, 3) for some in points])
+    low, high = selected.min(axis=0), selected.max(axis=0)
     pad = _PAD * float((high - low).max())
     ranges = np.round(np.stack([low - pad, high + pad], axis=1), _DIGITS)
     return {name: reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
@@ -263,7 +265,7 @@ def _moving(go: Any, run: _Driven, k: int) -> tuple[Any, Any, Any]:
     triangles = {"i": (0 * fan).tolist(), "j": fan.tolist(), "k": (fan + 1).tolist()}
     color = _HIDDEN if run.hidden[k].any() else _SEEN
     line_style = {"color": color, "flatshading": True, "name": "face", "hoverinfo": "name"}
-    face = go.Mesh3d(**_places(run.face[k]), **triangles, **line_style)
+    face = go.Mesh3d(**_coordinates(run.face[k]), **triangles, **line_style)
     return robot, face, _line(go, run.markers[k], "markers", style.GREY)
 
 
@@ -272,10 +274,10 @@ def _line(go: Any, points: FloatArray, name: str, color: str, width: float | Non
     line_style = {"mode": "markers", "marker": {"size": 3, "color": color}}
     if width is not None:
         line_style = {"mode": "lines", "line": {"color": color, "width": width}}
-    return go.Scatter3d(**_places(points), **line_style, name=name, hoverinfo="name")
+    return go.Scatter3d(**_coordinates(points), **line_style, name=name, hoverinfo="name")
 
 
-def _places(points: FloatArray) -> dict[str, list[float]]:
+def _coordinates(points: FloatArray) -> dict[str, list[float]]:
     return {name: np.round(points[:, i], _DIGITS).tolist() for i, name in enumerate("xyz")}
 
 
@@ -304,8 +306,8 @@ def write_animation(
     from PIL import Image
 
     direct = [name for name in traces if name in BODY_LAWS]
-    beside = [*direct[:1], *(name for name in traces if name in POINT_LAWS)]
-    columns = {name: traces[name] for name in (beside if len(beside) > 1 else [*traces])[:_MOST_COLUMNS]}
+    pair = [*direct[:1], *(name for name in traces if name in POINT_LAWS)]
+    columns = {name: traces[name] for name in (pair if len(pair) > 1 else [*traces])[:_MOST_COLUMNS]}
     if size is None:
         size = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
     images = []
@@ -349,8 +351,8 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
                 style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near, margin)
                 panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
                 panel.set_xlabel("u (px)" if view else "")
-            shown = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
-            columns.append([_Panel(*one) for one in shown])
+            selected = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
+            columns.append([_Panel(*one) for one in selected])
             if (film := films[name]) is not None and run.frame_index is not None:
                 for panel, frames in zip(columns[-1], film.swapaxes(0, 1), strict=True):
                     panel.over(frames, run.frame_index, size)

@@ -195,7 +195,7 @@ class _View(NamedTuple):
 
 def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> _View:
     """Return the page's data of a run in a ``folder``; ``prefix`` precedes its names."""
-    beside = run.path.parent
+    run_folder = run.path.parent
     stages = {name.split("/")[0] for name in run.results}
     found = {stage: stage_object(stage, run, about.joints, list(run.traces)) for stage in stages}
     report: Report | None = run.results["report"].records[""] if "report" in stages else None
@@ -207,7 +207,7 @@ def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> _Vie
         folder,
         about.configuration,
         list(_made(run, about)),
-        [(label, folder + name) for name, label in _EXTRAS.items() if (beside / name).is_file()],
+        [(label, folder + name) for name, label in _EXTRAS.items() if (run_folder / name).is_file()],
         calibration=_calibration(found["calibrate"], about) if "calibrate" in found else None,
         plan=found["plan"] | _visibility(run.plan) if "plan" in found else None,
         laws=[_law(trace, about) for trace in found["servo"]["laws"]] if "servo" in found else [],
@@ -215,7 +215,7 @@ def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> _Vie
         claims=report.claims if report else (),
         drift=_drift(report) if report else None,
         left_out=left_out,
-        pictures=_pictures(beside, report.figures if report else (), folder, prefix),
+        pictures=_pictures(run_folder, report.figures if report else (), folder, prefix),
     )
 
 
@@ -229,13 +229,13 @@ def _made(run: Run, about: About) -> Iterator[tuple[str, str]]:
     for key, label in (*_MADE.items(), ("", "versions")):
         by_value: dict[str, list[str]] = {}
         for name, result in run.results.items():
-            if value := _told(key, result.provenance):
+            if value := _provenance_text(key, result.provenance):
                 by_value.setdefault(value, []).append(name.split("/")[0])
         for value, names in by_value.items():
             yield label, value if len(by_value) == 1 else f"{value} ({', '.join(dict.fromkeys(names))})"
 
 
-def _told(key: str, made: Mapping[str, Any]) -> str:
+def _provenance_text(key: str, made: Mapping[str, Any]) -> str:
     """One of the things that made a result, in words; the versions where there is no key."""
     if not key:
         return ", ".join(f"{package} {made[package]}" for package in _VERSIONS if made.get(package))
@@ -295,11 +295,11 @@ def _visibility(plan: Plan) -> dict[str, Any]:
     """Return the minimum visibility of each camera and its changes; both senses of the rotation."""
     views = []
     for v, name in enumerate(VIEWS):
-        least = int(np.argmin(plan.margin[:, v]))
+        lowest = int(np.argmin(plan.margin[:, v]))
         seen = {
             "name": name,
-            "margin": float(plan.margin[least, v]),
-            "sigma": float(plan.path_parameter[least]),
+            "margin": float(plan.margin[lowest, v]),
+            "sigma": float(plan.path_parameter[lowest]),
         }
         seen["tau_0"] = float(plan.tau_0[v] / plan.tau) if plan.tau > 0 else None
         seen["theta_0"] = np.degrees(plan.theta_0[v]).tolist()
@@ -308,9 +308,9 @@ def _visibility(plan: Plan) -> dict[str, Any]:
 
 
 def _law(trace: dict[str, Any], about: About) -> dict[str, Any]:
-    told = {"title": title(name_of(trace["law"], trace["mode"])), "words": _law_words(trace)}
+    values = {"title": title(name_of(trace["law"], trace["mode"])), "words": _law_words(trace)}
     must = must_converge(trace["law"], about.required)
-    return trace | told | {"converged": trace["verdict"] == "converged", "must": must}
+    return trace | values | {"converged": trace["verdict"] == "converged", "must": must}
 
 
 def _drift(report: Report) -> dict[str, Any] | None:
@@ -405,5 +405,5 @@ def _write(path: Path, views: list[_View], settings: Sequence[Mapping[str, Any]]
     for section in SECTIONS:
         numbered = _side_by_side((v.pictures[section] for v in views), attrgetter("number"))
         pictures[section] = [numbered[number] for number in sorted(numbered, key=int)]
-    told = {"views": views, "claims": claims, "differences": _differences(settings), "pictures": pictures}
-    write_whole(path, template("page.html").render(told))
+    values = {"views": views, "claims": claims, "differences": _differences(settings), "pictures": pictures}
+    write_whole(path, template("page.html").render(values))

@@ -42,8 +42,8 @@ def of_plan(plan: Plan, scene: Any) -> "Figure":
         ),
     )
     plant = SimpleNamespace(order=cyclic_order(plan.A), image_size=extent)
-    shown = {"plan": plan, "calibrated": scene.model, "trajectory": scene.trajectory}
-    data = spec.data(SimpleNamespace(robot=robot, plant=plant, **shown))
+    displayed = {"plan": plan, "calibrated": scene.model, "trajectory": scene.trajectory}
+    data = spec.data(SimpleNamespace(robot=robot, plant=plant, **displayed))
     return style.drawn(spec.draw, data, spec.height)
 
 

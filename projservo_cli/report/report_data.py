@@ -178,8 +178,10 @@ class _FigureSpec:
             return "the run holds a calibration and no task: set robot, rig, markers and task"
         missing = self._without_run(report_data)
         if missing and (not self.any_law or len(missing) == len(self.laws)):
-            shown = {law: None for spec in REGISTER.values() for law in spec._without_run(report_data)}
-            return f"runs to compare are missing, of {', '.join(shown)}; make them: projservo servo report"
+            displayed = {law: None for spec in REGISTER.values() for law in spec._without_run(report_data)}
+            return (
+                f"runs to compare are missing, of {', '.join(displayed)}; make them: projservo servo report"
+            )
         if self.studies and report_data.studies is None:
             return f"the extra runs could not be made: {report_data.no_studies}"
         if self.shares and np.isnan(report_data.plan.mu).all():
@@ -228,9 +230,9 @@ def along_line(points: FloatArray, start: FloatArray, goal: FloatArray) -> tuple
     """Way (k,) along the straight line from start to goal and distance (k,) from it, m."""
     length = np.linalg.norm(goal - start)
     direction = (goal - start) / length if length > 0 else np.zeros(3)
-    way = (points - start) @ direction
-    off = points - start - way[:, None] * direction
-    return way, np.asarray(np.linalg.norm(off, axis=1))
+    deviation = (points - start) @ direction
+    off = points - start - deviation[:, None] * direction
+    return deviation, np.asarray(np.linalg.norm(off, axis=1))
 
 
 def curve_difference(first: FloatArray, second: FloatArray) -> FloatArray:

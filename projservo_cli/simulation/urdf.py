@@ -118,5 +118,5 @@ def _numbers(joint: ET.Element, tag: str, key: str, default: str, path: str) -> 
 
 def listed(names: Sequence[str]) -> str:
     """Up to thirty names, for a message."""
-    shown = ", ".join(name for name in names[:30] if name)
-    return shown + (" …" if len(names) > 30 else "")
+    displayed = ", ".join(name for name in names[:30] if name)
+    return displayed + (" …" if len(names) > 30 else "")

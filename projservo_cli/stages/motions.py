@@ -23,7 +23,7 @@ from projservo_cli.planning.rrt_connect import (
     margins_at,
     within_region,
 )
-from projservo_cli.planning.time_parameterization import TimedPath, joints_at, least_time
+from projservo_cli.planning.time_parameterization import TimedPath, joints_at, minimum_time
 from projservo_cli.records import (
     LIMITS_MISSING,
     NO_SPREAD,
@@ -71,7 +71,7 @@ def given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_transla
     sigma = np.linspace(0.0, 1.0, trajectory.n_samples)
     motion = along_shares(reaching, profile_shares(profile, sigma, pure_translation))
     speed = reaching.demands.limits.speed
-    shortest = least_time(speed, motion.along.q) if np.isfinite(speed).any() else np.nan * sigma
+    shortest = minimum_time(speed, motion.along.q) if np.isfinite(speed).any() else np.nan * sigma
     time = _timed(shortest, sigma, trajectory)
     return Found(motion, motion, time, *sight_words(profile, motion))
 

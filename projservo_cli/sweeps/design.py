@@ -51,7 +51,7 @@ def random_tasks(
     found: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in range(STRATA)]
     waiting: list[tuple[FloatArray, FloatArray]] = []
     drawn = 0
-    while any(len(tasks) < most for tasks, most in zip(found, quota, strict=True)):
+    while any(len(tasks) < high for tasks, high in zip(found, quota, strict=True)):
         if drawn >= MOST_DRAWS:
             raise WorkFailed(
                 f"of {drawn} joint vectors too few show the face to both cameras for {count} tasks: "
@@ -107,9 +107,9 @@ def _changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
     changes = [_override(what, key, value) for key, value in values.items()]
     try:
         for change in changes:
-            *way, last = change.path
+            *above, last = change.path
             section: Any = resolved
-            for step in way:
+            for step in above:
                 section = section[step]
             section[last] = change.value
         return Config.model_validate(resolved)
@@ -142,11 +142,11 @@ def _sample(distribution: Distribution, rng: np.random.Generator) -> Any:
     """One value; always as many random numbers, whatever the distribution."""
     uniform, normal = rng.random(), rng.standard_normal()
     if distribution.uniform is not None:
-        least, most = distribution.uniform
-        return least + (most - least) * uniform
+        low, high = distribution.uniform
+        return low + (high - low) * uniform
     if distribution.log_uniform is not None:
-        least, most = distribution.log_uniform
-        return math.exp(math.log(least) + (math.log(most) - math.log(least)) * uniform)
+        low, high = distribution.log_uniform
+        return math.exp(math.log(low) + (math.log(high) - math.log(low)) * uniform)
     if distribution.normal is not None:
         mean, deviation = distribution.normal
         return mean + deviation * normal
@@ -171,7 +171,7 @@ class _Axis(NamedTuple):
             yield _override(what, key, other)
 
 
-class _Places(NamedTuple):
+class _RunIndex(NamedTuple):
     """Places of runs, arrays (k,): their cells, their numbers in them, and the numbers of shared draws."""
 
     run: IntArray
@@ -243,17 +243,17 @@ class Design:
         _, cell, draw, calibration, task = (int(of_run[0]) for of_run in self.placed(np.array([run])))
         return cell, draw, calibration, task
 
-    def placed(self, runs: IntArray) -> _Places:
+    def placed(self, runs: IntArray) -> _RunIndex:
         """Return the places of runs (k,)."""
         cell, draw = np.divmod(runs, self.sweep.runs)
         tasks = self.sweep.tasks
         task = draw % tasks.random if tasks else np.full_like(draw, -1)
-        return _Places(runs, cell, draw, draw % self.sweep.calibrations, task)
+        return _RunIndex(runs, cell, draw, draw % self.sweep.calibrations, task)
 
     def values(self, cell: int) -> dict[str, Any]:
         """Value of each axis in a cell."""
-        places = np.unravel_index(cell, [len(axis.values) for axis in self.axes])
-        return {axis.name: axis.values[int(i)] for axis, i in zip(self.axes, places, strict=True)}
+        index = np.unravel_index(cell, [len(axis.values) for axis in self.axes])
+        return {axis.name: axis.values[int(i)] for axis, i in zip(self.axes, index, strict=True)}
 
     def base_of(self, cell: int) -> int:
         """Which base a cell is made from."""

@@ -52,17 +52,17 @@ class Engine:
         function: Callable[[Job], Result],
         jobs: Iterable[Job],
         *,
-        most: int | None = None,
+        max_workers: int | None = None,
         threads: bool = False,
     ) -> Generator[Result, None, None]:
         """Yield results of jobs as they are done, in any order; jobs of a lost worker are repeated.
 
         No more jobs wait than keep all workers busy, and a result is released at the next request.
 
-        most : workers that the jobs are worth.
+        max_workers : workers that the jobs are worth.
         threads : whether they seldom wait for each other; the memory is that of one process then.
         """
-        workers = min(self.workers, most or self.workers)
+        workers = min(self.workers, max_workers or self.workers)
         if self.here and workers == 1:
             yield from map(function, jobs)
             return

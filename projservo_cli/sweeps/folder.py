@@ -252,8 +252,8 @@ def run_sweep(
             design.tasks(base)  # or say that there are none, before anything else is made
         _compile_once(design, engine, say)
         wanted = folder.missing_calibrations(design)
-        most = 1 + len(wanted) // CALIBRATIONS
-        with closing(engine.completed(_calibrate, wanted, most=most)) as calibrated:
+        max_workers = 1 + len(wanted) // CALIBRATIONS
+        with closing(engine.completed(_calibrate, wanted, max_workers=max_workers)) as calibrated:
             for count, one in enumerate(calibrated, 1):
                 folder.keep_calibration(one)
                 progress("calibrations", count, len(wanted))

@@ -98,13 +98,13 @@ def columns_of(design: Design) -> tuple[_Column, ...]:
 
 def _input(name: str, values: Sequence[Any], about: str) -> _Column:
     """A column of values that are given: of numbers where all are, else of texts."""
-    shown = [_shown(value) for value in values]
-    if any(isinstance(value, str) for value in shown):
-        return _text(name, [str(value) for value in shown], about)
+    displayed = [_displayed(value) for value in values]
+    if any(isinstance(value, str) for value in displayed):
+        return _text(name, [str(value) for value in displayed], about)
     return _Column(name, "f8", "1", about)
 
 
-def _shown(value: Any) -> Any:
+def _displayed(value: Any) -> Any:
     """Numbers and texts as they are, everything else as text."""
     return value if type(value) in (int, float, str) else json.dumps(value)
 
@@ -145,7 +145,7 @@ def run_part(part: Part) -> _Made:
             cell, _, number, _ = design.numbers(first)
             calibration = part.calibrations[design.calibration_key(cell, number)]
             inputs = design.values(cell) | design.drawn(first)
-            _put(table, rows, {name: _shown(value) for name, value in inputs.items()})
+            _put(table, rows, {name: _displayed(value) for name, value in inputs.items()})
             if calibration is None:
                 _put(table, rows, {"verdict": NOT_CALIBRATED, "usable": 0})
                 continue
@@ -239,8 +239,8 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
         running, instants = list(range(first, min(first + TOGETHER, len(seeds)))), INSTANTS
         while running:  # those that outlast their noise are repeated with more
             drawn = min(instants, scenario.limits.max_steps + 1)
-            shown = [scenario.shown_at(seeds[i]) for i in running]
-            images = np.array([(ends.s_start, ends.s_star) for ends in shown])
+            displayed = [scenario.shown_at(seeds[i]) for i in running]
+            images = np.array([(ends.s_start, ends.s_star) for ends in displayed])
             noise = np.array([scenario.noise_of(law, seeds[i], drawn) for i in running])
             found[running] = trials.numbers(images, noise)
             running = [i for i in running if found[i, VERDICT] == RUNNING]

@@ -66,8 +66,8 @@ class Rows:
 
     def values(self, cell: int) -> dict[str, Any]:
         """Value of each axis in a cell."""
-        places = np.unravel_index(cell, [len(values) for _, values in self.axes])
-        return {name: values[int(i)] for (name, values), i in zip(self.axes, places, strict=True)}
+        positions = np.unravel_index(cell, [len(values) for _, values in self.axes])
+        return {name: values[int(i)] for (name, values), i in zip(self.axes, positions, strict=True)}
 
     def cells(self) -> Iterator[tuple[int, BoolArray]]:
         """Each cell that has runs, and which they are."""
@@ -244,9 +244,9 @@ def _final_errors(rows: Rows) -> Data:
         errors = rows["position_error_mm"][rows[LAW] == law]
         finite = np.sort(errors[np.isfinite(errors)])
         if len(finite):
-            shown = np.unique(np.linspace(0, len(finite) - 1, POINTS).astype(np.int64))
-            data[f"{law}.error"] = np.maximum(finite[shown], 1e-6)
-            data[f"{law}.share"] = (shown + 1) / len(errors)
+            displayed = np.unique(np.linspace(0, len(finite) - 1, POINTS).astype(np.int64))
+            data[f"{law}.error"] = np.maximum(finite[displayed], 1e-6)
+            data[f"{law}.share"] = (displayed + 1) / len(errors)
     return data
 
 
@@ -254,15 +254,15 @@ def _draw_success(data: Data, figure: "style.Figure") -> None:
     """Success of each law, ``<law>.rate``, from ``.low`` to ``.high``, over ``.x``, which is a ``label``."""
     axes = figure.add_subplot()
     laws = _laws(data, ".rate")
-    looks = {law: style.curve(i, marker=True) for i, law in enumerate(laws)}
+    line_styles = {law: style.curve(i, marker=True) for i, law in enumerate(laws)}
     span = max(float(np.ptp(data[f"{law}.x"])) for law in laws) or 1.0
     for i, law in enumerate(laws):
         x, rate = data[f"{law}.x"], data[f"{law}.rate"]
-        beside = 0.006 * span * (i - 0.5 * (len(laws) - 1))  # so that bars of laws do not hide each other
+        offset = 0.006 * span * (i - 0.5 * (len(laws) - 1))  # so that bars of laws do not hide each other
         reach = np.maximum(0.0, [rate - data[f"{law}.low"], data[f"{law}.high"] - rate])
-        axes.errorbar(x + beside, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **looks[law])
+        axes.errorbar(x + offset, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **line_styles[law])
     axes.set(xlabel=str(data["label"]), ylabel="success (%), bars: 95 %", ylim=(-3, 103))
-    style.legend_below(figure, looks, min(3, len(laws)))
+    style.legend_below(figure, line_styles, min(3, len(laws)))
 
 
 def _draw_basin(data: Data, figure: "style.Figure") -> None:
@@ -297,12 +297,12 @@ def _draw_final_errors(data: Data, figure: "style.Figure") -> None:
     ``data`` has for each law ``<law>.error`` (k,), mm, sorted, and ``<law>.share`` (k,) of all its runs.
     """
     axes = figure.add_subplot()
-    looks = {law: style.curve(i) for i, law in enumerate(_laws(data, ".error"))}
-    for law, look in looks.items():
-        axes.plot(data[f"{law}.error"], 100.0 * data[f"{law}.share"], drawstyle="steps-post", **look)
+    line_styles = {law: style.curve(i) for i, law in enumerate(_laws(data, ".error"))}
+    for law, line_style in line_styles.items():
+        axes.plot(data[f"{law}.error"], 100.0 * data[f"{law}.share"], drawstyle="steps-post", **line_style)
     label = "distance of the centre from the goal at the end (mm)"
     axes.set(xlabel=label, ylabel="runs within it (%)", xscale="log", ylim=(-3, 103))
-    style.legend_below(figure, looks, min(3, len(looks)))
+    style.legend_below(figure, line_styles, min(3, len(line_styles)))
 
 
 def _laws(data: Data, ending: str) -> list[str]:

@@ -15,7 +15,7 @@ from projservo_cli.planning.margins import (
     limits_alone,
 )
 from projservo_cli.planning.product_space import shortest, widest
-from projservo_cli.planning.time_parameterization import least_time
+from projservo_cli.planning.time_parameterization import minimum_time
 from projservo_cli.records import position_limits
 from tests.planning.cases import reaching_of
 from tests.samples import frame, in_frame, pixels, poe
@@ -143,6 +143,6 @@ def test_widest_and_shortest_path_among_all(seed):
     # Straighter paths are preferred by 1e-4 a step, at most eight of them.
     assert duration(taken) <= min(map(duration, wide)) + 1e-3
     q = np.array([joints[node] for node in taken])
-    assert least_time(speed, q)[-1] == pytest.approx(duration(taken))
-    unlimited = least_time(np.full(2, math.inf), q)
+    assert minimum_time(speed, q)[-1] == pytest.approx(duration(taken))
+    unlimited = minimum_time(np.full(2, math.inf), q)
     assert unlimited[1] == np.abs(q[1] - q[0]).max()

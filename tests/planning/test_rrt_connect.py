@@ -8,7 +8,7 @@ import pytest
 from projservo_cli.planning.constraints import new_trial
 from projservo_cli.planning.margins import JOINTS, VISIBILITY, WIDTH
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at
-from projservo_cli.planning.time_parameterization import ROOM, joints_at, least_time, time_parameterized
+from projservo_cli.planning.time_parameterization import ROOM, joints_at, minimum_time, time_parameterized
 from tests.planning.joint_space_cases import COUNT, case
 
 SEARCH = SearchLimits()
@@ -102,5 +102,5 @@ def test_no_way_is_told_with_what_stands_in_it():
 def test_a_shortened_way_is_no_longer_than_what_the_trees_found():
     found = case("stanford", next(k for k in range(COUNT) if len(way_of(case("stanford", k)).corners) > 2))
     path = way_of(found)
-    took = least_time(found.c.limits.speed, path.corners)[-1]
+    took = minimum_time(found.c.limits.speed, path.corners)[-1]
     assert took >= (np.abs(path.goals[0] - found.q_start) / found.c.limits.speed).max() - 1e-12

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from projservo_cli.planning.constraints import demands_into
 from projservo_cli.planning.margins import MARGINS
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at, with_ends
-from projservo_cli.planning.time_parameterization import least_time
+from projservo_cli.planning.time_parameterization import minimum_time
 from tests.studies.planning_tables import asked_for, quantiles, task_configs, true_search, write_rows
 
 SEEDS = 5
@@ -72,7 +72,7 @@ def of_ompl(c, q_start, goals, samples, seed):
     setup.simplifySolution(PATIENCE_S[1])
     path = setup.getSolutionPath()
     states = [joints(path.getState(i)) for i in range(path.getStateCount())]
-    return least_time(c.limits.speed, np.array(states))[-1]
+    return minimum_time(c.limits.speed, np.array(states))[-1]
 
 
 def of_toppra(pace, speed, acceleration):
@@ -114,7 +114,7 @@ def compared(config):
     }
     if way.timing is None:
         return row
-    straight, length = len(way.corners) == 2, least_time(c.limits.speed, way.corners)[-1]
+    straight, length = len(way.corners) == 2, minimum_time(c.limits.speed, way.corners)[-1]
     row |= {"straight": straight, "length": length, "duration": float(way.timing.time[-1])}
     if find_spec("toppra"):
         row["toppra"] = of_toppra(way.timing, c.limits.speed, acceleration)

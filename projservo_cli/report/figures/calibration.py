@@ -85,10 +85,10 @@ def _data(fit: Fit) -> Data:
         result[f"seen_{view}"] = seen[:, v][used[:, v]]
         result[f"residual_{view}"] = residual[:, v][used[:, v]]
         gone = np.maximum(rejected, 1)  # a marker without a prediction counts as an outlier
-        places = [seen[:, v][(read & out & (gone == i))[:, v]] for i in range(1, len(_KINDS))]
+        positions = [seen[:, v][(read & out & (gone == i))[:, v]] for i in range(1, len(_KINDS))]
         result |= {
             f"rejected_{kind}_{view}": of_kind
-            for kind, of_kind in zip(_KINDS, (*places, others), strict=True)
+            for kind, of_kind in zip(_KINDS, (*positions, others), strict=True)
         }
     extent = max(float(np.ptp(seen[:, v][read[:, v]], axis=0).max()) for v in (0, 1))
     result["factor"] = np.array(_magnification(result["residual"], extent))
@@ -145,8 +145,8 @@ def _observed(calibration: Calibration, observation: Observation) -> tuple[Float
     column = {number: j for j, number in enumerate(calibration.marker.tolist())}
     # The marker that it is was not seen there, or is left out as well: an exchange is listed once.
     renamed = [(pose, number, _BOTH) for pose, *pair in calibration.id_switches.tolist() for number in pair]
-    for why, places in ((2, renamed), (1, calibration.outlier.tolist())):
-        for pose, number, view in places:
+    for why, positions in ((2, renamed), (1, calibration.outlier.tolist())):
+        for pose, number, view in positions:
             if pose in row and number in column:
                 out[row[pose], slice(None) if view == _BOTH else view, column[number]] = why
     doubted = calibration.suspect[:, 0]
@@ -251,8 +251,8 @@ def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
     pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
     heads: Any = {"width": 0.0022, "headwidth": 4.0, "headlength": 5.0, "headaxislength": 4.0}
     axes.quiver(*seen.T, *arrows.T, **pixels, **heads, **_RESIDUAL)
-    for kind, places in out.items():
-        axes.plot(*places.T, **_LEFT_OUT[kind], markersize=_LARGE if count < _MANY else _SMALL)
+    for kind, positions in out.items():
+        axes.plot(*positions.T, **_LEFT_OUT[kind], markersize=_LARGE if count < _MANY else _SMALL)
     title = f"{view}: {len(seen):,} observations, {count:,} rejected"
     style.image_axes(axes, title, np.concatenate([seen, seen + arrows, *out.values()]))
 
@@ -283,8 +283,8 @@ def _poses(axes: "style.Axes", data: Data) -> None:
     if not np.isfinite(predicted).all():
         _without_covariance(axes)
         return
-    most = 1.06 * float(predicted.max(initial=0.0))
-    x = np.linspace(0.94 * float(predicted.min(initial=most)) if held_out else 0.0, most, 101)
+    upper = 1.06 * float(predicted.max(initial=0.0))
+    x = np.linspace(0.94 * float(predicted.min(initial=upper)) if held_out else 0.0, upper, 101)
     expected = x if held_out else _expected_residual(x, sigma)
     coordinates = float(np.median(data["pose_coordinates"])) if predicted.size else 1.0
     low, high = np.sqrt(chdtri(coordinates, 1.0 - np.array(_BAND)) / coordinates)

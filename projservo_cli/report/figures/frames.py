@@ -17,7 +17,7 @@ _FACE: style.LineStyle = {"color": style.GREEN, "linewidth": 1.2}
 _PATH: style.LineStyle = {"color": style.VERMILION, "linewidth": 0.9}
 
 
-def frames_of(trace: Trace, shown: IntArray | None = None, width: int | None = None) -> ByteArray | None:
+def frames_of(trace: Trace, selected: IntArray | None = None, width: int | None = None) -> ByteArray | None:
     """Frames (k, 2, height, width) of a run, of those kept the ones shown (k,); None where none are kept.
 
     width : px that they need not exceed, at which they are read faster and smaller.
@@ -27,9 +27,9 @@ def frames_of(trace: Trace, shown: IntArray | None = None, width: int | None = N
     if trace.frame_jpeg is None or trace.frame_size is None:
         return None
     ends = np.cumsum(trace.frame_size).reshape(-1, 2)
-    shown = np.arange(len(ends)) if shown is None else shown
+    selected = np.arange(len(ends)) if selected is None else selected
     pairs = []
-    for k in shown:
+    for k in selected:
         pair = []
         for end, size in zip(ends[k], trace.frame_size[k], strict=True):
             image = Image.open(io.BytesIO(trace.frame_jpeg[end - size : end].tobytes()), formats=["JPEG"])
@@ -53,14 +53,14 @@ def _data(report_data: Driven | ReportData) -> Data:
     assert trace.frame_index is not None
     assert trace.frame_s is not None
     half = np.abs(trace.image_error[trace.frame_index] - 0.5 * trace.image_error[0])
-    shown = np.array([0, int(np.nanargmin(half)), len(half) - 1])
-    frames = frames_of(trace, shown)
+    selected = np.array([0, int(np.nanargmin(half)), len(half) - 1])
+    frames = frames_of(trace, selected)
     assert frames is not None
     return {
         "run": np.array(f"{title(name)}, {trace.verdict}"),
-        "instant": trace.frame_index[shown],
+        "instant": trace.frame_index[selected],
         "period_s": np.array(trace.period),
-        "found": trace.frame_s[shown],
+        "found": trace.frame_s[selected],
         "s": trace.s[:, :, order],
         "s_star": trace.s_star[:, order],
         "frames": frames,

@@ -73,8 +73,8 @@ def _data_classical(report_data: ReportData) -> Data:
 def _draw_classical(data: Data, figure: "style.Figure") -> None:
     """One row a law, one column a camera."""
     laws, size = [law for law in POINT_LAWS if f"s_{law}" in data], data["image_size"]
-    shown = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
-    heights = [_PANEL_WIDTH * style.aspect(near_pixels(s, size)) for s in shown]
+    panels = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
+    heights = [_PANEL_WIDTH * style.aspect(near_pixels(s, size)) for s in panels]
     figure.set_figheight(sum(heights) + 0.62 * len(laws) + 0.45)
     axes = figure.subplots(len(laws), 2, squeeze=False, height_ratios=heights)
     border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
@@ -99,7 +99,7 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
     }
     line_styles |= {"face hidden from this camera": _HIDDEN, "plateau of the image error": _PLATEAU}
     line_styles["end of the run"] = {"color": style.BLACK, "marker": "x", "linestyle": "none"}
-    every = np.concatenate([near_pixels(s, size) for s in shown]) / size
+    every = np.concatenate([near_pixels(s, size) for s in panels]) / size
     if (np.abs(every - 0.5) > 0.5 - _BORDER_SHOWN).any():
         line_styles["border of the image"] = _BORDER
     style.legend_below(figure, line_styles, 4)
@@ -233,7 +233,7 @@ def _data_overview(report_data: ReportData) -> Data:
 )
 def _draw_overview(data: Data, figure: "style.Figure") -> None:
     """Left the images of both cameras, right the errors."""
-    shown = [
+    panels = [
         np.concatenate(
             [
                 data["s_star"][view],
@@ -243,7 +243,7 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
         )
         for view in range(2)
     ]
-    aspect = style.aspect(np.concatenate(shown), *_ASPECTS)
+    aspect = style.aspect(np.concatenate(panels), *_ASPECTS)
     figure.set_figheight(2.0 * _IMAGE_WIDTH * aspect + 1.75)
     axes = figure.subplots(2, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
     control, image = axes[:, 1]
@@ -255,7 +255,7 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
         panel.plot(*data["center"][:, view].T, **_CENTER)
         style.face(panel, data[f"s_{DIRECT[0]}"][0, view], style.START, fill=True)
         style.face(panel, data["s_star"][view], style.GOAL)
-        style.image_axes(panel, f"{name} camera", shown[view])
+        style.image_axes(panel, f"{name} camera", panels[view])
     for index, (name, label) in enumerate(_ERRORS):
         values = data[f"{name}_percent"]
         if np.isfinite(values).all():

@@ -136,14 +136,14 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     kinds: list[tuple[IntArray, str]] = [
         (np.flatnonzero(slides == kind), "mm" if kind else "deg") for kind in np.unique(slides)
     ]
-    shown = [_shown(data, view) for view in range(2)]
-    image = _IMAGE_WIDTH * style.aspect(np.concatenate(shown), upper=_HIGHEST)
+    visible = [_visible(data, view) for view in range(2)]
+    image = _IMAGE_WIDTH * style.aspect(np.concatenate(visible), upper=_HIGHEST)
     figure.set_figheight(image + 2.0 * _ROW + 1.9)
     grid = figure.add_gridspec(3, 2, height_ratios=[image, _ROW, _ROW])
     for view in range(2):
-        _image(figure.add_subplot(grid[0, view]), data, view, shown[view])
-    places = (grid[1:, 0],) if len(kinds) == 1 else (grid[1, 0], grid[2, 0])
-    for place, (chosen, unit) in zip(places, kinds, strict=True):
+        _image(figure.add_subplot(grid[0, view]), data, view, visible[view])
+    cells = (grid[1:, 0],) if len(kinds) == 1 else (grid[1, 0], grid[2, 0])
+    for place, (chosen, unit) in zip(cells, kinds, strict=True):
         _joints(figure.add_subplot(place), data, chosen.tolist(), unit)
     shares, distances = figure.add_subplot(grid[1, 1]), figure.add_subplot(grid[2, 1])
     _curves(shares, data, {name: color for name, (_, color) in _SHARES.items()})
@@ -158,7 +158,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     style.legend_below(figure, _legend(data), 3)
 
 
-def _shown(data: Data, view: int) -> FloatArray:
+def _visible(data: Data, view: int) -> FloatArray:
     """All pixels (k, 2) that are drawn of one image."""
     names = ["s", "s_star", "center", *(f"tree_{name}" for name in _TREES if f"tree_{name}" in data)]
     drawn = [data[name][..., view, :, :] if name[0] == "s" else data[name][:, view] for name in names]
@@ -166,7 +166,7 @@ def _shown(data: Data, view: int) -> FloatArray:
     return near_pixels(np.concatenate([pixels.reshape(-1, 2) for pixels in drawn]), data["image_size"])
 
 
-def _image(axes: "style.Axes", data: Data, view: int, shown: FloatArray) -> None:
+def _image(axes: "style.Axes", data: Data, view: int, visible: FloatArray) -> None:
     for name in (name for name in data if name.startswith(f"kept_out_{VIEWS[view]}")):
         axes.fill(*data[name].T, **_KEPT_OUT)
     for name, line_style in _TREES.items():
@@ -180,7 +180,7 @@ def _image(axes: "style.Axes", data: Data, view: int, shown: FloatArray) -> None
     axes.plot(*(np.interp(at, t, column) for column in center.T), **_CORNER)
     style.face(axes, s[0], style.START, fill=True)
     style.face(axes, data["s_star"][view], style.GOAL)
-    style.image_axes(axes, f"{VIEWS[view]} camera, {data['name']}", shown)
+    style.image_axes(axes, f"{VIEWS[view]} camera, {data['name']}", visible)
     border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * data["image_size"] - 0.5
     axes.plot(*style.closed(border).T, **_EDGE)
 
@@ -263,5 +263,7 @@ def _legend(data: Data) -> dict[str, style.LineStyle]:
         "right camera": grey | {"linestyle": _SIDES[1]},
     }
     line_styles["asked for"] = grey | _ASKED
-    shown = np.concatenate([_shown(data, view) for view in range(2)]) / data["image_size"]
-    return line_styles | ({"border of the image": _EDGE} if (np.abs(shown - 0.5) > _NEAR_EDGE).any() else {})
+    visible = np.concatenate([_visible(data, view) for view in range(2)]) / data["image_size"]
+    return line_styles | (
+        {"border of the image": _EDGE} if (np.abs(visible - 0.5) > _NEAR_EDGE).any() else {}
+    )

@@ -81,15 +81,15 @@ def _draw_partition(data: Data, figure: "style.Figure") -> None:
         (rf"within plane, $\theta_p$ = {within}°", data["within_plane"], ("A_r",)),
     )
     for panel, (title, ways, ends) in zip(panels, parts, strict=True):
-        shown = [data["A"], ways.reshape(-1, 2)]
+        visible = [data["A"], ways.reshape(-1, 2)]
         if panel is panels[1]:
             panel.plot(*data["axis"].T, **_AXIS)
-            shown.append(data["axis"])
+            visible.append(data["axis"])
         style.paths(panel, ways, _PATH)
         style.face(panel, data["A"], style.START, fill=True)
         for name in ends:
             style.face(panel, data[name], targets[name])
-        style.image_axes(panel, title, np.concatenate(shown))
+        style.image_axes(panel, title, np.concatenate(visible))
     arrow = {"arrowstyle": "->", "linewidth": 0.9}
     panels[0].annotate("", data["center"][1], data["center"][0], arrowprops=arrow)
     line_styles = {

@@ -87,8 +87,8 @@ def _center_path(report_data: ReportData, trace: Trace) -> FloatArray:
     """True centre (k, 3) along a run, m, between the instants too, where the joints move linearly."""
     amount = np.abs(np.diff(trace.q, axis=0)).max(axis=1, initial=0.0)
     points = [trace.center[0]]
-    for k, most in enumerate(amount):
-        parts = max(1, int(np.ceil(most / _RESOLUTION)))
+    for k, upper in enumerate(amount):
+        parts = max(1, int(np.ceil(upper / _RESOLUTION)))
         for share in np.arange(1, parts) / parts:
             q = trace.q[k] + share * (trace.q[k + 1] - trace.q[k])
             points.append((forward_kinematics(report_data.plant.model, q) @ report_data.middle)[:3])
@@ -113,23 +113,23 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     gains = data["gain"]
     line_styles = [*(style.curve(i) for i in range(len(gains))), _LIMITED]
-    for (path_axes, most), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
+    for (path_axes, upper), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
         paths = [data[f"path_mm_{law}_{i}"] for i in range(len(gains) + 1)]
-        least = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
+        lower = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
         for path, line_style in zip(paths, line_styles, strict=True):
-            path_axes.plot(path[:, 0], np.maximum(path[:, 1], least), **line_style)
+            path_axes.plot(path[:, 0], np.maximum(path[:, 1], lower), **line_style)
         path_axes.set(title=f"{title_of(law)}: path of the centre, calibrated operators")
         path_axes.set(xlabel=_WAY, ylabel=_OFF)
         style.log_scale(path_axes)
-        path_axes.set_ylim(bottom=least)
+        path_axes.set_ylim(bottom=lower)
         for (operators, limited), line_style in _MAXIMA.items():
             size = 4.5 if operators else 3.0  # an empty marker shows around a full one
-            most.plot(gains, deviation[operators, limited], markersize=size, **line_style)
-        most.set(title=f"{title_of(law)}: largest distance", xscale="log")
-        most.set(xlabel="gain per step (1)", ylabel="largest distance (mm)")
-        most.set_xticks(gains, [f"{gain:g}" for gain in gains])
-        most.minorticks_off()
-        style.log_scale(most)
+            upper.plot(gains, deviation[operators, limited], markersize=size, **line_style)
+        upper.set(title=f"{title_of(law)}: largest distance", xscale="log")
+        upper.set(xlabel="gain per step (1)", ylabel="largest distance (mm)")
+        upper.set_xticks(gains, [f"{gain:g}" for gain in gains])
+        upper.minorticks_off()
+        style.log_scale(upper)
     limit = f"{float(data['step_limit_deg']):g}° per step"
     legend = {
         f"gain {gain:g} per step": line_style for gain, line_style in zip(gains, line_styles, strict=False)
@@ -194,7 +194,7 @@ def _draw_modes(data: Data, figure: "style.Figure") -> None:
         axes.plot(way, off, **style.curve(i))
     axes.set(title="path of the centre", xlabel=_WAY, ylabel=_OFF)
     style.legend_below(figure, {title(name): style.curve(i) for i, name in enumerate(names)}, 2)
-    most = [float(data[f"path_mm_{name}"][:, 1].max()) for name in names]
-    if min(most) > 0.0 and max(most) > _WIDE * min(most):
+    upper = [float(data[f"path_mm_{name}"][:, 1].max()) for name in names]
+    if min(upper) > 0.0 and max(upper) > _WIDE * min(upper):
         style.log_scale(axes)
-        axes.set_ylim(bottom=_LEAST_OF_MODES * min(most))
+        axes.set_ylim(bottom=_LEAST_OF_MODES * min(upper))

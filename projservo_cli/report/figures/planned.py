@@ -134,10 +134,10 @@ def _draw_planned(data: Data, figure: "style.Figure") -> None:
     else:  # of a path through joint space
         margins = figure.add_subplot(grid[:, 1])
     style.paths(image, faces, {"color": style.GREY, "linewidth": 0.6})
-    shown = np.unique(np.linspace(0, len(sigma) - 1, _FACES).round().astype(int))
-    for j in shown:
+    visible = np.unique(np.linspace(0, len(sigma) - 1, _FACES).round().astype(int))
+    for j in visible:
         color = colormaps["cividis"](0.82 * sigma[j])
-        ends = j in (shown[0], shown[-1])
+        ends = j in (visible[0], visible[-1])
         style.face(image, faces[j], {"color": color, "linewidth": 1.8 if ends else 1.0})
     style.image_axes(image, f"from the rig's centre, {data['profile']}", faces)
     place: Any = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "va": "bottom"}
@@ -199,11 +199,11 @@ def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
         there = (M + share * plan.tau * moved).reshape(-1, 4)
         m = (there @ P.swapaxes(1, 2)).reshape(2, *M.shape[:3], 3)
         u, v = np.moveaxis(distort_visible(lens[:, None, None, None], m[..., :2] / m[..., 2:]), -1, 0)
-        least = np.minimum(np.minimum(u + 0.5, wide - u), np.minimum(v + 0.5, high - v)).min(axis=1)
+        lowest = np.minimum(np.minimum(u + 0.5, wide - u), np.minimum(v + 0.5, high - v)).min(axis=1)
         front = (m[..., 2] * depth > 0.0).all(axis=1)
-        least = np.where(front & np.isfinite(least), least, -np.inf)
-        best = least.min(axis=0).argmax(axis=1)
-        result[:, i] = least[:, np.arange(len(mu)), best]
+        lowest = np.where(front & np.isfinite(lowest), lowest, -np.inf)
+        best = lowest.min(axis=0).argmax(axis=1)
+        result[:, i] = lowest[:, np.arange(len(mu)), best]
     return result
 
 
@@ -266,11 +266,11 @@ def _map(axes: "style.Axes", data: Data, view: int) -> None:
 
 def _clear(contours: Any, lines: FloatArray) -> list[FloatArray]:
     """A place (2,) on each piece of each contour, away from the points (k, 2), the border and one another."""
-    places: list[FloatArray] = []
+    positions: list[FloatArray] = []
     for piece in (piece for pieces in contours for piece in pieces if len(piece) > 1):
-        taken = np.concatenate([lines, np.reshape(places, (-1, 2))])
+        taken = np.concatenate([lines, np.reshape(positions, (-1, 2))])
         room = np.linalg.norm(piece[:, None] - taken, axis=2).min(axis=1)
         room = np.minimum(room, np.minimum(piece, 1.0 - piece).min(axis=1))
         if room.max() > LABEL:
-            places.append(piece[room.argmax()])
-    return places
+            positions.append(piece[room.argmax()])
+    return positions

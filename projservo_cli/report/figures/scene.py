@@ -29,8 +29,8 @@ def _data(report_data: ReportData) -> Data:
         "robot": skeleton(joint_operators(plant.model, q), robot.joint_types, tool),
         "face_start": (face @ start.T)[:, :3],
     }
-    shown = pyramids(plant, result["face_start"])
-    result |= {"cameras": shown[:, 0], "pyramids": shown}
+    visible = pyramids(plant, result["face_start"])
+    result |= {"cameras": visible[:, 0], "pyramids": visible}
     goals = (trace.goal_pose for trace in report_data.traces.values() if np.isfinite(trace.goal_pose).all())
     if (pose := next(goals, None)) is not None:
         goal = pose @ np.linalg.inv(robot.base_tool)
@@ -95,22 +95,22 @@ def _draw(data: Data, figure: "style.Figure") -> None:
             axes.plot(*np.stack([center, corner]).T, **line_style)
     axes.plot(*style.closed(data["face_start"]).T, **style.START)
     line_styles = {"robot at the start": robot, "face at the start": style.START}
-    shown = [data["robot"], data["pyramids"].reshape(-1, 3), data["face_start"]]
+    visible = [data["robot"], data["pyramids"].reshape(-1, 3), data["face_start"]]
     if "face_goal" in data:
         goal: style.LineStyle = {"color": style.VERMILION, "linestyle": (0, (3, 1))}
         axes.plot(*style.closed(data["face_goal"]).T, **goal)
         line: style.LineStyle = {"color": style.GREY, "linestyle": (0, (1, 1))}
         axes.plot(*data["line"].T, **line)
         line_styles |= {"face at the goal": goal, "straight line of the centre": line}
-        shown.append(data["face_goal"])
-    points = np.concatenate(shown)
+        visible.append(data["face_goal"])
+    points = np.concatenate(visible)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = 0.05 * (high - low).max()
     extent = np.stack([low - pad, high + pad], axis=1)
     for name, (a, b) in zip("xyz", extent, strict=True):
         getattr(axes, f"set_{name}lim")(a, b)
         getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 10)
-        step = next(step for step, most in ((0.1, 0.4), (0.25, 0.75), (0.5, np.inf)) if b - a < most)
+        step = next(step for step, upper in ((0.1, 0.4), (0.25, 0.75), (0.5, np.inf)) if b - a < upper)
         getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(step))
     axes.tick_params(pad=0)
     towards = data["cameras"].mean(axis=0) - points.mean(axis=0)  # from the side of the rig
@@ -131,9 +131,9 @@ def _fit(axes: Any, figure: "style.Figure", extent: FloatArray) -> None:
         axes.set_box_aspect(size, zoom=zoom)
         figure.draw_without_rendering()
         m = axes.get_proj() @ corners
-        shown = axes.transData.transform((m[:2] / m[3]).T)
+        visible = axes.transData.transform((m[:2] / m[3]).T)
         labels = [axis.get_tightbbox().get_points() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
-        taken = np.concatenate([shown, *labels])
+        taken = np.concatenate([visible, *labels])
         low = np.array([0.0, figure.legends[0].get_window_extent().y1])
         room = figure.bbox.get_points()[1] - low
         zoom *= 0.95 * float((room / np.ptp(taken, axis=0)).min())
