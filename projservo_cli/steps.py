@@ -58,7 +58,7 @@ class Step:
         return f"{SERVO}{self.law}" if self.law else self.stage
 
     @property
-    def states(self) -> str:
+    def status(self) -> str:
         """State of a result that is not to be made."""
         return f"up to date, though {self.note}" if self.note else "up to date"
 

@@ -237,7 +237,7 @@ def test_a_law_that_must_converge_decides_the_exit_code(projservo, stages):
     stages.verdicts = {"direct_three": "no progress"}
     answer = projservo("servo", "-o", "out", "--law", "direct_three", "--force", "--json")
     assert answer.code == 1
-    assert "direct_three must converge, but ended in plateau" in answer.err
+    assert "direct_three must converge, but ended in no progress" in answer.err
     assert answer.json["laws"][0]["verdict"] == "no progress"
     assert projservo("servo", "report", "-o", "out").code == 1  # up to date, and still not converged
     assert projservo("servo", "-o", "out", "--set", "control.must_converge=[stacked]").code == 1
@@ -271,7 +271,7 @@ def test_a_named_law_must_converge_unless_it_is_classical_or_the_configuration_s
     by_flag = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", law, *sets)
     named = projservo("servo", "-c", "tiny.yaml", "-o", "two", "--set", f"control.laws=['{law}']", *sets)
     for answer in (by_flag, named):
-        assert (answer.code, answer.err.count("ended in plateau: text ä\n")) == (code, 1)
+        assert (answer.code, answer.err.count("ended in no progress: text ä\n")) == (code, 1)
         assert (" must converge, but ended" in answer.err) == bool(code)
 
 
@@ -306,7 +306,7 @@ def test_without_a_truth_the_table_tells_errors_in_the_images(projservo, stages,
     answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", "exact")
     head, columns, row = answer.out.splitlines()[:3]
     assert head == "servo: image errors at the end, self-occluded steps left/right"
-    assert columns.split() == ["law", "verdict", "steps", "px", "about", "mm", "occluded"]
+    assert columns.split() == ["law", "verdict", "steps", "image", "px", "about", "mm", "occluded"]
     assert row.split() == ["exact", "converged", "3", "0.25", "0.5", "3/3"]
     told |= {"position_error_mm": 2.0, "estimated_position_error_mm": None}
     answer = projservo("servo", "-o", "out", "--law", "exact", "--force")
