@@ -1,5 +1,6 @@
 """Monitor of a run: tests each look, holds the arm while looks disagree, and names the fault."""
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from projservo_cli.monitoring.statistics import (
     WINDOW,
     Detector,
     ErrorModel,
+    MemoryState,
     Residual,
     Sums,
     columns_of_marker,
@@ -50,6 +52,8 @@ _COVERED = 0.5
 _MOST_FOR_LONG = 0.25
 # Share of a slip that the set-point of a joint went without its reading: then the reading is frozen.
 _UNANSWERED = 0.5
+# Looks in which a hand comes or goes.
+_COMES = 10
 # Looks that are remembered one by one.
 _REMEMBERED = 80
 # Chance of a false alarm of one look alone: that of a look among so many.
@@ -66,6 +70,14 @@ class _Kept(NamedTuple):
     view: int  # number of the view that it is of
     views: int  # views that agreed up to it
     covered: bool  # whether something passes before a view
+
+
+class _Recent(NamedTuple):
+    """One of the last looks, as a hand that comes or goes shows in it."""
+
+    whole: bool  # whether both views show all markers that they did, and none is off by itself
+    hidden: bool  # whether a view shows less than half of them
+    state: MemoryState  # looks that agreed before it
 
 
 class ImageMonitor:
@@ -110,6 +122,7 @@ class ImageMonitor:
         self._pairing = Pairing()
         self._first: FloatArray | None = None  # (n,) joints of the first look, rad or m
         self._kept: list[_Kept] = []
+        self._recent: deque[_Recent] = deque(maxlen=_COMES)
         self.looks = self._view = 0
         self._at_view: FloatArray | None = None  # (2, m, 2) px predicted where the view began
         # Looks that disagree, the number of the first of them, and looks in a row that agree.
@@ -195,7 +208,7 @@ class ImageMonitor:
         self.rejected[:, self._shown[self._forgiven]] = True
         since, clean = None, residual.without(tested.aside)
         memory.learn(residual, tested.aside, tested.disagrees)
-        kept, covered = self._kept[-_REMEMBERED:], self._is_covered(residual)
+        kept, covered = self._kept[-_REMEMBERED:], self._is_covered(residual, tested.aside)
         self._sound = (self._sound + 1) * (not tested.disagrees)
         # What a hand leaves of a view tells nothing, nor looks between those that disagree.
         if self._sound > WINDOW * self.holds and not covered:
@@ -252,10 +265,25 @@ class ImageMonitor:
         self._crowded = 0
         return False
 
-    def _is_covered(self, residual: Residual) -> bool:
-        """Whether a view sees less than half of what it saw: something passes before it, and hides edges."""
-        seen = [one.residual.seen.sum(axis=1) for one in self._kept[-_REMEMBERED:]]
-        return bool((residual.seen.sum(axis=1) < _COVERED * np.max(seen or [[0, 0]], axis=0)).any())
+    def _is_covered(self, residual: Residual, aside: BoolArray) -> bool:
+        """Whether something passes before a view: it shows less than half of what it did, or did so just now.
+
+        A hand pulls the corners next to it before it hides them, by less than one look shows: looks in which
+        it came are forgotten, and those in which it goes are not kept.
+        """
+        count, memory = residual.seen.sum(axis=1), self._detector.memory
+        most = np.max([count, *(one.residual.seen.sum(axis=1) for one in self._kept[-_REMEMBERED:])], axis=0)
+        hidden = bool((count < _COVERED * most).any())
+        whole = bool((count >= most).all() and not aside.any())
+        was = bool(self._kept) and self._kept[-1].covered
+        goes = was and not whole and any(one.hidden for one in self._recent)
+        if hidden and not was:
+            for one in reversed(self._recent):
+                if one.whole:
+                    break
+                memory.return_to(one.state)
+        self._recent.append(_Recent(whole=whole, hidden=hidden, state=memory.state))
+        return hidden or goes
 
     def _clear(self) -> None:
         """Clear what is pending where looks agree again; a fault that shows in motion alone is named."""

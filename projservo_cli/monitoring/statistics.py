@@ -4,7 +4,7 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import cho_solve, eigh, solve_triangular
 from scipy.special import chdtri
 
 from projservo_cli.calibration.detections import MIN_SIGMA, per_rad
@@ -23,9 +23,11 @@ _LONGER = 1.5
 _BEYOND_FIRST_ORDER = 0.02
 # Lasting errors of a joint, by backlash and counts, differ between two times by √2 of their deviation.
 _LASTING = np.sqrt(2.0)
-# The part of a corner's error that is not new in each frame may last beyond a view. The χ² of such errors is
-# taken at this chance for the corners that a fault touches: two deviations rms for one, 1.3 for a camera.
+# The χ² of the errors that corners keep in one view is taken at this chance, for those that a fault touches:
+# two deviations rms for one corner, 1.3 for a camera.
 _LASTING_CORNERS = 3e-3
+# Differences between successive frames: of one view in motion, of one view at rest, and of two views.
+_IN_MOTION, _AT_REST, _BETWEEN_VIEWS = range(3)
 # Sightings of the calibration tell how a corner errs that is seen from within about this angle, rad; beside
 # them count so many of typical ones.
 _SLANT, _PRIOR_SIGHTINGS = 0.25, 4.0
@@ -74,6 +76,9 @@ class Sums(NamedTuple):
     looks: int  # views that they come from
     t: float  # when the last was taken, s from the first look
     normal: FloatArray  # (c, c) of errors of the calibration, of what may be wrong, and of the residual
+    by_corner: FloatArray  # (c - 1, 4 m) its last column by coordinates that all show off by one deviation
+    weight: float  # single looks that they are worth
+    weight_squares: float  # Σ of its square over views
     seen: FloatArray  # (2, m) coordinates seen of each marker
     bias: FloatArray  # (2, m) squared errors of the model that they may have, over the noise
 
@@ -83,13 +88,23 @@ class Sums(NamedTuple):
             looks=self.looks + other.looks,
             t=other.t,
             normal=self.normal + factor * other.normal,
+            by_corner=self.by_corner + factor * other.by_corner,
+            weight=self.weight + factor * other.weight,
+            weight_squares=self.weight_squares + factor**2 * other.weight_squares,
             seen=self.seen + factor * other.seen,
             bias=self.bias + factor * other.bias,
         )
 
     def times(self, factor: float) -> "Sums":
         """The same with another weight."""
-        return self._replace(normal=factor * self.normal, seen=factor * self.seen, bias=factor * self.bias)
+        return self._replace(
+            normal=factor * self.normal,
+            by_corner=factor * self.by_corner,
+            weight=factor * self.weight,
+            weight_squares=factor**2 * self.weight_squares,
+            seen=factor * self.seen,
+            bias=factor * self.bias,
+        )
 
 
 class ErrorModel:
@@ -210,15 +225,34 @@ class ErrorModel:
     def sums(self, residual: Residual, t: float) -> Sums:
         """What one look adds to the normal equations."""
         rows = np.concatenate([residual.B, residual.F, residual.r[:, None]], axis=1)
-        rows = solve_triangular(np.linalg.cholesky(residual.R), rows, lower=True, check_finite=False)
-        bias = 2.0 * residual.seen * (self.bias_px / residual.noise) ** 2
-        return Sums(looks=1, t=t, normal=rows.T @ rows, seen=np.where(residual.seen, 2.0, 0.0), bias=bias)
+        root = np.linalg.cholesky(residual.R)
+        rows = solve_triangular(root, rows, lower=True, check_finite=False)
+        by_corner = solve_triangular(root, rows[:, :-1], lower=True, trans="T", check_finite=False).T
+        return Sums(
+            looks=1,
+            t=t,
+            normal=rows.T @ rows,
+            by_corner=by_corner * np.repeat(residual.noise.ravel(), 2),
+            weight=1.0,
+            weight_squares=1.0,
+            seen=np.where(residual.seen, 2.0, 0.0),
+            bias=2.0 * residual.seen * (self.bias_px / residual.noise) ** 2,
+        )
 
     def nothing(self) -> Sums:
         """Sums of no look."""
         c = self.e + self.f + 1
         none = np.zeros((2, len(self.calibration.M)))
-        return Sums(looks=0, t=0.0, normal=np.zeros((c, c)), seen=none, bias=none)
+        return Sums(
+            looks=0,
+            t=0.0,
+            normal=np.zeros((c, c)),
+            by_corner=np.zeros((c - 1, 2 * none.size)),
+            weight=0.0,
+            weight_squares=0.0,
+            seen=none,
+            bias=none,
+        )
 
     def root(self, sums: Sums) -> FloatArray:
         """Root (e, e) of the information on the errors of the calibration."""
@@ -243,6 +277,15 @@ class ErrorModel:
         return np.asarray(line.T @ weight @ line)
 
 
+class MemoryState(NamedTuple):
+    """Looks that agreed up to one time."""
+
+    closed: tuple[Sums, ...]
+    view: Sums
+    length: float  # looks of that view, fading
+    first: FloatArray | None
+
+
 class Memory:
     """Looks that agreed, view by view: looks of one view share the errors of their corners."""
 
@@ -255,8 +298,8 @@ class Memory:
         self._first: FloatArray | None = None  # (2, m, 2) px predicted at its beginning
         # The last look, as ``learn`` is given it.
         self._before: tuple[Residual, BoolArray, bool] | None = None
-        # Of differences from look to look, over σ²: in motion, and at rest.
-        self._squares, self._freedom = np.zeros(2), np.zeros(2)
+        # Of differences from look to look, over σ²: in motion, at rest, and between views.
+        self._squares, self._freedom = np.zeros(3), np.zeros(3)
         # Of each sighting (2, m) from look to look at rest, px².
         self._steps: deque[FloatArray] = deque(maxlen=_DIFFERENCES)
 
@@ -277,11 +320,19 @@ class Memory:
 
         No more than is sure; a finder that makes the same error in each frame has none.
         """
-        i = int(self._freedom[1] >= _ENOUGH)
-        if not self._freedom[i]:
+        return self._sure_share(_AT_REST if self._freedom[_AT_REST] >= _ENOUGH else _IN_MOTION)
+
+    @property
+    def persistent(self) -> float:
+        """Greatest share of the variance of a corner that lasts beyond a view, by differences of views."""
+        return 1.0 - max(self.fresh, self._sure_share(_BETWEEN_VIEWS))
+
+    def _sure_share(self, kind: int) -> float:
+        """Share of the variance that differences of a kind have at least, by two deviations."""
+        if not self._freedom[kind]:
             return 0.0
-        sure = 1.0 - 2.0 * np.sqrt(2.0 / self._freedom[i])
-        return float(np.clip(self._squares[i] / self._freedom[i], 0.0, 1.0) * max(0.0, sure))
+        sure = 1.0 - 2.0 * np.sqrt(2.0 / self._freedom[kind])
+        return float(np.clip(self._squares[kind] / self._freedom[kind], 0.0, 1.0) * max(0.0, sure))
 
     def worth(self, looks: float) -> float:
         """How many single looks so many looks of one view are worth."""
@@ -298,8 +349,20 @@ class Memory:
         if self._total is None:
             self._total = self._closed[-1]
             if self._count:
-                self._total = self._total.plus(self._view.times(self.worth(self._count) / self._count))
+                worth = self.worth(self._count)
+                view = self._view.times(worth / self._count)
+                self._total = self._total.plus(view._replace(weight_squares=worth**2))
         return self._total
+
+    @property
+    def state(self) -> MemoryState:
+        """Looks so far, to return to."""
+        return MemoryState(closed=tuple(self._closed), view=self._view, length=self._count, first=self._first)
+
+    def return_to(self, state: MemoryState) -> None:
+        """Forget the looks since a state."""
+        self._closed, self._total = list(state.closed), None
+        self._view, self._count, self._first = state.view, state.length, state.first
 
     def onsets(self) -> list[Sums]:
         """Sums before each time that something may have begun, the earliest first."""
@@ -337,30 +400,36 @@ class Memory:
         disagrees : whether this look does; one that does and one that does not tell nothing.
         """
         last, self._before = self._before, (now, aside, disagrees)
-        i = int(last is not None and _alike(last[0].predicted, now.predicted, _AT_REST_PX))
-        if not i:
+        kind = _IN_MOTION if last is None else _kind_of(last[0].predicted, now.predicted)
+        if kind != _AT_REST:
             self._steps.clear()
-        if last is None or last[2] != disagrees or not is_same_view(last[0].predicted, now.predicted):
+        if last is None or last[2] != disagrees:
             return
         before, n = last[0], len(self._errors.sigma_q)
         seen = before.seen & now.seen
         rows = np.repeat((seen & ~aside & ~last[1]).ravel(), 2)
-        weight = 1.0 / np.repeat(now.noise.ravel(), 2)
-        off, moved = (now.r - before.r) * weight, now.F[:, [*range(n), 2 * n, 2 * n + 1]] * weight[:, None]
+        weight, columns = 1.0 / np.repeat(now.noise.ravel(), 2)[:, None], [*range(n), 2 * n, 2 * n + 1]
+        off, moved = (now.r - before.r) * weight[:, 0], now.F[:, columns] * weight
+        if kind == _BETWEEN_VIEWS:
+            moved = np.concatenate([moved, before.F[:, columns] * weight], axis=1)
         basis, R = np.linalg.qr(moved[rows])
         along = basis.T @ off[rows]
         freedom = len(basis) - basis.shape[1]
-        if freedom > 0:
-            square = float(off[rows] @ off[rows] - along @ along)
+        if freedom <= 0:
+            return
+        square = float(off[rows] @ off[rows] - along @ along)
+        if kind == _BETWEEN_VIEWS:
+            # Errors of the calibration differ between views, by no more than its covariance tells.
+            by_errors = ((now.B - before.B) * weight)[rows]
+            square = max(0.0, square - float(np.square(by_errors - basis @ (basis.T @ by_errors)).sum()))
+        elif kind == _AT_REST:
             off -= moved @ np.linalg.lstsq(R, along)[0]
-            if i:
-                step = 0.5 * np.square(off / weight).reshape(*seen.shape, 2).sum(axis=2)
-                self._steps.append(np.where(seen, step, np.nan))
-            # Fading, so that what a finder does in one light does not count for ever.
-            self._squares[i] *= 0.99
-            self._squares[i] += 0.5 * square
-            self._freedom[i] = 0.99 * self._freedom[i] + freedom
-            self._total = None
+            step = 0.5 * np.square(off / weight[:, 0]).reshape(*seen.shape, 2).sum(axis=2)
+            self._steps.append(np.where(seen, step, np.nan))
+        # Fading, so that what a finder does in one light does not count for ever.
+        self._squares[kind] = 0.99 * self._squares[kind] + 0.5 * square
+        self._freedom[kind] = 0.99 * self._freedom[kind] + freedom
+        self._total = None
 
 
 def is_same_view(before: FloatArray, now: FloatArray) -> bool:
@@ -368,10 +437,36 @@ def is_same_view(before: FloatArray, now: FloatArray) -> bool:
     return _alike(before, now, _SAME_VIEW_PX)
 
 
+def _kind_of(before: FloatArray, now: FloatArray) -> int:
+    """Kind of the difference between two looks by their predicted pixels (2, m, 2)."""
+    if not is_same_view(before, now):
+        return _BETWEEN_VIEWS
+    return _AT_REST if _alike(before, now, _AT_REST_PX) else _IN_MOTION
+
+
 def _alike(before: FloatArray, now: FloatArray, within_px: float) -> bool:
     """Whether predicted pixels (2, m, 2) are the same within so many px rms."""
     moved = np.square(now - before).sum(axis=-1)
     return bool(np.nanmean(np.append(moved, 0.0)) <= within_px**2)
+
+
+class _Reduced(NamedTuple):
+    """Normal equations of faults since an onset, beside all errors that are none: a Schur complement."""
+
+    normal: FloatArray  # (f + 1, f + 1) of what may be wrong, and of the residual
+    least: FloatArray  # (f + 1,) its diagonal at least
+    root: FloatArray  # (e, e) of the information on errors of the calibration
+    along: FloatArray  # (e, f) what may be wrong along these
+    beside: IntArray  # (k,) columns of lasting errors of joints and instants
+    solved: FloatArray  # (k, f) and what may be wrong along those
+    line: FloatArray  # (f, f) to time from the onset
+
+    def of(self, rows: FloatArray) -> FloatArray:
+        """Other right-hand sides (e + f, k) of the equations, (f, k) after the same steps."""
+        e = len(self.root)
+        found = self.line @ rows[e:]
+        found -= self.along.T @ solve_triangular(self.root, rows[:e], lower=True, check_finite=False)
+        return np.asarray(found - self.solved.T @ found[self.beside])
 
 
 class Tested(NamedTuple):
@@ -469,36 +564,78 @@ class Detector:
         most = 0.0
         for length in lengths if thorough else lengths[[looks % len(lengths)]]:
             since = min(onsets, key=lambda sums: abs(total.looks - length - sums.looks))
-            gain, bias = self._gain(since, total, late, free)
-            excess = float((np.sqrt(gain) - by_chance - np.sqrt(bias)).max())
+            excess = float(
+                self._excess(since, total, self._reduced(since, total, late, free), by_chance).max()
+            )
             if excess > most:
                 found, most = since, excess
         return found
 
-    def _gain(
-        self, since: Sums, total: Sums, late: FloatArray, free: list[IntArray]
-    ) -> tuple[FloatArray, FloatArray]:
-        """What each direction gains since an onset (h,), and what errors of the model may."""
-        e, n = self._errors.e, len(self._errors.sigma_q)
+    def _reduced(self, since: Sums, total: Sums, late: FloatArray, free: list[IntArray]) -> _Reduced:
+        """Normal equations of faults since an onset, beside errors of the calibration and lasting ones."""
+        e, f, n = self._errors.e, self._errors.f, len(self._errors.sigma_q)
+        line = np.eye(f)
+        line[n : 2 * n, :n] = -since.t * np.eye(n)
         across = (total.normal - since.normal)[:, e:]
-        for part in (across.T, across[e:]):  # time is from the onset
-            part[n : 2 * n] -= since.t * part[:n]
+        across[:, :f] = across[:, :f] @ line.T
+        across[e:-1] = line @ across[e:-1]
         least = RIDGE * across[e:].diagonal()
         across[:e, -1] = total.normal[:e, -1]
-        W = solve_triangular(self._errors.root(total), across[:e], lower=True, check_finite=False)
-        normal = across[e:] - W.T @ W
+        root = self._errors.root(total)
+        along = solve_triangular(root, across[:e], lower=True, check_finite=False)
+        normal = across[e:] - along.T @ along
         beside = np.concatenate([np.arange(2 * n + 2), *free]).astype(np.int64)
         weight = np.diag(np.maximum(least[beside], RIDGE))
         weight[: 2 * n + 2, : 2 * n + 2] = self._errors.lasting(total.t - since.t, late)
         solved = np.linalg.solve(normal[np.ix_(beside, beside)] + weight, normal[beside])
         normal -= normal[:, beside] @ solved
-        gain = np.zeros(len(self._sizes))
+        return _Reduced(
+            normal=normal,
+            least=least,
+            root=root,
+            along=along[:, :f],
+            beside=beside,
+            solved=solved[:, :f],
+            line=line,
+        )
+
+    def _excess(self, since: Sums, total: Sums, reduced: _Reduced, by_chance: FloatArray) -> FloatArray:
+        """Root of what each direction gains (h,) beyond chance, errors of the model and of corners.
+
+        Corners err at their worst in each view; or they do so in one, as independent from view to view, and
+        those that last beyond a view add to the covariance of a direction. The bound that allows less holds.
+        Of both only the part counts that errors of joints do not cover.
+        """
+        touches, parts = self._errors.touches, self._errors.parts
+        bias = touches @ (total.bias - since.bias).ravel()
+        gained = self._root_gains(reduced, 0.0)
+        excess = gained - by_chance - np.sqrt(bias)
+        beyond = np.flatnonzero(excess > 0.0)
+        if not beyond.size:
+            return excess
+        # Corners that are off all along change the calibration that looks before the onset tell, too.
+        e, memory = self._errors.e, self.memory
+        by_corner = total.by_corner - since.by_corner
+        by_corner[:e] = total.by_corner[:e]
+        off = reduced.of(by_corner)
+        spread, weight = off @ off.T, total.weight - since.weight
+        share = np.minimum([_greatest(spread, reduced, parts[i]) / weight for i in beyond], 1.0)
+        touched, seen = touches[beyond], (total.seen - since.seen).ravel()
+        corners = np.maximum(2.0 * touched @ (seen > 0.0), 4.0)  # coordinates of a view
+        worst = (1.0 - memory.fresh) * chdtri(corners, _LASTING_CORNERS) / corners * share * (touched @ seen)
+        one = (total.weight_squares - since.weight_squares) / weight**2  # what one view is of all
+        beside = self._root_gains(reduced, (1.0 - one) * memory.persistent * spread)
+        limits = [by_chance[beyond] + np.sqrt(bias[beyond] + part * worst) for part in (1.0, one)]
+        excess[beyond] = np.maximum(gained[beyond] - limits[0], beside[beyond] - limits[1])
+        return excess
+
+    def _root_gains(self, reduced: _Reduced, more: FloatArray | float) -> FloatArray:
+        """Root (h,) of what each direction gains, its score with more covariance (f, f)."""
+        normal, gain = reduced.normal, np.zeros(len(self._sizes))
+        covariance = normal[:-1, :-1] + more
         for which, columns in self._by_size:
-            gain[which] = gains(normal, normal[:, -1], columns, least)[0]
-        touches, seen = self._errors.touches, (total.seen - since.seen).ravel()
-        corners = np.maximum(2.0 * touches @ (seen > 0.0), 4.0)  # coordinates of a view
-        lasting = (1.0 - self.memory.fresh) * chdtri(corners, _LASTING_CORNERS) / corners
-        return gain, touches @ (total.bias - since.bias).ravel() + lasting * (touches @ seen)
+            gain[which] = gains(covariance, normal[:-1, -1], columns, reduced.least[:-1])[0]
+        return np.sqrt(gain)
 
 
 def gains(
@@ -510,6 +647,14 @@ def gains(
     b = right[parts] / size
     x = np.linalg.solve(blocks + RIDGE * np.eye(parts.shape[1]), b[..., None])[..., 0]
     return np.maximum((b * x).sum(axis=1), 0.0), x / size
+
+
+def _greatest(spread: FloatArray, reduced: _Reduced, part: IntArray) -> float:
+    """Greatest ratio of a covariance (f, f) to that of the score of a direction."""
+    own, other = reduced.normal[np.ix_(part, part)], spread[np.ix_(part, part)]
+    size = np.sqrt(np.maximum(own.diagonal(), np.maximum(reduced.least[part], 1e-300)))
+    unit = np.outer(size, size)
+    return float(eigh(other / unit, own / unit + _RANK * np.eye(len(part)), eigvals_only=True)[-1])
 
 
 def beside_others(S: FloatArray, r: FloatArray) -> FloatArray:
