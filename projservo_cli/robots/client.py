@@ -172,7 +172,7 @@ class DrivenRobot:
         if self.monitor is not None:
             q_dot = np.stack([history.speed_at(float(t)) for t in frames.t])
             self.monitor.unanswered = self.steered.set_point.unanswered
-            fault = self.monitor.look(
+            fault = self.monitor.observe(
                 frames.t, q_then, q_dot, frames.sigma, images, frames.fresh, stated=stated
             )
             self.disturbance = fault or self.disturbance
@@ -220,12 +220,12 @@ class DrivenRobot:
         Nothing is moved meanwhile.
         """
         for look in range(1, _MOST_LOOKS):
-            tested = 0 if self.monitor is None else self.monitor.looks
+            tested = 0 if self.monitor is None else self.monitor.observations
             self.joints()
             self.observe()
             if self.disturbance or self._agreed(look):
                 return self.disturbance
-            if self.monitor is None or self.monitor.looks > tested:
+            if self.monitor is None or self.monitor.observations > tested:
                 continue  # the next look shows another image
             if not self.robot.waits(self.robot.bounds.period):  # time passes in commands alone
                 if look >= WINDOW and self.monitor.agreeing and not self.pending:

@@ -83,7 +83,7 @@ def first_alarm(arm, read, s, q_dot=None, delay_sigma=0.0, fresh=None, sigma=SIG
         speed = np.zeros(read.shape[1]) if q_dot is None else q_dot[k]
         new = np.ones(2, dtype=bool) if fresh is None else fresh[k]
         at_once, t = (np.stack([row] * 2) for row in (read[k], speed)), np.full(2, PERIOD * k)
-        said = test.look(t, *at_once, np.full(2, delay_sigma), s[k], new, stated=stated)
+        said = test.observe(t, *at_once, np.full(2, delay_sigma), s[k], new, stated=stated)
         if said:
             return k, said
     return None, ""
@@ -130,7 +130,7 @@ def test_ticks_that_last_at_rest_do_not_average_into_a_slip(arm):
         test = ImageMonitor(arm.calibration, SIGMA, LOOKS)
         held = []
         for k in range(len(read)):
-            test.look(
+            test.observe(
                 np.full(2, PERIOD * k), *at_once(np.stack([read[k], 0 * q[k]])), np.zeros(2), s[k], [1, 1]
             )
             held.append(test.holds)
@@ -207,7 +207,7 @@ def test_what_one_camera_shows_later_is_no_fault_of_the_other(arm):
     for k in range(late, len(q)):
         rows = [k, k - late]
         t, shown = PERIOD * np.array(rows), np.stack([s[k, 0], s[k - late, 1]])
-        if said := test.look(t, q[rows], q_dot[rows], np.zeros(2), shown, np.ones(2, dtype=bool)):
+        if said := test.observe(t, q[rows], q_dot[rows], np.zeros(2), shown, np.ones(2, dtype=bool)):
             break
     assert "joint 3 slipped" in said
     assert 20 + late < k < 20 + late + 2 * WINDOW
@@ -409,7 +409,7 @@ def test_looks_in_which_a_hand_comes_and_goes_are_not_kept(arm):
     s[12:16, 1, :7] = np.nan
     test, new, views = ImageMonitor(arm.calibration, SIGMA, LOOKS), np.ones(2, dtype=bool), []
     for k in range(len(q)):
-        test.look(np.full(2, PERIOD * k), at_once(q)[k], np.zeros((2, 6)), np.zeros(2), s[k], new)
+        test.observe(np.full(2, PERIOD * k), at_once(q)[k], np.zeros((2, 6)), np.zeros(2), s[k], new)
         views.append(test._detector.memory.views)
     assert views[7] < views[11]
     assert views[12] == views[17] == views[7]
@@ -428,7 +428,7 @@ def test_a_slip_by_what_the_set_point_went_without_the_reading_is_a_frozen_one(a
     test.unanswered = -unanswered / 3.0 * slip
     still, new = np.zeros((2, 6)), np.ones(2, dtype=bool)
     for k in range(len(q)):
-        said = test.look(np.full(2, PERIOD * k), at_once(q)[k], still, np.zeros(2), s[k], new)
+        said = test.observe(np.full(2, PERIOD * k), at_once(q)[k], still, np.zeros(2), s[k], new)
         if said:
             break
     assert name in said
