@@ -1,4 +1,4 @@
-"""Frames of both cameras, paired into looks in the order in which they were taken."""
+"""Frames of both cameras, paired into observations in the order in which they were taken."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.records import BoolArray, FloatArray
 
-# Frames of both views so near to each other, s, are one look; so many are kept for those of the other view.
+# Frames of both views within this time, s, are one observation; number that waits for the other view.
 _TOGETHER_S, _WAITING = 0.025, 25
 # Between readings joints are taken to go straight: they are off by this share of the time times the change of
 # their speed at most.
@@ -27,7 +27,7 @@ class Frame(NamedTuple):
 class FramePair(NamedTuple):
     """Both images of one time; a view without a frame then sees no marker."""
 
-    t: FloatArray  # (2,) s, from the first look on
+    t: FloatArray  # (2,) s, from the first observation on
     q: FloatArray  # (2, n) rad or m
     q_dot: FloatArray  # (2, n)
     late: FloatArray  # (2,) s
@@ -59,7 +59,7 @@ class Pairing:
         self._reached = np.maximum(self._reached, t)
 
     def next(self, at_rest: bool) -> FramePair | None:
-        """Next look; None while a frame waits for that of the other view.
+        """Next observation; None while a frame waits for that of the other view.
 
         at_rest : the robot has not moved yet, so that frames of any two instants show the same.
         """
@@ -73,9 +73,9 @@ class Pairing:
             for v, waiting in enumerate(self._waiting)
         ]
         one = frames[0] or frames[1]
-        return None if one is None else self._look(one, frames)
+        return None if one is None else self._pair(one, frames)
 
-    def _look(self, one: Frame, frames: list[Frame | None]) -> FramePair:
+    def _pair(self, one: Frame, frames: list[Frame | None]) -> FramePair:
         """Pair of the frames of both views, at least one of them."""
         both = [frame or one._replace(image=np.full_like(one.image, np.nan)) for frame in frames]
         last, self._last = self._last or one, one

@@ -21,15 +21,15 @@ _STEPS, _HALVINGS, _EPSILON = 8, 6, 1e-6
 _NEAR_PX = 5.0
 # Causes of several parameters that are fitted, the likeliest after one step; a fall of χ² that ends a fit.
 _FITTED, _FALLS = 8, 0.05
-# Starts of a joint that was homed anew, factors of images of another size.
+# Starts of a joint that was homed again, factors of images of another size.
 _TURNS = 12
 _FACTORS = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 0.8, 1.25, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 # By so much a link may flex under its load, rad, which looks like a joint that slipped.
 _MOST_FLEXIBLE = np.radians(3.0)
 # Readings that differ by no more stand still, rad or m.
 _STILL = 1e-9
-# Most looks that are explained together.
-_MOST_LOOKS = 12
+# Most observations that are explained together.
+_MAX_PAIRS = 12
 
 
 class Changed(NamedTuple):
@@ -71,28 +71,28 @@ class Explanation(NamedTuple):
 
 
 class Evidence:
-    """Looks that disagree, whitened beside errors of the calibration, of joints and of instants.
+    """Observations that disagree, whitened; errors of calibration, joints and instants are nuisances.
 
-    errors : what images may be off; looks, residuals, weights : of each look, and how many it is worth.
-    agreed : sums of the looks before.
+    errors : covariance of images; pairs, residuals, weights : of each observation, and its weight.
+    agreed : sums of the observations before.
     """
 
     def __init__(
         self,
         errors: ErrorModel,
-        looks: list[FramePair],
+        pairs: list[FramePair],
         residuals: list[Residual],
         weights: FloatArray,
         agreed: Sums,
     ) -> None:
-        few = np.unique(np.linspace(0, len(looks) - 1, min(len(looks), _MOST_LOOKS)).round().astype(int))
-        self.looks, residuals = [looks[i] for i in few], [residuals[i] for i in few]
+        few = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MAX_PAIRS)).round().astype(int))
+        self.pairs, residuals = [pairs[i] for i in few], [residuals[i] for i in few]
         self._weights, self._agreed = weights[few] * (weights.sum() / weights[few].sum()), agreed
         factor = np.sqrt(self._weights)
         self._errors = errors
         self.scene: Parameters = errors.scene
-        self.away = np.array([look.q for look in self.looks]) - errors.calibration.q_reference
-        self._images = np.array([look.images for look in self.looks])
+        self.away = np.array([pair.q for pair in self.pairs]) - errors.calibration.q_reference
+        self._images = np.array([pair.images for pair in self.pairs])
         self.seen = np.array([residual.seen for residual in residuals])
         self._images[~self.seen] = 0.0
         bias = (errors.bias_px / np.array([residual.noise for residual in residuals])) ** 2
@@ -100,13 +100,13 @@ class Evidence:
         n = len(errors.sigma_q)
         roots = np.linalg.cholesky(np.array([residual.R for residual in residuals]))
         self._inverses = factor[:, None, None] * np.linalg.inv(roots)
-        onset = float(self.looks[0].t.mean())
-        seconds = float(self.looks[-1].t.mean()) - onset
+        onset = float(self.pairs[0].t.mean())
+        seconds = float(self.pairs[-1].t.mean()) - onset
         beside = np.array([np.hstack([r.B, r.F[:, : 2 * n + 2]]) for r in residuals])
         drift = slice(errors.e + n, errors.e + 2 * n)  # of joints, with time from the onset
         beside[..., drift] -= onset * beside[..., errors.e : errors.e + n]
         self._beside = self._whitened(beside)
-        late = np.maximum(np.max([look.late for look in self.looks], axis=0), 1e-6)
+        late = np.maximum(np.max([pair.late for pair in self.pairs], axis=0), 1e-6)
         prior = np.zeros((errors.e + 2 * n + 2,) * 2)
         prior[: errors.e, : errors.e] = np.eye(errors.e) + agreed.normal[: errors.e, : errors.e]
         prior[errors.e :, errors.e :] = errors.lasting(seconds, late)
@@ -125,7 +125,7 @@ class Evidence:
         self.at_first = self._off(self.nothing)
         self.before = self._square(self._whitened(self.at_first))
         seen = max(float(self.seen.sum()), 1.0)
-        self.off_px = float(np.sqrt(np.square(self.at_first).sum() / seen))  # rms of each sighting
+        self.off_px = float(np.sqrt(np.square(self.at_first).sum() / seen))  # rms of each detection
 
     def _whitened(self, rows: FloatArray) -> FloatArray:
         """Rows (K, 4 m, …) over the root of their covariance, (K 4 m, …)."""
@@ -149,14 +149,14 @@ class Evidence:
         return np.asarray(off.reshape(K, -1))
 
     def _square(self, r: FloatArray) -> float:
-        """χ² of whitened residuals, beside errors and their priors."""
+        """χ² of whitened residuals, after a fit of the nuisance errors with their priors."""
         b = self._beside.T @ r + self._known
         return float(r @ r + self._offset - b @ cho_solve(self._factor, b))
 
     def explanations(self, causes: Iterable[Cause]) -> list[Explanation]:
         """Fits of the causes that a first step of each makes the likeliest, and of all with one parameter.
 
-        A first step tells little of a joint that is far off, whose images move on curves.
+        The first step of a joint that is far off says little, since its images move on curves.
         """
         tried = [self._tried(cause) for cause in causes]
         tried.sort(key=lambda one: -one[0])
@@ -169,22 +169,22 @@ class Evidence:
     def _refitted(self, found: Explanation) -> Explanation:
         """Explanation of a cause that is far off, with errors of joints and calibration as they act there.
 
-        Looks are taken back to where nothing is wrong, and what is left of the cause is fitted to those.
+        The fit takes observations back to the state without the cause, and fits its remainder there.
         """
         kind, changed = found.cause.kind, found.cause.change(self.nothing, found.theta)
         if kind not in ("exchanged", "mirrored", "slipped", "sized") or found.changed_px < _NEAR_PX:
             return found
-        looks = []
-        for look, away in zip(self.looks, changed.away, strict=True):
-            images, noise = look.images, look.noise
+        pairs = []
+        for pair, away in zip(self.pairs, changed.away, strict=True):
+            images, noise = pair.images, pair.noise
             if kind == "exchanged":
                 images, noise = images[::-1], noise[::-1]
             images = (images - changed.shift[:, None] + 0.5) / changed.scale[:, None, None] - 0.5
             noise = noise / changed.scale[:, None]
             q = away + self._errors.calibration.q_reference
-            looks.append(look._replace(q=q, images=images, noise=noise))
-        residuals = [self._errors.residual(look) for look in looks]
-        there = Evidence(self._errors, looks, residuals, self._weights, self._agreed)
+            pairs.append(pair._replace(q=q, images=images, noise=noise))
+        residuals = [self._errors.residual(pair) for pair in pairs]
+        there = Evidence(self._errors, pairs, residuals, self._weights, self._agreed)
         left, theta = there.before, found.theta
         if theta.size:
             nearer = there._fitted(found.cause, np.full(1, 1.0 if kind == "sized" else 0.0))
@@ -205,7 +205,7 @@ class Evidence:
         return self.before - squares[best] + falls - cost, cause, start
 
     def _step(self, cause: Cause, theta: FloatArray, here: FloatArray) -> tuple[FloatArray, float, float]:
-        """Step of Gauss and Newton, what the parameters cost by their prior, and how far χ² falls at most."""
+        """Step of Gauss and Newton, cost of the parameters by their prior, and greatest fall of χ²."""
         F = np.stack(
             [(self._changed_by(cause, theta + h) - here) / _EPSILON for h in _EPSILON * np.eye(theta.size)],
             axis=-1,
@@ -222,7 +222,7 @@ class Evidence:
         return -unit * step, float(np.linalg.slogdet(normal)[1]), float(right @ step)
 
     def _touched(self, cause: Cause) -> BoolArray:
-        """Sightings (K, 2, m') that a cause touches."""
+        """Detections (K, 2, m') that a cause touches."""
         return self.seen[..., list(cause.markers)] if cause.markers else self.seen
 
     def _count(self, cause: Cause) -> float:
@@ -263,7 +263,7 @@ _NONE = np.zeros((1, 0))
 
 
 def causes_of(evidence: Evidence, numbers: IntArray, centre: FloatArray | None) -> Iterator[Cause]:
-    """All causes that are looked for, the simplest of a kind first.
+    """All causes that may be named, the simplest of a kind first.
 
     numbers : (m,) of the markers; centre : (2,) of the images, px; None where their size is not known.
     """
@@ -281,8 +281,8 @@ def causes_of(evidence: Evidence, numbers: IntArray, centre: FloatArray | None) 
 
 def _joint_causes(evidence: Evidence) -> Iterator[Cause]:
     q_reference = evidence._errors.calibration.q_reference
-    n, K = len(q_reference), len(evidence.looks)
-    velocity = np.array([look.q_dot for look in evidence.looks])
+    n, K = len(q_reference), len(evidence.pairs)
+    velocity = np.array([pair.q_dot for pair in evidence.pairs])
     for i in range(n):
 
         def mirrored(s: Changed, _: FloatArray, i: int = i) -> Changed:
@@ -299,7 +299,7 @@ def _joint_causes(evidence: Evidence) -> Iterator[Cause]:
             starts = np.concatenate([np.zeros((1, 1)), starts])
         yield Cause("mirrored", i, _NONE, mirrored)
         yield Cause("slipped", i, starts, slipped)
-    read = np.array([look.q for look in evidence.looks])
+    read = np.array([pair.q for pair in evidence.pairs])
     still: BoolArray = np.ptp(read, axis=(0, 1)) <= _STILL
     for j in np.flatnonzero(still) if K > 1 and not still.all() else ():
 
@@ -445,7 +445,7 @@ def together(moved: list[Explanation]) -> Explanation:
     )
 
 
-# What a cause contains: with more parameters it explains as much.
+# Causes that another contains: with more parameters it explains as much.
 _CONTAINS = {
     "camera": ("shifted", "focused", "sized", "camera"),
     "cameras": ("shifted", "focused", "sized", "camera", "rig"),

@@ -1,5 +1,6 @@
-"""Monitor of a run: tests each look, holds the arm while looks disagree, and names the fault."""
+"""Monitor of a run: tests each observation, holds the arm while they disagree, and names the fault."""
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from projservo_cli.monitoring.statistics import (
     WINDOW,
     Detector,
     ErrorModel,
+    MemoryState,
     Residual,
     Sums,
     columns_of_marker,
@@ -29,10 +31,10 @@ from projservo_cli.records import VIEWS, BoolArray, Calibration, FloatArray, Int
 
 # Markers that are tested, at most.
 _MOST_TESTED = 40
-# A corner that is so many times less certain than most is not tested: its error is the finder's, and lasts.
+# A corner with this many times the deviation of most is not tested: its error is the finder's, and lasts.
 _VAGUE = 10.0
-# A cause is looked for after so many looks that disagree, since blur passes; from the fourth time on two are
-# named that are as likely, and after the last the fault is told without a name: a hand passes in two seconds.
+# Causes are fitted after these numbers of observations that disagree, since blur passes. From the fourth on
+# two are named that are as likely; after the last the fault has no name: a hand passes in two seconds.
 _NAMED_AT = (5, 7, 10, 15, 25, 40, 60)
 _TWO_AT = 15
 # Advantage over the next cause, twice the logarithm of odds, at which one is named alone.
@@ -46,56 +48,67 @@ _LEAST_PART = 0.2
 _LEAST_MOVED_PX = 1.0
 # Share of the markers that a view saw shortly before: one that sees less is covered by something.
 _COVERED = 0.5
-# Share of the sightings of a view that may not be off by themselves for long: then the view is.
+# Share of the detections of a view that may not be off by themselves for long: then the view is.
 _MOST_FOR_LONG = 0.25
 # Share of a slip that the set-point of a joint went without its reading: then the reading is frozen.
 _UNANSWERED = 0.5
-# Looks that are remembered one by one.
+# Observations in which a hand comes or goes.
+_COMES = 10
+# Observations that are remembered one by one.
 _REMEMBERED = 80
-# Chance of a false alarm of one look alone: that of a look among so many.
+# Chance of a false alarm of one observation alone: that of an observation among so many.
 _SINGLE = 1000
-# Joints that differ by no more since the first look have not moved, rad or m.
+# Joints that differ by no more since the first observation have not moved, rad or m.
 _AT_REST = 1e-3
 
 
 class _Kept(NamedTuple):
-    """A look as it was tested."""
+    """An observation as it was tested."""
 
-    look: FramePair
+    pair: FramePair
     residual: Residual
     view: int  # number of the view that it is of
     views: int  # views that agreed up to it
     covered: bool  # whether something passes before a view
 
 
+class _Recent(NamedTuple):
+    """One of the last observations, as a hand that comes or goes shows in it."""
+
+    whole: bool  # whether both views show all markers that they did, and none is off by itself
+    hidden: bool  # whether a view shows less than half of them
+    state: MemoryState  # observations that agreed before it
+
+
 class ImageMonitor:
     """Monitor of the images of a run against a calibration.
 
-    Detection and isolation are two things. Each look is tested: whether it disagrees needs no cause. While
-    looks disagree they are ``pending``; after ``WINDOW`` of them the arm ``holds``; ``WINDOW`` looks in a row
-    that agree clear them. Meanwhile causes are fitted to them by the images that they predict, and one that
-    explains them, clearly better than others, is named. After sixty looks the fault is told without.
+    Detection and isolation are two things. The monitor tests each observation: whether it disagrees needs no
+    cause. While observations disagree they are ``pending``; after ``WINDOW`` of them the arm ``holds``;
+    ``WINDOW`` in a row that agree clear them. Meanwhile the monitor fits causes by the images that they
+    predict, and names one that explains them clearly better than others. After sixty observations the fault
+    has no name.
 
     Sources: R. Isermann, "Fault-Diagnosis Systems", Springer 2006, chapters 2 and 16; D. J. C. MacKay,
     "Bayesian interpolation", Neural Computation 4 (1992) 415–447, for the odds of causes.
 
     calibration : what predicts the pixels, with its covariance.
     sigma_px : pixel noise per coordinate.
-    observations : most looks of one sequence, which sets the thresholds.
+    max_observations : length of the longest sequence, which sets the thresholds.
     shown : indices of the markers that images may show, None all; of many, some stand for all.
     image_size : (2,) px; None or infinite where it is not known.
-    ``fault``: what is wrong, in words; empty while nothing is, or while it is not clear what.
-    ``looks``: how many showed a marker and were tested. ``agreeing``: looks of one view in a row that agree.
-    ``rejected``: (2, m) sightings of the last look that are off by themselves, of all markers of the
-    calibration. ``unanswered``: (n,) how far each set-point went since the reading of its joint last changed,
-    rad or m; the client of the robot sets it.
+    ``fault``: the fault in words; empty without one, or while its cause is not clear.
+    ``observations``: number of those that showed a marker and were tested. ``agreeing``: number of those of
+    one view in a row that agree. ``rejected``: (2, m) detections of the last observation that are off by
+    themselves, of all markers of the calibration. ``unanswered``: (n,) path of each set-point since the
+    reading of its joint last changed, rad or m; the client of the robot sets it.
     """
 
     def __init__(
         self,
         calibration: Calibration,
         sigma_px: float,
-        observations: int,
+        max_observations: int,
         shown: IntArray | None = None,
         image_size: FloatArray | None = None,
     ) -> None:
@@ -106,19 +119,20 @@ class ImageMonitor:
         known = image_size is not None and bool(np.isfinite(image_size).all())
         self._centre = 0.5 * (np.asarray(image_size) - 1.0) if known else None
         self._errors = ErrorModel(self.calibration, sigma_px)
-        self._detector = Detector(self._errors, observations)
+        self._detector = Detector(self._errors, max_observations)
         self._pairing = Pairing()
-        self._first: FloatArray | None = None  # (n,) joints of the first look, rad or m
+        self._first: FloatArray | None = None  # (n,) joints of the first observation, rad or m
         self._kept: list[_Kept] = []
-        self.looks = self._view = 0
+        self._recent: deque[_Recent] = deque(maxlen=_COMES)
+        self.observations = self._view = 0
         self._at_view: FloatArray | None = None  # (2, m, 2) px predicted where the view began
-        # Looks that disagree, the number of the first of them, and looks in a row that agree.
+        # Observations that disagree, the number of the first of them, and observations in a row that agree.
         self._off = self._onset = self._agreed = 0
-        self._sound = 0  # looks in a row that agree by themselves
+        self._sound = 0  # observations in a row that agree by themselves
         self._before = self._detector.memory.total  # sums up to the onset
-        self._unit = 1.0  # of χ², by what the best cause left
-        self._asides = np.zeros((2, len(self._shown)), dtype=np.int64)  # looks in a row
-        self._crowded = 0  # looks in a row of which many sightings are off by themselves
+        self._unit = 1.0  # of χ², by the remainder of the best cause
+        self._asides = np.zeros((2, len(self._shown)), dtype=np.int64)  # observations in a row
+        self._crowded = 0  # observations in a row of which many detections are off by themselves
         self._forgiven: list[int] = []
         self.fault, self.agreeing = "", 0
         self.unanswered = np.zeros(len(calibration.q_reference))
@@ -126,15 +140,15 @@ class ImageMonitor:
 
     @property
     def pending(self) -> bool:
-        """Whether looks disagreed that nothing has cleared or explained."""
+        """Whether observations disagreed that are neither cleared nor explained."""
         return self._off > 0
 
     @property
     def holds(self) -> bool:
-        """Whether so many looks disagreed that nothing should move."""
+        """Whether enough observations disagreed to keep the arm still."""
         return self._off >= WINDOW
 
-    def look(
+    def observe(
         self,
         t: FloatArray,
         q: FloatArray,
@@ -168,24 +182,24 @@ class ImageMonitor:
                 Frame(t=float(t[v]), q=q[v], q_dot=q_dot[v], late=uncertain, image=images[v], noise=noise[v]),
             )
         self._pairing.reach(t)
-        while not self.fault and (look := self._pairing.next(at_rest)) is not None:
-            self._take(look)
+        while not self.fault and (pair := self._pairing.next(at_rest)) is not None:
+            self._take(pair)
         return self.fault
 
     def give_up(self) -> str:
-        """Return the fault that is pending, by what is known of it."""
+        """Return the fault that is pending, by the observations so far."""
         if self.pending and not self.fault:
             self.fault = self._message(self._explanations(self._since_onset(), self._before))
         return self.fault
 
-    def _take(self, look: FramePair) -> None:
-        """Test a look, and judge what is known by now."""
+    def _take(self, pair: FramePair) -> None:
+        """Test an observation, and judge all of them."""
         memory = self._detector.memory
-        look = look._replace(noise=memory.noise(look.noise))
-        residual = self._errors.residual(look)
+        pair = pair._replace(noise=memory.noise(pair.noise))
+        residual = self._errors.residual(pair)
         if not residual.seen.any():
             return
-        self.looks += 1
+        self.observations += 1
         lasts = self._at_view is not None and is_same_view(self._at_view, residual.predicted)
         if not lasts:
             self._view, self._at_view = self._view + 1, residual.predicted
@@ -195,21 +209,21 @@ class ImageMonitor:
         self.rejected[:, self._shown[self._forgiven]] = True
         since, clean = None, residual.without(tested.aside)
         memory.learn(residual, tested.aside, tested.disagrees)
-        kept, covered = self._kept[-_REMEMBERED:], self._is_covered(residual)
+        kept, covered = self._kept[-_REMEMBERED:], self._is_covered(residual, tested.aside)
         self._sound = (self._sound + 1) * (not tested.disagrees)
-        # What a hand leaves of a view tells nothing, nor looks between those that disagree.
+        # The rest of a covered view is no evidence, nor are observations between those that disagree.
         if self._sound > WINDOW * self.holds and not covered:
-            memory.keep(clean, float(look.t.mean()), not tested.aside.any())
+            memory.keep(clean, float(pair.t.mean()), not tested.aside.any())
         self._kept = [
             *kept,
-            _Kept(look=look, residual=residual, view=self._view, views=memory.views, covered=covered),
+            _Kept(pair=pair, residual=residual, view=self._view, views=memory.views, covered=covered),
         ]
         crowd = (tested.aside.sum(axis=1) >= _MOST_FOR_LONG * residual.seen.sum(axis=1)).any()
         self._crowded = (self._crowded + 1) * bool(crowd and not covered)
         disagrees = tested.disagrees or self._crowd_is_fault()
         if not disagrees:
             free = [columns_of_marker(self._errors, j) for j in self._forgiven]
-            since = self._detector.significant(self.looks, look.late, free, self.pending)
+            since = self._detector.significant(self.observations, pair.late, free, self.pending)
         if not disagrees and since is None:
             self.agreeing = 1 + self.agreeing * lasts
             self._agreed += 1
@@ -220,12 +234,12 @@ class ImageMonitor:
             self._judge_markers()
 
     def _disagree(self, since: Sums | None) -> None:
-        """Count a look that disagrees, and name the fault where that can be done."""
-        if since is not None:  # the likeliest onset, as far as looks are remembered
-            after = [one for one in self._kept if one.views > since.looks]
-            self._onset, self._before = self.looks - max(1, len(after)), since
+        """Count an observation that disagrees, and name the fault where that can be done."""
+        if since is not None:  # the likeliest onset, as far as observations are remembered
+            after = [one for one in self._kept if one.views > since.views]
+            self._onset, self._before = self.observations - max(1, len(after)), since
         elif not self._off:
-            self._onset, self._before = self.looks - 1, self._detector.memory.total
+            self._onset, self._before = self.observations - 1, self._detector.memory.total
         self._off += 1
         self.agreeing = self._agreed = 0
         if self._off not in _NAMED_AT:
@@ -243,7 +257,7 @@ class ImageMonitor:
             self.fault = self._message(found)
 
     def _crowd_is_fault(self) -> bool:
-        """Whether many sightings are aside for long, and all of these looks together are beyond chance."""
+        """Whether many detections are aside for long, and these observations together are beyond chance."""
         if self._crowded < _TWO_AT or self.pending:
             return self._crowded >= _TWO_AT
         evidence = self._evidence(self._kept[-_TWO_AT:], self._detector.memory.total)
@@ -252,44 +266,59 @@ class ImageMonitor:
         self._crowded = 0
         return False
 
-    def _is_covered(self, residual: Residual) -> bool:
-        """Whether a view sees less than half of what it saw: something passes before it, and hides edges."""
-        seen = [one.residual.seen.sum(axis=1) for one in self._kept[-_REMEMBERED:]]
-        return bool((residual.seen.sum(axis=1) < _COVERED * np.max(seen or [[0, 0]], axis=0)).any())
+    def _is_covered(self, residual: Residual, aside: BoolArray) -> bool:
+        """Whether a hand or so covers a view: it shows less than half of its markers, or did so just now.
+
+        A hand pulls the corners next to it before it hides them, by less than one observation shows. Those in
+        which it came are forgotten, and those in which it goes are not kept.
+        """
+        count, memory = residual.seen.sum(axis=1), self._detector.memory
+        most = np.max([count, *(one.residual.seen.sum(axis=1) for one in self._kept[-_REMEMBERED:])], axis=0)
+        hidden = bool((count < _COVERED * most).any())
+        whole = bool((count >= most).all() and not aside.any())
+        was = bool(self._kept) and self._kept[-1].covered
+        goes = was and not whole and any(one.hidden for one in self._recent)
+        if hidden and not was:
+            for one in reversed(self._recent):
+                if one.whole:
+                    break
+                memory.return_to(one.state)
+        self._recent.append(_Recent(whole=whole, hidden=hidden, state=memory.state))
+        return hidden or goes
 
     def _clear(self) -> None:
-        """Clear what is pending where looks agree again; a fault that shows in motion alone is named."""
+        """Clear pending observations where new ones agree; name a fault that shows in motion alone."""
         if not self.pending or self._agreed < WINDOW:
             return
         if self.holds:
             kept = self._since_onset()
-            if any(look.q_dot.any() for look, *_ in kept):
+            if any(pair.q_dot.any() for pair, *_ in kept):
                 best = self._explanations(kept, self._before)[0]
                 if best.cause.kind in ("late", "frozen") and self._explains(best):
                     self.fault = self._message([best])
         self._off = 0
 
     def _since_onset(self) -> list[_Kept]:
-        """Looks since the onset of what is pending, but for the first, which may show half of it.
+        """Observations since the onset of the pending fault, but for the first, which may show half of it.
 
         Frames of both views that come one after the other may make that two.
         """
-        kept = self._kept[-max(1, self.looks - self._onset) :]
+        kept = self._kept[-max(1, self.observations - self._onset) :]
         return kept[1 + (self._off > _NAMED_AT[0]) :] if len(kept) >= _NAMED_AT[0] else kept
 
     def _explanations(
         self, kept: list[_Kept], before: Sums, markers: list[int] | None = None
     ) -> list[Explanation]:
-        """Causes fitted to looks, the likeliest first; only displacements of markers, if they are given.
+        """Causes fitted to observations, the likeliest first; displacements of markers alone, if given.
 
-        before : sums of the looks before them.
+        before : sums of the observations before them.
         """
         evidence = self._evidence_now = self._evidence(kept, before)
         causes = causes_of(evidence, self.calibration.marker, self._centre)
         if markers is not None:
             causes = (cause for cause in causes if cause.kind == "marker" and cause.which in markers)
         found = [self._frozen(one) for one in evidence.explanations(causes) if is_possible(one)]
-        if not found:  # markers that the chosen looks do not show
+        if not found:  # markers that the chosen observations do not show
             return found
         # Where even the best leaves more than chance does, the unit is what that leaves.
         least = min(found, key=lambda one: one.left)
@@ -302,7 +331,7 @@ class ImageMonitor:
         return [together(moved), *(one for one in found if one.cause.kind != "marker")]
 
     def _frozen(self, found: Explanation) -> Explanation:
-        """A slip by what the set-point went without the reading as what it is: the reading is frozen."""
+        """Turn a slip by as far as the set-point went without the reading into a frozen reading."""
         cause = found.cause
         if cause.kind == "slipped":
             slip = float(found.theta[0])
@@ -311,16 +340,16 @@ class ImageMonitor:
         return found
 
     def _evidence(self, kept: list[_Kept], before: Sums) -> Evidence:
-        """Looks to be explained, those of one view worth what they are."""
+        """Observations to be explained, those of one view with their common weight."""
         memory = self._detector.memory
         views = np.array([one.view for one in kept])
         count = np.array([(views == view).sum() for view in views], dtype=np.float64)
         weights = np.array([memory.worth(c) / c for c in count])
-        looks, residuals = [one.look for one in kept], [one.residual for one in kept]
-        return Evidence(self._errors, looks, residuals, weights, before)
+        pairs, residuals = [one.pair for one in kept], [one.residual for one in kept]
+        return Evidence(self._errors, pairs, residuals, weights, before)
 
     def _explains(self, found: Explanation) -> bool:
-        """Whether a cause explains most of what images are off, beside joints in error."""
+        """Whether a cause explains most of the residual, with joints in error."""
         left, allowed = self._unit * found.left, self._by_chance(self._evidence_now)
         return bool(found.score > 0.0 and left <= allowed + _LEFT * self._unit * found.gain)
 
@@ -370,7 +399,7 @@ class ImageMonitor:
         least = 0.0 if found[0].cause.markers else _LEAST_PART * self._evidence_now.off_px
         if not self._explains(found[0]) or found[0].changed_px < least:
             return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
-        # A mirrored reading near zero is a small slip: with backlash, images tell neither from the other.
+        # A mirrored reading near zero is a small slip: with backlash, images do not separate them.
         most = self._by_chance(self._evidence_now) / self._unit
         simpler = (one for one in found if not one.theta.size and contains(found[0].cause, one.cause))
         said = [found[0], *(one for one in simpler if one.left <= most), *_rivals(found)[1:]]
@@ -404,7 +433,7 @@ def fault_shown(
     pixels[:, calibration.places(marker[known])] = images[:, known]
     monitor = ImageMonitor(calibration, calibration.sigma_px, _SINGLE, image_size=image_size)
     rest, instants = np.zeros((2, len(q))), np.zeros(2)
-    monitor.look(instants, np.stack([q, q]), rest, instants, pixels, np.ones(2, dtype=np.bool_))
+    monitor.observe(instants, np.stack([q, q]), rest, instants, pixels, np.ones(2, dtype=np.bool_))
     return monitor.give_up()
 
 
@@ -419,7 +448,7 @@ def _rivals(found: list[Explanation]) -> list[Explanation]:
 
 
 def _all_but(seen: BoolArray, marker: int) -> BoolArray:
-    """Sightings (2, m) of all markers but one."""
+    """Detections (2, m) of all markers but one."""
     aside = np.ones_like(seen)
     aside[:, marker] = False
     return aside

@@ -4,7 +4,7 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import cho_solve, eigh, solve_triangular
 from scipy.special import chdtri
 
 from projservo_cli.calibration.detections import MIN_SIGMA, per_rad
@@ -12,46 +12,48 @@ from projservo_cli.calibration.prediction import CAMERA, Parameters, dense_pixel
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
 
-# Looks in a row that must agree: one may be blurred, or a marker taken for another.
+# Observations in a row that must agree: one may be blurred, or a marker taken for another.
 WINDOW = 3
-# Chance that a run of sound looks is called faulty, if all windows were independent. They overlap: it comes
-# to a twentieth of that. More of it is spent on the first looks.
+# Chance that a run of sound observations is called faulty, were all windows independent. They overlap: it
+# comes to a twentieth of that. More of it is spent on the first observations.
 _FALSE_ALARM, _SOON = 1e-2, 10.0
-# Windows in which an onset is looked for, one longer than the other by this factor.
+# Windows of the search for an onset, one longer than the other by this factor.
 _LONGER = 1.5
 # Error of the first order of a prediction, at most, as a share of the calibration's own noise.
 _BEYOND_FIRST_ORDER = 0.02
 # Lasting errors of a joint, by backlash and counts, differ between two times by √2 of their deviation.
 _LASTING = np.sqrt(2.0)
-# The part of a corner's error that is not new in each frame may last beyond a view. The χ² of such errors is
-# taken at this chance for the corners that a fault touches: two deviations rms for one, 1.3 for a camera.
+# The χ² of the errors that corners keep in one view is taken at this chance, for those that a fault touches:
+# two deviations rms for one corner, 1.3 for a camera.
 _LASTING_CORNERS = 3e-3
-# Sightings of the calibration tell how a corner errs that is seen from within about this angle, rad; beside
-# them count so many of typical ones.
+# Differences between successive frames: of one view in motion, of one view at rest, and of two views.
+_IN_MOTION, _AT_REST, _BETWEEN_VIEWS = range(3)
+# A corner errs as detections of the calibration from within about this angle, rad; this number of typical
+# ones counts with them.
 _SLANT, _PRIOR_SIGHTINGS = 0.25, 4.0
 # In a view that the calibration has not seen all of them are, by so many.
 _UNUSUAL = 1.0
 # Joints (rad or m) and instants (s) are known no better than this, whatever is stated.
 LEAST_ERROR = 1e-6
-# A direction counts where it keeps this share of its size beside the others; what is added for solving.
+# A direction counts where it keeps this share of its size after the others; ridge for solving.
 _RANK, RIDGE = 1e-6, 1e-9
 # Frames that are so near show joints of one reading, s.
 _AT_ONCE_S = 1e-4
-# A view lasts while markers move by no more than this, px rms; its looks are forgotten at this rate.
+# A view lasts while markers move by no more than this, px rms; its observations are forgotten at this rate.
 _SAME_VIEW_PX, _FORGET = 20.0, 1.0 - 1.0 / 30.0
-# Markers that move by no more, px rms, show the same pixels; coordinates of such looks that tell enough.
+# Markers that move by no more, px rms, show the same pixels; coordinates of such observations that suffice.
 _AT_REST_PX, _ENOUGH = 0.2, 100.0
-# Differences between so many frames at rest tell how a sighting trembles: the median of χ² with two degrees
-# of freedom, which is beyond the second number once in ten thousand.
+# Differences between this number of frames at rest show how a detection trembles: the median of χ² with two
+# degrees of freedom, which is beyond the second number once in ten thousand.
 _DIFFERENCES, _MEDIAN, _MEDIAN_AT_MOST = 9, 1.386, 5.6
-# χ² of a sighting that may be off by itself: once in ten thousand by chance.
+# χ² of a detection that may be off by itself: once in ten thousand by chance.
 _OFF_ALONE = 18.4
 # Share of the markers of a view that may be off one by one before the view itself is.
 _MOST_ASIDE = 0.5
 
 
 class Residual(NamedTuple):
-    """Residuals of one look: rows by view, marker and coordinate, zero where unseen."""
+    """Residuals of one observation: rows by view, marker and coordinate, zero where unseen."""
 
     seen: BoolArray  # (2, m)
     noise: FloatArray  # (2, m) px
@@ -59,49 +61,62 @@ class Residual(NamedTuple):
     r: FloatArray  # (4 m,) seen less predicted, px
     B: FloatArray  # (4 m, e) derivatives by the errors of the calibration, in units of their deviations
     F: FloatArray  # (4 m, f) derivatives by what may be wrong
-    R: FloatArray  # (4 m, 4 m) covariance of one look but for the errors of the calibration, px²
+    R: FloatArray  # (4 m, 4 m) covariance of one observation but for the errors of the calibration, px²
 
     def without(self, aside: BoolArray) -> "Residual":
-        """The same without some sightings (2, m)."""
+        """The same without some detections (2, m)."""
         rows = np.repeat(~aside.ravel(), 2)
         r, B, F = (part * (rows if part.ndim == 1 else rows[:, None]) for part in (self.r, self.B, self.F))
         return self._replace(seen=self.seen & ~aside, r=r, B=B, F=F)
 
 
 class Sums(NamedTuple):
-    """Normal equations of looks, those of one view together as so many as they are worth."""
+    """Normal equations of observations, those of one view with their common weight."""
 
-    looks: int  # views that they come from
-    t: float  # when the last was taken, s from the first look
+    views: int  # views that they come from
+    t: float  # when the last was taken, s from the first observation
     normal: FloatArray  # (c, c) of errors of the calibration, of what may be wrong, and of the residual
+    by_corner: FloatArray  # (c - 1, 4 m) its last column by coordinates that all show off by one deviation
+    weight: float  # single observations that they are worth
+    weight_squares: float  # Σ of its square over views
     seen: FloatArray  # (2, m) coordinates seen of each marker
     bias: FloatArray  # (2, m) squared errors of the model that they may have, over the noise
 
     def plus(self, other: "Sums", factor: float = 1.0) -> "Sums":
-        """Sums and so many times others, which are later."""
+        """Sums and later ones times a factor."""
         return Sums(
-            looks=self.looks + other.looks,
+            views=self.views + other.views,
             t=other.t,
             normal=self.normal + factor * other.normal,
+            by_corner=self.by_corner + factor * other.by_corner,
+            weight=self.weight + factor * other.weight,
+            weight_squares=self.weight_squares + factor**2 * other.weight_squares,
             seen=self.seen + factor * other.seen,
             bias=self.bias + factor * other.bias,
         )
 
     def times(self, factor: float) -> "Sums":
         """The same with another weight."""
-        return self._replace(normal=factor * self.normal, seen=factor * self.seen, bias=factor * self.bias)
+        return self._replace(
+            normal=factor * self.normal,
+            by_corner=factor * self.by_corner,
+            weight=factor * self.weight,
+            weight_squares=factor**2 * self.weight_squares,
+            seen=factor * self.seen,
+            bias=factor * self.bias,
+        )
 
 
 class ErrorModel:
-    """What a calibration allows images to be off, and directions in which faults would change them.
+    """Covariance of images by a calibration, and directions in which faults would change them.
 
-    At given joint readings the calibration predicts the pixels of every marker. What is seen differs by
+    At given joint readings the calibration predicts the pixels of every marker. Detections differ by
 
         r = J δ + J_q δq + J_q q̇ δd + c + ε
 
     to first order: δ ~ N(0, Σ), errors of the calibration, the same all along; δq of the joint readings, the
     same in both views of one instant; δd of the instant of each frame; c, errors of corners that last while
-    the view does, and ε, what is new in each frame, of the variance σ² together.
+    the view does, and ε, new in each frame, of the variance σ² together.
     """
 
     def __init__(self, calibration: Calibration, sigma_px: float) -> None:
@@ -137,39 +152,39 @@ class ErrorModel:
             return common
         return np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), common)
 
-    def residual(self, look: FramePair) -> Residual:
-        """Residuals of a look and their derivatives, each view at its own joints."""
-        scene, away, views = self.scene, look.q - self.calibration.q_reference, np.arange(2)
+    def residual(self, pair: FramePair) -> Residual:
+        """Residuals of an observation and their derivatives, each view at its own joints."""
+        scene, away, views = self.scene, pair.q - self.calibration.q_reference, np.arange(2)
         m, n, rows = len(scene.M), len(scene.H_hat), 4 * len(scene.M)
         predicted = scene.predict(away)[views, views]
-        r = look.images - predicted
+        r = pair.images - predicted
         seen = np.isfinite(r[..., 0])
-        noise = look.noise * np.sqrt(self._excess(away))
+        noise = pair.noise * np.sqrt(self._excess(away))
         at = scene.everywhere(away)
         B = dense_pixel_changes(scene, self.errors, away, at)[views, views]
         D = at.by_point.reshape(n + 1, 2, 2, m, 2, 4)[:, views, views]
         Y = at.points.reshape(n + 1, 2, m, 4)
         by_camera = at.by_camera.reshape(2, 2, m, 2, CAMERA)[views, views]
-        F = self._fault_derivative(D, Y, by_camera, look)
+        F = self._fault_derivative(D, Y, by_camera, pair)
         for part in (r, B, F):
             part[~seen] = 0.0
         F = F.reshape(rows, -1)
-        J_q, late = F[:, :n], F[:, 2 * n : 2 * n + 2] * look.late
-        # Errors of joints are the same in both views of a look, but for what they move between both frames.
+        J_q, late = F[:, :n], F[:, 2 * n : 2 * n + 2] * pair.late
+        # Errors of joints are the same in both views, but for their motion between both frames.
         new = np.concatenate([J_q * self.sigma_q, late], axis=1)
-        if abs(look.t[0] - look.t[1]) > _AT_ONCE_S:
+        if abs(pair.t[0] - pair.t[1]) > _AT_ONCE_S:
             left = np.arange(rows)[:, None] < rows // 2
-            between = J_q * look.curved
+            between = J_q * pair.curved
             new = np.concatenate([new, between * left, between * ~left], axis=1)
         # An instant so uncertain that the arm moves on a curve: half the square of the angle.
-        bend = 0.5 * np.abs(look.q_dot).sum(axis=1).max() * (late @ look.late)
+        bend = 0.5 * np.abs(pair.q_dot).sum(axis=1).max() * (late @ pair.late)
         R = new @ new.T + np.diag(np.repeat(noise.ravel(), 2) ** 2 + bend**2)
         return Residual(
             seen=seen, noise=noise, predicted=predicted, r=r.ravel(), B=B.reshape(rows, -1), F=F, R=R
         )
 
     def _excess(self, away: FloatArray) -> FloatArray:
-        """Variance of corners (2, m) over their noise, as sightings of the calibration from near them err.
+        """Variance of corners (2, m) over their noise, as detections of the calibration from near them err.
 
         A corner that is seen from another side, or under another slant, errs otherwise.
         away : (2, n) joints of both views from the reference.
@@ -184,7 +199,7 @@ class ErrorModel:
         return np.asarray(np.maximum(found / (near.sum(axis=(2, 3)) + _PRIOR_SIGHTINGS), 1.0))
 
     def _fault_derivative(
-        self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, look: FramePair
+        self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, pair: FramePair
     ) -> FloatArray:
         """Derivatives (2, m, 2, f) of pixels by what may be wrong, in the order of ``_directions_of``.
 
@@ -194,10 +209,10 @@ class ErrorModel:
         F, d = np.zeros((2, m, 2, self.f)), len(self.twists)
         velocity = Y[:n] @ self.scene.H_hat[:, None].swapaxes(2, 3)
         J_q = np.moveaxis((D[:n] @ velocity[..., None])[..., 0], 0, -1)
-        F[..., :n], F[..., n : 2 * n] = J_q, J_q * look.t[:, None, None, None]
+        F[..., :n], F[..., n : 2 * n] = J_q, J_q * pair.t[:, None, None, None]
         by_marker, first = D[n] @ self.directions.T, 2 * n + 2
         for v in (0, 1):
-            F[v, ..., 2 * n + v] = -J_q[v] @ look.q_dot[v]
+            F[v, ..., 2 * n + v] = -J_q[v] @ pair.q_dot[v]
             F[v, ..., first : first + CAMERA - 1] = by_camera[v] @ self.cameras[v]
             first += CAMERA - 1
         for j in range(m):
@@ -208,17 +223,36 @@ class ErrorModel:
         return F
 
     def sums(self, residual: Residual, t: float) -> Sums:
-        """What one look adds to the normal equations."""
+        """What one observation adds to the normal equations."""
         rows = np.concatenate([residual.B, residual.F, residual.r[:, None]], axis=1)
-        rows = solve_triangular(np.linalg.cholesky(residual.R), rows, lower=True, check_finite=False)
-        bias = 2.0 * residual.seen * (self.bias_px / residual.noise) ** 2
-        return Sums(looks=1, t=t, normal=rows.T @ rows, seen=np.where(residual.seen, 2.0, 0.0), bias=bias)
+        root = np.linalg.cholesky(residual.R)
+        rows = solve_triangular(root, rows, lower=True, check_finite=False)
+        by_corner = solve_triangular(root, rows[:, :-1], lower=True, trans="T", check_finite=False).T
+        return Sums(
+            views=1,
+            t=t,
+            normal=rows.T @ rows,
+            by_corner=by_corner * np.repeat(residual.noise.ravel(), 2),
+            weight=1.0,
+            weight_squares=1.0,
+            seen=np.where(residual.seen, 2.0, 0.0),
+            bias=2.0 * residual.seen * (self.bias_px / residual.noise) ** 2,
+        )
 
     def nothing(self) -> Sums:
-        """Sums of no look."""
+        """Sums of no observation."""
         c = self.e + self.f + 1
         none = np.zeros((2, len(self.calibration.M)))
-        return Sums(looks=0, t=0.0, normal=np.zeros((c, c)), seen=none, bias=none)
+        return Sums(
+            views=0,
+            t=0.0,
+            normal=np.zeros((c, c)),
+            by_corner=np.zeros((c - 1, 2 * none.size)),
+            weight=0.0,
+            weight_squares=0.0,
+            seen=none,
+            bias=none,
+        )
 
     def root(self, sums: Sums) -> FloatArray:
         """Root (e, e) of the information on the errors of the calibration."""
@@ -243,27 +277,36 @@ class ErrorModel:
         return np.asarray(line.T @ weight @ line)
 
 
+class MemoryState(NamedTuple):
+    """Observations that agreed up to one time."""
+
+    closed: tuple[Sums, ...]
+    view: Sums
+    length: float  # observations of that view, fading
+    first: FloatArray | None
+
+
 class Memory:
-    """Looks that agreed, view by view: looks of one view share the errors of their corners."""
+    """Observations that agreed, view by view: observations of one view share the errors of their corners."""
 
     def __init__(self, errors: ErrorModel) -> None:
         self._errors = errors
         self._closed = [errors.nothing()]
         self._total: Sums | None = None  # as last asked for
-        self._view = errors.nothing()  # looks of the view that lasts, fading
+        self._view = errors.nothing()  # observations of the view that lasts, fading
         self._count = 0.0
         self._first: FloatArray | None = None  # (2, m, 2) px predicted at its beginning
-        # The last look, as ``learn`` is given it.
+        # The last observation, as ``learn`` is given it.
         self._before: tuple[Residual, BoolArray, bool] | None = None
-        # Of differences from look to look, over σ²: in motion, and at rest.
-        self._squares, self._freedom = np.zeros(2), np.zeros(2)
-        # Of each sighting (2, m) from look to look at rest, px².
+        # Of differences from observation to observation, over σ²: in motion, at rest, and between views.
+        self._squares, self._freedom = np.zeros(3), np.zeros(3)
+        # Of each detection (2, m) from one observation at rest to the next, px².
         self._steps: deque[FloatArray] = deque(maxlen=_DIFFERENCES)
 
     def noise(self, stated: FloatArray) -> FloatArray:
-        """Standard deviations (2, m) of pixels, px: those stated, or as sightings tremble where that is more.
+        """Standard deviations (2, m) of pixels, px: those stated, or as they tremble where that is more.
 
-        The median of differences at rest tells it, which a step does not move, such as a fault makes.
+        The median of differences at rest gives it: a step, such as a fault makes, does not move it.
         """
         if len(self._steps) < _DIFFERENCES:
             return stated
@@ -273,33 +316,53 @@ class Memory:
 
     @property
     def fresh(self) -> float:
-        """Share of the variance of a corner that is new in each frame, as differences in a view tell.
+        """Share of the variance of a corner that is new in each frame, by differences in a view.
 
         No more than is sure; a finder that makes the same error in each frame has none.
         """
-        i = int(self._freedom[1] >= _ENOUGH)
-        if not self._freedom[i]:
-            return 0.0
-        sure = 1.0 - 2.0 * np.sqrt(2.0 / self._freedom[i])
-        return float(np.clip(self._squares[i] / self._freedom[i], 0.0, 1.0) * max(0.0, sure))
+        return self._sure_share(_AT_REST if self._freedom[_AT_REST] >= _ENOUGH else _IN_MOTION)
 
-    def worth(self, looks: float) -> float:
-        """How many single looks so many looks of one view are worth."""
-        return looks / (self.fresh + looks * (1.0 - self.fresh)) if looks else 0.0
+    @property
+    def persistent(self) -> float:
+        """Greatest share of the variance of a corner that lasts beyond a view, by differences of views."""
+        return 1.0 - max(self.fresh, self._sure_share(_BETWEEN_VIEWS))
+
+    def _sure_share(self, kind: int) -> float:
+        """Share of the variance that differences of a kind have at least, by two deviations."""
+        if not self._freedom[kind]:
+            return 0.0
+        sure = 1.0 - 2.0 * np.sqrt(2.0 / self._freedom[kind])
+        return float(np.clip(self._squares[kind] / self._freedom[kind], 0.0, 1.0) * max(0.0, sure))
+
+    def worth(self, observations: float) -> float:
+        """How many single observations so many observations of one view are worth."""
+        return observations / (self.fresh + observations * (1.0 - self.fresh)) if observations else 0.0
 
     @property
     def views(self) -> int:
         """Number of views that agreed."""
-        return self._closed[-1].looks + (self._count > 0.0)
+        return self._closed[-1].views + (self._count > 0.0)
 
     @property
     def total(self) -> Sums:
-        """Sums of all looks."""
+        """Sums of all observations."""
         if self._total is None:
             self._total = self._closed[-1]
             if self._count:
-                self._total = self._total.plus(self._view.times(self.worth(self._count) / self._count))
+                worth = self.worth(self._count)
+                view = self._view.times(worth / self._count)
+                self._total = self._total.plus(view._replace(weight_squares=worth**2))
         return self._total
+
+    @property
+    def state(self) -> MemoryState:
+        """Observations so far, to return to."""
+        return MemoryState(closed=tuple(self._closed), view=self._view, length=self._count, first=self._first)
+
+    def return_to(self, state: MemoryState) -> None:
+        """Forget the observations since a state."""
+        self._closed, self._total = list(state.closed), None
+        self._view, self._count, self._first = state.view, state.length, state.first
 
     def onsets(self) -> list[Sums]:
         """Sums before each time that something may have begun, the earliest first."""
@@ -307,10 +370,10 @@ class Memory:
         return [sums for sums in self._closed if sums.seen.sum() < seen]
 
     def keep(self, residual: Residual, t: float, whole: bool) -> None:
-        """Add a look; of earlier views those are kept that tell an onset to a quarter of its age.
+        """Add an observation; of earlier views those stay that date an onset to a quarter of its age.
 
-        whole : whether no sighting of it is aside. What else is left is perhaps of the same hand or blur, and
-        is no look that agrees where the calibration would have to be off beyond chance.
+        whole : whether no detection of it is aside. The rest is perhaps of the same hand or blur, and does
+        not agree where the calibration would have to be off beyond chance.
         """
         new = self._errors.sums(residual, t)
         if not whole and self._errors.strays(self.total.plus(new)):
@@ -318,54 +381,67 @@ class Memory:
         if self._first is None or not is_same_view(self._first, residual.predicted):
             if self._count:
                 self._closed.append(self.total)
-                age = [max(1, (self._closed[-1].looks - sums.looks) // 4) for sums in self._closed]
+                age = [max(1, (self._closed[-1].views - sums.views) // 4) for sums in self._closed]
                 self._closed = [
                     sums
                     for sums, a in zip(self._closed, age, strict=True)
-                    if sums.looks % (1 << (a.bit_length() - 1)) == 0
+                    if sums.views % (1 << (a.bit_length() - 1)) == 0
                 ]
             self._view, self._count, self._first = self._errors.nothing(), 0.0, residual.predicted
         self._total = None
-        self._view = self._view.times(_FORGET).plus(new)._replace(looks=1)
+        self._view = self._view.times(_FORGET).plus(new)._replace(views=1)
         self._count = _FORGET * self._count + 1.0
 
     def learn(self, now: Residual, aside: BoolArray, disagrees: bool) -> None:
-        """Learn what is new in each frame from two in a row, beside errors of joints and instants.
+        """Learn the fresh error of each frame from two in a row, free of errors of joints and instants.
 
-        Those at rest tell it, once there are enough: a corner that moves by part of a pixel errs otherwise.
-        aside : (2, m) sightings that are off by themselves, which tell how they tremble alone.
-        disagrees : whether this look does; one that does and one that does not tell nothing.
+        Those at rest give it, once there are enough: a corner that moves by part of a pixel errs otherwise.
+        aside : (2, m) detections that are off by themselves, of which only the trembling counts.
+        disagrees : whether this observation does; a pair of which one does is skipped.
         """
         last, self._before = self._before, (now, aside, disagrees)
-        i = int(last is not None and _alike(last[0].predicted, now.predicted, _AT_REST_PX))
-        if not i:
+        kind = _IN_MOTION if last is None else _kind_of(last[0].predicted, now.predicted)
+        if kind != _AT_REST:
             self._steps.clear()
-        if last is None or last[2] != disagrees or not is_same_view(last[0].predicted, now.predicted):
+        if last is None or last[2] != disagrees:
             return
         before, n = last[0], len(self._errors.sigma_q)
         seen = before.seen & now.seen
         rows = np.repeat((seen & ~aside & ~last[1]).ravel(), 2)
-        weight = 1.0 / np.repeat(now.noise.ravel(), 2)
-        off, moved = (now.r - before.r) * weight, now.F[:, [*range(n), 2 * n, 2 * n + 1]] * weight[:, None]
+        weight, columns = 1.0 / np.repeat(now.noise.ravel(), 2)[:, None], [*range(n), 2 * n, 2 * n + 1]
+        off, moved = (now.r - before.r) * weight[:, 0], now.F[:, columns] * weight
+        if kind == _BETWEEN_VIEWS:
+            moved = np.concatenate([moved, before.F[:, columns] * weight], axis=1)
         basis, R = np.linalg.qr(moved[rows])
         along = basis.T @ off[rows]
         freedom = len(basis) - basis.shape[1]
-        if freedom > 0:
-            square = float(off[rows] @ off[rows] - along @ along)
+        if freedom <= 0:
+            return
+        square = float(off[rows] @ off[rows] - along @ along)
+        if kind == _BETWEEN_VIEWS:
+            # Errors of the calibration differ between views, by no more than its covariance.
+            by_errors = ((now.B - before.B) * weight)[rows]
+            square = max(0.0, square - float(np.square(by_errors - basis @ (basis.T @ by_errors)).sum()))
+        elif kind == _AT_REST:
             off -= moved @ np.linalg.lstsq(R, along)[0]
-            if i:
-                step = 0.5 * np.square(off / weight).reshape(*seen.shape, 2).sum(axis=2)
-                self._steps.append(np.where(seen, step, np.nan))
-            # Fading, so that what a finder does in one light does not count for ever.
-            self._squares[i] *= 0.99
-            self._squares[i] += 0.5 * square
-            self._freedom[i] = 0.99 * self._freedom[i] + freedom
-            self._total = None
+            step = 0.5 * np.square(off / weight[:, 0]).reshape(*seen.shape, 2).sum(axis=2)
+            self._steps.append(np.where(seen, step, np.nan))
+        # Fading, so that the errors of a finder in one light do not count for ever.
+        self._squares[kind] = 0.99 * self._squares[kind] + 0.5 * square
+        self._freedom[kind] = 0.99 * self._freedom[kind] + freedom
+        self._total = None
 
 
 def is_same_view(before: FloatArray, now: FloatArray) -> bool:
     """Whether predicted pixels (2, m, 2) are of one view, of which corners err alike."""
     return _alike(before, now, _SAME_VIEW_PX)
+
+
+def _kind_of(before: FloatArray, now: FloatArray) -> int:
+    """Kind of the difference between two observations by their predicted pixels (2, m, 2)."""
+    if not is_same_view(before, now):
+        return _BETWEEN_VIEWS
+    return _AT_REST if _alike(before, now, _AT_REST_PX) else _IN_MOTION
 
 
 def _alike(before: FloatArray, now: FloatArray, within_px: float) -> bool:
@@ -374,31 +450,50 @@ def _alike(before: FloatArray, now: FloatArray, within_px: float) -> bool:
     return bool(np.nanmean(np.append(moved, 0.0)) <= within_px**2)
 
 
+class _Reduced(NamedTuple):
+    """Normal equations of faults since an onset without nuisance errors: a Schur complement."""
+
+    normal: FloatArray  # (f + 1, f + 1) of what may be wrong, and of the residual
+    least: FloatArray  # (f + 1,) its diagonal at least
+    root: FloatArray  # (e, e) of the information on errors of the calibration
+    along: FloatArray  # (e, f) what may be wrong along these
+    beside: IntArray  # (k,) columns of lasting errors of joints and instants
+    solved: FloatArray  # (k, f) and what may be wrong along those
+    line: FloatArray  # (f, f) to time from the onset
+
+    def of(self, rows: FloatArray) -> FloatArray:
+        """Other right-hand sides (e + f, k) of the equations, (f, k) after the same steps."""
+        e = len(self.root)
+        found = self.line @ rows[e:]
+        found -= self.along.T @ solve_triangular(self.root, rows[:e], lower=True, check_finite=False)
+        return np.asarray(found - self.solved.T @ found[self.beside])
+
+
 class Tested(NamedTuple):
-    """Tests of one look."""
+    """Tests of one observation."""
 
     disagrees: bool  # whether the whole of it does
-    aside: BoolArray  # (2, m) sightings that are off by themselves
+    aside: BoolArray  # (2, m) detections that are off by themselves
 
 
 class Detector:
-    """Tests of looks against a calibration.
+    """Tests of observations against a calibration.
 
-    Each look is tested by itself, each view and each marker; the looks of each window since an onset by the
-    likelihood ratio of each direction that a fault may take, beside the errors of the calibration and the
+    Each observation is tested by itself, each view and each marker; windows of them since an onset by the
+    likelihood ratio of each direction that a fault may take, with the errors of the calibration and the
     lasting ones with their priors.
 
     Source: A. S. Willsky, H. L. Jones, "A Generalized Likelihood Ratio Approach to the Detection and
     Estimation of Jumps in Linear Systems", IEEE Trans. Automatic Control 21 (1976) 108–112.
 
-    errors : what images may be off; observations : most looks of one sequence, which sets the thresholds.
+    errors : covariance of images; max_observations : length of the longest sequence, which sets thresholds.
     """
 
-    def __init__(self, errors: ErrorModel, observations: int) -> None:
+    def __init__(self, errors: ErrorModel, max_observations: int) -> None:
         self._errors, self.memory = errors, Memory(errors)
         m = len(errors.calibration.M)
-        tail = _FALSE_ALARM / observations
-        self._chance = _FALSE_ALARM / np.log1p(observations / _SOON)
+        tail = _FALSE_ALARM / max_observations
+        self._chance = _FALSE_ALARM / np.log1p(max_observations / _SOON)
         self._most_once = np.sqrt(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail / (3 + m)))
         self._sizes = np.array([len(columns) for columns in errors.parts])
         self._by_size = [
@@ -407,7 +502,7 @@ class Detector:
         ]
 
     def tested(self, residual: Residual) -> Tested:
-        """Test χ² of each view and each marker in one look, sightings that are off by themselves aside."""
+        """Test χ² of each view and each marker in one observation, without detections off by themselves."""
         errors, (_, m) = self._errors, residual.seen.shape
         total = self.memory.total
         both = np.concatenate([residual.B.T, total.normal[: errors.e, -1:]], axis=1)
@@ -415,9 +510,9 @@ class Detector:
         W = both[:, :-1]
         S, r = W.T @ W + residual.R, residual.r - W.T @ both[:, -1]
         rows = np.arange(4 * m).reshape(2, m, 2)
-        sightings = self._beyond(S, r, rows.reshape(2 * m, 2), residual).reshape(2, m)
+        single = self._beyond(S, r, rows.reshape(2 * m, 2), residual).reshape(2, m)
         markers = self._beyond(S, r, rows.swapaxes(0, 1).reshape(m, 4), residual)
-        aside = (sightings | (markers & ~sightings.any(axis=0))) & residual.seen
+        aside = (single | (markers & ~single.any(axis=0))) & residual.seen
         parts = (np.arange(2 * m) < m, np.arange(2 * m) >= m, np.ones(2 * m, dtype=np.bool_))
         off = [self._is_off(S, r, residual, aside, part) for part in parts]
         if any(off):
@@ -427,9 +522,9 @@ class Detector:
     def _is_off(
         self, S: FloatArray, r: FloatArray, residual: Residual, aside: BoolArray, part: BoolArray
     ) -> bool:
-        """Whether a view, or both, disagree even without their worst sightings, up to half, which go aside.
+        """Whether a view, or both, disagree even without their worst detections, up to half, which go aside.
 
-        part : (2 m,) its sightings.
+        part : (2 m,) its detections.
         """
         shown, out = residual.seen & part.reshape(aside.shape), aside.reshape(-1)
         allowed = _MOST_ASIDE * shown.sum(axis=1)
@@ -453,58 +548,100 @@ class Detector:
         gain = gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
         return np.asarray(gain > most**2)
 
-    def significant(self, looks: int, late: FloatArray, free: list[IntArray], thorough: bool) -> Sums | None:
-        """Sums before an onset since when something is beyond chance, if so.
+    def significant(self, count: int, late: FloatArray, free: list[IntArray], thorough: bool) -> Sums | None:
+        """Sums before the likeliest onset of residuals beyond chance, if there is one.
 
-        looks : number of this one; late : (2,) deviation of instants, s; free : columns of markers that are
-        known to be off; thorough : test windows of all lengths, not of another one at each look.
+        count : of observations so far; late : (2,) deviation of instants, s; free : columns of markers that
+        are known to be off; thorough : test windows of all lengths, not of another one each time.
         """
         total, onsets = self.memory.total, self.memory.onsets()
-        if not onsets or not total.looks:
+        if not onsets or not total.views:
             return None
-        lengths = _LONGER ** np.arange(1 + int(np.log(total.looks) / np.log(_LONGER)))
-        tail = self._chance / (looks + _SOON) / len(self._sizes)
+        lengths = _LONGER ** np.arange(1 + int(np.log(total.views) / np.log(_LONGER)))
+        tail = self._chance / (count + _SOON) / len(self._sizes)
         by_chance = np.sqrt(chdtri(self._sizes, tail))
         found: Sums | None = None
         most = 0.0
-        for length in lengths if thorough else lengths[[looks % len(lengths)]]:
-            since = min(onsets, key=lambda sums: abs(total.looks - length - sums.looks))
-            gain, bias = self._gain(since, total, late, free)
-            excess = float((np.sqrt(gain) - by_chance - np.sqrt(bias)).max())
+        for length in lengths if thorough else lengths[[count % len(lengths)]]:
+            since = min(onsets, key=lambda sums: abs(total.views - length - sums.views))
+            excess = float(
+                self._excess(since, total, self._reduced(since, total, late, free), by_chance).max()
+            )
             if excess > most:
                 found, most = since, excess
         return found
 
-    def _gain(
-        self, since: Sums, total: Sums, late: FloatArray, free: list[IntArray]
-    ) -> tuple[FloatArray, FloatArray]:
-        """What each direction gains since an onset (h,), and what errors of the model may."""
-        e, n = self._errors.e, len(self._errors.sigma_q)
+    def _reduced(self, since: Sums, total: Sums, late: FloatArray, free: list[IntArray]) -> _Reduced:
+        """Normal equations of faults since an onset without errors of the calibration and lasting ones."""
+        e, f, n = self._errors.e, self._errors.f, len(self._errors.sigma_q)
+        line = np.eye(f)
+        line[n : 2 * n, :n] = -since.t * np.eye(n)
         across = (total.normal - since.normal)[:, e:]
-        for part in (across.T, across[e:]):  # time is from the onset
-            part[n : 2 * n] -= since.t * part[:n]
+        across[:, :f] = across[:, :f] @ line.T
+        across[e:-1] = line @ across[e:-1]
         least = RIDGE * across[e:].diagonal()
         across[:e, -1] = total.normal[:e, -1]
-        W = solve_triangular(self._errors.root(total), across[:e], lower=True, check_finite=False)
-        normal = across[e:] - W.T @ W
+        root = self._errors.root(total)
+        along = solve_triangular(root, across[:e], lower=True, check_finite=False)
+        normal = across[e:] - along.T @ along
         beside = np.concatenate([np.arange(2 * n + 2), *free]).astype(np.int64)
         weight = np.diag(np.maximum(least[beside], RIDGE))
         weight[: 2 * n + 2, : 2 * n + 2] = self._errors.lasting(total.t - since.t, late)
         solved = np.linalg.solve(normal[np.ix_(beside, beside)] + weight, normal[beside])
         normal -= normal[:, beside] @ solved
-        gain = np.zeros(len(self._sizes))
+        return _Reduced(
+            normal=normal,
+            least=least,
+            root=root,
+            along=along[:, :f],
+            beside=beside,
+            solved=solved[:, :f],
+            line=line,
+        )
+
+    def _excess(self, since: Sums, total: Sums, reduced: _Reduced, by_chance: FloatArray) -> FloatArray:
+        """Root of what each direction gains (h,) beyond chance, errors of the model and of corners.
+
+        Corners err at their worst in each view; or they do so in one, as independent from view to view, and
+        those that last beyond a view add to the covariance of a direction. The bound that allows less holds.
+        Of both only the part counts that errors of joints do not cover.
+        """
+        touches, parts = self._errors.touches, self._errors.parts
+        bias = touches @ (total.bias - since.bias).ravel()
+        gained = self._root_gains(reduced, 0.0)
+        excess = gained - by_chance - np.sqrt(bias)
+        beyond = np.flatnonzero(excess > 0.0)
+        if not beyond.size:
+            return excess
+        # Corners that are off all along change the calibration as seen before the onset, too.
+        e, memory = self._errors.e, self.memory
+        by_corner = total.by_corner - since.by_corner
+        by_corner[:e] = total.by_corner[:e]
+        off = reduced.of(by_corner)
+        spread, weight = off @ off.T, total.weight - since.weight
+        share = np.minimum([_greatest(spread, reduced, parts[i]) / weight for i in beyond], 1.0)
+        touched, seen = touches[beyond], (total.seen - since.seen).ravel()
+        corners = np.maximum(2.0 * touched @ (seen > 0.0), 4.0)  # coordinates of a view
+        worst = (1.0 - memory.fresh) * chdtri(corners, _LASTING_CORNERS) / corners * share * (touched @ seen)
+        one = (total.weight_squares - since.weight_squares) / weight**2  # what one view is of all
+        beside = self._root_gains(reduced, (1.0 - one) * memory.persistent * spread)
+        limits = [by_chance[beyond] + np.sqrt(bias[beyond] + part * worst) for part in (1.0, one)]
+        excess[beyond] = np.maximum(gained[beyond] - limits[0], beside[beyond] - limits[1])
+        return excess
+
+    def _root_gains(self, reduced: _Reduced, more: FloatArray | float) -> FloatArray:
+        """Root (h,) of what each direction gains, its score with more covariance (f, f)."""
+        normal, gain = reduced.normal, np.zeros(len(self._sizes))
+        covariance = normal[:-1, :-1] + more
         for which, columns in self._by_size:
-            gain[which] = gains(normal, normal[:, -1], columns, least)[0]
-        touches, seen = self._errors.touches, (total.seen - since.seen).ravel()
-        corners = np.maximum(2.0 * touches @ (seen > 0.0), 4.0)  # coordinates of a view
-        lasting = (1.0 - self.memory.fresh) * chdtri(corners, _LASTING_CORNERS) / corners
-        return gain, touches @ (total.bias - since.bias).ravel() + lasting * (touches @ seen)
+            gain[which] = gains(covariance, normal[:-1, -1], columns, reduced.least[:-1])[0]
+        return np.sqrt(gain)
 
 
 def gains(
     normal: FloatArray, right: FloatArray, parts: IntArray, least: FloatArray | float
 ) -> tuple[FloatArray, FloatArray]:
-    """bᵀ A⁻¹ b (h,) and A⁻¹ b (h, p) for parts (h, p) of A x = b, its diagonal not below a least."""
+    """bᵀ A⁻¹ b (h,) and A⁻¹ b (h, p) for parts (h, p) of A x = b, its diagonal not below a minimum."""
     size = np.sqrt(np.maximum(np.maximum(normal.diagonal(), least), 1e-300))[parts]
     blocks = normal[parts[:, :, None], parts[:, None, :]] / (size[:, :, None] * size[:, None, :])
     b = right[parts] / size
@@ -512,10 +649,18 @@ def gains(
     return np.maximum((b * x).sum(axis=1), 0.0), x / size
 
 
-def beside_others(S: FloatArray, r: FloatArray) -> FloatArray:
-    """Return χ² (k,) of each sighting given all others, of residuals r (2 k,) with covariance S.
+def _greatest(spread: FloatArray, reduced: _Reduced, part: IntArray) -> float:
+    """Greatest ratio of a covariance (f, f) to that of the score of a direction."""
+    own, other = reduced.normal[np.ix_(part, part)], spread[np.ix_(part, part)]
+    size = np.sqrt(np.maximum(own.diagonal(), np.maximum(reduced.least[part], 1e-300)))
+    unit = np.outer(size, size)
+    return float(eigh(other / unit, own / unit + _RANK * np.eye(len(part)), eigvals_only=True)[-1])
 
-    Errors of joints move all of them: one by itself hardly shows what it is off.
+
+def beside_others(S: FloatArray, r: FloatArray) -> FloatArray:
+    """Return χ² (k,) of each detection given all others, of residuals r (2 k,) with covariance S.
+
+    Errors of joints move all of them: one by itself hardly shows its own error.
     """
     P, k = np.linalg.inv(S), np.arange(len(r) // 2)
     u, blocks = (P @ r).reshape(-1, 2, 1), P.reshape(len(k), 2, len(k), 2)[k, :, k]
@@ -533,7 +678,7 @@ def _rays(scene: Parameters, directions: FloatArray, q: FloatArray) -> FloatArra
 
 
 def _rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) -> FloatArray:
-    """Basis (d, 4, 4) of rigid motions: translations, and what the joints generate together."""
+    """Basis (d, 4, 4) of rigid motions: translations, and those that the joints generate together."""
     brackets = [A @ B - B @ A for A in H_hat for B in H_hat]
     known = np.concatenate([H_hat, np.array(brackets), directions[:, :, None] * a_inf])
     sizes, rows = np.linalg.svd(known.reshape(-1, 16))[1:]
@@ -541,7 +686,7 @@ def _rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray)
 
 
 def _directions_of(n: int, m: int, d: int) -> tuple[list[IntArray], FloatArray, int]:
-    """Columns of each direction of a fault, sightings (h, 2 m) that each touches, and how many columns.
+    """Columns of each direction of a fault, detections (h, 2 m) that each touches, and how many columns.
 
     The columns are: joints, joints that go on, instants, cameras, markers, rigid motions of the tool and of
     the rig.

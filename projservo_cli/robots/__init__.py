@@ -1,1 +1,1 @@
-"""What is driven: true robots and rigs, simulated ones, and those of users."""
+"""Robots of the contract: true ones and rigs, simulated ones, and those of users."""

@@ -1,7 +1,7 @@
 """A robot of the contract as the loop drives it: set-points at its pace, images as it will come to rest.
 
-A servo lags behind its set-point while that moves, and sags below it under gravity. What a law is given are
-the joints at which the arm would come to rest if nothing more were sent: lag has then no part in its loop,
+A servo lags behind its set-point while that moves, and sags below it under gravity. A law gets the
+joints at which the arm would come to rest without further commands: lag has then no part in its loop,
 and sag is integrated away.
 """
 
@@ -39,7 +39,7 @@ class _Shot(NamedTuple):
     """A pair of frames that is kept."""
 
     instant: int
-    s: FloatArray  # (2, m, 2) px, what was found in it
+    s: FloatArray  # (2, m, 2) px, its detections
     jpeg: tuple[bytes, bytes]
 
 
@@ -60,7 +60,7 @@ class Film:
             self._kept.append(_Shot(instant, s, _as_jpeg(frames)))
 
     def told(self) -> dict[str, Any]:
-        """What a ``Trace`` holds of it."""
+        """The part that a ``Trace`` holds."""
         if self._last is None:
             return {}
         instant, s, frames = self._last
@@ -87,7 +87,7 @@ def _as_jpeg(frames: ByteArray) -> tuple[bytes, bytes]:
 
 
 class Known(NamedTuple):
-    """What is known of a robot and its images before it is driven."""
+    """Knowledge of a robot and its images before it moves."""
 
     # pixels (k, 2, m, 2) of the markers of the calibration at joints (k, n), rad or m
     predicted: Callable[[FloatArray], FloatArray]
@@ -100,23 +100,23 @@ class Known(NamedTuple):
 
 
 class DrivenRobot:
-    """A robot with its cameras beside the plant that it is taken for.
+    """A robot with its cameras, and the plant that models it.
 
     A law is given the joints at which the arm comes to rest if nothing more is sent, and images as they will
     be there: each pixel is carried by predict(q) − predict(q_then) from when it was taken. Lag and delay so
     vanish from its loop.
 
-    robot : what is driven.
-    plant : face; image size and joint limits: of the calibration, or the true ones of a robot that tells its
+    robot : of the contract.
+    plant : face; image size and joint limits: of the calibration, or the true ones of a robot that knows its
         true joints.
     known : of robot and images.
     monitor : of the raw images against the calibration; None tests nothing.
     ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
     of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
     the images no longer agree with the calibration, or what failed; else empty. ``weight``: (2, k) of the
-    pixels shown in a fit, where the robot tells their deviations. Of each look since ``begin``:
+    pixels shown in a fit, where the robot states their deviations. Of each observation since ``begin``:
     ``delays`` of both views as followed, (2,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot
-    that tells them, joints (n,) or the pose (4, 4) of its tool; ``film`` of its frames.
+    that knows them, joints (n,) or the pose (4, 4) of its tool; ``film`` of its frames.
     """
 
     in_front = True
@@ -138,7 +138,7 @@ class DrivenRobot:
         self.begin()
 
     def begin(self) -> None:
-        """Keep what is told of a run from here on."""
+        """Record the run from here on."""
         self.delays: list[FloatArray] = []
         self.readings: list[FloatArray] = []
         self.truths: list[FloatArray] = []
@@ -172,7 +172,7 @@ class DrivenRobot:
         if self.monitor is not None:
             q_dot = np.stack([history.speed_at(float(t)) for t in frames.t])
             self.monitor.unanswered = self.steered.set_point.unanswered
-            fault = self.monitor.look(
+            fault = self.monitor.observe(
                 frames.t, q_then, q_dot, frames.sigma, images, frames.fresh, stated=stated
             )
             self.disturbance = fault or self.disturbance
@@ -206,27 +206,27 @@ class DrivenRobot:
 
     @property
     def pending(self) -> bool:
-        """Whether images disagreed and nothing has cleared that yet."""
+        """Whether images disagreed and later ones have not cleared that yet."""
         return self.monitor is not None and self.monitor.pending
 
     def give_up(self) -> None:
-        """Say what is wrong as far as it is known, where there is no time for more looks."""
+        """Set the fault as far as it is known, where there is no time for more observations."""
         if self.monitor is not None:
             self.disturbance = self.disturbance or self.monitor.give_up()
 
     def fits(self) -> str:
-        """Return what is wrong with the images where the robot stands; empty where enough of them agree.
+        """Return the fault that images show where the robot stands; empty where enough of them agree.
 
         Nothing is moved meanwhile.
         """
         for look in range(1, _MOST_LOOKS):
-            tested = 0 if self.monitor is None else self.monitor.looks
+            tested = 0 if self.monitor is None else self.monitor.observations
             self.joints()
             self.observe()
             if self.disturbance or self._agreed(look):
                 return self.disturbance
-            if self.monitor is None or self.monitor.looks > tested:
-                continue  # the next look shows another image
+            if self.monitor is None or self.monitor.observations > tested:
+                continue  # the next observation shows another image
             if not self.robot.waits(self.robot.bounds.period):  # time passes in commands alone
                 if look >= WINDOW and self.monitor.agreeing and not self.pending:
                     return ""
@@ -237,12 +237,12 @@ class DrivenRobot:
         return self.disturbance
 
     def _agreed(self, looks: int) -> bool:
-        """Whether enough of so many looks agree."""
+        """Whether enough of a number of observations agree."""
         agreeing = looks if self.monitor is None else self.monitor.agreeing
         return agreeing >= WINDOW and not self.pending
 
     def agrees(self) -> str:
-        """Test the images of the last look, held as long as they disagree; return what is wrong with them."""
+        """Test the last images, holding the arm while they disagree; return the fault."""
         self.observe()
         for _ in range(_MOST_LOOKS):
             if self.disturbance or not self.holds:
@@ -259,7 +259,7 @@ class DrivenRobot:
         return math.sqrt(2.0 * float(np.nanmean(face**2)))
 
     def settled(self, within_px: float) -> bool:
-        """Whether the arm stands as far as images to so many px rms, or its readings, can tell.
+        """Whether the arm stands, by images within a number of px rms or by its readings.
 
         Not before images of where it stands agree with the calibration.
         """

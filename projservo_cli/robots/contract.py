@@ -31,7 +31,7 @@ class Reading(NamedTuple):
     s: FloatArray  # (2, m, 2) px, NaN in both coordinates where unseen
     t_q: float  # when the joints were read, s: the robot's stamp, else its clock just before it was asked
     t_view: FloatArray  # (2,) stamps of both frames, s, by whatever clock; NaN where there are none
-    sigma_px: FloatArray | None  # (2, m) standard deviation of each corner, px; None where none is told
+    sigma_px: FloatArray | None  # (2, m) standard deviation of each corner, px; None where none is stated
 
     def new_views(self, before: "Reading | None") -> tuple[bool, bool]:
         """Whether each view has another frame than in the reading before."""
@@ -45,7 +45,7 @@ class Reading(NamedTuple):
 class Bounds(NamedTuple):
     """What no command may exceed, and how servos follow; (n,) each, rad or m.
 
-    ``units`` are those in which messages tell joints: deg, rad or m; empty where nobody says.
+    ``units`` are those in which messages give joints: deg, rad or m; empty where unknown.
     """
 
     limits: JointLimits  # of speed with the factor of every command
@@ -75,8 +75,8 @@ class Robot(Protocol):
     ``release()`` and ``hold()``, which let go of the arm, so that somebody can move it for ``projservo
     teach``, and hold it again; and, if it is a simulator, ``truth()``, the pose (4, 4) of the tool in its
     base frame, m, or its joints (n,), for results alone. A simulator's time passes in ``command`` alone,
-    which moves it to ``due``. And ``frames``, both images (2, height, width) of its last look in grey, uint8,
-    or None: a run keeps some, which the report shows.
+    which moves it to ``due``. And ``frames``, both images (2, height, width) of its last observation in grey,
+    uint8, or None: a run keeps some, which the report shows.
     """
 
     def open(self) -> None:
@@ -109,10 +109,10 @@ class Robot(Protocol):
 class ForeignRobot:
     """A robot of somebody whose answers are awaited for a time and checked, as are its commands.
 
-    robot : what is driven.
+    robot : an object of the contract.
     name : of it, for messages.
     markers : how many it observes.
-    bounds : of its commands; they tell the number of joints, too.
+    bounds : of its commands; they give the number of joints, too.
     timeout_s, open_s : most time an answer may take, s, and opening it.
     image_size : width and height of its frames, px; None for any.
     All methods raise ``WorkFailed`` where the robot fails, is late or answers nonsense. Calls are made in one
@@ -135,7 +135,7 @@ class ForeignRobot:
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
         self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
         self._last: Reading | None = None
-        self.frames: ByteArray | None = None  # (2, height, width) of the last look, where the robot has them
+        self.frames: ByteArray | None = None  # (2, height, width) last seen, where the robot has them
         self._sent: FloatArray | None = None  # the last set-point (n,)
         self._due = -math.inf  # when it is to be there, s
         self._orders: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
@@ -153,7 +153,7 @@ class ForeignRobot:
         self._opened = True
 
     def read(self) -> Reading:
-        """Joints and pixels of one look."""
+        """Joints and pixels of one observation."""
         before, answer, frames = self._ask("read", self._look)
         self._last = self._checked(self._time(before), answer)
         if frames is not None and not (
@@ -176,15 +176,15 @@ class ForeignRobot:
         return self._last
 
     def _look(self) -> tuple[Any, Any, Any]:
-        """What the clock shows, the look, and the frames of it."""
+        """Time of the clock, the observation, and its frames."""
         return self._now(), self.robot.read(), getattr(self.robot, "frames", None)
 
     def now(self) -> float:
-        """What the clock of the robot shows, s; that of this machine where it has none."""
+        """Time of the clock of the robot, s; of that of this machine where it has none."""
         return self._time(time.monotonic() if self._now is time.monotonic else self._ask("now", self._now))
 
     def truth(self) -> FloatArray | None:
-        """True pose (4, 4) of the tool, m, or true joints (n,), rad or m; None where nobody tells."""
+        """True pose (4, 4) of the tool, m, or true joints (n,), rad or m; None where unknown."""
         tell = getattr(self.robot, "truth", None)
         if tell is None:
             return None
@@ -265,7 +265,7 @@ class ForeignRobot:
             raise WorkFailed(f"{self.name}: stop() {what}; see to it that the robot is at rest")
 
     def close(self) -> None:
-        """Let go of the robot, once, in its thread, even if opening it failed; what goes wrong is said."""
+        """Let go of the robot, once, in its thread, even if opening it failed, and report errors."""
         if not self._begun:
             return
         self._begun = False
@@ -313,7 +313,7 @@ class ForeignRobot:
         return now
 
     def _checked(self, before: float, answer: Any) -> Reading:
-        """What read() gave as new numbers; ``before`` is what the clock showed then, s."""
+        """Copy the answer of read(); ``before`` is the time of the clock then, s."""
         if not isinstance(answer, tuple) or not 2 <= len(answer) <= 6:
             raise WorkFailed(
                 f"{self.name}: read() gave {type(answer).__name__}: expected (q, pixels), perhaps with t_q, "
@@ -356,7 +356,7 @@ class ForeignRobot:
         allowed = {
             "beyond its limits": bounds.within_limits(q),
             "too far ahead of the reading": bounds.not_far_ahead(q),
-            # Back towards the reading it may jump: that shortens the way of the robot.
+            # Back towards the reading it may jump: that shortens the path of the robot.
             "too far from the last one": (np.minimum(sent, q) - step, np.maximum(sent, q) + step),
         }
         slack = _ROUND_OFF * (1.0 + np.abs(target))
@@ -415,7 +415,7 @@ def _came(orders: "list[Future[Any]]", seconds: float) -> str | None:
 def at_rest_after(robot: ForeignRobot) -> Iterator[None]:
     """Open a robot; stop and close it on every way out, Ctrl-C, SIGTERM and a lost terminal among them.
 
-    Raises WorkFailed if it may not be at rest, beside what ended it.
+    Raises WorkFailed if it may not be at rest, with the error that ended it.
     """
     with _signals_interrupt():
         try:

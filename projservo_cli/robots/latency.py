@@ -14,7 +14,7 @@ import numpy as np
 from projservo_cli.calibration.time_offset import is_repeated_frame
 from projservo_cli.records import VIEWS, BoolArray, FloatArray, WorkFailed
 
-# Deviation of a delay of which nothing is known, and of a single frame where no calibration tells it, s.
+# Deviation of an unknown delay, and of a single frame where no calibration gives it, s.
 UNKNOWN_S, _JITTER_S = 0.3, 0.012
 # Readings that are kept, and how far beyond the last one joints are taken to move on, s.
 _KEPT, _AHEAD_S = 256, 0.1
@@ -24,12 +24,12 @@ _DELAYS = np.arange(-0.1, 1.0, 0.01)
 _APART_S = 0.02
 # Markers err alike: they count as so many coordinates. What no image excludes.
 _COUNTED, _LEAST_CHANCE = 8.0, 1e-9
-# A frame farther from its instant than so many deviations is none of this delay, nor are so many in a row; it
-# fits so much better elsewhere, in squares.
+# A frame farther from its instant than this number of deviations is none of this delay, nor is that number in
+# a row; the factor by which it fits better elsewhere, in squares.
 _GATE, _STRAYS, _CLEARLY = 4.0, 3, 9.0
-# How fast a delay may change, s for each frame that tells it; so many in a row err alike, by the model.
+# Rate at which a delay may change, s for each frame that shows it; number in a row that err alike.
 _DRIFT_S, _ALIKE = 0.2e-3, 10.0
-# What the model is off at least where it tells the instant of a frame, px.
+# Error of the model at least where it gives the instant of a frame, px.
 _MODEL_PX = 0.3
 # Images should have moved so far, px, before one that stands still is a fault.
 _STILL_PX = 5.0
@@ -73,7 +73,7 @@ class History:
 
 
 class DelayPrior(NamedTuple):
-    """What is known of the delays of both views before the first image."""
+    """Knowledge of the delays of both views before the first image."""
 
     mean: FloatArray  # (2,) s
     sigma: FloatArray  # (2,) s, of the mean; 0 where it is given and not followed
@@ -84,7 +84,7 @@ NOTHING_KNOWN = DelayPrior(np.zeros(2), np.full(2, UNKNOWN_S), np.full(2, _JITTE
 
 
 class _Frames(NamedTuple):
-    """When the images of a look were taken."""
+    """Instants of the images of an observation."""
 
     t: FloatArray  # (2,) s, by the clock of the readings
     sigma: FloatArray  # (2,) s, how well that was known before the images were looked at
@@ -124,10 +124,10 @@ class Delays:
         return np.array([view.mean for view in self._views])
 
     def look(self, t_view: FloatArray, images: FloatArray, history: History) -> _Frames:
-        """Instants of both images of a look.
+        """Instants of both images of an observation.
 
         t_view : (2,) s, stamps, NaN where there are none; images : (2, m, 2) px, NaN where unseen.
-        history : of the readings, that of this look the last.
+        history : of the readings, that of this observation the last.
         Raises WorkFailed if the clock of a camera jumped, or its image stands still while the joints move.
         """
         if self._sigma_q.any():
@@ -139,9 +139,9 @@ class Delays:
         return _Frames(np.array(t), np.array(sigma), np.array(fresh))
 
     def _reckon_with_joints(self, q: FloatArray) -> None:
-        """Take what errors of the readings at joints (n,) do to images into what the model is off.
+        """Add the effect of errors of the readings at joints (n,) to the error of the model.
 
-        While a joint goes through its play, readings move and images do not: as they would if they were late.
+        While a joint goes through its backlash, readings move and images do not, as with latency.
         """
         squares = squares_by_joints(self._predicted, q, self._sigma_q)
         for view, square in zip(self._views, squares, strict=True):
@@ -152,7 +152,7 @@ class Delays:
 class _View:
     """The delay of one view, and the instants of its frames.
 
-    While the joints move, an image tells when it was taken. Where little is known of the delay, the chance of
+    While the joints move, an image shows when it was taken. Where little is known of the delay, the chance of
     each is kept; else a Kalman filter follows the mean, from which single frames stray by jitter:
     s − ŝ(t) = ṡ (t′ − t), to first order.
 
@@ -269,7 +269,7 @@ class _View:
         return t + float(np.clip(shift, -_APART_S, _APART_S))
 
     def _followed(self, image: FloatArray, nominal: float, history: History) -> float:
-        """Instant of a fresh image, s, by what was known and what it shows; the delay is followed."""
+        """Instant of a fresh image, s, by the delay so far and the image; follow the delay."""
         expected, variance = nominal - self.mean, self._variance + self._jitter**2
         shift, sigma = self._shift(image, expected, history)
         if not math.isfinite(sigma):
@@ -295,7 +295,7 @@ class _View:
     def _shift(self, image: FloatArray, t: float, history: History) -> tuple[float, float]:
         """How much later than t an image was taken, to first order, and the deviation of that, s.
 
-        An image tells its instant only where it moved the same way before and after.
+        An image gives its instant only where it moved in the same direction before and after.
         """
         predicted = self._seen(history, t + _APART_S * np.array([-1.0, 0.0, 1.0]))
         known = np.isfinite(image[:, 0]) & np.isfinite(predicted[..., 0]).all(axis=0)

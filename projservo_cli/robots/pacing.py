@@ -8,14 +8,14 @@ from projservo_cli.records import BoolArray, FloatArray
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading
 from projservo_cli.robots.latency import History
 
-# Share of the sag allowed for that a servo may still be behind where sag is told from lag.
+# Share of the sag allowed for that a servo may still be behind where sag is separated from lag.
 _STILL = 0.2
 
 
 class SetPoint:
     """The set-point of a robot.
 
-    bounds : of its commands, with what is taken of its servos.
+    bounds : of its commands, with the limits of its servos.
     q : (n,) first reading, rad or m: where it is sent at first.
     ``target``: (n,) the set-point, rad or m. ``short``: (n,) joints whose last step was cut short because the
     set-point was too far ahead of the reading.
@@ -62,9 +62,9 @@ class Steered:
 
     The robot itself accumulates nothing.
 
-    robot : what is driven.
-    ``reading``: of the last look. ``history``: joint readings of all looks. ``set_point``: where it is sent,
-    at first where it is read to stand. ``overruns``: periods that reading and thinking did not fit into.
+    robot : of the contract.
+    ``reading``: the last one. ``history``: joint readings of all observations. ``set_point``: its
+    target, at first where it is read to stand. ``overruns``: periods that reading and computing did not fit.
     """
 
     reading: Reading

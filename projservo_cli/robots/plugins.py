@@ -55,7 +55,7 @@ def find(kind: str, target: str) -> Any:
 def make(kind: str, target: str, arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
     """Import a class and make an object of it.
 
-    kind, target : as for ``find``; arguments, options : what the class is called with.
+    kind, target : as for ``find``; arguments, options : of the call of the class.
     Raises InputError if there is no such class, it lacks a method or does not take the arguments; WorkFailed
     if the class fails when called.
     """
@@ -74,7 +74,7 @@ def called(kind: str, target: str, found: Any, arguments: Sequence[Any], options
         given = f"{kind}.options" if kind == "plant" else "the setting it is given"
         raise InputError(f"{where}: does not take {given}: {error}") from error
     except ValueError:
-        pass  # a class in C tells nothing about its arguments; the call itself will
+        pass  # a class in C does not show its arguments; the call itself checks them
     try:
         result = found(*arguments, **options)
     except Exception as error:
@@ -145,7 +145,7 @@ def bring(kind: str, given: Any) -> str:
 
 
 def importable(given: Any) -> bool:
-    """Whether another process finds a class by its name: not what a notebook or a function defines."""
+    """Whether another process finds a class by its name, unlike those of a notebook or a function."""
     module, path = sys.modules.get(given.__module__), given.__qualname__.split(".")
     found: Any = module if getattr(module, "__file__", None) is not None else None
     for step in path:
@@ -169,7 +169,7 @@ def _require_methods(where: str, found: Any, kind: str) -> None:
 
 
 def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:
-    """Refuse an object with an attribute that is spelt almost as one of those that are looked for.
+    """Refuse an object with an attribute that is spelt almost as one of the known ones.
 
     It would else count as one that the object does not have.
 

@@ -1,4 +1,4 @@
-"""What is configured of a robot: its joints and their limits, what its servos may do, and its class."""
+"""Settings of a robot: its joints and their limits, the bounds of its servos, and its class."""
 
 import math
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ class Pace(NamedTuple):
 
 
 class Joints(NamedTuple):
-    """What is known of the joints of a robot."""
+    """Knowledge of the joints of a robot."""
 
     types: str  # one letter a joint, R or P
     limits: JointLimits  # infinite where none is set; accelerations of the profile joint_space alone
@@ -58,9 +58,9 @@ def limit_passed(q: FloatArray, limits: JointLimits, units: Sequence[str]) -> st
 
 
 class JointSettings(NamedTuple):
-    """Joints as far as they are configured; data tell what is missing."""
+    """Joints as far as they are configured; data give the rest."""
 
-    types: str  # one letter a joint, R or P; empty where only a table tells
+    types: str  # one letter a joint, R or P; empty where only a table gives them
     ranges: tuple[tuple[float, float], ...] | None  # lowest and highest readings; None for no limits
     in_degrees: bool  # whether those of revolute joints are in degrees
     widened: float | None  # the limits are what joints cover in the data, widened by this share of it
@@ -69,9 +69,9 @@ class JointSettings(NamedTuple):
     pace: Pace = Pace()
 
     def joints(self, default_types: str = "", calibration: Calibration | None = None) -> Joints:
-        """Joints of the robot; of ``default_types``, else revolute ones, where nobody tells their types.
+        """Joints of the robot; of ``default_types``, else revolute ones, where their types are unknown.
 
-        calibration : whose data tell limits where they are taken from there; without, none are.
+        calibration : whose data give limits where they are taken from there; without, none are.
         """
         types, pace = self.types or default_types or "R" * self.known, self.pace
         lower, upper = self._limits(types, calibration)
@@ -82,7 +82,7 @@ class JointSettings(NamedTuple):
         return Joints(types, JointLimits(lower, upper, speed, acceleration), units)
 
     def _limits(self, types: str, calibration: Calibration | None) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper limits (n,), rad or m; infinite where nothing tells them."""
+        """Lower and upper limits (n,), rad or m; infinite where unknown."""
         if self.widened is not None and calibration is not None:
             share, span = self.widened, calibration.excitation
             return calibration.joint_min - share * span, calibration.joint_min + (1.0 + share) * span
@@ -99,7 +99,7 @@ class JointSettings(NamedTuple):
 
 
 class Following(NamedTuple):
-    """How commands go to a robot of the contract, and what is taken of its servos."""
+    """Pace of commands to a robot of the contract, and limits of its servos."""
 
     period: float  # of commands, s
     speed_scale: float  # factor of every command
@@ -110,7 +110,7 @@ class Following(NamedTuple):
     )  # how far a set-point may lead the reading; None for what lag and sag ask for
 
     def bounds(self, joints: Joints) -> Bounds:
-        """Return what no command may exceed, and what is taken of the servos."""
+        """Return the bounds of commands, and limits of the servos."""
         speed, sag = joints.limits.speed * self.speed_scale, joints.length_of(self.max_steady_state_error_deg)
         lead = speed * (self.max_servo_lag_s + self.period) + sag
         if self.max_relative_target_deg is not None:

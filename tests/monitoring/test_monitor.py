@@ -21,7 +21,7 @@ from projservo_cli.calibration.prediction import (
 from projservo_cli.monitoring import statistics
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.monitor import ImageMonitor
-from projservo_cli.monitoring.statistics import WINDOW, ErrorModel, Memory
+from projservo_cli.monitoring.statistics import WINDOW, Detector, ErrorModel, Memory
 from tests.calibration.simulated_robot import random_robot, trials
 from tests.configured import calibrate, truth_of
 from tests.known import configured
@@ -83,7 +83,7 @@ def first_alarm(arm, read, s, q_dot=None, delay_sigma=0.0, fresh=None, sigma=SIG
         speed = np.zeros(read.shape[1]) if q_dot is None else q_dot[k]
         new = np.ones(2, dtype=bool) if fresh is None else fresh[k]
         at_once, t = (np.stack([row] * 2) for row in (read[k], speed)), np.full(2, PERIOD * k)
-        said = test.look(t, *at_once, np.full(2, delay_sigma), s[k], new, stated=stated)
+        said = test.observe(t, *at_once, np.full(2, delay_sigma), s[k], new, stated=stated)
         if said:
             return k, said
     return None, ""
@@ -130,7 +130,7 @@ def test_ticks_that_last_at_rest_do_not_average_into_a_slip(arm):
         test = ImageMonitor(arm.calibration, SIGMA, LOOKS)
         held = []
         for k in range(len(read)):
-            test.look(
+            test.observe(
                 np.full(2, PERIOD * k), *at_once(np.stack([read[k], 0 * q[k]])), np.zeros(2), s[k], [1, 1]
             )
             held.append(test.holds)
@@ -207,7 +207,7 @@ def test_what_one_camera_shows_later_is_no_fault_of_the_other(arm):
     for k in range(late, len(q)):
         rows = [k, k - late]
         t, shown = PERIOD * np.array(rows), np.stack([s[k, 0], s[k - late, 1]])
-        if said := test.look(t, q[rows], q_dot[rows], np.zeros(2), shown, np.ones(2, dtype=bool)):
+        if said := test.observe(t, q[rows], q_dot[rows], np.zeros(2), shown, np.ones(2, dtype=bool)):
             break
     assert "joint 3 slipped" in said
     assert 20 + late < k < 20 + late + 2 * WINDOW
@@ -372,6 +372,50 @@ def test_errors_of_corners_that_last_hide_no_camera_that_moves_by_more(arm, way)
     assert "the left camera was moved" in first_alarm(arm, q, s)[1]
 
 
+@pytest.mark.parametrize(("stride", "way"), [(3, 4), (4, 7)])
+def test_a_camera_that_moves_by_two_pixels_in_motion_is_named_before_the_end(arm, stride, way):
+    """No two looks in motion are of one view: all differences count that tell how long corners err alike."""
+    q, _ = arm.way(way)
+    q = np.concatenate([q[:1].repeat(4, axis=0), q[3 : 3 + STEPS : stride], q[-1:].repeat(12, axis=0)])
+    s = noisy(arm.images(at_once(q)), way)
+    assert first_alarm(arm, q, s) == (None, "")
+    s[4 + STEPS // stride // 3 :, 0] += (2.0, 1.0)
+    assert "the left camera was moved" in first_alarm(arm, q, s)[1]
+
+
+@pytest.mark.parametrize("way", range(3))
+@pytest.mark.parametrize("shift", [0.0, 15.0])
+def test_errors_of_corners_excuse_only_what_joints_in_error_do_not_cover(arm, way, shift):
+    """Both cameras moved alike, where joints are uncertain by 0.003 rad: most of a score is theirs."""
+    errors = ErrorModel(arm.with_joint_noise(0.003).calibration, SIGMA)
+    detector, late = Detector(errors, LOOKS), np.full(2, statistics.LEAST_ERROR)
+    q = arm.way(way)[0][[0, STEPS // 2, -1]]
+    s = arm.images(at_once(q))
+    s[..., 0] += shift
+    noise = np.full((2, len(arm.scene.M)), SIGMA)
+    for k in range(len(q)):
+        t, both, still = np.full(2, PERIOD * k), at_once(q)[k], np.zeros((2, 6))
+        look = FramePair(t=t, q=both, q_dot=still, late=late, images=s[k], noise=noise, curved=still[0])
+        detector.memory.keep(errors.residual(look), PERIOD * k, True)
+    assert (detector.significant(len(q), late, [], True) is not None) == bool(shift)
+
+
+def test_looks_in_which_a_hand_comes_and_goes_are_not_kept(arm):
+    """It hides three markers of a view, then all but three, and three again; pulled corners hardly show."""
+    q, _ = arm.way(3)
+    q = q[:: len(q) // 24][:24]
+    s = noisy(arm.images(at_once(q)), 3)
+    s[8:12, 1, :3] = s[16:18, 1, :3] = np.nan
+    s[12:16, 1, :7] = np.nan
+    test, new, views = ImageMonitor(arm.calibration, SIGMA, LOOKS), np.ones(2, dtype=bool), []
+    for k in range(len(q)):
+        test.observe(np.full(2, PERIOD * k), at_once(q)[k], np.zeros((2, 6)), np.zeros(2), s[k], new)
+        views.append(test._detector.memory.views)
+    assert views[7] < views[11]
+    assert views[12] == views[17] == views[7]
+    assert views[-1] > views[17]
+
+
 @pytest.mark.parametrize(
     ("unanswered", "name"), [(3.0, "the reading of joint 2 stands still"), (0.5, "joint 2 slipped by")]
 )
@@ -384,7 +428,7 @@ def test_a_slip_by_what_the_set_point_went_without_the_reading_is_a_frozen_one(a
     test.unanswered = -unanswered / 3.0 * slip
     still, new = np.zeros((2, 6)), np.ones(2, dtype=bool)
     for k in range(len(q)):
-        said = test.look(np.full(2, PERIOD * k), at_once(q)[k], still, np.zeros(2), s[k], new)
+        said = test.observe(np.full(2, PERIOD * k), at_once(q)[k], still, np.zeros(2), s[k], new)
         if said:
             break
     assert name in said
