@@ -57,7 +57,7 @@ class _JointMoved(Section):
     by_deg: Number | None = Field(None, description="angle of a revolute joint")
     by_m: Number | None = Field(None, description="distance of a prismatic joint")
     encoder_slip: StrictBool = Field(
-        False, description="true: the link slips on its encoder, and the reading stays the same"
+        False, description="whether the link slips on its encoder, so that the reading stays the same"
     )
 
     def contradictions(self) -> Iterator[Finding]:
@@ -128,7 +128,7 @@ class Disturbance(Section):
         0.0, description="delay of the right camera behind the left one, with frame_rate_hz"
     )
     stamps: StrictBool = Field(
-        False, description="true: images carry the time of mid-exposure, each camera by its own clock"
+        False, description="whether images carry the time of mid-exposure, each camera by its own clock"
     )
     encoder_counts_per_turn: Count | None = Field(
         None,
@@ -136,7 +136,7 @@ class Disturbance(Section):
         "joint; null: continuous",
     )
     quantize_setpoints: StrictBool = Field(
-        False, description="true: set-points are rounded to encoder counts as well"
+        False, description="whether set-points are rounded to encoder counts as well"
     )
     servo_time_constant_s: NotNegative = Field(
         0.0, description="time constant of the first-order lag of the servos"
@@ -231,7 +231,7 @@ class _CalibrationSettings(Section):
 
     method: Literal["bundle_adjustment", "closed_form"] = Field(
         "bundle_adjustment",
-        description="bundle_adjustment: maximum likelihood; closed_form: the closed forms of the paper",
+        description="bundle_adjustment is maximum likelihood; closed_form has the closed forms of the paper",
     )
     frames_per_joint: StrictInt = Field(
         8, ge=0, le=10_000, description="trial poses of each joint, in addition to the reference"
@@ -268,7 +268,7 @@ class _CalibrationSettings(Section):
         None, description="seed of the noise of the trial motions; null: seed of the run"
     )
     lens: StrictBool = Field(
-        False, description="true: estimate two coefficients of radial distortion for each camera"
+        False, description="whether to estimate two coefficients of radial distortion for each camera"
     )
 
     def contradictions(self) -> Iterator[Finding]:
@@ -309,8 +309,9 @@ class _Control(Section):
     )
     mode: Annotated[_Modes, BeforeValidator(one_or_more, json_schema_input_type=_Mode | _Modes)] = Field(
         ("regulate",),
-        description="regulate: each step moves to the goal by the present images; track, image_track: "
-        "follow the plan; a list runs each law in those of the modes that it has",
+        description="regulate moves to the goal by the present images in each step; track and "
+        "image_track follow the plan; a list runs each law in those of the modes that it "
+        "has",
     )
     on_plan_failure: Literal["regulate", "refuse"] = Field(
         "regulate",
@@ -348,7 +349,7 @@ class _Control(Section):
         None, description="acceleration limit of prismatic joints, profile joint_space; null: 2"
     )
     substeps: Literal["none", "auto"] = Field(
-        "auto", description="auto: the law exact sends long steps in parts; none: in one"
+        "auto", description="auto lets the law exact send long steps in parts, none in one"
     )
     features: Literal["points", "body"] | None = Field(
         None,
@@ -380,7 +381,7 @@ class RenderedOptions(Section):
 
     servo: Literal["own", "position", "velocity"] = Field(
         "own",
-        description="actuators: position or velocity servos; own: those of robot.mjcf, else position",
+        description="actuators: position or velocity servos; own for those of robot.mjcf, else position",
     )
     grey_noise: NotNegative = Field(
         2.0, description="standard deviation of the image noise, grey levels of 255"
@@ -390,7 +391,7 @@ class RenderedOptions(Section):
         0.0, gt=-1, lt=1, description="radial distortion r (1 + k1 r²), r in units of the focal length"
     )
     light: Literal["soft", "side"] = Field(
-        "soft", description="soft: from all around; side: hard light from one side"
+        "soft", description="soft light from all around, or hard light from one side"
     )
 
 
@@ -403,8 +404,8 @@ class _PlantSettings(Section):
 
     use: PlantClass | None = Field(
         None,
-        description="module:Class of an external robot, or mujoco for a simulated arm with rendered "
-        "cameras; null: a simulated arm whose points are projected",
+        description="class of an external robot (module:Class), or mujoco for a simulated arm with "
+        "rendered cameras; null for a simulated arm whose points are projected",
     )
     options: dict[str, Plain] = Field({}, description="keyword arguments of the class")
     timeout_s: Positive = Field(1.0, description="maximum time of one answer of the robot")
@@ -435,7 +436,8 @@ class _PlantSettings(Section):
     )
     speed_scale: Number = Field(1.0, gt=0, le=1, description="factor of all commanded velocities")
     self_occlusion: Literal["transparent", "opaque"] = Field(
-        "transparent", description="opaque: a camera behind the face does not see its markers"
+        "transparent",
+        description="whether a camera behind the face sees its markers (transparent) or not (opaque)",
     )
     joint_limits: Literal["report", "stop"] = Field(
         "report", description="a joint limit is reported, or stops the run"

@@ -103,7 +103,7 @@ class SweepConfig(Root):
     )
     traces: tuple[Whole, ...] = Field((), description="numbers of the runs whose traces are stored")
     between_samples: Annotated[bool, Field(strict=True)] = Field(
-        False, description="true: measure the path deviation between samples too, which is slow"
+        False, description="whether to measure the path deviation between samples too, which is slow"
     )
     chunk: Count | None = Field(
         None, description="number of runs made and stored together; null: about one second of work"

@@ -113,8 +113,7 @@ class KeptOut(Section):
     right: _Polygon | None = Field(None, description="corners u and v in the right image, px; null: none")
     occludes: StrictBool = Field(
         True,
-        description="true: the obstacle may occlude markers, and those of the face stay outside in "
-        "both images",
+        description="whether the obstacle may occlude markers; those of the face stay outside in both images",
     )
 
     def contradictions(self) -> Iterator[Finding]:
