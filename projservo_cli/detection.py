@@ -457,6 +457,11 @@ class TagFinder:
         self._detector = aruco.ArucoDetector(tags, parameters)
         self._cells = int(tags.markerSize) + _BORDER
 
+    @property
+    def known(self) -> int:
+        """Number of tags in the dictionary."""
+        return len(self._tags.bytesList)
+
     def read(self, path: Path) -> FloatArray:
         """Read grey values (height, width) of an image, ignoring its orientation tag.
 
@@ -477,9 +482,10 @@ class TagFinder:
 
         Raises InputError if the dictionary has no such tag.
         """
-        known = len(self._tags.bytesList)
-        if number >= known:
-            raise InputError(f"there is no tag {number} in the dictionary, which has tags 0 to {known - 1}")
+        if number >= self.known:
+            raise InputError(
+                f"there is no tag {number} in the dictionary, which has tags 0 to {self.known - 1}"
+            )
         tag = self.cv.aruco.generateImageMarker(self._tags, number, self._cells * cell_px)
         return np.pad(tag, cell_px, constant_values=255)
 
