@@ -443,7 +443,7 @@ class TagFinder:
     """
 
     def __init__(self, dictionary: str) -> None:
-        self.cv = _opencv()
+        self.cv = opencv()
         aruco = self.cv.aruco
         known = {name.upper().removeprefix("DICT_"): name for name in dir(aruco) if name.startswith("DICT_")}
         name = known.get(dictionary.upper().removeprefix("DICT_"))
@@ -489,8 +489,8 @@ class TagFinder:
         tag = self.cv.aruco.generateImageMarker(self._tags, number, self._cells * cell_px)
         return np.pad(tag, cell_px, constant_values=255)
 
-    def find(self, image: FloatArray) -> tuple[dict[int, Corners], int]:
-        """Corners (4, …) of each tag in an image, and the number of tags that occur more than once.
+    def find(self, image: FloatArray) -> tuple[dict[int, Corners], tuple[int, ...]]:
+        """Corners (4, …) of each tag in an image, and the numbers of tags that occur more than once.
 
         A tag that occurs more than once is ambiguous and rejected.
 
@@ -498,22 +498,25 @@ class TagFinder:
         """
         quads, numbers, _ = self._detector.detectMarkers(image.astype(np.uint8))
         if numbers is None:
-            return {}, 0
+            return {}, ()
         found = [int(number) for number in np.ravel(numbers)]
         ambiguous = {number for number in found if found.count(number) > 1}
         corners = refine_corners(image, np.reshape(quads, (-1, 4, 2)).astype(np.float64), self._cells)
         each = (Corners(*tag) for tag in zip(*corners, strict=True))
         tags = dict(zip(found, each, strict=True))
-        return {number: tag for number, tag in tags.items() if number not in ambiguous}, len(ambiguous)
+        return {number: tag for number, tag in tags.items() if number not in ambiguous}, tuple(
+            sorted(ambiguous)
+        )
 
 
-def _opencv() -> Any:
+def opencv() -> Any:
+    """Return the module of OpenCV; an InputError says what to install."""
     try:
         import cv2
     except ImportError as error:
-        raise InputError("detect needs OpenCV: pip install '.[detect]'") from error
+        raise InputError("tags and cameras need OpenCV: pip install '.[detect]'") from error
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
-        raise InputError(f"detect needs OpenCV 4.7 or newer, not {cv2.__version__}: pip install '.[detect]'")
+        raise InputError(f"tags need OpenCV 4.7 or newer, not {cv2.__version__}: pip install '.[detect]'")
     return cv2
 
 
@@ -562,7 +565,7 @@ def observe_tags(
                     f"{width}×{height}; one camera takes images of one size"
                 )
             tags, ambiguous = finder.find(image)
-            found.ambiguous += ambiguous
+            found.ambiguous += len(ambiguous)
             found.empty += not tags
             for number, tag in tags.items():
                 in_corners = points == "corners"

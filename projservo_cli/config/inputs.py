@@ -116,7 +116,8 @@ def recording_inputs(config: Config) -> RecordingInputs:
         numbers=numbers,
         face=markers.front or (),
         dictionary=None if given is None else str(given),
-        tagged=(markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None),
+        tagged=config.cameras is not None
+        or (markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None),
         max_steady_state_error_deg=plant.max_steady_state_error_deg,
     )
 
@@ -462,7 +463,8 @@ def _own(config: Config) -> OwnRobot:
     plant, markers = config.plant, config.markers
     dictionary = markers.dictionary if markers is not None else None
     size, options = config.image_size_px, dict(plant.options)
-    return OwnRobot(plant.use or "", options, dictionary, plant.timeout_s, plant.open_s, size)
+    cameras = None if config.cameras is None else config.cameras.settings
+    return OwnRobot(plant.use or "", options, dictionary, plant.timeout_s, plant.open_s, size, cameras)
 
 
 def _simulated(config: Config, truth: Truth, files: Files | None) -> SimulatedRobot:

@@ -155,6 +155,8 @@ def importable(given: Any) -> bool:
 
 def _require_methods(where: str, found: Any, kind: str) -> None:
     methods = _METHODS[kind]
+    if kind == "plant" and not callable(getattr(found, "read", None)) and brings_no_pixels(found):
+        methods = tuple(name for name in methods if name != "read")
     lacking = [name for name in methods if not callable(getattr(found, name, None))]
     if lacking:
         require_spelt(where, found, lacking)
@@ -166,6 +168,11 @@ def _require_methods(where: str, found: Any, kind: str) -> None:
             require_spelt(where, found, (name,))
         elif not callable(getattr(found, name)):
             raise InputError(f"{where}: has {name}, which is to be a method; give it another name")
+
+
+def brings_no_pixels(found: object) -> bool:
+    """Whether a robot class, or an object of it, reads joints alone and leaves images to projservo."""
+    return callable(getattr(found, "joints", None))
 
 
 def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:

@@ -71,7 +71,9 @@ class RecordingInputs:
         The settings that drive an external robot may change during a recording.
         """
         trials, own = self.trials, self.own
-        robot = own._replace(timeout_s=0.0, open_s=0.0) if own else (trials.truth, trials.driven)
+        robot = (
+            own._replace(timeout_s=0.0, open_s=0.0, cameras=None) if own else (trials.truth, trials.driven)
+        )
         how = trials.motions.seed, trials.noise_px, trials.averaged_frames, trials.settle_s
         key = hashlib.sha256(encoded((robot, how, self.numbers, self.dictionary))).hexdigest()
         return f"{own.target if own else 'simulated'} {key[:16]}"

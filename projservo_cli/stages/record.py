@@ -300,7 +300,7 @@ def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> 
         return None
     if isinstance(driven.robot, OwnRobot):
         bounds = driven.following.bounds(joints)
-        return foreign_robot(driven.robot, bounds, joints.types, len(recording.marker))
+        return foreign_robot(driven.robot, bounds, joints.types, recording.marker.tolist())
     first = recording.targets[recording.pending[0]]
     return simulated_robot(driven, joints, robot_by_itself(driven.robot, first, trials.noise_px, drawn))
 

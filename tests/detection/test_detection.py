@@ -275,7 +275,7 @@ def test_folders_and_dictionaries_that_are_none(projservo):
 @pytest.mark.parametrize(
     ("module", "message"),
     [
-        (None, r"detect needs OpenCV: pip install '\.\[detect\]'"),
+        (None, r"tags and cameras need OpenCV: pip install '\.\[detect\]'"),
         (SimpleNamespace(__version__="4.5.4"), r"4\.7 or newer, not 4\.5\.4"),
     ],
 )

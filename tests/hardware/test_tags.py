@@ -45,7 +45,7 @@ def test_printed_tags_are_found_at_their_size(projservo, tmp_path, kind, size_mm
     image, size = page(file)
     assert size == pytest.approx(tags.PAPERS[paper], abs=0.01)
     found, ambiguous = TagFinder(dictionary).find(image)
-    assert (len(found), ambiguous) == (count, 0)
+    assert (len(found), ambiguous) == (count, ())
     assert sorted(found) == sorted(value["tags"])
     for tag in found.values():
         assert tag.clean.all()
