@@ -1,4 +1,4 @@
-"""Servos of the kind STS3215 on a pseudo-terminal, as slow as a real bus, with faults where they are asked for.
+"""Servos of the kind STS3215 on a pseudo-terminal, as slow as a real bus, with faults on request.
 
 What is known of their registers comes from the memory map of their maker, and from no table of the driver.
 """
@@ -131,7 +131,7 @@ class Servo:
             self._switch()
 
     def _go(self):
-        """Turn to a goal: never over 4095, where it goes the long way round, and torque comes on by itself."""
+        """Turn to a goal, the long way round rather than over 4095; torque comes on by itself."""
         low, high = self.get(9), self.get(11)
         goal = min(max(self.get(42), low), high)
         self.moments.append((self.arm.clock.now(), goal))
@@ -248,9 +248,8 @@ class Bus:
             copies = 2 if servo.number in self.faults.twice else 1
             reply = self._reply(servo, values)
             if copies == 2:  # two at once: what arrives is neither
-                reply = bytes(
-                    x & y for x, y in zip(reply, self._random.integers(0, 256, len(reply)).tolist())
-                )
+                noise = self._random.integers(0, 256, len(reply)).tolist()
+                reply = bytes(x & y for x, y in zip(reply, noise, strict=True))
             self._send(reply, taken + len(reply) * BYTE_S)
             taken = 0.0
 
