@@ -139,7 +139,7 @@ class Servo:
         if self.joint is None:
             self._held += goal - self.present
             return
-        self.arm.share[self.joint], self.arm.overloaded_s[self.joint] = 1.0, 0.0
+        self.arm.share[self.joint] = 1.0
         way = (goal - self.present) * self.sign * 2 * math.pi / TURN
         speed = self.get(46) & 0x7FFF
         self.arm.goal[self.joint] = self.arm.q[self.joint] + way
