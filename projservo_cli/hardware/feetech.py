@@ -1,7 +1,7 @@
 """Bus of serial servos by Feetech (STS and SMS series), protocol 0: requests, replies, retries.
 
-A reply tells neither what was asked nor when. So the input is cleared before each request, and after one that
-came to nothing the next ones read another number of bytes: a late reply has a wrong length, and is no reading.
+A reply tells neither what was asked nor when. So the input is cleared before each request, and after one
+that came to nothing the next ones read another number of bytes: a late reply has a wrong length.
 
 Source: Feetech, "Communication Protocol User Manual", and the memory map of the STS3215.
 """
@@ -24,7 +24,12 @@ _SHORTEST, _LENGTHS = 15, 12
 _REPLY_S = 0.012
 # Time for which a servo that does not answer is asked again, s: longer than a bus that is silent for 0.2 s.
 _PATIENCE_S = 0.5
-_PING, _READ, _WRITE, _SYNC_READ, _SYNC_WRITE, _ALL = 0x01, 0x02, 0x03, 0x82, 0x83, 0xFE
+# Pause between looks at what has arrived, and before what was written is read back, s.
+_PAUSE_S, _WRITTEN_S = 0.0002, 0.005
+# How often a write is repeated that a servo does not take.
+_WRITES = 5
+# Instructions, and the number that stands for all servos.
+_SYNC_READ, _SYNC_WRITE, _ALL = 0x82, 0x83, 0xFE
 
 
 class Reply(NamedTuple):
@@ -35,7 +40,7 @@ class Reply(NamedTuple):
 
 
 class ServoSilent(WorkFailed):
-    """Servos that do not answer, or whose answers are garbled: more than one has the number."""
+    """Servos that do not answer, or, where ``garbled``, of which what arrives is no reply."""
 
     def __init__(self, silent: Sequence[int], garbled: Sequence[int] = ()) -> None:
         self.silent, self.garbled = tuple(silent), tuple(garbled)
@@ -47,14 +52,9 @@ class PortLost(WorkFailed):
 
 
 class FeetechBus:
-    """A port with servos. ``now``, ``sleep``: the clock, s. Raises InputError where it cannot be opened."""
+    """A port with servos; an InputError where it cannot be opened. ``now``, ``sleep``: the clock, s."""
 
-    def __init__(
-        self,
-        port: str,
-        now: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ) -> None:
+    def __init__(self, port: str, now: Any = time.monotonic, sleep: Any = time.sleep) -> None:
         self.port, self.now, self.sleep = port, now, sleep
         self._lock, self._failed = threading.RLock(), 0
         self._serial = _opened(port)
@@ -79,38 +79,32 @@ class FeetechBus:
             garbled |= broken
         return {i: found[i] for i in ids}
 
-    def seen(self, ids: Sequence[int]) -> list[int]:
-        """Return which servos answer, each asked twice at most."""
-        found = {*self._asked(ids, 5, 1)[0]}
-        return sorted(found | {*self._asked([i for i in ids if i not in found], 5, 1)[0]})
-
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
-        """Write bytes into the memory of servos at once; none answers, so read back what matters."""
-        size = len(next(iter(values.values())))
-        rows = b"".join(bytes([number]) + row for number, row in values.items())
-        with self._lock:
-            self._send(_ALL, _SYNC_WRITE, bytes([address, size]) + rows)
+        """Write as many bytes into the memory of each servo at once; none answers."""
+        if values:
+            size = len(next(iter(values.values())))
+            rows = b"".join(bytes([number]) + row for number, row in values.items())
+            self._send(_SYNC_WRITE, bytes([address, size]) + rows)
 
     def store(self, address: int, values: Mapping[int, bytes]) -> None:
         """Write bytes until they are read back; WorkFailed where a servo does not take them."""
-        for _ in range(5):
-            self.write(address, values)
-            self.sleep(0.005)
-            back = self.read([*values], address, len(next(iter(values.values()))))
-            values = {number: row for number, row in values.items() if back[number].values != row}
+        for _ in range(_WRITES):
             if not values:
                 return
-        raise WorkFailed(f"servo {min(values)} does not take what is written to its register {address}")
+            self.write(address, values)
+            self.sleep(_WRITTEN_S)
+            back = self.read([*values], address, len(next(iter(values.values()))))
+            values = {number: row for number, row in values.items() if back[number].values != row}
+        if values:
+            raise WorkFailed(f"servo {min(values)} does not take what is written to its register {address}")
 
     def _asked(self, ids: Sequence[int], address: int, size: int) -> tuple[dict[int, Reply], set[int]]:
-        """Replies by servo to one request, and servos of which something arrived that is no reply."""
-        if not ids:
-            return {}, set()
+        """Replies to one request by servo, and the servo of which something arrived that is no reply."""
         with self._lock:
             longer = _SHORTEST + self._failed % _LENGTHS
             start = min(address, _MEMORY - longer)
-            self._reset()
-            self._send(_ALL, _SYNC_READ, bytes([start, longer, *ids]))
+            self._checked(self._serial.reset_input_buffer)
+            self._send(_SYNC_READ, bytes([start, longer, *ids]))
             found: dict[int, Reply] = {}
             heard, end = b"", self.now() + _REPLY_S
             while len(found) < len(ids) and self.now() < end:
@@ -122,19 +116,16 @@ class FeetechBus:
             self._failed += bool(missing)
             return found, missing if len(ids) == 1 and heard else set()
 
-    def _send(self, number: int, instruction: int, given: bytes) -> None:
-        body = bytes([number, len(given) + 2, instruction]) + given
-        self._checked(self._serial.write, b"\xff\xff" + body + bytes([~sum(body) & 0xFF]))
+    def _send(self, instruction: int, given: bytes) -> None:
+        body = bytes([_ALL, len(given) + 2, instruction]) + given
+        with self._lock:
+            self._checked(self._serial.write, b"\xff\xff" + body + _checksum(body))
 
     def _received(self) -> bytes:
-        waiting = int(self._checked(lambda: self._serial.in_waiting))
-        if not waiting:
-            self.sleep(0.0002)
-            return b""
-        return bytes(self._checked(self._serial.read, waiting))
-
-    def _reset(self) -> None:
-        self._checked(self._serial.reset_input_buffer)
+        if waiting := self._checked(lambda: self._serial.in_waiting):
+            return bytes(self._checked(self._serial.read, waiting))
+        self.sleep(_PAUSE_S)
+        return b""
 
     def _checked(self, call: Callable[..., Any], *given: Any) -> Any:
         """Call the port; PortLost where it is gone."""
@@ -144,18 +135,30 @@ class FeetechBus:
             raise PortLost(f"port {self.port} is gone: look at its USB cable ({error})") from error
 
 
+def _checksum(body: bytes) -> bytes:
+    return bytes([~sum(body) & 0xFF])
+
+
 def _packets(heard: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Number, status and values of each whole reply in some bytes, whose checksum is right."""
+    """Number, status and values of each whole reply in some bytes whose checksum is right."""
     at = heard.find(b"\xff\xff")
     while 0 <= at <= len(heard) - 6:
-        number, length = heard[at + 2], heard[at + 3]
-        body = heard[at + 2 : at + 3 + length]
+        number, length = heard[at + 2 : at + 4]
         end = at + 4 + length
-        if number != 0xFF and length >= 2 and end <= len(heard) and ~sum(body) & 0xFF == heard[end - 1]:
-            yield number, heard[at + 4], heard[at + 5 : end - 1]
+        body = heard[at + 2 : end - 1]
+        whole = number != 0xFF and length >= 2 and end <= len(heard)
+        if whole and heard[end - 1 : end] == _checksum(body):
+            yield number, body[2], body[3:]
             at = heard.find(b"\xff\xff", end)
         else:
             at = heard.find(b"\xff\xff", at + 1)
+
+
+_WHY = {
+    errno.EACCES: "you may not open it: sudo usermod -aG dialout $USER, then log in again",
+    errno.ENOENT: "there is no such port: look at the cable, and at plant.options.port",
+    errno.EBUSY: "another program has it: end that one",
+}
 
 
 def _opened(port: str) -> Any:
@@ -165,12 +168,8 @@ def _opened(port: str) -> Any:
     except ImportError as error:
         raise InputError("pyserial is missing: pip install '.[so101]'") from error
     try:
-        return serial.Serial(port, BAUD, timeout=0, write_timeout=0.5, exclusive=True)
+        return serial.Serial(port, BAUD, timeout=0, write_timeout=_PATIENCE_S, exclusive=True)
     except (OSError, ValueError) as error:
         number = getattr(error, "errno", None)
-        why = {
-            errno.EACCES: "you may not open it: sudo usermod -aG dialout $USER, then log in again",
-            errno.ENOENT: "there is no such port: look at the cable, and at plant.options.port",
-            errno.EBUSY: "another program has it: end that",
-        }.get(number or 0, "another program has it: end that" if "lock" in str(error) else str(error))
+        why = _WHY[errno.EBUSY] if "lock" in str(error) else _WHY.get(number or 0, str(error))
         raise InputError(f"port {port}: {why}") from error

@@ -24,36 +24,36 @@ from projservo_cli.records import FloatArray, InputError, JointLimits, WorkFaile
 TURN = 4096  # counts of a servo in a turn
 MIDDLE = 2048  # count that is read as 0 rad
 COUNT = 2.0 * math.pi / TURN  # rad
-
-# Registers, and how many bytes each takes.
-_MODEL, _LOWEST, _HIGHEST, _VOLTS, _PHASE = (3, 2), (9, 2), (11, 2), (14, 2), (18, 1)
-_OFFSET, _MODE, _TORQUE, _GOAL, _LOCK, _PRESENT = (31, 2), (33, 1), (40, 1), (42, 6), (55, 1), (56, 8)
+BUILT = {"ids": (1, 2, 3, 4, 5), "gripper": 6}  # of an SO-101
+# Addresses of registers.
+_MODEL, _LOWEST, _OFFSET, _TORQUE, _GOAL, _LOCK, _PRESENT = 3, 9, 31, 40, 42, 55, 56
 _STS3215 = 777  # register 3
 _MULTI_TURN = 0x10  # bit of register 18
 _OFFSET_SIGN = 0x800  # bit of register 31
-# What each bit of the status of a servo says, with what becomes of the joint and the remedy.
+# Each bit of the status of a servo in words, with the remedy.
 _WRONG = {
     0x01: "its supply has {volts:.1f} V ({least:.1f} to {most:.1f} V): look at the supply",
     0x02: "its angle sensor fails: replace it",
     0x04: "it is too hot, {heat} °C: let it cool",
     0x08: "its current is too high: free what holds it",
-    0x20: "it is overloaded and pushes with a fifth of its torque: free what it presses against, or lighten it",
+    0x20: "it is overloaded, and pushes with a fifth of its torque: free what it presses against",
 }
-# Fastest that somebody moves a joint by hand, or a servo turns, rad/s; more is no reading.
-_FASTEST = math.radians(720.0)
-# By how much a joint outruns its speed limit, and what readings scatter, rad.
-_OUTRUNS, _SCATTER = 1.5, math.radians(1.0)
+# Fastest that somebody turns a joint, or a servo does, rad/s, and what readings scatter, rad; more is no
+# reading.
+_FASTEST, _SCATTER = math.radians(720.0), math.radians(1.0)
+# Factor by which a servo may outrun set-points, so that it catches up; and what the gripper may, rad/s.
+_CATCHES_UP, _GRIPPER = 1.5, math.radians(60.0)
 # How often a reading is repeated that cannot be true, or tells of a fault.
 _REPEATS = 4
-# How far a joint may turn while its torque is switched on, rad, and after how long it is read back, s.
-_LEAP, _SWITCH_S = math.radians(3.0), 0.1
-_STANDS = math.radians(2.0)  # how far short a joint may stay that stands, rad
+# How far a joint may turn while its torque comes on, be beyond a limit, or lag where it stands, rad.
+_LEAP = math.radians(3.0)
+_SWITCH_S = 0.1  # after which torque has come on
 
 
 class Measured(NamedTuple):
     """What one servo measures."""
 
-    count: int
+    at: int  # counts
     volts: float
     heat: int  # °C
     status: int  # bits of what is wrong
@@ -61,7 +61,7 @@ class Measured(NamedTuple):
     @property
     def angle(self) -> float:
         """Joint reading, rad."""
-        return (self.count - MIDDLE) * COUNT
+        return (self.at - MIDDLE) * COUNT
 
 
 class Registers(NamedTuple):
@@ -86,82 +86,77 @@ class Servos:
         self.ids, self.all = (*ids,), (*ids, *others)
         if len({*self.all}) < len(self.all) or not all(0 < i < 254 for i in self.all):
             raise InputError(f"plant.options: ids {[*self.all]} must be numbers from 1 to 253, each once")
-        self.bus = FeetechBus(_found(self.all, **clock) if port == "auto" else port, **clock)
+        self.bus = FeetechBus(_port_of(self.all, **clock) if port == "auto" else port, **clock)
         self.lost: set[int] = set()  # that nothing is written to any more
         try:
-            self._require_all()
-            found = self.bus.read(self.all, 3, 13)
+            found = {i: reply.values for i, reply in self._first().items()}
         except BaseException:
             self.bus.close()
             raise
-        self.volts = {i: (0.1 * reply.values[12], 0.1 * reply.values[11]) for i, reply in found.items()}
-        for i, reply in found.items():
-            if (model := _number(reply.values[:2])) != _STS3215:
-                self.bus.close()
-                raise InputError(
-                    f"servo {i} on {self.bus.port} is of model {model}, not an STS3215 ({_STS3215})"
-                )
+        self.volts = {i: (0.1 * values[12], 0.1 * values[11]) for i, values in found.items()}
 
-    def name(self, number: int) -> str:
-        """Name of a servo by its joint, for messages."""
-        return (
-            f"joint {self.ids.index(number) + 1} (servo {number})"
-            if number in self.ids
-            else f"servo {number}"
-        )
-
-    def _require_all(self) -> None:
-        """Refuse a bus on which servos are missing or two have one number."""
+    def _first(self) -> Mapping[int, Any]:
+        """Read the first registers of all servos; an InputError for missing, double and other ones."""
+        where = f"port {self.bus.port}:"
         try:
-            self.bus.read(self.all, 5, 1)
+            found = self.bus.read(self.all, _MODEL, 13)
         except ServoSilent as error:
             there = [i for i in self.all if i not in error.silent]
             if error.garbled:
                 raise InputError(
-                    f"port {self.bus.port}: answers of servo {error.garbled[0]} are garbled, those of "
-                    f"{there or 'no other'} are not: two servos have this number. Unplug one, and set its id"
+                    f"{where} answers of servo {error.garbled[0]} are garbled, those of {there} are not: "
+                    "two servos have this id: unplug one of them, and set its id"
                 ) from error
             if there:
                 raise InputError(
-                    f"port {self.bus.port}: servos {[*error.silent]} do not answer, {there} do: look at the "
-                    "cable to the first of them, and at its id"
+                    f"{where} servos {[*error.silent]} do not answer, {there} do: look at the cable to "
+                    "the first of them, and at its id"
                 ) from error
             raise InputError(
-                f"port {self.bus.port}: no servo answers: switch the supply on, look at the cable to the "
-                "first servo, and whether this is the port of the arm"
+                f"{where} no servo answers: switch the supply on, look at the cable to the first servo, and "
+                "whether this is the port of the arm"
             ) from error
+        for i, reply in found.items():
+            if (model := _number(reply.values)) != _STS3215:
+                raise InputError(f"{where} servo {i} is of model {model}, no STS3215 ({_STS3215})")
+        return found
+
+    @property
+    def alive(self) -> list[int]:
+        """Numbers of servos that are written to."""
+        return [i for i in self.all if i not in self.lost]
+
+    def name(self, number: int) -> str:
+        """Name of a servo by its joint, for messages."""
+        servo = f"servo {number}"
+        return f"joint {self.ids.index(number) + 1} ({servo})" if number in self.ids else servo
 
     def measured(self) -> dict[int, Measured]:
         """Return what each servo measures that is not lost."""
-        found = self.bus.read([i for i in self.all if i not in self.lost], *_PRESENT)
-        return {
-            i: Measured(_number(v[:2]), 0.1 * v[6], v[7], reply.status)
-            for i, reply in found.items()
-            if (v := reply.values)
-        }
+        found = self.bus.read(self.alive, _PRESENT, 8).items()
+        return {i: Measured(_number(x), 0.1 * x[6], x[7], status) for i, (status, x) in found}
 
     def registers(self) -> dict[int, Registers]:
         """Return what is stored in each servo."""
-        first, last = self.bus.read(self.all, 9, 10), self.bus.read(self.all, 31, 3)
-        return {
-            i: Registers(_number(a[:2]), _number(a[2:4]), a[9], _signed(_number(b[:2])), b[2])
-            for i in self.all
-            if (a := first[i].values) and (b := last[i].values)
-        }
+        first, last = self.bus.read(self.all, _LOWEST, 10), self.bus.read(self.all, _OFFSET, 3)
+        found = {}
+        for i in self.all:
+            a, b = first[i].values, last[i].values
+            found[i] = Registers(_number(a), _number(a[2:]), a[9], _signed(_number(b)), b[2])
+        return found
 
     def torque(self) -> dict[int, bool]:
         """Whether each servo holds, by its number."""
-        found = self.bus.read([i for i in self.all if i not in self.lost], *_TORQUE)
-        return {i: reply.values[0] == 1 for i, reply in found.items()}
+        return {i: reply.values == b"\1" for i, reply in self.bus.read(self.alive, _TORQUE, 1).items()}
 
-    def release(self) -> None:
-        """Let go of the joints; other servos go on as they do."""
-        self.bus.store(_TORQUE[0], {i: b"\0" for i in self.ids if i not in self.lost})
+    def release(self, *, all_of_them: bool = False) -> None:
+        """Let go of the joints; of other servos too where that is asked for."""
+        servos = [i for i in self.alive if all_of_them or i in self.ids]
+        self.bus.store(_TORQUE, dict.fromkeys(servos, b"\0"))
 
     def send(self, counts: Mapping[int, int], speed: Mapping[int, int]) -> None:
-        """Send set-points, counts, with the highest speed towards them, counts/s, at least 1."""
-        rows = {i: _bytes(count) + b"\0\0" + _bytes(max(1, speed[i])) for i, count in counts.items()}
-        self.bus.write(_GOAL[0], {i: row for i, row in rows.items() if i not in self.lost})
+        """Send set-points, counts, with the highest speed towards them, counts/s."""
+        self.bus.write(_GOAL, _goals({i: x for i, x in counts.items() if i not in self.lost}, speed))
 
     def enable(self, speed: Mapping[int, int]) -> dict[int, int]:
         """Have all servos hold where they stand, and return these counts.
@@ -169,27 +164,36 @@ class Servos:
         The set-point is the reading before torque comes on, since a servo else leaps to its last one.
         Raises WorkFailed where a servo does not hold, or leaps.
         """
-        before = {i: one.count for i, one in self.measured().items()}
-        self.bus.store(
-            _GOAL[0], {i: _bytes(c) + b"\0\0" + _bytes(max(1, speed[i])) for i, c in before.items()}
-        )
-        self.bus.store(_TORQUE[0], dict.fromkeys(before, b"\1"))
+        before = {i: one.at for i, one in self.measured().items()}
+        self.bus.store(_GOAL, _goals(before, speed))
+        self.bus.store(_TORQUE, dict.fromkeys(before, b"\1"))
         self.bus.sleep(_SWITCH_S)
         for i, one in self.measured().items():
-            if abs(one.count - before[i]) * COUNT > _LEAP:
+            turned = abs(one.at - before[i]) * COUNT
+            if turned > _LEAP:
                 raise WorkFailed(
-                    f"{self.name(i)} turned by {math.degrees(abs(one.count - before[i]) * COUNT):.1f}° when its "
-                    f"torque came on ({math.degrees(_LEAP):g}° at most): look what pulls at it"
+                    f"{self.name(i)} turned by {_deg(turned)} when its torque came on ({_deg(_LEAP)} at "
+                    "most): look what pulls at it"
                 )
         return before
 
     def shift(self, number: int, by: int) -> None:
         """Store an offset by which a servo reads so many counts less; its torque must be off."""
-        offset = (self.registers()[number].offset + by + MIDDLE) % TURN - MIDDLE
-        written = max(offset, 1 - MIDDLE)
-        self.bus.store(_LOCK[0], {number: b"\0"})
-        self.bus.store(_OFFSET[0], {number: _bytes(abs(written) | (_OFFSET_SIGN if written < 0 else 0))})
-        self.bus.store(_LOCK[0], {number: b"\1"})
+        offset = max((self.registers()[number].offset + by + MIDDLE) % TURN - MIDDLE, 1 - MIDDLE)
+        self.bus.store(_LOCK, {number: b"\0"})
+        self.bus.store(_OFFSET, {number: _two(abs(offset) | (_OFFSET_SIGN if offset < 0 else 0))})
+        self.bus.store(_LOCK, {number: b"\1"})
+
+    def told(self, error: WorkFailed) -> str:
+        """Tell which joints may fall where the bus fails; nothing more is written to them."""
+        if not isinstance(error, ServoSilent):
+            return f"{error}; servos with power go on to their last set-points, and hold there"
+        if {*error.silent} >= {*self.alive}:
+            self.lost |= {*error.silent}
+            return "no servo answers any more: all joints may fall: hold the arm, and look at its supply"
+        self.lost |= {*error.silent}
+        names = ", ".join(map(self.name, error.silent))
+        return f"{names}: no answer any more: it may fall, with what it carries; look at the cable to it"
 
 
 class SO101:
@@ -198,11 +202,13 @@ class SO101:
     port : of the arm, such as /dev/ttyACM0; ``auto`` takes the only one on which all servos answer.
     ids : of the servos of the joints, base to tool. gripper : that of the gripper, which is held; None for
         an arm without.
-    limits : of its joints, rad; without, nothing is moved.
+    limits : of its joints, rad and rad/s; without, nothing is moved.
     """
 
     now = staticmethod(time.monotonic)  # its clock, s
     sleep = staticmethod(time.sleep)
+    _servos: Servos
+    _lease: "_Lease"
 
     def __init__(
         self,
@@ -211,31 +217,29 @@ class SO101:
         gripper: int | None = 6,
         limits: JointLimits | None = None,
     ) -> None:
-        self._port, self._ids, self._gripper = port, tuple(ids), gripper
-        self._limits = (
-            limits if limits is not None and np.isfinite(limits.lower + limits.upper).all() else None
-        )
-        self._servos: Servos | None = None
-        self._lease: _Lease | None = None
-        self._on = self._released = False
-        self._before: dict[int, Measured] = {}
-        self._read_at, self._agreed = -math.inf, False
-        self._sent: dict[int, int] = {}
+        self._port, self._ids = port, tuple(ids)
+        self._others = () if gripper is None else (gripper,)
+        known = limits is not None and bool(np.isfinite(limits.lower + limits.upper).all())
+        self._limits = limits if known else None
+        self._opened = self._on = self._released = False
+        self._before: dict[int, Measured] = {}  # the last reading
+        self._read_at, self._agreed = -math.inf, False  # when that was, and whether a second one agreed
+        self._sent: dict[int, int] = {}  # set-points, counts
         self.registers: dict[int, Registers] = {}
 
     def open(self) -> None:
         """Connect to the servos, and refuse those with which the arm would not stand where it is sent."""
-        others = () if self._gripper is None else (self._gripper,)
-        self._servos = servos = Servos(self._port, self._ids, others, now=self.now, sleep=self.sleep)
-        self._lease = _Lease(servos.bus.port)
-        self.registers = servos.registers()
+        self._servos = Servos(self._port, self._ids, self._others, now=self.now, sleep=self.sleep)
+        self._lease = _Lease(self._servos.bus.port)
+        self._opened = True
+        self.registers = self._servos.registers()
         for i in self._ids:
             if wrong := self._unfit(i, self.registers[i]):
-                raise InputError(f"{servos.name(i)}: {wrong}")
+                raise InputError(f"{self._servos.name(i)}: {wrong}")
         self._read()
         if killed := self._lease.killed:
             _say(
-                f"process {killed}, which moved this arm, was ended amid its work: servos went on to their last "
+                f"process {killed} was ended while it moved this arm: servos went on to their last "
                 "set-points; going on from where the arm stands"
             )
 
@@ -257,79 +261,67 @@ class SO101:
             self.hold()
         counts = {i: round(MIDDLE + float(q) / COUNT) for i, q in zip(self._ids, target, strict=True)}
         for i, count in counts.items():
-            low, high = self.registers[i].lowest, min(self.registers[i].highest, TURN - 1)
-            if not low <= count <= high:
-                raise WorkFailed(
-                    f"{self._arm.name(i)}: count {count} is beyond what it keeps, {low} to {high}"
-                )
-        self._arm.send(counts, self._speeds())
+            least, most = self._keeps(i)
+            if not least <= count <= most:
+                raise WorkFailed(f"{self._servos.name(i)}: {count} counts are beyond {least} to {most}")
+        self._servos.send(counts, self._speeds())
         self._sent |= counts
 
     def hold(self) -> None:
         """Hold the arm where it stands."""
         self._require_limits()
-        self._sent = self._arm.enable(self._speeds())
+        self._lease.moving()
+        self._sent = self._servos.enable(self._speeds())
         self._on, self._released = True, False
-        if self._lease is not None:
-            self._lease.moving()
 
     def release(self) -> None:
         """Let go of the arm; the gripper stays as it is."""
         self._released, self._on = True, False
-        self._arm.release()
+        self._servos.release()
 
     def stop(self) -> None:
         """Come to rest: joints that are on their way are sent where they are."""
-        if not self._on or self._servos is None:
+        if not self._on:
             return
         try:
-            there = self._servos.measured()
-            moving = {
-                i: one.count for i, one in there.items() if abs(one.count - self._sent[i]) * COUNT > _STANDS
-            }
-            if moving:
-                self._servos.send(moving, self._speeds())
+            there = {i: one.at for i, one in self._servos.measured().items()}
+            moving = {i: at for i, at in there.items() if abs(at - self._sent[i]) * COUNT > _LEAP}
+            self._servos.send(moving, self._speeds())
         except (ServoSilent, PortLost) as error:
-            raise WorkFailed(
-                f"{self._told(error)}; servos that have power go on to their last set-points"
-            ) from error
+            raise WorkFailed(self._servos.told(error)) from error
 
     def close(self) -> None:
         """Let go of the port; the arm goes on holding, or not, which is said."""
-        servos, self._servos = self._servos, None
-        if servos is None:
-            return
-        _say(torque_told(servos))
-        servos.bus.close()
-        if self._lease is not None:
+        if self._opened:
+            self._opened = False
+            _say(torque_told(self._servos))
+            self._servos.bus.close()
             self._lease.end()
 
-    @property
-    def _arm(self) -> Servos:
-        if self._servos is None:
-            raise WorkFailed("the arm is not open")
-        return self._servos
+    def _keeps(self, number: int) -> tuple[int, int]:
+        """Least and most counts that a servo goes to; over 4095 it goes the long way round."""
+        return self.registers[number].lowest, min(self.registers[number].highest, TURN - 1)
 
     def _speeds(self) -> dict[int, int]:
-        """Highest speed of each servo, counts/s: above that of set-points, so that it catches up."""
-        limits = self._limits
-        fast = np.full(len(self._ids), math.radians(60.0)) if limits is None else limits.speed
-        rates = dict(zip(self._ids, np.minimum(_OUTRUNS * fast, _FASTEST), strict=True))
-        return {i: max(1, math.ceil(rates.get(i, math.radians(60.0)) / COUNT)) for i in self._arm.all}
+        """Highest speed of each servo, counts/s, never 0, which stands for as fast as it can."""
+        rates = dict.fromkeys(self._servos.all, _GRIPPER)
+        if self._limits is not None:
+            rates |= zip(self._ids, np.minimum(_CATCHES_UP * self._limits.speed, _FASTEST), strict=True)
+        return {i: max(1, math.ceil(rate / COUNT)) for i, rate in rates.items()}
 
     def _require_limits(self) -> None:
-        """Refuse to move an arm without limits, or one that stands far beyond them."""
+        """Refuse to move an arm without limits, or one that stands beyond them."""
         if self._limits is None:
             raise InputError("nothing was moved: the arm has no limits: projservo limits -c FILE finds them")
-        found, low, high = self._read(), self._limits.lower, self._limits.upper
-        for k, i in enumerate(self._ids):
-            q, least, most = (math.degrees(x) for x in (found[i].angle, low[k], high[k]))
-            beyond = max(least - q, q - most)
-            if beyond > math.degrees(_LEAP):
+        found = self._read()
+        for i, low, high in zip(self._ids, self._limits.lower, self._limits.upper, strict=True):
+            q = found[i].angle
+            beyond = max(low - q, q - high)
+            if beyond > _LEAP:
                 raise WorkFailed(
-                    f"nothing was moved: {self._arm.name(i)} stands at {q:.1f}°, {beyond:.1f}° beyond its limits "
-                    f"{least:.1f}° to {most:.1f}°: move it there by hand; where all joints read otherwise, this "
-                    "is another arm (the leader's port?), or was homed since: projservo limits"
+                    f"nothing was moved: {self._servos.name(i)} stands at {_deg(q)}, {_deg(beyond)} beyond "
+                    f"its limits {_deg(low)} to {_deg(high)}: move it there by hand. If others do too, this "
+                    "is another arm (is it the leader's port?), or it was homed since: projservo limits"
                 )
 
     def _unfit(self, number: int, stored: Registers) -> str:
@@ -337,55 +329,54 @@ class SO101:
         if stored.mode != 0:
             return f"its mode (register 33) is {stored.mode}: set 0, position, with the tool of its maker"
         if stored.phase & _MULTI_TURN:
-            return f"register 18 is {stored.phase}, with multi-turn on: clear bit 4 ({stored.phase & ~_MULTI_TURN})"
-        if self._limits is not None:
-            k = self._ids.index(number)
-            low, high = (round(MIDDLE + x[k] / COUNT) for x in (self._limits.lower, self._limits.upper))
-            least, most = max(stored.lowest, 0), min(stored.highest, TURN - 1)
-            if not least <= low < high <= most:
-                limits = [math.degrees((x - MIDDLE) * COUNT) for x in (low, high, least, most)]
-                return (
-                    "its limits, {:.1f}° to {:.1f}°, go beyond what it keeps, {:.1f}° to {:.1f}° (registers 9 "
-                    "and 11): run projservo limits again"
-                ).format(*limits)
-        return ""
+            wanted = stored.phase & ~_MULTI_TURN
+            return f"it counts several turns (register 18 is {stored.phase}): set {wanted}"
+        if self._limits is None:
+            return ""
+        k, (least, most) = self._ids.index(number), self._keeps(number)
+        low, high = self._limits.lower[k], self._limits.upper[k]
+        if least <= round(MIDDLE + low / COUNT) < round(MIDDLE + high / COUNT) <= most:
+            return ""
+        kept = " to ".join(_deg((x - MIDDLE) * COUNT) for x in (least, most))
+        return (
+            f"its limits, {_deg(low)} to {_deg(high)}, go beyond those that it keeps itself, {kept} "
+            "(registers 9 and 11): run projservo limits again"
+        )
 
     def _read(self) -> dict[int, Measured]:
         """What all servos measure; a reading that cannot be true, or tells of a fault, is repeated.
 
         The first one counts where a second agrees with it.
         """
+        found, told = dict[int, Measured](), ""
         for _ in range(_REPEATS):
             try:
-                found = self._arm.measured()
+                found = self._servos.measured()
             except (ServoSilent, PortLost) as error:
-                raise WorkFailed(self._told(error)) from error
-            now, agreed = self.now(), self._agreed
+                raise WorkFailed(self._servos.told(error)) from error
+            now = self.now()
             told = self._leapt(found, now - self._read_at) or self._faulty(found)
-            if not told or not agreed:
-                self._before, self._read_at, self._agreed = found, now, not told and bool(self._before)
-            if not told and self._agreed:
+            agreed = not told and bool(self._before)
+            if agreed or not self._agreed:
+                self._before, self._read_at, self._agreed = found, now, agreed
+            if agreed:
                 return found
-        self._arm.lost |= {i for i, one in found.items() if one.status}
-        raise WorkFailed(told or "the servos give no reading twice")
+        self._servos.lost |= {i for i, one in found.items() if one.status}
+        raise WorkFailed(told)
 
     def _leapt(self, found: Mapping[int, Measured], seconds: float) -> str:
         """Which joint reads what it cannot have turned to since the last reading; empty for none."""
+        most = _FASTEST * seconds + _SCATTER
+        if self._on and self._limits is not None:
+            fastest = 2.0 * _CATCHES_UP * max(_GRIPPER, float(self._limits.speed.max()))
+            most = min(_FASTEST, fastest) * seconds + _SCATTER
         for i, one in found.items():
             before = self._before.get(i)
-            if one.count >= TURN:
-                return f"{self._arm.name(i)} reads {one.count} counts, more than a turn"
-            if before is None:
-                continue
-            fastest = _FASTEST
-            if self._on and self._limits is not None and i in self._ids:
-                fastest = min(fastest, 2.0 * _OUTRUNS * float(self._limits.speed[self._ids.index(i)]))
-            most = fastest * seconds + _SCATTER
-            if abs(one.count - before.count) * COUNT > most:
+            if one.at >= TURN or (before is not None and abs(one.at - before.at) * COUNT > most):
+                last = "" if before is None else f", {1000 * seconds:.0f} ms after {_deg(before.angle)}"
                 return (
-                    f"{self._arm.name(i)} reads {math.degrees(one.angle):.1f}°, and {1000 * seconds:.0f} ms before "
-                    f"{math.degrees(before.angle):.1f}° ({math.degrees(most):.1f}° at most): look at its gear "
-                    "and its cable"
+                    f"{self._servos.name(i)} reads {_deg(one.angle)}{last}: no joint turns so fast: look at "
+                    "its gear and its cable"
                 )
         return ""
 
@@ -394,24 +385,14 @@ class SO101:
         for i, one in found.items():
             for bit, told in _WRONG.items():
                 if one.status & bit:
-                    least, most = self._arm.volts[i]
+                    least, most = self._servos.volts[i]
                     what = told.format(volts=one.volts, heat=one.heat, least=least, most=most)
-                    return f"{self._arm.name(i)}: {what}; nothing more is written to it, and it may sink"
+                    return f"{self._servos.name(i)}: {what}; it is sent nothing more, and may sink"
         return ""
-
-    def _told(self, error: WorkFailed) -> str:
-        """What a bus that fails means for the arm."""
-        if not isinstance(error, ServoSilent):
-            return f"{error}; servos hold their last set-points as long as they have power"
-        self._arm.lost |= {*error.silent}
-        if {*error.silent} >= {*self._arm.all}:
-            return "no servo answers any more: look at the supply and its cable; all joints may fall: hold the arm"
-        names = ", ".join(map(self._arm.name, error.silent))
-        return f"{names}: no answer any more: look at the cable to it; it may fall, with what it carries"
 
 
 def torque_told(servos: Servos) -> str:
-    """Whether torque is on, in words, at the end of whatever was done with an arm."""
+    """Tell whether torque is on, at the end of whatever was done with an arm."""
     try:
         on = servos.torque()
     except (ServoSilent, PortLost):
@@ -433,8 +414,9 @@ class _Lease:
     def __init__(self, port: str) -> None:
         from filelock import FileLock, Timeout
 
-        stem = Path(tempfile.gettempdir(), "projservo" + str(Path(port).resolve()).replace("/", "-"))
-        self._note, self._lock = stem.with_suffix(".moving"), FileLock(stem.with_suffix(".lock"), timeout=0)
+        name = "projservo" + str(Path(port).resolve()).replace(os.sep, "-")
+        self._note = Path(tempfile.gettempdir(), f"{name}.moving")
+        self._lock = FileLock(self._note.with_suffix(".lock"), timeout=0)
         try:
             self._lock.acquire()
         except Timeout as error:
@@ -453,30 +435,30 @@ class _Lease:
         self._lock.release()
 
 
-def _found(ids: Sequence[int], **clock: Any) -> str:
+def _port_of(ids: Sequence[int], **clock: Any) -> str:
     """Return the only port on which all servos answer; an InputError lists what there is."""
     ports, fitting = candidate_ports(), []
     for port in ports:
         with suppress(InputError, WorkFailed):
             bus = FeetechBus(port, **clock)
             try:
-                bus.read(ids, 5, 1)
+                bus.read(ids, _MODEL, 2)
                 fitting.append(port)
             finally:
                 bus.close()
     if len(fitting) == 1:
         return fitting[0]
+    remedy = "set plant.options.port"
     if fitting:
         raise InputError(
-            f"arms answer on {' and '.join(fitting)}: one may be the leader: set plant.options.port to that of "
-            "the arm that is to move"
+            f"arms answer on {' and '.join(fitting)}: one may be the leader: {remedy} to the other"
         )
     if ports:
         raise InputError(
-            f"on none of {', '.join(ports)} servos {[*ids]} answer: switch the supply on; projservo doctor, or "
-            "plant.options.port with the port of the arm, says more"
+            f"servos {[*ids]} all answer on none of {', '.join(ports)}: switch the supply on; {remedy} "
+            "to the port of the arm, which says more"
         )
-    raise InputError("there is no serial port: plug the arm in, or set plant.options.port")
+    raise InputError(f"there is no serial port on USB: plug the arm in, or {remedy}")
 
 
 def candidate_ports() -> list[str]:
@@ -492,14 +474,24 @@ def _say(what: str) -> None:
     print(f"so101: {what}", file=sys.stderr)
 
 
-def _number(two: bytes) -> int:
-    return int.from_bytes(two, "little")
+def _deg(angle: float) -> str:
+    return f"{math.degrees(angle):.1f}°"
 
 
-def _bytes(number: int) -> bytes:
+def _goals(counts: Mapping[int, int], speed: Mapping[int, int]) -> dict[int, bytes]:
+    """Values of registers 42 to 47: set-point, time, which is of another mode, and speed."""
+    return {i: _two(count) + _two(0) + _two(speed[i]) for i, count in counts.items()}
+
+
+def _number(values: bytes) -> int:
+    """Number in the first two of some bytes."""
+    return int.from_bytes(values[:2], "little")
+
+
+def _two(number: int) -> bytes:
     return number.to_bytes(2, "little")
 
 
 def _signed(offset: int) -> int:
-    """Offset of register 31, whose bit 11 is the sign."""
+    """Offset of register 31, of which bit 11 is the sign."""
     return -(offset & (_OFFSET_SIGN - 1)) if offset & _OFFSET_SIGN else offset
