@@ -438,14 +438,14 @@ class TagFinder:
     """Detector of the tags of one dictionary.
 
     dictionary : name of OpenCV, with or without ``DICT_``, any case: ``4X4_50``, ``APRILTAG_36H11``.
-    ``cv``: the module of OpenCV.
+    ``cv``: the module of OpenCV. ``cells``: along a side of a tag, its border included.
     Raises InputError if OpenCV is not installed or has no such dictionary.
     """
 
     def __init__(self, dictionary: str) -> None:
         self.cv = opencv()
         aruco = self.cv.aruco
-        known = {name.upper().removeprefix("DICT_"): name for name in dir(aruco) if name.startswith("DICT_")}
+        known = dictionaries()
         name = known.get(dictionary.upper().removeprefix("DICT_"))
         if name is None:
             raise InputError(f"--dictionary {dictionary}: unknown; valid: {', '.join(sorted(known))}")
@@ -455,7 +455,7 @@ class TagFinder:
         # Shaded tags before brighter ground need windows of more sizes, and less contrast.
         parameters.adaptiveThreshWinSizeStep, parameters.adaptiveThreshConstant = 4, 5
         self._detector = aruco.ArucoDetector(tags, parameters)
-        self._cells = int(tags.markerSize) + _BORDER
+        self.cells = int(tags.markerSize) + _BORDER
 
     @property
     def known(self) -> int:
@@ -486,7 +486,7 @@ class TagFinder:
             raise InputError(
                 f"there is no tag {number} in the dictionary, which has tags 0 to {self.known - 1}"
             )
-        tag = self.cv.aruco.generateImageMarker(self._tags, number, self._cells * cell_px)
+        tag = self.cv.aruco.generateImageMarker(self._tags, number, self.cells * cell_px)
         return np.pad(tag, cell_px, constant_values=255)
 
     def find(self, image: FloatArray) -> tuple[dict[int, Corners], tuple[int, ...]]:
@@ -501,12 +501,18 @@ class TagFinder:
             return {}, ()
         found = [int(number) for number in np.ravel(numbers)]
         ambiguous = {number for number in found if found.count(number) > 1}
-        corners = refine_corners(image, np.reshape(quads, (-1, 4, 2)).astype(np.float64), self._cells)
+        corners = refine_corners(image, np.reshape(quads, (-1, 4, 2)).astype(np.float64), self.cells)
         each = (Corners(*tag) for tag in zip(*corners, strict=True))
         tags = dict(zip(found, each, strict=True))
         return {number: tag for number, tag in tags.items() if number not in ambiguous}, tuple(
             sorted(ambiguous)
         )
+
+
+def dictionaries() -> dict[str, str]:
+    """Names of all dictionaries of tags, and as OpenCV names them."""
+    names = [name for name in dir(opencv().aruco) if name.startswith("DICT_")]
+    return {name.upper().removeprefix("DICT_"): name for name in names}
 
 
 def opencv() -> Any:

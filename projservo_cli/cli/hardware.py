@@ -1,12 +1,22 @@
-"""Commands for hardware of people: ``tags``."""
+"""Commands for hardware of people: ``tags``, and ``doctor`` for a robot with its cameras."""
 
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from projservo_cli.cli import options as option
-from projservo_cli.cli.group import main
-from projservo_cli.cli.output import Console
+from projservo_cli.cli.group import FAILED, main
+from projservo_cli.cli.output import Console, wrapped
+
+if TYPE_CHECKING:
+    from projservo_cli.config import Config
+    from projservo_cli.hardware.preflight import Seen
+    from projservo_cli.records import FloatArray
+    from projservo_cli.robots.contract import ForeignRobot
+    from projservo_cli.stages.preflight import Checked
 
 _SIZE_MM = 30.0  # of tags: what webcams at arm's length see with 25 px and more
 _BODIES = ("roof", "plate")
@@ -120,3 +130,98 @@ _INSTRUCTIONS = {
         "Tag 0, in the middle, looks forward.",
     ),
 }
+
+
+def preflight(
+    console: Console,
+    run: Path | None,
+    config: str,
+    options: Mapping[str, Any],
+    output: Path,
+    move: bool,
+    watch: bool,
+) -> int:
+    """Check the robot and cameras of a configuration, write the page, and return the exit code."""
+    from projservo_cli.config.inputs import recording_inputs
+    from projservo_cli.files import write_whole
+    from projservo_cli.hardware.live_page import page
+    from projservo_cli.stages.preflight import check
+
+    settings = option.configured(config, options, teaching=True)
+    calibration = option.calibration_of(run, settings)
+    if move and not sys.stdin.isatty():
+        raise click.UsageError("--move: standard input is no terminal, so nobody can be asked; leave it out")
+    with option.writing(output):
+        checked = check(
+            recording_inputs(settings),
+            calibration,
+            confirmed=(lambda: console.agreed(_QUESTION)) if move else None,
+            watch=(lambda robot: _watch(console, settings, robot)) if watch else None,
+            progress=console.progress,
+        )
+        pictures = [] if checked.seen is None else _pictures(settings, checked.seen)
+        write_whole(output, page(settings.name, checked.findings, pictures))
+    value = {
+        "page": output.resolve(),
+        "works": checked.works,
+        "findings": [finding._asdict() for finding in checked.findings],
+    }
+    console.tell(value, [*_table(checked), f"page: {output}"])
+    return 0 if checked.works else FAILED
+
+
+_QUESTION = (
+    "doctor will move each joint by 3° to either side, one after the other. Is the arm free all around, with "
+    "room to each limit?"
+)
+
+
+def _table(checked: "Checked") -> Iterator[str]:
+    width = max(len(finding.where) for finding in checked.findings)
+    for finding in checked.findings:
+        text = f"{finding.level:8}{finding.where:{width + 2}}{finding.text}"
+        yield text
+        if finding.remedy:
+            yield wrapped(finding.remedy, " " * (width + 10))
+    faults = sum(finding.level == "fault" for finding in checked.findings)
+    yield "doctor: ready to record" if checked.works else f"doctor: {faults} faults to mend before recording"
+
+
+def _goal_pixels(settings: "Config") -> "list[FloatArray]":
+    """Pixels (g, 2) of the taught goal in both images; none where there is none."""
+    import numpy as np
+
+    images = None if settings.task is None else settings.task.goal.images
+    sides = (None, None) if images is None else (images.left, images.right)
+    return [np.array([at or (np.nan, np.nan) for at in side or ()]).reshape(-1, 2) for side in sides]
+
+
+def _pictures(settings: "Config", seen: "Seen") -> list[bytes]:
+    from projservo_cli.hardware.live_page import annotated
+
+    both = zip(seen.views, seen.s, _goal_pixels(settings), strict=False)
+    return [annotated(view.frame.grey, seen.marker, s, goal) for view, s, goal in both]
+
+
+def _watch(console: Console, settings: "Config", robot: "ForeignRobot") -> None:
+    """Serve both images until Ctrl-C."""
+    import time
+
+    from projservo_cli.hardware.live_page import LivePage, annotated
+    from projservo_cli.records import VIEWS
+
+    live, goal = LivePage(settings.name), _goal_pixels(settings)
+    assert settings.markers is not None
+    console.say(f"watch: open {live.url} in a browser; Ctrl-C ends it")
+    try:
+        while True:
+            s = robot.read().s
+            for view, grey in zip(range(2), () if robot.frames is None else robot.frames, strict=False):
+                live.pictures[VIEWS[view]] = annotated(
+                    grey, settings.markers.known or (), s[view], goal[view]
+                )
+            time.sleep(robot.bounds.period)
+    except KeyboardInterrupt:
+        console.say("watch: ended")
+    finally:
+        live.close()

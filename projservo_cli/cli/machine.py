@@ -70,14 +70,40 @@ def _as_text(schema: dict[str, Any]) -> str:
     return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
 
 
-@main.command("doctor", epilog="Example: projservo doctor --json")
+@main.command("doctor", epilog="Example: projservo doctor -c arm.yaml --move")
+@click.argument("run", required=False, type=option.PATH)
+@option.configuration(help="Configuration (YAML) of a robot to check. Default: check the installation.")
+@option.override
+@option.output(metavar="FILE", help="Page to write. Default: preflight.html.")
+@click.option("--move", is_flag=True, help="Ask, then move each joint by 3° to either side.")
+@click.option("--watch", is_flag=True, help="Show both images in a browser of this machine until Ctrl-C.")
 @option.told
-def _doctor(console: Console) -> int:
-    """Report installed packages and the folders in use.
+def _doctor(
+    console: Console,
+    *,
+    run: Path | None,
+    config: str | None,
+    sets: tuple[str, ...],
+    output: Path | None,
+    move: bool,
+    watch: bool,
+) -> int:
+    """Say what is installed, or check a robot and its cameras.
 
     Lists versions, extras, whether the kernels are compiled, and the folder of results. Exit code 1 when
     a required part is missing.
+
+    With -c it opens robot and cameras, moves nothing, and writes a table and a page with both pictures: frame
+    rates, exposure, sharpness, tags, joints, limits, each finding with its remedy. With a calibration in RUN,
+    by default that of the configuration's name in results, it says whether images still agree. --move
+    measures latency, hysteresis, sag, and whether tags sit fast. Exit code 1 where a recording would fail.
     """
+    if config is not None:
+        from projservo_cli.cli.hardware import preflight
+
+        return preflight(console, run, config, {"sets": sets}, output or Path("preflight.html"), move, watch)
+    if run is not None or sets or output is not None or move or watch:
+        raise click.UsageError("doctor checks a robot with -c alone: projservo doctor -c arm.yaml")
     packages, extras = _requirements()
     missing = [name for name, version in packages.items() if version is None]
     folder = Path("results").absolute()

@@ -192,6 +192,11 @@ class ForeignRobot:
         shape = (4, 4) if np.ndim(answer) == 2 else (self._joints,)
         return self._numbers("truth() gave numbers", answer, shape, finite=True)
 
+    def health(self) -> dict[str, float | str]:
+        """What the robot measures of itself, such as its voltage, by name; empty where it tells nothing."""
+        tell = getattr(self.robot, "health", None)
+        return {} if tell is None else dict(self._ask("health", tell))
+
     @property
     def lets_go(self) -> bool:
         """Whether the arm can be released, and held again."""

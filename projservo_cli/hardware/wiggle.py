@@ -1,0 +1,275 @@
+"""Small motions of one joint at a time, and findings of how joints, images and tags follow."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding
+from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArray
+from projservo_cli.robots.contract import ForeignRobot, Reading
+from projservo_cli.robots.pacing import Steered
+
+# How far a joint goes to each side, and how fast: quick strokes tell the latency, slow ones the hysteresis.
+REACH, _QUICK, _SLOW = math.radians(3.0), math.radians(20.0), math.radians(5.0)
+# Least way from one end to the other, rad, and distance kept from limits.
+_LEAST_WAY, _KEPT = math.radians(2.0), math.radians(0.5)
+# Pause after each stroke, s, and the part at its end in which all stands still.
+_PAUSE_S, _STILL_S = 0.6, 0.3
+# Share of a stroke by which a joint may fall short before it is given up: something holds it.
+_HELD = 0.6
+# Way after a turn of direction within which backlash is passed through, rad.
+_PASSING = math.radians(1.4)
+# Latencies that are tried, s; for a parabola through the best one and its neighbours.
+_LATENCIES = np.arange(-0.05, 0.7, 0.005)
+# Motion of images over the whole way, px, below which none moves with the joint.
+_MOVES_PX = 1.0
+# Hysteresis or sag from which it is told, and backlash that goals of images bear, rad.
+_TOLD, _WIDE = math.radians(0.15), math.radians(1.5)
+# Latency that tells of frames that queue somewhere, s.
+_LATE_S = 0.3
+# Motion of one tag against the others, px, and in standard deviations, that tells that it is loose.
+_LOOSE_PX, _LOOSE = 0.7, 8.0
+
+
+class Strokes(NamedTuple):
+    """Looks at one joint while it went to and fro."""
+
+    joint: int  # from 0
+    end: IntArray  # (k,) number of the stroke of each look
+    target: FloatArray  # (k,) rad or m
+    looks: tuple[Reading, ...]
+    given_up: str  # why it was broken off; empty where it was not
+
+    @property
+    def q(self) -> FloatArray:
+        """Readings (k,) of the joint, rad or m."""
+        return np.array([look.q[self.joint] for look in self.looks])
+
+    def rest(self, stroke: int) -> list[int]:
+        """Numbers of the looks at rest at the end of a stroke."""
+        rows = np.flatnonzero(self.end == stroke)
+        last = self.looks[rows[-1]].t_q
+        return [int(k) for k in rows if self.looks[k].t_q > last - _STILL_S]
+
+
+# Ends of the strokes, in reaches, and whether they are quick. The last three end in the middle from below, at
+# the upper end, and in the middle from above.
+_STROKES = ((1, True), (-1, True), (1, True), (-1, True), (0, False), (1, False), (0, False))
+_FROM_BELOW, _FROM_ABOVE = 4, 6
+
+
+def strokes(robot: ForeignRobot, joint: int) -> Strokes | str:
+    """Move a joint to and fro about where it stands; words where it has no room for that."""
+    steered = Steered(robot)
+    q, bounds = steered.look().q, robot.bounds
+    low = max(-REACH, bounds.limits.lower[joint] + _KEPT - q[joint])
+    high = min(REACH, bounds.limits.upper[joint] - _KEPT - q[joint])
+    if high - low < _LEAST_WAY or not low < 0.0 < high:
+        return f"it has no room for {math.degrees(_LEAST_WAY):g}°: move it away from its limit by hand"
+    middle = float(steered.target[joint])
+    rows: list[tuple[int, float, Reading]] = []
+    for number, (end, quick) in enumerate(_STROKES):
+        goal = middle + (high if end > 0 else low if end < 0 else 0.0)
+        speed = min(_QUICK if quick else _SLOW, float(bounds.limits.speed[joint]))
+        begun = float(steered.target[joint])
+        pauses = math.ceil(_PAUSE_S / bounds.period)
+        while pauses > 0:
+            step = np.zeros(len(q))
+            left = goal - steered.target[joint]
+            step[joint] = math.copysign(min(abs(left), speed * bounds.period), left)
+            steered.command(step, bounds.period)
+            pauses -= left == 0.0 or bool(steered.set_point.short[joint])
+            rows.append((number, float(steered.target[joint]), steered.look()))
+        way, short = abs(goal - begun), abs(goal - steered.reading.q[joint])
+        if short > max(_HELD * way, 2.0 * bounds.sag[joint]):
+            what = f"went {bounds.told(joint, way - short, 2)} of {bounds.told(joint, way, 2)}"
+            return Strokes(joint, *_columns(rows), what)
+    return Strokes(joint, *_columns(rows), "")
+
+
+def _columns(rows: Sequence[tuple[int, float, Reading]]) -> tuple[IntArray, FloatArray, tuple[Reading, ...]]:
+    ends, targets, looks = zip(*rows, strict=True)
+    return np.array(ends, dtype=np.int64), np.array(targets), looks
+
+
+class _Signal(NamedTuple):
+    """How far the markers of a view moved along their main direction."""
+
+    t: FloatArray  # (f,) stamps of new frames, s
+    p: FloatArray  # (f,) px
+
+
+def _signal(moved: Strokes, view: int) -> _Signal:
+    """Motion of what a view shows in all of its new frames."""
+    looks = moved.looks
+    new = [k for k in range(1, len(looks)) if looks[k].new_views(looks[k - 1])[view]]
+    s = np.array([looks[k].s[view] for k in new]).reshape(len(new), -1, 2)
+    stamps = np.array(
+        [looks[k].t_q if np.isnan(looks[k].t_view[view]) else looks[k].t_view[view] for k in new]
+    )
+    s = s[:, np.isfinite(s).all(axis=(0, 2))]
+    if not s.size:
+        return _Signal(stamps, np.zeros(len(new)))
+    off = (s - s.mean(axis=0)).mean(axis=1)
+    return _Signal(stamps, off @ np.linalg.svd(off, full_matrices=False)[2][0])
+
+
+class _Fit(NamedTuple):
+    """Motion of an image by the reading of a joint, for each latency that was tried."""
+
+    squares: FloatArray  # (d,) px², that it leaves, of the sum of all frames that count
+    slope: FloatArray  # (d,) px/rad
+    backlash: FloatArray  # (d,) rad, between reading and link
+
+
+def _fit(moved: Strokes, signal: _Signal) -> _Fit | None:
+    """Fit p(t) = c± + b q(t − d) + e q(t − d)², c+ where the joint went up last, else c−; None for no motion.
+
+    Looks from a turn of direction on, until backlash is passed, do not count.
+    """
+    t_q, q = np.array([look.t_q for look in moved.looks]), moved.q
+    mid = 0.5 * (q.min() + q.max())
+    found = []
+    for d in _LATENCIES:
+        x = np.interp(signal.t - d, t_q, q) - mid
+        up, far = _direction(t_q, q, signal.t - d)
+        counts = far & (signal.t - d > t_q[0])
+        A = np.column_stack([up, ~up, x, x * x])[counts].astype(float)
+        if (
+            counts.sum() < 12
+            or np.ptp(x[counts]) < _LEAST_WAY / 2
+            or not (up[counts].any() and (~up[counts]).any())
+        ):
+            return None
+        c, *_ = np.linalg.lstsq(A, signal.p[counts])
+        r = signal.p[counts] - A @ c
+        found.append(
+            (float(r @ r) * len(signal.p) / counts.sum(), c[2], (c[1] - c[0]) / c[2] if c[2] else 0.0)
+        )
+    return _Fit(*(np.array(column) for column in zip(*found, strict=True)))
+
+
+def _direction(t_q: FloatArray, q: FloatArray, t: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Whether a joint went up last at instants (f,), and has passed its backlash since it turned."""
+    up, far, turned, rising = np.zeros(len(q), dtype=bool), np.zeros(len(q), dtype=bool), q[0], True
+    extreme = q[0]
+    for k, x in enumerate(q):
+        ahead = x - extreme if rising else extreme - x
+        if ahead >= 0.0:
+            extreme = x
+        elif -ahead > 0.25 * _PASSING:  # it turned
+            rising, turned, extreme = not rising, extreme, x
+        up[k], far[k] = rising, abs(x - turned) > _PASSING
+    at = np.clip(np.searchsorted(t_q, t, side="right") - 1, 0, len(q) - 1)
+    return up[at], far[at]
+
+
+def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Finding]:
+    """Findings of the strokes of all joints; numbers : of the markers."""
+    still, total = [], np.zeros((2, len(_LATENCIES)))
+    for one in moved:
+        signals = [_signal(one, view) for view in range(2)]
+        fits = [_fit(one, signal) for signal in signals]
+        if one.given_up:
+            remedy = "look what holds it; a weak supply or an overloaded servo pushes with little force"
+            yield Finding(FAULT, f"joint {one.joint + 1}", f"{one.given_up}: it is held or too weak", remedy)
+            continue
+        span = max(np.ptp(signal.p) if len(signal.p) else 0.0 for signal in signals)
+        if span < _MOVES_PX:
+            still.append(one.joint)
+        else:
+            for view, fit in enumerate(fits):
+                total[view] += 0.0 if fit is None else fit.squares
+        yield from _of_servo(one, [fit for fit in fits if fit is not None] if span >= _MOVES_PX else [])
+    yield from _of_still(still, len(moved))
+    for name, squares in zip(VIEWS, total, strict=True):
+        if squares.any():
+            late = _least(squares)
+            remedy = "look for what queues frames: a hub, a network, a slow machine" if late > _LATE_S else ""
+            yield Finding(
+                WARNING if remedy else FINE, f"{name} camera", f"images are {1e3 * late:.0f} ms late", remedy
+            )
+    yield from _of_loose_tags(moved, numbers)
+
+
+def _least(squares: FloatArray) -> float:
+    """Latency, s, by a parabola through the least of the sums (d,) and its neighbours."""
+    k = int(np.clip(np.argmin(squares), 1, len(squares) - 2))
+    before, here, after = squares[k - 1 : k + 2]
+    bend = before - 2.0 * here + after
+    shift = 0.5 * (before - after) / bend if bend > 0.0 else 0.0
+    return float(_LATENCIES[k] + 0.005 * np.clip(shift, -1.0, 1.0))
+
+
+def _of_servo(one: Strokes, fits: Sequence[_Fit]) -> Iterator[Finding]:
+    """Hysteresis and sag of a joint, and backlash between its reading and the images."""
+    below, above = (one.rest(stroke) for stroke in (_FROM_BELOW, _FROM_ABOVE))
+    hysteresis = float(one.q[above].mean() - one.q[below].mean())
+    sag = float((one.target - one.q)[below + above].mean())
+    best = [int(np.argmin(fit.squares)) for fit in fits]
+    backlash = float(np.mean([fit.backlash[k] for fit, k in zip(fits, best, strict=True)])) if fits else 0.0
+    told = [f"{name} {math.degrees(x):.2g}°" for name, x in (("hysteresis", hysteresis), ("sag", abs(sag)))]
+    if fits:
+        hidden = abs(sag) > 2.0 * _TOLD and backlash < _TOLD
+        told.append(
+            "backlash hidden by gravity" if hidden else f"backlash {math.degrees(max(backlash, 0.0)):.2g}°"
+        )
+    wide = max(hysteresis, backlash) > _WIDE
+    remedy = (
+        "teach goals by images, which backlash does not move; look for a loose horn or screw" if wide else ""
+    )
+    yield Finding(WARNING if wide else FINE, f"joint {one.joint + 1}", ", ".join(told), remedy)
+
+
+def _of_still(still: Sequence[int], n: int) -> Iterator[Finding]:
+    """Joints with which no tag moves."""
+    if not still:
+        return
+    names = ", ".join(str(i + 1) for i in still)
+    where = f"joint{'s' if len(still) > 1 else ''} {names}"
+    if len(still) == n:
+        what, remedy = (
+            "turned, and no tag moved",
+            "look whether the tags are on this arm, and images come anew",
+        )
+    elif [*still] == [*range(still[0], n)]:
+        what = f"turned, and no tag moved: the tags sit on the link before joint {still[0] + 1}"
+        remedy = "mount them behind the last joint, on the fixed part of the tool and not on a moving jaw"
+    else:
+        what, remedy = "turned, and no tag moved", "look at the order of the joints, and at their horns"
+    yield Finding(FAULT, where, what, remedy)
+
+
+def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Finding]:
+    """Tags that moved against the others between rests at one posture, come to from either side."""
+    tags = {number // CORNERS for number in numbers}
+    for view, name in enumerate(VIEWS):
+        rests = []
+        for one in moved:
+            if not one.given_up:
+                for stroke in (_FROM_BELOW, _FROM_ABOVE):
+                    rests.append(np.array([one.looks[k].s[view] for k in one.rest(stroke)]))
+        for tag in sorted(tags) if len(rests) > 1 else ():
+            own = np.array([number // CORNERS == tag for number in numbers])
+            off = [_against_others(rests[0], rest, own) for rest in rests[1:]]
+            worst = max(off, default=0.0)
+            if worst > _LOOSE_PX:
+                what = f"tag {tag} moved by {worst:.1f} px against the others in the {name} image"
+                yield Finding(
+                    FAULT, "tags", what, "fix it: glue it flat on a stiff part, all tags on the same one"
+                )
+
+
+def _against_others(first: FloatArray, then: FloatArray, own: BoolArray) -> float:
+    """Motion (px) of some markers against an affine motion of the others between two rests (k, m, 2)."""
+    a, b = first.mean(axis=0), then.mean(axis=0)
+    seen = np.isfinite(a[:, 0]) & np.isfinite(b[:, 0])
+    if (seen & ~own).sum() < 2 * CORNERS or (seen & own).sum() < CORNERS:
+        return 0.0
+    noise = math.hypot(*(float(np.sqrt(x[:, seen].var(axis=0).mean() / len(x))) for x in (first, then)))
+    A = np.column_stack([a, np.ones(len(a))])
+    motion, *_ = np.linalg.lstsq(A[seen & ~own], b[seen & ~own])
+    off = float(np.linalg.norm((b - A @ motion)[seen & own].mean(axis=0)))
+    return off if off > _LOOSE * noise else 0.0
