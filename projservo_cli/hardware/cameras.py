@@ -215,6 +215,7 @@ def _cv() -> Any:
     """Return OpenCV, of which V4L2 waits for a frame for no longer than a second."""
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     return opencv()
 
 

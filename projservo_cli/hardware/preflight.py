@@ -68,15 +68,15 @@ def _of_camera(camera: Camera) -> Iterator[Finding]:
     where, grey = f"{camera.name} camera", camera.newest().grey
     rate, asked = camera.rate_hz, camera.settings.rate_hz or _USUAL_HZ
     stamps = "stamped by its driver" if camera.stamped else "stamped when they arrive"
-    text = f"{grey.shape[1]} x {grey.shape[0]} px, {rate:.1f} frames a second, {stamps}"
+    size = f"{grey.shape[1]} x {grey.shape[0]} px"
     if rate < _SLOW * asked:
         remedy = (
             "webcams expose longer in the dark: add light, or set exposure_ms below "
             f"{1e3 / asked:.0f}; on one hub with another camera, set fourcc: MJPG"
         )
-        yield Finding(WARNING, where, f"{text}, not {asked:g}", remedy)
+        yield Finding(WARNING, where, f"{size}, {rate:.1f} frames a second instead of {asked:g}", remedy)
     else:
-        yield Finding(FINE, where, text)
+        yield Finding(FINE, where, f"{size}, {rate:.1f} frames a second, {stamps}")
     for remark in camera.remarks:
         what, _, remedy = remark.partition(": ")
         yield Finding(WARNING, where, what, remedy or "take another camera, or keep it from changing")

@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding
 from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArray
-from projservo_cli.robots.contract import ForeignRobot, Reading
+from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.pacing import Steered
 
 # How far a joint goes to each side, and how fast: quick strokes tell the latency, slow ones the hysteresis.
@@ -30,7 +30,7 @@ _TOLD, _WIDE = math.radians(0.15), math.radians(1.5)
 # Latency that tells of frames that queue somewhere, s.
 _LATE_S = 0.3
 # Motion of one tag against the others, px, and in standard deviations, that tells that it is loose.
-_LOOSE_PX, _LOOSE = 0.7, 8.0
+_LOOSE_PX, _LOOSE = 0.7, 4.0
 
 
 class Strokes(NamedTuple):
@@ -57,13 +57,18 @@ class Strokes(NamedTuple):
 # Ends of the strokes, in reaches, and whether they are quick. The last three end in the middle from below, at
 # the upper end, and in the middle from above.
 _STROKES = ((1, True), (-1, True), (1, True), (-1, True), (0, False), (1, False), (0, False))
-_FROM_BELOW, _FROM_ABOVE = 4, 6
+_UP, _DOWN, _FROM_BELOW, _FROM_ABOVE = 2, 3, 4, 6
 
 
-def strokes(robot: ForeignRobot, joint: int) -> Strokes | str:
-    """Move a joint to and fro about where it stands; words where it has no room for that."""
-    steered = Steered(robot)
-    q, bounds = steered.look().q, robot.bounds
+def strokes(steered: Steered, joint: int) -> Strokes | str:
+    """Move a joint to and fro about where it stands; words where it has no room for that.
+
+    steered : the robot, one for all joints: each set-point that begins at a reading lets an arm sag further.
+    """
+    bounds = steered.robot.bounds
+    q = steered.look().q
+    for _ in range(math.ceil(_PAUSE_S / bounds.period)):
+        steered.hold()
     low = max(-REACH, bounds.limits.lower[joint] + _KEPT - q[joint])
     high = min(REACH, bounds.limits.upper[joint] - _KEPT - q[joint])
     if high - low < _LEAST_WAY or not low < 0.0 < high:
@@ -95,7 +100,7 @@ def _columns(rows: Sequence[tuple[int, float, Reading]]) -> tuple[IntArray, Floa
 
 
 class _Signal(NamedTuple):
-    """How far the markers of a view moved along their main direction."""
+    """How far the markers of a view moved along the main direction of their motion, rms."""
 
     t: FloatArray  # (f,) stamps of new frames, s
     p: FloatArray  # (f,) px
@@ -112,8 +117,8 @@ def _signal(moved: Strokes, view: int) -> _Signal:
     s = s[:, np.isfinite(s).all(axis=(0, 2))]
     if not s.size:
         return _Signal(stamps, np.zeros(len(new)))
-    off = (s - s.mean(axis=0)).mean(axis=1)
-    return _Signal(stamps, off @ np.linalg.svd(off, full_matrices=False)[2][0])
+    off = (s - s.mean(axis=0)).reshape(len(s), -1)
+    return _Signal(stamps, off @ np.linalg.svd(off, full_matrices=False)[2][0] / math.sqrt(s.shape[1]))
 
 
 class _Fit(NamedTuple):
@@ -173,7 +178,9 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
         signals = [_signal(one, view) for view in range(2)]
         fits = [_fit(one, signal) for signal in signals]
         if one.given_up:
-            remedy = "look what holds it; a weak supply or an overloaded servo pushes with little force"
+            remedy = (
+                "look what holds it, and at the supply; where it sags or plays so far, raise plant.sag_deg"
+            )
             yield Finding(FAULT, f"joint {one.joint + 1}", f"{one.given_up}: it is held or too weak", remedy)
             continue
         span = max(np.ptp(signal.p) if len(signal.p) else 0.0 for signal in signals)
@@ -243,33 +250,37 @@ def _of_still(still: Sequence[int], n: int) -> Iterator[Finding]:
 
 
 def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Finding]:
-    """Tags that moved against the others between rests at one posture, come to from either side."""
-    tags = {number // CORNERS for number in numbers}
-    for view, name in enumerate(VIEWS):
-        rests = []
-        for one in moved:
-            if not one.given_up:
-                for stroke in (_FROM_BELOW, _FROM_ABOVE):
-                    rests.append(np.array([one.looks[k].s[view] for k in one.rest(stroke)]))
-        for tag in sorted(tags) if len(rests) > 1 else ():
-            own = np.array([number // CORNERS == tag for number in numbers])
-            off = [_against_others(rests[0], rest, own) for rest in rests[1:]]
-            worst = max(off, default=0.0)
-            if worst > _LOOSE_PX:
-                what = f"tag {tag} moved by {worst:.1f} px against the others in the {name} image"
-                yield Finding(
-                    FAULT, "tags", what, "fix it: glue it flat on a stiff part, all tags on the same one"
-                )
+    """Tags that moved against the others between rests in the middle, come to from either side.
+
+    Hysteresis and backlash leave small motions of the joints, which all tags follow by the images of the
+    strokes; motions of the other tags tell those of the joints, and what is left moved on the tool.
+    """
+    sound = [one for one in moved if not one.given_up]
+    rests = [_at_rest(one, stroke) for one in sound for stroke in (_FROM_BELOW, _FROM_ABOVE)]
+    ways = [_at_rest(one, _UP) - _at_rest(one, _DOWN) for one in sound]
+    tag = np.array(numbers) // CORNERS
+    worst: dict[int, float] = {}
+    for rest in rests[1:]:
+        columns = np.stack([*ways, rest - rests[0]], axis=-1)  # (2, m, 2, j + 1)
+        seen = np.isfinite(columns).all(axis=(2, 3))
+        for number in sorted(set(tag.tolist())):
+            own, others = seen & (tag == number), seen & (tag != number)
+            if own.sum() < CORNERS or others.sum() < 2 * len(columns[0, 0, 0]):
+                continue
+            A, b = np.split(columns[others].reshape(-1, len(ways) + 1), [-1], axis=1)
+            c, *_ = np.linalg.lstsq(A, b[:, 0])
+            noise = float(np.sqrt(np.mean((b[:, 0] - A @ c) ** 2)))
+            left = np.abs(columns[own] @ [*-c, 1.0]).mean()
+            if left > max(_LOOSE_PX, _LOOSE * noise):
+                worst[number] = max(worst.get(number, 0.0), float(left))
+    if worst:
+        number = max(worst, key=lambda one: worst[one])
+        what = f"tag {number} moved by {worst[number]:.1f} px against the others"
+        yield Finding(FAULT, "tags", what, "glue it flat on a stiff part, all tags on the same one")
+    elif len(rests) > 1 and len(set(tag.tolist())) > 1:
+        yield Finding(FINE, "tags", "sit fast on the tool")
 
 
-def _against_others(first: FloatArray, then: FloatArray, own: BoolArray) -> float:
-    """Motion (px) of some markers against an affine motion of the others between two rests (k, m, 2)."""
-    a, b = first.mean(axis=0), then.mean(axis=0)
-    seen = np.isfinite(a[:, 0]) & np.isfinite(b[:, 0])
-    if (seen & ~own).sum() < 2 * CORNERS or (seen & own).sum() < CORNERS:
-        return 0.0
-    noise = math.hypot(*(float(np.sqrt(x[:, seen].var(axis=0).mean() / len(x))) for x in (first, then)))
-    A = np.column_stack([a, np.ones(len(a))])
-    motion, *_ = np.linalg.lstsq(A[seen & ~own], b[seen & ~own])
-    off = float(np.linalg.norm((b - A @ motion)[seen & own].mean(axis=0)))
-    return off if off > _LOOSE * noise else 0.0
+def _at_rest(one: Strokes, stroke: int) -> FloatArray:
+    """Mean pixels (2, m, 2) at rest at the end of a stroke."""
+    return np.asarray(np.mean([one.looks[k].s for k in one.rest(stroke)], axis=0))

@@ -14,6 +14,7 @@ from projservo_cli.hardware.wiggle import Strokes, findings_of, strokes
 from projservo_cli.monitoring.monitor import fault_shown
 from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
+from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import OwnRobot
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import foreign_robot
@@ -69,8 +70,9 @@ def check(
                     Finding(WARNING, "joints", "were not moved: something above is a fault", "mend it first")
                 )
             elif confirmed is not None and confirmed():
+                steered = Steered(robot)
                 for joint in range(len(seen.q)):
-                    one = strokes(robot, joint)
+                    one = strokes(steered, joint)
                     progress("move", joint + 1, len(seen.q))
                     if isinstance(one, str):
                         what, _, remedy = one.partition(": ")
