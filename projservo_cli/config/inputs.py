@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -67,6 +68,7 @@ from projservo_cli.stages.given import (
     TeachInputs,
     Trials,
 )
+from projservo_cli.tables import identity_in
 from projservo_cli.task.face import MIDPOINT
 from projservo_cli.task.trajectory import KeptOut, Trajectory
 
@@ -211,7 +213,9 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
     driven = Driven(robot, _following(config, plant.speed_scale), _endless(config))
     delay = None if plant.time_offset_s is None else (plant.time_offset_s.left, plant.time_offset_s.right)
     settle_s = plant.settle_s if plan.truth is None else None
-    return Contract(driven, events_of(config), plant.timeout_s, delay, settle_s)
+    table = _file(config, "table", files) if plan.truth is None else None
+    identity = "" if table is None or not Path(table.path).is_file() else identity_in(table.path)
+    return Contract(driven, events_of(config), plant.timeout_s, delay, settle_s, identity)
 
 
 def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:

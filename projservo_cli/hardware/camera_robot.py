@@ -63,7 +63,7 @@ class CameraRobot:
 
     def __init__(self, arm: Arm, stereo: StereoSettings, finder: TagFinder, numbers: Sequence[int]) -> None:
         self.arm, self.finder, self._numbers = arm, finder, np.array(numbers, dtype=np.int64)
-        for name in ("now", "truth", "release", "hold", "health"):
+        for name in ("now", "truth", "release", "hold", "health", "identity"):
             if callable(found := getattr(arm, name, None)):
                 setattr(self, name, found)
         now: Callable[[], float] = getattr(arm, "now", time.monotonic)

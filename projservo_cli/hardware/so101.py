@@ -11,8 +11,8 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -227,10 +227,15 @@ class SO101:
         self._sent: dict[int, int] = {}  # set-points, counts
         self.registers: dict[int, Registers] = {}
 
-    def open(self) -> None:
-        """Connect to the servos, and refuse those with which the arm would not stand where it is sent."""
+    def connect(self) -> Servos:
+        """Connect to the servos, which no other process may have."""
         self._servos = Servos(self._port, self._ids, self._others, now=self.now, sleep=self.sleep)
         self._lease = _Lease(self._servos.bus.port)
+        return self._servos
+
+    def open(self) -> None:
+        """Connect to the servos, and refuse those with which the arm would not stand where it is sent."""
+        self.connect()
         self._opened = True
         self.registers = self._servos.registers()
         for i in self._ids:
@@ -246,6 +251,12 @@ class SO101:
     def identity(self) -> str:
         """Registers on which the meaning of readings hangs: a recording holds as long as they do."""
         return ";".join(f"{i}:" + "/".join(map(str, self.registers[i])) for i in self._ids)
+
+    def health(self) -> dict[str, float | str]:
+        """Return the voltage and temperature of the servo that is worst off."""
+        found = self._read().values()
+        volts = min(one.volts for one in found)
+        return {"supply_v": round(volts, 1), "hottest_c": max(one.heat for one in found)}
 
     def joints(self) -> tuple[FloatArray, float]:
         """Joint readings (n,), rad, and when they were read, s."""
@@ -389,6 +400,17 @@ class SO101:
                     what = told.format(volts=one.volts, heat=one.heat, least=least, most=most)
                     return f"{self._servos.name(i)}: {what}; it is sent nothing more, and may sink"
         return ""
+
+
+@contextmanager
+def connected(arm: SO101) -> Iterator[Servos]:
+    """Connect to the servos of an arm alone, which is not driven."""
+    servos = arm.connect()
+    try:
+        yield servos
+    finally:
+        servos.bus.close()
+        arm._lease.end()
 
 
 def torque_told(servos: Servos) -> str:

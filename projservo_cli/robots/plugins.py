@@ -21,7 +21,8 @@ from projservo_cli.records import InputError, WorkFailed
 
 GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
 _METHODS = {"plant": ("open", "read", "command", "stop", "close"), "law": ("__call__",)}
-_OPTIONAL = {"plant": ("now", "truth", "release", "hold"), "law": ()}
+_OPTIONAL = {"plant": ("now", "truth", "release", "hold", "identity"), "law": ()}
+_OWN_PLANTS = {"so101": "projservo_cli.hardware.so101:SO101"}  # that projservo brings along
 DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
 # How alike two names are of which one is a slip, from 0 to 1: of a letter in four or five.
 _ALIKE = 0.8
@@ -29,8 +30,14 @@ TARGET = rf"^{DOTTED}:{DOTTED}$"
 
 
 def registered(kind: str) -> dict[str, str]:
-    """Names that installed packages register for a ``plant`` or ``law``, and the class of each."""
-    return {point.name: point.value for point in metadata.entry_points(group=GROUPS[kind])}
+    """Names of a ``plant`` or ``law``, projservo's own and those of installed packages, with the classes."""
+    found = {point.name: point.value for point in metadata.entry_points(group=GROUPS[kind])}
+    return found | (_OWN_PLANTS if kind == "plant" else {})
+
+
+def short_name(target: str) -> str:
+    """Return the name of a class ``module:Class`` for messages: the short one of a plant of projservo."""
+    return next((name for name, known in _OWN_PLANTS.items() if known == target), target)
 
 
 def target_of(kind: str, name: str) -> str | None:

@@ -56,8 +56,8 @@ def foreign_robot(
                 f"plant {own.target}: a robot that is not simulated needs a limit: set control.{key}"
             )
     robot, name, timeout_s = (
-        _made(own, numbers) if given is None else given,
-        f"plant {own.target}",
+        _made(own, numbers, bounds) if given is None else given,
+        f"plant {plugins.short_name(own.target)}",
         own.timeout_s,
     )
     if own.cameras is not None:  # a look waits for a camera that reconnects
@@ -65,9 +65,14 @@ def foreign_robot(
     return ForeignRobot(robot, name, len(numbers), bounds, timeout_s, own.open_s, own.image_size)
 
 
-def _made(own: OwnRobot, numbers: Sequence[int]) -> Robot:
-    """Make an object of the class of a robot, with its options, and cameras where it brings none."""
+def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds) -> Robot:
+    """Make an object of the class of a robot, with its options, and cameras where it brings none.
+
+    A class that takes an argument ``limits`` is given those of its joints.
+    """
     options = dict(own.options)
+    if "limits" not in options and plugins.takes("plant", own.target, "limits"):
+        options["limits"] = bounds.limits
     if own.cameras is not None:
         arm: Arm = plugins.make("plant", own.target, (), options)
         if not plugins.brings_no_pixels(arm):

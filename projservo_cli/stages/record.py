@@ -33,7 +33,7 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import averaged, foreign_robot, simulated_robot, way_to
 from projservo_cli.stages.given import RecordingInputs, Trials
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
-from projservo_cli.tables import read_table, recording_of, write_table
+from projservo_cli.tables import identity_in, read_table, recording_of, write_table
 
 SAVE_EVERY = 1.0  # s; maximum loss by an interruption without warning
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
@@ -57,6 +57,7 @@ class _Recording:
     # Frames in motion towards poses that are done, by the number of the motion: that of the pose, from 1.
     ways: dict[int, list[Reading]] = field(default_factory=dict)
     found: int = 0  # how many of them an earlier call recorded
+    identity: str = ""  # of the robot that recorded them
     why: str = "none yet"  # why there is something to record; empty where there is nothing
     commands: int = 0  # steps sent to the robot
     # Sum of the squares by which pixels of one pose are off their mean, px², and its degrees of freedom.
@@ -95,7 +96,7 @@ class _Recording:
 
     def save(self) -> None:
         """Write all that is done; the file appears whole or not at all."""
-        write_table(self.observation(), self.path, recording=self.key)
+        write_table(self.observation(), self.path, recording=self.key, identity=self.identity)
 
     def observation(self) -> Observation:
         """All poses that are done, in their order.
@@ -227,6 +228,7 @@ def _resumed(empty: _Recording, most: FloatArray) -> _Recording:
     """The poses of an interrupted recording taken over, at most so far (n,) from where they were to be."""
     recording = replace(empty, done={}, ways={})
     path, remedy = recording.path, "choose another table, or replace it with --force"
+    recording.identity = identity_in(path)
     if recording_of(path) != recording.key:
         raise _OutdatedError(f"{path}: was not recorded with this configuration; {remedy}")
     n = recording.targets.shape[1]
@@ -278,6 +280,9 @@ def record(
     stored, due = len(recording.done), time.monotonic() + SAVE_EVERY
     try:
         with nullcontext() if robot is None else at_rest_after(robot):
+            if robot is not None:
+                robot.require_identity(recording.identity)
+                recording.identity = robot.identity()
             for _ in poses:
                 progress("record", len(recording.done), len(recording.targets))
                 if kept and (start := time.monotonic()) >= due:
