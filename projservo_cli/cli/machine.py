@@ -20,14 +20,21 @@ _MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu"
 
 @main.command("init", epilog="Example: projservo init mine.yaml")
 @click.argument("file", default=_STARTER, type=option.PATH)
+@click.option(
+    "--arm",
+    metavar="KIND",
+    type=click.Choice(["so101"]),
+    help="For an arm that people build, with two webcams: so101. Default: a simulated robot.",
+)
 @option.force(help="Replace the file if there is one.")
 @option.told
-def _init(console: Console, *, file: Path, force: bool) -> None:
+def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None:
     """Write a commented configuration to start from.
 
     Writes a configuration that runs as it is, with a comment on every key, and next to it the schema by which
     editors complete and check it.
     """
+    from projservo_cli.config.arms import starter_for
     from projservo_cli.config.schema import json_schema, starter
     from projservo_cli.files import write_whole
 
@@ -36,11 +43,11 @@ def _init(console: Console, *, file: Path, force: bool) -> None:
         raise click.UsageError(f"{path}: name a YAML file to write, such as {path.with_suffix('.yaml')}")
     option.require_new(path, force=force)
     described = path.with_name(_SCHEMA)
-    write_whole(path, starter())
+    write_whole(path, starter() if arm is None else starter_for(arm))
     write_whole(described, _as_text(json_schema()))
     words = (
         f"init: {path}, with {described} for editors",
-        f"next: projservo calibrate plan servo report -c {path}",
+        f"next: projservo {'calibrate plan servo report' if arm is None else 'limits'} -c {path}",
     )
     console.tell({"configuration": path.resolve(), "schema": described.resolve()}, words)
 

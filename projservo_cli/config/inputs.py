@@ -436,7 +436,7 @@ def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
         ranges=ranges if limits is None else limits.joints,
         in_degrees=limits is not None and limits.unit == "deg",
         widened=None if limits is None else limits.from_data,
-        unit="rad" if vector is None else vector.unit,
+        unit=(limits.unit if limits is not None else None) or ("rad" if vector is None else vector.unit),
         known=0 if vector is None else len(vector.joints),
         pace=pace if paced else Pace(),
     )
