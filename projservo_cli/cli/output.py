@@ -111,10 +111,10 @@ class Console:
         click.echo(wrapped(f"{text}, then press Enter"), err=True)
         sys.stdin.readline()
 
-    def progress(self, what: str, done: int, total: int) -> None:
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
         """Move a progress bar; silent where standard error is not a terminal."""
         if not self.quiet:
-            self._bar(what, done, total)
+            self._bar(what, done, total, note)
 
 
 def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> Iterator[str]:

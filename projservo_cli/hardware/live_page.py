@@ -63,10 +63,21 @@ def page(name: str, findings: Sequence[Finding], pictures: Sequence[bytes]) -> s
     return _document(f"Preflight of {name}", f"<p>{images}</p><table>{head}{rows}</table>")
 
 
-def _document(title: str, body: str) -> str:
+def recording_page(name: str, done: str, pictures: Sequence[bytes], *, whole: bool) -> str:
+    """One file of HTML that shows how far a recording is, and loads itself again until it is whole."""
+    images = "".join(
+        f'<img alt="{view} image of the last pose" src="data:image/jpeg;base64,'
+        f'{base64.b64encode(picture).decode()}"> '
+        for view, picture in zip(VIEWS, pictures, strict=True)
+    )
+    again = "" if whole else '<meta http-equiv="refresh" content="2">'
+    return _document(f"Recording {name}", f"<p>{html.escape(done)}</p><p>{images}</p>", again)
+
+
+def _document(title: str, body: str, head: str = "") -> str:
     title = html.escape(title)
     return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{title}</title>'
+        f'<!doctype html><html lang="en"><meta charset="utf-8">{head}<title>{title}</title>'
         f"<style>{_STYLE}</style><h1>{title}</h1>{body}</html>\n"
     )
 

@@ -178,7 +178,10 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
         signals = [_signal(one, view) for view in range(2)]
         fits = [_fit(one, signal) for signal in signals]
         if one.given_up:
-            remedy = "look what holds it, and at the supply; where it sags or plays so far, raise plant.max_steady_state_error_deg"
+            remedy = (
+                "look what holds it, and at the supply; where it sags or plays so far, raise "
+                "plant.max_steady_state_error_deg"
+            )
             yield Finding(FAULT, f"joint {one.joint + 1}", f"{one.given_up}: it is held or too weak", remedy)
             continue
         span = max(np.ptp(signal.p) if len(signal.p) else 0.0 for signal in signals)

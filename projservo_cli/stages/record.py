@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,6 +14,8 @@ import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
+from projservo_cli.files import write_whole
+from projservo_cli.hardware.live_page import annotated, recording_page
 from projservo_cli.records import (
     CORNERS,
     VIEWS,
@@ -23,6 +25,7 @@ from projservo_cli.records import (
     JointList,
     Observation,
     WorkFailed,
+    in_unit,
 )
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
@@ -72,6 +75,19 @@ class _Recording:
     def unseen(self) -> int:
         """Marker–view pairs without a pixel in the poses that are done."""
         return sum(int(np.isnan(reading.s[..., 0]).sum()) for reading in self.done.values())
+
+    def note(self, units: Sequence[str] = ()) -> str:
+        """Return how many markers each view saw at the last pose, and the joint farthest off its target.
+
+        units : of the joints; empty for rad.
+        """
+        if not self.done:
+            return ""
+        last = self.done[max(self.done)]
+        left, right = np.isfinite(last.s[..., 0]).sum(axis=1).tolist()
+        off = np.array([np.abs(one.q - self.targets[pose]) for pose, one in self.done.items()]).max(axis=0)
+        i = int(off.argmax())
+        return f"markers {left}|{right}, joint {i + 1} {in_unit(off[i], units[i] if units else 'rad', 2)} off"
 
     @property
     def spread_px(self) -> float | None:
@@ -287,12 +303,30 @@ def record(
                 progress("record", len(recording.done), len(recording.targets))
                 if kept and (start := time.monotonic()) >= due:
                     recording.save()
+                    if robot is not None and robot.frames is not None:
+                        _show(recording, robot)
                     stored, now = len(recording.done), time.monotonic()
                     # A long table takes long to write: most of the time must stay for recording.
                     due = now + max(SAVE_EVERY, 10.0 * (now - start))
     finally:
         if kept and len(recording.done) > stored:
             recording.save()
+            if robot is not None and robot.frames is not None:
+                _show(recording, robot)
+
+
+def _show(recording: _Recording, robot: ForeignRobot) -> None:
+    """Write a page next to the table: how far it is, and both images of the last pose with the tags."""
+    last = recording.done[max(recording.done)]
+    nothing = np.empty((0, 2))
+    assert robot.frames is not None
+    pictures = [
+        annotated(grey, recording.marker.tolist(), s, nothing)
+        for grey, s in zip(robot.frames, last.s, strict=True)
+    ]
+    done = f"{len(recording.done)} of {len(recording.targets)} poses; {recording.note(robot.bounds.units)}"
+    text = recording_page(recording.path.name, done, pictures, whole=not recording.pending)
+    write_whole(recording.path.with_suffix(".html"), text)
 
 
 def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> ForeignRobot | None:
