@@ -17,8 +17,9 @@ REACH, _QUICK, _SLOW = math.radians(3.0), math.radians(20.0), math.radians(5.0)
 _LEAST_WAY, _KEPT = math.radians(2.0), math.radians(0.5)
 # Pause after each stroke, s, and the part at its end in which all stands still.
 _PAUSE_S, _STILL_S = 0.6, 0.3
-# Share of a stroke by which a joint may fall short before it is given up: something holds it.
-_HELD = 0.6
+# Share of strokes that a joint must go, else something holds it: hysteresis takes much of the first one, and
+# of those to the middle.
+_HELD = {0: 0.1, 1: 0.4, 2: 0.4, 3: 0.4}
 # Way after a turn of direction within which backlash is passed through, rad.
 _PASSING = math.radians(1.4)
 # Latencies that are tried, s; for a parabola through the best one and its neighbours.
@@ -78,7 +79,7 @@ def strokes(steered: Steered, joint: int) -> Strokes | str:
     for number, (end, quick) in enumerate(_STROKES):
         goal = middle + (high if end > 0 else low if end < 0 else 0.0)
         speed = min(_QUICK if quick else _SLOW, float(bounds.limits.speed[joint]))
-        begun = float(steered.target[joint])
+        begun, from_q = float(steered.target[joint]), float(steered.reading.q[joint])
         pauses = math.ceil(_PAUSE_S / bounds.period)
         while pauses > 0:
             step = np.zeros(len(q))
@@ -87,9 +88,9 @@ def strokes(steered: Steered, joint: int) -> Strokes | str:
             steered.command(step, bounds.period)
             pauses -= left == 0.0 or bool(steered.set_point.short[joint])
             rows.append((number, float(steered.target[joint]), steered.look()))
-        way, short = abs(goal - begun), abs(goal - steered.reading.q[joint])
-        if short > max(_HELD * way, 2.0 * bounds.sag[joint]):
-            what = f"went {bounds.told(joint, way - short, 2)} of {bounds.told(joint, way, 2)}"
+        way, gone = abs(goal - begun), abs(float(steered.reading.q[joint]) - from_q)
+        if number in _HELD and gone < _HELD[number] * way:
+            what = f"went {bounds.told(joint, gone, 2)} of {bounds.told(joint, way, 2)}"
             return Strokes(joint, *_columns(rows), what)
     return Strokes(joint, *_columns(rows), "")
 
