@@ -15,9 +15,9 @@ plant:
   # ids: servos of the joints, base to tool. gripper: its servo, which holds; null for an arm without.
   options: {port: auto, ids: [1, 2, 3, 4, 5], gripper: 6}
   # How far a joint at rest may stay from its set-point: such arms sag by 2 degrees under load.
-  sag_deg: 4
+  max_steady_state_error_deg: 4
   # Images of each pose that record averages.
-  frames: 5
+  averaged_frames: 5
 
 # projservo limits writes robot.limits here. Nothing moves without.
 

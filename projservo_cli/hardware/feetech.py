@@ -20,8 +20,9 @@ _MEMORY = 86
 # Fewest bytes that a request reads, and how many lengths there are, one after the other: those of as many
 # failed requests take 0.14 s, and no reply is later.
 _SHORTEST, _LENGTHS = 15, 12
-# Time within which a reply comes, s: the bytes of six servos, their delays, and two frames of a slow adapter.
-_REPLY_S = 0.012
+# Time within which replies come, s, at first and at most: the bytes of six servos and their delays take 3 ms,
+# adapters and busy machines more.
+_REPLY_S, _SLOW_S = 0.012, 0.1
 # Time for which a servo that does not answer is asked again, s: longer than a bus that is silent for 0.2 s.
 _PATIENCE_S = 0.5
 # Pause between looks at what has arrived, and before what was written is read back, s.
@@ -56,7 +57,7 @@ class FeetechBus:
 
     def __init__(self, port: str, now: Any = time.monotonic, sleep: Any = time.sleep) -> None:
         self.port, self.now, self.sleep = port, now, sleep
-        self._lock, self._failed = threading.RLock(), 0
+        self._lock, self._failed, self._reply_s = threading.RLock(), 0, _REPLY_S
         self._serial = _opened(port)
 
     def close(self) -> None:
@@ -106,7 +107,7 @@ class FeetechBus:
             self._checked(self._serial.reset_input_buffer)
             self._send(_SYNC_READ, bytes([start, longer, *ids]))
             found: dict[int, Reply] = {}
-            heard, end = b"", self.now() + _REPLY_S
+            heard, end = b"", self.now() + self._reply_s
             while len(found) < len(ids) and self.now() < end:
                 heard += self._received()
                 for number, status, values in _packets(heard):
@@ -114,6 +115,8 @@ class FeetechBus:
                         found[number] = Reply(status, values[address - start :][:size])
             missing = {*ids} - {*found}
             self._failed += bool(missing)
+            slower = 2.0 if missing else 0.5
+            self._reply_s = min(max(slower * self._reply_s, _REPLY_S), _SLOW_S)
             return found, missing if len(ids) == 1 and heard else set()
 
     def _send(self, instruction: int, given: bytes) -> None:
