@@ -158,24 +158,13 @@ class Servos:
         """Send set-points, counts, with the highest speed towards them, counts/s."""
         self.bus.write(_GOAL, _goals({i: x for i, x in counts.items() if i not in self.lost}, speed))
 
-    def enable(self, speed: Mapping[int, int]) -> dict[int, int]:
-        """Have all servos hold where they stand, and return these counts.
+    def enable(self, counts: Mapping[int, int], speed: Mapping[int, int]) -> None:
+        """Have servos hold where they stand, at these counts.
 
-        The set-point is the reading before torque comes on, since a servo else leaps to its last one.
-        Raises WorkFailed where a servo does not hold, or leaps.
+        The set-point is sent before torque comes on, since a servo else leaps to its last one.
         """
-        before = {i: one.at for i, one in self.measured().items()}
-        self.bus.store(_GOAL, _goals(before, speed))
-        self.bus.store(_TORQUE, dict.fromkeys(before, b"\1"))
-        self.bus.sleep(_SWITCH_S)
-        for i, one in self.measured().items():
-            turned = abs(one.at - before[i]) * COUNT
-            if turned > _LEAP:
-                raise WorkFailed(
-                    f"{self.name(i)} turned by {_deg(turned)} when its torque came on ({_deg(_LEAP)} at "
-                    "most): look what pulls at it"
-                )
-        return before
+        self.bus.store(_GOAL, _goals(counts, speed))
+        self.bus.store(_TORQUE, dict.fromkeys(counts, b"\1"))
 
     def shift(self, number: int, by: int) -> None:
         """Store an offset by which a servo reads so many counts less; its torque must be off."""
@@ -282,8 +271,17 @@ class SO101:
         """Hold the arm where it stands."""
         self._require_limits()
         self._lease.moving()
-        self._sent = self._servos.enable(self._speeds())
+        self._sent = {i: one.at for i, one in self._read().items()}
+        self._servos.enable(self._sent, self._speeds())
         self._on, self._released = True, False
+        self.sleep(_SWITCH_S)
+        for i, one in self._read().items():
+            turned = abs(one.at - self._sent[i]) * COUNT
+            if turned > _LEAP:
+                raise WorkFailed(
+                    f"{self._servos.name(i)} turned by {_deg(turned)} when its torque came on ({_deg(_LEAP)} "
+                    "at most): look what pulls at it"
+                )
 
     def release(self) -> None:
         """Let go of the arm; the gripper stays as it is."""
@@ -294,12 +292,16 @@ class SO101:
         """Come to rest: joints that are on their way are sent where they are."""
         if not self._on:
             return
-        try:
-            there = {i: one.at for i, one in self._servos.measured().items()}
-            moving = {i: at for i, at in there.items() if abs(at - self._sent[i]) * COUNT > _LEAP}
-            self._servos.send(moving, self._speeds())
-        except (ServoSilent, PortLost) as error:
-            raise WorkFailed(self._servos.told(error)) from error
+        failure = WorkFailed("")
+        for _ in self._servos.all:  # a servo that fails is left out of the next reading
+            try:
+                there = {i: one.at for i, one in self._read().items()}
+                moving = {i: at for i, at in there.items() if abs(at - self._sent[i]) * COUNT > _LEAP}
+                self._servos.send(moving, self._speeds())
+                return
+            except WorkFailed as error:
+                failure = error
+        raise failure
 
     def close(self) -> None:
         """Let go of the port; the arm goes on holding, or not, which is said."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from projservo_cli.config import load_config
+from projservo_cli.config import load_config, shipped
 from projservo_cli.config.inputs import scene_of
 from projservo_cli.simulation.mjcf import mujoco
 from projservo_cli.simulation.scene import rendered_model
@@ -55,7 +55,7 @@ class Arm:
 
     def __init__(self, clock, q_deg=(0, 10, -25, 15, 0), mechanics=None, settings=()):
         self.clock, self.mechanics = clock, mechanics or Mechanics()
-        self.config = load_config("configs/hobby.yaml", (*TAGS, *settings))
+        self.config = load_config(shipped("hobby"), (*TAGS, *settings))
         self.rendered = rendered_model(scene_of(self.config))
         self._model = copy.copy(self.rendered.model)
         self._model.opt.timestep = STEP_S
