@@ -109,7 +109,11 @@ def _of_tags(name: str, view: View, seen: Seen, finder: TagFinder, dictionary: s
             remedy = "name the corners of the tags on the tool (4 t + k) in markers.numbers"
             yield Finding(FAULT, where, f"tags {found} are there, and markers has none of them", remedy)
         else:
-            remedy = "turn the tool towards it; look at light, focus, and white margins of the tags"
+            least = math.ceil(MIN_CELL * finder.cells)
+            remedy = (
+                f"turn the tool towards it; look at light, focus and white margins; tags below {least} px "
+            )
+            remedy += f"({MIN_CELL:g} px a cell) are too small: print larger ones, or move the camera nearer"
             yield Finding(FAULT, where, f"there is no tag of {dictionary}", remedy)
         return
     width = {number: _width(tag) for number, tag in there.items()}

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding
 from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArray
@@ -20,8 +21,10 @@ _PAUSE_S, _STILL_S = 0.6, 0.3
 # Share of strokes that a joint must go, else something holds it: hysteresis takes much of the first one, and
 # of those to the middle.
 _HELD = {0: 0.1, 1: 0.4, 2: 0.4, 3: 0.4}
-# Way after a turn of direction within which backlash is passed through, rad.
-_PASSING = math.radians(1.4)
+# Way after a turn of direction within which backlash is passed, rad: at first, and at most where more shows.
+_PASSING, _MAX_PASSING = math.radians(1.4), math.radians(2.6)
+# Way back that tells a turn of direction, rad.
+_TURN = math.radians(0.35)
 # Latencies that are tried, s; for a parabola through the best one and its neighbours.
 _LATENCIES = np.arange(-0.05, 0.7, 0.005)
 # Motion of images over the whole way, px, below which none moves with the joint.
@@ -130,17 +133,18 @@ class _Fit(NamedTuple):
     backlash: FloatArray  # (d,) rad, between reading and link
 
 
-def _fit(moved: Strokes, signal: _Signal) -> _Fit | None:
+def _fit(moved: Strokes, signal: _Signal, passing: float) -> _Fit | None:
     """Fit p(t) = c± + b q(t − d) + e q(t − d)², c+ where the joint went up last, else c−; None for no motion.
 
-    Looks from a turn of direction on, until backlash is passed, do not count.
+    passing : way, rad, from a turn of direction on, over which looks do not count, since backlash is passed.
     """
     t_q, q = np.array([look.t_q for look in moved.looks]), moved.q
     mid = 0.5 * (q.min() + q.max())
+    reading = PchipInterpolator(t_q, q)  # straight lines would be late where a joint slows down
     found = []
     for d in _LATENCIES:
-        x = np.interp(signal.t - d, t_q, q) - mid
-        up, far = _direction(t_q, q, signal.t - d)
+        x = reading(np.clip(signal.t - d, t_q[0], t_q[-1])) - mid
+        up, far = _direction(t_q, q, signal.t - d, passing)
         counts = far & (signal.t - d > t_q[0])
         A = np.column_stack([up, ~up, x, x * x])[counts].astype(float)
         if (
@@ -157,7 +161,19 @@ def _fit(moved: Strokes, signal: _Signal) -> _Fit | None:
     return _Fit(*(np.array(column) for column in zip(*found, strict=True)))
 
 
-def _direction(t_q: FloatArray, q: FloatArray, t: FloatArray) -> tuple[BoolArray, BoolArray]:
+def _passed(moved: Strokes, signal: _Signal) -> _Fit | None:
+    """Fit without the looks in which the backlash is passed that the fit before shows."""
+    passing, found = _PASSING, _fit(moved, signal, _PASSING)
+    while found is not None and passing < _MAX_PASSING:
+        wider = 1.2 * float(found.backlash[np.argmin(found.squares)]) + math.radians(0.4)
+        if wider <= passing:
+            break
+        passing = min(max(wider, passing + math.radians(0.3)), _MAX_PASSING)
+        found = _fit(moved, signal, passing) or found
+    return found
+
+
+def _direction(t_q: FloatArray, q: FloatArray, t: FloatArray, passing: float) -> tuple[BoolArray, BoolArray]:
     """Whether a joint went up last at instants (f,), and has passed its backlash since it turned."""
     up, far, turned, rising = np.zeros(len(q), dtype=bool), np.zeros(len(q), dtype=bool), q[0], True
     extreme = q[0]
@@ -165,9 +181,9 @@ def _direction(t_q: FloatArray, q: FloatArray, t: FloatArray) -> tuple[BoolArray
         ahead = x - extreme if rising else extreme - x
         if ahead >= 0.0:
             extreme = x
-        elif -ahead > 0.25 * _PASSING:  # it turned
+        elif -ahead > _TURN:  # it turned
             rising, turned, extreme = not rising, extreme, x
-        up[k], far[k] = rising, abs(x - turned) > _PASSING
+        up[k], far[k] = rising, abs(x - turned) > passing
     at = np.clip(np.searchsorted(t_q, t, side="right") - 1, 0, len(q) - 1)
     return up[at], far[at]
 
@@ -177,7 +193,7 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
     still, total = [], np.zeros((2, len(_LATENCIES)))
     for one in moved:
         signals = [_signal(one, view) for view in range(2)]
-        fits = [_fit(one, signal) for signal in signals]
+        fits = [_passed(one, signal) for signal in signals]
         if one.given_up:
             remedy = (
                 "look what holds it, and at the supply; where it sags or plays so far, raise "
@@ -219,11 +235,11 @@ def _of_servo(one: Strokes, fits: Sequence[_Fit]) -> Iterator[Finding]:
     sag = float((one.target - one.q)[below + above].mean())
     best = [int(np.argmin(fit.squares)) for fit in fits]
     backlash = float(np.mean([fit.backlash[k] for fit, k in zip(fits, best, strict=True)])) if fits else 0.0
-    told = [f"{name} {math.degrees(x):.2g}°" for name, x in (("hysteresis", hysteresis), ("sag", abs(sag)))]
+    told = [f"{name} {math.degrees(x):.1f}°" for name, x in (("hysteresis", hysteresis), ("sag", abs(sag)))]
     if fits:
         hidden = abs(sag) > 2.0 * _TOLD and backlash < _TOLD
         told.append(
-            "backlash hidden by gravity" if hidden else f"backlash {math.degrees(max(backlash, 0.0)):.2g}°"
+            "backlash hidden by gravity" if hidden else f"backlash {math.degrees(max(backlash, 0.0)):.1f}°"
         )
     wide = max(hysteresis, backlash) > _WIDE
     remedy = (

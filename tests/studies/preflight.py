@@ -70,7 +70,8 @@ def at_rest(rng, change):
     """Findings of two drawn images."""
     finder, limits = TagFinder("4X4_50"), np.full(5, 2.0)
     baseline = change.get("baseline", rng.uniform(0.2, 0.35))
-    images = [seen_from(x, rng.uniform(10.0, 30.0)) for x in (-baseline / 2, baseline / 2)]
+    tilt = rng.uniform(10.0, 30.0)
+    images = [seen_from(x, tilt) for x in (-baseline / 2, baseline / 2)]
     if "blur" in change or "side" in change:
         images[0] = picture(
             at=(150.0, 120.0), side=change.get("side", 60.0), size=(640, 480), blur=change.get("blur", 0.7)
@@ -114,6 +115,7 @@ def set_ups():
 def main():
     named, blamed, errors = 0, 0, []
     for k, (name, rng) in enumerate(set_ups()):
+        off = []
         if name in AT_REST:
             change, where, words = AT_REST[name]
             found = at_rest(rng, change)
@@ -123,12 +125,11 @@ def main():
             errors += off
             found += [] if name else at_rest(rng, {})
         wrong = [one for one in found if one.level != "fine"]
-        hit = any(one.where.startswith(where) and words in one.text for one in wrong)
+        hit = any(one.where.startswith(where) and words in f"{one.text}: {one.remedy}" for one in wrong)
         named, blamed = named + (bool(name) and hit), blamed + (not name and bool(wrong))
         told = "; ".join(f"{one.where}: {one.text}" for one in wrong[:2])
-        print(
-            f"{k:2} {name or 'sound':12} {'named' if name and hit else '' if not (name or wrong) else 'MISSED' if name else 'BLAMED':7} {told}"
-        )
+        result = ("named" if hit else "MISSED") if name else ("BLAMED" if wrong else "")
+        print(f"{k:2} {name or 'sound':12} {result:7} {np.round(1e3 * np.array(off), 1)} {told}")
     faults = len(MOTIONS) * 2 + len(AT_REST) * 2
     print(f"named {named} of {faults}, blamed {blamed} of {SOUND} sound ones")
     print(f"latency off by {1e3 * np.max(np.abs(errors)):.1f} ms at most, {len(errors)} cameras")
