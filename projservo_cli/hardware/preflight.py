@@ -20,7 +20,7 @@ _GOOD_CELL = 4.0
 _SLOW, _USUAL_HZ = 0.75, 30.0
 # Angle between the directions from which both cameras see a tag, deg: depth errors grow with its inverse.
 _MIN_ANGLE_DEG, _GOOD_ANGLE_DEG = 4.0, 10.0
-# Standard deviations of a corner by which perspective must move it to tell the side of a tilt.
+# Standard deviations of a corner by which perspective must move it to show the side of a tilt.
 _CERTAIN = 4.0
 # Markers that both cameras must see: a turn about a line through two shows in no image.
 _MIN_SHARED = 3
@@ -39,13 +39,15 @@ class Finding(NamedTuple):
 
 @dataclass(eq=False)
 class Seen:
-    """Looks at a robot at rest."""
+    """A robot at rest, as its joints and cameras show it."""
 
     marker: Sequence[int]  # numbers of the markers
     face: Sequence[int]  # those that must stay visible
     q: FloatArray  # (n,) mean of the joint readings, rad or m
     s: FloatArray  # (2, m, 2) mean of the pixels, NaN where most frames do not show a marker
-    sigma: FloatArray | None  # (2, m) standard deviation of a corner of one frame as it is told, px
+    sigma: (
+        FloatArray | None
+    )  # (2, m) standard deviation of a corner of one frame as the detector states it, px
     scatter: FloatArray  # (2, m) as frames tell, px
     limits: JointLimits
     units: Sequence[str]  # of the joints, for messages
@@ -55,7 +57,7 @@ class Seen:
 
 
 def findings_at_rest(seen: Seen, finder: TagFinder, dictionary: str) -> Iterator[Finding]:
-    """All findings of looks at rest; ``dictionary``: name of that of the ``finder``."""
+    """All findings at rest; ``dictionary``: name of that of the ``finder``."""
     for camera, view in zip(seen.cameras, seen.views, strict=True):
         yield from _of_camera(camera)
         yield from _of_tags(camera.name, view, seen, finder, dictionary)
@@ -109,23 +111,23 @@ def _of_tags(name: str, view: View, seen: Seen, finder: TagFinder, dictionary: s
             remedy = "name the corners of the tags on the tool (4 t + k) in markers.numbers"
             yield Finding(FAULT, where, f"tags {found} are there, and markers has none of them", remedy)
         else:
-            least = math.ceil(MIN_CELL * finder.cells)
+            minimum = math.ceil(MIN_CELL * finder.cells)
             remedy = (
-                f"turn the tool towards it; look at light, focus and white margins; tags below {least} px "
+                f"turn the tool towards it; look at light, focus and white margins; tags below {minimum} px "
             )
             remedy += f"({MIN_CELL:g} px a cell) are too small: print larger ones, or move the camera nearer"
             yield Finding(FAULT, where, f"there is no tag of {dictionary}", remedy)
         return
     width = {number: _width(tag) for number, tag in there.items()}
-    least = min(width, key=lambda number: width[number])
-    cell = width[least] / finder.cells
+    smallest = min(width, key=lambda number: width[number])
+    cell = width[smallest] / finder.cells
     sigma = float(np.nanmedian([tag.sigma for tag in there.values()]))
-    told = ", ".join(f"{number} ({width[number]:.0f} px)" for number in sorted(there))
-    text = f"tags {told}; corners to {sigma:.2g} px"
+    sizes = ", ".join(f"{number} ({width[number]:.0f} px)" for number in sorted(there))
+    text = f"tags {sizes}; corners to {sigma:.2g} px"
     if cell < _GOOD_CELL:
         limit = MIN_CELL if cell < MIN_CELL else _GOOD_CELL
         level = FAULT if max(width.values()) / finder.cells < MIN_CELL else WARNING
-        what = f"tag {least} is {width[least]:.0f} px wide, {cell:.1f} px a cell ({limit:g} at least)"
+        what = f"tag {smallest} is {width[smallest]:.0f} px wide, {cell:.1f} px a cell ({limit:g} at least)"
         yield Finding(level, where, what, "print larger tags, move the camera nearer, or raise its size_px")
     yield Finding(FINE, where, text)
 
@@ -138,7 +140,7 @@ def _width(tag: Corners) -> float:
 def other_dictionary(grey: ByteArray, dictionary: str) -> tuple[str, int]:
     """Dictionary with the most tags in an image, and how many, among those with tags of another kind.
 
-    Of two with as many tags the one of the larger and the fewer tags is told.
+    Of two with as many tags it is the one of the larger and the fewer tags.
     """
     counts = {}
     for name in dictionaries():
@@ -178,10 +180,15 @@ def _of_both(seen: Seen) -> Iterator[Finding]:
             yield Finding(FAULT if angle < _MIN_ANGLE_DEG else WARNING, "both cameras", what, remedy)
         elif np.isfinite(angle):
             yield Finding(FINE, "both cameras", f"see the tags from directions {angle:.0f}° apart")
-    noise, told = np.nanmedian(seen.scatter) if np.isfinite(seen.scatter).any() else 0.0, seen.sigma
-    if told is not None and np.isfinite(told).any() and noise > 5.0 * np.nanmedian(told) and noise > 0.3:
+    noise, stated = np.nanmedian(seen.scatter) if np.isfinite(seen.scatter).any() else 0.0, seen.sigma
+    if (
+        stated is not None
+        and np.isfinite(stated).any()
+        and noise > 5.0 * np.nanmedian(stated)
+        and noise > 0.3
+    ):
         what = (
-            f"corners scatter by {noise:.2g} px at rest, {noise / np.nanmedian(told):.0f} times their noise"
+            f"corners scatter by {noise:.2g} px at rest, {noise / np.nanmedian(stated):.0f} times their noise"
         )
         remedy = "look for lamps that flicker, tables that shake, and autofocus"
         yield Finding(WARNING, "both images", what, remedy)
@@ -190,7 +197,7 @@ def _of_both(seen: Seen) -> Iterator[Finding]:
 def view_angle_deg(left: Mapping[int, Corners], right: Mapping[int, Corners]) -> float:
     """Angle between the directions from which both cameras see the tags, median over tags; NaN without one.
 
-    Tags whose perspective does not tell to which side they are tilted count where there are no others; of the
+    Tags whose perspective does not show to which side they are tilted count where there are no others; of the
     sides that fit them the nearer ones are taken.
     """
     sure, unsure = list[float](), list[float]()
@@ -228,10 +235,10 @@ def _directions(pixels: FloatArray, sigma: FloatArray) -> list[FloatArray]:
 
 
 def _of_joints(seen: Seen) -> Iterator[Finding]:
-    """Readings within their limits, and what the arm tells of itself."""
+    """Readings within their limits, and the measurements of the arm itself."""
     lower, upper = seen.limits.lower, seen.limits.upper
-    told = ", ".join(in_unit(x, unit, 4) for x, unit in zip(seen.q.tolist(), seen.units, strict=True))
-    yield Finding(FINE, "joints", f"read {told}")
+    readings = ", ".join(in_unit(x, unit, 4) for x, unit in zip(seen.q.tolist(), seen.units, strict=True))
+    yield Finding(FINE, "joints", f"read {readings}")
     for i, (x, unit) in enumerate(zip(seen.q.tolist(), seen.units, strict=True)):
         low, high = (in_unit(float(limit[i]), unit, 4) for limit in (lower, upper))
         if not np.isfinite([lower[i], upper[i]]).all():

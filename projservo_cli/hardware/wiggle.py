@@ -12,56 +12,56 @@ from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArra
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.pacing import Steered
 
-# How far a joint goes to each side, and how fast: quick strokes tell the latency, slow ones the hysteresis.
+# How far a joint goes to each side, and how fast: quick strokes show the latency, slow ones the hysteresis.
 REACH, _QUICK, _SLOW = math.radians(3.0), math.radians(20.0), math.radians(5.0)
-# Least way from one end to the other, rad, and distance kept from limits.
+# Minimum motion from one end to the other, rad, and distance kept from limits.
 _LEAST_WAY, _KEPT = math.radians(2.0), math.radians(0.5)
 # Pause after each stroke, s, and the part at its end in which all stands still.
 _PAUSE_S, _STILL_S = 0.6, 0.3
 # Share of strokes that a joint must go, else something holds it: hysteresis takes much of the first one, and
 # of those to the middle.
 _HELD = {0: 0.1, 1: 0.4, 2: 0.4, 3: 0.4}
-# Way after a turn of direction within which backlash is passed, rad: at first, and at most where more shows.
+# Motion after a turn of direction within which backlash is passed, rad: at first, and at most where more shows.
 _PASSING, _MAX_PASSING = math.radians(1.4), math.radians(2.6)
-# Way back that tells a turn of direction, rad.
+# Motion back that counts as a turn of direction, rad.
 _TURN = math.radians(0.35)
 # Latencies that are tried, s; for a parabola through the best one and its neighbours.
 _LATENCIES = np.arange(-0.05, 0.7, 0.005)
 # Motion of images over the whole way, px, below which none moves with the joint.
 _MOVES_PX = 1.0
-# Hysteresis or sag from which it is told, and backlash that goals of images bear, rad.
-_TOLD, _WIDE = math.radians(0.15), math.radians(1.5)
-# Latency that tells of frames that queue somewhere, s.
-_LATE_S = 0.3
-# Motion of one tag against the others, px, and in standard deviations, that tells that it is loose.
+# Hysteresis or sag from which it is parts, and backlash that goals of images bear, rad.
+_NOTABLE, _WIDE = math.radians(0.15), math.radians(1.5)
+# Latency from which frames queue somewhere, s.
+_MAX_LATENCY_S = 0.3
+# Motion of one tag against the others, px, and in standard deviations, from which it is loose.
 _LOOSE_PX, _LOOSE = 0.7, 4.0
 
 
 class Strokes(NamedTuple):
-    """Looks at one joint while it went to and fro."""
+    """Readings of a robot while one joint went to and fro."""
 
     joint: int  # from 0
-    end: IntArray  # (k,) number of the stroke of each look
+    end: IntArray  # (k,) number of the stroke of each reading
     target: FloatArray  # (k,) rad or m
-    looks: tuple[Reading, ...]
+    readings: tuple[Reading, ...]
     given_up: str  # why it was broken off; empty where it was not
 
     @property
     def q(self) -> FloatArray:
         """Readings (k,) of the joint, rad or m."""
-        return np.array([look.q[self.joint] for look in self.looks])
+        return np.array([reading.q[self.joint] for reading in self.readings])
 
     def rest(self, stroke: int) -> list[int]:
-        """Numbers of the looks at rest at the end of a stroke."""
+        """Indices of the readings at rest at the end of a stroke."""
         rows = np.flatnonzero(self.end == stroke)
-        last = self.looks[rows[-1]].t_q
-        return [int(k) for k in rows if self.looks[k].t_q > last - _STILL_S]
+        last = self.readings[rows[-1]].t_q
+        return [int(k) for k in rows if self.readings[k].t_q > last - _STILL_S]
 
 
 # Ends of the strokes, in reaches, and whether they are quick. The last three end in the middle from below, at
 # the upper end, and in the middle from above.
-_STROKES = ((1, True), (-1, True), (1, True), (-1, True), (0, False), (1, False), (0, False))
-_UP, _DOWN, _FROM_BELOW, _FROM_ABOVE = 2, 3, 4, 6
+_STROKES = (*((1, True), (-1, True)) * 3, (0, False), (1, False), (0, False))
+_UP, _DOWN, _FROM_BELOW, _FROM_ABOVE = 4, 5, 6, 8
 
 
 def strokes(steered: Steered, joint: int) -> Strokes | str:
@@ -93,14 +93,14 @@ def strokes(steered: Steered, joint: int) -> Strokes | str:
             rows.append((number, float(steered.target[joint]), steered.look()))
         way, gone = abs(goal - begun), abs(float(steered.reading.q[joint]) - from_q)
         if number in _HELD and gone < _HELD[number] * way:
-            what = f"went {bounds.told(joint, gone, 2)} of {bounds.told(joint, way, 2)}"
+            what = f"went {bounds.parts(joint, gone, 2)} of {bounds.parts(joint, way, 2)}"
             return Strokes(joint, *_columns(rows), what)
     return Strokes(joint, *_columns(rows), "")
 
 
 def _columns(rows: Sequence[tuple[int, float, Reading]]) -> tuple[IntArray, FloatArray, tuple[Reading, ...]]:
-    ends, targets, looks = zip(*rows, strict=True)
-    return np.array(ends, dtype=np.int64), np.array(targets), looks
+    ends, targets, readings = zip(*rows, strict=True)
+    return np.array(ends, dtype=np.int64), np.array(targets), readings
 
 
 class _Signal(NamedTuple):
@@ -112,11 +112,11 @@ class _Signal(NamedTuple):
 
 def _signal(moved: Strokes, view: int) -> _Signal:
     """Motion of what a view shows in all of its new frames."""
-    looks = moved.looks
-    new = [k for k in range(1, len(looks)) if looks[k].new_views(looks[k - 1])[view]]
-    s = np.array([looks[k].s[view] for k in new]).reshape(len(new), -1, 2)
+    readings = moved.readings
+    new = [k for k in range(1, len(readings)) if readings[k].new_views(readings[k - 1])[view]]
+    s = np.array([readings[k].s[view] for k in new]).reshape(len(new), -1, 2)
     stamps = np.array(
-        [looks[k].t_q if np.isnan(looks[k].t_view[view]) else looks[k].t_view[view] for k in new]
+        [readings[k].t_q if np.isnan(readings[k].t_view[view]) else readings[k].t_view[view] for k in new]
     )
     s = s[:, np.isfinite(s).all(axis=(0, 2))]
     if not s.size:
@@ -136,14 +136,14 @@ class _Fit(NamedTuple):
 def _fit(moved: Strokes, signal: _Signal, passing: float) -> _Fit | None:
     """Fit p(t) = c± + b q(t − d) + e q(t − d)², c+ where the joint went up last, else c−; None for no motion.
 
-    passing : way, rad, from a turn of direction on, over which looks do not count, since backlash is passed.
+    passing : motion, rad, after a turn of direction, in which the backlash is passed: frames there do not count.
     """
-    t_q, q = np.array([look.t_q for look in moved.looks]), moved.q
+    t_q, q = np.array([reading.t_q for reading in moved.readings]), moved.q
     mid = 0.5 * (q.min() + q.max())
-    reading = PchipInterpolator(t_q, q)  # straight lines would be late where a joint slows down
+    course = PchipInterpolator(t_q, q)  # straight lines would lag behind a joint that slows down
     found = []
     for d in _LATENCIES:
-        x = reading(np.clip(signal.t - d, t_q[0], t_q[-1])) - mid
+        x = course(np.clip(signal.t - d, t_q[0], t_q[-1])) - mid
         up, far = _direction(t_q, q, signal.t - d, passing)
         counts = far & (signal.t - d > t_q[0])
         A = np.column_stack([up, ~up, x, x * x])[counts].astype(float)
@@ -162,7 +162,7 @@ def _fit(moved: Strokes, signal: _Signal, passing: float) -> _Fit | None:
 
 
 def _passed(moved: Strokes, signal: _Signal) -> _Fit | None:
-    """Fit without the looks in which the backlash is passed that the fit before shows."""
+    """Fit without the frames in which the backlash is passed, by the backlash of the fit before."""
     passing, found = _PASSING, _fit(moved, signal, _PASSING)
     while found is not None and passing < _MAX_PASSING:
         wider = 1.2 * float(found.backlash[np.argmin(found.squares)]) + math.radians(0.4)
@@ -211,16 +211,20 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
     yield from _of_still(still, len(moved))
     for name, squares in zip(VIEWS, total, strict=True):
         if squares.any():
-            late = _least(squares)
-            remedy = "look for what queues frames: a hub, a network, a slow machine" if late > _LATE_S else ""
+            latency = _minimum(squares)
+            remedy = (
+                "look for what queues frames: a hub, a network, a slow machine"
+                if latency > _MAX_LATENCY_S
+                else ""
+            )
             yield Finding(
-                WARNING if remedy else FINE, f"{name} camera", f"images are {1e3 * late:.0f} ms late", remedy
+                WARNING if remedy else FINE, f"{name} camera", f"latency {1e3 * latency:.0f} ms", remedy
             )
     yield from _of_loose_tags(moved, numbers)
 
 
-def _least(squares: FloatArray) -> float:
-    """Latency, s, by a parabola through the least of the sums (d,) and its neighbours."""
+def _minimum(squares: FloatArray) -> float:
+    """Latency, s, by a parabola through the minimum of the sums (d,) and its neighbours."""
     k = int(np.clip(np.argmin(squares), 1, len(squares) - 2))
     before, here, after = squares[k - 1 : k + 2]
     bend = before - 2.0 * here + after
@@ -235,17 +239,17 @@ def _of_servo(one: Strokes, fits: Sequence[_Fit]) -> Iterator[Finding]:
     sag = float((one.target - one.q)[below + above].mean())
     best = [int(np.argmin(fit.squares)) for fit in fits]
     backlash = float(np.mean([fit.backlash[k] for fit, k in zip(fits, best, strict=True)])) if fits else 0.0
-    told = [f"{name} {math.degrees(x):.1f}°" for name, x in (("hysteresis", hysteresis), ("sag", abs(sag)))]
+    parts = [f"{name} {math.degrees(x):.1f}°" for name, x in (("hysteresis", hysteresis), ("sag", abs(sag)))]
     if fits:
-        hidden = abs(sag) > 2.0 * _TOLD and backlash < _TOLD
-        told.append(
+        hidden = abs(sag) > 2.0 * _NOTABLE and backlash < _NOTABLE
+        parts.append(
             "backlash hidden by gravity" if hidden else f"backlash {math.degrees(max(backlash, 0.0)):.1f}°"
         )
     wide = max(hysteresis, backlash) > _WIDE
     remedy = (
         "teach goals by images, which backlash does not move; look for a loose horn or screw" if wide else ""
     )
-    yield Finding(WARNING if wide else FINE, f"joint {one.joint + 1}", ", ".join(told), remedy)
+    yield Finding(WARNING if wide else FINE, f"joint {one.joint + 1}", ", ".join(parts), remedy)
 
 
 def _of_still(still: Sequence[int], n: int) -> Iterator[Finding]:
@@ -257,7 +261,7 @@ def _of_still(still: Sequence[int], n: int) -> Iterator[Finding]:
     if len(still) == n:
         what, remedy = (
             "turned, and no tag moved",
-            "look whether the tags are on this arm, and images come anew",
+            "look whether the tags are on this arm, and that the images are live",
         )
     elif [*still] == [*range(still[0], n)]:
         what = f"turned, and no tag moved: the tags sit on the link before joint {still[0] + 1}"
@@ -271,21 +275,21 @@ def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator
     """Tags that moved against the others between rests in the middle, come to from either side.
 
     Hysteresis and backlash leave small motions of the joints, which all tags follow by the images of the
-    strokes; motions of the other tags tell those of the joints, and what is left moved on the tool.
+    strokes; the other tags show the motions of the joints, and the rest is motion on the tool.
     """
     sound = [one for one in moved if not one.given_up]
     rests = [_at_rest(one, stroke) for one in sound for stroke in (_FROM_BELOW, _FROM_ABOVE)]
-    ways = [_at_rest(one, _UP) - _at_rest(one, _DOWN) for one in sound]
+    spans = [_at_rest(one, _UP) - _at_rest(one, _DOWN) for one in sound]
     tag = np.array(numbers) // CORNERS
     worst: dict[int, float] = {}
     for rest in rests[1:]:
-        columns = np.stack([*ways, rest - rests[0]], axis=-1)  # (2, m, 2, j + 1)
+        columns = np.stack([*spans, rest - rests[0]], axis=-1)  # (2, m, 2, j + 1)
         seen = np.isfinite(columns).all(axis=(2, 3))
         for number in sorted(set(tag.tolist())):
             own, others = seen & (tag == number), seen & (tag != number)
             if own.sum() < CORNERS or others.sum() < 2 * len(columns[0, 0, 0]):
                 continue
-            A, b = np.split(columns[others].reshape(-1, len(ways) + 1), [-1], axis=1)
+            A, b = np.split(columns[others].reshape(-1, len(spans) + 1), [-1], axis=1)
             c, *_ = np.linalg.lstsq(A, b[:, 0])
             noise = float(np.sqrt(np.mean((b[:, 0] - A @ c) ** 2)))
             left = np.abs(columns[own] @ [*-c, 1.0]).mean()
@@ -301,4 +305,4 @@ def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator
 
 def _at_rest(one: Strokes, stroke: int) -> FloatArray:
     """Mean pixels (2, m, 2) at rest at the end of a stroke."""
-    return np.asarray(np.mean([one.looks[k].s for k in one.rest(stroke)], axis=0))
+    return np.asarray(np.mean([one.readings[k].s for k in one.rest(stroke)], axis=0))

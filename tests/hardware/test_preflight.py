@@ -216,7 +216,7 @@ def _scaled(s, factor):
 def test_motions_of_a_sound_arm_tell_latency_hysteresis_and_backlash():
     found, moved = findings(Faults(latency_s=(0.12, 0.06), hysteresis_deg=0.6, backlash_deg=0.4))
     assert [one.level for one in found] == ["fine"] * len(found)
-    late = {one.where: float(one.text.split()[2]) for one in found if one.text.endswith("ms late")}
+    late = {one.where: float(one.text.split()[1]) for one in found if one.text.startswith("latency")}
     assert late == {"left camera": pytest.approx(120, abs=5), "right camera": pytest.approx(60, abs=5)}
     for one in found[:5]:
         hysteresis = float(one.text.split("hysteresis ")[1].split("°")[0])

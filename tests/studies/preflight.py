@@ -24,8 +24,8 @@ from tests.hardware.wiggled import Faults, findings
 SEED, SOUND = 20261125, 16
 # Each fault with the words that name it, and for motions what it changes.
 MOTIONS = {
-    "late": (lambda rng: {"latency_s": (0.6, 0.6)}, "left camera", "images are"),
-    "right late": (lambda rng: {"latency_s": (0.1, 0.6)}, "right camera", "images are"),
+    "late": (lambda rng: {"latency_s": (0.6, 0.6)}, "left camera", "latency"),
+    "right late": (lambda rng: {"latency_s": (0.1, 0.6)}, "right camera", "latency"),
     "backlash": (lambda rng: {"backlash_deg": 3.0}, "joint", "backlash"),
     "hysteresis": (lambda rng: {"hysteresis_deg": 3.0}, "joint", "hysteresis"),
     "loose tag": (lambda rng: {"loose": int(rng.integers(5)), "loose_px": 2.8}, "tags", "moved by"),
@@ -61,7 +61,7 @@ def moved(rng, change):
         given |= {"loose": int(rng.integers(5)), "loose_px": 0.7}  # half of the threshold between two rests
     q = np.array([0.0, 10.0, -25.0, 15.0, 0.0]) + rng.uniform(-8.0, 8.0, 5)
     found, _ = findings(Faults(**given), q_deg=tuple(q))
-    late = [float(one.text.split()[2]) for one in found if one.text.endswith("ms late")]
+    late = [float(one.text.split()[1]) for one in found if one.text.startswith("latency")]
     errors = [1e-3 * ms - true for ms, true in zip(late, given["latency_s"], strict=len(late) == 2)]
     return found, errors
 
