@@ -21,7 +21,7 @@ _PAUSE_S, _STILL_S = 0.6, 0.3
 # Share of strokes that a joint must go, else something holds it: hysteresis takes much of the first one, and
 # of those to the middle.
 _HELD = {0: 0.1, 1: 0.4, 2: 0.4, 3: 0.4}
-# Motion after a turn of direction within which backlash is passed, rad: at first, and at most where more shows.
+# Motion after a turn of direction within which backlash is passed, rad: at first, and where more shows.
 _PASSING, _MAX_PASSING = math.radians(1.4), math.radians(2.6)
 # Motion back that counts as a turn of direction, rad.
 _TURN = math.radians(0.35)
@@ -93,7 +93,7 @@ def strokes(steered: Steered, joint: int) -> Strokes | str:
             rows.append((number, float(steered.target[joint]), steered.look()))
         way, gone = abs(goal - begun), abs(float(steered.reading.q[joint]) - from_q)
         if number in _HELD and gone < _HELD[number] * way:
-            what = f"went {bounds.parts(joint, gone, 2)} of {bounds.parts(joint, way, 2)}"
+            what = f"went {bounds.told(joint, gone, 2)} of {bounds.told(joint, way, 2)}"
             return Strokes(joint, *_columns(rows), what)
     return Strokes(joint, *_columns(rows), "")
 
@@ -136,7 +136,7 @@ class _Fit(NamedTuple):
 def _fit(moved: Strokes, signal: _Signal, passing: float) -> _Fit | None:
     """Fit p(t) = c± + b q(t − d) + e q(t − d)², c+ where the joint went up last, else c−; None for no motion.
 
-    passing : motion, rad, after a turn of direction, in which the backlash is passed: frames there do not count.
+    passing : motion, rad, after a turn of direction, that passes the backlash: frames there do not count.
     """
     t_q, q = np.array([reading.t_q for reading in moved.readings]), moved.q
     mid = 0.5 * (q.min() + q.max())
