@@ -13,10 +13,21 @@ from projservo_cli.simulation.cameras import Frames
 _BOUNDARY = "frame"
 _KEPT = 90  # frames of each camera for whoever comes late
 _NAMES = ("left", "right")
+_STILL = 1e-6  # rad, by which joints at rest creep
 
 
 class _Unsearched(Frames):
-    """Frames that nobody searches for tags where they are taken."""
+    """Frames that nobody searches for tags where they are taken; an arm at rest is drawn once."""
+
+    def __init__(self, rendered):
+        super().__init__(rendered)
+        self._kept = {}
+
+    def _drawn(self, view, q):
+        before = self._kept.get(view)
+        if before is None or np.abs(before[0] - q).max() > _STILL:
+            before = self._kept[view] = q.copy(), super()._drawn(view, q)
+        return before[1]
 
     def _found(self, view):
         return np.empty((0, 2)), np.empty(0)

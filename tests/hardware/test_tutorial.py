@@ -17,7 +17,7 @@ from tests.emulated.cameras import Cameras, Optics
 from tests.emulated.servos import Bus
 
 START, GOAL = (0.0, 10.0, -25.0, 15.0, 0.0), (16.0, -2.0, -2.0, -6.0, 35.0)
-RATE = 0.5  # of the emulated clock
+RATE = 0.7  # of the emulated clock
 # What makes the recording short, and the tags as large as those of the emulator.
 SHORTER = {
     "amplitude_deg: 20": "amplitude_deg: 18",
