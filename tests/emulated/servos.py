@@ -9,7 +9,7 @@ import os
 import select
 import threading
 import tty
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,7 +74,8 @@ class Servo:
         for address, size, value in _FACTORY:
             self.put(address, size, value)
         self.memory[5] = number
-        self.moments, self.refused, self._goal = [], 0, 0.0
+        self.moments, self.refused = [], 0  # when it was sent where; writes that it did not take
+        self.reads = deque(maxlen=200)  # when it was read, and the angle in its reply
 
     def get(self, address, size=2):
         return int.from_bytes(self.memory[address : address + size], "little")
@@ -102,6 +103,7 @@ class Servo:
     def refresh(self):
         """Bring the registers of what is measured up to date."""
         self.put(56, 2, self.present)
+        self.reads.append((self.arm.clock.now(), self.get(56)))
         if self.joint is None:
             return
         if self.on and self.arm.overloaded_s[self.joint] > 0.01 * self.memory[35]:
