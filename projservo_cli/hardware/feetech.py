@@ -24,7 +24,7 @@ _SHORTEST, _LENGTHS = 15, 12
 # adapters and busy machines more.
 _REPLY_S, _SLOW_S = 0.012, 0.1
 # Time for which a servo that does not answer is asked again, s: longer than a bus that is silent for 0.2 s.
-_PATIENCE_S = 0.5
+_PATIENCE_S = 0.8
 # Pause between looks at what has arrived, and before what was written is read back, s.
 _PAUSE_S, _WRITTEN_S = 0.0002, 0.005
 # How often a write is repeated that a servo does not take.

@@ -245,15 +245,17 @@ class Bus:
         with self.arm.lock:
             self.arm.advance()
             replies = list(self._carried_out(number, instruction, given))
+        whole = b""
         for servo, values in replies:
-            taken += servo.memory[7] * DELAY_UNIT_S
-            copies = 2 if servo.number in self.faults.twice else 1
             reply = self._reply(servo, values)
-            if copies == 2:  # two at once: what arrives is neither
+            if servo.number in self.faults.twice:  # two at once: what arrives is neither
                 noise = self._random.integers(0, 256, len(reply)).tolist()
                 reply = bytes(x & y for x, y in zip(reply, noise, strict=True))
-            self._send(reply, taken + len(reply) * BYTE_S)
-            taken = 0.0
+            taken += servo.memory[7] * DELAY_UNIT_S + len(reply) * BYTE_S
+            whole += self._garbled(reply)
+        if whole:
+            self.clock.sleep(taken)
+            self._write_out(whole)
 
     def _carried_out(self, number, instruction, given):
         """Do what is asked; yield each servo that answers, and its values."""
@@ -302,7 +304,8 @@ class Bus:
             return None
         return None if drawn < faults.silent + (faults.altered + faults.dropped) / 2 else packet
 
-    def _send(self, reply, after):
+    def _garbled(self, reply):
+        """A reply as it arrives at the port; nothing where it is late and sent by itself."""
         faults, drawn = self.faults, self._random.random()
         place = int(self._random.integers(len(reply)))
         if drawn < faults.altered / 2:
@@ -310,14 +313,13 @@ class Bus:
             reply = reply[:place] + other + reply[place + 1 :]
         elif drawn < (faults.altered + faults.dropped) / 2:
             reply = reply[:place] + reply[place + 1 :]
-        self.clock.sleep(after)
         if self._random.random() < faults.late:
             wait = float(self._random.uniform(0.02, 0.06)) / self.clock.rate
             timer = threading.Timer(wait, self._write_out, (reply,))
             timer.daemon = True
             timer.start()
-            return
-        self._write_out(reply)
+            return b""
+        return reply
 
     def _write_out(self, reply):
         with contextlib.suppress(OSError):
