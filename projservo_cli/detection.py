@@ -131,6 +131,8 @@ _STEPS = (6, 3)
 _FAR = (2.0, 0.05)
 # Number of parameters of an edge.
 _EDGE = 6
+# Made once: it takes a tenth of the time of a small fit.
+_IDENTITY = np.eye(_EDGE)
 # Standard deviation of the height of the arc that a lens makes of a side, px.
 _BOW = 0.01
 # Minimum noise of grey values.
@@ -247,7 +249,7 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
         """Normal matrices, gradients and sums of squares."""
         r, J = _edge_model(x, strips)
         flat = r.reshape(len(r), -1, 1)
-        A = J @ J.swapaxes(1, 2) + stiff[:, :, None] * np.eye(_EDGE)
+        A = J @ J.swapaxes(1, 2) + stiff[:, :, None] * _IDENTITY
         cost = (r * r).sum(axis=(1, 2)) + (stiff * x * x).sum(axis=1)
         return A, (J @ flat)[..., 0] + stiff * x, cost
 
@@ -255,7 +257,7 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
     damping = np.full(len(x), 1e-3)
     for _ in range(steps):
         ridge = damping[:, None] * np.diagonal(A, axis1=1, axis2=2) + 1e-9
-        step = np.linalg.solve(A + ridge[:, :, None] * np.eye(_EDGE), g[..., None])[..., 0]
+        step = np.linalg.solve(A + ridge[:, :, None] * _IDENTITY, g[..., None])[..., 0]
         moved = x - step
         moved[:, 4] = np.clip(np.abs(moved[:, 4]), _MIN_BLUR, _MAX_BLUR)
         new = equations(moved)
