@@ -179,10 +179,10 @@ _QUESTION = (
 def _table(checked: "Checked") -> Iterator[str]:
     width = max(len(finding.where) for finding in checked.findings)
     for finding in checked.findings:
-        text = f"{finding.level:8}{finding.where:{width + 2}}{finding.text}"
-        yield text
+        head = f"{finding.level:8}{finding.where:{width + 2}}"
+        yield head + wrapped(finding.text, " " * len(head))[len(head) :]
         if finding.remedy:
-            yield wrapped(finding.remedy, " " * (width + 10))
+            yield wrapped(finding.remedy, " " * len(head))
     faults = sum(finding.level == "fault" for finding in checked.findings)
     yield "doctor: ready to record" if checked.works else f"doctor: {faults} faults to mend before recording"
 
