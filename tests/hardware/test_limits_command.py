@@ -35,6 +35,13 @@ def arm(tmp_path, monkeypatch):
         yield types.SimpleNamespace(bus=bus, script=script, file=tmp_path / "arm.yaml")
 
 
+def wait_for_readings(bus, count=4):
+    """Wait until servos were read so often, as somebody does who moves slowly."""
+    now = bus.clock.now()
+    while sum(t > now for t, _ in list(bus.servos[1].reads)) < count:
+        time.sleep(0.01)
+
+
 def moved(bus, ways):
     """Somebody moves each joint by ways (n, 2), deg."""
 
@@ -46,7 +53,7 @@ def moved(bus, ways):
                 bus.arm.put(q, 600.0)
                 while np.abs(np.degrees(bus.arm.q) - q).max() > 0.01:
                     time.sleep(0.01)
-                time.sleep(0.06)
+                wait_for_readings(bus)
             bus.arm.put(START, 600.0)
             time.sleep(0.3)
         return "\n"

@@ -42,7 +42,7 @@ def by_hand(arm, *ways):
             while np.abs(np.degrees(arm.q) - q).max() > 0.01:
                 arm.clock.sleep(0.02)
                 arm.advance()
-            arm.clock.sleep(0.1)
+            arm.clock.sleep(0.2)
 
     return move
 
