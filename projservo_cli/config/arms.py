@@ -49,6 +49,9 @@ control:
   mode: track
   period_s: 0.05
   joint_speed_limit_deg_s: 40
+
+# A joint with a degree of hysteresis answers after its set-point went so far, in small steps near the goal.
+stop: {stall_periods: 150}
 """
 _ARMS = {"so101": _SO101}
 

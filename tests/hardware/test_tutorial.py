@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import time
 import types
 
 import numpy as np
@@ -93,8 +94,11 @@ def test_ten_commands_lead_from_an_empty_folder_to_the_taught_goal(bench, capsys
     printed = {}
     for words in given[:10]:
         bench.script[:] = acts.get(" ".join(words[: 1 + ("--start" in words)]), [])
+        begun = time.monotonic()
         assert run(words) == 0, f"{words}: {''.join(capsys.readouterr())}"
         printed[words[0]] = capsys.readouterr()
+        with capsys.disabled():
+            print(f"{words[0]} {time.monotonic() - begun:.0f} s", flush=True)
         if words[0] == "init":
             text = file.read_text()
             for before, after in SHORTER.items():
