@@ -45,5 +45,5 @@ def test_words_of_a_class_are_passed_on():
         raise WorkFailed("joint 3 is too hot")
 
     robot = robot_with(read=read)
-    with at_rest_after(robot), pytest.raises(WorkFailed, match="^arm: joint 3 is too hot$"):
+    with at_rest_after(robot), pytest.raises(WorkFailed, match=r"^arm: joint 3 is too hot$"):
         robot.read()
