@@ -163,7 +163,7 @@ def importable(given: Any) -> bool:
 def _require_methods(where: str, found: Any, kind: str) -> None:
     methods = _METHODS[kind]
     if kind == "plant" and not callable(getattr(found, "read", None)) and brings_no_pixels(found):
-        methods = tuple(name for name in methods if name != "read")
+        methods = tuple("joints" if name == "read" else name for name in methods)
     lacking = [name for name in methods if not callable(getattr(found, name, None))]
     if lacking:
         require_spelt(where, found, lacking)

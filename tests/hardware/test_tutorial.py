@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.cli import run
-from projservo_cli.hardware import so101
+from projservo_cli.hardware import feetech, so101
 from projservo_cli.records import InputError
 from tests.documentation.blocks import PAGES, blocks_of
 from tests.emulated.arm import Arm, Clock, Mechanics
@@ -23,7 +23,7 @@ RATE = 0.7  # of the emulated clock
 SHORTER = {
     "amplitude_deg: 20": "amplitude_deg: 18",
     "frames_per_joint: 6": "frames_per_joint: 2\n  random_poses: 3",
-    "averaged_frames: 5": "averaged_frames: 2",
+    "averaged_frames: 5": "averaged_frames: 2\n  timeout_s: 10",
     "tag_size_m: 0.03": "tag_size_m: 0.04",
 }
 
@@ -60,6 +60,8 @@ def bench(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     clock = Clock(RATE)
     monkeypatch.setattr(so101.tempfile, "gettempdir", lambda: str(tmp_path))
+    # Compiling and importing take the bus, which is in this process, its turn for seconds.
+    monkeypatch.setattr(feetech, "_PATIENCE_S", 5.0)
     monkeypatch.setattr(so101.SO101, "now", staticmethod(clock.now))
     monkeypatch.setattr(so101.SO101, "sleep", staticmethod(clock.sleep))
     script = []
