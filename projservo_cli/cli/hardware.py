@@ -138,10 +138,11 @@ def preflight(
     config: str,
     options: Mapping[str, Any],
     output: Path,
-    move: bool,
-    watch: bool,
 ) -> int:
-    """Check the robot and cameras of a configuration, write the page, and return the exit code."""
+    """Check the robot and cameras of a configuration, write the page, and return the exit code.
+
+    options : sets, move and watch of ``doctor``.
+    """
     from projservo_cli.config.inputs import recording_inputs
     from projservo_cli.files import write_whole
     from projservo_cli.hardware.live_page import page
@@ -149,6 +150,7 @@ def preflight(
 
     settings = option.configured(config, options, teaching=True)
     calibration = option.calibration_of(run, settings)
+    move, watch = options["move"], options["watch"]
     if move and not sys.stdin.isatty():
         raise click.UsageError("--move: standard input is no terminal, so nobody can be asked; leave it out")
     with option.writing(output):

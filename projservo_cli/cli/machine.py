@@ -108,7 +108,8 @@ def _doctor(
     if config is not None:
         from projservo_cli.cli.hardware import preflight
 
-        return preflight(console, run, config, {"sets": sets}, output or Path("preflight.html"), move, watch)
+        options = {"sets": sets, "move": move, "watch": watch}
+        return preflight(console, run, config, options, output or Path("preflight.html"))
     if run is not None or sets or output is not None or move or watch:
         raise click.UsageError("doctor checks a robot with -c alone: projservo doctor -c arm.yaml")
     packages, extras = _requirements()

@@ -19,7 +19,7 @@ _DARK, _CLIPPED_SHARE = 20.0, 0.2
 _WHITE = 252
 # Blur of the sharpest edges of an image, px, from which it is blurred: corners then lose half their accuracy.
 _BLURRED = 2.5
-# Number of edges that tell the blur, and half the width within which their contrast is taken, px.
+# Number of edges that show the blur, and half the width within which their contrast is taken, px.
 _EDGES, _REACH = 300, 6
 
 

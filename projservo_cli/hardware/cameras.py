@@ -32,7 +32,7 @@ class Frame(NamedTuple):
     serial: int  # how many frames came up to it
 
 
-# Frames whose stamps tell the rate.
+# Number of stamps from which the rate is computed.
 _TIMED = 30
 # Pause between attempts to open a lost camera, s.
 _RETRY_S = 0.2
@@ -184,9 +184,9 @@ class Camera:
         now = self._now()
         if self._now is not time.monotonic or _device(self.settings.source) is None:
             return now
-        told = 1e-3 * float(capture.get(_cv().CAP_PROP_POS_MSEC))
-        self.stamped = 0.0 < now - told < _FIRST_S
-        return told if self.stamped else now
+        stamp = 1e-3 * float(capture.get(_cv().CAP_PROP_POS_MSEC))
+        self.stamped = 0.0 < now - stamp < _FIRST_S
+        return stamp if self.stamped else now
 
     def _connected(self) -> Any:
         """Open its source, and set what can be set; WorkFailed with the reason if it does not open."""
@@ -214,9 +214,10 @@ class Camera:
 def _cv() -> Any:
     """Return OpenCV, of which V4L2 waits for a frame for no longer than a second."""
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    return opencv()
+    cv = opencv()
+    cv.utils.logging.setLogLevel(cv.utils.logging.LOG_LEVEL_ERROR)
+    return cv
 
 
 def _set_up(capture: Any, settings: CameraSettings) -> Iterator[str]:
@@ -266,7 +267,7 @@ def stable_name(source: int | str) -> str:
 
 
 def _capabilities(device: Path) -> tuple[int, bytes] | None:
-    """Capabilities of a device node and the bus it is on; None where it does not tell."""
+    """Capabilities of a device node and the bus it is on; None for other nodes."""
     import fcntl
 
     answer = bytearray(_SIZE_OF)
@@ -295,13 +296,13 @@ def _wrong_device(device: Path) -> str:
         return f"there is no {device}; devices: {listed}"
     if not os.access(device, os.R_OK | os.W_OK):
         return f"{device} may not be read: sudo usermod -aG video $USER, then log in again"
-    told = _capabilities(device)
-    if told is None or told[0] & _GIVES_PICTURES:
+    found = _capabilities(device)
+    if found is None or found[0] & _GIVES_PICTURES:
         return ""
     same = [
         str(node)
         for node in others
-        if (other := _capabilities(node)) and other[1] == told[1] and other[0] & _GIVES_PICTURES
+        if (other := _capabilities(node)) and other[1] == found[1] and other[0] & _GIVES_PICTURES
     ]
     remedy = f"take {same[0]}" if same else "take another device"
     return f"{device} gives no pictures: it is the second node of a webcam, for metadata: {remedy}"

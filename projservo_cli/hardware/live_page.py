@@ -54,24 +54,23 @@ def page(name: str, findings: Sequence[Finding], pictures: Sequence[bytes]) -> s
         + "</tr>"
         for one in findings
     )
-    images = "".join(
-        f'<img alt="{view} image with the tags found" src="data:image/jpeg;base64,'
-        f'{base64.b64encode(picture).decode()}"> '
-        for view, picture in zip(VIEWS, pictures, strict=False)
-    )
     head = "<tr><th></th><th>part</th><th>found</th><th>remedy</th></tr>"
-    return _document(f"Preflight of {name}", f"<p>{images}</p><table>{head}{rows}</table>")
+    return _document(f"Preflight of {name}", f"<p>{_images(pictures)}</p><table>{head}{rows}</table>")
 
 
 def recording_page(name: str, done: str, pictures: Sequence[bytes], *, whole: bool) -> str:
     """One file of HTML that shows how far a recording is, and loads itself again until it is whole."""
-    images = "".join(
-        f'<img alt="{view} image of the last pose" src="data:image/jpeg;base64,'
-        f'{base64.b64encode(picture).decode()}"> '
-        for view, picture in zip(VIEWS, pictures, strict=True)
-    )
     again = "" if whole else '<meta http-equiv="refresh" content="2">'
-    return _document(f"Recording {name}", f"<p>{html.escape(done)}</p><p>{images}</p>", again)
+    return _document(f"Recording {name}", f"<p>{html.escape(done)}</p><p>{_images(pictures)}</p>", again)
+
+
+def _images(pictures: Sequence[bytes]) -> str:
+    """Elements of both pictures, JPEG, inside the page itself."""
+    both = zip(VIEWS, map(base64.b64encode, pictures), strict=False)
+    return " ".join(
+        f'<img alt="{view} image with the tags found" src="data:image/jpeg;base64,{data.decode()}">'
+        for view, data in both
+    )
 
 
 def _document(title: str, body: str, head: str = "") -> str:

@@ -48,7 +48,7 @@ class Seen:
     sigma: (
         FloatArray | None
     )  # (2, m) standard deviation of a corner of one frame as the detector states it, px
-    scatter: FloatArray  # (2, m) as frames tell, px
+    scatter: FloatArray  # (2, m) between frames, px
     limits: JointLimits
     units: Sequence[str]  # of the joints, for messages
     views: Sequence[View] = ()  # the last one of each camera of projservo
@@ -215,7 +215,7 @@ def _directions(pixels: FloatArray, sigma: FloatArray) -> list[FloatArray]:
     """Directions (3,) towards the camera, in the frame of a square tag, that fit its corners (4, 2).
 
     Near its centre an image of a square is a scaled orthographic one: a circle there becomes an ellipse,
-    whose axes tell the tilt. Perspective, if it is more than the noise ``sigma`` (4,) of the corners, tells
+    whose axes show the tilt. Perspective, if it is more than the noise ``sigma`` (4,) of the corners, shows
     to which side: the farther part is smaller. Neither needs intrinsics.
     """
     square = np.array([(-1.0, 1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
