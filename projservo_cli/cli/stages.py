@@ -247,7 +247,7 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     call = _asked(console, names, options)
     chain = call.chain
     if options["dry_run"]:
-        words = (f"{s.name}: {f'would be made ({s.why})' if s.why else s.standing}" for s in chain.steps)
+        words = (f"{s.name}: {f'would be made ({s.why})' if s.why else s.states}" for s in chain.steps)
         steps = [{"stage": s.stage, "law": s.law or None, "why": s.why or None} for s in chain.steps]
         console.tell({"run": chain.run.path.resolve(), "dry_run": True, "steps": steps}, words)
         return 0
@@ -432,7 +432,7 @@ def _announce(console: Console, chain: Any) -> None:
             continue  # it was said before it was made
         needed = "" if step.stage in chain.names else f", needed by {chain.names[-1]}"
         if step.why or not needed:
-            said = f"making ({step.why}{needed})" if step.why else step.standing
+            said = f"making ({step.why}{needed})" if step.why else step.states
             reasons.setdefault(said, []).append(step.name)
     for said, found in reasons.items():
         console.say(f"{', '.join(found)}: {said}")
