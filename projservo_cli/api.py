@@ -160,7 +160,7 @@ def record(
             assert given.trials.driven is not None
             assert given.own is not None
             bounds = given.trials.driven.following.bounds(joints)
-            driven = foreign_robot(given.own, bounds, joints.types, len(made.marker), robot)
+            driven = foreign_robot(given.own, bounds, joints.types, made.marker.tolist(), robot)
         recording.record(given, made, driven, kept=table is not None, progress=listener.progress)
     return Observations.of(
         made.observation(),

@@ -131,6 +131,8 @@ _STEPS = (6, 3)
 _FAR = (2.0, 0.05)
 # Number of parameters of an edge.
 _EDGE = 6
+# Made once: it takes a tenth of the time of a small fit.
+_IDENTITY = np.eye(_EDGE)
 # Standard deviation of the height of the arc that a lens makes of a side, px.
 _BOW = 0.01
 # Minimum noise of grey values.
@@ -247,7 +249,7 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
         """Normal matrices, gradients and sums of squares."""
         r, J = _edge_model(x, strips)
         flat = r.reshape(len(r), -1, 1)
-        A = J @ J.swapaxes(1, 2) + stiff[:, :, None] * np.eye(_EDGE)
+        A = J @ J.swapaxes(1, 2) + stiff[:, :, None] * _IDENTITY
         cost = (r * r).sum(axis=(1, 2)) + (stiff * x * x).sum(axis=1)
         return A, (J @ flat)[..., 0] + stiff * x, cost
 
@@ -255,7 +257,7 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
     damping = np.full(len(x), 1e-3)
     for _ in range(steps):
         ridge = damping[:, None] * np.diagonal(A, axis1=1, axis2=2) + 1e-9
-        step = np.linalg.solve(A + ridge[:, :, None] * np.eye(_EDGE), g[..., None])[..., 0]
+        step = np.linalg.solve(A + ridge[:, :, None] * _IDENTITY, g[..., None])[..., 0]
         moved = x - step
         moved[:, 4] = np.clip(np.abs(moved[:, 4]), _MIN_BLUR, _MAX_BLUR)
         new = equations(moved)
@@ -438,14 +440,14 @@ class TagFinder:
     """Detector of the tags of one dictionary.
 
     dictionary : name of OpenCV, with or without ``DICT_``, any case: ``4X4_50``, ``APRILTAG_36H11``.
-    ``cv``: the module of OpenCV.
+    ``cv``: the module of OpenCV. ``cells``: along a side of a tag, its border included.
     Raises InputError if OpenCV is not installed or has no such dictionary.
     """
 
     def __init__(self, dictionary: str) -> None:
-        self.cv = _opencv()
+        self.cv = opencv()
         aruco = self.cv.aruco
-        known = {name.upper().removeprefix("DICT_"): name for name in dir(aruco) if name.startswith("DICT_")}
+        known = dictionaries()
         name = known.get(dictionary.upper().removeprefix("DICT_"))
         if name is None:
             raise InputError(f"--dictionary {dictionary}: unknown; valid: {', '.join(sorted(known))}")
@@ -455,7 +457,12 @@ class TagFinder:
         # Shaded tags before brighter ground need windows of more sizes, and less contrast.
         parameters.adaptiveThreshWinSizeStep, parameters.adaptiveThreshConstant = 4, 5
         self._detector = aruco.ArucoDetector(tags, parameters)
-        self._cells = int(tags.markerSize) + _BORDER
+        self.cells = int(tags.markerSize) + _BORDER
+
+    @property
+    def known(self) -> int:
+        """Number of tags in the dictionary."""
+        return len(self._tags.bytesList)
 
     def read(self, path: Path) -> FloatArray:
         """Read grey values (height, width) of an image, ignoring its orientation tag.
@@ -477,14 +484,15 @@ class TagFinder:
 
         Raises InputError if the dictionary has no such tag.
         """
-        known = len(self._tags.bytesList)
-        if number >= known:
-            raise InputError(f"there is no tag {number} in the dictionary, which has tags 0 to {known - 1}")
-        tag = self.cv.aruco.generateImageMarker(self._tags, number, self._cells * cell_px)
+        if number >= self.known:
+            raise InputError(
+                f"there is no tag {number} in the dictionary, which has tags 0 to {self.known - 1}"
+            )
+        tag = self.cv.aruco.generateImageMarker(self._tags, number, self.cells * cell_px)
         return np.pad(tag, cell_px, constant_values=255)
 
-    def find(self, image: FloatArray) -> tuple[dict[int, Corners], int]:
-        """Corners (4, …) of each tag in an image, and the number of tags that occur more than once.
+    def find(self, image: FloatArray) -> tuple[dict[int, Corners], tuple[int, ...]]:
+        """Corners (4, …) of each tag in an image, and the numbers of tags that occur more than once.
 
         A tag that occurs more than once is ambiguous and rejected.
 
@@ -492,22 +500,31 @@ class TagFinder:
         """
         quads, numbers, _ = self._detector.detectMarkers(image.astype(np.uint8))
         if numbers is None:
-            return {}, 0
+            return {}, ()
         found = [int(number) for number in np.ravel(numbers)]
         ambiguous = {number for number in found if found.count(number) > 1}
-        corners = refine_corners(image, np.reshape(quads, (-1, 4, 2)).astype(np.float64), self._cells)
+        corners = refine_corners(image, np.reshape(quads, (-1, 4, 2)).astype(np.float64), self.cells)
         each = (Corners(*tag) for tag in zip(*corners, strict=True))
         tags = dict(zip(found, each, strict=True))
-        return {number: tag for number, tag in tags.items() if number not in ambiguous}, len(ambiguous)
+        return {number: tag for number, tag in tags.items() if number not in ambiguous}, tuple(
+            sorted(ambiguous)
+        )
 
 
-def _opencv() -> Any:
+def dictionaries() -> dict[str, str]:
+    """Names of all dictionaries of tags, and as OpenCV names them."""
+    names = [name for name in dir(opencv().aruco) if name.startswith("DICT_")]
+    return {name.upper().removeprefix("DICT_"): name for name in names}
+
+
+def opencv() -> Any:
+    """Return the module of OpenCV; an InputError says what to install."""
     try:
         import cv2
     except ImportError as error:
-        raise InputError("detect needs OpenCV: pip install '.[detect]'") from error
+        raise InputError("tags and cameras need OpenCV: pip install '.[detect]'") from error
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
-        raise InputError(f"detect needs OpenCV 4.7 or newer, not {cv2.__version__}: pip install '.[detect]'")
+        raise InputError(f"tags need OpenCV 4.7 or newer, not {cv2.__version__}: pip install '.[detect]'")
     return cv2
 
 
@@ -556,7 +573,7 @@ def observe_tags(
                     f"{width}×{height}; one camera takes images of one size"
                 )
             tags, ambiguous = finder.find(image)
-            found.ambiguous += ambiguous
+            found.ambiguous += len(ambiguous)
             found.empty += not tags
             for number, tag in tags.items():
                 in_corners = points == "corners"

@@ -15,8 +15,8 @@ class Bar:
     def __init__(self) -> None:
         self._bar: Any = None
 
-    def __call__(self, what: str, done: int, total: int) -> None:
-        """Move the bar of ``what`` to ``done`` of ``total``, and remove it at the end."""
+    def __call__(self, what: str, done: int, total: int, note: str = "") -> None:
+        """Move the bar of ``what`` to ``done`` of ``total``, with a note, and remove it at the end."""
         if not sys.stderr.isatty():
             return
         if self._bar is None or self._bar.desc != what:
@@ -26,6 +26,7 @@ class Bar:
             self._bar = tqdm(total=total, desc=what, leave=False, ncols=80)
             threading.Thread(target=self._tick, args=(self._bar,), daemon=True).start()
         self._bar.total = total
+        self._bar.set_postfix_str(note, refresh=False)
         self._bar.update(done - self._bar.n)
         if done >= total:
             self.close()

@@ -32,6 +32,7 @@ _PIXELS = ("u_left", "v_left", "u_right", "v_right")  # columns of pixels
 _SIGMAS = ("sigma_left", "sigma_right")  # columns of their standard deviations
 _MOVING = "moving"  # column of the number of a motion
 _TIMES = ("t_q", "t_left", "t_right")  # columns of times, s
+_IDENTITY = " of "  # in that column, before the identity of the robot
 _RECORDING = "recording"  # column of the recording that a row belongs to
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
 _INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
@@ -133,15 +134,29 @@ def read_joint_list(
 
 def recording_of(path: Path | str) -> str | None:
     """Recording that all rows of a table belong to; None if they name none or several."""
+    found = _recording(path)
+    return None if found is None else found.partition(_IDENTITY)[0]
+
+
+def identity_in(path: Path | str) -> str:
+    """Identity of the robot that a table was recorded with; empty where it names none."""
+    return (_recording(path) or "").partition(_IDENTITY)[2]
+
+
+def _recording(path: Path | str) -> str | None:
+    """What all rows of a table have in the column of their recording; None if they have none or several."""
     sheet = _Sheet(path, [], optional=[_RECORDING])
     found = {row[_RECORDING] for row in sheet.rows() if _RECORDING in row}
     return found.pop() if len(found) == 1 else None
 
 
-def write_table(observation: Observation, path: Path | str, *, recording: str = "") -> None:
+def write_table(
+    observation: Observation, path: Path | str, *, recording: str = "", identity: str = ""
+) -> None:
     """Write an observation table that ``read_table`` reads back to the last bit.
 
-    Every marker of every pose has a row, with empty cells if unseen. ``recording`` fills a further column.
+    Every marker of every pose has a row, with empty cells if unseen. ``recording`` fills a further column,
+    with the ``identity`` of the robot.
     """
     K, m = len(observation.pose), len(observation.marker)
     columns = {"pose": np.repeat(observation.pose, m), "marker": np.tile(observation.marker, K)}
@@ -158,7 +173,7 @@ def write_table(observation: Observation, path: Path | str, *, recording: str = 
         if values is not None:
             columns[name] = _or_empty(np.repeat(values, m))
     if recording:
-        columns[_RECORDING] = np.full(K * m, recording)
+        columns[_RECORDING] = np.full(K * m, recording + (_IDENTITY + identity if identity else ""))
     write_whole(Path(path), to_csv(columns))
 
 

@@ -74,7 +74,7 @@ def bounds_of(config, joints):
 
 def foreign_robot(config, joints, markers):
     robot = given.recording_inputs(config).own
-    return external_robot.foreign_robot(robot, bounds_of(config, joints), joints.types, markers)
+    return external_robot.foreign_robot(robot, bounds_of(config, joints), joints.types, range(markers))
 
 
 def robot_by_itself(config, truth, q, sigma_px, seed, stream):

@@ -20,14 +20,21 @@ _MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu"
 
 @main.command("init", epilog="Example: projservo init mine.yaml")
 @click.argument("file", default=_STARTER, type=option.PATH)
+@click.option(
+    "--arm",
+    metavar="KIND",
+    type=click.Choice(["so101"]),
+    help="For an arm that people build, with two webcams: so101. Default: a simulated robot.",
+)
 @option.force(help="Replace the file if there is one.")
 @option.told
-def _init(console: Console, *, file: Path, force: bool) -> None:
+def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None:
     """Write a commented configuration to start from.
 
     Writes a configuration that runs as it is, with a comment on every key, and next to it the schema by which
     editors complete and check it.
     """
+    from projservo_cli.config.arms import starter_for
     from projservo_cli.config.schema import json_schema, starter
     from projservo_cli.files import write_whole
 
@@ -36,11 +43,11 @@ def _init(console: Console, *, file: Path, force: bool) -> None:
         raise click.UsageError(f"{path}: name a YAML file to write, such as {path.with_suffix('.yaml')}")
     option.require_new(path, force=force)
     described = path.with_name(_SCHEMA)
-    write_whole(path, starter())
+    write_whole(path, starter() if arm is None else starter_for(arm))
     write_whole(described, _as_text(json_schema()))
     words = (
         f"init: {path}, with {described} for editors",
-        f"next: projservo calibrate plan servo report -c {path}",
+        f"next: projservo {'calibrate plan servo report' if arm is None else 'limits'} -c {path}",
     )
     console.tell({"configuration": path.resolve(), "schema": described.resolve()}, words)
 
@@ -70,14 +77,41 @@ def _as_text(schema: dict[str, Any]) -> str:
     return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
 
 
-@main.command("doctor", epilog="Example: projservo doctor --json")
+@main.command("doctor", epilog="Example: projservo doctor -c arm.yaml --move")
+@click.argument("run", required=False, type=option.PATH)
+@option.configuration(help="Configuration (YAML) of a robot to check. Default: check the installation.")
+@option.override
+@option.output(metavar="FILE", help="Page to write. Default: preflight.html.")
+@click.option("--move", is_flag=True, help="Ask, then move each joint by 3° to either side.")
+@click.option("--watch", is_flag=True, help="Show both images in a browser of this machine until Ctrl-C.")
 @option.told
-def _doctor(console: Console) -> int:
-    """Report installed packages and the folders in use.
+def _doctor(
+    console: Console,
+    *,
+    run: Path | None,
+    config: str | None,
+    sets: tuple[str, ...],
+    output: Path | None,
+    move: bool,
+    watch: bool,
+) -> int:
+    """Say what is installed, or check a robot and its cameras.
 
     Lists versions, extras, whether the kernels are compiled, and the folder of results. Exit code 1 when
     a required part is missing.
+
+    With -c it opens robot and cameras, moves nothing, and writes a table and a page with both pictures: frame
+    rates, exposure, sharpness, tags, joints, limits, each finding with its remedy. With a calibration in RUN,
+    by default that of the configuration's name in results, it says whether images still agree. --move
+    measures latency, hysteresis, sag, and whether tags sit fast. Exit code 1 where a recording would fail.
     """
+    if config is not None:
+        from projservo_cli.cli.hardware import preflight
+
+        options = {"sets": sets, "move": move, "watch": watch}
+        return preflight(console, run, config, options, output or Path("preflight.html"))
+    if run is not None or sets or output is not None or move or watch:
+        raise click.UsageError("doctor checks a robot with -c alone: projservo doctor -c arm.yaml")
     packages, extras = _requirements()
     missing = [name for name, version in packages.items() if version is None]
     folder = Path("results").absolute()

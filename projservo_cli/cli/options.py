@@ -248,6 +248,9 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
     if (size := options.get("image_size")) is not None:  # such as 1280x1024
         sides = size.lower().replace("x", ", ")
         found.append(Override.parse(f"data.image_size_px=[{sides}]", f"--image-size {size}"))
+    if (goal := options.get("goal")) is not None:
+        named = goal if goal.endswith((".yaml", ".yml")) else f"{goal}.yaml"
+        found.append(Override(f"--goal {goal}", "task.goal", named))
     found += map(Override.parse, options["sets"])
     if (scale := options.get("speed_scale")) is not None:  # --set plant=… would else undo it
         found.append(Override(f"--speed-scale {scale}", "plant.speed_scale", scale))

@@ -92,18 +92,18 @@ class Console:
 
     def confirm(self, command: str, plant: Any) -> None:
         """Ask before the first motion of a ``plant``; a KeyboardInterrupt where the answer is not yes."""
-        self._bar.close()
-        try:
-            agreed = click.confirm(
-                f"{command} will move {plant.use or 'the simulated robot'}, "
-                f"speeds times {plant.speed_scale:g}. Go?",
-                err=True,
-            )
-        except click.Abort:
-            agreed = False
-        if not agreed:
+        driven = plant.use or "the simulated robot"
+        if not self.agreed(f"{command} will move {driven}, speeds times {plant.speed_scale:g}. Go?"):
             self.say("not confirmed: nothing was moved")
             raise KeyboardInterrupt
+
+    def agreed(self, question: str) -> bool:
+        """Ask somebody at the terminal, and return whether the answer is yes."""
+        self._bar.close()
+        try:
+            return click.confirm(question, err=True)
+        except click.Abort:
+            return False
 
     def wait(self, text: str) -> None:
         """Tell somebody at the terminal to do something, and wait for the Enter key."""
@@ -111,10 +111,10 @@ class Console:
         click.echo(wrapped(f"{text}, then press Enter"), err=True)
         sys.stdin.readline()
 
-    def progress(self, what: str, done: int, total: int) -> None:
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
         """Move a progress bar; silent where standard error is not a terminal."""
         if not self.quiet:
-            self._bar(what, done, total)
+            self._bar(what, done, total, note)
 
 
 def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> Iterator[str]:

@@ -93,17 +93,21 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
 
 def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> str:
     """Record the pending poses, and report the progress on an interrupt; return the reason of a failure."""
-    from projservo_cli.config.inputs import recording_inputs
+    from projservo_cli.config.inputs import joints_of, recording_inputs
     from projservo_cli.records import WorkFailed
     from projservo_cli.stages.record import record
 
     if recording.pending and confirm:
         console.confirm("record", config.plant)
-    total = len(recording.targets)
+    total, units = len(recording.targets), joints_of(config).joints().units
+
+    def progress(what: str, done: int, whole: int) -> None:
+        console.progress(what, done, whole, recording.note(units))
+
     if recording.found and recording.pending:
         console.say(f"{recording.path}: continued after {recording.found} of {total} poses")
     try:
-        record(recording_inputs(config), recording, progress=console.progress)
+        record(recording_inputs(config), recording, progress=progress)
     except WorkFailed as error:
         return " ".join(str(error).split()).removeprefix("record: ")
     except KeyboardInterrupt:
@@ -168,6 +172,11 @@ def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
 )
 @option.speed_scale
 @option.confirm
+@click.option(
+    "--goal",
+    metavar="NAME",
+    help="Go to this taught goal, NAME.yaml next to the configuration, instead of task.goal.",
+)
 @click.option(
     "--from",
     "origin",

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -67,6 +68,7 @@ from projservo_cli.stages.given import (
     TeachInputs,
     Trials,
 )
+from projservo_cli.tables import identity_in
 from projservo_cli.task.face import MIDPOINT
 from projservo_cli.task.trajectory import KeptOut, Trajectory
 
@@ -116,7 +118,8 @@ def recording_inputs(config: Config) -> RecordingInputs:
         numbers=numbers,
         face=markers.front or (),
         dictionary=None if given is None else str(given),
-        tagged=(markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None),
+        tagged=config.cameras is not None
+        or (markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None),
         max_steady_state_error_deg=plant.max_steady_state_error_deg,
     )
 
@@ -210,7 +213,9 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
     driven = Driven(robot, _following(config, plant.speed_scale), _endless(config))
     delay = None if plant.time_offset_s is None else (plant.time_offset_s.left, plant.time_offset_s.right)
     settle_s = plant.settle_s if plan.truth is None else None
-    return Contract(driven, events_of(config), plant.timeout_s, delay, settle_s)
+    table = _file(config, "table", files) if plan.truth is None else None
+    identity = "" if table is None or not Path(table.path).is_file() else identity_in(table.path)
+    return Contract(driven, events_of(config), plant.timeout_s, delay, settle_s, identity)
 
 
 def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
@@ -431,7 +436,7 @@ def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
         ranges=ranges if limits is None else limits.joints,
         in_degrees=limits is not None and limits.unit == "deg",
         widened=None if limits is None else limits.from_data,
-        unit="rad" if vector is None else vector.unit,
+        unit=(limits.unit if limits is not None else None) or ("rad" if vector is None else vector.unit),
         known=0 if vector is None else len(vector.joints),
         pace=pace if paced else Pace(),
     )
@@ -462,7 +467,8 @@ def _own(config: Config) -> OwnRobot:
     plant, markers = config.plant, config.markers
     dictionary = markers.dictionary if markers is not None else None
     size, options = config.image_size_px, dict(plant.options)
-    return OwnRobot(plant.use or "", options, dictionary, plant.timeout_s, plant.open_s, size)
+    cameras = None if config.cameras is None else config.cameras.settings
+    return OwnRobot(plant.use or "", options, dictionary, plant.timeout_s, plant.open_s, size, cameras)
 
 
 def _simulated(config: Config, truth: Truth, files: Files | None) -> SimulatedRobot:

@@ -18,6 +18,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from projservo_cli.config.cameras import Cameras
 from projservo_cli.config.markers import Markers
 from projservo_cli.config.robot import (
     Count,
@@ -604,6 +605,19 @@ def _dictionary(plant: _PlantSettings, markers: Markers | None) -> Iterator[Find
         yield ("markers", "dictionary"), "plant.options gives the class its dictionary as well; keep one"
 
 
+def _cameras(plant: _PlantSettings, markers: Markers | None, cameras: Cameras | None) -> Iterator[Finding]:
+    """Cameras of nobody, or with nothing to find."""
+    if cameras is None:
+        return
+    if plant.simulated:
+        yield (
+            ("cameras",),
+            "are those of a robot that is not simulated: set plant.use to its class, or leave them out",
+        )
+    if markers is None or (markers.tags is None and markers.numbers is None):
+        yield ("cameras",), "find tags: set markers.tags, or markers.numbers of their corners (4 t + k)"
+
+
 def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> Iterator[Finding]:
     if robot is None or not robot.joints:
         return
@@ -659,7 +673,7 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
     rule: {*inspect.signature(rule).parameters}
     for rule in (
         *(_same_joints, _joint_vectors, _goal_images, _simulated_alone, _rendered),
-        *(_dictionary, _disturbed_joints, _disturbed_markers, _plan_to_follow, _keeping_out),
+        *(_dictionary, _cameras, _disturbed_joints, _disturbed_markers, _plan_to_follow, _keeping_out),
         *(_speed_in_joint_space, _limits_in_joint_space),
     )
 }
@@ -696,6 +710,7 @@ class Settings(Root):
     trajectory: Trajectory = Trajectory()
     control: _Control = _Control()
     plant: _PlantSettings = _PlantSettings()
+    cameras: Cameras | None = None
     disturbance: Disturbance = Disturbance()
     stop: _Stop = _Stop()
     report: _ReportSettings = _ReportSettings()
@@ -766,4 +781,8 @@ class Settings(Root):
         """Width and height of the images, if they are known."""
         if self.data is not None and self.data.image_size_px is not None:
             return self.data.image_size_px
+        if self.cameras is not None:
+            return (
+                self.cameras.left.size_px if self.cameras.left.size_px == self.cameras.right.size_px else None
+            )
         return self.rig.image_size_px if self.rig is not None else None

@@ -73,10 +73,12 @@ class Robot(Protocol):
 
     A class may also have ``now() -> float``, its clock, s, without which ``time.monotonic`` is taken;
     ``release()`` and ``hold()``, which let go of the arm, so that somebody can move it for ``projservo
-    teach``, and hold it again; and, if it is a simulator, ``truth()``, the pose (4, 4) of the tool in its
-    base frame, m, or its joints (n,), for results alone. A simulator's time passes in ``command`` alone,
-    which moves it to ``due``. And ``frames``, both images (2, height, width) of its last observation in grey,
-    uint8, or None: a run keeps some, which the report shows.
+    teach``, and hold it again; ``identity() -> str``, without spaces, which changes where readings mean
+    something else, such as after homing, and without which no recording holds; and, if it is a simulator,
+    ``truth()``, the pose (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A
+    simulator's time passes in ``command`` alone, which moves it to ``due``. And ``frames``, both images
+    (2, height, width) of its last reading in grey, uint8, or None: a run keeps some, which the report shows.
+    A class that takes an argument ``limits`` is given those of its joints, ``JointLimits``.
     """
 
     def open(self) -> None:
@@ -192,6 +194,26 @@ class ForeignRobot:
         shape = (4, 4) if np.ndim(answer) == 2 else (self._joints,)
         return self._numbers("truth() gave numbers", answer, shape, finite=True)
 
+    def health(self) -> dict[str, float | str]:
+        """What the robot measures of itself, such as its voltage, by name; empty where it tells nothing."""
+        tell = getattr(self.robot, "health", None)
+        return {} if tell is None else dict(self._ask("health", tell))
+
+    def identity(self) -> str:
+        """Text that changes where readings mean something else; empty where the robot tells none."""
+        tell = getattr(self.robot, "identity", None)
+        return "" if tell is None else "".join(str(self._ask("identity", tell)).split())
+
+    def require_identity(self, recorded: str) -> None:
+        """Refuse a robot whose readings mean something else than when they were recorded; a WorkFailed."""
+        now = self.identity()
+        if recorded and now != recorded:
+            raise WorkFailed(
+                f"{self.name}: nothing was moved: its readings mean something else than in the recording: "
+                f"{_difference(recorded, now)}: was it homed or calibrated since? Record again: projservo "
+                "record calibrate --force"
+            )
+
     @property
     def lets_go(self) -> bool:
         """Whether the arm can be released, and held again."""
@@ -298,6 +320,8 @@ class ForeignRobot:
             ) from None
         if isinstance(error, (KeyboardInterrupt, InputError)):
             raise error
+        if isinstance(error, WorkFailed):  # of a class that says it in words
+            raise WorkFailed(f"{self.name}: {error}") from error
         if error is not None:
             raise WorkFailed(f"{self.name}: {what}() failed: {what_failed(error)}") from error
         return order.result()
@@ -386,6 +410,12 @@ class ForeignRobot:
         return np.array(found, dtype=np.float64)
 
 
+def _difference(before: str, now: str) -> str:
+    """Tell the parts of two identities, divided by semicolons, that differ."""
+    pairs = zip(before.split(";"), now.split(";"), strict=False)
+    return ", ".join(f"{x} is now {y}" for x, y in pairs if x != y) or f"{before} is now {now}"
+
+
 def _serve(call: Callable[[], Any], order: "Future[Any]") -> None:
     """Make a call, unless it was cancelled, and keep what comes of it."""
     if order.set_running_or_notify_cancel():
@@ -406,7 +436,10 @@ def _came(orders: "list[Future[Any]]", seconds: float) -> str | None:
             done, _ = wait(orders, max(0.0, end - time.monotonic()), return_when="FIRST_COMPLETED")
             if done:
                 errors = [order.exception() for order in done]
-                return "" if None in errors else what_failed(errors[0] or RuntimeError())
+                if None in errors:
+                    return ""
+                said = [str(error) for error in errors if isinstance(error, WorkFailed)]
+                return said[0] if said else what_failed(errors[0] or RuntimeError())
             if time.monotonic() >= end:
                 return None
 

@@ -21,7 +21,8 @@ from projservo_cli.records import InputError, WorkFailed
 
 GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
 _METHODS = {"plant": ("open", "read", "command", "stop", "close"), "law": ("__call__",)}
-_OPTIONAL = {"plant": ("now", "truth", "release", "hold"), "law": ()}
+_OPTIONAL = {"plant": ("now", "truth", "release", "hold", "identity"), "law": ()}
+_OWN_PLANTS = {"so101": "projservo_cli.hardware.so101:SO101"}  # that projservo brings along
 DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
 # How alike two names are of which one is a slip, from 0 to 1: of a letter in four or five.
 _ALIKE = 0.8
@@ -29,8 +30,14 @@ TARGET = rf"^{DOTTED}:{DOTTED}$"
 
 
 def registered(kind: str) -> dict[str, str]:
-    """Names that installed packages register for a ``plant`` or ``law``, and the class of each."""
-    return {point.name: point.value for point in metadata.entry_points(group=GROUPS[kind])}
+    """Names of a ``plant`` or ``law``, projservo's own and those of installed packages, with the classes."""
+    found = {point.name: point.value for point in metadata.entry_points(group=GROUPS[kind])}
+    return found | (_OWN_PLANTS if kind == "plant" else {})
+
+
+def short_name(target: str) -> str:
+    """Return the name of a class ``module:Class`` for messages: the short one of a plant of projservo."""
+    return next((name for name, known in _OWN_PLANTS.items() if known == target), target)
 
 
 def target_of(kind: str, name: str) -> str | None:
@@ -155,6 +162,8 @@ def importable(given: Any) -> bool:
 
 def _require_methods(where: str, found: Any, kind: str) -> None:
     methods = _METHODS[kind]
+    if kind == "plant" and not callable(getattr(found, "read", None)) and brings_no_pixels(found):
+        methods = tuple("joints" if name == "read" else name for name in methods)
     lacking = [name for name in methods if not callable(getattr(found, name, None))]
     if lacking:
         require_spelt(where, found, lacking)
@@ -166,6 +175,11 @@ def _require_methods(where: str, found: Any, kind: str) -> None:
             require_spelt(where, found, (name,))
         elif not callable(getattr(found, name)):
             raise InputError(f"{where}: has {name}, which is to be a method; give it another name")
+
+
+def brings_no_pixels(found: object) -> bool:
+    """Whether a robot class, or an object of it, reads joints alone and leaves images to projservo."""
+    return callable(getattr(found, "joints", None))
 
 
 def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""Settings of a robot: its joints and their limits, the bounds of its servos, and its class."""
+"""Settings of a robot: its joints and their limits, its servos, its class and its cameras."""
 
 import math
 from collections.abc import Sequence
@@ -119,6 +119,26 @@ class Following(NamedTuple):
         return Bounds(limits, lead, self.period, self.max_servo_lag_s, sag, joints.units)
 
 
+class CameraSettings(NamedTuple):
+    """One camera, as it is configured."""
+
+    source: int | str  # index, device, file or URL
+    size_px: tuple[int, int] | None = None  # width and height; None for what it gives
+    rate_hz: float | None = None  # frames a second; None for its own
+    fourcc: str = "MJPG"  # format in which a device sends frames
+    exposure_ms: float | None = None  # None leaves it to the camera
+    focus: float | None = None  # in units of the driver; None for where it stands
+
+
+class StereoSettings(NamedTuple):
+    """Both cameras, and how long projservo waits for their frames."""
+
+    left: CameraSettings
+    right: CameraSettings
+    max_age_s: float = 0.3  # of a frame that still counts as new
+    reconnect_s: float = 1.5  # within which a lost camera must give frames again
+
+
 class OwnRobot(NamedTuple):
     """A robot of somebody's."""
 
@@ -128,3 +148,4 @@ class OwnRobot(NamedTuple):
     timeout_s: float  # most time an answer may take
     open_s: float  # most time that opening may take
     image_size: tuple[int, int] | None  # width and height of its images, px, if they are known
+    cameras: StereoSettings | None = None  # of an arm that reads joints alone

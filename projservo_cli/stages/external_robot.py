@@ -2,13 +2,15 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
 
 from projservo_cli.calibration import predict
+from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.geometry.algebra import mat
+from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
@@ -41,11 +43,11 @@ _WAITED = 5  # looks for each image that is wanted, where the same one comes aga
 
 
 def foreign_robot(
-    own: OwnRobot, bounds: Bounds, types: str, markers: int, given: Robot | None = None
+    own: OwnRobot, bounds: Bounds, types: str, numbers: Sequence[int], given: Robot | None = None
 ) -> ForeignRobot:
     """Make a robot of somebody's, unless it is given; an InputError where a joint has no speed limit.
 
-    types : one letter a joint, R or P; markers : how many the robot observes.
+    types : one letter a joint, R or P; numbers : of the markers that the robot observes.
     """
     limited = np.isfinite(bounds.limits.speed)
     for kind, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
@@ -53,13 +55,32 @@ def foreign_robot(
             raise InputError(
                 f"plant {own.target}: a robot that is not simulated needs a limit: set control.{key}"
             )
-    robot, name = _made(own) if given is None else given, f"plant {own.target}"
-    return ForeignRobot(robot, name, markers, bounds, own.timeout_s, own.open_s, own.image_size)
+    robot, name, timeout_s = (
+        _made(own, numbers, bounds) if given is None else given,
+        f"plant {plugins.short_name(own.target)}",
+        own.timeout_s,
+    )
+    if own.cameras is not None:  # a look waits for a camera that reconnects
+        timeout_s += own.cameras.reconnect_s
+    return ForeignRobot(robot, name, len(numbers), bounds, timeout_s, own.open_s, own.image_size)
 
 
-def _made(own: OwnRobot) -> Robot:
-    """Make an object of the class of a robot, with its options."""
+def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds) -> Robot:
+    """Make an object of the class of a robot, with its options, and cameras where it brings none.
+
+    A class that takes an argument ``limits`` is given those of its joints.
+    """
     options = dict(own.options)
+    if "limits" not in options and plugins.takes("plant", own.target, "limits"):
+        options["limits"] = bounds.limits
+    if own.cameras is not None:
+        arm: Arm = plugins.make("plant", own.target, (), options)
+        if not plugins.brings_no_pixels(arm):
+            raise InputError(
+                f"plant {own.target}: has read(), which brings pixels, and cameras are configured as well: "
+                "write joints() in its place, or leave cameras out"
+            )
+        return CameraRobot(arm, own.cameras, TagFinder(own.dictionary or DICTIONARY), numbers)
     if own.dictionary is not None:
         if not plugins.takes("plant", own.target, "dictionary"):
             raise InputError(
@@ -68,6 +89,10 @@ def _made(own: OwnRobot) -> Robot:
             )
         options["dictionary"] = own.dictionary
     robot: Robot = plugins.make("plant", own.target, (), options)
+    if not callable(getattr(robot, "read", None)):
+        raise InputError(
+            f"plant {own.target}: has joints(), which brings no pixels: configure cameras, left and right"
+        )
     return robot
 
 
@@ -297,7 +322,7 @@ def connected(scenario: RunScenario, law: str, given: Robot | None = None) -> Dr
     driven = contract.driven
     if isinstance(driven.robot, OwnRobot):
         plant, bounds = _believed_plant(scenario, calibration), driven.following.bounds(joints)
-        robot = foreign_robot(driven.robot, bounds, joints.types, len(scenario.observed), given)
+        robot = foreign_robot(driven.robot, bounds, joints.types, scenario.observed, given)
     else:
         plant = scenario.plant_of(law)
         robot = simulated_robot(driven, joints, _in_the_loop(scenario, driven.robot, contract.events))

@@ -71,7 +71,9 @@ class RecordingInputs:
         The settings that drive an external robot may change during a recording.
         """
         trials, own = self.trials, self.own
-        robot = own._replace(timeout_s=0.0, open_s=0.0) if own else (trials.truth, trials.driven)
+        robot = (
+            own._replace(timeout_s=0.0, open_s=0.0, cameras=None) if own else (trials.truth, trials.driven)
+        )
         how = trials.motions.seed, trials.noise_px, trials.averaged_frames, trials.settle_s
         key = hashlib.sha256(encoded((robot, how, self.numbers, self.dictionary))).hexdigest()
         return f"{own.target if own else 'simulated'} {key[:16]}"
@@ -224,6 +226,7 @@ class Contract(NamedTuple):
     timeout_s: float  # most time that an answer may take
     time_offset_s: tuple[float, float] | None  # of the images of both cameras; None to estimate them
     settle_s: float | None  # for how long a robot of somebody's has stood still at the start
+    identity: str = ""  # of the robot in the recording that the calibration is of; empty where none is told
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,6 +14,8 @@ import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
+from projservo_cli.files import write_whole
+from projservo_cli.hardware.live_page import annotated, recording_page
 from projservo_cli.records import (
     CORNERS,
     VIEWS,
@@ -23,6 +25,7 @@ from projservo_cli.records import (
     JointList,
     Observation,
     WorkFailed,
+    in_unit,
 )
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
@@ -33,7 +36,7 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import averaged, foreign_robot, simulated_robot, way_to
 from projservo_cli.stages.given import RecordingInputs, Trials
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
-from projservo_cli.tables import read_table, recording_of, write_table
+from projservo_cli.tables import identity_in, read_table, recording_of, write_table
 
 SAVE_EVERY = 1.0  # s; maximum loss by an interruption without warning
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
@@ -57,6 +60,7 @@ class _Recording:
     # Frames in motion towards poses that are done, by the number of the motion: that of the pose, from 1.
     ways: dict[int, list[Reading]] = field(default_factory=dict)
     found: int = 0  # how many of them an earlier call recorded
+    identity: str = ""  # of the robot that recorded them
     why: str = "none yet"  # why there is something to record; empty where there is nothing
     commands: int = 0  # steps sent to the robot
     # Sum of the squares by which pixels of one pose are off their mean, px², and its degrees of freedom.
@@ -71,6 +75,19 @@ class _Recording:
     def unseen(self) -> int:
         """Marker–view pairs without a pixel in the poses that are done."""
         return sum(int(np.isnan(reading.s[..., 0]).sum()) for reading in self.done.values())
+
+    def note(self, units: Sequence[str] = ()) -> str:
+        """Return how many markers each view saw at the last pose, and the joint farthest off its target.
+
+        units : of the joints; empty for rad.
+        """
+        if not self.done:
+            return ""
+        last = self.done[max(self.done)]
+        left, right = np.isfinite(last.s[..., 0]).sum(axis=1).tolist()
+        off = np.array([np.abs(one.q - self.targets[pose]) for pose, one in self.done.items()]).max(axis=0)
+        i = int(off.argmax())
+        return f"markers {left}|{right}, joint {i + 1} {in_unit(off[i], units[i] if units else 'rad', 2)} off"
 
     @property
     def spread_px(self) -> float | None:
@@ -95,7 +112,7 @@ class _Recording:
 
     def save(self) -> None:
         """Write all that is done; the file appears whole or not at all."""
-        write_table(self.observation(), self.path, recording=self.key)
+        write_table(self.observation(), self.path, recording=self.key, identity=self.identity)
 
     def observation(self) -> Observation:
         """All poses that are done, in their order.
@@ -227,6 +244,7 @@ def _resumed(empty: _Recording, most: FloatArray) -> _Recording:
     """The poses of an interrupted recording taken over, at most so far (n,) from where they were to be."""
     recording = replace(empty, done={}, ways={})
     path, remedy = recording.path, "choose another table, or replace it with --force"
+    recording.identity = identity_in(path)
     if recording_of(path) != recording.key:
         raise _OutdatedError(f"{path}: was not recorded with this configuration; {remedy}")
     n = recording.targets.shape[1]
@@ -278,16 +296,37 @@ def record(
     stored, due = len(recording.done), time.monotonic() + SAVE_EVERY
     try:
         with nullcontext() if robot is None else at_rest_after(robot):
+            if robot is not None:
+                robot.require_identity(recording.identity)
+                recording.identity = robot.identity()
             for _ in poses:
                 progress("record", len(recording.done), len(recording.targets))
                 if kept and (start := time.monotonic()) >= due:
                     recording.save()
+                    if robot is not None and robot.frames is not None:
+                        _show(recording, robot)
                     stored, now = len(recording.done), time.monotonic()
                     # A long table takes long to write: most of the time must stay for recording.
                     due = now + max(SAVE_EVERY, 10.0 * (now - start))
     finally:
         if kept and len(recording.done) > stored:
             recording.save()
+            if robot is not None and robot.frames is not None:
+                _show(recording, robot)
+
+
+def _show(recording: _Recording, robot: ForeignRobot) -> None:
+    """Write a page next to the table: how far it is, and both images of the last pose with the tags."""
+    last = recording.done[max(recording.done)]
+    nothing = np.empty((0, 2))
+    assert robot.frames is not None
+    pictures = [
+        annotated(grey, recording.marker.tolist(), s, nothing)
+        for grey, s in zip(robot.frames, last.s, strict=True)
+    ]
+    done = f"{len(recording.done)} of {len(recording.targets)} poses; {recording.note(robot.bounds.units)}"
+    text = recording_page(recording.path.name, done, pictures, whole=not recording.pending)
+    write_whole(recording.path.with_suffix(".html"), text)
 
 
 def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> ForeignRobot | None:
@@ -300,7 +339,7 @@ def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> 
         return None
     if isinstance(driven.robot, OwnRobot):
         bounds = driven.following.bounds(joints)
-        return foreign_robot(driven.robot, bounds, joints.types, len(recording.marker))
+        return foreign_robot(driven.robot, bounds, joints.types, recording.marker.tolist())
     first = recording.targets[recording.pending[0]]
     return simulated_robot(driven, joints, robot_by_itself(driven.robot, first, trials.noise_px, drawn))
 

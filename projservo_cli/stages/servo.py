@@ -380,6 +380,7 @@ class _Asked:
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), at_rest_after(driven.robot):
             if own:
+                driven.robot.require_identity(contract.identity)
                 wrong = driven.fits()
                 if wrong:
                     raise WorkFailed(f"the robot did not move, since at the start {wrong}")

@@ -100,7 +100,7 @@ def teach(
         if at is not None:
             raise InputError("--at is where a simulated robot is put to; move yours by hand")
         bounds = driven.following.bounds(joints)
-        robot = foreign_robot(driven.robot, bounds, joints.types, len(inputs.numbers))
+        robot = foreign_robot(driven.robot, bounds, joints.types, inputs.numbers)
     else:
         if at is None:
             raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")

@@ -168,3 +168,26 @@ def test_what_is_taught_beside_a_run_is_of_its_configuration(projservo, tmp_path
     save(Run(tmp_path / "run.h5", to_yaml(config).replace("plant:", "plant:\n  use: nowhere:Robot"), {}))
     refused = projservo("teach", tmp_path, "--force")
     assert (refused.code, "named by the stored run alone" in refused.err) == (2, True)
+
+
+PICK = """\
+images:
+  markers: [0, 1, 2]
+  left: [[10.0, 20.0], [30.0, 20.0], [10.0, 40.0]]
+  right: [[12.0, 20.0], [32.0, 20.0], [12.0, 40.0]]
+  joints: {joints: [0.3, 0.1], unit: rad}
+"""
+
+
+def test_servo_goes_to_a_taught_goal_by_its_name(projservo, stages, tmp_path):
+    (tmp_path / "pick.yaml").write_text(PICK, encoding="utf-8")
+    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--goal", "pick", "-q")
+    assert answer.code == 0, answer.err
+    images = load_config("out", text=load("out").configuration).task.goal.images
+    assert images.left == ((10.0, 20.0), (30.0, 20.0), (10.0, 40.0))
+    again = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--goal", "pick.yaml")
+    assert "up to date" in again.err
+    other = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--goal", "place")
+    assert other.code == 2
+    assert "place.yaml: cannot be read" in other.err
+    assert "expected a file that projservo teach wrote" in other.err

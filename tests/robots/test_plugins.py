@@ -39,7 +39,7 @@ def written(name, text):
         (f"{HERE}:Zzz", r"has no Zzz; classes: Sound, Telling, Faulty, "),
         (f"{HERE}:NOT_A_CLASS", r"is no class, but of type int"),
         (f"{HERE}:NoStop", r"lacks stop\(\); needed: open, read, command, stop, close"),
-        (f"{HERE}:Old", r"lacks open\(\), read\(\), close\(\); needed: open, read,"),
+        (f"{HERE}:Old", r"lacks open\(\), close\(\); needed: open, joints,"),
         (f"{HERE}:Truths", r"has truths, which nothing looks for; did you mean truth\?"),
         (f"{HERE}:Now", r"has now, which is to be a method; give it another name"),
         (f"{HERE}:Stopp", r"has stopp, which nothing looks for; did you mean stop\?"),

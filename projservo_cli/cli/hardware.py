@@ -1,0 +1,229 @@
+"""Commands for hardware of people: ``tags``, and ``doctor`` for a robot with its cameras."""
+
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from projservo_cli.cli import options as option
+from projservo_cli.cli.group import FAILED, main
+from projservo_cli.cli.output import Console, wrapped
+
+if TYPE_CHECKING:
+    from projservo_cli.config import Config
+    from projservo_cli.hardware.preflight import Seen
+    from projservo_cli.records import FloatArray
+    from projservo_cli.robots.contract import ForeignRobot
+    from projservo_cli.stages.preflight import Checked
+
+_SIZE_MM = 30.0  # of tags: what webcams at arm's length see with 25 px and more
+_BODIES = ("roof", "plate")
+
+
+@main.command("tags", epilog="Example: projservo tags --kind roof --size-mm 30 -o tags.pdf")
+@option.output(metavar="FILE", help="PDF to write. Default: tags.pdf.")
+@click.option(
+    "--kind",
+    type=click.Choice(["single", *_BODIES]),
+    default="single",
+    show_default=True,
+    help="Tags to cut out one by one; a plate of 2x2; a roof of five to fold and glue.",
+)
+@click.option(
+    "--size-mm",
+    metavar="S",
+    type=click.FloatRange(5.0, 190.0),
+    default=_SIZE_MM,
+    show_default=True,
+    help="Side of the black square of each tag.",
+)
+@click.option(
+    "--dictionary",
+    metavar="NAME",
+    default="4X4_50",
+    show_default=True,
+    help="The tags, such as APRILTAG_36H11.",
+)
+@click.option(
+    "--numbers", metavar="N,...", help="Single tags to print, such as 0-4,7. Default: as many as fit."
+)
+@click.option(
+    "--paper", type=click.Choice(["a4", "letter"]), default="a4", show_default=True, help="Its size."
+)
+@option.force(help="Replace the file if there is one.")
+@option.told
+def _tags(
+    console: Console,
+    *,
+    output: Path | None,
+    kind: str,
+    size_mm: float,
+    dictionary: str,
+    numbers: str | None,
+    paper: str,
+    force: bool,
+) -> None:
+    """Write a sheet of tags in true scale.
+
+    Print it in actual size (100 %) and hold a ruler against the one on it. With --kind roof the sheet is a
+    net: cut along full lines, fold back along dashed ones, glue. Such a roof or plate needs no measured pose:
+    the last line above the tags is its part of the configuration. Needs OpenCV: pip install '.[detect]'.
+    """
+    import numpy as np
+
+    from projservo_cli.config.markers import GROUND, Markers
+    from projservo_cli.detection import TagFinder
+    from projservo_cli.files import write_whole
+    from projservo_cli.hardware import tags as sheets
+
+    if numbers is not None and kind != "single":
+        raise click.UsageError(
+            f"--numbers: is for --kind single; a {kind} has the tags of markers.tags: {kind}"
+        )
+    output = output or Path("tags.pdf")
+    option.require_new(output, force=force)
+    finder, margin = TagFinder(dictionary), GROUND * size_mm
+    size_m = round(1e-3 * size_mm, 6)
+    own = "" if dictionary == "4X4_50" else f", dictionary: {dictionary}"
+    if kind == "single":
+        wanted = None if numbers is None else list(sheets.numbers_of(numbers))
+        net = sheets.single(wanted, finder.known, margin, paper)
+        corners = f"[{', '.join(str(4 * net.tags[0].number + k) for k in range(4))}, ...]"
+        keys = f"markers: {{numbers: {corners}, tag_size_m: {size_m:g}{own}}}"
+    else:
+        described = Markers.model_validate({"tags": kind, "tag_size_m": size_m}).all_tags
+        poses, known = np.array([tag.pose for tag in described]), [tag.number for tag in described]
+        net = sheets.unfolded(known, poses) if kind == "roof" else sheets.plate(known, poses, margin)
+        keys = f"markers: {{tags: {kind}, tag_size_m: {size_m:g}{own}}}"
+    body = "" if kind == "single" else f"{kind} of "
+    head = (
+        f"projservo: {body}{dictionary} tags of {size_mm:g} mm",
+        *_INSTRUCTIONS[kind],
+        keys,
+    )
+    figure = sheets.sheet(net, finder, size_mm, paper, head)
+    write_whole(output, sheets.pdf(figure))
+    value = {
+        "file": output.resolve(),
+        "kind": kind,
+        "tags": [tag.number for tag in net.tags],
+        "size_m": size_m,
+        "dictionary": dictionary,
+        "paper": paper,
+    }
+    words = (
+        f"tags: {len(net.tags)} of {size_mm:g} mm on {paper} in {output}",
+        "print in actual size (100 %), hold a ruler against the one printed",
+        f"configuration: {keys}",
+    )
+    console.tell(value, words)
+
+
+_INSTRUCTIONS = {
+    "single": ("Cut along the lines; leave the white margin. Glue each on a stiff, flat plate on the tool.",),
+    "plate": ("Cut along the line; leave the white margin. Glue it on a stiff, flat plate on the tool.",),
+    "roof": (
+        "Cut along full lines. Fold back (print outside) along dashed lines. Glue flaps “glue” behind the",
+        "tag next to it. Fold the flaps “base” inwards and glue them on a plate on the tool.",
+        "Tag 0, in the middle, looks forward.",
+    ),
+}
+
+
+def preflight(
+    console: Console,
+    run: Path | None,
+    config: str,
+    options: Mapping[str, Any],
+    output: Path,
+) -> int:
+    """Check the robot and cameras of a configuration, write the page, and return the exit code.
+
+    options : sets, move and watch of ``doctor``.
+    """
+    from projservo_cli.config.inputs import recording_inputs
+    from projservo_cli.files import write_whole
+    from projservo_cli.hardware.live_page import page
+    from projservo_cli.stages.preflight import check
+
+    settings = option.configured(config, options, teaching=True)
+    calibration = option.calibration_of(run, settings)
+    move, watch = options["move"], options["watch"]
+    if move and not sys.stdin.isatty():
+        raise click.UsageError("--move: standard input is no terminal, so nobody can be asked; leave it out")
+    with option.writing(output):
+        checked = check(
+            recording_inputs(settings),
+            calibration,
+            confirmed=(lambda: console.agreed(_QUESTION)) if move else None,
+            watch=(lambda robot: _watch(console, settings, robot)) if watch else None,
+            progress=console.progress,
+        )
+        pictures = [] if checked.seen is None else _pictures(settings, checked.seen)
+        write_whole(output, page(settings.name, checked.findings, pictures))
+    value = {
+        "page": output.resolve(),
+        "works": checked.works,
+        "findings": [finding._asdict() for finding in checked.findings],
+    }
+    console.tell(value, [*_table(checked), f"page: {output}"])
+    return 0 if checked.works else FAILED
+
+
+_QUESTION = (
+    "doctor will move each joint by 3° to either side, one after the other. Is the arm free all around, with "
+    "room to each limit?"
+)
+
+
+def _table(checked: "Checked") -> Iterator[str]:
+    width = max(len(finding.where) for finding in checked.findings)
+    for finding in checked.findings:
+        head = f"{finding.level:8}{finding.where:{width + 2}}"
+        yield head + wrapped(finding.text, " " * len(head))[len(head) :]
+        if finding.remedy:
+            yield wrapped(finding.remedy, " " * len(head))
+    faults = sum(finding.level == "fault" for finding in checked.findings)
+    yield "doctor: ready to record" if checked.works else f"doctor: {faults} faults to mend before recording"
+
+
+def _goal_pixels(settings: "Config") -> "list[FloatArray]":
+    """Pixels (g, 2) of the taught goal in both images; none where there is none."""
+    import numpy as np
+
+    images = None if settings.task is None else settings.task.goal.images
+    sides = (None, None) if images is None else (images.left, images.right)
+    return [np.array([at or (np.nan, np.nan) for at in side or ()]).reshape(-1, 2) for side in sides]
+
+
+def _pictures(settings: "Config", seen: "Seen") -> list[bytes]:
+    from projservo_cli.hardware.live_page import annotated
+
+    both = zip(seen.views, seen.s, _goal_pixels(settings), strict=False)
+    return [annotated(view.frame.grey, seen.marker, s, goal) for view, s, goal in both]
+
+
+def _watch(console: Console, settings: "Config", robot: "ForeignRobot") -> None:
+    """Serve both images until Ctrl-C."""
+    import time
+
+    from projservo_cli.hardware.live_page import LivePage, annotated
+    from projservo_cli.records import VIEWS
+
+    live, goal = LivePage(settings.name), _goal_pixels(settings)
+    assert settings.markers is not None
+    console.say(f"watch: open {live.url} in a browser; Ctrl-C ends it")
+    try:
+        while True:
+            s = robot.read().s
+            for view, grey in zip(range(2), () if robot.frames is None else robot.frames, strict=False):
+                live.pictures[VIEWS[view]] = annotated(
+                    grey, settings.markers.known or (), s[view], goal[view]
+                )
+            time.sleep(robot.bounds.period)
+    except KeyboardInterrupt:
+        console.say("watch: ended")
+    finally:
+        live.close()

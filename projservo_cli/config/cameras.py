@@ -1,0 +1,50 @@
+"""Cameras that projservo itself reads, for an arm whose class reads joints alone."""
+
+from collections.abc import Iterator
+from typing import Annotated
+
+from pydantic import Field, StrictInt, StrictStr, StringConstraints
+
+from projservo_cli.config.robot import Count, Finding, NotNegative, Positive, Section
+from projservo_cli.robots.settings import CameraSettings, StereoSettings
+
+
+class _Source(Section):
+    """A camera: a device, a film, or a stream."""
+
+    source: Annotated[StrictInt, Field(ge=0)] | Annotated[StrictStr, Field(min_length=1)] = Field(
+        description="index of a device, its path (/dev/v4l/by-path/... stays the same), a film, or a URL"
+    )
+    size_px: tuple[Count, Count] | None = Field(None, description="width and height; null for its own")
+    rate_hz: Positive | None = Field(None, description="frames a second; null for its own")
+    fourcc: Annotated[str, StringConstraints(min_length=4, max_length=4)] = Field(
+        "MJPG", description="format in which a device sends frames; YUYV fills a USB 2 hub with one camera"
+    )
+    exposure_ms: Positive | None = Field(None, description="of a device; null leaves it to the camera")
+    focus: NotNegative | None = Field(
+        None, description="of a device, in units of its driver; null leaves it where it stands; no autofocus"
+    )
+
+
+class Cameras(Section):
+    """Both cameras, of an arm whose class has joints() in place of read(); projservo finds the tags."""
+
+    left: _Source = Field(description="the left camera")
+    right: _Source = Field(description="the right camera")
+    max_age_s: Positive = Field(0.3, description="how old a frame may be, from its stamp")
+    reconnect_s: Positive = Field(
+        1.5, description="within which a lost camera must give frames again; the arm holds meanwhile"
+    )
+
+    def contradictions(self) -> Iterator[Finding]:
+        """One camera twice, or no time to reconnect."""
+        if self.left.source == self.right.source:
+            yield ("right", "source"), "is that of the left camera as well: name the other one"
+        if self.reconnect_s < self.max_age_s:
+            yield ("reconnect_s",), f"must not be below max_age_s, {self.max_age_s:g}"
+
+    @property
+    def settings(self) -> StereoSettings:
+        """Both cameras as records."""
+        left, right = (CameraSettings(**vars(one)) for one in (self.left, self.right))
+        return StereoSettings(left, right, self.max_age_s, self.reconnect_s)

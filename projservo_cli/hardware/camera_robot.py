@@ -1,0 +1,176 @@
+"""A robot of the contract made of an arm that reads joints alone, two cameras, and the detector of tags."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from projservo_cli.detection import Corners, TagFinder
+from projservo_cli.hardware.cameras import Camera, Frame
+from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray
+from projservo_cli.robots.settings import StereoSettings
+
+# Mean grey value, of 255, below which an image is dark, and share of clipped pixels that is too much.
+_DARK, _CLIPPED_SHARE = 20.0, 0.2
+# Grey value from which white is clipped.
+_WHITE = 252
+# Blur of the sharpest edges of an image, px, from which it is blurred: corners then lose half their accuracy.
+_BLURRED = 2.5
+# Number of edges that show the blur, and half the width within which their contrast is taken, px.
+_EDGES, _REACH = 300, 6
+
+
+class Arm(Protocol):
+    """A robot class whose images are projservo's.
+
+    It may have ``now``, ``truth``, ``release`` and ``hold`` as in ``Robot``, and what the checks before the
+    first motion show: ``health() -> dict[str, float | str]``, such as the voltage.
+    """
+
+    def open(self) -> None:
+        """Connect to the arm; the first call."""
+
+    def joints(self) -> tuple[Any, float | None]:
+        """Return readings (n,), rad or m, and when they were read, s, by ``now``; None for just now."""
+
+    def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
+        """Be at the joints ``target`` when the clock shows ``due``, as in ``Robot``."""
+
+    def stop(self) -> None:
+        """Come to rest."""
+
+    def close(self) -> None:
+        """Let go of the arm; the last call."""
+
+
+class View(NamedTuple):
+    """Tags in a frame."""
+
+    frame: Frame
+    tags: dict[int, Corners]  # by their numbers
+    repeated: tuple[int, ...]  # numbers that occur more than once
+
+
+class CameraRobot:
+    """A robot of the contract: joints of an arm, and corners of tags in the newest frame of each camera.
+
+    numbers : of the markers, of which 4 t to 4 t + 3 are the corners of tag t.
+    ``views`` are those of the last look, None before.
+    """
+
+    def __init__(self, arm: Arm, stereo: StereoSettings, finder: TagFinder, numbers: Sequence[int]) -> None:
+        self.arm, self.finder, self._numbers = arm, finder, np.array(numbers, dtype=np.int64)
+        for name in ("now", "truth", "release", "hold", "health", "identity"):
+            if callable(found := getattr(arm, name, None)):
+                setattr(self, name, found)
+        now: Callable[[], float] = getattr(arm, "now", time.monotonic)
+        both = zip(VIEWS, (stereo.left, stereo.right), strict=True)
+        self.cameras = [Camera(view, one, stereo.max_age_s, stereo.reconnect_s, now) for view, one in both]
+        self.views: list[View | None] = [None, None]
+        self._begun = False
+
+    def open(self) -> None:
+        """Connect to both cameras, and then to the arm."""
+        with ThreadPoolExecutor(2) as pool:
+            for opened in [pool.submit(camera.open) for camera in self.cameras]:
+                opened.result()
+        self._begun = True
+        self.arm.open()
+
+    def read(self) -> tuple[Any, FloatArray, float | None, float, float, FloatArray]:
+        """Readings of the joints, corners of the tags, their stamps and standard deviations."""
+        q, t_q = self.arm.joints()
+        seen = [self._looked(view) for view in range(2)]
+        pixels, sigma = (np.stack(both) for both in zip(*map(self._corners, seen), strict=True))
+        return q, pixels, t_q, seen[0].frame.t, seen[1].frame.t, sigma
+
+    @property
+    def frames(self) -> ByteArray | None:
+        """Both frames (2, height, width) of the last look; None where their sizes differ."""
+        grey = [view.frame.grey for view in self.views if view is not None]
+        return np.stack(grey) if len(grey) == 2 and grey[0].shape == grey[1].shape else None
+
+    def _looked(self, view: int) -> View:
+        """Find tags in the newest frame of a view, unless that was done before."""
+        frame, last = self.cameras[view].newest(), self.views[view]
+        if last is None or last.frame.serial != frame.serial:
+            last = View(frame, *self.finder.find(frame.grey.astype(np.float64)))
+            self.views[view] = last
+        return last
+
+    def _corners(self, view: View) -> tuple[FloatArray, FloatArray]:
+        """Pixels (m, 2) of all markers and their deviations (m,); NaN where unseen or rejected."""
+        pixels, sigma = np.full((len(self._numbers), 2), np.nan), np.full(len(self._numbers), np.nan)
+        for k, number in enumerate(self._numbers.tolist()):
+            if (tag := view.tags.get(number // CORNERS)) is not None:
+                pixels[k], sigma[k] = tag.pixels[number % CORNERS], tag.sigma[number % CORNERS]
+        pixels[np.isnan(sigma)] = np.nan
+        sigma[np.isnan(pixels[:, 0])] = np.nan
+        return pixels, sigma
+
+    def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
+        """Pass a set-point on to the arm."""
+        self.arm.command(target, speed, due)
+
+    def stop(self) -> None:
+        """Bring the arm to rest."""
+        if self._begun:
+            self.arm.stop()
+
+    def close(self) -> None:
+        """Let go of the arm, and of both cameras in any case."""
+        try:
+            if self._begun:
+                self.arm.close()
+        finally:
+            for camera in self.cameras:
+                camera.close()
+
+    def remarks(self) -> list[str]:
+        """Tell what is wrong with the last frames, in words: dark, clipped or blurred ones."""
+        shown = [(name, view) for name, view in zip(VIEWS, self.views, strict=True) if view is not None]
+        return [f"the {name} image {what}" for name, view in shown for what in wrong_with(view.frame.grey)]
+
+
+class Exposure(NamedTuple):
+    """How a frame is exposed, and how sharp it is."""
+
+    mean: float  # grey value
+    clipped: float  # share of pixels that are white
+    blur_px: float  # standard deviation of the blur of its sharpest edges; NaN where it has none
+
+
+def exposure_of(grey: ByteArray) -> Exposure:
+    """Measure a frame (height, width).
+
+    An edge of contrast c, blurred by a normal distribution of deviation σ, has the slope c/(σ √(2π)).
+    """
+    import cv2
+
+    level = cv2.GaussianBlur(grey, (3, 3), 0).astype(np.float32)
+    slope = np.hypot(cv2.Sobel(level, cv2.CV_32F, 1, 0) / 8.0, cv2.Sobel(level, cv2.CV_32F, 0, 1) / 8.0)
+    kernel = np.ones((2 * _REACH + 1, 2 * _REACH + 1), dtype=np.uint8)
+    contrast = cv2.dilate(level, kernel) - cv2.erode(level, kernel)
+    steepest = np.argpartition(slope.ravel(), -_EDGES)[-_EDGES:]
+    c, s = contrast.ravel()[steepest], slope.ravel()[steepest]
+    edges = c > _DARK
+    blur = float(np.median(c[edges] / s[edges])) / math.sqrt(2.0 * math.pi) if edges.sum() > 20 else math.nan
+    return Exposure(float(grey.mean()), float((grey >= _WHITE).mean()), blur)
+
+
+def wrong_with(grey: ByteArray) -> list[str]:
+    """Tell what is wrong with a frame, in words with the remedy; nothing for a sound one."""
+    found = exposure_of(grey)
+    wrong = []
+    if grey.max() < _DARK:
+        wrong.append("is black: take the cap off, or look whether its shutter is closed")
+    elif found.mean < _DARK:
+        wrong.append(f"is dark (grey {found.mean:.0f} of 255 on average): add light, or raise exposure_ms")
+    if found.clipped > _CLIPPED_SHARE:
+        wrong.append(f"is saturated: {found.clipped:.0%} of it is white: lower exposure_ms, or the light")
+    if found.blur_px > _BLURRED:
+        wrong.append(f"is blurred by {found.blur_px:.1f} px ({_BLURRED:g} at most): focus it on the tags")
+    return wrong

@@ -1,0 +1,319 @@
+"""Cameras of people: the newest frame of each, with its stamp.
+
+OpenCV's ``VideoCapture`` reads devices, files and streams. A thread a camera always grabs: drivers queue
+frames, so whoever asks now and then would get old ones.
+"""
+
+import contextlib
+import math
+import os
+import re
+import struct
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from projservo_cli.detection import opencv
+from projservo_cli.records import ByteArray, WorkFailed
+from projservo_cli.robots.settings import CameraSettings
+
+
+class Frame(NamedTuple):
+    """A frame of a camera."""
+
+    grey: ByteArray  # (height, width)
+    t: float  # s, when it was taken: the stamp of its driver, else when it came
+    serial: int  # how many frames came up to it
+
+
+# Number of stamps from which the rate is computed.
+_TIMED = 30
+# Pause between attempts to open a lost camera, s.
+_RETRY_S = 0.2
+# Time that a stream may take to open, and to give a frame, ms.
+_OPEN_MS, _READ_MS = 5000, 1000
+# Time within which the first frame must come: webcams settle their exposure, s.
+_FIRST_S = 8.0
+# Codes of VIDIOC_QUERYCAP and offsets in its struct v4l2_capability (videodev2.h).
+_QUERYCAP, _SIZE_OF, _BUS, _CAPS = 0x80685600, 104, slice(48, 80), 88
+# Capability of nodes that give pictures (V4L2_CAP_VIDEO_CAPTURE, and of several planes).
+_GIVES_PICTURES = 0x1 | 0x1000
+
+
+class Camera:
+    """A camera that is always grabbed.
+
+    name : of it, ``left`` or ``right``. now : clock of the stamps, s.
+    ``remarks``: what its driver would not do, in words.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        settings: CameraSettings,
+        max_age_s: float,
+        reconnect_s: float,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.name, self.settings, self._now = name, settings, now
+        self._max_age_s, self._reconnect_s = max_age_s, reconnect_s
+        self.remarks: list[str] = []
+        self.reconnections = 0
+        self.stamped = False  # whether frames carry stamps of the driver
+        self._stamps: deque[float] = deque(maxlen=_TIMED)
+        self._frame: Frame | None = None
+        self._why = "it has given none yet"
+        self._refused = ""  # why no frame of it will do
+        self._came = threading.Condition()
+        self._closing = threading.Event()
+
+    @property
+    def where(self) -> str:
+        """Name and source, for messages."""
+        return f"the {self.name} camera (cameras.{self.name}.source: {self.settings.source})"
+
+    def open(self) -> None:
+        """Connect, and wait for the first frame; WorkFailed if there is none."""
+        capture = self._connected()
+        threading.Thread(target=self._grab_always, args=(capture,), daemon=True, name=self.name).start()
+        with self._came:
+            self._came.wait_for(lambda: self._frame is not None or self._refused, _FIRST_S)
+        if self._refused or self._frame is None:
+            self.close()
+            device = _device(self.settings.source)
+            holder = _holder(device) if device is not None else ""
+            raise WorkFailed(
+                f"{self.where}: {self._refused or holder or f'gives no frame within {_FIRST_S:g} s'}"
+                + (
+                    ""
+                    if self._refused or holder
+                    else ": look at cable and hub; two webcams on one USB 2 hub "
+                    f"need cameras.{self.name}.fourcc: MJPG or a smaller size_px"
+                )
+            )
+
+    def newest(self) -> Frame:
+        """Newest frame, waited for while the camera reconnects; WorkFailed where that takes too long."""
+        while True:
+            frame = self._frame
+            assert frame is not None
+            age = self._now() - frame.t
+            if self._refused:
+                raise WorkFailed(f"{self.where}: {self._refused}")
+            if age <= self._max_age_s:
+                return frame
+            if age > self._reconnect_s:
+                raise WorkFailed(
+                    f"{self.where}: no frame for {age:.2g} s ({self._reconnect_s:g} s at most, "
+                    f"cameras.reconnect_s): {self._why}: look at its cable and hub"
+                )
+            with self._came:
+                self._came.wait(0.01)
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames a second by their stamps; NaN for fewer than three."""
+        stamps = list(self._stamps)
+        return (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 2 else math.nan
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self._closing.set()
+
+    def _grab_always(self, capture: Any) -> None:
+        """Keep the newest frame until the camera is closed; connect again where it is lost."""
+        while not self._closing.is_set():
+            if capture is None:
+                try:
+                    capture = self._connected()
+                    self.reconnections += 1
+                except WorkFailed as error:
+                    self._why = str(error).removeprefix(f"{self.where}: ")
+                    self._closing.wait(_RETRY_S)
+                continue
+            came, image = capture.read()
+            if not came and self._is_file and capture.set(_cv().CAP_PROP_POS_FRAMES, 0):
+                came, image = capture.read()  # a film begins again
+            if came:
+                self._keep(image, self._stamp(capture))
+                if self._is_file:
+                    self._closing.wait(
+                        1.0 / (self.settings.rate_hz or capture.get(_cv().CAP_PROP_FPS) or 30.0)
+                    )
+                continue
+            self._why = "it stopped giving frames"
+            capture.release()
+            capture = None
+        if capture is not None:
+            capture.release()
+
+    @property
+    def _is_file(self) -> bool:
+        return isinstance(self.settings.source, str) and Path(self.settings.source).is_file()
+
+    def _keep(self, image: Any, t: float) -> None:
+        """Take a frame as the newest; refuse one of another size."""
+        cv = _cv()
+        grey = np.asarray(image if image.ndim == 2 else cv.cvtColor(image, cv.COLOR_BGR2GRAY), dtype=np.uint8)
+        before, wanted = self._frame, self.settings.size_px
+        size = grey.shape[::-1]
+        with self._came:
+            if wanted is not None and size != tuple(wanted):
+                self._refused = (
+                    f"gives frames of {size[0]} x {size[1]} px, not the {wanted[0]} x {wanted[1]} of "
+                    f"cameras.{self.name}.size_px: set a size that it has"
+                )
+            elif before is not None and before.grey.shape != grey.shape:
+                self._refused = (
+                    f"changed its frames from {before.grey.shape[1]} x {before.grey.shape[0]} px to "
+                    f"{size[0]} x {size[1]}: set cameras.{self.name}.size_px"
+                )
+            else:
+                self._frame = Frame(grey, t, 1 if before is None else before.serial + 1)
+                self._stamps.append(t)
+            self._came.notify_all()
+
+    def _stamp(self, capture: Any) -> float:
+        """When a frame was taken, s: V4L2 stamps buffers on the monotonic clock; else now."""
+        now = self._now()
+        if self._now is not time.monotonic or _device(self.settings.source) is None:
+            return now
+        stamp = 1e-3 * float(capture.get(_cv().CAP_PROP_POS_MSEC))
+        self.stamped = 0.0 < now - stamp < _FIRST_S
+        return stamp if self.stamped else now
+
+    def _connected(self) -> Any:
+        """Open its source, and set what can be set; WorkFailed with the reason if it does not open."""
+        cv, source = _cv(), self.settings.source
+        device = _device(source)
+        if device is not None:
+            if wrong := _wrong_device(device):
+                raise WorkFailed(f"{self.where}: {wrong}")
+            capture = cv.VideoCapture(int(device.name.removeprefix("video")), cv.CAP_V4L2)
+        elif isinstance(source, str) and "://" in source:
+            limits = [cv.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS, cv.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
+            capture = cv.VideoCapture(source, cv.CAP_FFMPEG, limits)
+        else:
+            capture = cv.VideoCapture(source)
+        if not capture.isOpened():
+            holder = _holder(device) if device is not None else ""
+            raise WorkFailed(
+                f"{self.where}: {holder or 'cannot be opened: look at its name, cable and power'}"
+            )
+        if isinstance(source, int) or device is not None:
+            self.remarks = list(_set_up(capture, self.settings))
+        return capture
+
+
+def _cv() -> Any:
+    """Return OpenCV, of which V4L2 waits for a frame for no longer than a second."""
+    os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    cv = opencv()
+    cv.utils.logging.setLogLevel(cv.utils.logging.LOG_LEVEL_ERROR)
+    return cv
+
+
+def _set_up(capture: Any, settings: CameraSettings) -> Iterator[str]:
+    """Set format, size, rate, exposure and focus of a device; what it does not take, in words."""
+    cv = _cv()
+    capture.set(cv.CAP_PROP_FOURCC, cv.VideoWriter.fourcc(*settings.fourcc))
+    if settings.size_px is not None:
+        capture.set(cv.CAP_PROP_FRAME_WIDTH, settings.size_px[0])
+        capture.set(cv.CAP_PROP_FRAME_HEIGHT, settings.size_px[1])
+    if settings.rate_hz is not None:
+        capture.set(cv.CAP_PROP_FPS, settings.rate_hz)
+    capture.set(cv.CAP_PROP_BUFFERSIZE, 1)
+    capture.set(cv.CAP_PROP_AUTO_WB, 0)
+    if not capture.set(cv.CAP_PROP_AUTOFOCUS, 0) and capture.get(cv.CAP_PROP_AUTOFOCUS) > 0:
+        yield "autofocus is on, and its driver does not switch it off: a camera that refocuses is another one"
+    if settings.focus is not None and not capture.set(cv.CAP_PROP_FOCUS, settings.focus):
+        yield f"its driver does not set the focus to {settings.focus:g}"
+    if settings.exposure_ms is None:
+        yield "its exposure is automatic: fix it with exposure_ms, below a frame's time"
+        return
+    v4l = capture.getBackendName() == "V4L2"
+    # V4L2: manual is 1, times in 100 µs; DirectShow and Media Foundation: 0.25, times as powers of two, s.
+    manual, exposure = (
+        (1, 10.0 * settings.exposure_ms) if v4l else (0.25, math.log2(1e-3 * settings.exposure_ms))
+    )
+    capture.set(cv.CAP_PROP_AUTO_EXPOSURE, manual)
+    if not capture.set(cv.CAP_PROP_EXPOSURE, exposure):
+        yield f"its driver does not fix the exposure at {settings.exposure_ms:g} ms"
+
+
+def _device(source: int | str) -> Path | None:
+    """Device node of V4L2 that a source is, such as ``/dev/video0``; None for others."""
+    if not sys.platform.startswith("linux"):
+        return None
+    path = Path(f"/dev/video{source}") if isinstance(source, int) else Path(source)
+    if not str(path).startswith("/dev/"):
+        return None
+    return path.resolve() if re.fullmatch(r"video\d+", path.resolve().name) else path
+
+
+def stable_name(source: int | str) -> str:
+    """Name of a device that stays when it is plugged in again; empty where there is none or it is given."""
+    device, links = _device(source), Path("/dev/v4l/by-path")
+    if device is None or str(source).startswith("/dev/v4l/") or not links.is_dir():
+        return ""
+    return next((str(link) for link in sorted(links.iterdir()) if link.resolve() == device), "")
+
+
+def _capabilities(device: Path) -> tuple[int, bytes] | None:
+    """Capabilities of a device node and the bus it is on; None for other nodes."""
+    import fcntl
+
+    answer = bytearray(_SIZE_OF)
+    try:
+        node = os.open(device, os.O_RDWR | os.O_NONBLOCK)
+    except OSError:
+        return None
+    try:
+        fcntl.ioctl(node, _QUERYCAP, answer)
+    except OSError:
+        return None
+    finally:
+        os.close(node)
+    return struct.unpack_from("=I", answer, _CAPS)[0], bytes(answer[_BUS])
+
+
+def _nodes() -> list[Path]:
+    return sorted(Path("/dev").glob("video*"))
+
+
+def _wrong_device(device: Path) -> str:
+    """Why a device node gives no pictures, with the remedy; empty where it may."""
+    others = _nodes()
+    if not device.exists():
+        listed = ", ".join(map(str, others)) or "none: look at the cable"
+        return f"there is no {device}; devices: {listed}"
+    if not os.access(device, os.R_OK | os.W_OK):
+        return f"{device} may not be read: sudo usermod -aG video $USER, then log in again"
+    found = _capabilities(device)
+    if found is None or found[0] & _GIVES_PICTURES:
+        return ""
+    same = [
+        str(node)
+        for node in others
+        if (other := _capabilities(node)) and other[1] == found[1] and other[0] & _GIVES_PICTURES
+    ]
+    remedy = f"take {same[0]}" if same else "take another device"
+    return f"{device} gives no pictures: it is the second node of a webcam, for metadata: {remedy}"
+
+
+def _holder(device: Path) -> str:
+    """Which other process has a device open, with the remedy; empty where none of this user's shows."""
+    for link in Path("/proc").glob("[0-9]*/fd/*"):
+        number = int(link.parts[2])
+        with contextlib.suppress(OSError):
+            if number != os.getpid() and link.readlink() == device:
+                name = Path("/proc", str(number), "comm").read_text(encoding="utf-8").strip()
+                return f"{device} is in use by {name} (process {number}): close that"
+    return ""

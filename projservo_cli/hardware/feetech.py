@@ -1,0 +1,178 @@
+"""Bus of serial servos by Feetech (STS and SMS series), protocol 0: requests, replies, retries.
+
+A reply tells neither what was asked nor when. So the input is cleared before each request, and after one
+that came to nothing the next ones read another number of bytes: a late reply has a wrong length.
+
+Source: Feetech, "Communication Protocol User Manual", and the memory map of the STS3215.
+"""
+
+import errno
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from projservo_cli.records import InputError, WorkFailed
+
+BAUD = 1_000_000
+# Bytes of memory that can be read.
+_MEMORY = 86
+# Fewest bytes that a request reads, and how many lengths there are, one after the other: those of as many
+# failed requests take 0.14 s, and no reply is later.
+_SHORTEST, _LENGTHS = 15, 12
+# Time within which replies come, s, at first and at most: the bytes of six servos and their delays take 3 ms,
+# adapters and busy machines more.
+_REPLY_S, _SLOW_S = 0.012, 0.1
+# Time for which a servo that does not answer is asked again, s: longer than a bus that is silent for 0.2 s.
+_PATIENCE_S = 0.8
+# Pause between looks at what has arrived, and before what was written is read back, s.
+_PAUSE_S, _WRITTEN_S = 0.0002, 0.005
+# How often a write is repeated that a servo does not take.
+_WRITES = 5
+# Instructions, and the number that stands for all servos.
+_SYNC_READ, _SYNC_WRITE, _ALL = 0x82, 0x83, 0xFE
+
+
+class Reply(NamedTuple):
+    """What a servo answered."""
+
+    status: int  # bits of what is wrong with it
+    values: bytes
+
+
+class ServoSilent(WorkFailed):
+    """Servos that do not answer, or, where ``garbled``, of which what arrives is no reply."""
+
+    def __init__(self, silent: Sequence[int], garbled: Sequence[int] = ()) -> None:
+        self.silent, self.garbled = tuple(silent), tuple(garbled)
+        super().__init__(f"servos {', '.join(map(str, silent))} do not answer")
+
+
+class PortLost(WorkFailed):
+    """A port that is gone."""
+
+
+class FeetechBus:
+    """A port with servos; an InputError where it cannot be opened. ``now``, ``sleep``: the clock, s."""
+
+    def __init__(self, port: str, now: Any = time.monotonic, sleep: Any = time.sleep) -> None:
+        self.port, self.now, self.sleep = port, now, sleep
+        self._lock, self._failed, self._reply_s = threading.RLock(), 0, _REPLY_S
+        self._serial = _opened(port)
+
+    def close(self) -> None:
+        """Let go of the port."""
+        self._serial.close()
+
+    def read(self, ids: Sequence[int], address: int, size: int) -> dict[int, Reply]:
+        """Return so many bytes, 15 at most, of the memory of each servo; silent ones are asked again.
+
+        Raises ServoSilent, or PortLost.
+        """
+        found: dict[int, Reply] = {}
+        garbled: set[int] = set()
+        end = self.now() + _PATIENCE_S
+        while missing := [i for i in ids if i not in found]:
+            if self.now() > end:
+                raise ServoSilent(missing, sorted(garbled.intersection(missing)))
+            replies, broken = self._asked(missing, address, size)
+            found |= replies
+            garbled |= broken
+        return {i: found[i] for i in ids}
+
+    def write(self, address: int, values: Mapping[int, bytes]) -> None:
+        """Write as many bytes into the memory of each servo at once; none answers."""
+        if values:
+            size = len(next(iter(values.values())))
+            rows = b"".join(bytes([number]) + row for number, row in values.items())
+            self._send(_SYNC_WRITE, bytes([address, size]) + rows)
+
+    def store(self, address: int, values: Mapping[int, bytes]) -> None:
+        """Write bytes until they are read back; WorkFailed where a servo does not take them."""
+        for _ in range(_WRITES):
+            if not values:
+                return
+            self.write(address, values)
+            self.sleep(_WRITTEN_S)
+            back = self.read([*values], address, len(next(iter(values.values()))))
+            values = {number: row for number, row in values.items() if back[number].values != row}
+        if values:
+            raise WorkFailed(f"servo {min(values)} does not take what is written to its register {address}")
+
+    def _asked(self, ids: Sequence[int], address: int, size: int) -> tuple[dict[int, Reply], set[int]]:
+        """Replies to one request by servo, and the servo of which something arrived that is no reply."""
+        with self._lock:
+            longer = _SHORTEST + self._failed % _LENGTHS
+            start = min(address, _MEMORY - longer)
+            self._checked(self._serial.reset_input_buffer)
+            self._send(_SYNC_READ, bytes([start, longer, *ids]))
+            found: dict[int, Reply] = {}
+            heard, end = b"", self.now() + self._reply_s
+            while len(found) < len(ids) and self.now() < end:
+                heard += self._received()
+                for number, status, values in _packets(heard):
+                    if number in ids and len(values) == longer:
+                        found[number] = Reply(status, values[address - start :][:size])
+            missing = {*ids} - {*found}
+            self._failed += bool(missing)
+            slower = 2.0 if missing else 0.5
+            self._reply_s = min(max(slower * self._reply_s, _REPLY_S), _SLOW_S)
+            return found, missing if len(ids) == 1 and heard else set()
+
+    def _send(self, instruction: int, given: bytes) -> None:
+        body = bytes([_ALL, len(given) + 2, instruction]) + given
+        with self._lock:
+            self._checked(self._serial.write, b"\xff\xff" + body + _checksum(body))
+
+    def _received(self) -> bytes:
+        if waiting := self._checked(lambda: self._serial.in_waiting):
+            return bytes(self._checked(self._serial.read, waiting))
+        self.sleep(_PAUSE_S)
+        return b""
+
+    def _checked(self, call: Callable[..., Any], *given: Any) -> Any:
+        """Call the port; PortLost where it is gone."""
+        try:
+            return call(*given)
+        except Exception as error:  # of another kind on each system
+            raise PortLost(f"port {self.port} is gone: look at its USB cable ({error})") from error
+
+
+def _checksum(body: bytes) -> bytes:
+    return bytes([~sum(body) & 0xFF])
+
+
+def _packets(heard: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Number, status and values of each whole reply in some bytes whose checksum is right."""
+    at = heard.find(b"\xff\xff")
+    while 0 <= at <= len(heard) - 6:
+        number, length = heard[at + 2 : at + 4]
+        end = at + 4 + length
+        body = heard[at + 2 : end - 1]
+        whole = number != 0xFF and length >= 2 and end <= len(heard)
+        if whole and heard[end - 1 : end] == _checksum(body):
+            yield number, body[2], body[3:]
+            at = heard.find(b"\xff\xff", end)
+        else:
+            at = heard.find(b"\xff\xff", at + 1)
+
+
+_WHY = {
+    errno.EACCES: "you may not open it: sudo usermod -aG dialout $USER, then log in again",
+    errno.ENOENT: "there is no such port: look at the cable, and at plant.options.port",
+    errno.EBUSY: "another program has it: end that one",
+}
+
+
+def _opened(port: str) -> Any:
+    """Open a port; an InputError says what is in the way."""
+    try:
+        import serial
+    except ImportError as error:
+        raise InputError("pyserial is missing: pip install '.[so101]'") from error
+    try:
+        return serial.Serial(port, BAUD, timeout=0, write_timeout=_PATIENCE_S, exclusive=True)
+    except (OSError, ValueError) as error:
+        number = getattr(error, "errno", None)
+        why = _WHY[errno.EBUSY] if "lock" in str(error) else _WHY.get(number or 0, str(error))
+        raise InputError(f"port {port}: {why}") from error

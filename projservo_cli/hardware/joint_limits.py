@@ -1,0 +1,89 @@
+"""Joint limits that somebody shows by moving a released arm through what is allowed."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.hardware.so101 import COUNT, MIDDLE, TURN, Servos
+from projservo_cli.records import InputError, WorkFailed
+
+# Pause between readings, s, and readings whose median counts: a false one is none.
+_PERIOD_S, _MEDIAN = 0.02, 3
+# Least range of a joint that was moved, deg, and how far limits stay within where it was moved, deg.
+_MOVED_DEG, _WITHIN_DEG = 20.0, 1.0
+
+
+class Moved(NamedTuple):
+    """How far somebody moved a joint, in counts that go on over a whole turn."""
+
+    lowest: int
+    highest: int
+
+
+def watch(servos: Servos, done: Callable[[], bool]) -> dict[int, Moved]:
+    """Return how far each joint is moved until that is done, by the number of its servo."""
+    last = {i: one.at for i, one in servos.measured().items()}
+    seen = {i: deque([float(last[i])] * _MEDIAN, _MEDIAN) for i in servos.ids}
+    found = {i: Moved(last[i], last[i]) for i in servos.ids}
+    while not done():
+        servos.bus.sleep(_PERIOD_S)
+        for i, one in servos.measured().items():
+            if i in seen:
+                seen[i].append(seen[i][-1] + (one.at - last[i] + MIDDLE) % TURN - MIDDLE)
+                last[i], now = one.at, int(np.median(seen[i]))
+                found[i] = Moved(min(found[i].lowest, now), max(found[i].highest, now))
+    return found
+
+
+def limits_deg(
+    servos: Servos, moved: dict[int, Moved], shift: Sequence[int] = ()
+) -> list[tuple[float, float]]:
+    """Return lowest and highest angle of each joint, deg, within where it was moved.
+
+    shift : joints, from 1, whose servos may store an offset, so that no range crosses the end of their turn.
+    Raises WorkFailed for a joint that was hardly moved, or whose range crosses that end.
+    """
+    for k, i in enumerate(servos.ids, 1):
+        if wrong := _unusable(moved[i], k, shift):
+            raise WorkFailed(f"{servos.name(i)} {wrong}")
+    kept = servos.registers()
+    found = []
+    for i in servos.ids:
+        low, high = moved[i]
+        if low < 0 or high >= TURN:
+            by = round(0.5 * (low + high)) - MIDDLE
+            servos.shift(i, by)
+            low, high = low - by, high - by
+        low, high = max(low, kept[i].lowest), min(high, kept[i].highest)
+        least, most = (math.degrees((x - MIDDLE) * COUNT) for x in (low, high))
+        tenths = math.ceil(10.0 * (least + _WITHIN_DEG)), math.floor(10.0 * (most - _WITHIN_DEG))
+        found.append((tenths[0] / 10.0, tenths[1] / 10.0))
+    return found
+
+
+def _unusable(moved: Moved, joint: int, shift: Sequence[int]) -> str:
+    """Why no limits follow from how far a joint was moved, with the remedy; empty where they do."""
+    span = math.degrees((moved.highest - moved.lowest) * COUNT)
+    if span < _MOVED_DEG:
+        return (
+            f"was moved by {span:.1f}° ({_MOVED_DEG:g}° at least): move each joint through all that is "
+            "allowed, and run projservo limits again"
+        )
+    if span >= math.degrees(TURN * COUNT):
+        return f"was moved by {span:.0f}°, a whole turn or more: its limits must be within one"
+    if (moved.lowest < 0 or moved.highest >= TURN) and joint not in shift:
+        return (
+            "was moved over the end of its turn, where servos go the long way round: leave that place "
+            f"out, or run projservo limits --shift {joint}, which stores an offset in its servo"
+        )
+    return ""
+
+
+def require_known(joints: Sequence[int], count: int) -> None:
+    """Refuse numbers of joints that there are not."""
+    for k in joints:
+        if not 1 <= k <= count:
+            raise InputError(f"--shift {k}: the arm has joints 1 to {count}")

@@ -1,0 +1,141 @@
+"""The page of a preflight, and both images live in a browser of this machine."""
+
+import base64
+import html
+import threading
+import time
+from collections.abc import Callable, Sequence
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import numpy as np
+
+from projservo_cli.detection import opencv
+from projservo_cli.hardware.preflight import Finding
+from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray
+
+_STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:80rem;margin:1.5rem auto;padding:0 1rem}
+img{width:49%;min-width:20rem}td,th{padding:.2rem .6rem;text-align:left;vertical-align:top}
+.fault td:first-child{color:#b00020;font-weight:700}.warning td:first-child{color:#a05a00;font-weight:700}
+@media(prefers-color-scheme:dark){body{background:#111;color:#eee}.fault td:first-child{color:#ff8a80}
+.warning td:first-child{color:#ffc46b}}"""
+# Grey values are drawn over in BGR: found tags, and the goal.
+_TAG, _GOAL = (60, 200, 0), (255, 140, 0)
+# Longest pause between two images of a live page, s.
+_PAUSE_S = 0.1
+
+
+def annotated(grey: ByteArray, marker: Sequence[int], pixels: FloatArray, goal: FloatArray) -> bytes:
+    """JPEG of an image with outlines and numbers of the tags found in it, and circles at goal pixels.
+
+    marker : numbers (m,) of the markers; pixels (m, 2), goal (g, 2) : px, NaN where unseen.
+    """
+    cv = opencv()
+    image = cv.cvtColor(grey, cv.COLOR_GRAY2BGR)
+    corners: dict[int, list[FloatArray]] = {}
+    for number, at in zip(marker, pixels, strict=True):
+        if np.isfinite(at).all():
+            corners.setdefault(number // CORNERS, []).append(at)
+    for tag, points in corners.items():
+        outline = np.rint(points).astype(np.int32)
+        cv.polylines(image, [outline], True, _TAG, 2, cv.LINE_AA)
+        center = tuple(np.rint(np.mean(points, axis=0)).astype(int).tolist())
+        cv.putText(image, str(tag), center, cv.FONT_HERSHEY_SIMPLEX, 0.6, _TAG, 2, cv.LINE_AA)
+    for at in goal[np.isfinite(goal).all(axis=1)]:
+        cv.circle(image, tuple(np.rint(at).astype(int).tolist()), 5, _GOAL, 2, cv.LINE_AA)
+    return bytes(cv.imencode(".jpg", image, [cv.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+
+
+def page(name: str, findings: Sequence[Finding], pictures: Sequence[bytes]) -> str:
+    """One file of HTML with the findings of a preflight and both pictures, JPEG."""
+    rows = "".join(
+        f'<tr class="{one.level}"><td>{one.level}</td>'
+        + "".join(f"<td>{html.escape(text)}</td>" for text in (one.where, one.text, one.remedy))
+        + "</tr>"
+        for one in findings
+    )
+    head = "<tr><th></th><th>part</th><th>found</th><th>remedy</th></tr>"
+    return _document(f"Preflight of {name}", f"<p>{_images(pictures)}</p><table>{head}{rows}</table>")
+
+
+def recording_page(name: str, done: str, pictures: Sequence[bytes], *, whole: bool) -> str:
+    """One file of HTML that shows how far a recording is, and loads itself again until it is whole."""
+    again = "" if whole else '<meta http-equiv="refresh" content="2">'
+    return _document(f"Recording {name}", f"<p>{html.escape(done)}</p><p>{_images(pictures)}</p>", again)
+
+
+def _images(pictures: Sequence[bytes]) -> str:
+    """Elements of both pictures, JPEG, inside the page itself."""
+    both = zip(VIEWS, map(base64.b64encode, pictures), strict=False)
+    return " ".join(
+        f'<img alt="{view} image with the tags found" src="data:image/jpeg;base64,{data.decode()}">'
+        for view, data in both
+    )
+
+
+def _document(title: str, body: str, head: str = "") -> str:
+    title = html.escape(title)
+    return (
+        f'<!doctype html><html lang="en"><meta charset="utf-8">{head}<title>{title}</title>'
+        f"<style>{_STYLE}</style><h1>{title}</h1>{body}</html>\n"
+    )
+
+
+class LivePage:
+    """Both images on a page that this machine alone can open, at ``url``, until it is closed.
+
+    name : of the configuration. port : 0 for any that is free.
+    """
+
+    def __init__(self, name: str, port: int = 0) -> None:
+        images = "".join(f'<img alt="{view} image" src="/{view}.mjpg"> ' for view in VIEWS)
+        text = _document(f"Live images of {name}", f"<p>{images}</p><p>Ctrl-C in the terminal ends it.</p>")
+        self.pictures: dict[str, bytes] = {}
+        live = self
+
+        class Handler(BaseHTTPRequestHandler):
+            """Serve the page, and each image as multipart JPEGs."""
+
+            def do_GET(self) -> None:
+                """Answer a browser."""
+                view = self.path.strip("/").removesuffix(".mjpg")
+                self.send_response(200 if self.path == "/" or view in VIEWS else 404)
+                if view not in VIEWS:
+                    self.send_header("Content-Type", "text/html; charset=utf-8")
+                    self.end_headers()
+                    self.wfile.write(text.encode() if self.path == "/" else b"not found")
+                    return
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+                self.end_headers()
+                live.stream(view, self.wfile.write)
+
+            def log_message(self, *_: Any) -> None:
+                """Keep the terminal quiet."""
+
+        self._ended = threading.Event()
+        self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        self._server.daemon_threads = True
+        threading.Thread(target=self._server.serve_forever, args=(0.1,), daemon=True).start()
+        self.url = f"http://127.0.0.1:{self._server.server_port}/"
+
+    def stream(self, view: str, write: Callable[[bytes], Any]) -> None:
+        """Write the images of a view as they come, until the browser leaves or the page is closed."""
+        last = None
+        while not self._ended.is_set():
+            picture = self.pictures.get(view)
+            if picture is None or picture is last:
+                time.sleep(0.2 * _PAUSE_S)
+                continue
+            last = picture
+            head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(picture)}\r\n\r\n"
+            try:
+                write(head.encode() + picture + b"\r\n")
+            except OSError:
+                return
+            self._ended.wait(_PAUSE_S)
+
+    def close(self) -> None:
+        """Serve nothing any more."""
+        self._ended.set()
+        self._server.shutdown()
+        self._server.server_close()

@@ -1,0 +1,256 @@
+"""Checks of robot and cameras before anything is recorded, and findings with their remedies."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.detection import MIN_CELL, Corners, TagFinder, dictionaries
+from projservo_cli.hardware.camera_robot import View, exposure_of, wrong_with
+from projservo_cli.hardware.cameras import Camera, stable_name
+from projservo_cli.records import CORNERS, ByteArray, FloatArray, JointLimits, in_unit
+
+FAULT, WARNING, FINE = "fault", "warning", "fine"
+# Width of a cell, px, from which corners are good.
+_GOOD_CELL = 4.0
+# Frames a second, as a share of those asked for, below which a camera is slow; those of webcams by day, 1/s.
+_SLOW, _USUAL_HZ = 0.75, 30.0
+# Angle between the directions from which both cameras see a tag, deg: depth errors grow with its inverse.
+_MIN_ANGLE_DEG, _GOOD_ANGLE_DEG = 4.0, 10.0
+# Standard deviations of a corner by which perspective must move it to show the side of a tilt.
+_CERTAIN = 4.0
+# Markers that both cameras must see: a turn about a line through two shows in no image.
+_MIN_SHARED = 3
+# Distance from a limit at which a joint has no room, rad.
+_ROOM = math.radians(1.0)
+
+
+class Finding(NamedTuple):
+    """One result of a check."""
+
+    level: str  # fault, warning or fine
+    where: str  # what it is about
+    text: str  # what was found, with the number and its limit
+    remedy: str = ""  # empty where nothing is wrong
+
+
+@dataclass(eq=False)
+class Seen:
+    """A robot at rest, as its joints and cameras show it."""
+
+    marker: Sequence[int]  # numbers of the markers
+    face: Sequence[int]  # those that must stay visible
+    q: FloatArray  # (n,) mean of the joint readings, rad or m
+    s: FloatArray  # (2, m, 2) mean of the pixels, NaN where most frames do not show a marker
+    sigma: (
+        FloatArray | None
+    )  # (2, m) standard deviation of a corner of one frame as the detector states it, px
+    scatter: FloatArray  # (2, m) between frames, px
+    limits: JointLimits
+    units: Sequence[str]  # of the joints, for messages
+    views: Sequence[View] = ()  # the last one of each camera of projservo
+    cameras: Sequence[Camera] = ()
+    health: Mapping[str, float | str] = field(default_factory=dict)  # such as the voltage
+
+
+def findings_at_rest(seen: Seen, finder: TagFinder, dictionary: str) -> Iterator[Finding]:
+    """All findings at rest; ``dictionary``: name of that of the ``finder``."""
+    for camera, view in zip(seen.cameras, seen.views, strict=True):
+        yield from _of_camera(camera)
+        yield from _of_tags(camera.name, view, seen, finder, dictionary)
+    yield from _of_both(seen)
+    yield from _of_joints(seen)
+
+
+def _of_camera(camera: Camera) -> Iterator[Finding]:
+    """Rate, stamps, exposure and sharpness of a camera."""
+    where, grey = f"{camera.name} camera", camera.newest().grey
+    rate, asked = camera.rate_hz, camera.settings.rate_hz or _USUAL_HZ
+    stamps = "stamped by its driver" if camera.stamped else "stamped when they arrive"
+    size = f"{grey.shape[1]} x {grey.shape[0]} px"
+    if rate < _SLOW * asked:
+        remedy = (
+            "webcams expose longer in the dark: add light, or set exposure_ms below "
+            f"{1e3 / asked:.0f}; on one hub with another camera, set fourcc: MJPG"
+        )
+        yield Finding(WARNING, where, f"{size}, {rate:.1f} frames a second instead of {asked:g}", remedy)
+    else:
+        yield Finding(FINE, where, f"{size}, {rate:.1f} frames a second, {stamps}")
+    for remark in camera.remarks:
+        what, _, remedy = remark.partition(": ")
+        yield Finding(WARNING, where, what, remedy or "take another camera, or keep it from changing")
+    if name := stable_name(camera.settings.source):
+        what = f"device {camera.settings.source} may get another number when it is plugged in again"
+        yield Finding(WARNING, where, what, f"set cameras.{camera.name}.source: {name}")
+    light = exposure_of(grey)
+    for wrong in wrong_with(grey):
+        what, _, remedy = wrong.rpartition(": ")
+        yield Finding(FAULT if "black" in wrong else WARNING, where, f"its image {what}", remedy)
+    white, blur = f"{light.clipped:.1%} white", f"edges blurred by {light.blur_px:.1f} px"
+    text = f"mean grey {light.mean:.0f} of 255, {white}, {blur}"
+    yield Finding(FINE, where, text)
+
+
+def _of_tags(name: str, view: View, seen: Seen, finder: TagFinder, dictionary: str) -> Iterator[Finding]:
+    """Tags in the image of a camera: which, how large, how certain."""
+    where, known = f"{name} image", {number // CORNERS for number in seen.marker}
+    for number in view.repeated:
+        remedy = "a number must be unique: print another one, or cover the tag that is not on the tool"
+        yield Finding(FAULT, where, f"tag {number} is there twice", remedy)
+    there = {number: tag for number, tag in view.tags.items() if number in known}
+    if not there:
+        other, count = other_dictionary(view.frame.grey, dictionary)
+        if count > len(view.tags):
+            remedy = f"set markers.dictionary: {other}, or print tags of {dictionary}"
+            yield Finding(FAULT, where, f"{count} tags are of {other}, none of {dictionary}", remedy)
+        elif view.tags:
+            found = ", ".join(map(str, sorted(view.tags)))
+            remedy = "name the corners of the tags on the tool (4 t + k) in markers.numbers"
+            yield Finding(FAULT, where, f"tags {found} are there, and markers has none of them", remedy)
+        else:
+            minimum = math.ceil(MIN_CELL * finder.cells)
+            remedy = (
+                f"turn the tool towards it; look at light, focus and white margins; tags below {minimum} px "
+            )
+            remedy += f"({MIN_CELL:g} px a cell) are too small: print larger ones, or move the camera nearer"
+            yield Finding(FAULT, where, f"there is no tag of {dictionary}", remedy)
+        return
+    width = {number: _width(tag) for number, tag in there.items()}
+    smallest = min(width, key=lambda number: width[number])
+    cell = width[smallest] / finder.cells
+    sigma = float(np.nanmedian([tag.sigma for tag in there.values()]))
+    sizes = ", ".join(f"{number} ({width[number]:.0f} px)" for number in sorted(there))
+    text = f"tags {sizes}; corners to {sigma:.2g} px"
+    if cell < _GOOD_CELL:
+        limit = MIN_CELL if cell < MIN_CELL else _GOOD_CELL
+        level = FAULT if max(width.values()) / finder.cells < MIN_CELL else WARNING
+        what = f"tag {smallest} is {width[smallest]:.0f} px wide, {cell:.1f} px a cell ({limit:g} at least)"
+        yield Finding(level, where, what, "print larger tags, move the camera nearer, or raise its size_px")
+    yield Finding(FINE, where, text)
+
+
+def _width(tag: Corners) -> float:
+    """Mean side of a tag, px."""
+    return float(np.linalg.norm(np.roll(tag.pixels, -1, axis=0) - tag.pixels, axis=1).mean())
+
+
+def other_dictionary(grey: ByteArray, dictionary: str) -> tuple[str, int]:
+    """Dictionary with the most tags in an image, and how many, among those with tags of another kind.
+
+    Of two with as many tags it is the one of the larger and the fewer tags.
+    """
+    counts = {}
+    for name in dictionaries():
+        if name != dictionary.upper().removeprefix("DICT_"):
+            finder = TagFinder(name)
+            counts[name] = len(finder.find(grey.astype(np.float64))[0]), finder.cells, -finder.known
+    best = max(counts, key=lambda name: counts[name])
+    return best, counts[best][0]
+
+
+def _of_both(seen: Seen) -> Iterator[Finding]:
+    """Markers that both cameras see, the face among them, and whether the views differ enough for depth."""
+    shown = np.isfinite(seen.s[..., 0])
+    shared = int(shown.all(axis=0).sum())
+    if shown.any(axis=1).all() and shared < _MIN_SHARED:
+        remedy = "turn the tool towards both cameras, or move them"
+        what = f"share {shared} of {len(seen.marker)} markers ({_MIN_SHARED} at least)"
+        yield Finding(FAULT, "both images", what, remedy)
+    elif shared:
+        yield Finding(FINE, "both images", f"share {shared} of {len(seen.marker)} markers")
+    both = {number for k, number in enumerate(seen.marker) if shown[:, k].all()}
+    for number in seen.marker:
+        if shared and number in seen.face and number not in both:
+            what = f"do not both show marker {number} of the face, tag {number // CORNERS}"
+            remedy = "turn the tool towards both cameras, or name another markers.face"
+            yield Finding(WARNING, "both images", what, remedy)
+            break
+    if len(seen.views) == 2:
+        angle = view_angle_deg(seen.views[0].tags, seen.views[1].tags)
+        if angle < _GOOD_ANGLE_DEG:
+            what = (
+                f"the cameras see the tags from directions {angle:.1f}° apart ({_GOOD_ANGLE_DEG:g}° at least)"
+            )
+            remedy = (
+                "move them apart, by a third of their distance from the tool: depth shows in their difference"
+            )
+            yield Finding(FAULT if angle < _MIN_ANGLE_DEG else WARNING, "both cameras", what, remedy)
+        elif np.isfinite(angle):
+            yield Finding(FINE, "both cameras", f"see the tags from directions {angle:.0f}° apart")
+    noise, stated = np.nanmedian(seen.scatter) if np.isfinite(seen.scatter).any() else 0.0, seen.sigma
+    if (
+        stated is not None
+        and np.isfinite(stated).any()
+        and noise > 5.0 * np.nanmedian(stated)
+        and noise > 0.3
+    ):
+        what = (
+            f"corners scatter by {noise:.2g} px at rest, {noise / np.nanmedian(stated):.0f} times their noise"
+        )
+        remedy = "look for lamps that flicker, tables that shake, and autofocus"
+        yield Finding(WARNING, "both images", what, remedy)
+
+
+def view_angle_deg(left: Mapping[int, Corners], right: Mapping[int, Corners]) -> float:
+    """Angle between the directions from which both cameras see the tags, median over tags; NaN without one.
+
+    Tags whose perspective does not show to which side they are tilted count where there are no others; of the
+    sides that fit them the nearer ones are taken.
+    """
+    sure, unsure = list[float](), list[float]()
+    for number in left.keys() & right.keys():
+        if not np.isfinite([left[number].sigma, right[number].sigma]).all():
+            continue
+        towards = [_directions(one[number].pixels, one[number].sigma) for one in (left, right)]
+        cosine = max(float(np.clip(a @ b, -1.0, 1.0)) for a, b in product(*towards))
+        certain = len(towards[0]) == len(towards[1]) == 1
+        (sure if certain else unsure).append(math.degrees(math.acos(cosine)))
+    return float(np.median(sure or unsure)) if sure or unsure else math.nan
+
+
+def _directions(pixels: FloatArray, sigma: FloatArray) -> list[FloatArray]:
+    """Directions (3,) towards the camera, in the frame of a square tag, that fit its corners (4, 2).
+
+    Near its centre an image of a square is a scaled orthographic one: a circle there becomes an ellipse,
+    whose axes show the tilt. Perspective, if it is more than the noise ``sigma`` (4,) of the corners, shows
+    to which side: the farther part is smaller. Neither needs intrinsics.
+    """
+    square = np.array([(-1.0, 1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
+    rows = []
+    for (x, y), (u, v) in zip(square, pixels - pixels.mean(axis=0), strict=True):
+        rows += [[x, y, 1, 0, 0, 0, -u * x, -u * y, -u], [0, 0, 0, x, y, 1, -v * x, -v * y, -v]]
+    h = np.linalg.svd(np.array(rows))[2][-1].reshape(3, 3)
+    h /= h[2, 2]
+    affine = h[:2, :2] - np.outer(h[:2, 2], h[2, :2])
+    _, (large, small), axes = np.linalg.svd(affine)
+    z = small / large
+    side = math.sqrt(max(0.0, 1.0 - z * z)) * axes[1]
+    nearer, width = -h[2, :2] @ axes[1], 2.0 * large
+    if width * abs(nearer) > _CERTAIN * np.nanmax(sigma):
+        return [np.array([*(math.copysign(1.0, nearer) * side), z])]
+    return [np.array([*side, z]), np.array([*-side, z])]
+
+
+def _of_joints(seen: Seen) -> Iterator[Finding]:
+    """Readings within their limits, and the measurements of the arm itself."""
+    lower, upper = seen.limits.lower, seen.limits.upper
+    readings = ", ".join(in_unit(x, unit, 4) for x, unit in zip(seen.q.tolist(), seen.units, strict=True))
+    yield Finding(FINE, "joints", f"read {readings}")
+    for i, (x, unit) in enumerate(zip(seen.q.tolist(), seen.units, strict=True)):
+        low, high = (in_unit(float(limit[i]), unit, 4) for limit in (lower, upper))
+        if not np.isfinite([lower[i], upper[i]]).all():
+            yield Finding(
+                WARNING, f"joint {i + 1}", "has no limits", "set robot.limits, or run projservo limits"
+            )
+        elif not lower[i] <= x <= upper[i]:
+            what = f"reads {in_unit(x, unit, 4)}, beyond its limits {low} to {high}"
+            remedy = "move it back by hand; a reading far off has another unit or zero than the limits"
+            yield Finding(FAULT, f"joint {i + 1}", what, remedy)
+        elif unit != "m" and min(x - lower[i], upper[i] - x) < _ROOM:
+            what = f"reads {in_unit(x, unit, 4)}, at its limits {low} to {high}"
+            yield Finding(WARNING, f"joint {i + 1}", what, "move it away from there by hand")
+    for name, value in seen.health.items():
+        yield Finding(FINE, "arm", f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")

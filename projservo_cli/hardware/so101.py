@@ -1,0 +1,521 @@
+"""Plant ``so101``: an arm of bus servos STS3215, such as the SO-100 and SO-101, or any other by its ids.
+
+Joint readings are counts from the middle of the turn of each servo, in rad. Zeros and signs may be any:
+calibration finds what they mean, and registers that change it are stored with a recording.
+
+Source: Feetech, memory map of the STS3215.
+"""
+
+import math
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from projservo_cli.hardware.feetech import FeetechBus, PortLost, ServoSilent
+from projservo_cli.records import FloatArray, InputError, JointLimits, WorkFailed
+
+TURN = 4096  # counts of a servo in a turn
+MIDDLE = 2048  # count that is read as 0 rad
+COUNT = 2.0 * math.pi / TURN  # rad
+BUILT = {"ids": (1, 2, 3, 4, 5), "gripper": 6}  # of an SO-101
+# Addresses of registers.
+_MODEL, _LOWEST, _OFFSET, _TORQUE, _GOAL, _LOCK, _PRESENT = 3, 9, 31, 40, 42, 55, 56
+_STS3215 = 777  # register 3
+_MULTI_TURN = 0x10  # bit of register 18
+_OFFSET_SIGN = 0x800  # bit of register 31
+# Each bit of the status of a servo in words, with the remedy.
+_WRONG = {
+    0x01: "its supply has {volts:.1f} V ({least:.1f} to {most:.1f} V): look at the supply",
+    0x02: "its angle sensor fails: replace it",
+    0x04: "it is too hot, {heat} °C: let it cool",
+    0x08: "its current is too high: free what holds it",
+    0x20: "it is overloaded, and pushes with a fifth of its torque: free what it presses against",
+}
+# Fastest that somebody turns a joint, or a servo does, rad/s, and what readings scatter, rad; more is no
+# reading.
+_FASTEST, _SCATTER = math.radians(720.0), math.radians(1.0)
+# Factor by which a servo may outrun set-points, so that it catches up; and what the gripper may, rad/s.
+_CATCHES_UP, _GRIPPER = 1.5, math.radians(60.0)
+# How often a reading is repeated that cannot be true, or tells of a fault.
+_REPEATS = 4
+# How far a joint may turn while its torque comes on, be beyond a limit, or lag where it stands, rad.
+_LEAP = math.radians(3.0)
+_SWITCH_S = 0.1  # after which torque has come on
+
+
+class Measured(NamedTuple):
+    """What one servo measures."""
+
+    at: int  # counts
+    volts: float
+    heat: int  # °C
+    status: int  # bits of what is wrong
+
+    @property
+    def angle(self) -> float:
+        """Joint reading, rad."""
+        return (self.at - MIDDLE) * COUNT
+
+
+class Registers(NamedTuple):
+    """Stored registers of a servo on which the meaning of its readings hangs."""
+
+    lowest: int
+    highest: int
+    phase: int
+    offset: int
+    mode: int
+
+
+class Servos:
+    """The servos of an arm on a port: what they measure and store, torque, set-points.
+
+    port : its name; ``auto`` for the only one on which all of them answer.
+    ids : of the joints, base to tool; others : of further servos, such as a gripper.
+    Raises InputError where the port cannot be opened, servos are missing, or are of another kind.
+    """
+
+    def __init__(self, port: str, ids: Sequence[int], others: Sequence[int] = (), **clock: Any) -> None:
+        self.ids, self.all = (*ids,), (*ids, *others)
+        if len({*self.all}) < len(self.all) or not all(0 < i < 254 for i in self.all):
+            raise InputError(f"plant.options: ids {[*self.all]} must be numbers from 1 to 253, each once")
+        self.bus = FeetechBus(_port_of(self.all, **clock) if port == "auto" else port, **clock)
+        self.lost: set[int] = set()  # that nothing is written to any more
+        try:
+            found = {i: reply.values for i, reply in self._first().items()}
+        except BaseException:
+            self.bus.close()
+            raise
+        self.volts = {i: (0.1 * values[12], 0.1 * values[11]) for i, values in found.items()}
+
+    def _first(self) -> Mapping[int, Any]:
+        """Read the first registers of all servos; an InputError for missing, double and other ones."""
+        where = f"port {self.bus.port}:"
+        try:
+            found = self.bus.read(self.all, _MODEL, 13)
+        except ServoSilent as error:
+            there = [i for i in self.all if i not in error.silent]
+            if error.garbled:
+                raise InputError(
+                    f"{where} answers of servo {error.garbled[0]} are garbled, those of {there} are not: "
+                    "two servos have this id: unplug one of them, and set its id"
+                ) from error
+            if there:
+                raise InputError(
+                    f"{where} servos {[*error.silent]} do not answer, {there} do: look at the cable to "
+                    "the first of them, and at its id"
+                ) from error
+            raise InputError(
+                f"{where} no servo answers: switch the supply on, look at the cable to the first servo, and "
+                "whether this is the port of the arm"
+            ) from error
+        for i, reply in found.items():
+            if (model := _number(reply.values)) != _STS3215:
+                raise InputError(f"{where} servo {i} is of model {model}, no STS3215 ({_STS3215})")
+        return found
+
+    @property
+    def alive(self) -> list[int]:
+        """Numbers of servos that are written to."""
+        return [i for i in self.all if i not in self.lost]
+
+    def name(self, number: int) -> str:
+        """Name of a servo by its joint, for messages."""
+        servo = f"servo {number}"
+        return f"joint {self.ids.index(number) + 1} ({servo})" if number in self.ids else servo
+
+    def measured(self) -> dict[int, Measured]:
+        """Return what each servo measures that is not lost."""
+        found = self.bus.read(self.alive, _PRESENT, 8).items()
+        return {i: Measured(_number(x), 0.1 * x[6], x[7], status) for i, (status, x) in found}
+
+    def registers(self) -> dict[int, Registers]:
+        """Return what is stored in each servo."""
+        first, last = self.bus.read(self.all, _LOWEST, 10), self.bus.read(self.all, _OFFSET, 3)
+        found = {}
+        for i in self.all:
+            a, b = first[i].values, last[i].values
+            found[i] = Registers(_number(a), _number(a[2:]), a[9], _signed(_number(b)), b[2])
+        return found
+
+    def torque(self) -> dict[int, bool]:
+        """Whether each servo holds, by its number."""
+        return {i: reply.values == b"\1" for i, reply in self.bus.read(self.alive, _TORQUE, 1).items()}
+
+    def release(self, *, all_of_them: bool = False) -> None:
+        """Let go of the joints; of other servos too where that is asked for."""
+        servos = [i for i in self.alive if all_of_them or i in self.ids]
+        self.bus.store(_TORQUE, dict.fromkeys(servos, b"\0"))
+
+    def send(self, counts: Mapping[int, int], speed: Mapping[int, int]) -> None:
+        """Send set-points, counts, with the highest speed towards them, counts/s."""
+        self.bus.write(_GOAL, _goals({i: x for i, x in counts.items() if i not in self.lost}, speed))
+
+    def enable(self, counts: Mapping[int, int], speed: Mapping[int, int]) -> None:
+        """Have servos hold where they stand, at these counts.
+
+        The set-point is sent before torque comes on, since a servo else leaps to its last one.
+        """
+        self.bus.store(_GOAL, _goals(counts, speed))
+        self.bus.store(_TORQUE, dict.fromkeys(counts, b"\1"))
+
+    def shift(self, number: int, by: int) -> None:
+        """Store an offset by which a servo reads so many counts less; its torque must be off."""
+        offset = max((self.registers()[number].offset + by + MIDDLE) % TURN - MIDDLE, 1 - MIDDLE)
+        self.bus.store(_LOCK, {number: b"\0"})
+        self.bus.store(_OFFSET, {number: _two(abs(offset) | (_OFFSET_SIGN if offset < 0 else 0))})
+        self.bus.store(_LOCK, {number: b"\1"})
+
+    def told(self, error: WorkFailed) -> str:
+        """Tell which joints may fall where the bus fails; nothing more is written to them."""
+        if not isinstance(error, ServoSilent):
+            return f"{error}; servos with power go on to their last set-points, and hold there"
+        if {*error.silent} >= {*self.alive}:
+            self.lost |= {*error.silent}
+            return "no servo answers any more: all joints may fall: hold the arm, and look at its supply"
+        self.lost |= {*error.silent}
+        names = ", ".join(map(self.name, error.silent))
+        return f"{names}: no answer any more: it may fall, with what it carries; look at the cable to it"
+
+
+class SO101:
+    """An arm of bus servos, driven by the contract of robots; its images are those of ``cameras``.
+
+    port : of the arm, such as /dev/ttyACM0; ``auto`` takes the only one on which all servos answer.
+    ids : of the servos of the joints, base to tool. gripper : that of the gripper, which is held; None for
+        an arm without.
+    limits : of its joints, rad and rad/s; without, nothing is moved.
+    """
+
+    now = staticmethod(time.monotonic)  # its clock, s
+    sleep = staticmethod(time.sleep)
+    _servos: Servos
+    _lease: "_Lease"
+
+    def __init__(
+        self,
+        port: str = "auto",
+        ids: Sequence[int] = (1, 2, 3, 4, 5),
+        gripper: int | None = 6,
+        limits: JointLimits | None = None,
+    ) -> None:
+        self._port, self._ids = port, tuple(ids)
+        self._others = () if gripper is None else (gripper,)
+        known = limits is not None and bool(np.isfinite(limits.lower + limits.upper).all())
+        self._limits = limits if known else None
+        self._opened = self._on = self._released = False
+        self._before: dict[int, Measured] = {}  # the last reading
+        self._read_at, self._agreed = -math.inf, False  # when that was, and whether a second one agreed
+        self._sent: dict[int, int] = {}  # set-points, counts
+        self.registers: dict[int, Registers] = {}
+
+    def connect(self) -> Servos:
+        """Connect to the servos, which no other process may have."""
+        self._servos = Servos(self._port, self._ids, self._others, now=self.now, sleep=self.sleep)
+        self._lease = _Lease(self._servos.bus.port)
+        return self._servos
+
+    def open(self) -> None:
+        """Connect to the servos, and refuse those with which the arm would not stand where it is sent."""
+        self.connect()
+        self._opened = True
+        self.registers = self._servos.registers()
+        for i in self._ids:
+            if wrong := self._unfit(i, self.registers[i]):
+                raise InputError(f"{self._servos.name(i)}: {wrong}")
+        self._read()
+        if killed := self._lease.killed:
+            _say(
+                f"process {killed} was ended while it moved this arm: servos went on to their last "
+                "set-points; going on from where the arm stands"
+            )
+
+    def identity(self) -> str:
+        """Registers on which the meaning of readings hangs: a recording holds as long as they do."""
+        return ";".join(f"{i}:" + "/".join(map(str, self.registers[i])) for i in self._ids)
+
+    def health(self) -> dict[str, float | str]:
+        """Return the voltage and temperature of the servo that is worst off."""
+        found = self._read().values()
+        volts = min(one.volts for one in found)
+        return {"supply_v": round(volts, 1), "hottest_c": max(one.heat for one in found)}
+
+    def joints(self) -> tuple[FloatArray, float]:
+        """Joint readings (n,), rad, and when they were read, s."""
+        before = self.now()
+        found = self._read()
+        return np.array([found[i].angle for i in self._ids]), 0.5 * (before + self.now())
+
+    def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
+        """Send the set-points; at the first, torque comes on. A released arm is sent nothing."""
+        if self._released:
+            return
+        if not self._on:
+            self.hold()
+        counts = {i: round(MIDDLE + float(q) / COUNT) for i, q in zip(self._ids, target, strict=True)}
+        for i, count in counts.items():
+            least, most = self._keeps(i)
+            if not least <= count <= most:
+                raise WorkFailed(f"{self._servos.name(i)}: {count} counts are beyond {least} to {most}")
+        self._servos.send(counts, self._speeds())
+        self._sent |= counts
+
+    def hold(self) -> None:
+        """Hold the arm where it stands."""
+        self._require_limits()
+        self._lease.moving()
+        self._sent = {i: one.at for i, one in self._read().items()}
+        self._servos.enable(self._sent, self._speeds())
+        self._on, self._released = True, False
+        self.sleep(_SWITCH_S)
+        for i, one in self._read().items():
+            turned = abs(one.at - self._sent[i]) * COUNT
+            if turned > _LEAP:
+                raise WorkFailed(
+                    f"{self._servos.name(i)} turned by {_deg(turned)} when its torque came on ({_deg(_LEAP)} "
+                    "at most): look what pulls at it"
+                )
+
+    def release(self) -> None:
+        """Let go of the arm; the gripper stays as it is."""
+        self._released, self._on = True, False
+        self._servos.release()
+
+    def stop(self) -> None:
+        """Come to rest: joints that are on their way are sent where they are."""
+        if not self._on:
+            return
+        failure = WorkFailed("")
+        for _ in self._servos.all:  # a servo that fails is left out of the next reading
+            try:
+                there = {i: one.at for i, one in self._read().items()}
+                moving = {i: at for i, at in there.items() if abs(at - self._sent[i]) * COUNT > _LEAP}
+                self._servos.send(moving, self._speeds())
+                return
+            except WorkFailed as error:
+                failure = error
+        raise failure
+
+    def close(self) -> None:
+        """Let go of the port; the arm goes on holding, or not, which is said."""
+        if self._opened:
+            self._opened = False
+            _say(torque_told(self._servos))
+            self._servos.bus.close()
+            self._lease.end()
+
+    def _keeps(self, number: int) -> tuple[int, int]:
+        """Least and most counts that a servo goes to; over 4095 it goes the long way round."""
+        return self.registers[number].lowest, min(self.registers[number].highest, TURN - 1)
+
+    def _speeds(self) -> dict[int, int]:
+        """Highest speed of each servo, counts/s, never 0, which stands for as fast as it can."""
+        rates = dict.fromkeys(self._servos.all, _GRIPPER)
+        if self._limits is not None:
+            rates |= zip(self._ids, np.minimum(_CATCHES_UP * self._limits.speed, _FASTEST), strict=True)
+        return {i: max(1, math.ceil(rate / COUNT)) for i, rate in rates.items()}
+
+    def _require_limits(self) -> None:
+        """Refuse to move an arm without limits, or one that stands beyond them."""
+        if self._limits is None:
+            raise InputError("nothing was moved: the arm has no limits: projservo limits -c FILE finds them")
+        found = self._read()
+        for i, low, high in zip(self._ids, self._limits.lower, self._limits.upper, strict=True):
+            q = found[i].angle
+            beyond = max(low - q, q - high)
+            if beyond > _LEAP:
+                raise WorkFailed(
+                    f"nothing was moved: {self._servos.name(i)} stands at {_deg(q)}, {_deg(beyond)} beyond "
+                    f"its limits {_deg(low)} to {_deg(high)}: move it there by hand. If others do too, this "
+                    "is another arm (is it the leader's port?), or it was homed since: projservo limits"
+                )
+
+    def _unfit(self, number: int, stored: Registers) -> str:
+        """Why a joint would not stand where it is sent, with the remedy; empty where it does."""
+        if stored.mode != 0:
+            return f"its mode (register 33) is {stored.mode}: set 0, position, with the tool of its maker"
+        if stored.phase & _MULTI_TURN:
+            wanted = stored.phase & ~_MULTI_TURN
+            return f"it counts several turns (register 18 is {stored.phase}): set {wanted}"
+        if self._limits is None:
+            return ""
+        k, (least, most) = self._ids.index(number), self._keeps(number)
+        low, high = self._limits.lower[k], self._limits.upper[k]
+        if least <= round(MIDDLE + low / COUNT) < round(MIDDLE + high / COUNT) <= most:
+            return ""
+        kept = " to ".join(_deg((x - MIDDLE) * COUNT) for x in (least, most))
+        return (
+            f"its limits, {_deg(low)} to {_deg(high)}, go beyond those that it keeps itself, {kept} "
+            "(registers 9 and 11): run projservo limits again"
+        )
+
+    def _read(self) -> dict[int, Measured]:
+        """What all servos measure; a reading that cannot be true, or tells of a fault, is repeated.
+
+        The first one counts where a second agrees with it.
+        """
+        found, told = dict[int, Measured](), ""
+        for _ in range(_REPEATS):
+            try:
+                found = self._servos.measured()
+            except (ServoSilent, PortLost) as error:
+                raise WorkFailed(self._servos.told(error)) from error
+            now = self.now()
+            told = self._leapt(found, now - self._read_at) or self._faulty(found)
+            agreed = not told and bool(self._before)
+            if agreed or not self._agreed:
+                self._before, self._read_at, self._agreed = found, now, agreed
+            if agreed:
+                return found
+        self._servos.lost |= {i for i, one in found.items() if one.status}
+        raise WorkFailed(told)
+
+    def _leapt(self, found: Mapping[int, Measured], seconds: float) -> str:
+        """Which joint reads what it cannot have turned to since the last reading; empty for none."""
+        most = _FASTEST * seconds + _SCATTER
+        if self._on and self._limits is not None:
+            fastest = 2.0 * _CATCHES_UP * max(_GRIPPER, float(self._limits.speed.max()))
+            most = min(_FASTEST, fastest) * seconds + _SCATTER
+        for i, one in found.items():
+            before = self._before.get(i)
+            if one.at >= TURN or (before is not None and abs(one.at - before.at) * COUNT > most):
+                last = "" if before is None else f", {1000 * seconds:.0f} ms after {_deg(before.angle)}"
+                return (
+                    f"{self._servos.name(i)} reads {_deg(one.angle)}{last}: no joint turns so fast: look at "
+                    "its gear and its cable"
+                )
+        return ""
+
+    def _faulty(self, found: Mapping[int, Measured]) -> str:
+        """Which servo says that something is wrong with it, with the remedy; empty for none."""
+        for i, one in found.items():
+            for bit, told in _WRONG.items():
+                if one.status & bit:
+                    least, most = self._servos.volts[i]
+                    what = told.format(volts=one.volts, heat=one.heat, least=least, most=most)
+                    return f"{self._servos.name(i)}: {what}; it is sent nothing more, and may sink"
+        return ""
+
+
+@contextmanager
+def connected(arm: SO101) -> Iterator[Servos]:
+    """Connect to the servos of an arm alone, which is not driven."""
+    servos = arm.connect()
+    try:
+        yield servos
+    finally:
+        servos.bus.close()
+        arm._lease.end()
+
+
+def torque_told(servos: Servos) -> str:
+    """Tell whether torque is on, at the end of whatever was done with an arm."""
+    try:
+        on = servos.torque()
+    except (ServoSilent, PortLost):
+        return "whether torque is on is not known, since servos do not answer: hold the arm"
+    holding = [i for i in servos.ids if on.get(i)]
+    if not holding:
+        return "torque is off: nothing holds the arm"
+    if len(holding) < len(servos.ids):
+        return f"torque is on in {', '.join(map(servos.name, holding))} alone: hold the arm"
+    return "torque is on: the arm holds where it is; projservo release lets go of it"
+
+
+class _Lease:
+    """The port of an arm, which one process has; and a note that outlives it where it is killed.
+
+    ``killed``: number of a process that was ended while it moved the arm; empty for none.
+    """
+
+    def __init__(self, port: str) -> None:
+        from filelock import FileLock, Timeout
+
+        name = "projservo" + str(Path(port).resolve()).replace(os.sep, "-")
+        self._note = Path(tempfile.gettempdir(), f"{name}.moving")
+        self._lock = FileLock(self._note.with_suffix(".lock"), timeout=0)
+        try:
+            self._lock.acquire()
+        except Timeout as error:
+            raise InputError(f"port {port}: another projservo drives this arm: wait for its end") from error
+        self.killed = ""
+        with suppress(OSError):
+            self.killed = self._note.read_text(encoding="ascii").strip()
+
+    def moving(self) -> None:
+        """Note that this process moves the arm."""
+        self._note.write_text(f"{os.getpid()}\n", encoding="ascii")
+
+    def end(self) -> None:
+        """Forget it."""
+        self._note.unlink(missing_ok=True)
+        self._lock.release()
+
+
+def _port_of(ids: Sequence[int], **clock: Any) -> str:
+    """Return the only port on which all servos answer; an InputError lists what there is."""
+    ports, fitting = candidate_ports(), []
+    for port in ports:
+        with suppress(InputError, WorkFailed):
+            bus = FeetechBus(port, **clock)
+            try:
+                bus.read(ids, _MODEL, 2)
+                fitting.append(port)
+            finally:
+                bus.close()
+    if len(fitting) == 1:
+        return fitting[0]
+    remedy = "set plant.options.port"
+    if fitting:
+        raise InputError(
+            f"arms answer on {' and '.join(fitting)}: one may be the leader: {remedy} to the other"
+        )
+    if ports:
+        raise InputError(
+            f"servos {[*ids]} all answer on none of {', '.join(ports)}: switch the supply on; {remedy} "
+            "to the port of the arm, which says more"
+        )
+    raise InputError(f"there is no serial port on USB: plug the arm in, or {remedy}")
+
+
+def candidate_ports() -> list[str]:
+    """Return serial ports that may be an arm's."""
+    try:
+        from serial.tools import list_ports
+    except ImportError as error:
+        raise InputError("pyserial is missing: pip install '.[so101]'") from error
+    return sorted(port.device for port in list_ports.comports() if port.vid is not None)
+
+
+def _say(what: str) -> None:
+    print(f"so101: {what}", file=sys.stderr)
+
+
+def _deg(angle: float) -> str:
+    return f"{math.degrees(angle):.1f}°"
+
+
+def _goals(counts: Mapping[int, int], speed: Mapping[int, int]) -> dict[int, bytes]:
+    """Values of registers 42 to 47: set-point, time, which is of another mode, and speed."""
+    return {i: _two(count) + _two(0) + _two(speed[i]) for i, count in counts.items()}
+
+
+def _number(values: bytes) -> int:
+    """Number in the first two of some bytes."""
+    return int.from_bytes(values[:2], "little")
+
+
+def _two(number: int) -> bytes:
+    return number.to_bytes(2, "little")
+
+
+def _signed(offset: int) -> int:
+    """Offset of register 31, of which bit 11 is the sign."""
+    return -(offset & (_OFFSET_SIGN - 1)) if offset & _OFFSET_SIGN else offset

@@ -1,0 +1,308 @@
+"""Small motions of one joint at a time, and findings of how joints, images and tags follow."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding
+from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArray
+from projservo_cli.robots.contract import Reading
+from projservo_cli.robots.pacing import Steered
+
+# How far a joint goes to each side, and how fast: quick strokes show the latency, slow ones the hysteresis.
+REACH, _QUICK, _SLOW = math.radians(3.0), math.radians(20.0), math.radians(5.0)
+# Minimum motion from one end to the other, rad, and distance kept from limits.
+_LEAST_WAY, _KEPT = math.radians(2.0), math.radians(0.5)
+# Pause after each stroke, s, and the part at its end in which all stands still.
+_PAUSE_S, _STILL_S = 0.6, 0.3
+# Share of strokes that a joint must go, else something holds it: hysteresis takes much of the first one, and
+# of those to the middle.
+_HELD = {0: 0.1, 1: 0.4, 2: 0.4, 3: 0.4}
+# Motion after a turn of direction within which backlash is passed, rad: at first, and where more shows.
+_PASSING, _MAX_PASSING = math.radians(1.4), math.radians(2.6)
+# Motion back that counts as a turn of direction, rad.
+_TURN = math.radians(0.35)
+# Latencies that are tried, s; for a parabola through the best one and its neighbours.
+_LATENCIES = np.arange(-0.05, 0.7, 0.005)
+# Motion of images over the whole way, px, below which none moves with the joint.
+_MOVES_PX = 1.0
+# Hysteresis or sag from which it is parts, and backlash that goals of images bear, rad.
+_NOTABLE, _WIDE = math.radians(0.15), math.radians(1.5)
+# Latency from which frames queue somewhere, s.
+_MAX_LATENCY_S = 0.3
+# Motion of one tag against the others, px, and in standard deviations, from which it is loose.
+_LOOSE_PX, _LOOSE = 0.7, 4.0
+
+
+class Strokes(NamedTuple):
+    """Readings of a robot while one joint went to and fro."""
+
+    joint: int  # from 0
+    end: IntArray  # (k,) number of the stroke of each reading
+    target: FloatArray  # (k,) rad or m
+    readings: tuple[Reading, ...]
+    given_up: str  # why it was broken off; empty where it was not
+
+    @property
+    def q(self) -> FloatArray:
+        """Readings (k,) of the joint, rad or m."""
+        return np.array([reading.q[self.joint] for reading in self.readings])
+
+    def rest(self, stroke: int) -> list[int]:
+        """Indices of the readings at rest at the end of a stroke."""
+        rows = np.flatnonzero(self.end == stroke)
+        last = self.readings[rows[-1]].t_q
+        return [int(k) for k in rows if self.readings[k].t_q > last - _STILL_S]
+
+
+# Ends of the strokes, in reaches, and whether they are quick. The last three end in the middle from below, at
+# the upper end, and in the middle from above.
+_STROKES = (*((1, True), (-1, True)) * 3, (0, False), (1, False), (0, False))
+_UP, _DOWN, _FROM_BELOW, _FROM_ABOVE = 4, 5, 6, 8
+
+
+def strokes(steered: Steered, joint: int) -> Strokes | str:
+    """Move a joint to and fro about where it stands; words where it has no room for that.
+
+    steered : the robot, one for all joints: each set-point that begins at a reading lets an arm sag further.
+    """
+    bounds = steered.robot.bounds
+    q = steered.look().q
+    for _ in range(math.ceil(_PAUSE_S / bounds.period)):
+        steered.hold()
+    low = max(-REACH, bounds.limits.lower[joint] + _KEPT - q[joint])
+    high = min(REACH, bounds.limits.upper[joint] - _KEPT - q[joint])
+    if high - low < _LEAST_WAY or not low < 0.0 < high:
+        return f"it has no room for {math.degrees(_LEAST_WAY):g}°: move it away from its limit by hand"
+    middle = float(steered.target[joint])
+    rows: list[tuple[int, float, Reading]] = []
+    for number, (end, quick) in enumerate(_STROKES):
+        goal = middle + (high if end > 0 else low if end < 0 else 0.0)
+        speed = min(_QUICK if quick else _SLOW, float(bounds.limits.speed[joint]))
+        begun, from_q = float(steered.target[joint]), float(steered.reading.q[joint])
+        pauses = math.ceil(_PAUSE_S / bounds.period)
+        while pauses > 0:
+            step = np.zeros(len(q))
+            left = goal - steered.target[joint]
+            step[joint] = math.copysign(min(abs(left), speed * bounds.period), left)
+            steered.command(step, bounds.period)
+            pauses -= left == 0.0 or bool(steered.set_point.short[joint])
+            rows.append((number, float(steered.target[joint]), steered.look()))
+        way, gone = abs(goal - begun), abs(float(steered.reading.q[joint]) - from_q)
+        if number in _HELD and gone < _HELD[number] * way:
+            what = f"went {bounds.told(joint, gone, 2)} of {bounds.told(joint, way, 2)}"
+            return Strokes(joint, *_columns(rows), what)
+    return Strokes(joint, *_columns(rows), "")
+
+
+def _columns(rows: Sequence[tuple[int, float, Reading]]) -> tuple[IntArray, FloatArray, tuple[Reading, ...]]:
+    ends, targets, readings = zip(*rows, strict=True)
+    return np.array(ends, dtype=np.int64), np.array(targets), readings
+
+
+class _Signal(NamedTuple):
+    """How far the markers of a view moved along the main direction of their motion, rms."""
+
+    t: FloatArray  # (f,) stamps of new frames, s
+    p: FloatArray  # (f,) px
+
+
+def _signal(moved: Strokes, view: int) -> _Signal:
+    """Motion of what a view shows in all of its new frames."""
+    readings = moved.readings
+    new = [k for k in range(1, len(readings)) if readings[k].new_views(readings[k - 1])[view]]
+    s = np.array([readings[k].s[view] for k in new]).reshape(len(new), -1, 2)
+    stamps = np.array(
+        [readings[k].t_q if np.isnan(readings[k].t_view[view]) else readings[k].t_view[view] for k in new]
+    )
+    s = s[:, np.isfinite(s).all(axis=(0, 2))]
+    if not s.size:
+        return _Signal(stamps, np.zeros(len(new)))
+    off = (s - s.mean(axis=0)).reshape(len(s), -1)
+    return _Signal(stamps, off @ np.linalg.svd(off, full_matrices=False)[2][0] / math.sqrt(s.shape[1]))
+
+
+class _Fit(NamedTuple):
+    """Motion of an image by the reading of a joint, for each latency that was tried."""
+
+    squares: FloatArray  # (d,) px², that it leaves, of the sum of all frames that count
+    slope: FloatArray  # (d,) px/rad
+    backlash: FloatArray  # (d,) rad, between reading and link
+
+
+def _fit(moved: Strokes, signal: _Signal, passing: float) -> _Fit | None:
+    """Fit p(t) = c± + b q(t − d) + e q(t − d)², c+ where the joint went up last, else c−; None for no motion.
+
+    passing : motion, rad, after a turn of direction, that passes the backlash: frames there do not count.
+    """
+    t_q, q = np.array([reading.t_q for reading in moved.readings]), moved.q
+    mid = 0.5 * (q.min() + q.max())
+    course = PchipInterpolator(t_q, q)  # straight lines would lag behind a joint that slows down
+    found = []
+    for d in _LATENCIES:
+        x = course(np.clip(signal.t - d, t_q[0], t_q[-1])) - mid
+        up, far = _direction(t_q, q, signal.t - d, passing)
+        counts = far & (signal.t - d > t_q[0])
+        A = np.column_stack([up, ~up, x, x * x])[counts].astype(float)
+        if (
+            counts.sum() < 12
+            or np.ptp(x[counts]) < _LEAST_WAY / 2
+            or not (up[counts].any() and (~up[counts]).any())
+        ):
+            return None
+        c, *_ = np.linalg.lstsq(A, signal.p[counts])
+        r = signal.p[counts] - A @ c
+        found.append(
+            (float(r @ r) * len(signal.p) / counts.sum(), c[2], (c[1] - c[0]) / c[2] if c[2] else 0.0)
+        )
+    return _Fit(*(np.array(column) for column in zip(*found, strict=True)))
+
+
+def _passed(moved: Strokes, signal: _Signal) -> _Fit | None:
+    """Fit without the frames in which the backlash is passed, by the backlash of the fit before."""
+    passing, found = _PASSING, _fit(moved, signal, _PASSING)
+    while found is not None and passing < _MAX_PASSING:
+        wider = 1.2 * float(found.backlash[np.argmin(found.squares)]) + math.radians(0.4)
+        if wider <= passing:
+            break
+        passing = min(max(wider, passing + math.radians(0.3)), _MAX_PASSING)
+        found = _fit(moved, signal, passing) or found
+    return found
+
+
+def _direction(t_q: FloatArray, q: FloatArray, t: FloatArray, passing: float) -> tuple[BoolArray, BoolArray]:
+    """Whether a joint went up last at instants (f,), and has passed its backlash since it turned."""
+    up, far, turned, rising = np.zeros(len(q), dtype=bool), np.zeros(len(q), dtype=bool), q[0], True
+    extreme = q[0]
+    for k, x in enumerate(q):
+        ahead = x - extreme if rising else extreme - x
+        if ahead >= 0.0:
+            extreme = x
+        elif -ahead > _TURN:  # it turned
+            rising, turned, extreme = not rising, extreme, x
+        up[k], far[k] = rising, abs(x - turned) > passing
+    at = np.clip(np.searchsorted(t_q, t, side="right") - 1, 0, len(q) - 1)
+    return up[at], far[at]
+
+
+def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Finding]:
+    """Findings of the strokes of all joints; numbers : of the markers."""
+    still, total = [], np.zeros((2, len(_LATENCIES)))
+    for one in moved:
+        signals = [_signal(one, view) for view in range(2)]
+        fits = [_passed(one, signal) for signal in signals]
+        if one.given_up:
+            remedy = (
+                "look what holds it, and at the supply; where it sags or plays so far, raise "
+                "plant.max_steady_state_error_deg"
+            )
+            yield Finding(FAULT, f"joint {one.joint + 1}", f"{one.given_up}: it is held or too weak", remedy)
+            continue
+        span = max(np.ptp(signal.p) if len(signal.p) else 0.0 for signal in signals)
+        if span < _MOVES_PX:
+            still.append(one.joint)
+        else:
+            for view, fit in enumerate(fits):
+                total[view] += 0.0 if fit is None else fit.squares
+        yield from _of_servo(one, [fit for fit in fits if fit is not None] if span >= _MOVES_PX else [])
+    yield from _of_still(still, len(moved))
+    for name, squares in zip(VIEWS, total, strict=True):
+        if squares.any():
+            latency = _minimum(squares)
+            remedy = (
+                "look for what queues frames: a hub, a network, a slow machine"
+                if latency > _MAX_LATENCY_S
+                else ""
+            )
+            yield Finding(
+                WARNING if remedy else FINE, f"{name} camera", f"latency {1e3 * latency:.0f} ms", remedy
+            )
+    yield from _of_loose_tags(moved, numbers)
+
+
+def _minimum(squares: FloatArray) -> float:
+    """Latency, s, by a parabola through the minimum of the sums (d,) and its neighbours."""
+    k = int(np.clip(np.argmin(squares), 1, len(squares) - 2))
+    before, here, after = squares[k - 1 : k + 2]
+    bend = before - 2.0 * here + after
+    shift = 0.5 * (before - after) / bend if bend > 0.0 else 0.0
+    return float(_LATENCIES[k] + 0.005 * np.clip(shift, -1.0, 1.0))
+
+
+def _of_servo(one: Strokes, fits: Sequence[_Fit]) -> Iterator[Finding]:
+    """Hysteresis and sag of a joint, and backlash between its reading and the images."""
+    below, above = (one.rest(stroke) for stroke in (_FROM_BELOW, _FROM_ABOVE))
+    hysteresis = float(one.q[above].mean() - one.q[below].mean())
+    sag = float((one.target - one.q)[below + above].mean())
+    best = [int(np.argmin(fit.squares)) for fit in fits]
+    backlash = float(np.mean([fit.backlash[k] for fit, k in zip(fits, best, strict=True)])) if fits else 0.0
+    parts = [f"{name} {math.degrees(x):.1f}°" for name, x in (("hysteresis", hysteresis), ("sag", abs(sag)))]
+    if fits:
+        hidden = abs(sag) > 2.0 * _NOTABLE and backlash < _NOTABLE
+        parts.append(
+            "backlash hidden by gravity" if hidden else f"backlash {math.degrees(max(backlash, 0.0)):.1f}°"
+        )
+    wide = max(hysteresis, backlash) > _WIDE
+    remedy = (
+        "teach goals by images, which backlash does not move; look for a loose horn or screw" if wide else ""
+    )
+    yield Finding(WARNING if wide else FINE, f"joint {one.joint + 1}", ", ".join(parts), remedy)
+
+
+def _of_still(still: Sequence[int], n: int) -> Iterator[Finding]:
+    """Joints with which no tag moves."""
+    if not still:
+        return
+    names = ", ".join(str(i + 1) for i in still)
+    where = f"joint{'s' if len(still) > 1 else ''} {names}"
+    if len(still) == n:
+        what, remedy = (
+            "turned, and no tag moved",
+            "look whether the tags are on this arm, and that the images are live",
+        )
+    elif [*still] == [*range(still[0], n)]:
+        what = f"turned, and no tag moved: the tags sit on the link before joint {still[0] + 1}"
+        remedy = "mount them behind the last joint, on the fixed part of the tool and not on a moving jaw"
+    else:
+        what, remedy = "turned, and no tag moved", "look at the order of the joints, and at their horns"
+    yield Finding(FAULT, where, what, remedy)
+
+
+def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Finding]:
+    """Tags that moved against the others between rests in the middle, come to from either side.
+
+    Hysteresis and backlash leave small motions of the joints, which all tags follow by the images of the
+    strokes; the other tags show the motions of the joints, and the rest is motion on the tool.
+    """
+    sound = [one for one in moved if not one.given_up]
+    rests = [_at_rest(one, stroke) for one in sound for stroke in (_FROM_BELOW, _FROM_ABOVE)]
+    spans = [_at_rest(one, _UP) - _at_rest(one, _DOWN) for one in sound]
+    tag = np.array(numbers) // CORNERS
+    worst: dict[int, float] = {}
+    for rest in rests[1:]:
+        columns = np.stack([*spans, rest - rests[0]], axis=-1)  # (2, m, 2, j + 1)
+        seen = np.isfinite(columns).all(axis=(2, 3))
+        for number in sorted(set(tag.tolist())):
+            own, others = seen & (tag == number), seen & (tag != number)
+            if own.sum() < CORNERS or others.sum() < 2 * len(columns[0, 0, 0]):
+                continue
+            A, b = np.split(columns[others].reshape(-1, len(spans) + 1), [-1], axis=1)
+            c, *_ = np.linalg.lstsq(A, b[:, 0])
+            noise = float(np.sqrt(np.mean((b[:, 0] - A @ c) ** 2)))
+            left = np.abs(columns[own] @ [*-c, 1.0]).mean()
+            if left > max(_LOOSE_PX, _LOOSE * noise):
+                worst[number] = max(worst.get(number, 0.0), float(left))
+    if worst:
+        number = max(worst, key=lambda one: worst[one])
+        what = f"tag {number} moved by {worst[number]:.1f} px against the others"
+        yield Finding(FAULT, "tags", what, "glue it flat on a stiff part, all tags on the same one")
+    elif len(rests) > 1 and len(set(tag.tolist())) > 1:
+        yield Finding(FINE, "tags", "sit fast on the tool")
+
+
+def _at_rest(one: Strokes, stroke: int) -> FloatArray:
+    """Mean pixels (2, m, 2) at rest at the end of a stroke."""
+    return np.asarray(np.mean([one.readings[k].s for k in one.rest(stroke)], axis=0))

@@ -1,0 +1,149 @@
+"""Preflight: look at robot and cameras before anything is recorded, and move each joint a little."""
+
+import time
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.detection import DICTIONARY, TagFinder
+from projservo_cli.hardware.camera_robot import CameraRobot
+from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding, Seen, findings_at_rest
+from projservo_cli.hardware.wiggle import Strokes, findings_of, strokes
+from projservo_cli.monitoring.monitor import fault_shown
+from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
+from projservo_cli.robots.pacing import Steered
+from projservo_cli.robots.settings import OwnRobot
+from projservo_cli.stages import Progress, silent
+from projservo_cli.stages.external_robot import foreign_robot
+from projservo_cli.stages.given import RecordingInputs
+
+# For how long a robot at rest is looked at, s, and the least number of looks.
+_LOOK_S, _MIN_LOOKS = 1.5, 8
+
+
+class Checked(NamedTuple):
+    """What was found."""
+
+    findings: tuple[Finding, ...]
+    seen: Seen | None  # None where robot or cameras did not open
+    moved: tuple[Strokes, ...]  # of the joints that were moved
+
+    @property
+    def works(self) -> bool:
+        """Whether nothing stands against a recording."""
+        return all(finding.level != FAULT for finding in self.findings)
+
+
+def check(
+    inputs: RecordingInputs,
+    calibration: Calibration | None = None,
+    confirmed: Callable[[], bool] | None = None,
+    watch: Callable[[ForeignRobot], None] | None = None,
+    progress: Progress = silent,
+) -> Checked:
+    """Open robot and cameras, look, and close them.
+
+    calibration : whose images are compared, where there is one.
+    confirmed : asks whether joints may be moved by a few degrees; None moves none.
+    watch : is called with the open robot, for as long as somebody wants to see its images.
+    Raises InputError where the robot is a simulated one.
+    """
+    robot = _robot_of(inputs)
+    found: list[Finding] = []
+    seen, moved = None, list[Strokes]()
+    try:
+        with at_rest_after(robot):
+            if watch is not None:
+                watch(robot)
+            seen = _seen(robot, inputs, progress)
+            found += findings_at_rest(
+                seen, TagFinder(inputs.dictionary or DICTIONARY), inputs.dictionary or DICTIONARY
+            )
+            if calibration is not None:
+                found.append(_against(calibration, seen, robot.image_size))
+            works = all(finding.level != FAULT for finding in found)
+            if confirmed is not None and not works:
+                found.append(
+                    Finding(WARNING, "joints", "were not moved: something above is a fault", "mend it first")
+                )
+            elif confirmed is not None and confirmed():
+                steered = Steered(robot)
+                for joint in range(len(seen.q)):
+                    one = strokes(steered, joint)
+                    progress("move", joint + 1, len(seen.q))
+                    if isinstance(one, str):
+                        what, _, remedy = one.partition(": ")
+                        found.append(Finding(WARNING, f"joint {joint + 1}", what, remedy))
+                    else:
+                        moved.append(one)
+                found += findings_of(moved, seen.marker)
+    except WorkFailed as error:
+        what, _, remedy = str(error).partition(": look ")
+        found.append(Finding(FAULT, "robot and cameras", what, f"look {remedy}" if remedy else ""))
+    return Checked(tuple(found), seen, tuple(moved))
+
+
+def _robot_of(inputs: RecordingInputs) -> ForeignRobot:
+    """The robot of a configuration."""
+    driven = inputs.trials.driven
+    if driven is None or not isinstance(driven.robot, OwnRobot):
+        raise InputError(
+            "doctor -c checks a robot and its cameras, and this one is simulated: set plant.use and cameras"
+        )
+    joints = inputs.trials.joints.joints()
+    return foreign_robot(driven.robot, driven.following.bounds(joints), joints.types, inputs.numbers)
+
+
+def _seen(robot: ForeignRobot, inputs: RecordingInputs, progress: Progress) -> Seen:
+    """Look for a while at a robot that stands where it is."""
+    period, looks = robot.bounds.period, [robot.read()]
+    wanted = max(_MIN_LOOKS, round(_LOOK_S / period))
+    while len(looks) < wanted:
+        time.sleep(period)
+        looks.append(robot.read())
+        progress("look", len(looks), wanted)
+    s, scatter = (np.stack(both) for both in zip(*(_mean(looks, view) for view in range(2)), strict=True))
+    own = robot.robot
+    cameras = own.cameras if isinstance(own, CameraRobot) else []
+    views = [view for view in own.views if view is not None] if isinstance(own, CameraRobot) else []
+    return Seen(
+        marker=inputs.numbers,
+        face=inputs.face,
+        q=np.mean([look.q for look in looks], axis=0),
+        s=s,
+        sigma=looks[-1].sigma_px,
+        scatter=scatter,
+        limits=robot.bounds.limits,
+        units=robot.bounds.units,
+        views=views,
+        cameras=cameras,
+        health=robot.health(),
+    )
+
+
+def _mean(looks: Sequence[Reading], view: int) -> tuple[FloatArray, FloatArray]:
+    """Mean (m, 2) of the new frames of a view, NaN where most show no marker, and scatter (m,), px."""
+    new = [looks[0], *(b for a, b in pairwise(looks) if b.new_views(a)[view])]
+    s = np.array([look.s[view] for look in new])
+    often = 2 * np.isfinite(s[..., 0]).sum(axis=0) > len(s)
+    mean, scatter = np.full(s.shape[1:], np.nan), np.full(s.shape[1], np.nan)
+    mean[often] = np.nanmean(s[:, often], axis=0)
+    if len(s) > 2:
+        scatter[often] = np.sqrt(np.nanvar(s[:, often], axis=0).mean(axis=1))
+    return mean, scatter
+
+
+def _against(calibration: Calibration, seen: Seen, image_size: tuple[int, int] | None) -> Finding:
+    """Whether images at rest still agree with a calibration, and what changed if they do not."""
+    if not calibration.usable or not calibration.has_covariance:
+        return Finding(WARNING, "calibration", "is not usable", "record and calibrate again")
+    size = None if image_size is None else np.array(image_size, dtype=np.float64)
+    if size is None and len(seen.views):
+        size = np.array(seen.views[0].frame.grey.shape[::-1], dtype=np.float64)
+    marker = np.array(seen.marker, dtype=np.int64)
+    if fault := fault_shown(calibration, seen.q, marker, seen.s, size):
+        return Finding(FAULT, "calibration", fault, "put that back, or record and calibrate again")
+    return Finding(FINE, "calibration", "agrees with the images")

@@ -1,0 +1,5 @@
+"""Fixtures of the tests of hardware."""
+
+from tests.cli.conftest import projservo
+
+__all__ = ["projservo"]

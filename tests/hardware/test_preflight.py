@@ -1,0 +1,262 @@
+"""Checks before a recording: mistakes that beginners make with tags and cameras, each with its remedy."""
+
+import html
+import json
+import urllib.request
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from projservo_cli.calibration import predict
+from projservo_cli.config import load_config
+from projservo_cli.config.inputs import calibration_inputs
+from projservo_cli.detection import TagFinder
+from projservo_cli.hardware.live_page import LivePage
+from projservo_cli.hardware.preflight import view_angle_deg
+from projservo_cli.stages import calibrate, preflight
+from tests.hardware.streams import Stream, picture
+from tests.hardware.wiggled import Faults, findings
+
+LEFT = picture(at=(60.0, 80.0), numbers=(0, 1, 2), side=50.0, step=75.0)
+CONFIGURATION = """\
+name: arm
+plant: {{use: "tests.hardware.still:Still"{options}}}
+data: {{table: arm.csv, joints: RRRRR}}
+cameras:
+  left: {{source: "{left}", rate_hz: {rate}}}
+  right: {{source: "{right}", rate_hz: {rate}}}
+  max_age_s: 5.0  # other programs share the machine
+  reconnect_s: 20.0
+markers: {{numbers: [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11], face: [0, 1, 2, 3]}}
+robot: {{limits: {{joints: [[-110, 110], [-100, 100], [-97, 97], [-95, 95], [-160, 160]], unit: deg}}}}
+calibration: {{reference: {{joints: [0, 10, -25, 15, 0], unit: deg}}}}
+control: {{joint_speed_limit_deg_s: 60}}
+"""
+
+
+@pytest.fixture
+def doctor(projservo, tmp_path, monkeypatch):
+    """Function that checks an arm before two drawn images; the answer, and findings by level."""
+    monkeypatch.chdir(tmp_path)
+    streams = []
+
+    def check(left, right, rate_hz=30.0, asked_hz=20, options="", sets=()):
+        streams.extend(Stream(lambda image=image: image, rate_hz) for image in (left, right))
+        text = CONFIGURATION.format(
+            left=streams[-2].url, right=streams[-1].url, rate=asked_hz, options=options
+        )
+        (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
+        answer = projservo("doctor", "-c", "arm.yaml", "--json", *sets)
+        told = json.loads(answer.out)["findings"]
+        return answer, {
+            level: [
+                f"{one['where']}: {one['text']}: {one['remedy']}" for one in told if one["level"] == level
+            ]
+            for level in ("fault", "warning", "fine")
+        }
+
+    yield check
+    for stream in streams:
+        stream.close()
+
+
+def seen_from(x_m, tilt_deg=20.0, size=(640, 480)):
+    """Image of a tag of 40 mm, half a metre away, by a camera so far to the side that looks at it."""
+    c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
+    corners = 0.02 * np.array([(-1, -c, -s), (1, -c, -s), (1, c, s), (-1, c, s)])
+    position = np.array([x_m, 0.0, -0.5])
+    z = -position / np.linalg.norm(position)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    seen = (corners - position) @ np.array([x, np.cross(z, x), z]).T
+    pixels = 600.0 * seen[:, :2] / seen[:, 2:] + np.array(size) / 2
+    tag = TagFinder("4X4_50").picture(0, 40)
+    outer = np.array([(40, 40), (280, 40), (280, 280), (40, 280)], dtype=np.float32) - 0.5
+    H = cv2.getPerspectiveTransform(outer, (4.0 * pixels + 1.5).astype(np.float32))
+    big = (4 * size[0], 4 * size[1])
+    image = cv2.warpPerspective(tag, H, big, borderValue=130, flags=cv2.INTER_AREA)
+    return cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (0, 0), 0.7)
+
+
+def test_a_sound_set_up_is_ready_and_shown_on_a_page(doctor, tmp_path):
+    answer, found = doctor(LEFT, picture(at=(50.0, 90.0), numbers=(0, 1, 2), side=50.0, step=70.0))
+    warned = [
+        one for one in found["warning"] if "directions" not in one
+    ]  # both pictures are drawn from ahead
+    assert warned == []
+    assert "left image: tags 0 (50 px), 1 (50 px), 2 (50 px); corners to 0.0" in "\n".join(found["fine"])
+    assert any("supply, V 12.1" in one for one in found["fine"])
+    assert any("frames a second, stamped when they arrive" in one for one in found["fine"])
+    page = (tmp_path / "preflight.html").read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg;base64,") == 2
+    assert html.escape("share 12 of 12 markers") in page
+    assert "directions" in found["fault"][0]
+    assert answer.code == 1
+
+
+_OTHER = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "level", "words"),
+    [
+        (
+            picture(at=(30.0, 80.0), numbers=(0, 1, 0), side=50.0),
+            picture(numbers=(0, 1), at=(60.0, 80.0), tags=_OTHER),
+            "fault",
+            (
+                "left image: tag 0 is there twice: a number must be unique: print another one",
+                "right image: 2 tags are of 5X5_50, none of 4X4_50: set markers.dictionary: 5X5_50",
+            ),
+        ),
+        (
+            picture(at=(60.0, 80.0), numbers=(7, 8)),
+            np.full((240, 320), 2, np.uint8),
+            "fault",
+            (
+                "left image: tags 7, 8 are there, and markers has none of them: name the corners",
+                "right camera: its image is black: take the cap off",
+            ),
+        ),
+        (
+            picture(at=(60.0, 80.0), numbers=(0, 1, 2), side=19.0),
+            picture(numbers=(0, 1), at=(60.0, 80.0), blur=3.5),
+            "warning",
+            (
+                " px a cell (4 at least): print larger tags, move the camera nearer",
+                "right camera: its image is blurred by",
+            ),
+        ),
+    ],
+)
+def test_a_mistake_with_tags_or_light_is_named_with_its_remedy(doctor, left, right, level, words):
+    _, found = doctor(left, right)
+    for text in words:
+        assert [one for one in found[level] if text in one], found
+
+
+def test_a_camera_that_slows_down_in_the_dark_is_named(doctor):
+    _, found = doctor(LEFT, LEFT, rate_hz=15.0, asked_hz=30)
+    slow = [one for one in found["warning"] if "frames a second instead of 30" in one]
+    assert len(slow) == 2
+    assert "webcams expose longer in the dark: add light, or set exposure_ms below 33" in slow[0]
+
+
+def test_cameras_close_together_are_named_and_apart_are_not(doctor):
+    _, found = doctor(seen_from(-0.01), seen_from(0.01))
+    (close,) = (one for one in found["fault"] if "directions" in one)
+    assert "apart (10° at least): move them apart, by a third of their distance" in close
+    assert float(close.split("directions ")[1].split("°")[0]) == pytest.approx(2.3, abs=1.5)
+    finder = TagFinder("4X4_50")
+    for baseline in (0.1, 0.2):
+        views = [finder.find(seen_from(x).astype(float))[0] for x in (-baseline / 2, baseline / 2)]
+        expected = 2.0 * np.degrees(np.arctan(baseline))
+        assert view_angle_deg(*views) == pytest.approx(expected, rel=0.15)
+
+
+def test_an_arm_at_a_stop_and_one_beyond_its_limits_are_named(doctor):
+    _, found = doctor(LEFT, LEFT, options=", options: {q_deg: [0, 99.5, -120, 0, 0]}")
+    assert any(
+        "joint 2: reads 99.5 deg, at its limits -100 deg to 100 deg" in one for one in found["warning"]
+    )
+    assert any("joint 3: reads -120 deg, beyond its limits -97 deg" in one for one in found["fault"])
+
+
+def test_a_camera_that_does_not_open_ends_in_a_fault_with_its_name(doctor, projservo):
+    answer, found = doctor(LEFT, LEFT, sets=("--set", "cameras.left.source=nowhere.mp4"))
+    assert answer.code == 1
+    (fault,) = found["fault"]
+    assert "the left camera (cameras.left.source: nowhere.mp4): cannot be opened" in fault
+    assert "look at its name" in fault
+    answer = projservo("doctor", "--move")
+    assert (answer.code, "doctor checks a robot with -c alone" in answer.err) == (2, True)
+    answer = projservo("doctor", "-c", "arm.yaml", "--move")
+    assert (answer.code, "nobody can be asked" in answer.err) == (2, True)
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    settings = (
+        "markers={tags: roof, tag_size_m: 0.04}",
+        "noise.calibration_px=0.05",
+        "calibration.random_poses=8",
+    )
+    config = load_config("configs/hobby.yaml", settings)
+    return calibrate.run(calibration_inputs(config))[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: s, "agrees with the images"),
+        (lambda s: s[::-1], "exchanged"),
+        (lambda s: s + np.array([[[12.0, 0.0]], [[0.0, 0.0]]]), "the left camera"),
+        (
+            lambda s: _scaled(s, 0.94),
+            "all tags are 6 % smaller than those of the calibration; print them in their size",
+        ),
+    ],
+    ids=["sound", "exchanged", "moved", "fit to page"],
+)
+def test_a_calibrated_run_tells_what_changed_since(calibrated, change, words):
+    q = calibrated.q_reference
+    s = change(predict(calibrated, q[None])[0])
+    seen = SimpleNamespace(marker=calibrated.marker.tolist(), q=q, s=s, views=())
+    finding = preflight._against(calibrated, seen, (640, 480))
+    assert words in f"{finding.text}: {finding.remedy}"
+    assert (finding.level == "fine") == (words == "agrees with the images")
+
+
+def _scaled(s, factor):
+    """Images of tags printed smaller, each about its own centre."""
+    tags = s.reshape(2, -1, 4, 2)
+    center = tags.mean(axis=2, keepdims=True)
+    return (center + factor * (tags - center)).reshape(s.shape)
+
+
+def test_motions_of_a_sound_arm_tell_latency_hysteresis_and_backlash():
+    found, moved = findings(Faults(latency_s=(0.12, 0.06), hysteresis_deg=0.6, backlash_deg=0.4))
+    assert [one.level for one in found] == ["fine"] * len(found)
+    late = {one.where: float(one.text.split()[1]) for one in found if one.text.startswith("latency")}
+    assert late == {"left camera": pytest.approx(120, abs=5), "right camera": pytest.approx(60, abs=5)}
+    for one in found[:5]:
+        hysteresis = float(one.text.split("hysteresis ")[1].split("°")[0])
+        assert hysteresis == pytest.approx(0.6, abs=0.12)
+        assert "backlash 0.3" in one.text or "backlash 0.4" in one.text
+    assert max(np.degrees(np.ptp(one.q)) for one in moved) < 8.0
+
+
+@pytest.mark.parametrize(
+    ("faults", "where", "words"),
+    [
+        (
+            Faults(link=3),
+            "joints 4, 5",
+            "no tag moved: the tags sit on the link before joint 4: mount them behind",
+        ),
+        (Faults(loose=3, loose_px=3.0), "tags", "tag 3 moved by"),
+        (Faults(held=1), "joint 2", "went 0 deg of 3 deg: it is held or too weak: look what holds it"),
+    ],
+)
+def test_motions_name_what_a_recording_would_fail_at(faults, where, words):
+    found, _ = findings(faults)
+    (fault,) = (one for one in found if one.level == "fault")
+    assert fault.where == where
+    assert words in f"{fault.text}: {fault.remedy}"
+
+
+def test_a_live_page_serves_both_images_to_this_machine_alone():
+    page = LivePage("arm <1>")
+    assert page.url.startswith("http://127.0.0.1:")
+    page.pictures["left"] = b"JPEG-1"
+    with urllib.request.urlopen(page.url, timeout=5) as answer:
+        text = answer.read().decode()
+    assert "Live images of arm &lt;1&gt;" in text
+    assert 'src="/right.mjpg"' in text
+    with urllib.request.urlopen(f"{page.url}left.mjpg", timeout=5) as answer:
+        assert answer.headers["Content-Type"].startswith("multipart/x-mixed-replace")
+        head = [answer.readline() for _ in range(4)]
+        assert head[:2] == [b"--frame\r\n", b"Content-Type: image/jpeg\r\n"]
+        assert answer.read(6) == b"JPEG-1"
+    page.close()

@@ -1,0 +1,72 @@
+"""Progress of a recording: a note after each pose, and a page with both images of the last one."""
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.hardware.streams import Stream, picture
+from tests.hardware.test_preflight import CONFIGURATION
+
+
+class Walking:
+    """Two joints that stand where they are sent, but for a tenth of a degree of the second one."""
+
+    def __init__(self):
+        self.q, self.time = np.zeros(2), 0.0
+
+    def now(self):
+        return self.time
+
+    def open(self):
+        pass
+
+    def joints(self):
+        return self.q + np.radians([0.0, -0.1]), self.time
+
+    def command(self, target, speed, due):
+        self.q, self.time = target.copy(), due
+
+    def stop(self):
+        pass
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def recording(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    images = picture(at=(60.0, 80.0)), picture(at=(80.0, 90.0))
+    streams = [Stream(lambda image=image: image) for image in images]
+    text = CONFIGURATION.format(left=streams[0].url, right=streams[1].url, rate=30, options="")
+    config = yaml.safe_load(text)
+    config["plant"] = "tests.hardware.test_recording:Walking"
+    config["data"]["joints"] = "RR"
+    config["markers"] = {"numbers": [0, 1, 2, 3], "face": [0, 1, 2, 3]}
+    config["robot"]["limits"]["joints"] = [[-90, 90]] * 2
+    config["calibration"] = {
+        "reference": {"joints": [0, 0], "unit": "deg"},
+        "frames_per_joint": 2,
+        "random_poses": 1,
+    }
+    config["cameras"]["max_age_s"] = config["cameras"]["reconnect_s"] = 1e6  # its clock is none of the wall
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    yield tmp_path
+    for stream in streams:
+        stream.close()
+
+
+def test_a_recording_notes_its_worst_joint_and_shows_the_last_images(projservo, recording, monkeypatch):
+    notes = []
+    monkeypatch.setattr(
+        "projservo_cli.cli.output.Console.progress",
+        lambda self, what, done, total, note="": notes.append((what, done, total, note)),
+    )
+    answer = projservo("record", "-c", "arm.yaml", "-o", "arm.csv", "--json")
+    assert answer.code == 0, answer.err
+    assert [note[:3] for note in notes] == [("record", k, 6) for k in range(1, 7)]
+    assert notes[-1][3] == "markers 4|4, joint 2 0.1 deg off"
+    page = (recording / "arm.html").read_text(encoding="utf-8")
+    assert "6 of 6 poses; markers 4|4, joint 2 0.1 deg off" in page
+    assert page.count("data:image/jpeg;base64,") == 2
+    assert 'http-equiv="refresh"' not in page

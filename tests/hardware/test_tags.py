@@ -1,0 +1,101 @@
+"""The command tags: true scale for the detector of the project, and a net that folds to the roof."""
+
+import math
+
+import numpy as np
+import pytest
+
+from projservo_cli.config.markers import GROUND, Markers
+from projservo_cli.detection import TagFinder
+from projservo_cli.hardware import tags
+
+pdfium = pytest.importorskip("pypdfium2")
+pytest.importorskip("cv2")
+
+DPI = 300
+PX_MM = DPI / 25.4
+
+
+def page(path):
+    """Grey values of the page of a PDF, and its width and height, mm."""
+    document = pdfium.PdfDocument(path)
+    size = np.array(document[0].get_size()) * 25.4 / 72
+    image = np.asarray(document[0].render(scale=DPI / 72, grayscale=True).to_pil(), dtype=float)
+    document.close()
+    return image, size
+
+
+def sides(corners):
+    return np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1) / PX_MM
+
+
+@pytest.mark.parametrize(
+    ("kind", "size_mm", "dictionary", "paper", "count"),
+    [
+        ("single", 30, "4X4_50", "a4", 16),
+        ("plate", 55, "APRILTAG_36H11", "letter", 4),
+        ("roof", 30, "4X4_50", "letter", 5),
+        ("roof", 42, "5X5_100", "a4", 5),
+    ],
+)
+def test_printed_tags_are_found_at_their_size(projservo, tmp_path, kind, size_mm, dictionary, paper, count):
+    file = tmp_path / "tags.pdf"
+    given = ("--kind", kind, "--size-mm", size_mm, "--dictionary", dictionary, "--paper", paper)
+    value = projservo("tags", "-o", file, *map(str, given), "--json").json
+    image, size = page(file)
+    assert size == pytest.approx(tags.PAPERS[paper], abs=0.01)
+    found, ambiguous = TagFinder(dictionary).find(image)
+    assert (len(found), ambiguous) == (count, ())
+    assert sorted(found) == sorted(value["tags"])
+    for tag in found.values():
+        assert tag.clean.all()
+        assert sides(tag.pixels) == pytest.approx(size_mm, rel=2e-3)
+
+
+def test_a_folded_net_is_the_described_roof(projservo, tmp_path):
+    file, size = tmp_path / "tags.pdf", 30.0
+    projservo("tags", "--kind", "roof", "-o", file)
+    found, _ = TagFinder("4X4_50").find(page(file)[0])
+    flat = {n: np.c_[t.pixels[:, 0], -t.pixels[:, 1]] / PX_MM for n, t in found.items()}
+    origin, half, tilt = flat[0].mean(axis=0), 0.5 * GROUND * size, math.radians(35)
+    body = Markers.model_validate({"tags": "roof", "tag_size_m": 1e-3 * size}).all_tags
+    for tag in body:
+        corners = flat[tag.number] - origin
+        out = corners.mean(axis=0)
+        folded = np.c_[corners, np.zeros(4)]
+        if tag.number:
+            out /= np.linalg.norm(out)
+            beyond = corners @ out - half
+            folded[:, :2] += np.outer(beyond * (math.cos(tilt) - 1.0), out)
+            folded[:, 2] = -beyond * math.sin(tilt)
+        folded[:, 2] += 1.5 * half
+        assert folded == pytest.approx(1e3 * tag.corners, abs=0.06)  # mm
+
+
+def test_triangles_of_the_net_close_the_gaps_of_the_tilted_roof():
+    body = Markers.model_validate({"tags": "roof", "tag_size_m": 0.03}).all_tags
+    net = tags.unfolded([tag.number for tag in body], np.array([tag.pose for tag in body]))
+    tilt, width = math.radians(35), 0.03 * GROUND * 1e3
+    a = width * np.array([math.cos(tilt), 0, -math.sin(tilt)])
+    b = width * np.array([0, math.cos(tilt), -math.sin(tilt)])
+    (_, flap, brim, end) = next(line.points for line in net.lines if len(line.points) == 4 and not line.fold)
+    assert np.linalg.norm(brim - end) == pytest.approx(np.linalg.norm(a - b))
+    assert np.linalg.norm(brim - flap) > 5.0  # mm, wide enough to take glue
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("--kind", "roof", "--size-mm", "60"), "a4 has 194 x 225 mm for them: take about 45 mm"),
+        (("--numbers", "3,60"), "there is no tag 60 in the dictionary, which has tags 0 to 49"),
+        (("--numbers", "3,a"), "expected numbers of tags such as 0-4,7"),
+        (("--numbers", "0-40"), "a4 takes 16 tags with margins of 40 mm, not 41: take smaller tags"),
+        (("--kind", "roof", "--numbers", "3"), "--numbers: is for --kind single"),
+        (("--dictionary", "4X4"), "--dictionary 4X4: unknown; valid: 4X4_100"),
+    ],
+)
+def test_a_sheet_that_cannot_be_is_refused(projservo, tmp_path, given, words):
+    answer = projservo("tags", "-o", tmp_path / "tags.pdf", *given)
+    assert answer.code == 2
+    assert words in answer.err
+    assert not (tmp_path / "tags.pdf").exists()

@@ -1,0 +1,129 @@
+"""The ten commands of the tutorial of the SO-101, typed on an emulated arm and two emulated webcams."""
+
+import json
+import os
+import re
+import time
+import types
+
+import numpy as np
+import pytest
+
+from projservo_cli.cli import run
+from projservo_cli.hardware import feetech, so101
+from projservo_cli.records import InputError
+from tests.documentation.blocks import PAGES, blocks_of
+from tests.emulated.arm import Arm, Clock, Mechanics
+from tests.emulated.cameras import Cameras, Optics
+from tests.emulated.servos import Bus
+
+START, GOAL = (0.0, 10.0, -25.0, 15.0, 0.0), (16.0, -2.0, -2.0, -6.0, 35.0)
+RATE = 0.7  # of the emulated clock
+# What makes the recording short, and the tags as large as those of the emulator.
+SHORTER = {
+    "amplitude_deg: 20": "amplitude_deg: 18",
+    "frames_per_joint: 6": "frames_per_joint: 2\n  random_poses: 3",
+    "averaged_frames: 5": "averaged_frames: 2\n  timeout_s: 10",
+    "tag_size_m: 0.03": "tag_size_m: 0.04",
+}
+
+
+def commands():
+    """The commands of the page, as lists of words."""
+    lines = "\n".join(block.text for block in blocks_of(PAGES["so101"])).splitlines()
+    return [line.split()[1:] for line in lines if line.startswith("projservo ")]
+
+
+def by_hand(arm, *ways):
+    """Somebody who moves an arm to one pose after the other (n,), deg."""
+
+    def move():
+        for q in ways:
+            arm.put(q, 300.0)
+            while np.abs(np.degrees(arm.q) - q).max() > 0.01:
+                arm.clock.sleep(0.02)
+                arm.advance()
+            arm.clock.sleep(0.2)
+
+    return move
+
+
+def through_all(span=75.0):
+    """Poses of one joint after the other at both ends of what is allowed, deg."""
+    ends = [np.array(START) + side * span * row for row in np.eye(5) for side in (-1, 1, 0)]
+    return [np.clip(q, -130.0, 130.0) for q in ends]
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch):
+    """An emulated arm with its cameras, and somebody who presses Enter."""
+    monkeypatch.chdir(tmp_path)
+    clock = Clock(RATE)
+    monkeypatch.setattr(so101.tempfile, "gettempdir", lambda: str(tmp_path))
+    # Compiling and importing take the bus, which is in this process, its turn for seconds.
+    monkeypatch.setattr(feetech, "_PATIENCE_S", 5.0)
+    monkeypatch.setattr(so101.SO101, "now", staticmethod(clock.now))
+    monkeypatch.setattr(so101.SO101, "sleep", staticmethod(clock.sleep))
+    script = []
+
+    def enter():
+        if script and (act := script.pop(0)):
+            act()
+        return "\n"
+
+    monkeypatch.setattr("sys.stdin", types.SimpleNamespace(isatty=lambda: True, readline=enter))
+    arm = Arm(clock, START, Mechanics())
+    try:
+        with Bus(arm) as bus, Cameras(arm, Optics(rate_hz=15.0)) as cameras:
+            monkeypatch.setattr(so101, "candidate_ports", lambda: [bus.port])
+            yield types.SimpleNamespace(arm=arm, bus=bus, cameras=cameras, script=script, folder=tmp_path)
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="plans and drives")
+def test_ten_commands_lead_from_an_empty_folder_to_the_taught_goal(bench, capsys):
+    arm, file = bench.arm, bench.folder / "arm.yaml"
+    acts = {
+        "limits": [None, by_hand(arm, *through_all())],
+        "teach --start": [None, by_hand(arm, START), None],
+        "teach": [None, by_hand(arm, GOAL), lambda: setattr(bench, "taught", arm.link.copy())],
+    }
+    given = commands()
+    assert [words[0] for words in given][:10] == [
+        *("init", "tags", "limits", "teach", "teach", "doctor", "record", "plan", "servo", "release")
+    ]
+    printed = {}
+    for words in given[:10]:
+        bench.script[:] = acts.get(" ".join(words[: 1 + ("--start" in words)]), [])
+        begun = time.monotonic()
+        assert run(words) == 0, f"{words}: {''.join(capsys.readouterr())}"
+        printed[words[0]] = capsys.readouterr()
+        with capsys.disabled():
+            print(f"{words[0]} {time.monotonic() - begun:.0f} s", flush=True)
+        if words[0] == "init":
+            text = file.read_text()
+            for before, after in SHORTER.items():
+                assert before in text
+                text = text.replace(before, after)
+            text = text.replace("source: 0", f"source: '{bench.cameras.left}'")
+            file.write_text(text.replace("source: 2", f"source: '{bench.cameras.right}'"))
+        if words[0] == "servo":
+            bench.reached = arm.link.copy()
+    assert "torque is on: the arm holds" in printed["servo"].err
+    assert "torque is off" in printed["release"].err
+    off = np.degrees(np.abs(bench.reached - bench.taught))
+    assert off.max() < 0.5, off
+    _homed_since(bench, capsys)
+
+
+def _homed_since(bench, capsys):
+    """An arm that was homed after it was recorded is named before anything moves."""
+    servo = bench.bus.servos[3]
+    servo.put(31, 2, 40)
+    written = len(bench.bus.writes)
+    assert run(["servo", "-c", "arm.yaml", "--json", "--force"]) == 1
+    told = capsys.readouterr()
+    assert re.search(r"readings mean something else .* 3:0/4095/12/0/0 is now 3:0/4095/12/40/0", told.err)
+    assert json.loads(told.out)
+    assert not [row for row in bench.bus.writes[written:] if row[2] == 42]
