@@ -35,6 +35,10 @@ _UNDETERMINED = 0.3
 # Singular value of the invariance, over the largest, below which a second form is invariant too.
 _SECOND_FORM = 1e-6
 _MM_PER_M = 1e3
+_ALL_PARALLEL = (
+    "metric: within their noise all revolute axes are parallel, which leaves the stretch along them open: a "
+    "revolute joint about another direction would fix it"
+)
 
 Scale = str | tuple[int, int]
 
@@ -112,6 +116,13 @@ def exponentials(axes: FloatArray, prismatic: BoolArray, q: FloatArray) -> Float
     return np.asarray(np.eye(4) + sine * H + versine * (H @ H))
 
 
+def rigid(rotation_vector: FloatArray, shift: FloatArray) -> FloatArray:
+    """Rigid displacement (4, 4) by a rotation vector (3,), rad, and a shift (3,), m."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(rotation_vector).as_matrix(), shift
+    return T
+
+
 def rigid_inverse(T: FloatArray) -> FloatArray:
     """Inverse of rigid displacements (…, 4, 4)."""
     R = T[..., :3, :3].swapaxes(-1, -2)
@@ -147,32 +158,14 @@ def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
     changes = (moved + np.einsum("...nacs->...ncas", moved)).reshape(*L.shape[:-3], -1, 6)
     _, sizes, rows = np.linalg.svd(changes)
     if (sizes[..., 4] < _SECOND_FORM * sizes[..., 0]).any():
-        raise InputError(_all_parallel())
+        raise InputError(_ALL_PARALLEL)
     S = np.einsum("...s,sab->...ab", rows[..., 5, :], basis)
     S *= np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None]
     try:
         A = np.linalg.cholesky(S)
     except np.linalg.LinAlgError:
-        raise InputError(_all_parallel()) from None
+        raise InputError(_ALL_PARALLEL) from None
     return np.concatenate([np.linalg.solve(A, D), a_inf[..., None, :]], axis=-2)
-
-
-def _all_parallel() -> str:
-    return (
-        "metric: within their noise all revolute axes are parallel, which leaves the stretch along them "
-        "open: a revolute joint about another direction would fix it"
-    )
-
-
-@dataclass(frozen=True)
-class _Frames:
-    """Choices that stay the same for all models of a calibration: joints and markers that frames rest on."""
-
-    joint: int  # first joint whose direction is not that of joint 1
-    first: int  # first revolute joint
-    second: int  # first revolute joint not parallel to it
-    face: list[int]  # indices of the markers of the face
-    across: int  # index of the marker that is off the line of the first two of the face
 
 
 def _directions(axes: FloatArray, prismatic: BoolArray) -> FloatArray:
@@ -181,26 +174,37 @@ def _directions(axes: FloatArray, prismatic: BoolArray) -> FloatArray:
     return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
 
-def _choose_frames(axes: FloatArray, prismatic: BoolArray, M: FloatArray, face: Sequence[int]) -> _Frames:
-    """Choose what both frames rest on. Raises InputError if the markers lie on one line."""
+def base_joints(axes: FloatArray, prismatic: BoolArray) -> tuple[int, int, int]:
+    """Joints that the base frame rests on, by screws (n, 6): for x, then the pair for the origin.
+
+    Raises InputError if all revolute axes are parallel.
+    """
     d = _directions(axes, prismatic)
     sine = np.linalg.norm(np.cross(d[:, None], d[None]), axis=-1)
     turning = np.flatnonzero(~prismatic)
-    off = [i for i in turning if sine[turning[0], i] > _PARALLEL]
-    if not off:
-        raise InputError(_all_parallel())
-    if len(face) < 3:
-        raise InputError(f"metric: a face of {len(face)} markers: a frame of the tool needs three")
-    rest = M[[*face[2:]]] - M[face[0]]
-    side = M[face[1]] - M[face[0]]
-    area = np.linalg.norm(np.cross(rest, side), axis=1)
-    far = area > _PARALLEL * np.linalg.norm(rest, axis=1) * np.linalg.norm(side)
-    if not far.any():
-        raise InputError("metric: the markers of the face lie on one line: name three that do not")
-    return _Frames(
-        int(np.argmax(sine[0] > _PARALLEL)), int(turning[0]), int(off[0]), [*face],
-        face[2 + int(np.argmax(far))],
-    )  # fmt: skip
+    off = turning[sine[turning[0], turning] > _PARALLEL]
+    if not off.size:
+        raise InputError(_ALL_PARALLEL)
+    return int(np.argmax(sine[0] > _PARALLEL)), int(turning[0]), int(off[0])
+
+
+def base_frame(axes: FloatArray, prismatic: BoolArray, joints: tuple[int, int, int]) -> FloatArray:
+    """Pose (…, 4, 4) of the base frame of screws (…, n, 6) at readings of zero, by ``base_joints``."""
+    d, (k, i, j) = _directions(axes, prismatic), joints
+    w, u = axes[..., i, :3], axes[..., j, :3]
+    p, r = np.cross(w, axes[..., i, 3:]), np.cross(u, axes[..., j, 3:])
+    normal = np.cross(w, u)
+    along = (np.cross(r - p, u) * normal).sum(axis=-1) / (normal**2).sum(axis=-1)
+    return _frame(np.cross(d[..., 0, :], d[..., k, :]), d[..., 0, :], p + along[..., None] * w)
+
+
+def _off_line(M: FloatArray, face: Sequence[int]) -> int:
+    """Index of the marker of a face that is off the line of its first two. Raises InputError if none is."""
+    for j in face[2:]:
+        a, b = M[face[1]] - M[face[0]], M[j] - M[face[0]]
+        if np.linalg.norm(np.cross(a, b)) > _PARALLEL * np.linalg.norm(a) * np.linalg.norm(b):
+            return j
+    raise InputError("metric: the face has no three markers off one line, which a frame of the tool needs")
 
 
 def _frame(x: FloatArray, z: FloatArray, origin: FloatArray) -> FloatArray:
@@ -212,21 +216,11 @@ def _frame(x: FloatArray, z: FloatArray, origin: FloatArray) -> FloatArray:
     return T
 
 
-def _base_frame(axes: FloatArray, prismatic: BoolArray, frames: _Frames) -> FloatArray:
-    """Pose (…, 4, 4) of the base frame, by axes (…, n, 6) at readings of zero."""
-    d = _directions(axes, prismatic)
-    w, u = axes[..., frames.first, :3], axes[..., frames.second, :3]
-    p, r = np.cross(w, axes[..., frames.first, 3:]), np.cross(u, axes[..., frames.second, 3:])
-    normal = np.cross(w, u)
-    along = (np.cross(r - p, u) * normal).sum(axis=-1) / (normal**2).sum(axis=-1)
-    return _frame(np.cross(d[..., 0, :], d[..., frames.joint, :]), d[..., 0, :], p + along[..., None] * w)
-
-
-def _tool_frame(M: FloatArray, frames: _Frames) -> FloatArray:
-    """Pose (…, 4, 4) of the tool frame among markers (…, m, 3)."""
-    start = M[..., frames.face[0], :]
-    x, y = M[..., frames.face[1], :] - start, M[..., frames.across, :] - start
-    return _frame(x, np.cross(x, y), M[..., frames.face, :].mean(axis=-2))
+def _tool_frame(M: FloatArray, face: Sequence[int], across: int) -> FloatArray:
+    """Pose (…, 4, 4) of the tool frame among markers (…, m, 3), of which one is off the line of the first."""
+    start = M[..., face[0], :]
+    x, y = M[..., face[1], :] - start, M[..., across, :] - start
+    return _frame(x, np.cross(x, y), M[..., [*face], :].mean(axis=-2))
 
 
 class _Projective(NamedTuple):
@@ -271,8 +265,8 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
     moved = np.stack(chain[:-1], axis=1)
     axes = screws(moved @ twists(at_reference) @ rigid_inverse(moved))
     axes[:, c.prismatic, :3] = 0.0
-    frames = _choose_frames(axes[0], c.prismatic, M[0], face)
-    base, tool = _base_frame(axes, c.prismatic, frames), _tool_frame(M, frames)
+    base = base_frame(axes, c.prismatic, base_joints(axes[0], c.prismatic))
+    tool = _tool_frame(M, face, _off_line(M[0], face))
     inverse = rigid_inverse(base)
     P = models.P @ back[:, None] @ base[:, None]
     P /= np.linalg.norm(P[..., 2, :3], axis=-1)[..., None, None]
@@ -365,10 +359,10 @@ class Metric:
             bodies = _bodies(models, c, list(chosen))
             K = bodies.intrinsics()
         except np.linalg.LinAlgError:
-            raise InputError(_all_parallel()) from None
+            raise InputError(_ALL_PARALLEL) from None
         change = np.linalg.solve(K[0], (K[1 : 1 + factor.shape[1]] - K[1 + factor.shape[1] :]))
         if np.sqrt((change**2).sum(axis=(0, 2, 3))).min() > 2.0 * _STEP * _UNDETERMINED:
-            raise InputError(_all_parallel())
+            raise InputError(_ALL_PARALLEL)
         known = _length_of(bodies, between, marker, c.prismatic)
         if not known[0] > 0.0:
             raise InputError(f"metric: the markers {between} of the known length are one point")
@@ -460,11 +454,11 @@ class Metric:
         return np.asarray(C.reshape(*s.shape[1:-1], 3, 3))
 
     def covariance(self, name: str) -> FloatArray:
-        """Covariance of an array: K, lens, poses, axes or markers.
+        """Covariance of an array: K, lens, poses, axes, markers or tool.
 
         Of ``K`` (2, 5, 5): fx, skew, cx, fy, cy, px; of ``lens`` (2, 2, 2): k1, k2; of ``poses`` (2, 6, 6):
         rotation vector, rad, and position, m, in the base frame; of ``axes`` (n, 6, 6); of ``markers``
-        (m, 3, 3), m².
+        (m, 3, 3), m²; of ``tool`` (1, 6, 6), its pose at readings of zero.
         """
         return _covariances(self.deviations(name))
 
@@ -478,6 +472,7 @@ class Metric:
             "poses": lambda: self._changes(lambda body: body.camera_poses(), _pose_difference),
             "axes": lambda: self._changes(lambda body: body.axes),
             "markers": lambda: self._changes(lambda body: body.markers),
+            "tool": lambda: self._changes(lambda body: body.tool[:, None], _pose_difference),
         }
         if name not in parts:
             raise InputError(f"metric: no covariance of {name!r}: choose one of {', '.join(parts)}")

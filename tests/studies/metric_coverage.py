@@ -1,8 +1,8 @@
 """Whether 95 % regions of the metric hold the truth: ``python -m tests.studies.metric_coverage [ARM …]``.
 
-Each draw is a calibration of a simulated arm at 0.5 px from its own trial motions, and a length between the two
-markers farthest apart, known to 0.2 %. Prints, for each arm, the share of regions that hold the truth: of the
-intrinsics and the pose of each camera, of each axis, and of tool positions at ten poses within the data's range.
+Each draw is a calibration of a simulated arm at 0.5 px from its own trial motions, and a length between the
+two markers farthest apart, known to 0.2 %. Prints, for each arm, the share of regions that hold the truth: of
+the intrinsics and the pose of each camera, of each axis, and of tool positions within the data's range.
 """
 
 import argparse
