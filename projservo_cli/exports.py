@@ -75,6 +75,7 @@ def opencv_yaml(found: OpenCV, size: tuple[int, int] | None) -> str:
     lines = ["%YAML:1.0", "---", f"delta_chi2: {found.delta_chi2!r}"]
     if size is not None:
         lines += [f"image_width: {size[0]}", f"image_height: {size[1]}"]
+    K[:, 0, 1] = 0.0  # what rounding leaves
     world, dist = rigid_inverse(poses), found.distortion()
     for v, view in enumerate(VIEWS):
         lines += _matrix(f"{view}_camera_matrix", K[v])

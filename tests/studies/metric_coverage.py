@@ -23,7 +23,8 @@ NOISE_PX = 0.5
 LENGTH_STD = 0.002  # of the length
 SEED = 330_000  # of draw 0
 POSES = 10  # of the tool
-RANK = 1e-9  # of the largest eigenvalue: directions that frames fix
+RANK = 1e-9  # of the largest eigenvalue, below which a direction is fixed
+FIXED = 1e-18  # of the largest eigenvalue, in rad², m² or px², of what a frame fixes
 
 
 def true_metric(truth, calibration, length):
@@ -52,14 +53,16 @@ def longest(truth, calibration):
 
 
 def held(error, covariance):
-    """Whether each error (k, d) is in the 95 % region of its covariance (k, d, d); NaN if that is empty."""
+    """Whether each error (k, d) is in the 95 % region of its covariance (k, d, d); NaN if that is empty.
+
+    A region has no more directions than its covariance: a unit vector has two, a line four.
+    """
     result = np.full(len(error), np.nan)
     for k, (e, C) in enumerate(zip(error, covariance, strict=True)):
-        unit = np.sqrt(np.maximum(np.diag(C), 1e-300))
-        values, vectors = np.linalg.eigh(C / np.outer(unit, unit))
-        known = (values > RANK * values[-1]) & (C.max() > 1e-18)
+        values, vectors = np.linalg.eigh(C)
+        known = (values > RANK * values[-1]) & (values[-1] > FIXED)
         if known.any():
-            square = ((vectors.T @ (e / unit))[known] ** 2 / values[known]).sum()
+            square = ((vectors.T @ e)[known] ** 2 / values[known]).sum()
             result[k] = square <= chi2.ppf(0.95, known.sum())
     return result
 
