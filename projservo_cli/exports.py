@@ -9,9 +9,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.kinematic_errors import JointError
+from projservo_cli.geometry.lens import distort
 from projservo_cli.geometry.metric import Body, Metric, rigid_inverse
 from projservo_cli.records import VIEWS, FloatArray
 
+# Arrays that move along with the cameras.
+_MOVED = ("lens", "poses", "axes", "tool", "markers")
 # Limits of a URDF joint that no calibration knows: N m or N, and rad/s or m/s.
 _EFFORT, _SPEED = 100.0, 1.0
 
@@ -19,43 +22,72 @@ _EFFORT, _SPEED = 100.0, 1.0
 class OpenCV(NamedTuple):
     """Robot and rig whose cameras are OpenCV's, and what that costs."""
 
-    body: Body
-    delta_chi2: float  # increase of the squared residuals over the squared noise, to first order
-    conditions: int  # number of conditions: as many as it costs on average where they are true
+    body: Body  # without lenses
+    distortion: FloatArray  # (2, 5) k1, k2, p1, p2, k3
+    delta_chi2: float  # increase of the squared residuals over the squared noise, for no skew
+    lens_rms_px: float  # difference between both lenses where markers were seen, px
 
-    def distortion(self) -> FloatArray:
-        """OpenCV's coefficients (2, 5): k1, k2, p1, p2, k3."""
-        scale = (self.body.intrinsics()[:, 0, 0] / self.body.lens[:, 2]) ** 2
-        k1, k2 = self.body.lens[:, 3:].T
-        return np.pad(np.stack([k1 * scale, k2 * scale**2], axis=1), ((0, 0), (0, 3)))
+    def pixels(self, points: FloatArray) -> FloatArray:
+        """Pixels (K, 2, 2) of points (K, 3) of the base frame, by view."""
+        K, straight = self.body.intrinsics(), self.body.pixels(points)
+        bent = _terms(_normalized(K, straight)) @ self.distortion[:, :, None]
+        focal = np.diagonal(K[:, :2, :2], axis1=1, axis2=2)
+        return np.asarray(straight + bent[..., 0].reshape(straight.shape) * focal)
 
 
 def opencv_cameras(metric: Metric) -> OpenCV:
-    """Return the most likely robot and rig whose cameras have no skew, and OpenCV's lens where they have one.
+    """Return the most likely robot and rig whose cameras have no skew, and OpenCV's lens about their centre.
 
-    OpenCV's lens is about the principal point and in units of the focal lengths: with a lens, the principal
-    point is its centre and pixels are square. All else moves along by the covariance.
+    All else moves along by the covariance. The lens is fitted to the calibrated one over its radius, within
+    which markers were seen; its two terms of tangential distortion carry it to the principal point.
     """
-    K, lens, of_K = metric.K, metric.lens.copy(), metric.deviations("K")
-    g, G = K[:, 0, 1:2], of_K[..., 1:2]
-    if lens[:, 3:].any():
-        off = K[:, :2, 2] - lens[:, :2]
-        g = np.concatenate([g, off, K[:, 0, :1] - K[:, 1, 1:2]], axis=1)
-        G = np.concatenate([G, of_K[..., [2, 4]], of_K[..., :1] - of_K[..., 3:4]], axis=2)
-    g, G = g.ravel(), G.reshape(len(of_K), -1).T
-    e = -G.T @ np.linalg.solve(G @ G.T, g)  # the most likely errors that meet the conditions
+    K, of_K = metric.K, metric.deviations("K")
+    skew = of_K[..., 1]
+    e = -skew @ np.linalg.solve(skew.T @ skew, K[:, 0, 1])  # the most likely errors that undo it
+    change = {name: np.tensordot(e, metric.deviations(name), 1) for name in _MOVED}
     K[:, (0, 0, 0, 1, 1), (0, 1, 2, 1, 2)] += np.tensordot(e, of_K, 1)
-    lens[:, 3:] += np.tensordot(e, metric.deviations("lens"), 1)
-    axes = metric.axes + np.tensordot(e, metric.deviations("axes"), 1)
-    w, v = axes[~metric.prismatic, :3], axes[~metric.prismatic, 3:]
+    lens = metric.lens.copy()
+    lens[:, 3:] += change["lens"]
+    axes, turning = metric.axes + change["axes"], ~metric.prismatic
+    w, v = axes[turning, :3], axes[turning, 3:]
     w = w / np.linalg.norm(w, axis=1, keepdims=True)
-    axes[~metric.prismatic] = np.concatenate([w, v - w * (w * v).sum(axis=1, keepdims=True)], axis=1)
-    turns = np.tensordot(e, metric.deviations("poses"), 1)
-    rigs = [_shifted(T, turn) for T, turn in zip(metric.poses, turns, strict=True)]
-    tool = _shifted(metric.body.tool, np.tensordot(e, metric.deviations("tool"), 1)[0])
-    P = K @ rigid_inverse(np.array(rigs))[:, :3]
-    markers = metric.markers + np.tensordot(e, metric.deviations("markers"), 1)
-    return OpenCV(Body(P, lens, axes, tool, markers), float(e @ e), len(g))
+    axes[turning] = np.concatenate([w, v - w * (w * v).sum(axis=1, keepdims=True)], axis=1)
+    rigs = np.array([_shifted(T, by) for T, by in zip(metric.poses, change["poses"], strict=True)])
+    tool = _shifted(metric.body.tool, change["tool"][0])
+    straight = lens * [1.0, 1.0, 1.0, 0.0, 0.0]
+    body = Body(K @ rigid_inverse(rigs)[:, :3], straight, axes, tool, metric.markers + change["markers"])
+    coefficients, rms = zip(*(_fitted_lens(K[v], lens[v]) for v in (0, 1)), strict=True)
+    return OpenCV(body, np.array(coefficients), float(e @ e), float(np.sqrt(np.mean(np.square(rms)))))
+
+
+def _normalized(K: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Undistorted pixels (…, 2) in units of the focal lengths from the principal point."""
+    return (pixels - K[..., :2, 2]) / np.diagonal(K[..., :2, :2], axis1=-2, axis2=-1)
+
+
+def _terms(x: FloatArray) -> FloatArray:
+    """Shifts (…, 2, 5) of normalized points (…, 2) by a unit of k1, k2, p1, p2, k3, as OpenCV has them."""
+    square = (x**2).sum(axis=-1)[..., None]
+    radial = [x * square**power for power in (1, 2, 3)]
+    product = 2.0 * x[..., :1] * x[..., 1:]
+    p1 = np.concatenate([product, square + 2.0 * x[..., 1:] ** 2], axis=-1)
+    p2 = np.concatenate([square + 2.0 * x[..., :1] ** 2, product], axis=-1)
+    return np.stack([*radial[:2], p1, p2, radial[2]], axis=-1)
+
+
+def _fitted_lens(K: FloatArray, lens: FloatArray) -> tuple[FloatArray, float]:
+    """Coefficients (5,) of OpenCV's lens nearest to a lens (5,), and the difference that is left, rms px."""
+    if not lens[3:].any():
+        return np.zeros(5), 0.0
+    radius, angle = np.meshgrid(np.linspace(0.1, 1.0, 10), np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False))
+    pixels = lens[:2] + lens[2] * (radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    pixels = pixels.reshape(-1, 2)
+    focal = np.diag(K)[:2]
+    A = (_terms(_normalized(K, pixels)) * focal[:, None]).reshape(-1, 5)
+    target = (distort(lens, pixels) - pixels).ravel()
+    scale = np.linalg.norm(A, axis=0)
+    found = np.linalg.lstsq(A / scale, target)[0] / scale
+    return found, float(np.sqrt(2.0 * np.mean((A @ found - target) ** 2)))
 
 
 def _shifted(T: FloatArray, change: FloatArray) -> FloatArray:
@@ -76,10 +108,10 @@ def opencv_yaml(found: OpenCV, size: tuple[int, int] | None) -> str:
     if size is not None:
         lines += [f"image_width: {size[0]}", f"image_height: {size[1]}"]
     K[:, 0, 1] = 0.0  # what rounding leaves
-    world, dist = rigid_inverse(poses), found.distortion()
+    world = rigid_inverse(poses)
     for v, view in enumerate(VIEWS):
         lines += _matrix(f"{view}_camera_matrix", K[v])
-        lines += _matrix(f"{view}_distortion_coefficients", dist[v : v + 1])
+        lines += _matrix(f"{view}_distortion_coefficients", found.distortion[v : v + 1])
         lines += _matrix(f"{view}_R", world[v, :3, :3]) + _matrix(f"{view}_T", world[v, :3, 3:])
     stereo = world[1] @ poses[0]
     lines += _matrix("R", stereo[:3, :3]) + _matrix("T", stereo[:3, 3:])

@@ -21,7 +21,7 @@ from projservo_cli.geometry.metric import (
 from projservo_cli.records import BoolArray, FloatArray, InputError
 
 # Errors of axes that any model has, of machining and assembly, rad and m.
-_LINK_STD = np.repeat([1e-3, 1e-3], 3)
+_LINK_STD = np.repeat([5e-4, 5e-4], 3)
 # Step of the differences that propagate covariances, in standard deviations.
 _STEP = 1e-3
 
@@ -42,7 +42,7 @@ def kinematic_errors(metric: Metric, given: FloatArray) -> list[JointError]:
     """Compare a model with the calibrated arm, joint by joint.
 
     The base and the zeros of the inner joints are fitted first, weighted by the covariance of the axes and by
-    1 mm and 1 mrad for the links of any model. What remains are errors of axes.
+    0.5 mm and 0.5 mrad for the links of any model. What remains are errors of axes.
 
     metric : of the calibration, in metres.
     given : (n, 6) screws of the model at readings of zero, rad and m.

@@ -184,10 +184,9 @@ def _in_metres(
         words += exports.kinematic_words(errors, metric.joint_types)
     if to == "opencv":
         found = exports.opencv_cameras(metric)
-        value |= {"delta_chi2": found.delta_chi2, "conditions": found.conditions}
-        lens = "" if calibration.lens is None else ", with square pixels and the lens about their centre"
-        cost = f"Δχ² {found.delta_chi2:.3g} for {found.conditions} conditions"
-        words.insert(0, f"cameras without skew{lens}: {cost}")
+        value |= {"delta_chi2": found.delta_chi2, "lens_rms_px": found.lens_rms_px}
+        lens = f", OpenCV's lens {found.lens_rms_px:.2g} px" if calibration.lens is not None else ""
+        words.insert(0, f"cameras without skew cost Δχ² {found.delta_chi2:.3g} (2 on average){lens}")
         return exports.opencv_yaml(found, config.image_size_px), value, words
     if to == "urdf":
         names = [name or f"joint_{i}" for i, name in enumerate(config.joint_names, 1)]
