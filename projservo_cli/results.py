@@ -192,8 +192,8 @@ class ImageModel(Displayable, Calibration):
             If the joints determine no metric, the images of one camera are mirrored, the length is not known,
             or the method has no covariance.
         """
-        if not self.has_covariance or not self.shared_error.size:
-            raise InputError(f"metric: the method {self.method} has no covariance; use refined")
+        if not self.has_covariance or not self.sqrt_cov_shared.size:
+            raise InputError(f"metric: the method {self.method} has no covariance; use bundle_adjustment")
         return Metric.of(
             self,
             error_factor(self),

@@ -374,7 +374,7 @@ class Metric:
             cut = 1 + factor.shape[1]
             parts = zip(bodies, off, strict=True)
             bodies = Body(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
-        moved = np.stack([c.lowest, c.lowest + c.excitation], axis=1)
+        moved = np.stack([c.joint_min, c.joint_min + c.excitation], axis=1)
         return cls(c.joint_types, marker, c.sigma_px, bodies, moved)
 
     @property

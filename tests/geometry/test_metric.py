@@ -34,7 +34,7 @@ def calibrated(arm, frame):
     M = arm.markers @ frame.T
     fields = {field.name: None for field in dataclasses.fields(Calibration)}
     fields |= {
-        "method": "refined",
+        "method": "bundle_adjustment",
         "joint_types": arm.joint_types,
         "P": arm.cameras @ back,
         "H_hat_0": frame @ arm.twists @ back,
@@ -42,11 +42,11 @@ def calibrated(arm, frame):
         "a_inf": a_inf,
         "marker": 10 * np.arange(len(M)),
         "M": M / (M @ a_inf)[:, None],
-        "shared_error": np.zeros((24 + 16 * n, 1)),
-        "marker_error": np.zeros((len(M), 4, 1)),
-        "own_error": np.zeros((len(M), 4, 3)),
+        "sqrt_cov_shared": np.zeros((24 + 16 * n, 1)),
+        "sqrt_cov_marker": np.zeros((len(M), 4, 1)),
+        "sqrt_cov_own": np.zeros((len(M), 4, 3)),
         "sigma_px": 0.5,
-        "lowest": np.full(n, -1.0),
+        "joint_min": np.full(n, -1.0),
         "excitation": np.full(n, 2.0),
     }
     return ImageModel(**fields)
@@ -134,8 +134,8 @@ def test_two_axes_that_noise_alone_makes_skew_have_no_metric():
     c = projservo.calibrate(projservo.simulate(config, seed=5))
     q = c.q_reference[[1, 2]]
     part = dataclasses.replace(
-        c, joint_types="RR", H_hat_0=c.H_hat_0[[1, 2]], q_reference=q, lowest=q, excitation=q,
-        shared_error=np.delete(c.shared_error, np.r_[24:40, 72:120], axis=0),
+        c, joint_types="RR", H_hat_0=c.H_hat_0[[1, 2]], q_reference=q, joint_min=q, excitation=q,
+        sqrt_cov_shared=np.delete(c.sqrt_cov_shared, np.r_[24:40, 72:120], axis=0),
     )  # fmt: skip
     with pytest.raises(InputError, match="all revolute axes are parallel"):
         part.metric(0.3, "cameras")

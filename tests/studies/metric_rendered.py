@@ -4,8 +4,8 @@ The model is off by 2° in the zeros of joints 3 and 5, and by 3 mm in the third
 from the images of rendered.yaml alone, and finds those zeros by ``kinematic_errors``. OpenCV's
 robot-world–hand–eye calibration is given the same images, true intrinsics, the true tags and the wrong model.
 Both cameras then triangulate the markers at the poses of the recording; errors are those in the true base
-frame, rms. The distance of two markers sets the scale. ``ur5`` as an argument takes simulated points of 0.5 px
-instead.
+frame, rms. The distance of two markers sets the scale. ``ur5`` as an argument takes simulated points of
+0.5 px instead.
 """
 
 import sys
