@@ -16,13 +16,11 @@ import numpy as np
 from markupsafe import Markup
 
 from projservo_cli.calibration import WEAK_NOISE, chi2_band
-from projservo_cli.calibration.detections import MAX_JUDGED, REACH_M, REACH_RAD, even_choice
-from projservo_cli.calibration.prediction import error_factor
+from projservo_cli.calibration.detections import REACH_M, REACH_RAD
 from projservo_cli.display import About
 from projservo_cli.files import lies_inside, write_whole
-from projservo_cli.geometry.metric import Metric
 from projservo_cli.laws import must_converge, name_of
-from projservo_cli.records import Calibration, InputError, Plan, Report
+from projservo_cli.records import Plan, Report
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows
 from projservo_cli.report.report_data import (
@@ -210,9 +208,7 @@ def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> _Vie
         about.configuration,
         list(_made(run, about)),
         [(label, folder + name) for name, label in _EXTRAS.items() if (run_folder / name).is_file()],
-        calibration=_calibration(found["calibrate"], about, run.calibration)
-        if "calibrate" in found
-        else None,
+        calibration=_calibration(found["calibrate"], about) if "calibrate" in found else None,
         plan=found["plan"] | _visibility(run.plan) if "plan" in found else None,
         laws=[_law(trace, about) for trace in found["servo"]["laws"]] if "servo" in found else [],
         reported=report is not None,
@@ -254,7 +250,7 @@ def _provenance_text(key: str, made: Mapping[str, Any]) -> str:
     return "" if value is None else str(value)
 
 
-def _calibration(found: dict[str, Any], about: About, record: Calibration) -> dict[str, Any]:
+def _calibration(found: dict[str, Any], about: About) -> dict[str, Any]:
     """Plain values of a calibration with its sentences, and its numbers with their labels and units."""
     lens = [
         (f"lens of the {view} camera, {k}", terms[k], "")
@@ -275,35 +271,12 @@ def _calibration(found: dict[str, Any], about: About, record: Calibration) -> di
         ("markers", found["markers_used"], ""),
         *lens,
         *_joints_and_time(found),
-        *_metric(record),
         ("time", found["seconds"], "s"),
     ]
     return found | {
         "words": list(_calibration_words(found, estimated=about.estimates_noise)),
         "numbers": numbers,
     }
-
-
-def _metric(record: Calibration) -> Iterator[tuple[str, Any, str]]:
-    """Intrinsics of both cameras with their deviations, which need no known length: label, value, unit."""
-    if not record.has_covariance or not record.sqrt_cov_shared.size:
-        return
-    few = record.with_markers(even_choice(len(record.M), MAX_JUDGED))
-    try:
-        metric = Metric.of(few, error_factor(few), length_m=1.0, between="cameras")
-    except InputError as error:
-        yield "cameras", str(error), ""
-        return
-    std = np.sqrt(np.diagonal(metric.covariance("K"), axis1=1, axis2=2))
-    for view, K, (fx, skew, cx, fy, cy) in zip(VIEWS, metric.K, std, strict=True):
-        pairs = {
-            "focal lengths": ((K[0, 0], fx), (K[1, 1], fy)),
-            "principal point": ((K[0, 2], cx), (K[1, 2], cy)),
-            "skew": ((K[0, 1], skew),),
-        }
-        for name, values in pairs.items():
-            told = ", ".join(f"{_short(value, 4)} ± {_short(deviation, 2)}" for value, deviation in values)
-            yield f"{name} of the {view} camera", told, "px"
 
 
 def _joints_and_time(found: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
