@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Self, overload
 
 import numpy as np
@@ -11,6 +12,7 @@ from projservo_cli.calibration import predict, prediction_variance, residual_sta
 from projservo_cli.calibration.prediction import error_factor, joint_derivative
 from projservo_cli.display import Displayable, require_radians
 from projservo_cli.geometry.kinematics import project as pixels_of
+from projservo_cli.geometry.metric import Metric, Scale
 from projservo_cli.records import (
     Calibration,
     CrossValidation,
@@ -165,6 +167,41 @@ class ImageModel(Displayable, Calibration):
             raise InputError(f"covariance: the method {self.method} has none; use bundle_adjustment")
         factor = error_factor(self)
         return np.asarray(factor @ factor.T)
+
+    def metric(
+        self,
+        length_m: float | None = None,
+        between: Scale = "joint",
+        *,
+        length_std_m: float = 0.0,
+        face: Sequence[int] | None = None,
+    ) -> Metric:
+        """Return cameras, axes and markers in metres, in the base frame of the arm, with covariances.
+
+        Parameters
+        ----------
+        length_m : a known length, m; not needed with ``joint``.
+        between : two ends of the length: the numbers of two markers; ``tags``, the sides of all; ``cameras``,
+            the distance of their centres; or ``joint``, the readings of the first prismatic joint.
+        length_std_m : standard deviation of the length, m.
+        face : numbers of markers whose frame the tool has, by default all.
+
+        Raises
+        ------
+        InputError
+            If the joints determine no metric, the images of one camera are mirrored, the length is not known,
+            or the method has no covariance.
+        """
+        if not self.has_covariance or not self.sqrt_cov_shared.size:
+            raise InputError(f"metric: the method {self.method} has no covariance; use bundle_adjustment")
+        return Metric.of(
+            self,
+            error_factor(self),
+            length_m=length_m,
+            between=between,
+            length_std_m=length_std_m,
+            face=face,
+        )
 
     def project(self, points: npt.ArrayLike) -> FloatArray:
         """Pixels of points of the calibration's projective frame, such as ``M``, [RH00] eq. (1).

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.calibration.position_error import Positions
 from projservo_cli.files import lines_of, write_whole
 from projservo_cli.records import FloatArray, InputError, IntArray, JointList, Observation
 
@@ -33,6 +34,7 @@ _SIGMAS = ("sigma_left", "sigma_right")  # columns of their standard deviations
 _MOVING = "moving"  # column of the number of a motion
 _TIMES = ("t_q", "t_left", "t_right")  # columns of times, s
 _IDENTITY = " of "  # in that column, before the identity of the robot
+_XYZ = ("x", "y", "z")  # columns of a position, m
 _RECORDING = "recording"  # column of the recording that a row belongs to
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
 _INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
@@ -130,6 +132,26 @@ def read_joint_list(
     q = sheet.in_radians(poses, np.array(readings), joint_unit)
     left, right = zip(*names, strict=True) if names[0] else (None, None)
     return JointList(pose=poses, q=q, numbered="pose" in sheet.columns, left=left, right=right)
+
+
+def read_positions(path: Path | str, joint_types: str, joint_unit: str | None = None) -> Positions:
+    """Read positions of a point of the tool: columns ``pose, q1 … qN, x, y, z``, m, optionally ``sigma``, m.
+
+    Arguments as for an observation table.
+    Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
+    """
+    sheet = _Sheet(path, ["pose", *_XYZ], joint_types, optional=["sigma"])
+    rows = [
+        (row.integer("pose"), [row.number(name) for name in (*sheet.joints, *_XYZ)],
+         row.number("sigma") if "sigma" in row else 0.0)
+        for row in sheet.rows()
+    ]  # fmt: skip
+    if not rows:
+        raise InputError(f"{sheet.file}: the table has a header but no rows; add a position a row")
+    numbers, values, sigma = zip(*rows, strict=True)
+    pose, found = np.array(numbers, dtype=np.int64), np.array(values)
+    q = sheet.in_radians(pose, found[:, :-3], joint_unit)
+    return Positions(pose=pose, q=q, xyz=found[:, -3:], sigma=np.array(sigma))
 
 
 def recording_of(path: Path | str) -> str | None:

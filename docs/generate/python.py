@@ -12,6 +12,7 @@ from projservo_cli import api, records
 from projservo_cli.config import Config
 from projservo_cli.control.law import Gains
 from projservo_cli.experiment import Experiment
+from projservo_cli.geometry.metric import Metric
 from projservo_cli.observations import Observations
 from projservo_cli.results import ImageModel
 from projservo_cli.robots.contract import Robot
@@ -25,7 +26,8 @@ INTERFACE: dict[Any, tuple[str, ...]] = {
     api.simulate: (),
     api.record: (),
     api.calibrate: (),
-    ImageModel: ("predict", "jacobian", "score", "covariance", "project", "plot"),
+    ImageModel: ("predict", "jacobian", "score", "covariance", "metric", "project", "plot"),
+    Metric: (),
     api.plan: (),
     api.servo: (),
     api.sweep: (),

@@ -31,7 +31,9 @@ from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray
 
 def cross_matrix(w: FloatArray) -> FloatArray:
     """Matrices (…, 3, 3) of the cross products with w (…, 3)."""
-    return np.cross(w[..., None, :], np.eye(3)).swapaxes(-1, -2)
+    W = np.zeros((*w.shape, 3))
+    W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
+    return W - W.swapaxes(-1, -2)
 
 
 def _axis_of(H_hat: FloatArray) -> FloatArray:
@@ -304,6 +306,10 @@ _MAX_DAMPING = 1e8
 _SETTLED = 1e-7
 # Change of the images, as a share of the residual, that ends a first search, with fixed cameras.
 _ROUGHLY = 1e-2
+# Decrease of the squared residuals, as a share, that gains nothing: a thousandth of a deviation among 1,000.
+_NO_GAIN = 1e-8
+# Number of such steps in a row that end a search: along a valley that the data leave flat they never end.
+_FLAT_STEPS = 3
 # Residual below which that rule sees round-off, px: pixels have some 1e-13 of their size.
 _MIN_RESIDUAL = 1e-5
 # Width of the Cauchy loss in robust standard deviations: 95 % efficient on normal residuals.
@@ -591,6 +597,7 @@ def minimize(
     damping = 1e-3
     settled = False
     fresh = True
+    flat = 0
     for _ in range(max_steps):
         if fresh:
             here = _Expansion(problem, params, residual, weight, scale)
@@ -604,6 +611,9 @@ def minimize(
             fresh = bool(np.isfinite(new_cost)) and new_cost <= cost
             moved = _cost(weight, here.change(x), np.zeros(0))
             settled = moved <= min_change * max(cost, _MIN_RESIDUAL**2 * float(weight.sum()))
+            if fresh and not robust:
+                flat = flat + 1 if cost - new_cost <= _NO_GAIN * cost else 0
+                settled |= flat == _FLAT_STEPS
         if fresh:
             del here  # the next one takes as much memory again
             params, residual, weight = candidate, new_residual, _weights(new_residual, rows, robust)

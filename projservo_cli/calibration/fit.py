@@ -62,6 +62,8 @@ _PATIENCE = 10
 _NOISE_ROUNDS = 5
 # Relative change of the noise of joints that ends them.
 _NOISE_SETTLED = 0.01
+# Relative difference of squared residuals below which two fits are one.
+_SAME_FIT = 1e-4
 # Relative difference of residuals below which two fits are the same.
 _SAME_LEVEL = 1e-3
 # Factors of the best focal length in each pass over the starts: a wrong one often succeeds where it fails.
@@ -585,6 +587,8 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
             found = fit_inliers(whole, params, level / RAYLEIGH, epipolar.noise_px, hopeless=hopeless)
             if found is None:
                 continue
+            if best is not None and _same_fit(found, best) and expected.ratio(best) <= REFUSE_RATIO:
+                return best
             if best is None or found.typical_px < best.typical_px:
                 best = found
                 explained = fit_joint_noise(found, expected, search.joint_noise)
@@ -607,6 +611,11 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
             "their units (rad, m) and types (R or P), and that rows of one pose belong together"
         )
     return best
+
+
+def _same_fit(one: Solution, other: Solution) -> bool:
+    """Whether two fits use the same detections and leave the same residuals, as from one minimum."""
+    return np.array_equal(one.used, other.used) and abs(one.chi2 - other.chi2) <= _SAME_FIT * other.chi2
 
 
 def _explained(solution: Solution) -> BoolArray:

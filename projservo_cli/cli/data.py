@@ -220,7 +220,26 @@ def _detect(
 @main.command("validate", epilog="Example: projservo validate results/mine --data validation.csv")
 @click.argument("run", required=False, type=option.PATH)
 @option.output(metavar="DIR", help="The run, instead of an argument.")
-@click.option("--data", metavar="TABLE", type=option.PATH, required=True, help="Observation table (CSV).")
+@click.option("--data", metavar="TABLE", type=option.PATH, help="Observation table (CSV).")
+@click.option(
+    "--metric",
+    metavar="TABLE",
+    type=option.PATH,
+    help="Positions of a point of the tool (CSV): pose, q1 ... qN, x, y, z in m, perhaps sigma.",
+)
+@click.option(
+    "--fit",
+    metavar="TABLE",
+    type=option.PATH,
+    help="Other positions, for scale, pose and point. Default: the rest of --metric, in five parts.",
+)
+@click.option(
+    "--arm-std-mm",
+    metavar="MM",
+    type=click.FloatRange(0.0, 1000.0),
+    default=0.0,
+    help="Deviation of the arm that no image shows, a coordinate, beyond the covariance.",
+)
 @click.option(
     "--joint-unit",
     type=click.Choice(["deg", "rad"]),
@@ -228,16 +247,31 @@ def _detect(
 )
 @option.told
 def _validate(
-    console: Console, *, run: Path | None, output: Path | None, data: Path, joint_unit: str | None
+    console: Console,
+    *,
+    run: Path | None,
+    output: Path | None,
+    data: Path | None,
+    metric: Path | None,
+    fit: Path | None,
+    arm_std_mm: float,
+    joint_unit: str | None,
 ) -> None:
-    """Predict held-out images with a calibration.
+    """Predict held-out images, or positions, with a calibration.
 
     Compares the pixels of an observation table (--data) with those the calibration of a run predicts at the
     table's joint readings.
+
+    With --metric it compares positions that another instrument measured, such as a laser tracker. Its scale,
+    its pose and the place of its point on the tool are fitted to --fit.
     """
     target = option.one_run("validate", run, output)
     if target is None:
         raise click.UsageError("validate needs a run: projservo validate RUN --data TABLE")
+    if (data is None) == (metric is None):
+        raise click.UsageError("validate needs --data TABLE, or else --metric TABLE")
+    if metric is None and (fit is not None or arm_std_mm):
+        raise click.UsageError("--fit and --arm-std-mm are for --metric, which is not given")
     from projservo_cli.calibration import residual_statistics
     from projservo_cli.config import load_config
     from projservo_cli.store import load
@@ -248,6 +282,15 @@ def _validate(
     if joint_unit is None:
         config = load_config(found.path, text=found.results["calibrate"].configuration)
         joint_unit = config.data.joint_unit if config.data is not None else None
+    if data is None:
+        value = _position_errors(calibration, (metric, fit), joint_unit, arm_std_mm)
+        lines = (
+            "validate: {count} positions",
+            "  error mm: rms {rms_mm:.3g}, median {median_mm:.3g}, largest {max_mm:.3g}",
+            "  covariance: rms {predicted_rms_mm:.3g} mm, mean squared error over it {mahalanobis:.3g}",
+        )
+        console.tell({"run": found.path.resolve(), **value}, [text.format_map(value) for text in lines])
+        return
     observation = read_table(data, calibration.joint_types, joint_unit)
     value = {"run": found.path.resolve(), **residual_statistics(calibration, observation)}
     if value["count"] and value["median_px"] > _FAR * calibration.sigma_px:
@@ -262,3 +305,19 @@ def _validate(
             "  residual px: rms {rms_px:.4g}, median {median_px:.4g}, p95 {p95_px:.4g}".format_map(value)
         )
     console.tell(value, words)
+
+
+def _position_errors(
+    calibration: Any, tables: tuple[Path | None, Path | None], joint_unit: str | None, arm_std_mm: float
+) -> dict[str, Any]:
+    """Statistics of the arm's positions against a table, and against a second one if it is fitted."""
+    from projservo_cli.calibration.position_error import position_errors
+    from projservo_cli.results import ImageModel
+    from projservo_cli.tables import read_positions
+
+    types = calibration.joint_types
+    table, fit = (None if path is None else read_positions(path, types, joint_unit) for path in tables)
+    assert table is not None
+    # The instrument sets the scale, so any unit serves.
+    metric = ImageModel.of(calibration).metric(1.0, "cameras")
+    return position_errors(metric, table, fit, arm_std_mm / 1e3)

@@ -91,26 +91,116 @@ def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: b
     console.tell(value, [f"compare: {len(runs)} runs: {output}"])
 
 
-@main.command("export", epilog="Example: projservo export results/ur5 -o tables")
-@click.argument("run", type=option.PATH)
-@option.output(metavar="DIR", help="Folder to write. Default: csv, next to run.h5.")
-@option.force(help="Replace existing files.")
-@click.option("--to", type=click.Choice(["csv"]), default="csv", help="Kind of files.", expose_value=False)
-@option.told
-def _export(console: Console, *, run: Path, output: Path | None, force: bool) -> None:
-    """Write all arrays of a run as CSV tables.
+_MAX_BYTES = 10_000_000  # maximum size of a URDF
+_KINDS = {"opencv": "cameras.yaml", "urdf": "robot.urdf", "json": "metric.json", "ros": "cameras.launch.xml"}
 
-    Writes a folder with a table for each result, a column for each index of an array, and fields.csv, which
+
+@main.command("export", epilog="Example: projservo export results/ur5 --metric 0.06 --between 0,1 --to urdf")
+@click.argument("run", type=option.PATH)
+@option.output(metavar="DIR", help="Folder to write. Default: the name of the kind, next to run.h5.")
+@option.force(help="Replace existing files.")
+@click.option("--to", type=click.Choice(["csv", *_KINDS]), default="csv", help="Kind of files.")
+@click.option(
+    "--metric", metavar="M", type=float, help="A known length, m, for all kinds but csv. See --between."
+)
+@click.option(
+    "--between",
+    metavar="A,B",
+    help="Ends of the length: two markers, or tags (their sides), or cameras. Default: a prismatic joint's.",
+)
+@click.option(
+    "--metric-std", metavar="M", type=float, default=0.0, help="Standard deviation of the length, m."
+)
+@click.option(
+    "--nominal", metavar="URDF", type=option.PATH, help="Model of the arm, whose zeros and axes are compared."
+)
+@click.option("--tip", metavar="LINK", help="Link of the model that carries the tool. Default: the last one.")
+@option.told
+def _export(
+    console: Console,
+    *,
+    run: Path,
+    output: Path | None,
+    force: bool,
+    to: str,
+    metric: float | None,
+    between: str | None,
+    metric_std: float,
+    nominal: Path | None,
+    tip: str | None,
+) -> None:
+    """Write a run as tables, or its cameras and arm in metres.
+
+    With --to csv, writes a table for each result, a column for each index of an array, and fields.csv, which
     says what every array is, in which unit.
+
+    The other kinds are in metres, by a known length: opencv both cameras for cv2.FileStorage, urdf the arm,
+    ros static transforms of the cameras, json all numbers with their covariances.
+
+    With --nominal it tells which zeros and axes of a model are off, the most significant first.
     """
     from projservo_cli.store import load
 
     found = load(run)
-    folder = output or found.path.parent / "csv"
+    folder = output or found.path.parent / to
+    if to == "csv":
+        if metric is not None or between or nominal is not None:
+            raise click.UsageError("--metric, --between and --nominal are for --to opencv, urdf, json or ros")
+        option.require_new(folder, force=force)
+        files = list(_write_tables(found, folder))
+        value = {"run": found.path.resolve(), "files": [file.resolve() for file in files]}
+        console.tell(value, [f"export: {len(files)} files: {folder}"])
+        return
+    from projservo_cli.files import write_whole
+
     option.require_new(folder, force=force)
-    files = list(_write_tables(found, folder))
-    value = {"run": found.path.resolve(), "files": [file.resolve() for file in files]}
-    console.tell(value, [f"export: {len(files)} files: {folder}"])
+    content, value, words = _in_metres(found, to, (metric, between, metric_std), nominal, tip)
+    file = write_whole(folder / _KINDS[to], content)
+    value = {"run": found.path.resolve(), "files": [file.resolve()], **value}
+    console.tell(value, [f"export: {file}", *(wrapped(line, "  ") for line in words)])
+
+
+def _in_metres(
+    run: Any, to: str, length: tuple[float | None, str | None, float], nominal: Path | None, tip: str | None
+) -> tuple[str, dict[str, Any], list[str]]:
+    """Text of a file in metres, what there is to tell of it as an object, and in words."""
+    from projservo_cli import exports
+    from projservo_cli.calibration.kinematic_errors import kinematic_errors
+    from projservo_cli.config import load_config
+    from projservo_cli.files import text_of
+    from projservo_cli.results import ImageModel
+    from projservo_cli.simulation.urdf import urdf_axes
+
+    calibration, config = ImageModel.of(run.calibration), load_config(run.path, text=run.configuration)
+    length_m, ends, std = length
+    metric = calibration.metric(length_m, _ends(ends or "joint"), length_std_m=std)
+    value: dict[str, Any] = {}
+    words: list[str] = []
+    if nominal is not None:
+        errors = kinematic_errors(
+            metric, urdf_axes(str(nominal), tip, text_of(nominal, "a URDF", _MAX_BYTES))
+        )
+        value["nominal"] = [error._asdict() for error in errors]
+        words += exports.kinematic_words(errors, metric.joint_types)
+    if to == "opencv":
+        found = exports.opencv_cameras(metric)
+        value |= {"delta_chi2": found.delta_chi2, "lens_rms_px": found.lens_rms_px}
+        lens = f", OpenCV's lens {found.lens_rms_px:.2g} px" if calibration.lens is not None else ""
+        words.insert(0, f"cameras without skew cost Δχ² {found.delta_chi2:.3g} (2 on average){lens}")
+        return exports.opencv_yaml(found, config.image_size_px), value, words
+    if to == "urdf":
+        names = [name or f"joint_{i}" for i, name in enumerate(config.joint_names, 1)]
+        names += [f"joint_{i}" for i in range(len(names) + 1, len(metric.joint_types) + 1)]
+        return exports.urdf(metric, names), value, words
+    return exports.static_transforms(metric) if to == "ros" else exports.to_json(metric, value), value, words
+
+
+def _ends(between: str) -> Any:
+    """Ends of a length as ``ImageModel.metric`` takes them."""
+    try:
+        return tuple(int(end) for end in between.split(","))
+    except ValueError:
+        return between
 
 
 def _write_tables(run: Any, folder: Path) -> Iterator[Path]:

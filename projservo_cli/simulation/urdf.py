@@ -66,6 +66,25 @@ def read_urdf(path: str, tip: str, text: str) -> dict[str, Any]:
     return arm_screws(joints, np.zeros(len(joints)), T)
 
 
+def urdf_axes(path: str, tip: str | None, text: str) -> FloatArray:
+    """Screws (n, 6) of a URDF's joints at readings of zero, from its root to a link, by default the last one.
+
+    Raises InputError as ``read_urdf``, or if several links are last.
+    """
+    if tip is None:
+        try:
+            root = ET.fromstring(text)
+        except ET.ParseError as error:
+            raise InputError(f"{path}: not XML: {error}") from error
+        parents = {_of(joint, "parent", "link", "", path) for joint in root.findall("joint")}
+        ends = [name for link in root.findall("link") if (name := link.get("name", "")) not in parents]
+        if len(ends) != 1:
+            raise InputError(f"{path}: has {len(ends)} last links ({listed(ends)}): name one with --tip")
+        tip = ends[0]
+    joints = read_urdf(path, tip, text)["joints"]
+    return np.array([[*joint["w"], *joint["v"]] for joint in joints])
+
+
 def joint_screw(
     kind: str, name: str, axis: FloatArray, point: FloatArray, limits: Sequence[float] | None
 ) -> dict[str, Any]:

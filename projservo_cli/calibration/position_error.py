@@ -1,0 +1,135 @@
+"""Errors of the metric arm against positions of a point of the tool that another instrument measured."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.geometry.metric import Metric
+from projservo_cli.records import FloatArray, InputError, IntArray, WorkFailed
+
+# Number of unknowns between both frames: scale, pose, and the point on the tool.
+_UNKNOWNS = 10
+# Minimum number of positions that a fit takes, three coordinates each, with some to spare.
+_MIN_POSITIONS = 6
+# Number of parts that a table is divided into when it is fitted itself.
+_PARTS = 5
+_MM_PER_M = 1e3
+
+
+class Positions(NamedTuple):
+    """Positions of a point fixed to the tool, in the frame of the instrument."""
+
+    pose: IntArray  # (K,) number of the pose
+    q: FloatArray  # (K, n) readings, rad or m
+    xyz: FloatArray  # (K, 3) m
+    sigma: FloatArray  # (K,) standard deviation of a coordinate, m
+
+    def rows(self, at: Any) -> "Positions":
+        """Select positions."""
+        return Positions(*(values[at] for values in self))
+
+
+class _Link(NamedTuple):
+    """The instrument's frame and the point on the tool: log scale, rotation vector, shift, point."""
+
+    x: FloatArray  # (10,)
+
+    def place(self, metric: Metric, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Positions (K, 3) by the arm, and changes (c, K, 3) by errors of the calibration, m."""
+        A = np.exp(self.x[0]) * Rotation.from_rotvec(self.x[1:4]).as_matrix()
+        at, changes = metric.points(q, self.x[7:])
+        return at @ A.T + self.x[4:7], changes @ A.T
+
+
+def _fit_link(metric: Metric, table: Positions) -> _Link:
+    """Fit scale, pose and point on the tool by least squares.
+
+    Raises WorkFailed if the table does not determine them.
+    """
+    T = metric.pose(table.q)
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    centered, target = t - t.mean(axis=0), table.xyz - table.xyz.mean(axis=0)
+    U, s, Vt = np.linalg.svd(target.T @ centered)  # Umeyama 1991, with the point at the tool's origin
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    scale = float(np.trace(np.diag(s) @ turn) / (centered**2).sum())
+    rotation = U @ turn @ Vt
+    shift = table.xyz.mean(axis=0) - scale * rotation @ t.mean(axis=0)
+    start = np.r_[np.log(scale), Rotation.from_matrix(rotation).as_rotvec(), shift, np.zeros(3)]
+
+    def residual(x: FloatArray) -> FloatArray:
+        A = np.exp(x[0]) * Rotation.from_rotvec(x[1:4]).as_matrix()
+        return np.asarray(((R @ x[7:] + t) @ A.T + x[4:7] - table.xyz).ravel())
+
+    found = least_squares(residual, start, x_scale="jac")
+    J = np.asarray(found.jac)
+    if np.linalg.matrix_rank(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), tol=1e-6) < _UNKNOWNS:
+        raise WorkFailed("the positions do not determine the point on the tool: turn the tool about two axes")
+    return _Link(found.x)
+
+
+def _jacobian(metric: Metric, link: _Link, q: FloatArray) -> FloatArray:
+    """Derivative (3 K, 10) of the positions by the link."""
+    step = 1e-6
+    columns = [
+        (_Link(link.x + d).place(metric, q)[0] - _Link(link.x - d).place(metric, q)[0]).ravel() / (2.0 * step)
+        for d in step * np.eye(_UNKNOWNS)
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _held_out(
+    metric: Metric, table: Positions, fit: Positions, arm_std_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Errors (K, 3), m, of positions held out of a fit, and their covariances (K, 3, 3), m²."""
+    if len(fit.q) < _MIN_POSITIONS:
+        raise InputError(
+            f"{len(fit.q)} positions to fit: scale, pose and point need {_MIN_POSITIONS} or more"
+        )
+    link = _fit_link(metric, fit)
+    (_, of_fit), (found, changes) = link.place(metric, fit.q), link.place(metric, table.q)
+    carry = _jacobian(metric, link, table.q) @ np.linalg.pinv(_jacobian(metric, link, fit.q))
+    own = np.repeat(np.sqrt(fit.sigma**2 + arm_std_m**2), 3)
+    left = changes.reshape(len(changes), -1) - of_fit.reshape(len(of_fit), -1) @ carry.T
+    both = np.concatenate([left.T, carry * own], axis=1).reshape(len(table.q), 3, -1)
+    noise = (table.sigma**2 + arm_std_m**2)[:, None, None] * np.eye(3)
+    return found - table.xyz, both @ both.swapaxes(1, 2) + noise
+
+
+def position_errors(
+    metric: Metric, table: Positions, fit: Positions | None = None, arm_std_m: float = 0.0
+) -> dict[str, Any]:
+    """Compare positions by the metric arm with those that another instrument measured.
+
+    Scale, pose and the point on the tool, ten numbers, are fitted to other positions.
+
+    metric : of the calibration, in any scale.
+    table, fit : positions to compare, and those to fit; without ``fit`` the table is divided into five parts,
+        and each is compared after a fit to the others.
+    arm_std_m : deviation of the arm that no image shows, m a coordinate.
+    Returns ``count, rms_mm, median_mm, max_mm`` of distances; ``predicted_rms_mm`` by the covariance, and
+    ``mahalanobis``, the mean square of errors over it a coordinate.
+    Raises InputError if there are too few positions, WorkFailed if they do not determine the ten numbers.
+    """
+    parts = [(np.arange(len(table.q)), fit)]
+    if fit is not None:
+        shared = np.intersect1d(table.pose, fit.pose)
+        same = [k for k in shared if np.array_equal(table.q[table.pose == k], fit.q[fit.pose == k])]
+        if same:
+            raise InputError(f"pose {same[0]} is in both tables: hold out what is to be compared")
+    else:
+        of = np.arange(len(table.q)) % _PARTS
+        parts = [(np.flatnonzero(of == k), table.rows(of != k)) for k in range(min(_PARTS, len(of)))]
+    found = [_held_out(metric, table.rows(at), rest, arm_std_m) for at, rest in parts if rest is not None]
+    error, C = (np.concatenate(part) for part in zip(*found, strict=True))
+    distance = _MM_PER_M * np.linalg.norm(error, axis=1)
+    square = np.einsum("ki,kij,kj->k", error, np.linalg.inv(C), error)
+    return {
+        "count": len(distance),
+        "rms_mm": float(np.sqrt((distance**2).mean())),
+        "median_mm": float(np.median(distance)),
+        "max_mm": float(distance.max()),
+        "predicted_rms_mm": float(_MM_PER_M * np.sqrt(np.trace(C, axis1=1, axis2=2).mean())),
+        "mahalanobis": float(square.mean() / 3.0),
+    }

@@ -1,0 +1,527 @@
+"""Metric of a calibrated arm: cameras, axes and markers in metres, each with its covariance.
+
+All revolute joints preserve one symmetric form of the plane at infinity. Its root turns every joint operator
+into a rigid twist, up to one scale, which a known length fixes. Source of the principle: A. Ruf, R. Horaud,
+"Projective rotations applied to a pan-tilt stereo head", CVPR 1999.
+
+Base frame, at readings of zero: z along joint 1, x along z × the direction of the first joint that is not
+parallel to it. The origin is on the first revolute axis, at its common normal with the first revolute axis
+that is not parallel to it. Tool frame: origin at the mean of the face, x from its first to its second marker,
+z across the plane of the first two and the next that is off their line.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.geometry.lens import distort, undistort
+from projservo_cli.geometry.stereo import triangulate_points
+from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError
+
+# Step of the differences that propagate covariances, in standard deviations of the calibration.
+_STEP = 0.05
+# Step of the differences of pixels by points, over the distance of the camera.
+_PROBE = 1e-4
+# Sine of an angle between axes, or of markers off a line, below which a frame does not rest on it: 3°.
+_PARALLEL = 0.05
+# Relative deviation of the invariant form above which the data do not determine it.
+_UNDETERMINED = 0.3
+# Singular value of the invariance, over the largest, below which a second form is invariant too.
+_SECOND_FORM = 1e-6
+_MM_PER_M = 1e3
+_ALL_PARALLEL = (
+    "metric: within their noise all revolute axes are parallel, which leaves the stretch along them open: a "
+    "revolute joint about another direction would fix it"
+)
+
+Scale = str | tuple[int, int]
+
+
+class Body(NamedTuple):
+    """Cameras, arm and markers in the base frame, of one model or of many (…)."""
+
+    P: FloatArray  # (…, 2, 3, 4) cameras to undistorted pixels
+    lens: FloatArray  # (…, 2, 5) lenses
+    axes: FloatArray  # (…, n, 6) screws at readings of zero: w rad and v m, per rad or m
+    tool: FloatArray  # (…, 4, 4) pose of the tool at readings of zero, m
+    markers: FloatArray  # (…, m, 3) in the tool frame, m
+
+    def scaled(self, factor: FloatArray) -> "Body":
+        """Multiply all lengths by a factor (…)."""
+        P, axes, tool = self.P.copy(), self.axes.copy(), self.tool.copy()
+        P[..., 3] *= factor[..., None, None]
+        axes[..., 3:] *= factor[..., None, None]
+        tool[..., :3, 3] *= factor[..., None]
+        return Body(P, self.lens, axes, tool, self.markers * factor[..., None, None])
+
+    def intrinsics(self) -> FloatArray:
+        """Intrinsic matrices (…, 2, 3, 3), px, from K Kᵀ of the cameras."""
+        rows = self.P[..., ::-1, :3]
+        K = np.linalg.cholesky(rows @ rows.swapaxes(-1, -2))[..., ::-1, ::-1]
+        return np.asarray(K / K[..., 2:, 2:])
+
+    def camera_poses(self) -> FloatArray:
+        """Poses (…, 2, 4, 4) of both cameras in the base frame, m."""
+        A = self.P[..., :3]
+        R = np.linalg.solve(self.intrinsics(), A)
+        R /= np.cbrt(np.linalg.det(R))[..., None, None]
+        T = np.zeros((*R.shape[:-2], 4, 4))
+        T[..., :3, :3], T[..., 3, 3] = R.swapaxes(-1, -2), 1.0
+        T[..., :3, 3] = -np.linalg.solve(A, self.P[..., 3, None])[..., 0]
+        return T
+
+    def tool_poses(self, prismatic: BoolArray, q: FloatArray) -> FloatArray:
+        """Poses (…, K, 4, 4) of the tool at readings (K, n), [RH00] eq. (6), m."""
+        moved = exponentials(self.axes[..., None, :, :], prismatic, q)
+        factors = [moved[..., i, :, :] for i in range(len(prismatic))]
+        return np.asarray(reduce(np.matmul, factors) @ self.tool[..., None, :, :])
+
+    def pixels(self, points: FloatArray) -> FloatArray:
+        """Raw pixels (…, K, 2, 2) of points (…, K, 3) of the base frame, by view."""
+        m = np.einsum("...vrj,...kj->...kvr", self.P, homogeneous(points))
+        return distort(self.lens[..., None, :, :], m[..., :2] / m[..., 2:])
+
+
+def homogeneous(points: FloatArray) -> FloatArray:
+    """Points (…, 3) with a fourth coordinate of one."""
+    return np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+
+
+def twists(axes: FloatArray) -> FloatArray:
+    """Twists (…, 4, 4) of screws (…, 6)."""
+    result = np.zeros((*axes.shape[:-1], 4, 4))
+    result[..., :3, :3] = -np.cross(axes[..., None, :3], np.eye(3))
+    result[..., :3, 3] = axes[..., 3:]
+    return result
+
+
+def screws(H_hat: FloatArray) -> FloatArray:
+    """Screws (…, 6) of twists (…, 4, 4)."""
+    skew = 0.5 * (H_hat[..., :3, :3] - H_hat[..., :3, :3].swapaxes(-1, -2))
+    w = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
+    return np.concatenate([w, H_hat[..., :3, 3]], axis=-1)
+
+
+def exponentials(axes: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
+    """Displacements (…, n, 4, 4) of screws (…, n, 6) by readings (…, n), [RH00] eqs. (4), (5)."""
+    H = twists(axes)
+    sine = np.where(prismatic, q, np.sin(q))[..., None, None]
+    versine = np.where(prismatic, 0.0, 2.0 * np.sin(0.5 * q) ** 2)[..., None, None]
+    return np.asarray(np.eye(4) + sine * H + versine * (H @ H))
+
+
+def rigid(rotation_vector: FloatArray, shift: FloatArray) -> FloatArray:
+    """Rigid displacement (4, 4) by a rotation vector (3,), rad, and a shift (3,), m."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(rotation_vector).as_matrix(), shift
+    return T
+
+
+def rigid_inverse(T: FloatArray) -> FloatArray:
+    """Inverse of rigid displacements (…, 4, 4)."""
+    R = T[..., :3, :3].swapaxes(-1, -2)
+    result = np.zeros_like(T)
+    result[..., :3, :3], result[..., 3, 3] = R, 1.0
+    result[..., :3, 3] = -(R @ T[..., :3, 3, None])[..., 0]
+    return result
+
+
+def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
+    """Homographies (…, 4, 4) from the projective frame to one in which operators (…, n, 4, 4) are twists.
+
+    With D an orthonormal basis of the complement of the plane at infinity and L = D Ĥ Dᵀ, the form S with
+    L S + S Lᵀ = 0 for all revolute joints is unique if two axes are not parallel; S = A Aᵀ, and A⁻¹ L A is a
+    rotation.
+    Raises InputError if the joints leave a second form.
+    """
+    turning = ~prismatic
+    if turning.sum() < 2:
+        left = (
+            "one revolute joint leaves the stretch along its axis open: a second one, not parallel to it,"
+            if turning.any()
+            else "without a revolute joint five stretches and shears are open: two that are not parallel"
+        )
+        raise InputError(f"metric: {left} would fix it")
+    U = np.linalg.svd(np.concatenate(np.moveaxis(H_hat, -3, 0), axis=-1))[0]
+    D, a_inf = U[..., :3].swapaxes(-1, -2), U[..., 3]
+    L = (D[..., None, :, :] @ H_hat @ D.swapaxes(-1, -2)[..., None, :, :])[..., turning, :, :]
+    i, j = np.triu_indices(3)
+    basis = np.zeros((6, 3, 3))
+    basis[range(6), i, j] = basis[range(6), j, i] = np.where(i == j, 1.0, np.sqrt(0.5))
+    moved = np.einsum("...nab,sbc->...nacs", L, basis)
+    changes = (moved + np.einsum("...nacs->...ncas", moved)).reshape(*L.shape[:-3], -1, 6)
+    _, sizes, rows = np.linalg.svd(changes)
+    if (sizes[..., 4] < _SECOND_FORM * sizes[..., 0]).any():
+        raise InputError(_ALL_PARALLEL)
+    S = np.einsum("...s,sab->...ab", rows[..., 5, :], basis)
+    S *= np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None]
+    try:
+        A = np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        raise InputError(_ALL_PARALLEL) from None
+    return np.concatenate([np.linalg.solve(A, D), a_inf[..., None, :]], axis=-2)
+
+
+def _directions(axes: FloatArray, prismatic: BoolArray) -> FloatArray:
+    """Unit directions (…, n, 3) of axes, or of translations."""
+    d = np.where(prismatic[:, None], axes[..., 3:], axes[..., :3])
+    return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
+
+
+def base_joints(axes: FloatArray, prismatic: BoolArray) -> tuple[int, int, int]:
+    """Joints that the base frame rests on, by screws (n, 6): for x, then the pair for the origin.
+
+    Raises InputError if all revolute axes are parallel.
+    """
+    d = _directions(axes, prismatic)
+    sine = np.linalg.norm(np.cross(d[:, None], d[None]), axis=-1)
+    turning = np.flatnonzero(~prismatic)
+    off = turning[sine[turning[0], turning] > _PARALLEL]
+    if not off.size:
+        raise InputError(_ALL_PARALLEL)
+    return int(np.argmax(sine[0] > _PARALLEL)), int(turning[0]), int(off[0])
+
+
+def base_frame(axes: FloatArray, prismatic: BoolArray, joints: tuple[int, int, int]) -> FloatArray:
+    """Pose (…, 4, 4) of the base frame of screws (…, n, 6) at readings of zero, by ``base_joints``."""
+    d, (k, i, j) = _directions(axes, prismatic), joints
+    w, u = axes[..., i, :3], axes[..., j, :3]
+    p, r = np.cross(w, axes[..., i, 3:]), np.cross(u, axes[..., j, 3:])
+    normal = np.cross(w, u)
+    along = (np.cross(r - p, u) * normal).sum(axis=-1) / (normal**2).sum(axis=-1)
+    return _frame(np.cross(d[..., 0, :], d[..., k, :]), d[..., 0, :], p + along[..., None] * w)
+
+
+def _off_line(M: FloatArray, face: Sequence[int]) -> int:
+    """Index of the marker of a face that is off the line of its first two. Raises InputError if none is."""
+    for j in face[2:]:
+        a, b = M[face[1]] - M[face[0]], M[j] - M[face[0]]
+        if np.linalg.norm(np.cross(a, b)) > _PARALLEL * np.linalg.norm(a) * np.linalg.norm(b):
+            return j
+    raise InputError("metric: the face has no three markers off one line, which a frame of the tool needs")
+
+
+def _frame(x: FloatArray, z: FloatArray, origin: FloatArray) -> FloatArray:
+    """Pose (…, 4, 4) of a frame with x and z along vectors (…, 3) that are perpendicular."""
+    x, z = (vector / np.linalg.norm(vector, axis=-1, keepdims=True) for vector in (x, z))
+    T = np.zeros((*x.shape[:-1], 4, 4))
+    T[..., :3, 0], T[..., :3, 1], T[..., :3, 2], T[..., :3, 3] = x, np.cross(z, x), z, origin
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def _tool_frame(M: FloatArray, face: Sequence[int], across: int) -> FloatArray:
+    """Pose (…, 4, 4) of the tool frame among markers (…, m, 3), of which one is off the line of the first."""
+    start = M[..., face[0], :]
+    x, y = M[..., face[1], :] - start, M[..., across, :] - start
+    return _frame(x, np.cross(x, y), M[..., [*face], :].mean(axis=-2))
+
+
+class _Projective(NamedTuple):
+    """Arrays of a calibration, or of many that are off by its deviations (…)."""
+
+    P: FloatArray
+    H_hat: FloatArray
+    lens: FloatArray
+    M: FloatArray
+
+    @classmethod
+    def around(cls, c: Calibration, lens: FloatArray, factor: FloatArray) -> "_Projective":
+        """The calibration, then pairs off by plus and minus a step of each column of the factor."""
+        steps = _STEP * np.concatenate([np.zeros((len(factor), 1)), factor, -factor], axis=1).T
+        n, B = len(c.H_hat_0), len(steps)
+        edges = np.cumsum([24, 16 * n, 0 if c.lens is None else 4])
+        P, H_hat, k, M = np.split(steps, edges, axis=1)
+        lenses = np.tile(lens, (B, 1, 1))
+        if c.lens is not None:
+            lenses[..., 3:] += k.reshape(B, 2, 2)
+        return cls(
+            c.P + P.reshape(B, 2, 3, 4), c.H_hat_0 + H_hat.reshape(B, n, 4, 4), lenses,
+            c.M + M.reshape(B, -1, 4),
+        )  # fmt: skip
+
+
+def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
+    """Bodies (B, …) of models, the first of which decides what frames rest on. Their scale is arbitrary."""
+    G = invariant_upgrade(models.H_hat, c.prismatic)
+    G = G * np.sign(models.M[:, :1] @ G[:, 3, :, None])
+    G, M = _right_handed(models, G)
+    back = np.linalg.inv(G)
+    at_reference = screws(G[:, None] @ models.H_hat @ back[:, None])
+    turning = ~c.prismatic
+    at_reference[:, c.prismatic, :3] = 0.0
+    w, v = at_reference[:, turning, :3], at_reference[:, turning, 3:]
+    at_reference[:, turning, 3:] = v - w * (w * v).sum(axis=-1, keepdims=True) / (w * w).sum(-1)[..., None]
+    to_zero = exponentials(at_reference, c.prismatic, -c.q_reference)
+    chain = [np.broadcast_to(np.eye(4), G.shape)]
+    for i in range(len(c.prismatic)):
+        chain.append(chain[-1] @ to_zero[:, i])
+    moved = np.stack(chain[:-1], axis=1)
+    axes = screws(moved @ twists(at_reference) @ rigid_inverse(moved))
+    axes[:, c.prismatic, :3] = 0.0
+    base = base_frame(axes, c.prismatic, base_joints(axes[0], c.prismatic))
+    tool = _tool_frame(M, face, _off_line(M[0], face))
+    inverse = rigid_inverse(base)
+    P = models.P @ back[:, None] @ base[:, None]
+    P /= np.linalg.norm(P[..., 2, :3], axis=-1)[..., None, None]
+    markers = (homogeneous(M) @ rigid_inverse(tool).swapaxes(-1, -2))[..., :3]
+    axes = screws(inverse[:, None] @ twists(axes) @ base[:, None])
+    axes[:, c.prismatic, :3] = 0.0
+    return Body(P, models.lens, axes, inverse @ chain[-1] @ tool, markers)
+
+
+def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Upgrades (B, 4, 4) to a right-handed frame, and markers (B, m, 3) there.
+
+    Both cameras have the markers in front of them, so each tells the handedness of the frame.
+    Raises InputError if they contradict each other.
+    """
+    M = models.M @ G.swapaxes(-1, -2)
+    points = M[..., :3] / M[..., 3:]
+    P = models.P @ np.linalg.inv(G)[:, None]
+    depth = (P[:, :, 2] @ homogeneous(points).swapaxes(-1, -2)).mean(axis=-1)
+    side = np.sign(np.linalg.det(P[..., :3]) * depth)
+    if side[0, 0] != side[0, 1]:
+        raise InputError("metric: one camera's images are mirrored: turn its flip off, and record again")
+    flip = np.ones((len(G), 4))
+    flip[:, 0] = side[:, 0]
+    return flip[:, :, None] * G, points * flip[:, None, :3]
+
+
+def _length_of(body: Body, between: Scale, marker: list[int], prismatic: BoolArray) -> FloatArray:
+    """Length (…) that is known, in the unit of bodies. Raises InputError if there is none such."""
+    if between == "joint":
+        if not prismatic.any():
+            raise InputError("metric: no joint is prismatic, so none has readings in metres: give length_m")
+        return np.asarray(np.linalg.norm(body.axes[..., int(np.argmax(prismatic)), 3:], axis=-1))
+    if between == "cameras":
+        centers = body.camera_poses()[..., :3, 3]
+        return np.asarray(np.linalg.norm(centers[..., 1, :] - centers[..., 0, :], axis=-1))
+    if between == "tags":
+        tags = [number for number in marker if number % 4 == 0 and {*range(number, number + 4)} <= {*marker}]
+        sides = [(t + k, t + (k + 1) % 4) for t in tags for k in range(4)]
+        if not sides:
+            raise InputError("metric: no tag has all its corners (4 t to 4 t + 3) among the markers")
+    elif isinstance(between, str) or len(between) != 2 or between[0] == between[1]:
+        raise InputError(f"metric: between {between!r}: give two markers, tags, cameras or joint")
+    else:
+        sides = [(int(between[0]), int(between[1]))]
+        if unknown := [number for number in sides[0] if number not in marker]:
+            raise InputError(f"metric: marker {unknown[0]} is not in the calibration; markers: {marker}")
+    ends = np.array([[marker.index(end) for end in side] for side in sides])
+    apart = body.markers[..., ends[:, 0], :] - body.markers[..., ends[:, 1], :]
+    return np.asarray(np.linalg.norm(apart, axis=-1).mean(axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class Metric:
+    """A calibration in metres, in the base frame of the arm: its arrays, and functions with covariances.
+
+    Frames are those of the module ``geometry.metric``. Covariances are those of the calibration, to first
+    order, with those of frames and of the known length.
+    """
+
+    joint_types: str  # one letter a joint, R or P
+    marker: list[int]  # (m,) numbers of the markers
+    sigma_px: float  # noise of a pixel, px
+    bodies: Body  # the model, then pairs off by plus and minus a step of each independent error
+    range: FloatArray  # (n, 2) readings in the data, rad or m
+
+    @classmethod
+    def of(
+        cls,
+        c: Calibration,
+        factor: FloatArray,
+        *,
+        length_m: float | None = None,
+        between: Scale = "joint",
+        length_std_m: float = 0.0,
+        face: Sequence[int] | None = None,
+    ) -> "Metric":
+        """Upgrade a calibration, by the factor of its covariance; the rest as for ``ImageModel.metric``."""
+        length = (1.0 if between == "joint" else math.nan) if length_m is None else float(length_m)
+        if not 0.0 < length < np.inf or not 0.0 <= length_std_m < np.inf:
+            raise InputError(
+                f"metric: length_m {length_m!r}, length_std_m {length_std_m!r}: give a positive length in m, "
+                "and a deviation that is not negative"
+            )
+        marker = c.marker.tolist()
+        chosen = range(len(marker)) if face is None else c.places([n for n in face if n in marker])
+        lens = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2) if c.lens is None else c.lens
+        models = _Projective.around(c, lens, factor)
+        try:
+            bodies = _bodies(models, c, list(chosen))
+            K = bodies.intrinsics()
+        except np.linalg.LinAlgError:
+            raise InputError(_ALL_PARALLEL) from None
+        change = np.linalg.solve(K[0], (K[1 : 1 + factor.shape[1]] - K[1 + factor.shape[1] :]))
+        if np.sqrt((change**2).sum(axis=(0, 2, 3))).min() > 2.0 * _STEP * _UNDETERMINED:
+            raise InputError(_ALL_PARALLEL)
+        known = _length_of(bodies, between, marker, c.prismatic)
+        if not known[0] > 0.0:
+            raise InputError(f"metric: the markers {between} of the known length are one point")
+        bodies = bodies.scaled(length / known)
+        if length_std_m > 0.0:  # one more independent error
+            step = _STEP * length_std_m / length
+            off = Body(*(values[:1].repeat(2, axis=0) for values in bodies))
+            off = off.scaled(np.array([1.0 + step, 1.0 - step]))
+            cut = 1 + factor.shape[1]
+            parts = zip(bodies, off, strict=True)
+            bodies = Body(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
+        moved = np.stack([c.joint_min, c.joint_min + c.excitation], axis=1)
+        return cls(c.joint_types, marker, c.sigma_px, bodies, moved)
+
+    @property
+    def body(self) -> Body:
+        """Cameras, arm and markers as calibrated."""
+        return Body(*(values[0] for values in self.bodies))
+
+    @property
+    def prismatic(self) -> BoolArray:
+        """Whether each joint (n,) is prismatic."""
+        return np.array([letter == "P" for letter in self.joint_types])
+
+    @property
+    def K(self) -> FloatArray:
+        """Intrinsic matrices (2, 3, 3) of both cameras, px."""
+        return self.body.intrinsics()
+
+    @property
+    def lens(self) -> FloatArray:
+        """Radial distortion (2, 5): centre u, v and radius, px, then k1, k2."""
+        return self.body.lens
+
+    @property
+    def poses(self) -> FloatArray:
+        """Poses (2, 4, 4) of both cameras in the base frame: z forward, y down; m."""
+        return self.body.camera_poses()
+
+    @property
+    def axes(self) -> FloatArray:
+        """Screws (n, 6) of the joints at readings of zero in the base frame: w rad and v m, per rad or m."""
+        return self.body.axes
+
+    @property
+    def markers(self) -> FloatArray:
+        """Markers (m, 3) in the tool frame, m."""
+        return self.body.markers
+
+    def pose(self, q: npt.ArrayLike) -> FloatArray:
+        """Poses (…, 4, 4) of the tool in the base frame at readings (…, n), rad or m."""
+        readings = self._readings(q)
+        T = self.body.tool_poses(self.prismatic, readings.reshape(-1, readings.shape[-1]))
+        return T.reshape(*readings.shape[:-1], 4, 4)
+
+    def pose_covariance(self, q: npt.ArrayLike) -> FloatArray:
+        """Covariances (…, 6, 6) of the tool's pose in the base frame: rotation vector, rad; position, m."""
+        readings = self._readings(q)
+        rows = readings.reshape(-1, readings.shape[-1])
+        of = self._changes(lambda body: body.tool_poses(self.prismatic, rows), _pose_difference)
+        return _covariances(of).reshape(*readings.shape[:-1], 6, 6)
+
+    def position_std(self, q: npt.ArrayLike) -> FloatArray:
+        """Standard deviations (…, 3) of the position of the tool along the axes of the base frame, mm."""
+        C = self.pose_covariance(q)[..., 3:, 3:]
+        return _MM_PER_M * np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
+
+    def triangulate(self, pixels: npt.ArrayLike) -> FloatArray:
+        """Points (…, 3) of the base frame, m, by raw pixels (2, …, 2) of both views.
+
+        Raises InputError for pixels of another shape, WorkFailed if two rays determine no finite point.
+        """
+        s = self._pixels(pixels)
+        straight = undistort(self.body.lens, s.reshape(2, -1, 2))
+        points = triangulate_points(self.body.P, np.array([0.0, 0.0, 0.0, 1.0]), straight)
+        return points[:, :3].reshape(*s.shape[1:-1], 3)
+
+    def triangulation_covariance(self, pixels: npt.ArrayLike) -> FloatArray:
+        """Covariances (…, 3, 3) of triangulated points, m², with the noise of their pixels."""
+        s = self._pixels(pixels)
+        X = self.triangulate(s).reshape(-1, 3)
+        step = _PROBE * np.linalg.norm(self.poses[0, :3, 3] - X, axis=1)[:, None]
+        moves = [self.body.pixels(X + step * e) - self.body.pixels(X - step * e) for e in np.eye(3)]
+        J = np.moveaxis(np.stack(moves).reshape(3, len(X), 4) / (2.0 * step), 0, -1)
+        pinv = np.linalg.pinv(J)
+        moved = self._changes(lambda body: body.pixels(np.broadcast_to(X, (len(body.P), *X.shape))))
+        of = np.einsum("kij,ckj->cki", pinv, moved.reshape(len(moved), len(X), 4))
+        C = _covariances(of) + self.sigma_px**2 * (pinv @ pinv.swapaxes(-1, -2))
+        return np.asarray(C.reshape(*s.shape[1:-1], 3, 3))
+
+    def covariance(self, name: str) -> FloatArray:
+        """Covariance of an array: K, lens, poses, axes, markers or tool.
+
+        Of ``K`` (2, 5, 5): fx, skew, cx, fy, cy, px; of ``lens`` (2, 2, 2): k1, k2; of ``poses`` (2, 6, 6):
+        rotation vector, rad, and position, m, in the base frame; of ``axes`` (n, 6, 6); of ``markers``
+        (m, 3, 3), m²; of ``tool`` (1, 6, 6), its pose at readings of zero.
+        """
+        return _covariances(self.deviations(name))
+
+    def deviations(self, name: str) -> FloatArray:
+        """Changes (c, count, d) of an array by independent errors of unit variance, as ``covariance`` has."""
+        u, v = np.triu_indices(3)
+        u, v = u[:5], v[:5]
+        parts: dict[str, Callable[[], FloatArray]] = {
+            "K": lambda: self._changes(lambda body: body.intrinsics()[..., u, v]),
+            "lens": lambda: self._changes(lambda body: body.lens[..., 3:]),
+            "poses": lambda: self._changes(lambda body: body.camera_poses(), _pose_difference),
+            "axes": lambda: self._changes(lambda body: body.axes),
+            "markers": lambda: self._changes(lambda body: body.markers),
+            "tool": lambda: self._changes(lambda body: body.tool[:, None], _pose_difference),
+        }
+        if name not in parts:
+            raise InputError(f"metric: no covariance of {name!r}: choose one of {', '.join(parts)}")
+        return parts[name]()
+
+    def points(self, q: FloatArray, point: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Positions (K, 3) of a tool's point (3,) at readings (K, n), m, and changes (c, K, 3) by errors."""
+
+        def of(body: Body) -> FloatArray:
+            T = body.tool_poses(self.prismatic, q)
+            return np.asarray(T[..., :3, :3] @ point + T[..., :3, 3])
+
+        return of(self.body), self._changes(of)
+
+    def _changes(
+        self,
+        function: Callable[[Body], FloatArray],
+        difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract,
+    ) -> FloatArray:
+        """Changes (c, …) of a function of bodies by independent errors of unit variance."""
+        count = (len(self.bodies.P) - 1) // 2
+        up, down = (
+            function(Body(*(values[part] for values in self.bodies)))
+            for part in (slice(1, 1 + count), slice(1 + count, None))
+        )
+        return np.asarray(difference(up, down) / (2.0 * _STEP))
+
+    def _readings(self, q: npt.ArrayLike) -> FloatArray:
+        readings = np.asarray(q, dtype=np.float64)
+        n = len(self.joint_types)
+        if readings.ndim == 0 or readings.shape[-1] != n or not np.isfinite(readings).all():
+            raise InputError(f"joint readings of shape {readings.shape}: expected {n} finite numbers each")
+        return readings
+
+    @staticmethod
+    def _pixels(pixels: npt.ArrayLike) -> FloatArray:
+        s = np.asarray(pixels, dtype=np.float64)
+        if s.ndim < 2 or s.shape[0] != 2 or s.shape[-1] != 2:
+            raise InputError(f"pixels of shape {s.shape}: expected (2, …, 2), left and right")
+        return s
+
+
+def _covariances(changes: FloatArray) -> FloatArray:
+    """Covariances (k, d, d) by changes (c, k, d)."""
+    return np.asarray(np.einsum("cki,ckj->kij", changes, changes))
+
+
+def _pose_difference(T: FloatArray, T0: FloatArray) -> FloatArray:
+    """Rotation vectors and shifts (…, 6) from poses T0 to T (…, 4, 4), in the outer frame."""
+    R = T[..., :3, :3] @ T0[..., :3, :3].swapaxes(-1, -2)
+    turn = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
+    return np.concatenate([turn, T[..., :3, 3] - T0[..., :3, 3]], axis=-1)

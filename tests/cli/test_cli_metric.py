@@ -1,0 +1,157 @@
+"""Files in metres, read by other people's code, and positions against a table: from the command line."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from projservo_cli import exports, store
+from projservo_cli.cli import run
+from projservo_cli.results import ImageModel
+from projservo_cli.simulation.urdf import urdf_axes
+
+KNOWN = ["--metric", "0.2492990172463582", "--between", "2,8"]
+
+
+@pytest.fixture(scope="module")
+def ur5(shared_data, tmp_path_factory):
+    """A run of another simulator's UR5, with lenses."""
+    folder = tmp_path_factory.mktemp("metric") / "ur5"
+    table = shared_data / "ur5" / "trials_0.5px.csv"
+    assert (
+        run(["calibrate", "--data", str(table), "--lens", "-o", str(folder), "--image-size", "1280x1024"])
+        == 0
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def metric(ur5):
+    return ImageModel.of(store.load(ur5).calibration).metric(float(KNOWN[1]), (2, 8))
+
+
+Q = np.array([[0.3, -1.2, 1.1, -0.4, 0.8, 0.2], [0.1, -1.0, 1.4, -0.8, 1.1, -0.6]])
+
+
+def export(ur5, tmp_path, kind, *more):
+    assert run(["export", str(ur5), "--to", kind, "-o", str(tmp_path / kind), *KNOWN, *more]) == 0
+    (file,) = (tmp_path / kind).iterdir()
+    return file
+
+
+def test_opencv_reads_the_cameras_and_projects_as_the_model_that_was_fitted(ur5, metric, tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    file = cv2.FileStorage(str(export(ur5, tmp_path, "opencv")), cv2.FILE_STORAGE_READ)
+    found = exports.opencv_cameras(metric)
+    body = found.body
+    # The true cameras have no skew, so that this costs what chance does: 14 in one of 1,000 draws.
+    assert 0.0 < found.delta_chi2 < 13.9
+    assert found.lens_rms_px < 0.1
+    assert file.getNode("delta_chi2").real() == pytest.approx(found.delta_chi2)
+    T = body.tool_poses(metric.prismatic, Q)
+    points = (body.markers @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]).reshape(-1, 3)
+    for v, view in enumerate(("left", "right")):
+        names = ("R", "T", "camera_matrix", "distortion_coefficients")
+        R, t, K, dist = (file.getNode(f"{view}_{name}").mat() for name in names)
+        pixels = cv2.projectPoints(points, cv2.Rodrigues(R)[0], t, K, dist)[0][:, 0]
+        np.testing.assert_allclose(pixels, found.pixels(points)[:, v], atol=1e-6)
+    left, right = (
+        np.vstack([np.hstack([file.getNode(f"{v}_{part}").mat() for part in "RT"]), [0, 0, 0, 1]])
+        for v in ("left", "right")
+    )
+    stereo = np.hstack([file.getNode("R").mat(), file.getNode("T").mat()])
+    np.testing.assert_allclose(stereo, (right @ np.linalg.inv(left))[:3], atol=1e-12)
+
+
+def pixels_at(metric, tool):
+    return metric.body.pixels(metric.markers @ tool[:3, :3].T + tool[:3, 3])
+
+
+def test_mujoco_reads_the_arm_and_predicts_the_same_pixels(ur5, metric, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_path(str(export(ur5, tmp_path, "urdf")))
+    data = mujoco.MjData(model)
+    for q in Q:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        tool = np.eye(4)
+        tool[:3, :3], tool[:3, 3] = data.body("tool").xmat.reshape(3, 3), data.body("tool").xpos
+        np.testing.assert_allclose(pixels_at(metric, tool), pixels_at(metric, metric.pose(q)), atol=1e-6)
+    camera = data.body("camera_left")
+    np.testing.assert_allclose(camera.xpos, metric.poses[0, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(camera.xmat.reshape(3, 3), metric.poses[0, :3, :3], atol=1e-12)
+
+
+def test_yourdfpy_reads_the_arm_and_predicts_the_same_pixels(ur5, metric, tmp_path):
+    yourdfpy = pytest.importorskip("yourdfpy")
+    robot = yourdfpy.URDF.load(str(export(ur5, tmp_path, "urdf")))
+    for q in Q:
+        robot.update_cfg(q)
+        tool = robot.get_transform("tool", "base_link")
+        np.testing.assert_allclose(pixels_at(metric, tool), pixels_at(metric, metric.pose(q)), atol=1e-6)
+    assert robot.joint_map["joint_2"].limit.lower == pytest.approx(metric.range[1, 0])
+
+
+def test_the_own_reader_finds_the_same_axes(ur5, metric, tmp_path):
+    file = export(ur5, tmp_path, "urdf")
+    axes = urdf_axes(str(file), "tool", file.read_text())
+    np.testing.assert_allclose(axes, metric.axes, atol=1e-12)
+
+
+def test_ros_gets_the_poses_of_the_cameras(ur5, metric, tmp_path):
+    words = export(ur5, tmp_path, "ros").read_text().split("args=")[1].split()
+    value = {name: float(words[words.index(f"--{name}" if name != "x" else '"--x') + 1]) for name in "xyz"}
+    np.testing.assert_allclose(list(value.values()), metric.poses[0, :3, 3], atol=1e-12)
+    turn = [float(words[words.index(f"--q{name}") + 1]) for name in "xyzw"]
+    np.testing.assert_allclose(Rotation.from_quat(turn).as_matrix(), metric.poses[0, :3, :3], atol=1e-12)
+
+
+def test_json_has_all_numbers_with_covariances(ur5, metric, tmp_path):
+    found = json.loads(export(ur5, tmp_path, "json").read_text())
+    for name in ("K", "lens", "poses", "axes", "markers"):
+        np.testing.assert_array_equal(found[name], getattr(metric, name))
+        np.testing.assert_allclose(found[f"{name}_covariance"], metric.covariance(name))
+
+
+def matrix(screw):
+    H = np.zeros((4, 4))
+    H[:3, :3], H[:3, 3] = np.cross(np.eye(3), screw[:3]), screw[3:]
+    return H
+
+
+def wrong_model(true, q, zero):
+    """A URDF of screws (n, 6) at readings q, whose zeros are off and whose third link is 3 mm too long."""
+    T, last, lines = np.eye(4), np.zeros(3), ['<robot name="wrong"><link name="l0"/>']
+    for i, screw in enumerate(true):
+        H = T @ matrix(screw) @ np.linalg.inv(T)
+        w, v = np.array([H[2, 1], H[0, 2], H[1, 0]]), H[:3, 3]
+        place = np.cross(w, v) + w * (w @ last)
+        if i == 3:
+            place += 0.003 * (place - last) / np.linalg.norm(place - last)
+        lines.append(
+            f'<link name="l{i + 1}"/><joint name="j{i}" type="continuous"><parent link="l{i}"/>'
+            f'<child link="l{i + 1}"/><origin xyz="{" ".join(map(str, place - last))}"/>'
+            f'<axis xyz="{" ".join(map(str, w))}"/></joint>'
+        )
+        last = place
+        T = T @ expm(matrix(screw) * (-q[i] - zero[i]))
+    return "".join([*lines, "</robot>"])
+
+
+def test_zeros_and_links_of_a_wrong_model_are_found(ur5, reference_truth, tmp_path, capsys):
+    """A model off by 2° in the zeros of joints 3 and 5 and 3 mm in a link, beside the truth."""
+    true = np.array([[*s["w"], *s["v"]] for s in reference_truth("ur5")["screws"]])
+    q = np.array(reference_truth("ur5")["q_reference"])
+    file = tmp_path / "model.urdf"
+    zero = np.radians([0.0, 0.0, -2.0, 0.0, -2.0, 0.0])
+    file.write_text(wrong_model(true, q, zero))
+    capsys.readouterr()
+    export(ur5, tmp_path, "ros", "--nominal", str(file), "--json")
+    errors = {e["joint"]: e for e in json.loads(capsys.readouterr().out)["nominal"]}
+    for joint in (2, 3, 4, 5):
+        found, std = np.degrees([errors[joint]["zero"], errors[joint]["zero_std"]])
+        assert abs(found - np.degrees(zero[joint - 1])) < 3.5 * std
+    assert errors[1]["zero"] is None
+    assert errors[6]["zero"] is None
