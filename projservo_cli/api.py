@@ -138,7 +138,7 @@ def record(
     Raises
     ------
     InputError
-        When something is missing in the configuration, or the table is of another one.
+        If the configuration lacks a key, or the table is of another one.
     WorkFailed
         When the robot fails, or its images show too little; the recorded poses stay in the table.
     """
@@ -304,7 +304,7 @@ def servo(
     Raises
     ------
     InputError
-        When there is no such law or mode, or something is missing in the configuration.
+        When there is no such law or mode, or the configuration lacks a key.
     WorkFailed
         When the run could not begin: the goal is out of reach, or the images of a robot disagree with the
         calibration.

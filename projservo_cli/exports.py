@@ -36,14 +36,14 @@ class OpenCV(NamedTuple):
 
 
 def opencv_cameras(metric: Metric) -> OpenCV:
-    """Return the most likely robot and rig whose cameras have no skew, and OpenCV's lens about their centre.
+    """Return the maximum-likelihood robot and rig with cameras without skew, and OpenCV's lens.
 
     All else moves along by the covariance. The lens is fitted to the calibrated one over its radius, within
     which markers were seen; its two terms of tangential distortion carry it to the principal point.
     """
     K, of_K = metric.K, metric.deviations("K")
     skew = of_K[..., 1]
-    e = -skew @ np.linalg.solve(skew.T @ skew, K[:, 0, 1])  # the most likely errors that undo it
+    e = -skew @ np.linalg.solve(skew.T @ skew, K[:, 0, 1])  # the maximum-likelihood errors that undo it
     change = {name: np.tensordot(e, metric.deviations(name), 1) for name in _MOVED}
     K[:, (0, 0, 0, 1, 1), (0, 1, 2, 1, 2)] += np.tensordot(e, of_K, 1)
     lens = metric.lens.copy()

@@ -166,7 +166,7 @@ def identity_in(path: Path | str) -> str:
 
 
 def _recording(path: Path | str) -> str | None:
-    """What all rows of a table have in the column of their recording; None if they have none or several."""
+    """Return the common recording of all rows of a table; None for none or several."""
     sheet = _Sheet(path, [], optional=[_RECORDING])
     found = {row[_RECORDING] for row in sheet.rows() if _RECORDING in row}
     return found.pop() if len(found) == 1 else None

@@ -117,7 +117,7 @@ def position_errors(
         shared = np.intersect1d(table.pose, fit.pose)
         same = [k for k in shared if np.array_equal(table.q[table.pose == k], fit.q[fit.pose == k])]
         if same:
-            raise InputError(f"pose {same[0]} is in both tables: hold out what is to be compared")
+            raise InputError(f"pose {same[0]} is in both tables: remove it from one of them")
     else:
         of = np.arange(len(table.q)) % _PARTS
         parts = [(np.flatnonzero(of == k), table.rows(of != k)) for k in range(min(_PARTS, len(of)))]

@@ -89,7 +89,7 @@ def _teach(
         except WorkFailed as error:
             reason = " ".join(str(error).split()).removeprefix("teach: ")
             value = {"file": output.resolve(), "failed": "teach", "reason": reason}
-            console.tell(value, ["teach: failed, nothing was written"])
+            console.tell(value, ["teach: failed; no file was written"])
             raise WorkFailed(f"teach: {reason}") from error
         write_whole(output, _TAUGHT + plain_yaml(taught.as_goal()))
     _tell_taught(console, output, taught, check, key="task.start" if start else "task.goal")

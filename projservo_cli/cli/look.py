@@ -137,7 +137,7 @@ def _export(
     The other kinds are in metres, by a known length: opencv both cameras for cv2.FileStorage, urdf the arm,
     ros static transforms of the cameras, json all numbers with their covariances.
 
-    With --nominal it tells which zeros and axes of a model are off, the most significant first.
+    With --nominal it lists the errors of zeros and axes of a model, the most significant first.
     """
     from projservo_cli.store import load
 
@@ -163,7 +163,7 @@ def _export(
 def _in_metres(
     run: Any, to: str, length: tuple[float | None, str | None, float], nominal: Path | None, tip: str | None
 ) -> tuple[str, dict[str, Any], list[str]]:
-    """Text of a file in metres, what there is to tell of it as an object, and in words."""
+    """Return the text of a file in metres, its JSON object, and its summary in words."""
     from projservo_cli import exports
     from projservo_cli.calibration.kinematic_errors import kinematic_errors
     from projservo_cli.config import load_config

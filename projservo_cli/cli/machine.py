@@ -95,7 +95,7 @@ def _doctor(
     move: bool,
     watch: bool,
 ) -> int:
-    """Say what is installed, or check a robot and its cameras.
+    """Report installed packages, or check a robot and its cameras.
 
     Lists versions, extras, whether the kernels are compiled, and the folder of results. Exit code 1 when
     a required part is missing.

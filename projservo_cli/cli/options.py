@@ -74,7 +74,7 @@ confirm = click.option(
 def told(function: _Function) -> _Function:
     """Give a command its console, made of ``--json``, ``-q`` and ``-v``, which all commands take.
 
-    What a robot or a law of a user prints meanwhile goes to standard error: it is not a result.
+    The output of a plug-in robot or law goes to standard error: it is not a result.
     """
 
     @click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")

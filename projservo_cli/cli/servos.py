@@ -74,7 +74,7 @@ def _release(console: Console, *, config: str) -> None:
 
 @contextmanager
 def _servos(console: Console, config: "Config") -> Iterator["Servos"]:
-    """Connect to the servos of a configuration; whether their torque is on is said in the end."""
+    """Connect to the servos of a configuration, and report at the end whether their torque is on."""
     from projservo_cli.hardware.so101 import SO101, connected, torque_told
     from projservo_cli.records import InputError, WorkFailed
     from projservo_cli.robots import plugins
@@ -93,7 +93,7 @@ def _servos(console: Console, config: "Config") -> Iterator["Servos"]:
 
 
 def _entered(console: Console, what: str) -> Callable[[], bool]:
-    """Ask somebody to do something meanwhile; a function that tells whether Enter came since."""
+    """Ask the user to act; return a function that tells whether Enter came since."""
     came = threading.Event()
 
     def ask() -> None:

@@ -6,7 +6,7 @@ _SO101 = """\
 # yaml-language-server: $schema=projservo.schema.json
 
 # An SO-101, or an SO-100, before two webcams: docs/tutorials/so101.md leads through it.
-# Angles are in degrees and lengths in metres where a key says so.
+# Keys name their units.
 name: arm
 
 plant:

@@ -279,7 +279,7 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
 def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Upgrades (B, 4, 4) to a right-handed frame, and markers (B, m, 3) there.
 
-    Both cameras have the markers in front of them, so each tells the handedness of the frame.
+    Both cameras have the markers in front of them, so each determines the handedness of the frame.
     Raises InputError if they contradict each other.
     """
     M = models.M @ G.swapaxes(-1, -2)

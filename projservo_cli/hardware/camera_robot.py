@@ -58,7 +58,7 @@ class CameraRobot:
     """A robot of the contract: joints of an arm, and corners of tags in the newest frame of each camera.
 
     numbers : of the markers, of which 4 t to 4 t + 3 are the corners of tag t.
-    ``views`` are those of the last look, None before.
+    ``views`` are those of the last reading, None before.
     """
 
     def __init__(self, arm: Arm, stereo: StereoSettings, finder: TagFinder, numbers: Sequence[int]) -> None:
@@ -89,7 +89,7 @@ class CameraRobot:
 
     @property
     def frames(self) -> ByteArray | None:
-        """Both frames (2, height, width) of the last look; None where their sizes differ."""
+        """Both frames (2, height, width) of the last reading; None if their sizes differ."""
         grey = [view.frame.grey for view in self.views if view is not None]
         return np.stack(grey) if len(grey) == 2 and grey[0].shape == grey[1].shape else None
 
@@ -130,13 +130,13 @@ class CameraRobot:
                 camera.close()
 
     def remarks(self) -> list[str]:
-        """Tell what is wrong with the last frames, in words: dark, clipped or blurred ones."""
+        """Return the faults of the last frames, in words: dark, clipped or blurred ones."""
         shown = [(name, view) for name, view in zip(VIEWS, self.views, strict=True) if view is not None]
         return [f"the {name} image {what}" for name, view in shown for what in wrong_with(view.frame.grey)]
 
 
 class Exposure(NamedTuple):
-    """How a frame is exposed, and how sharp it is."""
+    """Exposure and sharpness of a frame."""
 
     mean: float  # grey value
     clipped: float  # share of pixels that are white
@@ -162,7 +162,7 @@ def exposure_of(grey: ByteArray) -> Exposure:
 
 
 def wrong_with(grey: ByteArray) -> list[str]:
-    """Tell what is wrong with a frame, in words with the remedy; nothing for a sound one."""
+    """Return the fault of a frame with its remedy; empty for a sound one."""
     found = exposure_of(grey)
     wrong = []
     if grey.max() < _DARK:

@@ -221,7 +221,7 @@ def _cv() -> Any:
 
 
 def _set_up(capture: Any, settings: CameraSettings) -> Iterator[str]:
-    """Set format, size, rate, exposure and focus of a device; what it does not take, in words."""
+    """Set format, size, rate, exposure and focus of a device; return the refused settings, in words."""
     cv = _cv()
     capture.set(cv.CAP_PROP_FOURCC, cv.VideoWriter.fourcc(*settings.fourcc))
     if settings.size_px is not None:
@@ -289,7 +289,7 @@ def _nodes() -> list[Path]:
 
 
 def _wrong_device(device: Path) -> str:
-    """Why a device node gives no pictures, with the remedy; empty where it may."""
+    """Return the reason why a device node gives no pictures, with the remedy; empty if it may."""
     others = _nodes()
     if not device.exists():
         listed = ", ".join(map(str, others)) or "none: look at the cable"

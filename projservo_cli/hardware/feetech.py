@@ -1,6 +1,6 @@
 """Bus of serial servos by Feetech (STS and SMS series), protocol 0: requests, replies, retries.
 
-A reply tells neither what was asked nor when. So the input is cleared before each request, and after one
+A reply names neither its request nor its time. So the input is cleared before each request, and after one
 that came to nothing the next ones read another number of bytes: a late reply has a wrong length.
 
 Source: Feetech, "Communication Protocol User Manual", and the memory map of the STS3215.
@@ -25,7 +25,7 @@ _SHORTEST, _LENGTHS = 15, 12
 _REPLY_S, _SLOW_S = 0.012, 0.1
 # Time for which a servo that does not answer is asked again, s: longer than a bus that is silent for 0.2 s.
 _PATIENCE_S = 0.8
-# Pause between looks at what has arrived, and before what was written is read back, s.
+# Pause between checks of the input, and before a written value is read back, s.
 _PAUSE_S, _WRITTEN_S = 0.0002, 0.005
 # How often a write is repeated that a servo does not take.
 _WRITES = 5
@@ -34,9 +34,9 @@ _SYNC_READ, _SYNC_WRITE, _ALL = 0x82, 0x83, 0xFE
 
 
 class Reply(NamedTuple):
-    """What a servo answered."""
+    """Reply of a servo."""
 
-    status: int  # bits of what is wrong with it
+    status: int  # bits of its faults
     values: bytes
 
 
@@ -97,7 +97,7 @@ class FeetechBus:
             back = self.read([*values], address, len(next(iter(values.values()))))
             values = {number: row for number, row in values.items() if back[number].values != row}
         if values:
-            raise WorkFailed(f"servo {min(values)} does not take what is written to its register {address}")
+            raise WorkFailed(f"servo {min(values)} refuses the value written to its register {address}")
 
     def _asked(self, ids: Sequence[int], address: int, size: int) -> tuple[dict[int, Reply], set[int]]:
         """Replies to one request by servo, and the servo of which something arrived that is no reply."""
@@ -165,7 +165,7 @@ _WHY = {
 
 
 def _opened(port: str) -> Any:
-    """Open a port; an InputError says what is in the way."""
+    """Open a port; an InputError names the obstacle."""
     try:
         import serial
     except ImportError as error:

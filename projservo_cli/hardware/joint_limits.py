@@ -1,4 +1,4 @@
-"""Joint limits that somebody shows by moving a released arm through what is allowed."""
+"""Joint limits taught by moving a released arm through its allowed range."""
 
 import math
 from collections import deque
@@ -17,7 +17,7 @@ _MOVED_DEG, _WITHIN_DEG = 20.0, 1.0
 
 
 class Moved(NamedTuple):
-    """How far somebody moved a joint, in counts that go on over a whole turn."""
+    """Range of a joint moved by hand, in counts that continue over a whole turn."""
 
     lowest: int
     highest: int
@@ -65,7 +65,7 @@ def limits_deg(
 
 
 def _unusable(moved: Moved, joint: int, shift: Sequence[int]) -> str:
-    """Why no limits follow from how far a joint was moved, with the remedy; empty where they do."""
+    """Return the reason why the range of a joint gives no limits, with the remedy; empty if it does."""
     span = math.degrees((moved.highest - moved.lowest) * COUNT)
     if span < _MOVED_DEG:
         return (

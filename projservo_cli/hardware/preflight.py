@@ -32,9 +32,9 @@ class Finding(NamedTuple):
     """One result of a check."""
 
     level: str  # fault, warning or fine
-    where: str  # what it is about
-    text: str  # what was found, with the number and its limit
-    remedy: str = ""  # empty where nothing is wrong
+    where: str  # subject
+    text: str  # finding, with the number and its limit
+    remedy: str = ""  # empty for a sound part
 
 
 @dataclass(eq=False)
@@ -138,7 +138,7 @@ def _width(tag: Corners) -> float:
 
 
 def other_dictionary(grey: ByteArray, dictionary: str) -> tuple[str, int]:
-    """Dictionary with the most tags in an image, and how many, among those with tags of another kind.
+    """Return the dictionary with the highest number of tags in an image, among other kinds, and the number.
 
     Of two with as many tags it is the one of the larger and the fewer tags.
     """

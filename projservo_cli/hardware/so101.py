@@ -1,7 +1,7 @@
 """Plant ``so101``: an arm of bus servos STS3215, such as the SO-100 and SO-101, or any other by its ids.
 
 Joint readings are counts from the middle of the turn of each servo, in rad. Zeros and signs may be any:
-calibration finds what they mean, and registers that change it are stored with a recording.
+calibration finds their meaning, and registers that change it are stored with a recording.
 
 Source: Feetech, memory map of the STS3215.
 """
@@ -35,15 +35,15 @@ _WRONG = {
     0x01: "its supply has {volts:.1f} V ({least:.1f} to {most:.1f} V): look at the supply",
     0x02: "its angle sensor fails: replace it",
     0x04: "it is too hot, {heat} °C: let it cool",
-    0x08: "its current is too high: free what holds it",
-    0x20: "it is overloaded, and pushes with a fifth of its torque: free what it presses against",
+    0x08: "its current is too high: free it",
+    0x20: "it is overloaded, and pushes with a fifth of its torque: free it from its obstacle",
 }
 # Fastest that somebody turns a joint, or a servo does, rad/s, and what readings scatter, rad; more is no
 # reading.
 _FASTEST, _SCATTER = math.radians(720.0), math.radians(1.0)
-# Factor by which a servo may outrun set-points, so that it catches up; and what the gripper may, rad/s.
+# Factor by which a servo may outrun set-points, so that it catches up; and speed limit of the gripper, rad/s.
 _CATCHES_UP, _GRIPPER = 1.5, math.radians(60.0)
-# How often a reading is repeated that cannot be true, or tells of a fault.
+# Repetitions of a reading that cannot be true, or reports a fault.
 _REPEATS = 4
 # How far a joint may turn while its torque comes on, be beyond a limit, or lag where it stands, rad.
 _LEAP = math.radians(3.0)
@@ -51,12 +51,12 @@ _SWITCH_S = 0.1  # after which torque has come on
 
 
 class Measured(NamedTuple):
-    """What one servo measures."""
+    """Measurements of one servo."""
 
     at: int  # counts
     volts: float
     heat: int  # °C
-    status: int  # bits of what is wrong
+    status: int  # bits of its faults
 
     @property
     def angle(self) -> float:
@@ -75,7 +75,7 @@ class Registers(NamedTuple):
 
 
 class Servos:
-    """The servos of an arm on a port: what they measure and store, torque, set-points.
+    """The servos of an arm on a port: measurements, registers, torque, set-points.
 
     port : its name; ``auto`` for the only one on which all of them answer.
     ids : of the joints, base to tool; others : of further servos, such as a gripper.
@@ -87,7 +87,7 @@ class Servos:
         if len({*self.all}) < len(self.all) or not all(0 < i < 254 for i in self.all):
             raise InputError(f"plant.options: ids {[*self.all]} must be numbers from 1 to 253, each once")
         self.bus = FeetechBus(_port_of(self.all, **clock) if port == "auto" else port, **clock)
-        self.lost: set[int] = set()  # that nothing is written to any more
+        self.lost: set[int] = set()  # servos that get no further writes
         try:
             found = {i: reply.values for i, reply in self._first().items()}
         except BaseException:
@@ -137,7 +137,7 @@ class Servos:
         return {i: Measured(_number(x), 0.1 * x[6], x[7], status) for i, (status, x) in found}
 
     def registers(self) -> dict[int, Registers]:
-        """Return what is stored in each servo."""
+        """Return the registers of each servo."""
         first, last = self.bus.read(self.all, _LOWEST, 10), self.bus.read(self.all, _OFFSET, 3)
         found = {}
         for i in self.all:
@@ -150,7 +150,7 @@ class Servos:
         return {i: reply.values == b"\1" for i, reply in self.bus.read(self.alive, _TORQUE, 1).items()}
 
     def release(self, *, all_of_them: bool = False) -> None:
-        """Let go of the joints; of other servos too where that is asked for."""
+        """Release the joints, on request other servos too."""
         servos = [i for i in self.alive if all_of_them or i in self.ids]
         self.bus.store(_TORQUE, dict.fromkeys(servos, b"\0"))
 
@@ -182,7 +182,7 @@ class Servos:
             return "no servo answers any more: all joints may fall: hold the arm, and look at its supply"
         self.lost |= {*error.silent}
         names = ", ".join(map(self.name, error.silent))
-        return f"{names}: no answer any more: it may fall, with what it carries; look at the cable to it"
+        return f"{names}: no answer any more: it may fall with its load; check the cable to it"
 
 
 class SO101:
@@ -191,7 +191,7 @@ class SO101:
     port : of the arm, such as /dev/ttyACM0; ``auto`` takes the only one on which all servos answer.
     ids : of the servos of the joints, base to tool. gripper : that of the gripper, which is held; None for
         an arm without.
-    limits : of its joints, rad and rad/s; without, nothing is moved.
+    limits : of its joints, rad and rad/s; without them the arm does not move.
     """
 
     now = staticmethod(time.monotonic)  # its clock, s
@@ -304,7 +304,7 @@ class SO101:
         raise failure
 
     def close(self) -> None:
-        """Let go of the port; the arm goes on holding, or not, which is said."""
+        """Release the port, and report whether the arm holds."""
         if self._opened:
             self._opened = False
             _say(torque_told(self._servos))
@@ -338,7 +338,7 @@ class SO101:
                 )
 
     def _unfit(self, number: int, stored: Registers) -> str:
-        """Why a joint would not stand where it is sent, with the remedy; empty where it does."""
+        """Return the reason why a joint would miss its set-point, with the remedy; empty if it does not."""
         if stored.mode != 0:
             return f"its mode (register 33) is {stored.mode}: set 0, position, with the tool of its maker"
         if stored.phase & _MULTI_TURN:
@@ -357,7 +357,7 @@ class SO101:
         )
 
     def _read(self) -> dict[int, Measured]:
-        """What all servos measure; a reading that cannot be true, or tells of a fault, is repeated.
+        """Return the measurements of all servos; repeat an impossible reading, or one with a fault.
 
         The first one counts where a second agrees with it.
         """
@@ -378,7 +378,7 @@ class SO101:
         raise WorkFailed(told)
 
     def _leapt(self, found: Mapping[int, Measured], seconds: float) -> str:
-        """Which joint reads what it cannot have turned to since the last reading; empty for none."""
+        """Return the joint whose reading is impossible since the last one; empty for none."""
         most = _FASTEST * seconds + _SCATTER
         if self._on and self._limits is not None:
             fastest = 2.0 * _CATCHES_UP * max(_GRIPPER, float(self._limits.speed.max()))
@@ -394,7 +394,7 @@ class SO101:
         return ""
 
     def _faulty(self, found: Mapping[int, Measured]) -> str:
-        """Which servo says that something is wrong with it, with the remedy; empty for none."""
+        """Return the servo that reports a fault, with the remedy; empty for none."""
         for i, one in found.items():
             for bit, told in _WRONG.items():
                 if one.status & bit:
@@ -460,7 +460,7 @@ class _Lease:
 
 
 def _port_of(ids: Sequence[int], **clock: Any) -> str:
-    """Return the only port on which all servos answer; an InputError lists what there is."""
+    """Return the only port on which all servos answer; an InputError lists the ports."""
     ports, fitting = candidate_ports(), []
     for port in ports:
         with suppress(InputError, WorkFailed):

@@ -104,14 +104,14 @@ def _columns(rows: Sequence[tuple[int, float, Reading]]) -> tuple[IntArray, Floa
 
 
 class _Signal(NamedTuple):
-    """How far the markers of a view moved along the main direction of their motion, rms."""
+    """Return the motion of the markers of a view along its main direction, rms."""
 
     t: FloatArray  # (f,) stamps of new frames, s
     p: FloatArray  # (f,) px
 
 
 def _signal(moved: Strokes, view: int) -> _Signal:
-    """Motion of what a view shows in all of its new frames."""
+    """Motion of the markers of a view in all of its new frames."""
     readings = moved.readings
     new = [k for k in range(1, len(readings)) if readings[k].new_views(readings[k - 1])[view]]
     s = np.array([readings[k].s[view] for k in new]).reshape(len(new), -1, 2)
@@ -196,7 +196,7 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
         fits = [_passed(one, signal) for signal in signals]
         if one.given_up:
             remedy = (
-                "look what holds it, and at the supply; where it sags or plays so far, raise "
+                "free it, and check the supply; if its sag or backlash is that large, raise "
                 "plant.max_steady_state_error_deg"
             )
             yield Finding(FAULT, f"joint {one.joint + 1}", f"{one.given_up}: it is held or too weak", remedy)

@@ -48,7 +48,7 @@ class Monitored(Protocol):
         """Tell whether images disagreed and have not agreed since."""
 
     def give_up(self) -> None:
-        """Return the most likely fault without further frames."""
+        """Return the maximum-likelihood fault without further frames."""
 
 
 class Monitor(Protocol):

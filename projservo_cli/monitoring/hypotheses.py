@@ -133,7 +133,7 @@ class Evidence:
         return np.asarray(found.reshape(-1, *rows.shape[2:]))
 
     def _off(self, changed: Changed) -> FloatArray:
-        """What images (K, 4 m) are off the prediction of a cause, px; zero where unseen."""
+        """Return the residuals (K, 4 m) of images from the prediction of a cause, px; zero if unseen."""
         K, _, n = changed.away.shape
         scene = Parameters(
             P=changed.P,

@@ -395,7 +395,7 @@ class ImageMonitor:
         """Sentence on the fault by the likeliest of causes."""
         residual = self._kept[-1].residual
         rms = np.sqrt(np.square(residual.r).sum() / max(2.0 * residual.seen.sum(), 1.0))
-        off = f"images are {rms:.3g} px rms per coordinate off what the calibration predicts"
+        off = f"images are {rms:.3g} px rms per coordinate off their prediction by the calibration"
         least = 0.0 if found[0].cause.markers else _LEAST_PART * self._evidence_now.off_px
         if not self._explains(found[0]) or found[0].changed_px < least:
             return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
@@ -407,7 +407,7 @@ class ImageMonitor:
         return f"{off}: {'; or '.join(names)}"
 
     def _where(self, residual: Residual) -> str:
-        """Where images are off most: a view, and a tag or marker."""
+        """Return the place of the largest residuals: a view, and a tag or marker."""
         square = np.square(residual.r.reshape(2, -1, 2)).sum(axis=-1)
         view, j = np.unravel_index(int(np.argmax(square)), square.shape)
         number = int(self.calibration.marker[j])

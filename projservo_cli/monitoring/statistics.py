@@ -223,7 +223,7 @@ class ErrorModel:
         return F
 
     def sums(self, residual: Residual, t: float) -> Sums:
-        """What one observation adds to the normal equations."""
+        """Contribution of one observation to the normal equations."""
         rows = np.concatenate([residual.B, residual.F, residual.r[:, None]], axis=1)
         root = np.linalg.cholesky(residual.R)
         rows = solve_triangular(root, rows, lower=True, check_finite=False)
@@ -335,7 +335,7 @@ class Memory:
         return float(np.clip(self._squares[kind] / self._freedom[kind], 0.0, 1.0) * max(0.0, sure))
 
     def worth(self, observations: float) -> float:
-        """How many single observations so many observations of one view are worth."""
+        """Return the effective number of independent observations of a view."""
         return observations / (self.fresh + observations * (1.0 - self.fresh)) if observations else 0.0
 
     @property

@@ -41,7 +41,7 @@ def _listed(values: FloatArray) -> str:
 
 
 # A curve follows an exponential where each step's factor is within this share of 1 - gain·period, over enough
-# steps that are this long after the last one at the joint-speed limit, and down to errors that nothing but
+# steps that are this long after the last one at the joint-speed limit, and down to errors that only
 # the calibration explains, m and rad.
 _FACTOR_TOLERANCE = 0.01
 _LEAST_STEPS, _SETTLING_STEPS = 10, 20

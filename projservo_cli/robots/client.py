@@ -254,7 +254,7 @@ class DrivenRobot:
 
     @property
     def carried_px(self) -> float:
-        """How far the face is from where it comes to rest, px rms per marker and view."""
+        """Return the distance of the face from its place of rest, px rms per marker and view."""
         face = self._carried[:, : len(self.plant.M)]
         return math.sqrt(2.0 * float(np.nanmean(face**2)))
 

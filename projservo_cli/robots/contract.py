@@ -43,7 +43,7 @@ class Reading(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """What no command may exceed, and how servos follow; (n,) each, rad or m.
+    """Limits of every command, and bounds of the servos; (n,) each, rad or m.
 
     ``units`` are those in which messages give joints: deg, rad or m; empty where unknown.
     """
@@ -118,7 +118,7 @@ class ForeignRobot:
     timeout_s, open_s : most time an answer may take, s, and opening it.
     image_size : width and height of its frames, px; None for any.
     All methods raise ``WorkFailed`` where the robot fails, is late or answers nonsense. Calls are made in one
-    thread of its own, so that the loop goes on where one never returns.
+    separate thread, so that the loop goes on if one never returns.
     """
 
     def __init__(
@@ -195,12 +195,12 @@ class ForeignRobot:
         return self._numbers("truth() gave numbers", answer, shape, finite=True)
 
     def health(self) -> dict[str, float | str]:
-        """What the robot measures of itself, such as its voltage, by name; empty where it tells nothing."""
+        """Return the measurements of the robot on itself, such as its voltage, by name; may be empty."""
         tell = getattr(self.robot, "health", None)
         return {} if tell is None else dict(self._ask("health", tell))
 
     def identity(self) -> str:
-        """Text that changes where readings mean something else; empty where the robot tells none."""
+        """Return a text that changes with the meaning of the readings; may be empty."""
         tell = getattr(self.robot, "identity", None)
         return "" if tell is None else "".join(str(self._ask("identity", tell)).split())
 
@@ -284,7 +284,7 @@ class ForeignRobot:
         error = _came(orders, STOP_S)
         if self._opened and error != "":
             what = f"failed: {error}" if error else f"did not return within {STOP_S:g} s"
-            raise WorkFailed(f"{self.name}: stop() {what}; see to it that the robot is at rest")
+            raise WorkFailed(f"{self.name}: stop() {what}; make sure that the robot is at rest")
 
     def close(self) -> None:
         """Let go of the robot, once, in its thread, even if opening it failed, and report errors."""
@@ -315,7 +315,7 @@ class ForeignRobot:
             error = order.exception(seconds)
         except TimeoutError:
             raise WorkFailed(
-                f"{self.name}: {what}() did not return within {seconds:g} s: look what it waits for, or "
+                f"{self.name}: {what}() did not return within {seconds:g} s: find out why it waits, or "
                 f"raise plant.{key}"
             ) from None
         if isinstance(error, (KeyboardInterrupt, InputError)):
@@ -367,7 +367,7 @@ class ForeignRobot:
         )
 
     def _wrong(self, target: FloatArray, speed: FloatArray, due: float) -> str:
-        """Why a command must not be sent, whoever computed it; empty where it may."""
+        """Return the reason why a command must not be sent; empty if it may."""
         bounds = self.bounds
         if self._last is None:
             return "nothing was read before"
@@ -426,7 +426,7 @@ def _serve(call: Callable[[], Any], order: "Future[Any]") -> None:
 
 
 def _came(orders: "list[Future[Any]]", seconds: float) -> str | None:
-    """What went wrong with the first of the orders that was carried out; None for none yet.
+    """Return the error of the first finished order; None for none yet.
 
     Whoever interrupts meanwhile is not heeded.
     """

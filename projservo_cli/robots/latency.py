@@ -293,7 +293,7 @@ class _View:
             self._log_chance = self._open(self.mean, UNKNOWN_S)
 
     def _shift(self, image: FloatArray, t: float, history: History) -> tuple[float, float]:
-        """How much later than t an image was taken, to first order, and the deviation of that, s.
+        """Return the time of an image after t, to first order, and its standard deviation, s.
 
         An image gives its instant only where it moved in the same direction before and after.
         """

@@ -34,7 +34,7 @@ class SetPoint:
 
     @property
     def unanswered(self) -> FloatArray:
-        """How far (n,) the set-point went since the reading of each joint last changed, rad or m."""
+        """Return the motion (n,) of the set-point since the last change of each reading, rad or m."""
         return self.target - self._answered
 
     def read(self, q: FloatArray, seconds: float) -> None:

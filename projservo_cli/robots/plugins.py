@@ -193,7 +193,7 @@ def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:
     for name in own:
         near = difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
         if near and near[0] not in own:
-            raise InputError(f"{where}: has {name}, which nothing looks for; did you mean {near[0]}?")
+            raise InputError(f"{where}: has {name}, which is not in the contract; did you mean {near[0]}?")
 
 
 def what_failed(error: BaseException) -> str:

@@ -25,7 +25,7 @@ class Readings(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """How fast joints may move: per s and per s², rad for revolute joints and m for prismatic ones."""
+    """Speed and acceleration limits of joints: per s and per s², rad (revolute) and m (prismatic)."""
 
     revolute: float = math.inf
     prismatic: float = math.inf
@@ -123,7 +123,7 @@ class CameraSettings(NamedTuple):
     """One camera, as it is configured."""
 
     source: int | str  # index, device, file or URL
-    size_px: tuple[int, int] | None = None  # width and height; None for what it gives
+    size_px: tuple[int, int] | None = None  # width and height; None for the native size
     rate_hz: float | None = None  # frames a second; None for its own
     fourcc: str = "MJPG"  # format in which a device sends frames
     exposure_ms: float | None = None  # None leaves it to the camera

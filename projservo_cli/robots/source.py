@@ -73,7 +73,7 @@ def _imports(spec: ModuleSpec, source: bytes) -> Iterator[str]:
     """Names of modules that a source imports, or may: a name from a package may be a module of it."""
     try:
         statements = list(ast.walk(ast.parse(source)))
-    except (SyntaxError, ValueError):  # importing it says so
+    except (SyntaxError, ValueError):  # its import reports it
         return
     package = spec.name.split(".") if spec.submodule_search_locations else spec.name.split(".")[:-1]
     for statement in statements:

@@ -448,7 +448,7 @@ class _Joints:
             self._slip = by
 
     def _load(self, q: FloatArray) -> FloatArray:
-        """Torque (n,) of gravity in each joint by the tool at joints (n,), 1 for the most at full reach."""
+        """Torque (n,) of gravity in each joint by the tool at joints (n,), 1 at full reach."""
         if not self._loaded:
             return np.zeros(len(q))
         turning = self.arm.joint_types != PRISMATIC

@@ -95,7 +95,7 @@ def chain_of(model: Any, body: int, where: str) -> list[int]:
     for joint in chain:
         if mj.mjtJoint(int(model.jnt_type[joint])) not in (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_SLIDE):
             name = model.joint(joint).name or joint
-            raise InputError(f"{where}: joint {name}, on the way to {told}, has more than one axis")
+            raise InputError(f"{where}: joint {name}, on the chain to {told}, has more than one axis")
     if not chain:
         raise InputError(f"{where}: no joint moves body {told}")
     return chain

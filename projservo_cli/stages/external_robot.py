@@ -60,7 +60,7 @@ def foreign_robot(
         f"plant {plugins.short_name(own.target)}",
         own.timeout_s,
     )
-    if own.cameras is not None:  # a look waits for a camera that reconnects
+    if own.cameras is not None:  # a reading waits for a camera that reconnects
         timeout_s += own.cameras.reconnect_s
     return ForeignRobot(robot, name, len(numbers), bounds, timeout_s, own.open_s, own.image_size)
 

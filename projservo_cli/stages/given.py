@@ -226,7 +226,7 @@ class Contract(NamedTuple):
     timeout_s: float  # most time that an answer may take
     time_offset_s: tuple[float, float] | None  # of the images of both cameras; None to estimate them
     settle_s: float | None  # for how long a robot of somebody's has stood still at the start
-    identity: str = ""  # of the robot in the recording that the calibration is of; empty where none is told
+    identity: str = ""  # of the robot in the recording that the calibration is of; may be empty
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,12 +20,12 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import foreign_robot
 from projservo_cli.stages.given import RecordingInputs
 
-# For how long a robot at rest is looked at, s, and the least number of looks.
+# Time of observation of a robot at rest, s, and minimum number of readings.
 _LOOK_S, _MIN_LOOKS = 1.5, 8
 
 
 class Checked(NamedTuple):
-    """What was found."""
+    """Findings."""
 
     findings: tuple[Finding, ...]
     seen: Seen | None  # None where robot or cameras did not open

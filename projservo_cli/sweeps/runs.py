@@ -221,7 +221,7 @@ TOGETHER = 16
 
 
 def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatArray:
-    """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone."""
+    """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its seed alone."""
     setting = Setting(
         code=CODES[law],
         model=scenario.model,

@@ -236,7 +236,7 @@ def test_motions_of_a_sound_arm_tell_latency_hysteresis_and_backlash():
             "no tag moved: the tags sit on the link before joint 4: mount them behind",
         ),
         (Faults(loose=3, loose_px=3.0), "tags", "tag 3 moved by"),
-        (Faults(held=1), "joint 2", "went 0 deg of 3 deg: it is held or too weak: look what holds it"),
+        (Faults(held=1), "joint 2", "went 0 deg of 3 deg: it is held or too weak: free it"),
     ],
 )
 def test_motions_name_what_a_recording_would_fail_at(faults, where, words):

@@ -243,7 +243,7 @@ def test_what_fails_is_named_in_time_and_written_to_no_more(opened, fault):
 def test_an_arm_that_presses_against_a_stop_is_named(opened, rig):
     bus = rig(mechanics=Mechanics(stops_deg={0: (-15.0, 15.0)}))
     bus, arm = opened(bus)
-    with pytest.raises(WorkFailed, match=r"joint 1 \(servo 1\): it is overloaded, .* free what it presses"):
+    with pytest.raises(WorkFailed, match=r"joint 1 \(servo 1\): it is overloaded, .* free it from"):
         drive(arm, np.radians([60.0, 0, 0, 0, 0]), 120)
 
 

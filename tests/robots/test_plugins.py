@@ -40,9 +40,9 @@ def written(name, text):
         (f"{HERE}:NOT_A_CLASS", r"is no class, but of type int"),
         (f"{HERE}:NoStop", r"lacks stop\(\); needed: open, read, command, stop, close"),
         (f"{HERE}:Old", r"lacks open\(\), close\(\); needed: open, joints,"),
-        (f"{HERE}:Truths", r"has truths, which nothing looks for; did you mean truth\?"),
+        (f"{HERE}:Truths", r"has truths, which is not in the contract; did you mean truth\?"),
         (f"{HERE}:Now", r"has now, which is to be a method; give it another name"),
-        (f"{HERE}:Stopp", r"has stopp, which nothing looks for; did you mean stop\?"),
+        (f"{HERE}:Stopp", r"has stopp, which is not in the contract; did you mean stop\?"),
         (f"{HERE}:Sound", r"does not take plant\.options: missing a required argument: 'config'"),
         ("mine_bad_syntax:A", r"importing mine_bad_syntax failed: SyntaxError: .* \(mine_bad_syntax.py:2\)$"),
         (

@@ -18,7 +18,7 @@ from projservo_cli.report.report_data import (
     title,
 )
 
-_LEAST_SHARE = 0.05  # of the largest deviation of the best run, below which nothing is drawn
+_LEAST_SHARE = 0.05  # of the largest deviation of the best run, below which no curve is drawn
 _PATH_POINTS = 400
 _WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
 _WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a fraction of the smallest
