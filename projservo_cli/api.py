@@ -42,7 +42,7 @@ from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
-from projservo_cli.stages.external_robot import foreign_robot
+from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.given import Estimation, Trials
 from projservo_cli.store import load as stored_run
 from projservo_cli.store import run_path
@@ -160,7 +160,7 @@ def record(
             assert given.trials.driven is not None
             assert given.own is not None
             bounds = given.trials.driven.following.bounds(joints)
-            driven = foreign_robot(given.own, bounds, joints.types, made.marker.tolist(), robot)
+            driven = plugin_robot(given.own, bounds, joints.types, made.marker.tolist(), robot)
         recording.record(given, made, driven, kept=table is not None, progress=listener.progress)
     return Observations.of(
         made.observation(),

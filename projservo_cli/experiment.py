@@ -198,9 +198,9 @@ class Chain:
         made = [step.stage for step in self.steps if step.why]
         if "calibrate" not in made or "servo" not in made:
             return nullcontext()
-        from projservo_cli.loop.jit_warmup import compiling_beside
+        from projservo_cli.loop.jit_warmup import compiling_in_background
 
-        return compiling_beside()
+        return compiling_in_background()
 
     def _say_compilation(self) -> None:
         """The first run on a machine is slower by the time of compilation; say so."""

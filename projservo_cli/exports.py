@@ -30,9 +30,9 @@ class OpenCV(NamedTuple):
     def pixels(self, points: FloatArray) -> FloatArray:
         """Pixels (K, 2, 2) of points (K, 3) of the base frame, by view."""
         K, straight = self.body.intrinsics(), self.body.pixels(points)
-        bent = _terms(_normalized(K, straight)) @ self.distortion[:, :, None]
+        distorted = _terms(_normalized(K, straight)) @ self.distortion[:, :, None]
         focal = np.diagonal(K[:, :2, :2], axis1=1, axis2=2)
-        return np.asarray(straight + bent[..., 0].reshape(straight.shape) * focal)
+        return np.asarray(straight + distorted[..., 0].reshape(straight.shape) * focal)
 
 
 def opencv_cameras(metric: Metric) -> OpenCV:
@@ -125,7 +125,7 @@ def _matrix(name: str, values: FloatArray) -> list[str]:
     return [*head, f"   data: [{numbers}]"]
 
 
-def _places(metric: Metric) -> FloatArray:
+def _points(metric: Metric) -> FloatArray:
     """Points (n, 3) of the axes at readings of zero, each the nearest to the one before, m."""
     points, last = [], np.zeros(3)
     for screw, slides in zip(metric.axes, metric.prismatic, strict=True):
@@ -141,7 +141,7 @@ def urdf(metric: Metric, names: Sequence[str]) -> str:
 
     All link frames are parallel to the base at readings of zero. Limits of joints are the readings found.
     """
-    places, prismatic = _places(metric), metric.prismatic
+    places, prismatic = _points(metric), metric.prismatic
     links = ["base_link", *(f"link_{i + 1}" for i in range(len(places))), "tool"]
     links += [f"camera_{view}" for view in VIEWS]
     lines = ['<?xml version="1.0"?>', '<robot name="calibrated">']
@@ -210,8 +210,8 @@ def kinematic_words(errors: Sequence[JointError], joint_types: str) -> Iterator[
     for one in sorted(zeros, key=lambda one: -abs((one.zero or 0.0) / (one.zero_std or 1.0))):
         scale, unit = (1e3, " mm") if joint_types[one.joint - 1] == "P" else (float(np.degrees(1.0)), "°")
         zero, std = scale * (one.zero or 0.0), scale * (one.zero_std or 0.0)
-        told = f"joint {one.joint}: zero off by {round(zero, 2) + 0.0:+.2f}{unit} ± {std:.2f}{unit}"
-        yield told.replace("-", "\N{MINUS SIGN}")
+        summary = f"joint {one.joint}: zero off by {round(zero, 2) + 0.0:+.2f}{unit} ± {std:.2f}{unit}"
+        yield summary.replace("-", "\N{MINUS SIGN}")
     for one in sorted(errors, key=lambda one: -one.offset_m / max(one.offset_std_m, 1e-12)):
         yield (
             f"joint {one.joint}: axis off by {1e3 * one.offset_m:.2f} mm ± {1e3 * one.offset_std_m:.2f} mm, "

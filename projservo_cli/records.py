@@ -316,7 +316,7 @@ class Calibration:
         "limit", about="95 % interval of sigma_scale", default=None
     )
 
-    def places(self, numbers: Iterable[int]) -> list[int]:
+    def indices_of(self, numbers: Iterable[int]) -> list[int]:
         """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""
         known = self.marker.tolist()
         return [known.index(number) for number in numbers]

@@ -72,9 +72,9 @@ def bounds_of(config, joints):
     return given._following(config, config.plant.speed_scale).bounds(joints)
 
 
-def foreign_robot(config, joints, markers):
+def plugin_robot(config, joints, markers):
     robot = given.recording_inputs(config).own
-    return external_robot.foreign_robot(robot, bounds_of(config, joints), joints.types, range(markers))
+    return external_robot.plugin_robot(robot, bounds_of(config, joints), joints.types, range(markers))
 
 
 def robot_by_itself(config, truth, q, sigma_px, seed, stream):
@@ -87,9 +87,9 @@ def rendered_of(config):
     return rendered_model(given.scene_of(config))
 
 
-def shown_in_frames(config, truth, q, drawn):
+def observed_in_frames(config, truth, q, drawn):
     scene = given.scene_of(config)
-    return faults.shown_in_frames(scene, config.noise.averaged_frames, q, drawn)
+    return faults.observed_in_frames(scene, config.noise.averaged_frames, q, drawn)
 
 
 def eyes_of(config):

@@ -16,7 +16,7 @@ from projservo_cli.geometry.metric import Metric
 from projservo_cli.observations import Observations
 from projservo_cli.results import ImageModel
 from projservo_cli.robots.contract import Robot
-from projservo_cli.stages.servo import ForeignLaw, LawSetup
+from projservo_cli.stages.servo import LawSetup, PluginLaw
 from projservo_cli.sweeps.study import Study
 
 # What Python users call, in the order of a run, and the members of each class.
@@ -38,7 +38,7 @@ INTERFACE: dict[Any, tuple[str, ...]] = {
     records.WorkFailed: (),
 }
 ROBOT = ("open", "read", "command", "stop", "close")
-LAW = (LawSetup, ForeignLaw, Gains)
+LAW = (LawSetup, PluginLaw, Gains)
 
 
 def python_interface() -> Iterator[str]:

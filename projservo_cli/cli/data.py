@@ -89,15 +89,15 @@ def _teach(
         except WorkFailed as error:
             reason = " ".join(str(error).split()).removeprefix("teach: ")
             value = {"file": output.resolve(), "failed": "teach", "reason": reason}
-            console.tell(value, ["teach: failed; no file was written"])
+            console.report(value, ["teach: failed; no file was written"])
             raise WorkFailed(f"teach: {reason}") from error
         write_whole(output, _TAUGHT + plain_yaml(taught.as_goal()))
-    _tell_taught(console, output, taught, check, key="task.start" if start else "task.goal")
+    _print_taught(console, output, taught, check, key="task.start" if start else "task.goal")
     if check is not None and not check.reached:
         raise WorkFailed(f"{output}: by the calibration, {check.reason}")
 
 
-def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: str) -> None:
+def _print_taught(console: Console, path: Path, taught: Any, check: Any, *, key: str) -> None:
     import numpy as np
 
     value = {
@@ -124,7 +124,7 @@ def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: 
         far = ", ".join(f"{number} ({side}) by {px:.3g} px" for number, side, px in check.far)
         words.append(wrapped(check.reason, "  "))
         words.append(wrapped(f"markers that disagree with the calibration: {far or 'none'}", "  "))
-    console.tell(value, [*words, f"set {key}: {path}"])
+    console.report(value, [*words, f"set {key}: {path}"])
 
 
 @main.command(
@@ -214,7 +214,7 @@ def _detect(
         "  {unrefined} points without clean edges: less certain, or rejected if occluded",
         "  rejected: {ambiguous} tags twice in an image; images without a tag: {empty_images}",
     )
-    console.tell(value, [*(text.format_map(value) for text in words), f"table: {output}"])
+    console.report(value, [*(text.format_map(value) for text in words), f"table: {output}"])
 
 
 @main.command("validate", epilog="Example: projservo validate results/mine --data validation.csv")
@@ -289,7 +289,7 @@ def _validate(
             "  error mm: rms {rms_mm:.3g}, median {median_mm:.3g}, largest {max_mm:.3g}",
             "  covariance: rms {predicted_rms_mm:.3g} mm, mean squared error over it {mahalanobis:.3g}",
         )
-        console.tell({"run": found.path.resolve(), **value}, [text.format_map(value) for text in lines])
+        console.report({"run": found.path.resolve(), **value}, [text.format_map(value) for text in lines])
         return
     observation = read_table(data, calibration.joint_types, joint_unit)
     value = {"run": found.path.resolve(), **residual_statistics(calibration, observation)}
@@ -304,7 +304,7 @@ def _validate(
         words.append(
             "  residual px: rms {rms_px:.4g}, median {median_px:.4g}, p95 {p95_px:.4g}".format_map(value)
         )
-    console.tell(value, words)
+    console.report(value, words)
 
 
 def _position_errors(

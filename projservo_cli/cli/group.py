@@ -143,7 +143,7 @@ class _Group(click.Group):
         """Run the command line, or answer a shell that completes it, and leave with the exit code."""
         if _COMPLETE in os.environ:
             sys.exit(shell_complete(self, {}, "projservo", _COMPLETE, os.environ[_COMPLETE]))
-        sys.unraisablehook = _interrupt_anew
+        sys.unraisablehook = _raise_again
         sys.exit(run(sys.argv[1:] if args is None else args))
 
 
@@ -218,7 +218,7 @@ def _complain(text: str, code: int) -> int:
     return code
 
 
-def _interrupt_anew(lost: "sys.UnraisableHookArgs") -> None:
+def _raise_again(lost: "sys.UnraisableHookArgs") -> None:
     """Interrupt a moment later where Ctrl-C came amid what cannot raise, such as the end of an object."""
     if not issubclass(lost.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(lost)

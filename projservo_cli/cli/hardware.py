@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from projservo_cli.config import Config
     from projservo_cli.hardware.preflight import Seen
     from projservo_cli.records import FloatArray
-    from projservo_cli.robots.contract import ForeignRobot
+    from projservo_cli.robots.contract import PluginRobot
     from projservo_cli.stages.preflight import Checked
 
 _SIZE_MM = 30.0  # of tags: what webcams at arm's length see with 25 px and more
@@ -118,7 +118,7 @@ def _tags(
         "print in actual size (100 %), hold a ruler against the one printed",
         f"configuration: {keys}",
     )
-    console.tell(value, words)
+    console.report(value, words)
 
 
 _INSTRUCTIONS = {
@@ -168,7 +168,7 @@ def preflight(
         "works": checked.works,
         "findings": [finding._asdict() for finding in checked.findings],
     }
-    console.tell(value, [*_table(checked), f"page: {output}"])
+    console.report(value, [*_table(checked), f"page: {output}"])
     return 0 if checked.works else FAILED
 
 
@@ -205,7 +205,7 @@ def _pictures(settings: "Config", seen: "Seen") -> list[bytes]:
     return [annotated(view.frame.grey, seen.marker, s, goal) for view, s, goal in both]
 
 
-def _watch(console: Console, settings: "Config", robot: "ForeignRobot") -> None:
+def _watch(console: Console, settings: "Config", robot: "PluginRobot") -> None:
     """Serve both images until Ctrl-C."""
     import time
 

@@ -48,7 +48,7 @@ def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
     made = {name: {"key": result.key, **result.provenance} for name, result in found.results.items()}
     settings = config.model_dump(mode="json")
     value = {"run": found.path.resolve(), "configuration": settings, "made": made, **values}
-    console.tell(value, words())
+    console.report(value, words())
 
 
 def _made(provenance: Any) -> str:
@@ -88,7 +88,7 @@ def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: b
     abouts = [(run, about_of(config)) for run, config in zip(found, configs, strict=True)]
     write_comparison(abouts, [settings_of(config) for config in configs], output)
     value = {"page": output.resolve(), "runs": [run.path.resolve() for run in found]}
-    console.tell(value, [f"compare: {len(runs)} runs: {output}"])
+    console.report(value, [f"compare: {len(runs)} runs: {output}"])
 
 
 _MAX_BYTES = 10_000_000  # maximum size of a URDF
@@ -149,7 +149,7 @@ def _export(
         option.require_new(folder, force=force)
         files = list(_write_tables(found, folder))
         value = {"run": found.path.resolve(), "files": [file.resolve() for file in files]}
-        console.tell(value, [f"export: {len(files)} files: {folder}"])
+        console.report(value, [f"export: {len(files)} files: {folder}"])
         return
     from projservo_cli.files import write_whole
 
@@ -157,7 +157,7 @@ def _export(
     content, value, words = _in_metres(found, to, (metric, between, metric_std), nominal, tip)
     file = write_whole(folder / _KINDS[to], content)
     value = {"run": found.path.resolve(), "files": [file.resolve()], **value}
-    console.tell(value, [f"export: {file}", *(wrapped(line, "  ") for line in words)])
+    console.report(value, [f"export: {file}", *(wrapped(line, "  ") for line in words)])
 
 
 def _in_metres(
@@ -254,4 +254,4 @@ def _equations(console: Console) -> None:
             if entry.erratum:
                 yield wrapped(f"erratum: {entry.erratum}", "    ")
 
-    console.tell({"equations": [dataclasses.asdict(entry) for entry in REGISTER]}, words())
+    console.report({"equations": [dataclasses.asdict(entry) for entry in REGISTER]}, words())

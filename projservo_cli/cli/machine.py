@@ -49,7 +49,7 @@ def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None
         f"init: {path}, with {described} for editors",
         f"next: projservo {'calibrate plan servo report' if arm is None else 'limits'} -c {path}",
     )
-    console.tell({"configuration": path.resolve(), "schema": described.resolve()}, words)
+    console.report({"configuration": path.resolve(), "schema": described.resolve()}, words)
 
 
 @main.command("schema", epilog="Example: projservo schema -o schema.json")
@@ -68,7 +68,7 @@ def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
     schema = sweep_schema() if what else json_schema()
     if output is None:
         console.as_json = True
-        console.tell(schema, ())
+        console.report(schema, ())
     else:
         write_whole(output, _as_text(schema))
 
@@ -134,7 +134,7 @@ def _doctor(
 
         count = 0 if CACHE_FOLDER is None else sum(1 for _ in CACHE_FOLDER.rglob("*.nbi"))
         value["kernels"] = {"jit": COMPILED, "cache": CACHE_FOLDER, "compiled": count}
-    console.tell(value, map(wrapped, _found(value)))
+    console.report(value, map(wrapped, _found(value)))
     return FAILED if missing or not writable else 0
 
 
@@ -202,7 +202,7 @@ def _bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> No
     result = timings(Case(servo_inputs(settings)))
     collected = provenance.collect(seed=settings.seed)
     machine = {name: collected[name] for name in _MACHINE}
-    console.tell({**result, "machine": machine}, _timed(result, machine))
+    console.report({**result, "machine": machine}, _timed(result, machine))
 
 
 def _timed(result: dict[str, Any], machine: dict[str, Any]) -> Iterator[str]:

@@ -71,7 +71,7 @@ class Console:
     def __exit__(self, *_: object) -> None:
         self._bar.close()
 
-    def tell(self, value: dict[str, Any], lines: Iterable[str]) -> None:
+    def report(self, value: dict[str, Any], lines: Iterable[str]) -> None:
         """Data on standard output: one object of strict JSON in UTF-8, whatever the locale, or in words."""
         if self.as_json:
             text = visible(json.dumps(_plain(value), ensure_ascii=False, allow_nan=False, indent=2))

@@ -53,7 +53,7 @@ def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
     write_whole(path, with_limits(path.read_text(encoding="utf-8"), limits, config))
     words = [f"limits: joint {k} {low:g} to {high:g} deg" for k, (low, high) in enumerate(limits, 1)]
     value = {"configuration": path.resolve(), "limits_deg": limits, "shifted": sorted(shift)}
-    console.tell(value, [*words, f"written to {path}: robot.limits"])
+    console.report(value, [*words, f"written to {path}: robot.limits"])
 
 
 @main.command("release", epilog="Example: projservo release -c arm.yaml")
@@ -69,13 +69,13 @@ def _release(console: Console, *, config: str) -> None:
     with _servos(console, load_config(config, teaching=True)) as servos:
         console.wait("take hold of the arm, and of what its gripper holds: they will be released")
         servos.release(all_of_them=True)
-    console.tell({"released": list(servos.all)}, ["release: done"])
+    console.report({"released": list(servos.all)}, ["release: done"])
 
 
 @contextmanager
 def _servos(console: Console, config: "Config") -> Iterator["Servos"]:
     """Connect to the servos of a configuration, and report at the end whether their torque is on."""
-    from projservo_cli.hardware.so101 import SO101, connected, torque_told
+    from projservo_cli.hardware.so101 import SO101, connected, torque_reported
     from projservo_cli.records import InputError, WorkFailed
     from projservo_cli.robots import plugins
 
@@ -89,7 +89,7 @@ def _servos(console: Console, config: "Config") -> Iterator["Servos"]:
         except WorkFailed as error:
             raise WorkFailed(f"{error}; nothing was written") from error
         finally:
-            console.say(torque_told(servos))
+            console.say(torque_reported(servos))
 
 
 def _entered(console: Console, what: str) -> Callable[[], bool]:

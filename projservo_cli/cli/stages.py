@@ -68,14 +68,14 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
         with option.writing(path):
             recording = new_recording(given, path, motions=poses, force=options["force"])
             reason = _drive(console, config, recording, confirm=options["confirm"])
-    value = _told_recording(recording, reason)
-    console.tell(value, [*words_of("record", value), *([f"table: {path}"] if path.exists() else [])])
+    value = _recording_object(recording, reason)
+    console.report(value, [*words_of("record", value), *([f"table: {path}"] if path.exists() else [])])
     if reason:
         click.echo(visible(f"projservo: record: {reason}"), err=True)
     return FAILED if reason else 0
 
 
-def _told_recording(recording: Any, reason: str) -> dict[str, Any]:
+def _recording_object(recording: Any, reason: str) -> dict[str, Any]:
     """The JSON object of a recording, and why it stopped short where it did."""
     told: dict[str, Any] = recording.told
     return told | ({"reason": reason, "failed": "record"} if reason else {})
@@ -223,7 +223,7 @@ def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **op
     with intervals, final errors, laws compared on the same tasks.
     """
     if sweep is not None:
-        return _tell_sweep(console, sweep, options)
+        return _print_sweep(console, sweep, options)
     return _make(console, stages, options)
 
 
@@ -249,7 +249,7 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     if options["dry_run"]:
         words = (f"{s.name}: {f'would be made ({s.why})' if s.why else s.status}" for s in chain.steps)
         steps = [{"stage": s.stage, "law": s.law or None, "why": s.why or None} for s in chain.steps]
-        console.tell({"run": chain.run.path.resolve(), "dry_run": True, "steps": steps}, words)
+        console.report({"run": chain.run.path.resolve(), "dry_run": True, "steps": steps}, words)
         return 0
     folder = chain.run.path.parent
     if not chain.pending and not _extras(options):
@@ -312,7 +312,7 @@ def _asked(
             "use --set calibration.method=bundle_adjustment"
         )
     if wanted := _extras(options):
-        require_extras(config, wanted)
+        require_optional(config, wanted)
     if records and recording is None:
         recording = _recording(config, stored, options)
     stages, why = [name for name in names if name != "record"], recording.why if records else ""
@@ -327,7 +327,7 @@ def _asked(
     return _Call(console, options, chain)
 
 
-def require_extras(config: Any, wanted: Sequence[str]) -> None:
+def require_optional(config: Any, wanted: Sequence[str]) -> None:
     """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted."""
     from projservo_cli.config.inputs import truth_of
     from projservo_cli.records import InputError
@@ -400,14 +400,14 @@ def _work(call: _Call) -> int:
     if (count := call.options.get("suggest")) is not None and not chain.lacks("calibrate"):
         call.beside["calibrate"] = _suggestions(chain, count)
     if (wanted := _extras(call.options)) and not chain.lacks("report"):
-        call.beside["report"] = _made_extras(console, chain, wanted)
+        call.beside["report"] = _made_optional(console, chain, wanted)
     from projservo_cli.report.report_data import failed_object, stage_object
 
     values, joints = {}, chain.config.joint_names
     for name in chain.names:
         if name == "record":
             reason = chain.reason if chain.lacks(name) else ""
-            values[name] = {"run": chain.run.path.resolve()} | _told_recording(chain.recording, reason)
+            values[name] = {"run": chain.run.path.resolve()} | _recording_object(chain.recording, reason)
         elif chain.lacks(name):
             values[name] = failed_object(name, chain.run, chain.reason, chain.failed, chain.laws_done)
         else:
@@ -416,7 +416,7 @@ def _work(call: _Call) -> int:
     words = [line for name in values for line in words_of(name, values[name], detailed=console.verbose)]
     words += [f"table: {chain.recording.path}"] if chain.recording is not None else []
     words += [f"run: {chain.run.path}"] if chain.run.results else []
-    console.tell(values if len(values) > 1 else values[chain.names[0]], words)
+    console.report(values if len(values) > 1 else values[chain.names[0]], words)
     findings = list(_findings(call))
     for text, fatal in findings:
         if fatal or not console.quiet:
@@ -459,7 +459,7 @@ def _suggestions(chain: Any, count: int) -> dict[str, Any]:
     }
 
 
-def _made_extras(console: Console, chain: Any, wanted: Sequence[str]) -> dict[str, Path]:
+def _made_optional(console: Console, chain: Any, wanted: Sequence[str]) -> dict[str, Path]:
     """Write the requested files, and the page with links to them; return the paths by name."""
     from projservo_cli.config.inputs import about_of, scenery_of
     from projservo_cli.report.page import write_page
@@ -520,7 +520,7 @@ def _of_runs(chain: Any) -> Iterator[tuple[str, bool]]:
         yield said, not converged and (must or disturbed)
 
 
-def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> int:
+def _print_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> int:
     """Write the report of a sweep and print its tables; the exit code."""
     from projservo_cli.files import working_in
     from projservo_cli.report.style import FORMATS
@@ -536,5 +536,5 @@ def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> in
         found, files = report(folder.assembled(), FORMATS, console.progress)
     value = {"sweep": folder.path.resolve(), **found, "files": [path.resolve() for path in files]}
     names = ", ".join(path.name for path in files)
-    console.tell(value, [*words_of("sweep", found), wrapped(f"files: {folder.path}: {names}")])
+    console.report(value, [*words_of("sweep", found), wrapped(f"files: {folder.path}: {names}")])
     return 0

@@ -82,4 +82,4 @@ def _sweep(
     left = status.total - status.done
     state = f"{left} runs are left" if left else "all runs are done"
     words = [f"sweep: {status.total} runs in {design.cells} cells, {state}"]
-    console.tell(value, [*words, *([f"table: {folder.table}"] if table else [])])
+    console.report(value, [*words, *([f"table: {folder.table}"] if table else [])])

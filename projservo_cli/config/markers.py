@@ -194,5 +194,5 @@ class Markers(Section):
 
 
 def _listed(numbers: Sequence[int]) -> str:
-    shown = ", ".join(map(str, numbers[:20]))
-    return shown + (" …" if len(numbers) > 20 else "")
+    listed = ", ".join(map(str, numbers[:20]))
+    return listed + (" …" if len(numbers) > 20 else "")

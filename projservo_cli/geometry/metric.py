@@ -352,7 +352,7 @@ class Metric:
                 "and a deviation that is not negative"
             )
         marker = c.marker.tolist()
-        chosen = range(len(marker)) if face is None else c.places([n for n in face if n in marker])
+        chosen = range(len(marker)) if face is None else c.indices_of([n for n in face if n in marker])
         lens = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2) if c.lens is None else c.lens
         models = _Projective.around(c, lens, factor)
         try:

@@ -173,7 +173,7 @@ class Servos:
         self.bus.store(_OFFSET, {number: _two(abs(offset) | (_OFFSET_SIGN if offset < 0 else 0))})
         self.bus.store(_LOCK, {number: b"\1"})
 
-    def told(self, error: WorkFailed) -> str:
+    def described(self, error: WorkFailed) -> str:
         """Tell which joints may fall where the bus fails; nothing more is written to them."""
         if not isinstance(error, ServoSilent):
             return f"{error}; servos with power go on to their last set-points, and hold there"
@@ -307,7 +307,7 @@ class SO101:
         """Release the port, and report whether the arm holds."""
         if self._opened:
             self._opened = False
-            _say(torque_told(self._servos))
+            _say(torque_reported(self._servos))
             self._servos.bus.close()
             self._lease.end()
 
@@ -366,7 +366,7 @@ class SO101:
             try:
                 found = self._servos.measured()
             except (ServoSilent, PortLost) as error:
-                raise WorkFailed(self._servos.told(error)) from error
+                raise WorkFailed(self._servos.described(error)) from error
             now = self.now()
             told = self._leapt(found, now - self._read_at) or self._faulty(found)
             agreed = not told and bool(self._before)
@@ -415,7 +415,7 @@ def connected(arm: SO101) -> Iterator[Servos]:
         arm._lease.end()
 
 
-def torque_told(servos: Servos) -> str:
+def torque_reported(servos: Servos) -> str:
     """Tell whether torque is on, at the end of whatever was done with an arm."""
     try:
         on = servos.torque()

@@ -107,8 +107,8 @@ def plate(numbers: Sequence[int], poses: FloatArray, margin_mm: float) -> Net:
     tags = tuple(FlatTag(n, c, pose[:2, 1]) for n, c, pose in zip(numbers, at, poses, strict=True))
     half = np.abs(at).max(axis=0) + 0.5 * margin_mm
     corners = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
-    beside = [np.array([math.copysign(half[0] + 3.0, c[0]), c[1]]) for c in at]
-    labels = tuple((f"{number}", place) for number, place in zip(numbers, beside, strict=True))
+    label_at = [np.array([math.copysign(half[0] + 3.0, c[0]), c[1]]) for c in at]
+    labels = tuple((f"{number}", place) for number, place in zip(numbers, label_at, strict=True))
     return Net(tags, (_Line(corners, fold=False),), 2.0 * half + [12.0, 0.0], labels)
 
 
@@ -168,8 +168,8 @@ def sheet(net: Net, finder: TagFinder, size_mm: float, paper: str, head: Sequenc
     ax.set_axis_off()
     origin = np.array([0.5 * width, _BORDER + _FOOT + 0.5 * room[1]])
     for line in net.lines:
-        look = _FOLD if line.fold else _CUT
-        ax.add_patch(Polygon(origin + line.points, closed=False, **look))
+        line_style = _FOLD if line.fold else _CUT
+        ax.add_patch(Polygon(origin + line.points, closed=False, **line_style))
     for tag in net.tags:
         black = finder.picture(tag.number, 1) == 0
         path = _tag_path(black, origin + tag.center, tag.up, size_mm / (len(black) - 2))

@@ -70,7 +70,7 @@ def strokes(steered: Steered, joint: int) -> Strokes | str:
     steered : the robot, one for all joints: each set-point that begins at a reading lets an arm sag further.
     """
     bounds = steered.robot.bounds
-    q = steered.look().q
+    q = steered.observe().q
     for _ in range(math.ceil(_PAUSE_S / bounds.period)):
         steered.hold()
     low = max(-REACH, bounds.limits.lower[joint] + _KEPT - q[joint])
@@ -90,10 +90,10 @@ def strokes(steered: Steered, joint: int) -> Strokes | str:
             step[joint] = math.copysign(min(abs(left), speed * bounds.period), left)
             steered.command(step, bounds.period)
             pauses -= left == 0.0 or bool(steered.set_point.short[joint])
-            rows.append((number, float(steered.target[joint]), steered.look()))
+            rows.append((number, float(steered.target[joint]), steered.observe()))
         way, gone = abs(goal - begun), abs(float(steered.reading.q[joint]) - from_q)
         if number in _HELD and gone < _HELD[number] * way:
-            what = f"went {bounds.told(joint, gone, 2)} of {bounds.told(joint, way, 2)}"
+            what = f"went {bounds.text(joint, gone, 2)} of {bounds.text(joint, way, 2)}"
             return Strokes(joint, *_columns(rows), what)
     return Strokes(joint, *_columns(rows), "")
 

@@ -29,7 +29,7 @@ from projservo_cli.task.partition import NO_PARTS
 
 
 @contextmanager
-def compiling_beside() -> Iterator[None]:
+def compiling_in_background() -> Iterator[None]:
     """Let another process compile meanwhile, where no kernel of the loop is in the cache."""
     if CACHE_FOLDER is None or any(CACHE_FOLDER.rglob("compiled.run_compiled-*.nbi")):
         yield

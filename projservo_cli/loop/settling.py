@@ -50,8 +50,8 @@ class StallMonitor:
     def __init__(self, robot: DrivenRobot, limits: Limits) -> None:
         self._robot, self._limits = robot, limits
         known, bounds = robot.known, robot.robot.bounds
-        late = bounds.max_servo_lag_s + max(0.0, float((known.delays.mean + known.delays.sigma).max()))
-        self._window = max(limits.stall_periods, math.ceil(_TIMES_LATE * late / bounds.period))
+        latency = bounds.max_servo_lag_s + max(0.0, float((known.delays.mean + known.delays.sigma).max()))
+        self._window = max(limits.stall_periods, math.ceil(_TIMES_LATE * latency / bounds.period))
         self._still = np.maximum(_DEVIATIONS * known.sigma_q, _LEAST)
         self._best, self._since = math.inf, 0
         self._read: list[FloatArray] = []
@@ -112,9 +112,9 @@ class StallMonitor:
             return FOLLOWING_ERROR
         if stands and (sent <= _LEAST).all():
             self.minimum = True
-            most = self._robot.robot.bounds.told(int(np.argmax(sent)), float(sent.max()), 2)
+            maximum = self._robot.robot.bounds.text(int(np.argmax(sent)), float(sent.max()), 2)
             self.reason = (
-                f"set-points moved by no more than {most}: play in the joints, coarse set-points or coarse "
+                f"set-points moved by no more than {maximum}: backlash, coarse set-points or coarse "
                 "readings hide the rest"
                 if near
                 else "the law asks for no motion there, a local minimum"
@@ -128,19 +128,19 @@ class StallMonitor:
     def _say_who_stays(self, stays: BoolArray) -> None:
         """A joint stays where it is however far its set-point goes."""
         gap = np.abs(self._sent[-1] - self._read[-1]) * stays
-        i, told = int(np.argmax(gap)), self._robot.robot.bounds.told
+        i, text = int(np.argmax(gap)), self._robot.robot.bounds.text
         self.reason = (
-            f"joint {i + 1} stands at {told(i, self._read[-1][i])}, {told(i, gap[i], 3)} off its set-point: "
+            f"joint {i + 1} stands at {text(i, self._read[-1][i])}, {text(i, gap[i], 3)} off its set-point: "
             "look whether it is blocked, braked or in a protective stop, or raise "
             "plant.max_steady_state_error_deg or plant.max_relative_target_deg"
         )
 
     def _say_what_holds(self, moved: FloatArray, sent: FloatArray) -> None:
         """Return the cause of a robot that oscillates without coming nearer."""
-        i, told = int(np.argmax(sent / self._still)), self._robot.robot.bounds.told
-        amounts = f"{told(i, sent[i], 3)}, its readings by {told(i, moved[i], 3)}"
+        i, text = int(np.argmax(sent / self._still)), self._robot.robot.bounds.text
+        amounts = f"{text(i, sent[i], 3)}, its readings by {text(i, moved[i], 3)}"
         what = f"set-points of joint {i + 1} moved by {amounts}"
         if moved[i] <= 0.5 * sent[i]:
             self.reason = f"{what}: it does not follow such small steps; coarse set-points, or friction"
         else:
-            self.reason = f"{what}, and images show no gain: play in the joints, or coarse set-points"
+            self.reason = f"{what}, and images show no gain: backlash, or coarse set-points"

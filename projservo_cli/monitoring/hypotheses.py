@@ -62,7 +62,7 @@ class Explanation(NamedTuple):
     cost: float  # of its parameters, by their prior
     left: float  # χ² that stays
     changed_px: float  # by how much it changes images of the markers that it touches, rms
-    least_px: float  # the same in the view where that is less
+    min_px: float  # the same in the view where that is less
 
     @property
     def score(self) -> float:
@@ -255,7 +255,7 @@ class Evidence:
             cost=cost,
             left=square,
             changed_px=changed_px,
-            least_px=float(np.sqrt(by_view.min())),
+            min_px=float(np.sqrt(by_view.min())),
         )
 
 
@@ -441,7 +441,7 @@ def together(moved: list[Explanation]) -> Explanation:
         cost=sum(one.cost for one in moved),
         left=first.left - sum(one.gain for one in moved[1:]),
         changed_px=max(one.changed_px for one in moved),
-        least_px=min(one.least_px for one in moved),
+        min_px=min(one.min_px for one in moved),
     )
 
 

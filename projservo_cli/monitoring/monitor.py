@@ -41,7 +41,7 @@ _TWO_AT = 15
 _CLEAR = 2.0 * np.log(100.0)
 # Share of what images are off that a cause may leave.
 _LEFT = 0.15
-# Share of the pixels that images are off by which a cause changes them at least: play in the joints that is
+# Share of the pixels that images are off by which a cause changes them at least: backlash that is
 # more than the calibration found is no turn of a camera by the rest.
 _LEAST_PART = 0.2
 # A corner that is off by less, px, in one view of the tool is an edge that the finder took for another.
@@ -367,7 +367,7 @@ class ImageMonitor:
             return False
         seen = self._evidence_now.seen[:, :, list(found.cause.markers)]
         alone = seen.all(axis=1).sum() <= 0.5 * seen.any(axis=1).sum()
-        return bool(alone) or (found.least_px < _LEAST_MOVED_PX and views < WINDOW)
+        return bool(alone) or (found.min_px < _LEAST_MOVED_PX and views < WINDOW)
 
     def _judge_markers(self) -> None:
         """Name markers that both views show off by themselves for long."""
@@ -414,7 +414,7 @@ class ImageMonitor:
         return f"in the {VIEWS[view]} image, at marker {number}"
 
 
-def fault_shown(
+def detected_fault(
     calibration: Calibration,
     q: FloatArray,
     marker: IntArray,
@@ -430,7 +430,7 @@ def fault_shown(
         return ""
     known = np.isin(marker, calibration.marker)
     pixels = np.full((2, len(calibration.marker), 2), np.nan)
-    pixels[:, calibration.places(marker[known])] = images[:, known]
+    pixels[:, calibration.indices_of(marker[known])] = images[:, known]
     monitor = ImageMonitor(calibration, calibration.sigma_px, _SINGLE, image_size=image_size)
     rest, instants = np.zeros((2, len(q))), np.zeros(2)
     monitor.observe(instants, np.stack([q, q]), rest, instants, pixels, np.ones(2, dtype=np.bool_))

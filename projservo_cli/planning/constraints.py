@@ -194,7 +194,7 @@ def twin_of(c: Constraints, j: int) -> Model:
 
 
 @internal
-def most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
+def max_error(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
     """Standard deviation of a coordinate in each image, px, no less than that of any marker of the body."""
     left = right = c.spread.rest * c.spread.rest
     for j in range(1, c.spread.P.shape[0]):
@@ -290,7 +290,7 @@ def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
     room = min(margins[IMAGE] - c.full[IMAGE], margins[IMAGE + 1] - c.full[IMAGE + 1])
     near = room < DEVIATIONS * maximum or margins[CLEAR] - c.full[CLEAR] < DEVIATIONS * anywhere
     if visible and maximum > 0.0 and near:
-        left, right = most_off(c, q, H)
+        left, right = max_error(c, q, H)
         anywhere = max(left, right)
     margins[IMAGE] -= DEVIATIONS * left
     margins[IMAGE + 1] -= DEVIATIONS * right

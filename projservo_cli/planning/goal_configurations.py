@@ -21,7 +21,7 @@ from projservo_cli.planning.constraints import (
     Trial,
     clear_by,
     margins_into,
-    most_off,
+    max_error,
     new_trial,
     twin_of,
 )
@@ -272,7 +272,7 @@ def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
             return HIDDEN
     # A goal was chosen, and is seen on arrival: what its prediction may be off speaks for it.
     H = forward(c.model, q)
-    left, right = most_off(c, q, H)
+    left, right = max_error(c, q, H)
     doubt = min(DEVIATIONS * max(left, right), FINE_PX)
     return SHOWN if clear_by(c, H, trial.s) > -doubt else BLOCKED
 

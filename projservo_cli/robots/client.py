@@ -18,7 +18,7 @@ from projservo_cli.geometry.kinematics import forward
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, IntArray
-from projservo_cli.robots.contract import ForeignRobot
+from projservo_cli.robots.contract import PluginRobot
 from projservo_cli.robots.latency import DelayPrior, Delays, squares_by_joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.simulation.ideal import Plant, observe
@@ -43,7 +43,7 @@ class _Shot(NamedTuple):
     jpeg: tuple[bytes, bytes]
 
 
-class Film:
+class FrameRecorder:
     """Frames of a run, evenly thinned while it runs, the first and the last among them."""
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ class Film:
         if instant % self._every == 0:
             self._kept.append(_Shot(instant, s, _as_jpeg(frames)))
 
-    def told(self) -> dict[str, Any]:
+    def fields(self) -> dict[str, Any]:
         """The part that a ``Trace`` holds."""
         if self._last is None:
             return {}
@@ -122,7 +122,7 @@ class DrivenRobot:
     in_front = True
     takes_parts = True
 
-    def __init__(self, robot: ForeignRobot, plant: Plant, known: Known, monitor: ImageMonitor | None) -> None:
+    def __init__(self, robot: PluginRobot, plant: Plant, known: Known, monitor: ImageMonitor | None) -> None:
         self.robot, self.steered, self.plant = robot, Steered(robot), plant
         self.known, self.monitor = known, monitor
         self.markers = len(known.shown)
@@ -142,12 +142,12 @@ class DrivenRobot:
         self.delays: list[FloatArray] = []
         self.readings: list[FloatArray] = []
         self.truths: list[FloatArray] = []
-        self.film = Film()
+        self.film = FrameRecorder()
         self.steered.overruns = 0
 
     def joints(self) -> FloatArray:
         """Joints (n,), rad or m, at which the arm comes to rest, after a new look at robot and images."""
-        read, truth = self.steered.look().q, self.robot.truth()
+        read, truth = self.steered.observe().q, self.robot.truth()
         self.q = read if truth is None or truth.ndim > 1 else truth
         H = forward(self.plant.model, self.q)
         self.H = as_array(H)
@@ -167,7 +167,7 @@ class DrivenRobot:
         if reading.sigma_px is not None:
             stated = reading.sigma_px[:, order]
             self.weight = weights(reading.sigma_px[:, shown], reading.s[:, shown])
-        frames = self._instants.look(reading.t_view, images, history)
+        frames = self._instants.update(reading.t_view, images, history)
         q_then = history.at(frames.t)
         if self.monitor is not None:
             q_dot = np.stack([history.speed_at(float(t)) for t in frames.t])

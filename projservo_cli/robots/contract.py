@@ -55,7 +55,7 @@ class Bounds(NamedTuple):
     sag: FloatArray  # (n,) how far joints stay short under gravity
     units: tuple[str, ...] = ()
 
-    def told(self, i: int, value: float, digits: int = 6) -> str:
+    def text(self, i: int, value: float, digits: int = 6) -> str:
         """Write a value of joint i, rad or m, in its unit."""
         return in_unit(value, self.units[i] if self.units else "rad or m", digits)
 
@@ -108,7 +108,7 @@ class Robot(Protocol):
         """Let go of robot and cameras; the last call."""
 
 
-class ForeignRobot:
+class PluginRobot:
     """A robot of somebody whose answers are awaited for a time and checked, as are its commands.
 
     robot : an object of the contract.
@@ -386,10 +386,10 @@ class ForeignRobot:
         slack = _ROUND_OFF * (1.0 + np.abs(target))
         for what, (low, high) in allowed.items():
             for i in np.flatnonzero((target < low - slack) | (target > high + slack)).tolist():
-                at, least, most = (bounds.told(i, values[i]) for values in (target, low, high))
+                at, least, most = (bounds.text(i, values[i]) for values in (target, low, high))
                 return f"the set-point of joint {i + 1}, {at}, is {what}: allowed are {least} to {most}"
         for i in np.flatnonzero(np.abs(speed) > bounds.limits.speed * (1.0 + _ROUND_OFF)).tolist():
-            at, most = (bounds.told(i, values[i]) for values in (speed, bounds.limits.speed))
+            at, most = (bounds.text(i, values[i]) for values in (speed, bounds.limits.speed))
             return f"the speed of joint {i + 1}, {at}/s, is beyond its limit of {most}/s"
         return ""
 
@@ -445,7 +445,7 @@ def _came(orders: "list[Future[Any]]", seconds: float) -> str | None:
 
 
 @contextmanager
-def at_rest_after(robot: ForeignRobot) -> Iterator[None]:
+def at_rest_after(robot: PluginRobot) -> Iterator[None]:
     """Open a robot; stop and close it on every way out, Ctrl-C, SIGTERM and a lost terminal among them.
 
     Raises WorkFailed if it may not be at rest, with the error that ended it.

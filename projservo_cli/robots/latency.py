@@ -123,7 +123,7 @@ class Delays:
         """Delays (2,) as followed, s: of images from their readings, or from their stamps."""
         return np.array([view.mean for view in self._views])
 
-    def look(self, t_view: FloatArray, images: FloatArray, history: History) -> _Frames:
+    def update(self, t_view: FloatArray, images: FloatArray, history: History) -> _Frames:
         """Instants of both images of an observation.
 
         t_view : (2,) s, stamps, NaN where there are none; images : (2, m, 2) px, NaN where unseen.
@@ -133,7 +133,7 @@ class Delays:
         if self._sigma_q.any():
             self._reckon_with_joints(history.last[1])
         found = [
-            view.look(float(t), s, history) for view, t, s in zip(self._views, t_view, images, strict=True)
+            view.update(float(t), s, history) for view, t, s in zip(self._views, t_view, images, strict=True)
         ]
         t, sigma, fresh = zip(*found, strict=True)
         return _Frames(np.array(t), np.array(sigma), np.array(fresh))
@@ -180,7 +180,7 @@ class _View:
         self._t = -math.inf  # when the last image was taken
         self._moved_at = math.nan  # when joints began to leave it
 
-    def look(self, stamp: float, image: FloatArray, history: History) -> tuple[float, float, bool]:
+    def update(self, stamp: float, image: FloatArray, history: History) -> tuple[float, float, bool]:
         """Instant of an image (m, 2), s, how well it was known before, s, and whether the image is new."""
         nominal = self._nominal(stamp, history.last[0])
         expected, sigma = nominal - self.mean, math.sqrt(self._variance + self._jitter**2)

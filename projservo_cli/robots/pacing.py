@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from projservo_cli.records import BoolArray, FloatArray
-from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading
+from projservo_cli.robots.contract import Bounds, PluginRobot, Reading
 from projservo_cli.robots.latency import History
 
 # Share of the sag allowed for that a servo may still be behind where sag is separated from lag.
@@ -70,7 +70,7 @@ class Steered:
     reading: Reading
     set_point: SetPoint
 
-    def __init__(self, robot: ForeignRobot) -> None:
+    def __init__(self, robot: PluginRobot) -> None:
         self.robot, self.history, self.overruns = robot, History(), 0
         self._due: float | None = None
 
@@ -79,7 +79,7 @@ class Steered:
         """The set-point (n,), rad or m."""
         return self.set_point.target
 
-    def look(self) -> Reading:
+    def observe(self) -> Reading:
         """Read joints and images."""
         self.reading = self.robot.read()
         t, q = self.reading.t_q, self.reading.q
@@ -105,4 +105,4 @@ class Steered:
     def hold(self) -> Reading:
         """Hold the set-point for a period, and look."""
         self.command(np.zeros_like(self.reading.q), self.robot.bounds.period)
-        return self.look()
+        return self.observe()

@@ -40,7 +40,7 @@ class Frames:
         self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._scene.light == "side"
         self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SKYBOX] = 0  # of a file: it takes longer than the rest
         self._model = copy.copy(rendered.model)
-        self._data = rendered.begin(self._model, rendered.model.qpos0[rendered.places])
+        self._data = rendered.begin(self._model, rendered.model.qpos0[rendered.positions])
         self._shown = mj.MjvOption()
         self._shown.sitegroup[:] = 0
 
@@ -50,7 +50,7 @@ class Frames:
             self._renderer.close()
             self._renderer = None
 
-    def look(
+    def capture(
         self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
         """Pixels (m, 2) that are found in a frame, NaN where unseen, and their deviations (m,), px.
@@ -82,7 +82,7 @@ class Frames:
     def _drawn(self, view: int, q: FloatArray) -> ByteArray:
         """Return the grey values (height, width) of a camera at joints (n,), without blur and noise."""
         mj = mujoco()
-        self._data.qpos[self.rendered.places] = q
+        self._data.qpos[self.rendered.positions] = q
         mj.mj_kinematics(self._model, self._data)
         mj.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, CAMERAS[view], self._shown)

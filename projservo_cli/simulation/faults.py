@@ -123,7 +123,7 @@ class _Eyes(Protocol):
     def close(self) -> None:
         """Release the cameras."""
 
-    def look(
+    def capture(
         self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray | None]:
         """Pixels (m, 2) in a frame of a view, NaN where unseen, and their deviations (m,), px, if known.
@@ -148,7 +148,7 @@ class Points(NamedTuple):
     def close(self) -> None:
         """Nothing is left open."""
 
-    def look(
+    def capture(
         self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray | None]:
         """As of all cameras."""
@@ -227,7 +227,7 @@ def robot_of(
     return FaultyRobot(World(truth, q_start, Frames(rendered), period, *drawn, servos), faults, events)
 
 
-def shown_in_frames(
+def observed_in_frames(
     scene: Scene, frames: int, q: FloatArray, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
     """Pixels (2, m, 2) that frames of a robot at rest at joints (n,), rad or m, show on average.
@@ -249,7 +249,7 @@ def _looked(
     eyes.open()
     try:
         for k, view in np.ndindex(frames, 2):
-            pixels, sigma = eyes.look(view, q, None, _random(*drawn, view, k))
+            pixels, sigma = eyes.capture(view, q, None, _random(*drawn, view, k))
             found[k, view] = np.column_stack([pixels, sigma])
     finally:
         eyes.close()
@@ -511,7 +511,7 @@ class _Camera:
         rng = world.random(self._view, _BEFORE + k)
         rng.standard_normal()  # that of the jitter
         q = np.array([self._joints.at(t) for t in instants])
-        pixels, sigma = world.eyes.look(self._view, q, moved, rng)
+        pixels, sigma = world.eyes.capture(self._view, q, moved, rng)
         if (knocked := events.camera_moved) is not None and step >= knocked.at_step:
             pixels += knocked.by_px[self._view]
         if (lost := events.lost_markers) is not None and _lasts(lost, step):
@@ -521,7 +521,7 @@ class _Camera:
         return _Frame(middle, middle + self._clock, pixels, sigma)
 
 
-def hindrance_of(robot: object) -> str:
+def obstruction_of(robot: object) -> str:
     """Return the obstruction of an arm, if its simulation knows one; else empty."""
     servos = robot.world.servos if isinstance(robot, FaultyRobot) else None
-    return servos.hindrance if isinstance(servos, Physics) else ""
+    return servos.obstruction if isinstance(servos, Physics) else ""

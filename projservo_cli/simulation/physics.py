@@ -54,7 +54,11 @@ class Physics:
 
     def __init__(self, rendered: RenderedModel, q: FloatArray, lag_s: float, sag: float) -> None:
         arm, servo = rendered.scene.arm, rendered.scene.servo
-        self._model, self._places, self._rates = copy.copy(rendered.model), rendered.places, rendered.rates
+        self._model, self._places, self._rates = (
+            copy.copy(rendered.model),
+            rendered.positions,
+            rendered.rates,
+        )
         self._joints = rendered.joints
         self._data, self._base = (
             rendered.begin(self._model, q),
@@ -99,7 +103,7 @@ class Physics:
         return np.array(self._data.qpos[self._places])
 
     @property
-    def hindrance(self) -> str:
+    def obstruction(self) -> str:
         """Return the obstruction of the arm: contacts, saturated servos; else empty."""
         weak = " and ".join(str(i + 1) for i in self._own if self._at_end(i))
         obstructions = (

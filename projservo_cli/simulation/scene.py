@@ -82,7 +82,7 @@ class RenderedModel:
     tool: FloatArray  # (3, 3) rotation of the tool in the frame of the body that holds the tags
 
     @property
-    def places(self) -> IntArray:
+    def positions(self) -> IntArray:
         """Places (n,) of the joints among all positions."""
         return np.asarray(self.model.jnt_qposadr[self.joints])
 
@@ -97,7 +97,7 @@ class RenderedModel:
         data = mj.MjData(model)
         if self.key >= 0:
             mj.mj_resetDataKeyframe(model, data, self.key)
-        data.qpos[self.places] = q
+        data.qpos[self.positions] = q
         mj.mj_forward(model, data)
         return data
 
@@ -190,12 +190,12 @@ def _add_arm(spec: Any, arm: Arm) -> None:
                 axis=axes[i - 1],
                 ref=arm.q_reference[i - 1],
             )
-        looks = {"rgba": _LINK, "contype": 0, "conaffinity": 0}
+        sights = {"rgba": _LINK, "contype": 0, "conaffinity": 0}
         if lengths[i] > _LEAST_LINK_M:
             ends = [*points[i], *points[i + 1]]
-            body.add_geom(type=mj.mjtGeom.mjGEOM_CAPSULE, size=[radius, 0, 0], fromto=ends, **looks)
+            body.add_geom(type=mj.mjtGeom.mjGEOM_CAPSULE, size=[radius, 0, 0], fromto=ends, **sights)
         else:
-            body.add_geom(type=mj.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=points[i], **looks)
+            body.add_geom(type=mj.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=points[i], **sights)
 
 
 def _name(tag: Tag, side: str) -> str:
@@ -226,10 +226,10 @@ def _add_tags(spec: Any, tip: Any, tool: FloatArray, tags: Sequence[Tag], finder
         material.textures[mj.mjtTextureRole.mjTEXROLE_RGB] = name
         quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
         # All faces of a box show its texture.
-        for side, depth, looks in zip(_SIDES, (1.0, 3.0), (name, "tag holder"), strict=True):
+        for side, depth, sights in zip(_SIDES, (1.0, 3.0), (name, "tag holder"), strict=True):
             place = pose[:3, 3] - depth * _PLATE_M * pose[:3, 2]
             size = [half, half, _PLATE_M]
-            add(mj.mjtGeom.mjGEOM_BOX, looks, name=_name(tag, side), size=size, pos=place, quat=quaternion)
+            add(mj.mjtGeom.mjGEOM_BOX, sights, name=_name(tag, side), size=size, pos=place, quat=quaternion)
         behind = pose[:3, 3] - 4.0 * _PLATE_M * pose[:3, 2]
         if np.linalg.norm(behind - origin) > _LEAST_LINK_M:
             ends = [*origin, *behind]

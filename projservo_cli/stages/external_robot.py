@@ -16,7 +16,7 @@ from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.client import DrivenRobot, Known
-from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
+from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
 from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints, OwnRobot
@@ -25,7 +25,7 @@ from projservo_cli.simulation.faults import (
     FaultyRobot,
     Points,
     SimulatedRobot,
-    hindrance_of,
+    obstruction_of,
     robot_of,
 )
 from projservo_cli.simulation.ideal import Plant, observe
@@ -42,9 +42,9 @@ _PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
 _WAITED = 5  # looks for each image that is wanted, where the same one comes again
 
 
-def foreign_robot(
+def plugin_robot(
     own: OwnRobot, bounds: Bounds, types: str, numbers: Sequence[int], given: Robot | None = None
-) -> ForeignRobot:
+) -> PluginRobot:
     """Make a robot of somebody's, unless it is given; an InputError where a joint has no speed limit.
 
     types : one letter a joint, R or P; numbers : of the markers that the robot observes.
@@ -62,7 +62,7 @@ def foreign_robot(
     )
     if own.cameras is not None:  # a reading waits for a camera that reconnects
         timeout_s += own.cameras.reconnect_s
-    return ForeignRobot(robot, name, len(numbers), bounds, timeout_s, own.open_s, own.image_size)
+    return PluginRobot(robot, name, len(numbers), bounds, timeout_s, own.open_s, own.image_size)
 
 
 def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds) -> Robot:
@@ -104,14 +104,14 @@ def _require_no_turn_off(bounds: Bounds, q: FloatArray) -> None:
         turns = np.round((q[i] - 0.5 * (lower[i] + upper[i])) / (2.0 * np.pi))
         if bounds.units[i] == "m" or not lower[i] <= q[i] - 2.0 * np.pi * turns <= upper[i]:
             continue
-        limits = f"{bounds.told(i, lower[i])} to {bounds.told(i, upper[i])}"
+        limits = f"{bounds.text(i, lower[i])} to {bounds.text(i, upper[i])}"
         raise WorkFailed(
-            f"nothing was moved: joint {i + 1} reads {bounds.told(i, q[i])}, a whole turn beyond its limits "
+            f"nothing was moved: joint {i + 1} reads {bounds.text(i, q[i])}, a whole turn beyond its limits "
             f"{limits}: home it again where it stands"
         )
 
 
-def way_to(
+def path_to(
     robot: Steered, q: FloatArray, settle_s: float, what: str, fit: Callable[[Reading], None] | None = None
 ) -> Iterator[Reading]:
     """Move to joints (n,) along a straight line at the speed limit and come to rest there.
@@ -123,14 +123,14 @@ def way_to(
     one reads a whole turn beyond its limits.
     """
     bounds, still = robot.robot.bounds, _Standstill(settle_s)
-    begun = robot.look().q
+    begun = robot.observe().q
     _require_no_turn_off(bounds, begun)
     if fit is not None:
         fit(robot.reading)
     while (gap := q - robot.target).any():
         periods = np.max(np.abs(gap) / (bounds.limits.speed * bounds.period), initial=1.0)
         robot.command(gap / periods, bounds.period)
-        stands = still.joints(robot.look())
+        stands = still.joints(robot.observe())
         yield robot.reading
         away = np.abs(q - robot.reading.q) - np.abs(q - begun)
         held = np.abs(robot.target - robot.reading.q) >= bounds.lead * (1.0 - 1e-6)
@@ -144,14 +144,14 @@ def way_to(
         remedy = "free the robot, or check its sag and backlash (plant.max_steady_state_error_deg)"
         if gap[i] > abs(q[i] - begun[i]) + sag[i]:
             remedy = (
-                f"it moved away from there, from {bounds.told(i, begun[i])}: check its sign and unit, and "
+                f"it moved away from there, from {bounds.text(i, begun[i])}: check its sign and unit, and "
                 "whether it can hold its load"
             )
-        if hindrance := hindrance_of(robot.robot.robot):
-            remedy = f"{hindrance}: take joints that it can reach and hold"
+        if obstruction := obstruction_of(robot.robot.robot):
+            remedy = f"{obstruction}: take joints that it can reach and hold"
         raise WorkFailed(
-            f"{what}: joint {i + 1} was sent to {bounds.told(i, q[i])} and stands at "
-            f"{bounds.told(i, robot.reading.q[i])}, {bounds.told(i, gap[i], 3)} short: {remedy}; then run "
+            f"{what}: joint {i + 1} was sent to {bounds.text(i, q[i])} and stands at "
+            f"{bounds.text(i, robot.reading.q[i])}, {bounds.text(i, gap[i], 3)} short: {remedy}; then run "
             "the command again" + (" to continue" if what == "record" else "")
         )
 
@@ -283,14 +283,14 @@ def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.var(means, axis=0, ddof=1), noise / third
 
 
-def simulated_robot(driven: Driven, joints: Joints, robot: FaultyRobot) -> ForeignRobot:
+def simulated_robot(driven: Driven, joints: Joints, robot: FaultyRobot) -> PluginRobot:
     """A simulated robot of the contract, which is never late, and goes beyond its limits where it may."""
     bounds = driven.following.bounds(joints)
     if driven.endless:
         endless = np.full(len(joints.types), math.inf)
         bounds = bounds._replace(limits=bounds.limits._replace(lower=-endless, upper=endless))
     markers = len(robot.world.truth.number)
-    return ForeignRobot(robot, "the simulated robot", markers, bounds, _NEVER_LATE_S, _NEVER_LATE_S)
+    return PluginRobot(robot, "the simulated robot", markers, bounds, _NEVER_LATE_S, _NEVER_LATE_S)
 
 
 def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -> FaultyRobot:
@@ -322,7 +322,7 @@ def connected(scenario: RunScenario, law: str, given: Robot | None = None) -> Dr
     driven = contract.driven
     if isinstance(driven.robot, OwnRobot):
         plant, bounds = _believed_plant(scenario, calibration), driven.following.bounds(joints)
-        robot = foreign_robot(driven.robot, bounds, joints.types, scenario.observed, given)
+        robot = plugin_robot(driven.robot, bounds, joints.types, scenario.observed, given)
     else:
         plant = scenario.plant_of(law)
         robot = simulated_robot(driven, joints, _in_the_loop(scenario, driven.robot, contract.events))
@@ -340,7 +340,7 @@ def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
     task = scenario.ends.by_points().task(scenario.model)
     return Plant(
         model=scenario.model,
-        M=np.ascontiguousarray(calibration.M[calibration.places(scenario.numbers[: scenario.m])]),
+        M=np.ascontiguousarray(calibration.M[calibration.indices_of(scenario.numbers[: scenario.m])]),
         order=task.order,
         center=task.center,
         O=task.O,

@@ -156,13 +156,13 @@ class GoalImages(NamedTuple):
     def deviations(self, numbers: Sequence[int]) -> list[list[float]]:
         """Standard deviation of markers in the left and in the right image, px; NaN if unknown."""
         sides = [side or (None,) * len(self.markers) for side in (self.sigma_left, self.sigma_right)]
-        told = [dict(zip(self.markers, side, strict=True)) for side in sides]
-        return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in told]
+        known = [dict(zip(self.markers, side, strict=True)) for side in sides]
+        return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in known]
 
     def sigma_px(self, face: Sequence[int]) -> float | None:
         """Standard deviation of a coordinate of the markers of the face, rms; None if unknown."""
-        told = [sigma**2 for side in self.deviations(face) for sigma in side]
-        return None if any(map(math.isnan, told)) else math.sqrt(sum(told) / len(told))
+        known = [sigma**2 for side in self.deviations(face) for sigma in side]
+        return None if any(map(math.isnan, known)) else math.sqrt(sum(known) / len(known))
 
 
 class Goal(NamedTuple):

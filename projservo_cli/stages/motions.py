@@ -79,7 +79,7 @@ def given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_transla
 class JointSearch(NamedTuple):
     """Inputs of the profile ``joint_space``, except model, images and demands."""
 
-    q_shown: FloatArray  # (k, n) joints known to show the goal, rad or m
+    goal_joints: FloatArray  # (k, n) joints known to show the goal, rad or m
     sigma: float  # standard deviation of a coordinate of the images of the goal, px
     spread: Spread = NO_SPREAD  # how far predictions err
     closed: str = ""  # reason why no path can be searched
@@ -93,7 +93,7 @@ def search_of(scenario: Scenario) -> JointSearch:
         demands = scenario.demands
         spread = spread_of(
             calibration,
-            tuple(calibration.places(numbers)),
+            tuple(calibration.indices_of(numbers)),
             scenario.m,
             (tuple(demands.limits.lower), tuple(demands.limits.upper), tuple(demands.image_size)),
             scenario.inputs.trajectory.search_seed,
@@ -101,7 +101,7 @@ def search_of(scenario: Scenario) -> JointSearch:
     limits, closed = scenario.joints.limits, ""
     if scenario.truth is None and not (np.isfinite(limits.lower) & np.isfinite(limits.upper)).all():
         closed = f"the limits of some joints are unknown: {LIMITS_MISSING}"
-    return JointSearch(scenario.q_shown, scenario.goal_sigma_px, spread, closed)
+    return JointSearch(scenario.goal_joints, scenario.goal_sigma_px, spread, closed)
 
 
 def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
@@ -199,7 +199,7 @@ def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: J
     how = SearchLimits(
         trajectory.max_search_samples, trajectory.search_seed, trajectory.max_goal_configurations
     )
-    path = find_path(c, aim, reaching.q_start, search.q_shown, how)
+    path = find_path(c, aim, reaching.q_start, search.goal_joints, how)
     if path.timing is None:
         linear = given("linear", reaching, trajectory._replace(duration_s=None), 1.0)
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.n_samples, np.nan)
@@ -267,7 +267,7 @@ class PathReplanner:
             asked.max_search_samples, asked.search_seed + self._made, asked.max_goal_configurations, excluded
         )
         start = np.clip(q, c.limits.lower, c.limits.upper)
-        path = find_path(c, self._goal, start, self._search.q_shown, how)
+        path = find_path(c, self._goal, start, self._search.goal_joints, how)
         if path.timing is None:
             return None
         found = _sampled_path(self._reaching, path.timing, asked.n_samples)

@@ -12,7 +12,7 @@ from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.loop.batch import begin
-from projservo_cli.monitoring.monitor import fault_shown
+from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.records import (
     NO_SPREAD,
@@ -130,7 +130,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
         return
     pixels, q = images.pixels(), images.joints.values(calibration.joint_types)
     seen = np.swapaxes(np.array([*pixels.values()]), 0, 1)
-    if fault := fault_shown(calibration, q, np.array([*pixels]), seen, scenario.demands.image_size):
+    if fault := detected_fault(calibration, q, np.array([*pixels]), seen, scenario.demands.image_size):
         raise WorkFailed(f"the goal was taught after a change since the calibration: {fault}; teach it again")
 
 

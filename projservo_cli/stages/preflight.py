@@ -11,13 +11,13 @@ from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding, Seen, findings_at_rest
 from projservo_cli.hardware.wiggle import Strokes, findings_of, strokes
-from projservo_cli.monitoring.monitor import fault_shown
+from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
-from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
+from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import OwnRobot
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.external_robot import foreign_robot
+from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.given import RecordingInputs
 
 # Time of observation of a robot at rest, s, and minimum number of readings.
@@ -41,7 +41,7 @@ def check(
     inputs: RecordingInputs,
     calibration: Calibration | None = None,
     confirmed: Callable[[], bool] | None = None,
-    watch: Callable[[ForeignRobot], None] | None = None,
+    watch: Callable[[PluginRobot], None] | None = None,
     progress: Progress = silent,
 ) -> Checked:
     """Open robot and cameras, look, and close them.
@@ -86,7 +86,7 @@ def check(
     return Checked(tuple(found), seen, tuple(moved))
 
 
-def _robot_of(inputs: RecordingInputs) -> ForeignRobot:
+def _robot_of(inputs: RecordingInputs) -> PluginRobot:
     """The robot of a configuration."""
     driven = inputs.trials.driven
     if driven is None or not isinstance(driven.robot, OwnRobot):
@@ -94,10 +94,10 @@ def _robot_of(inputs: RecordingInputs) -> ForeignRobot:
             "doctor -c checks a robot and its cameras, and this one is simulated: set plant.use and cameras"
         )
     joints = inputs.trials.joints.joints()
-    return foreign_robot(driven.robot, driven.following.bounds(joints), joints.types, inputs.numbers)
+    return plugin_robot(driven.robot, driven.following.bounds(joints), joints.types, inputs.numbers)
 
 
-def _seen(robot: ForeignRobot, inputs: RecordingInputs, progress: Progress) -> Seen:
+def _seen(robot: PluginRobot, inputs: RecordingInputs, progress: Progress) -> Seen:
     """Look for a while at a robot that stands where it is."""
     period, looks = robot.bounds.period, [robot.read()]
     wanted = max(_MIN_LOOKS, round(_LOOK_S / period))
@@ -144,6 +144,6 @@ def _against(calibration: Calibration, seen: Seen, image_size: tuple[int, int] |
     if size is None and len(seen.views):
         size = np.array(seen.views[0].frame.grey.shape[::-1], dtype=np.float64)
     marker = np.array(seen.marker, dtype=np.int64)
-    if fault := fault_shown(calibration, seen.q, marker, seen.s, size):
+    if fault := detected_fault(calibration, seen.q, marker, seen.s, size):
         return Finding(FAULT, "calibration", fault, "put that back, or record and calibrate again")
     return Finding(FINE, "calibration", "agrees with the images")

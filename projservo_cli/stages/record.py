@@ -27,13 +27,13 @@ from projservo_cli.records import (
     WorkFailed,
     in_unit,
 )
-from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
+from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints, OwnRobot
 from projservo_cli.simulation.faults import robot_by_itself
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.external_robot import averaged, foreign_robot, simulated_robot, way_to
+from projservo_cli.stages.external_robot import averaged, path_to, plugin_robot, simulated_robot
 from projservo_cli.stages.given import RecordingInputs, Trials
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
 from projservo_cli.tables import identity_in, read_table, recording_of, write_table
@@ -274,7 +274,7 @@ def _resumed(empty: _Recording, most: FloatArray) -> _Recording:
 def record(
     inputs: RecordingInputs,
     recording: _Recording,
-    robot: ForeignRobot | None = None,
+    robot: PluginRobot | None = None,
     *,
     kept: bool = True,
     progress: Progress = silent,
@@ -315,7 +315,7 @@ def record(
                 _show(recording, robot)
 
 
-def _show(recording: _Recording, robot: ForeignRobot) -> None:
+def _show(recording: _Recording, robot: PluginRobot) -> None:
     """Write a page next to the table: how far it is, and both images of the last pose with the tags."""
     last = recording.done[max(recording.done)]
     nothing = np.empty((0, 2))
@@ -329,7 +329,7 @@ def _show(recording: _Recording, robot: ForeignRobot) -> None:
     write_whole(recording.path.with_suffix(".html"), text)
 
 
-def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> ForeignRobot | None:
+def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> PluginRobot | None:
     """The robot that is to be driven; None for one that need not be.
 
     drawn : seed and stream of the random numbers of a simulated one.
@@ -339,7 +339,7 @@ def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> 
         return None
     if isinstance(driven.robot, OwnRobot):
         bounds = driven.following.bounds(joints)
-        return foreign_robot(driven.robot, bounds, joints.types, recording.marker.tolist())
+        return plugin_robot(driven.robot, bounds, joints.types, recording.marker.tolist())
     first = recording.targets[recording.pending[0]]
     return simulated_robot(driven, joints, robot_by_itself(driven.robot, first, trials.noise_px, drawn))
 
@@ -388,7 +388,7 @@ class _Sight:
     inputs: RecordingInputs
     recording: _Recording
 
-    def before(self, robot: ForeignRobot, reading: Reading) -> None:
+    def before(self, robot: PluginRobot, reading: Reading) -> None:
         """Refuse to move if the first readings, for a while, show too few markers."""
         period, waited = robot.bounds.period, 0.0
         while wrong := self._wrong(reading.s[None], "where the robot stands"):
@@ -482,7 +482,7 @@ class _Sight:
 
 
 def _recorded(
-    robot: ForeignRobot, trials: Trials, recording: _Recording, sight: _Sight | None = None
+    robot: PluginRobot, trials: Trials, recording: _Recording, sight: _Sight | None = None
 ) -> Iterator[int]:
     """Drive to one pending pose after the other and look; the number of each that was recorded.
 
@@ -500,7 +500,7 @@ def _recorded(
         return steered.hold()
 
     for pose in recording.pending:
-        seen = list(way_to(steered, recording.targets[pose], settle_s, "record", fit))
+        seen = list(path_to(steered, recording.targets[pose], settle_s, "record", fit))
         fit = None
         recording.commands += len(seen)
         recording.done[pose], squares, count = averaged(steered.reading, look, trials.averaged_frames)

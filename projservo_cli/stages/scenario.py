@@ -31,7 +31,7 @@ from projservo_cli.records import (
 from projservo_cli.robots.client import weights
 from projservo_cli.robots.settings import Joints, limit_passed
 from projservo_cli.simulation.arm import METRIC_A_INF
-from projservo_cli.simulation.faults import shown_in_frames
+from projservo_cli.simulation.faults import observed_in_frames
 from projservo_cli.simulation.ideal import NO_PINS, Ends, Plant
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.given import GoalImages, PlanInputs, ReachingTask, ServoInputs
@@ -64,13 +64,13 @@ class Scenario:
     observed: tuple[int, ...]  # numbers of all markers that the robot observes, in its order
     exact: TaskImages  # start and goal without noise; predicted for a robot that is not simulated
     true_ends: Ends  # true poses of the tool; NaN if unknown
-    q_shown: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 if unknown
+    goal_joints: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 if unknown
     noise_px: float  # of the images in the loop; at least the residual of a calibration of recorded ones
 
     @cached_property
     def ends(self) -> TaskImages:
         """Start and goal as the laws see them."""
-        return self.shown_at(self.inputs.seed)
+        return self.images_at(self.inputs.seed)
 
     @property
     def truth(self) -> Truth | None:
@@ -92,7 +92,7 @@ class Scenario:
             return "the calibration has no covariance, which the method bundle_adjustment gives"
         return ""
 
-    def shown_to(self, law: str) -> TaskImages:
+    def images_for(self, law: str) -> TaskImages:
         """Start and goal as a law measures them: with the body, or point by point."""
         return self.ends if law in BODY_LAWS else self.ends.by_points()
 
@@ -140,15 +140,15 @@ class Scenario:
     def goal_sigma_px(self) -> float:
         """Standard deviation of a coordinate of the face in the images of the goal, px."""
         images = self._given
-        told = None if images is None else images.sigma_px(self.numbers[: self.m])
-        return self.noise_px / math.sqrt(self.inputs.averaged_frames) if told is None else told
+        stated = None if images is None else images.sigma_px(self.numbers[: self.m])
+        return self.noise_px / math.sqrt(self.inputs.averaged_frames) if stated is None else stated
 
     @property
     def _given(self) -> GoalImages | None:
         """Images of the goal that are given."""
         return None if self.inputs.task is None else self.inputs.task.goal.images
 
-    def shown_at(self, seed: int) -> TaskImages:
+    def images_at(self, seed: int) -> TaskImages:
         """Start and goal as the images of a seed show them, which are averages."""
         if self.inputs.scene is not None:
             return self._rendered(seed)
@@ -171,26 +171,26 @@ class Scenario:
         The body is fitted to both by the deviations of their pixels, whichever is the larger. Markers of the
         face that frames do not show are predicted from those that they show.
         """
-        numbers, shown, given = self.numbers, self.exact, self._given
-        start, sigma = self._frames(shown.q_start, (seed, START_FRAMES))
+        numbers, shown_images, given = self.numbers, self.exact, self._given
+        start, sigma = self._frames(shown_images.q_start, (seed, START_FRAMES))
         if given is None:
-            goal, there = self._frames(self.q_shown[0], (seed, GOAL_FRAMES))
+            goal, there = self._frames(self.goal_joints[0], (seed, GOAL_FRAMES))
         else:
-            goal, there = shown.s_star, np.array(given.deviations(numbers))
+            goal, there = shown_images.s_star, np.array(given.deviations(numbers))
         sigma = np.fmax(sigma, there)
-        start = self._with_face("task.start", start, shown.q_start)
-        shown = shown._replace(s_start=start, s_star=self._with_face("task.goal", goal, None))
-        if not len(shown.body.M):
-            return shown
+        start = self._with_face("task.start", start, shown_images.q_start)
+        shown_images = shown_images._replace(s_start=start, s_star=self._with_face("task.goal", goal, None))
+        if not len(shown_images.body.M):
+            return shown_images
         weight = weights(sigma, sigma[..., None])
         weight[np.isnan(sigma)] = _GUESSED
-        return shown._replace(body=shown.body._replace(weight=weight))
+        return shown_images._replace(body=shown_images.body._replace(weight=weight))
 
     def _frames(self, q: FloatArray, drawn: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Pixels (2, b, 2) in rendered frames at joints (n,), rad or m, and their deviations (2, b)."""
         assert self.inputs.scene is not None
         which = [self.inputs.scene.numbers.index(number) for number in self.numbers]
-        s, sigma = shown_in_frames(self.inputs.scene, self.inputs.averaged_frames, q, drawn)
+        s, sigma = observed_in_frames(self.inputs.scene, self.inputs.averaged_frames, q, drawn)
         return np.ascontiguousarray(s[:, which]), sigma[:, which]
 
     def _with_face(self, key: str, s: FloatArray, q: FloatArray | None) -> FloatArray:
@@ -207,7 +207,7 @@ class Scenario:
         if known is not None and np.isfinite(s[..., 0]).sum(axis=1).min() > CORNERS - 1:
             q = _joints_showing(known, self.numbers, s, self.exact.q_start) if q is None else q
             if q is not None:
-                there = predict(known, q[None])[0][:, known.places(self.numbers)]
+                there = predict(known, q[None])[0][:, known.indices_of(self.numbers)]
                 return np.ascontiguousarray(np.where(unseen[..., None], there, s))
         raise WorkFailed(
             f"{key}: the {VIEWS[view]} camera does not see marker {self.numbers[k]} of the face, and too "
@@ -266,7 +266,7 @@ def _joints_showing(
 
     Least squares from joints (n,) and from others about them; None where no start leads near enough.
     """
-    places, seen, rng = calibration.places(numbers), np.isfinite(s), np.random.default_rng(0)
+    places, seen, rng = calibration.indices_of(numbers), np.isfinite(s), np.random.default_rng(0)
 
     def off(q: FloatArray) -> FloatArray:
         """Return the prediction errors, px; large behind a camera."""
@@ -318,7 +318,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
         observed=observed,
         exact=exact._replace(body=body),
         true_ends=ends,
-        q_shown=np.empty((0, len(joints.types))) if q_goal is None else q_goal[None],
+        goal_joints=np.empty((0, len(joints.types))) if q_goal is None else q_goal[None],
         noise_px=sigma_px,
     )
 
@@ -368,7 +368,7 @@ def _body(known: Calibration | Truth, numbers: tuple[int, ...]) -> Body:
     """Body of markers of a calibration, by their numbers, the same for every run with it."""
     if isinstance(known, Truth):
         return make_body(known.model, known.of(numbers))
-    return make_body(known.model(), known.M[known.places(numbers)])
+    return make_body(known.model(), known.M[known.indices_of(numbers)])
 
 
 def _observed(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
@@ -398,11 +398,11 @@ def _simulated_ends(
         return task.goal.turn.joints(robot, truth.P, q)
 
     numbers = tuple(truth.number[i] for i in truth.face), pins
-    shown, q_goal = _shown(task, types, numbers, center, images, turn)
-    return shown, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal), q_goal
+    shown_images, q_goal = _task_images(task, types, numbers, center, images, turn)
+    return shown_images, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal), q_goal
 
 
-def _shown(
+def _task_images(
     task: ReachingTask,
     types: str,
     numbers: tuple[Sequence[int], Sequence[int]],
@@ -439,7 +439,7 @@ def _predicted_ends(
     inputs: PlanInputs, task: ReachingTask, calibration: Calibration, joints: Joints, numbers: Sequence[int]
 ) -> tuple[TaskImages, Ends, FloatArray | None]:
     """Start and goal of a robot that is not simulated, as the calibration predicts them, as above."""
-    m, columns = len(inputs.face), calibration.places(numbers)
+    m, columns = len(inputs.face), calibration.indices_of(numbers)
     taught = None if task.goal.images is None else task.goal.images.joints
     given = (task.start, "start"), (task.goal.joints, "goal.joints"), (taught, "goal.images.joints")
     for vector, key in given:
@@ -462,8 +462,10 @@ def _predicted_ends(
             )
         return task.goal.turn.joints(inputs.arm, inputs.P, q)
 
-    shown, q_goal = _shown(task, joints.types, (numbers[:m], numbers[m:]), inputs.center, images, turn)
-    return shown, _unknown(np.full((4, 4), np.nan)), q_goal
+    shown_images, q_goal = _task_images(
+        task, joints.types, (numbers[:m], numbers[m:]), inputs.center, images, turn
+    )
+    return shown_images, _unknown(np.full((4, 4), np.nan)), q_goal
 
 
 def plant_of(truth: Truth, q_start: FloatArray, *, opaque: bool) -> Plant:

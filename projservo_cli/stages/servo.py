@@ -27,7 +27,7 @@ from projservo_cli.robots import plugins
 from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.contract import at_rest_after
 from projservo_cli.robots.plugins import what_failed
-from projservo_cli.simulation.faults import hindrance_of
+from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.ideal import AnalyticPlant, Plant
 from projservo_cli.stages import external_robot
 from projservo_cli.stages.given import ServoInputs
@@ -137,7 +137,7 @@ class _Outcome:
             untested="" if driven is None else scenario.untested,
             overruns=None if driven is None else driven.steered.overruns,
             latency=None if driven is None else _whole(driven.delays, rows),
-            **({} if driven is None else driven.film.told()),
+            **({} if driven is None else driven.film.fields()),
         )
 
 
@@ -159,8 +159,8 @@ def _reported_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArr
     truths : the poses, or joints (k, n), from which a configured arm gives them.
     """
     arm, goal = scenario.inputs.arm, np.full((4, 4), np.nan)
-    if arm is not None and len(scenario.q_shown):
-        goal = arm.pose(scenario.q_shown[0])
+    if arm is not None and len(scenario.goal_joints):
+        goal = arm.pose(scenario.goal_joints[0])
     if truths.ndim == 3:
         return truths, goal
     return np.array([goal * np.nan if arm is None else arm.pose(q) for q in truths]), goal
@@ -244,10 +244,10 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
         **dict.fromkeys(("fault detected", "failed"), run.why),
     }
-    hindrance = ""
+    obstruction = ""
     if run.driven is not None and run.verdict != "converged":
-        hindrance = hindrance_of(run.driven.robot.robot)
-    return "; ".join(filter(None, (reasons[run.verdict], hindrance)))
+        obstruction = obstruction_of(run.driven.robot.robot)
+    return "; ".join(filter(None, (reasons[run.verdict], obstruction)))
 
 
 class Given(NamedTuple):
@@ -386,7 +386,7 @@ class _Asked:
                     raise WorkFailed(f"the robot did not move, since at the start {wrong}")
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
-                for _ in external_robot.way_to(driven.steered, start, settle_s, "servo"):
+                for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
                         raise WorkFailed(f"stopped on the path to the start, since {wrong}")
             driven.begin()
@@ -432,7 +432,7 @@ class _Asked:
     def _task(self, model: Model, plan: Plan) -> Task:
         """The task as a built-in law with a model is given it, with the plan that it follows."""
         scenario = self.scenario
-        task, scale = scenario.shown_to(self.law).task(model), scenario.given.speed_scale
+        task, scale = scenario.images_for(self.law).task(model), scenario.given.speed_scale
         return followed(model, task, plan, scenario.gains.period, scale)
 
     def _built_in(self) -> BuiltInLaw:
@@ -440,7 +440,7 @@ class _Asked:
         scenario, plan = self.scenario, self.plan
         model = self.believed or scenario.believed_by(self.law)
         if self.replans:
-            task = scenario.shown_to(self.law).task(model)
+            task = scenario.images_for(self.law).task(model)
         else:
             assert isinstance(plan, Plan)
             task = self._task(model, plan)
@@ -461,12 +461,12 @@ class _Asked:
         scenario, gains, ends = self.scenario, self.scenario.gains, self.scenario.ends.by_points()
         assert scenario.calibration is not None
         assert isinstance(self.plan, Plan)
-        face = np.array(scenario.calibration.places(scenario.numbers[: scenario.m]))
+        face = np.array(scenario.calibration.indices_of(scenario.numbers[: scenario.m]))
         model, shown = ImageModel.of(scenario.calibration), (ends.s_start, ends.s_star)
         # A copy: no law may write to the arrays of another.
         setup = copy.deepcopy(LawSetup(model, face, *shown, self.plan, gains, gains.period))
         factory = self.given.law or plugins.find("law", self.law)
-        return ForeignLaw(plugins.called("law", self.law, factory, (setup,), {}), f"law {self.law}")
+        return PluginLaw(plugins.called("law", self.law, factory, (setup,), {}), f"law {self.law}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -492,7 +492,7 @@ class LawSetup:
     period: float
 
 
-class ForeignLaw:
+class PluginLaw:
     """A law ``law(s, q) -> q_dot`` whose answers are checked; None holds the robot for a period.
 
     Parameters

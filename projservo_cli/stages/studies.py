@@ -106,8 +106,8 @@ def run_studies(
     Periods with a gain of 1 a step or more, which no loop survives, are left out.
     """
     own, limits = bench.scenario.gains, (False, True)
-    most = max(own.gain_t, own.gain_r, own.gain_p, own.gain_s)
-    periods = [period for period in periods if most * period < 1.0]
+    maximum = max(own.gain_t, own.gain_r, own.gain_p, own.gain_s)
+    periods = [period for period in periods if maximum * period < 1.0]
     both = ("true", "calibrated")
     cases: list[tuple[Any, Gains, str, bool]] = [
         *((case, _with_gain(own, case[3]), *case[1:3]) for case in product(DIRECT, both, limits, gains)),

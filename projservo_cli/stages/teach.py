@@ -14,7 +14,7 @@ from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
 from projservo_cli.robots.settings import OwnRobot, Readings
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.external_robot import at_rest, averaged, foreign_robot, simulated_robot
+from projservo_cli.stages.external_robot import at_rest, averaged, plugin_robot, simulated_robot
 from projservo_cli.stages.given import Goal, GoalImages, PlanInputs, ReachingTask, TeachInputs
 from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
 
@@ -100,7 +100,7 @@ def teach(
         if at is not None:
             raise InputError("--at is where a simulated robot is put to; move yours by hand")
         bounds = driven.following.bounds(joints)
-        robot = foreign_robot(driven.robot, bounds, joints.types, inputs.numbers)
+        robot = plugin_robot(driven.robot, bounds, joints.types, inputs.numbers)
     else:
         if at is None:
             raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
@@ -151,8 +151,8 @@ def _require_still(bounds: Bounds, before: FloatArray, after: FloatArray, since:
     i = int(np.argmax(off / most))
     if off[i] > most[i]:
         raise WorkFailed(
-            f"teach: joint {i + 1} moved by {bounds.told(i, off[i], 3)} {since} "
-            f"({bounds.told(i, most[i], 3)} at most): take the hands away when asked to, and check "
+            f"teach: joint {i + 1} moved by {bounds.text(i, off[i], 3)} {since} "
+            f"({bounds.text(i, most[i], 3)} at most): take the hands away when asked to, and check "
             "whether the arm holds its load; nothing was written"
         )
 
@@ -189,7 +189,7 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     numbers = taught.marker.tolist()
     both = np.flatnonzero(np.isin(numbers, calibration.marker))
     off = np.full(taught.sigma.shape, np.nan)
-    expected = predict(calibration, q[None])[0][:, calibration.places(taught.marker[both])]
+    expected = predict(calibration, q[None])[0][:, calibration.indices_of(taught.marker[both])]
     off[:, both] = np.linalg.norm(taught.s[:, both] - expected, axis=2)
     noise = np.maximum(np.nan_to_num(taught.sigma), calibration.sigma_px)
     far = [

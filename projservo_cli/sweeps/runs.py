@@ -239,7 +239,7 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
         running, instants = list(range(first, min(first + TOGETHER, len(seeds)))), INSTANTS
         while running:  # those that outlast their noise are repeated with more
             drawn = min(instants, scenario.limits.max_steps + 1)
-            displayed = [scenario.shown_at(seeds[i]) for i in running]
+            displayed = [scenario.images_at(seeds[i]) for i in running]
             images = np.array([(ends.s_start, ends.s_star) for ends in displayed])
             noise = np.array([scenario.noise_of(law, seeds[i], drawn) for i in running])
             found[running] = trials.numbers(images, noise)

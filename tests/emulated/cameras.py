@@ -134,7 +134,7 @@ class Cameras:
 
         def shot(instant):
             q = np.array([self.arm.at(instant + x) for x in within])
-            eyes.look(view, q, None, self._random)
+            eyes.capture(view, q, None, self._random)
             return eyes.last[view]
 
         if optics.rolling_s > 0.0:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import JointLimits, Observation, WorkFailed
-from projservo_cli.robots.contract import Bounds, ForeignRobot, at_rest_after
+from projservo_cli.robots.contract import Bounds, PluginRobot, at_rest_after
 from projservo_cli.tables import identity_in, recording_of, write_table
 
 
@@ -14,7 +14,7 @@ def robot_with(**methods):
     quiet = dict.fromkeys(("open", "read", "command", "stop", "close"), lambda *_: None)
     limits = JointLimits(*np.array([[-1.0], [1.0], [1.0], [1.0]]))
     bounds = Bounds(limits, np.ones(1), 0.04, 0.1, np.zeros(1))
-    return ForeignRobot(SimpleNamespace(**quiet | methods), "arm", 4, bounds, 1.0, 1.0)
+    return PluginRobot(SimpleNamespace(**quiet | methods), "arm", 4, bounds, 1.0, 1.0)
 
 
 def test_an_arm_that_was_homed_since_is_named_by_what_changed():

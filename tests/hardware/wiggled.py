@@ -7,7 +7,7 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import recording_inputs, truth_of
 from projservo_cli.hardware import wiggle
-from projservo_cli.robots.contract import ForeignRobot, at_rest_after
+from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from tests.configured import bounds_of, joints_of
 
@@ -92,7 +92,7 @@ def findings(faults, **given):
     config = load_config("configs/hobby.yaml", SETTINGS)
     joints, numbers = joints_of(config), recording_inputs(config).numbers
     robot = Wiggled(truth_of(config), faults, **given)
-    foreign = ForeignRobot(robot, "arm", len(numbers), bounds_of(config, joints), 30.0, 30.0)
+    foreign = PluginRobot(robot, "arm", len(numbers), bounds_of(config, joints), 30.0, 30.0)
     with at_rest_after(foreign):
         steered = Steered(foreign)
         moved = [wiggle.strokes(steered, joint) for joint in range(5)]

@@ -167,7 +167,7 @@ def test_no_way_is_told_and_the_law_goes_alone():
     scenario = scenario_of(config, calibration)
     shut = scenario.ends.q_start - 1e-3, scenario.ends.q_start + 1e-3
     demands = scenario.demands._replace(limits=scenario.demands.limits._replace(lower=shut[0], upper=shut[1]))
-    search = planning.JointSearch(scenario.q_shown, 0.5)
+    search = planning.JointSearch(scenario.goal_joints, 0.5)
     plan = planning.plan_task(scenario.model, scenario.ends, scenario.inputs.trajectory, demands, search)
     assert not plan.feasible
     assert plan.profile == "joint_space"

@@ -10,7 +10,7 @@ from projservo_cli.laws import LAW_SPECS, LAWS, name_of
 from projservo_cli.records import PRISMATIC, Calibration
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import ReportData
-from projservo_cli.robots.client import Film
+from projservo_cli.robots.client import FrameRecorder
 from projservo_cli.stages import studies
 from tests.configured import record
 from tests.fake_records import fake
@@ -74,14 +74,14 @@ def case(name="paper", steps=SHORT, whole=False):
 
 def filmed(trace, width, height):
     """A run of which there are frames: black, with a bright square where a marker is."""
-    film = Film()
+    film = FrameRecorder()
     for k, s in enumerate(trace.s):
         frames = np.zeros((2, height, width), dtype=np.uint8)
         for view, marker in np.ndindex(s.shape[:2]):
             u, v = s[view, marker].round().astype(int)
             frames[view, max(0, v - 8) : v + 9, max(0, u - 8) : u + 9] = 200
         film.show(k, s, frames)
-    return replace(trace, **film.told())
+    return replace(trace, **film.fields())
 
 
 def known(config, true, model, q):

@@ -12,7 +12,7 @@ from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Fit
-from projservo_cli.robots.client import Film
+from projservo_cli.robots.client import FrameRecorder
 from projservo_cli.steps import steps_for
 from projservo_cli.store import Result, Run
 from tests.configured import calibrate, report_on
@@ -210,7 +210,7 @@ def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_t
     table.write_text("pose,marker\n")
     material = case()[2]
     trace = material.traces["direct_three"]
-    film = Film()
+    film = FrameRecorder()
     for k in range(trace.steps + 1):
         film.show(k, np.ones((2, 3, 2)), np.full((2, 8, 16), 99, dtype=np.uint8))
     settings = {
@@ -223,7 +223,7 @@ def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_t
     records = {"calibration": material.calibration, "observation": material.observation}
     blank = Run(tmp_path / "run.h5", to_yaml(config), {"calibrate": Result("", "", {}, {}, records)})
     keys = {step.name: step.key for step in steps_for(config, blank, ["servo"])}
-    filmed = {"": dataclasses.replace(trace, **film.told())}
+    filmed = {"": dataclasses.replace(trace, **film.fields())}
     made = {
         "calibrate": records,
         "plan": {"": material.plan},

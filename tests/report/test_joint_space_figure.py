@@ -26,7 +26,7 @@ def material():
     """The paper's task with a box between start and goal; the model is the true one in another frame."""
     _, bench, known = case()
     scenario, trajectory = bench.scenario, asked("joint_space", 21, keep_out=[{"left": BOX, "right": BOX}])
-    search = JointSearch(scenario.q_shown, 0.01)
+    search = JointSearch(scenario.goal_joints, 0.01)
     plan = plan_task(known.calibrated, scenario.ends, trajectory, scenario.demands, search)
     assert plan.feasible
     return dataclasses.replace(known, plan=plan, trajectory=trajectory)
@@ -106,7 +106,7 @@ def test_no_way_is_drawn_with_what_stood_in_it(material, monkeypatch):
     _, bench, _ = case()
     scenario = bench.scenario
     trajectory = asked("joint_space", 21, keep_out=[{"left": wall}], search={"max_samples": 300})
-    search = JointSearch(scenario.q_shown, 0.01)
+    search = JointSearch(scenario.goal_joints, 0.01)
     plan = plan_task(material.calibrated, scenario.ends, trajectory, scenario.demands, search)
     assert not plan.feasible
     assert "in 300 samples; what stopped most: " in plan.reason

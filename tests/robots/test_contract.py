@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.robots.contract import ForeignRobot, at_rest_after
+from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.stages.external_robot import way_to
+from projservo_cli.stages.external_robot import path_to
 from tests.configured import bounds_of, joints_of, robot_by_itself, truth_of
 from tests.documentation.blocks import PAGES, ROOT, blocks_of
 from tests.documentation.test_pages import put_truth
@@ -73,10 +73,10 @@ def steered(robot):
         noted(name)
     config = load_config(CONFIG, ["plant.max_steady_state_error_deg=1.5"])
     joints = joints_of(config)
-    foreign = ForeignRobot(robot, "robot", 10, bounds_of(config, joints), 5.0, 5.0)
+    foreign = PluginRobot(robot, "robot", 10, bounds_of(config, joints), 5.0, 5.0)
     with at_rest_after(foreign):
         steered = Steered(foreign)
-        steered.look()
+        steered.observe()
         yield steered
     assert {*threads} == {"open", "read", "command", "stop", "close"}
     assert len(set.union(*threads.values())) == 1
@@ -84,7 +84,7 @@ def steered(robot):
 
 
 def to(steered, target):
-    for _ in way_to(steered, target, 0.5, "test"):
+    for _ in path_to(steered, target, 0.5, "test"):
         pass
     return steered.reading.q
 
@@ -106,7 +106,7 @@ def test_it_goes_where_it_is_sent_and_adds_nothing_up(robot, steered):
     np.testing.assert_allclose(to(steered, target), target, atol=OFF)
     for _ in range(20):
         steered.command(np.zeros(6), PERIOD)
-        steered.look()
+        steered.observe()
     np.testing.assert_allclose(steered.reading.q, target, atol=OFF)
     np.testing.assert_allclose(to(steered, start), start, atol=OFF)
     assert steered.overruns == 0
@@ -115,7 +115,7 @@ def test_it_goes_where_it_is_sent_and_adds_nothing_up(robot, steered):
 def test_a_command_expires(robot, steered):
     for _ in range(10):
         steered.command(np.full(6, 0.02), PERIOD)  # 0.5 rad/s
-        last = steered.look().q
+        last = steered.observe().q
     hold(robot, 1.0)
     gone = where(robot)
     # Until it was due and two periods on, and what its servo lags behind: 0.1 s and 50 ms of 0.5 rad/s.
@@ -126,7 +126,7 @@ def test_a_command_expires(robot, steered):
 
 def test_time_passes_in_commands_alone(robot, steered):
     before = steered.robot.now()
-    steered.look()
+    steered.observe()
     assert steered.robot.now() == before
     steered.command(np.zeros(6), PERIOD)
     assert steered.robot.now() == pytest.approx(before + PERIOD, abs=1e-6)

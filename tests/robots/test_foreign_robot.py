@@ -12,9 +12,9 @@ import pytest
 
 from projservo_cli.records import JointLimits, WorkFailed
 from projservo_cli.robots import contract
-from projservo_cli.robots.contract import Bounds, ForeignRobot, at_rest_after
+from projservo_cli.robots.contract import Bounds, PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.stages.external_robot import way_to
+from projservo_cli.stages.external_robot import path_to
 
 PERIOD = 0.04
 BOUNDS = Bounds(
@@ -66,7 +66,7 @@ class Scripted:
 
 
 def guarded(robot, timeout_s=1.0):
-    return ForeignRobot(robot, "plant m:C", 3, BOUNDS, timeout_s, timeout_s)
+    return PluginRobot(robot, "plant m:C", 3, BOUNDS, timeout_s, timeout_s)
 
 
 @contextmanager
@@ -153,10 +153,10 @@ def test_a_joint_that_was_homed_a_turn_off_is_named_before_it_turns_back(reads, 
             f"nothing was moved: joint 2 reads {beyond} rad, a whole turn beyond its limits -1 rad to 1 rad"
         )
         with pytest.raises(WorkFailed, match=said):
-            next(way_to(Steered(foreign), np.zeros(2), 0.1, "test"))
+            next(path_to(Steered(foreign), np.zeros(2), 0.1, "test"))
         assert robot.sent == []
         robot.answer = (0.1, 1.4), S  # beyond its limits, and no turn off: it may return
-        next(way_to(Steered(foreign), np.zeros(2), 0.1, "test"))
+        next(path_to(Steered(foreign), np.zeros(2), 0.1, "test"))
     assert robot.sent
 
 
@@ -238,7 +238,7 @@ def test_a_late_answer_ends_the_waiting_and_stop_is_called_meanwhile(capsys):
 def test_opening_has_time_of_its_own_and_is_closed_where_it_fails():
     robot = Scripted()
     robot.open = lambda: time.sleep(0.2)
-    foreign = ForeignRobot(robot, "plant m:C", 3, BOUNDS, 0.05, 5.0)
+    foreign = PluginRobot(robot, "plant m:C", 3, BOUNDS, 0.05, 5.0)
     with at_rest_after(foreign):
         pass
     assert len(robot.closed) == 1

@@ -8,7 +8,7 @@ from PIL import Image
 
 from projservo_cli.records import Trace, WorkFailed
 from projservo_cli.report.figures.frames import frames_of
-from projservo_cli.robots.client import MOST_FRAMES, Film
+from projservo_cli.robots.client import MOST_FRAMES, FrameRecorder
 from projservo_cli.store import load
 from tests.fake_records import fake
 from tests.robots.robots import Sound
@@ -18,10 +18,10 @@ from tests.robots.test_servo import NEAR, OPTIONS
 
 @pytest.mark.parametrize("looks", [1, 2, 59, 60, 61, 118, 1000])
 def test_frames_are_thinned_evenly_and_the_first_and_last_are_kept(looks):
-    film, s = Film(), np.arange(12.0).reshape(2, 3, 2)
+    film, s = FrameRecorder(), np.arange(12.0).reshape(2, 3, 2)
     for k in range(looks):
         film.show(k, s + k, np.full((2, 8, 16), [[[k % 251]], [[255 - k % 251]]], dtype=np.uint8))
-    told = film.told()
+    told = film.fields()
     instant = told["frame_index"]
     assert (instant[0], instant[-1]) == (0, looks - 1)
     assert min(looks, MOST_FRAMES // 2) <= len(instant) <= MOST_FRAMES

@@ -34,7 +34,7 @@ def looks(delays, late, steps=60, stamped=None, noise=NOISE, first=-4):
         s = np.stack([predicted(motion(t)[None])[0, view] for view, t in enumerate(taken)])
         s += noise * rng.standard_normal(s.shape)
         stamps = np.full(2, np.nan) if stamped is None else taken + stamped
-        off.append(delays.look(stamps, s, history).t - taken)
+        off.append(delays.update(stamps, s, history).t - taken)
     return np.array(off)
 
 
@@ -61,7 +61,9 @@ def test_play_in_the_joints_is_no_delay(late):
         times = PERIOD * np.arange(-11, k + 1)
         link = [np.interp(now - late, times, [q[i] for q in links]) for i in range(2)]
         s = predicted(np.array(link)[None])[0]
-        off.append(delays.look(np.full(2, np.nan), s + NOISE * rng.standard_normal(s.shape), history).t - now)
+        off.append(
+            delays.update(np.full(2, np.nan), s + NOISE * rng.standard_normal(s.shape), history).t - now
+        )
     assert np.abs(np.array(off)[10:] + late).max() < 0.15
     assert np.abs(np.array(off)[30:] + late).max() < 0.06
 
@@ -83,7 +85,7 @@ def test_a_delay_that_changes_is_followed():
         now, late = k * PERIOD, 0.05 if k < 50 else 0.2
         history.add(now, motion(now))
         s = predicted(motion(now - late)[None])[0]
-        delays.look(np.full(2, np.nan), s + NOISE * rng.standard_normal(s.shape), history)
+        delays.update(np.full(2, np.nan), s + NOISE * rng.standard_normal(s.shape), history)
     np.testing.assert_allclose(delays.mean, 0.2, atol=0.01)
 
 
@@ -92,13 +94,13 @@ def test_an_image_that_comes_twice_keeps_its_instant():
     history, unstamped = History(), np.full(2, np.nan)
     history.add(0.0, motion(0.0))
     s = predicted(motion(0.0)[None])[0]
-    assert delays.look(unstamped, s, history).fresh.all()
+    assert delays.update(unstamped, s, history).fresh.all()
     history.add(PERIOD, motion(PERIOD))
     other = np.stack([s[0], s[1] + 1.0])
-    frames = delays.look(unstamped, other, history)
+    frames = delays.update(unstamped, other, history)
     assert frames.fresh.tolist() == [False, True]
     assert frames.t[0] == 0.0
-    assert not delays.look(unstamped, np.full(s.shape, np.nan), history).fresh.any()
+    assert not delays.update(unstamped, np.full(s.shape, np.nan), history).fresh.any()
 
 
 def test_a_camera_that_stands_still_while_joints_move_is_named():
@@ -109,7 +111,7 @@ def test_a_camera_that_stands_still_while_joints_move_is_named():
     def look(now, q):
         history.add(now, q)
         s = predicted(q[None])[0, 0] + NOISE * rng.standard_normal(still.shape)
-        delays.look(np.full(2, np.nan), np.stack([s, still]), history)
+        delays.update(np.full(2, np.nan), np.stack([s, still]), history)
 
     for k in range(26):
         look(k * PERIOD, motion(k * PERIOD))
@@ -127,10 +129,10 @@ def test_a_clock_of_a_camera_that_jumps_is_named():
     )
     for k in range(10):
         history.add(k * PERIOD, np.zeros(2))
-        delays.look(np.full(2, k * PERIOD), s + k, history)
+        delays.update(np.full(2, k * PERIOD), s + k, history)
     history.add(10 * PERIOD, np.zeros(2))
     with pytest.raises(WorkFailed, match="stamp of a left image"):
-        delays.look(np.array([5.0, 10 * PERIOD]), s + 10, history)
+        delays.update(np.array([5.0, 10 * PERIOD]), s + 10, history)
 
 
 def test_joints_of_the_past_are_those_read_to_the_bit_and_straight_between():

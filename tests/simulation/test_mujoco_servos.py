@@ -138,10 +138,10 @@ def test_what_an_arm_touches_is_told(tmp_path):
     post = '<worldbody><body name="post" pos="0 0.5 0.4"><geom size="0.04"/></body>'
     path.write_text(path.read_text(encoding="utf-8").replace("<worldbody>", post), encoding="utf-8")
     physics = driven(config, np.array([0.4, 0.0]))
-    assert physics.hindrance == ""
+    assert physics.obstruction == ""
     physics.follow(np.array([1.7, 0.0]), 2.0)
     assert physics.motor[0] < 1.5
-    assert physics.hindrance == "the arm touches: post and boom"
+    assert physics.obstruction == "the arm touches: post and boom"
 
 
 @pytest.mark.usefixtures("needs_mujoco")
@@ -158,9 +158,9 @@ def test_a_servo_too_weak_for_what_it_holds_is_told(tmp_path, limit):
     path.write_text(text, encoding="utf-8")
     physics = driven(config, np.array([0.4, math.pi / 2.0]))  # it hangs
     physics.follow(physics.setpoint, 0.1)
-    assert physics.hindrance == ""
+    assert physics.obstruction == ""
     physics.follow(np.array([0.4, 0.0]), 2.0)
-    assert physics.hindrance == "at the end of what their servos can do: joint 2"
+    assert physics.obstruction == "at the end of what their servos can do: joint 2"
 
 
 @pytest.mark.usefixtures("needs_mujoco")
@@ -192,7 +192,7 @@ def test_a_real_arm_with_its_meshes(shared_data, small, drawn):
         f"task={{start: {{joints: {q.tolist()}, unit: rad}}, goal: {{roll_deg: 10}}}}",
     )
     truth, eyes = drawn(config)
-    looks = [eyes.look(view, q[None], None, np.random.default_rng(0)) for view in range(2)]
+    looks = [eyes.capture(view, q[None], None, np.random.default_rng(0)) for view in range(2)]
     seen, sigma = zip(*looks, strict=True)
     off, sigma = np.array(seen) - truth.images(q, truth.M), np.array(sigma)[..., None]
     assert np.isfinite(sigma).sum(axis=(1, 2)).min() >= 8

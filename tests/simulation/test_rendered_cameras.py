@@ -20,7 +20,7 @@ def misses(truth, eyes, postures, seed=0):
     found = []
     for i, q in enumerate(postures):
         rngs = [np.random.default_rng((seed, i, view)) for view in range(2)]
-        seen = np.array([eyes.look(view, q[None], None, rng)[0] for view, rng in enumerate(rngs)])
+        seen = np.array([eyes.capture(view, q[None], None, rng)[0] for view, rng in enumerate(rngs)])
         found.append(seen - truth.images(q, truth.M))
     return np.array(found)
 
@@ -54,9 +54,9 @@ def test_an_exposure_is_the_mean_of_the_frames_in_it(small, drawn):
     rng = np.random.default_rng(0)
     single = []
     for step in way:
-        eyes.look(1, (q + step)[None], None, rng)
+        eyes.capture(1, (q + step)[None], None, rng)
         single.append(eyes.last[1].astype(float))
-    seen, _ = eyes.look(1, q + way, None, rng)
+    seen, _ = eyes.capture(1, q + way, None, rng)
     assert np.abs(eyes.last[1] - np.mean(single, axis=0)).max() <= 1.0
     assert np.nanmean(np.abs(seen - truth.images(q, truth.M)[1])) < 0.1
 
@@ -66,7 +66,7 @@ def test_a_tag_that_is_moved_is_seen_to_be_moved(small, drawn):
     q, by = POSTURES[7], np.array([0.01, 0.0, 0.005])
     moved = truth.M.copy()
     moved[4:8, :3] += truth.robot.base_tool[:3, :3] @ by
-    seen, _ = eyes.look(1, q[None], (6, by), np.random.default_rng(0))
+    seen, _ = eyes.capture(1, q[None], (6, by), np.random.default_rng(0))
     assert seen == pytest.approx(truth.images(q, moved)[1], abs=0.15, nan_ok=True)
     assert np.isfinite(seen[4:8]).all()
 
@@ -90,7 +90,7 @@ from projservo_cli.config import load_config
 from tests.configured import eyes_of
 eyes = eyes_of(load_config("small.yaml", ["plant.options={k1: -0.1}"], text=sys.stdin.read()))
 eyes.open()
-seen = [eyes.look(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)]
+seen = [eyes.capture(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)]
 print(hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest())
 eyes.close()
 """
@@ -101,7 +101,7 @@ def test_processes_draw_the_same_to_the_bit(small, drawn, gl):
     config = small("plant.options={k1: -0.1}")
     _, eyes = drawn(config)
     seen = [
-        eyes.look(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)
+        eyes.capture(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)
     ]
     here = hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest()
     there = subprocess.run(

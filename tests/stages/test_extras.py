@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from projservo_cli.cli.stages import require_extras
+from projservo_cli.cli.stages import require_optional
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report import animation as film
 from projservo_cli.report.report_data import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
@@ -64,8 +64,8 @@ def test_the_view_holds_every_instant_of_every_law(run, view):
 def test_without_plotly_the_view_says_what_to_install(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
     with pytest.raises(InputError, match=r"pip install '\.\[view\]'"):
-        require_extras(configured("paper"), ["view"])
-    require_extras(configured("paper"), ["animation"])
+        require_optional(configured("paper"), ["view"])
+    require_optional(configured("paper"), ["animation"])
 
 
 def test_what_has_no_metres_or_no_task_is_refused_with_the_remedy():
@@ -73,10 +73,10 @@ def test_what_has_no_metres_or_no_task_is_refused_with_the_remedy():
     config = configured("paper")
     projective = config.model_copy(update={"robot": None})
     with pytest.raises(InputError, match=r"--view: .*no metres.*robot\.dh or robot\.screws.*--animation"):
-        require_extras(projective, ["view"])
-    require_extras(projective, ["animation"])
+        require_optional(projective, ["view"])
+    require_optional(projective, ["animation"])
     with pytest.raises(InputError, match=r"--animation: .*task"):
-        require_extras(config.model_copy(update={"task": None}), ["animation"])
+        require_optional(config.model_copy(update={"task": None}), ["animation"])
 
 
 def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):

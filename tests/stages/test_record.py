@@ -10,10 +10,10 @@ from projservo_cli.cli.output import Console
 from projservo_cli.config import load_config
 from projservo_cli.detection import cells_of
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.robots.contract import ForeignRobot
+from projservo_cli.robots.contract import PluginRobot
 from projservo_cli.store import load
 from projservo_cli.tables import read_joint_list, read_table
-from tests.configured import bounds_of, foreign_robot, joints_of, simulate, trial_motions, truth_of
+from tests.configured import bounds_of, joints_of, plugin_robot, simulate, trial_motions, truth_of
 from tests.configured import record as stage
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -223,7 +223,7 @@ class Arm:
 
 def driven(config, robot):
     bounds = bounds_of(config, joints_of(config))
-    return ForeignRobot(robot, "plant Arm", len(config.markers.known), bounds, 30.0, 1.0)
+    return PluginRobot(robot, "plant Arm", len(config.markers.known), bounds, 30.0, 1.0)
 
 
 TEN = ["calibration.frames_per_joint=2"]
@@ -533,7 +533,7 @@ class Unnamed(Arm):
 
 def made(kind, *settings):
     config = load_config(UR5, [f"plant.use='tests.stages.test_record:{kind}'", *settings])
-    return foreign_robot(config, joints_of(config), 10).robot.given
+    return plugin_robot(config, joints_of(config), 10).robot.given
 
 
 def test_a_dictionary_reaches_the_class_or_is_refused():
@@ -552,6 +552,6 @@ def test_a_dictionary_reaches_the_class_or_is_refused():
 def test_joints_are_told_in_the_unit_of_the_configuration():
     for path, told in ((CONFIGS / "hobby.yaml", "90 deg"), (UR5, "1.57 rad")):
         config = load_config(path)
-        assert bounds_of(config, joints_of(config)).told(1, np.pi / 2, 3) == told
+        assert bounds_of(config, joints_of(config)).text(1, np.pi / 2, 3) == told
     config = load_config(STANFORD)
-    assert bounds_of(config, joints_of(config)).told(2, 0.5) == "0.5 m"
+    assert bounds_of(config, joints_of(config)).text(2, 0.5) == "0.5 m"

@@ -25,7 +25,7 @@ import pytest
 from projservo_cli.laws import POINT_LAWS
 from projservo_cli.records import WorkFailed
 from projservo_cli.simulation.faults import FaultyRobot
-from tests.configured import calibrate, plan, record, robot_by_itself, servo, shown_in_frames, truth_of
+from tests.configured import calibrate, observed_in_frames, plan, record, robot_by_itself, servo, truth_of
 from tests.conftest import ROOT
 from tests.studies import hand_eye
 from tests.studies.arrival import errors
@@ -138,7 +138,7 @@ def by_hand_eye(config, known, seed):
     (views, points, mount), truth = known, truth_of(config)
     arm = truth.robot
     start, goal = tasks_of()[seed]
-    shown, sigma = shown_in_frames(config, truth, goal, (seed, 7))
+    shown, sigma = observed_in_frames(config, truth, goal, (seed, 7))
     shown = np.where((sigma <= VAGUE_PX)[..., None], shown, np.nan)
     wanted = hand_eye.tool_in_base(views, points, shown)
     hand, rows = wanted @ np.linalg.inv(mount), []

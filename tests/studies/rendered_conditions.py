@@ -12,9 +12,9 @@ import numpy as np
 
 from projservo_cli.config.robot import JointVector
 from projservo_cli.records import FloatArray
-from projservo_cli.simulation.faults import hindrance_of
+from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.sweeps.design import STRATA, random_tasks
-from tests.configured import robot_by_itself, shown_in_frames, truth_of
+from tests.configured import observed_in_frames, robot_by_itself, truth_of
 from tests.conftest import SHARED
 from tests.known import configured
 from tests.studies.planning_tables import write_rows
@@ -92,7 +92,7 @@ def task_config(config, seed, *, taught=False):
 def taught_images(config, q: FloatArray, seed):
     """What ``teach`` writes of images at joints (n,)."""
     truth = truth_of(config)
-    s, sigma = shown_in_frames(config, truth, q, (seed, 7))
+    s, sigma = observed_in_frames(config, truth, q, (seed, 7))
     pixels = [[None if np.isnan(uv).any() else uv.tolist() for uv in view] for view in s]
     told = [[None if np.isnan(x) else float(x) for x in view] for view in sigma]
     sides = {"left": pixels[0], "right": pixels[1], "sigma_left_px": told[0], "sigma_right_px": told[1]}
@@ -112,7 +112,7 @@ def drawn():
             starts, goals = random_tasks(truth, np.array(FRONT), STRATA, rng)
             ends = starts[(seed - 1) % STRATA], goals[(seed - 1) % STRATA]
             robots = [robot_by_itself(config, truth, q, 0.0, 0, 0) for q in ends]
-            free = not any("touches" in hindrance_of(robot) for robot in robots)
+            free = not any("touches" in obstruction_of(robot) for robot in robots)
             found = ends if free and all(_shows(config, truth, q) for q in ends) else None
         yield {"seed": seed} | {
             f"{end}_q{i}": repr(float(x))
@@ -127,7 +127,7 @@ def _shows(config, truth, q):
     sides = np.linalg.norm(face - np.roll(face, 1, axis=1), axis=2)
     if sides.max(axis=1).min() < LEAST_PX:
         return False
-    s, _ = shown_in_frames(config.model_copy(update={"noise": type(config.noise)()}), truth, q, (0, 0))
+    s, _ = observed_in_frames(config.model_copy(update={"noise": type(config.noise)()}), truth, q, (0, 0))
     return bool(np.isfinite(s[:, list(truth.face)]).all())
 
 

@@ -18,7 +18,7 @@ from projservo_cli.config import load_config, shipped
 from projservo_cli.config.inputs import recording_inputs
 from projservo_cli.hardware.so101 import COUNT, MIDDLE, SO101
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages.external_robot import foreign_robot
+from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.record import new_recording, record
 from tests.configured import truth_of
 from tests.emulated.arm import Arm, Clock
@@ -76,7 +76,7 @@ def recorded(seed, faults=BAD):
         recording, joints = new_recording(inputs, Path(folder, "t.csv")), inputs.trials.joints.joints()
         bounds = inputs.trials.driven.following.bounds(joints)
         robot = Projected(bus, bounds.limits)
-        foreign = foreign_robot(inputs.own, bounds, joints.types, inputs.numbers, robot)
+        foreign = plugin_robot(inputs.own, bounds, joints.types, inputs.numbers, robot)
         try:
             record(inputs, recording, foreign)
         except WorkFailed as failure:

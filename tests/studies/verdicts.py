@@ -91,7 +91,7 @@ FAULTS = {
         ("disturbance.link_deflection_deg=0.5",),
         FaultyRobot,
     ),
-    "play 0.5 deg": ("converged|play in the joints", ("disturbance.backlash_deg=0.5",), FaultyRobot),
+    "play 0.5 deg": ("converged|backlash", ("disturbance.backlash_deg=0.5",), FaultyRobot),
     "joint struck by 3 deg": (
         "converged",
         (f"disturbance.joint_moved={{at_step: {AT}, joint: 2, by_deg: 3}}",),

@@ -81,7 +81,7 @@ def test_plane_of_a_bent_face_is_a_compromise():
     assert a / a[2] == pytest.approx(np.array([0, 0, 1, -1.4]), abs=1e-14)
 
 
-def shown_to(model, s_start, s_star):
+def images_for(model, s_start, s_star):
     return TaskImages(model.q_reference, s_start, s_star, MIDPOINT).task(model)
 
 
@@ -93,12 +93,12 @@ def images(A, T):
 def test_task_from_images_alone():
     T = displacement([0.1, 0.2, 1.0], [0.05, 0.02, -0.1])
     model, s_start, s_star = images(face(), T)
-    wanted = shown_to(model, s_start, s_star)
+    wanted = images_for(model, s_start, s_star)
     assert wanted.A_star == pytest.approx(face() @ T.T, abs=1e-11)
     assert wanted.O[:, :3] == pytest.approx(np.array([[-0.15, 0, 0], [0.15, 0, 0]]), abs=1e-12)
     for seed in (1, 2):
         G = frame(seed, mirrored=seed == 2)
-        task = shown_to(in_frame(model, G), s_start, s_star)
+        task = images_for(in_frame(model, G), s_start, s_star)
         assert task.A_star == pytest.approx(wanted.A_star @ G.T, abs=1e-10)
         a = plane(face() @ G.T, task.order)
         assert ((task.O @ a) * task.visible > 0).all()
@@ -108,18 +108,18 @@ def test_a_goal_that_shows_the_back_is_refused():
     """To one camera or to both; the camera is named."""
     model, s_start, s_star = images(SQUARE, turned(SQUARE_CENTER, [math.pi, 0, 0]))
     with pytest.raises(WorkFailed, match="left camera sees one side of the face"):
-        shown_to(model, s_start, s_star)
+        images_for(model, s_start, s_star)
     # Turned by 88° about the vertical the face is seen from the left only.
     model, s_start, s_star = images(SQUARE, turned(SQUARE_CENTER, [0, math.radians(88), 0]))
     with pytest.raises(WorkFailed, match=r"(left|right) camera sees one side of the face"):
-        shown_to(model, s_start, s_star)
+        images_for(model, s_start, s_star)
 
 
 def test_a_marker_without_a_point_is_named():
     model, s_start, s_star = images(face(), np.eye(4))
     s_star[1, 2, 0] = np.nan
     with pytest.raises(WorkFailed, match="marker 2"):
-        shown_to(model, s_start, s_star)
+        images_for(model, s_start, s_star)
 
 
 def test_order_does_not_depend_on_the_frame():
