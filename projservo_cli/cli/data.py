@@ -34,7 +34,7 @@ _TAUGHT = "# What both cameras saw: projservo teach. Name this file under task.g
     "--at-unit", type=click.Choice(["deg", "rad"]), default="rad", help="Unit of --at. Default: rad."
 )
 @option.force(help="Replace the file if there is one.")
-@option.told
+@option.explained
 def _teach(
     console: Console,
     *,
@@ -116,7 +116,7 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, *, key:
     if taught.moved is not None:
         i = int(np.abs(taught.moved).argmax())
         words.append(
-            f"  since it is held, joint {i + 1} moved by {taught.bounds.told(i, taught.moved[i], 3)}"
+            f"  since it is held, joint {i + 1} moved by {taught.bounds.text(i, taught.moved[i], 3)}"
         )
     if unseen := ", ".join(f"{number} ({side})" for number, side in taught.unseen):
         words.append(wrapped(f"unseen: {unseen}", "  "))
@@ -155,7 +155,7 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, *, key:
     help="Four markers a tag, or one.",
 )
 @option.force(help="Replace the table if there is one.")
-@option.told
+@option.explained
 def _detect(
     console: Console,
     *,
@@ -245,7 +245,7 @@ def _detect(
     type=click.Choice(["deg", "rad"]),
     help="Unit of the table's revolute joints. Default: that of the run.",
 )
-@option.told
+@option.explained
 def _validate(
     console: Console,
     *,

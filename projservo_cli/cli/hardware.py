@@ -53,7 +53,7 @@ _BODIES = ("roof", "plate")
     "--paper", type=click.Choice(["a4", "letter"]), default="a4", show_default=True, help="Its size."
 )
 @option.force(help="Replace the file if there is one.")
-@option.told
+@option.explained
 def _tags(
     console: Console,
     *,

@@ -17,7 +17,7 @@ from projservo_cli.cli.output import Console, words_of, wrapped
 @main.command("show", epilog="Example: projservo show results/ur5 --json")
 @click.argument("run", required=False, type=option.PATH)
 @option.output(metavar="DIR", help="The run, instead of an argument.")
-@option.told
+@option.explained
 def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
     """Show the contents and the provenance of a run.
 
@@ -66,7 +66,7 @@ def _made(provenance: Any) -> str:
 @click.argument("runs", nargs=-1, required=True, type=option.PATH, metavar="RUN RUN ...")
 @option.output(metavar="PAGE", help="Page to write.", default="compare.html", show_default=True)
 @option.force(help="Replace the page if there is one.")
-@option.told
+@option.explained
 def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bool) -> None:
     """Show runs side by side on one page.
 
@@ -115,7 +115,7 @@ _KINDS = {"opencv": "cameras.yaml", "urdf": "robot.urdf", "json": "metric.json",
     "--nominal", metavar="URDF", type=option.PATH, help="Model of the arm, whose zeros and axes are compared."
 )
 @click.option("--tip", metavar="LINK", help="Link of the model that carries the tool. Default: the last one.")
-@option.told
+@option.explained
 def _export(
     console: Console,
     *,
@@ -238,7 +238,7 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
 
 
 @main.command("equations", epilog="Example: projservo equations --json")
-@option.told
+@option.explained
 def _equations(console: Console) -> None:
     """List the equations of the paper and the code of each.
 

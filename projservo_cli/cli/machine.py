@@ -27,7 +27,7 @@ _MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu"
     help="For an arm that people build, with two webcams: so101. Default: a simulated robot.",
 )
 @option.force(help="Replace the file if there is one.")
-@option.told
+@option.explained
 def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None:
     """Write a commented configuration to start from.
 
@@ -55,7 +55,7 @@ def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None
 @main.command("schema", epilog="Example: projservo schema -o schema.json")
 @click.argument("what", required=False, metavar="[sweep]", type=click.Choice(["sweep"]))
 @option.output(metavar="FILE", help="File to write. Default: standard output.")
-@option.told
+@option.explained
 def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
     """Print the JSON Schema of the configuration.
 
@@ -84,7 +84,7 @@ def _as_text(schema: dict[str, Any]) -> str:
 @option.output(metavar="FILE", help="Page to write. Default: preflight.html.")
 @click.option("--move", is_flag=True, help="Ask, then move each joint by 3° to either side.")
 @click.option("--watch", is_flag=True, help="Show both images in a browser of this machine until Ctrl-C.")
-@option.told
+@option.explained
 def _doctor(
     console: Console,
     *,
@@ -170,23 +170,23 @@ def _found(value: dict[str, Any]) -> Iterator[str]:
         yield f"extra {name}: {lacks if lacking else 'installed'}"
     kernels, results = value["kernels"], value["results"]
     if kernels is None:
-        told = "unknown, packages are missing"
+        explained = "unknown, packages are missing"
     elif not kernels["jit"]:
-        told = "not compiled at all: NUMBA_DISABLE_JIT is set"
+        explained = "not compiled at all: NUMBA_DISABLE_JIT is set"
     elif kernels["cache"] is None:
-        told = "compiled again in every run: no folder can be written; set PROJSERVO_CACHE_DIR"
+        explained = "compiled again in every run: no folder can be written; set PROJSERVO_CACHE_DIR"
     elif not kernels["compiled"]:
-        told = f"to be compiled by the first run, once, into {kernels['cache']}"
+        explained = f"to be compiled by the first run, once, into {kernels['cache']}"
     else:
-        told = f"{kernels['compiled']} compiled, in {kernels['cache']}"
-    yield f"kernels: {told}"
+        explained = f"{kernels['compiled']} compiled, in {kernels['cache']}"
+    yield f"kernels: {explained}"
     yield f"results: {results['folder']}{'' if results['writable'] else ', which CANNOT be written to'}"
 
 
 @main.command("bench", epilog="Example: projservo bench --json")
 @option.configuration(help="Configuration (YAML) with a simulated task. Default: paper.yaml.")
 @option.override
-@option.told
+@option.explained
 def _bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> None:
     """Measure the speed of a control step and of a run.
 

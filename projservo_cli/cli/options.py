@@ -71,7 +71,7 @@ confirm = click.option(
 )
 
 
-def told(function: _Function) -> _Function:
+def explained(function: _Function) -> _Function:
     """Give a command its console, made of ``--json``, ``-q`` and ``-v``, which all commands take.
 
     The output of a plug-in robot or law goes to standard error: it is not a result.
@@ -108,7 +108,7 @@ _OF_STAGES = (
     force(help="Make the named stages even where they are up to date."),
     dry_run,
     threads(help="Threads. Default: all processors."),
-    told,
+    explained,
     click.pass_obj,  # the names of the stages of the call
 )
 
@@ -190,8 +190,8 @@ def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Co
     run = stored or _run_of(options, config)
     table = run.path.resolve().with_name(_TRIALS)
     if config.data is None and (recording or table.is_file()):
-        beside = Override(f"{table}", "data.table", str(table))
-        config = load_config(config.name, [beside], text=to_yaml(config))
+        in_folder = Override(f"{table}", "data.table", str(table))
+        config = load_config(config.name, [in_folder], text=to_yaml(config))
     return config, run
 
 

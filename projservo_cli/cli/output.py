@@ -316,14 +316,14 @@ def _of_laws(value: dict[str, Any]) -> Iterator[str]:
 
 def _of_report(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     claims = value["claims"]
-    told = [claim for claim in claims if detailed or claim["holds"] is False]
+    explained = [claim for claim in claims if detailed or claim["holds"] is False]
     holding = sum(claim["holds"] is True for claim in claims)
     held = f"; {holding} of {len(claims)} claims hold" if claims else ""
-    but = "; it does not hold that" if told and not detailed else ""
+    but = "; it does not hold that" if explained and not detailed else ""
     count = len(value["figures"])
     yield f"report: {count} file{'s' * (count != 1)} of figures{held}{but}"
     words = {True: "holds", False: "does not hold", None: "not measured"}
-    for claim in told:
+    for claim in explained:
         if detailed:
             yield wrapped(f"{words[claim['holds']]}: {claim['claim']}: {claim['measured']}", "  ")
         else:

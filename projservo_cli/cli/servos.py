@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     multiple=True,
     help="Let the servo of a joint store an offset where its range crosses the end of its turn. Repeatable.",
 )
-@option.told
+@option.explained
 def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
     """Find joint limits by hand and write them.
 
@@ -58,7 +58,7 @@ def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
 
 @main.command("release", epilog="Example: projservo release -c arm.yaml")
 @option.configuration(help="Configuration (YAML) of the arm.", required=True)
-@option.told
+@option.explained
 def _release(console: Console, *, config: str) -> None:
     """Let go of an arm of bus servos.
 

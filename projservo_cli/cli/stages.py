@@ -39,7 +39,7 @@ def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -
 @option.confirm
 @option.force(help="Start again, whatever the table holds.")
 @option.dry_run
-@option.told
+@option.explained
 @click.pass_obj
 def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     """Drive the robot through trial motions and write a table.
@@ -77,8 +77,8 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
 
 def _recording_object(recording: Any, reason: str) -> dict[str, Any]:
     """The JSON object of a recording, and why it stopped short where it did."""
-    told: dict[str, Any] = recording.told
-    return told | ({"reason": reason, "failed": "record"} if reason else {})
+    explained: dict[str, Any] = recording.summary
+    return explained | ({"reason": reason, "failed": "record"} if reason else {})
 
 
 def _motions(config: Any, options: Mapping[str, Any]) -> Any:
@@ -465,16 +465,16 @@ def _made_optional(console: Console, chain: Any, wanted: Sequence[str]) -> dict[
     from projservo_cli.report.page import write_page
     from projservo_cli.stages import report as reporting
 
-    told, config, made = chain.reported(), chain.config, {}
+    explained, config, made = chain.reported(), chain.config, {}
     for name in wanted:
         console.detail(f"report: making the {name}")
         if name == "view":
-            path = reporting.view(scenery_of(config), told, console.progress)
+            path = reporting.view(scenery_of(config), explained, console.progress)
         else:
-            path = reporting.animation(config.image_size_px, told, console.progress)
+            path = reporting.animation(config.image_size_px, explained, console.progress)
         made[name] = path.resolve()
-    told = replace(told, results={**told.results, "report": chain.run.results["report"]})
-    write_page(told, about_of(config))
+    explained = replace(explained, results={**explained.results, "report": chain.run.results["report"]})
+    write_page(explained, about_of(config))
     return made
 
 

@@ -22,7 +22,7 @@ from projservo_cli.cli.output import Console
     metavar="ADDRESS",
     help="The Dask scheduler whose workers do the work, such as tcp://host:8786.",
 )
-@option.told
+@option.explained
 def _sweep(
     console: Console,
     *,

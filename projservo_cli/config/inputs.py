@@ -32,7 +32,7 @@ from projservo_cli.records import (
     InputError,
     position_limits,
 )
-from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Pace, Readings
+from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings, SpeedLimits
 from projservo_cli.simulation import dh
 from projservo_cli.simulation.arm import Arm, twist
 from projservo_cli.simulation.faults import (
@@ -425,7 +425,7 @@ def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
     limits = robot.limits if robot is not None else None
     ranges = robot.ranges if robot is not None and limits is None else None
     turning = c.joint_acceleration_limit_deg_s2 or _ACCELERATION_DEG_S2
-    pace = Pace(
+    speeds = SpeedLimits(
         math.inf if c.joint_speed_limit_deg_s is None else math.radians(c.joint_speed_limit_deg_s),
         math.inf if c.prismatic_speed_limit_m_s is None else c.prismatic_speed_limit_m_s,
         math.radians(turning),
@@ -438,7 +438,7 @@ def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
         widened=None if limits is None else limits.from_data,
         unit=(limits.unit if limits is not None else None) or ("rad" if vector is None else vector.unit),
         known=0 if vector is None else len(vector.joints),
-        pace=pace if paced else Pace(),
+        speeds=speeds if paced else SpeedLimits(),
     )
 
 

@@ -64,8 +64,8 @@ def _roof(size_m: float) -> tuple[Tag, ...]:
 def _plate(size_m: float) -> tuple[Tag, ...]:
     """Two by two tags in a plane that look forward; their margins meet."""
     half = 0.5 * GROUND * size_m
-    places = [(-half, half), (half, half), (half, -half), (-half, -half)]
-    return tuple(_tag(k, size_m, Rotation.identity(), [*at, 1.5 * half]) for k, at in enumerate(places))
+    centers = [(-half, half), (half, half), (half, -half), (-half, -half)]
+    return tuple(_tag(k, size_m, Rotation.identity(), [*at, 1.5 * half]) for k, at in enumerate(centers))
 
 
 _TOOLS = {"roof": _roof, "plate": _plate}

@@ -131,8 +131,8 @@ class CameraRobot:
 
     def remarks(self) -> list[str]:
         """Return the faults of the last frames, in words: dark, clipped or blurred ones."""
-        shown = [(name, view) for name, view in zip(VIEWS, self.views, strict=True) if view is not None]
-        return [f"the {name} image {what}" for name, view in shown for what in wrong_with(view.frame.grey)]
+        visible = [(name, view) for name, view in zip(VIEWS, self.views, strict=True) if view is not None]
+        return [f"the {name} image {what}" for name, view in visible for what in wrong_with(view.frame.grey)]
 
 
 class Exposure(NamedTuple):

@@ -153,15 +153,15 @@ def other_dictionary(grey: ByteArray, dictionary: str) -> tuple[str, int]:
 
 def _of_both(seen: Seen) -> Iterator[Finding]:
     """Markers that both cameras see, the face among them, and whether the views differ enough for depth."""
-    shown = np.isfinite(seen.s[..., 0])
-    shared = int(shown.all(axis=0).sum())
-    if shown.any(axis=1).all() and shared < _MIN_SHARED:
+    visible = np.isfinite(seen.s[..., 0])
+    shared = int(visible.all(axis=0).sum())
+    if visible.any(axis=1).all() and shared < _MIN_SHARED:
         remedy = "turn the tool towards both cameras, or move them"
         what = f"share {shared} of {len(seen.marker)} markers ({_MIN_SHARED} at least)"
         yield Finding(FAULT, "both images", what, remedy)
     elif shared:
         yield Finding(FINE, "both images", f"share {shared} of {len(seen.marker)} markers")
-    both = {number for k, number in enumerate(seen.marker) if shown[:, k].all()}
+    both = {number for k, number in enumerate(seen.marker) if visible[:, k].all()}
     for number in seen.marker:
         if shared and number in seen.face and number not in both:
             what = f"do not both show marker {number} of the face, tag {number // CORNERS}"

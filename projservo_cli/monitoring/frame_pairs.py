@@ -19,7 +19,7 @@ class Frame(NamedTuple):
     t: float  # when it was taken, s
     q: FloatArray  # (n,) joint readings then, rad or m
     q_dot: FloatArray  # (n,) and their velocities
-    late: float  # standard deviation of the instant, s
+    sigma_t: float  # standard deviation of the instant, s
     image: FloatArray  # (m, 2) px, NaN where unseen
     noise: FloatArray  # (m,) standard deviation of the pixels, px
 
@@ -30,7 +30,7 @@ class FramePair(NamedTuple):
     t: FloatArray  # (2,) s, from the first observation on
     q: FloatArray  # (2, n) rad or m
     q_dot: FloatArray  # (2, n)
-    late: FloatArray  # (2,) s
+    sigma_t: FloatArray  # (2,) s
     images: FloatArray  # (2, m, 2) px
     noise: FloatArray  # (2, m) px
     curved: FloatArray  # (n,) how far joints may be off since they do not go straight between readings
@@ -81,8 +81,8 @@ class Pairing:
         last, self._last = self._last or one, one
         self._start = one.t if self._start is None else self._start
         stacked = (np.array([frame[i] for frame in both]) for i in range(len(one)))
-        t, q, q_dot, late, images, noise = stacked
+        t, q, q_dot, sigma_t, images, noise = stacked
         curved = _STRAIGHT * np.abs(one.q_dot - last.q_dot) * abs(one.t - last.t)
         return FramePair(
-            t=t - self._start, q=q, q_dot=q_dot, late=late, images=images, noise=noise, curved=curved
+            t=t - self._start, q=q, q_dot=q_dot, sigma_t=sigma_t, images=images, noise=noise, curved=curved
         )

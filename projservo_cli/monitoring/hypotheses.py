@@ -102,14 +102,14 @@ class Evidence:
         self._inverses = factor[:, None, None] * np.linalg.inv(roots)
         onset = float(self.pairs[0].t.mean())
         seconds = float(self.pairs[-1].t.mean()) - onset
-        beside = np.array([np.hstack([r.B, r.F[:, : 2 * n + 2]]) for r in residuals])
+        nuisance = np.array([np.hstack([r.B, r.F[:, : 2 * n + 2]]) for r in residuals])
         drift = slice(errors.e + n, errors.e + 2 * n)  # of joints, with time from the onset
-        beside[..., drift] -= onset * beside[..., errors.e : errors.e + n]
-        self._beside = self._whitened(beside)
-        late = np.maximum(np.max([pair.late for pair in self.pairs], axis=0), 1e-6)
+        nuisance[..., drift] -= onset * nuisance[..., errors.e : errors.e + n]
+        self._beside = self._whitened(nuisance)
+        sigma_t = np.maximum(np.max([pair.sigma_t for pair in self.pairs], axis=0), 1e-6)
         prior = np.zeros((errors.e + 2 * n + 2,) * 2)
         prior[: errors.e, : errors.e] = np.eye(errors.e) + agreed.normal[: errors.e, : errors.e]
-        prior[errors.e :, errors.e :] = errors.lasting(seconds, late)
+        prior[errors.e :, errors.e :] = errors.persistent_prior(seconds, sigma_t)
         self._known = np.append(agreed.normal[: errors.e, -1], np.zeros(2 * n + 2))
         self._factor = cho_factor(prior + self._beside.T @ self._beside)
         self._offset = float(self._known @ cho_solve(cho_factor(prior), self._known))
@@ -319,12 +319,12 @@ def _joint_causes(evidence: Evidence) -> Iterator[Cause]:
     yield Cause("flexible", -1, np.zeros((1, n)), lambda s, theta: s._replace(away=s.away + theta))
     for v in (0, 1, -1):
 
-        def late(s: Changed, theta: FloatArray, v: int = v) -> Changed:
+        def sigma_t(s: Changed, theta: FloatArray, v: int = v) -> Changed:
             both = theta if v < 0 else np.eye(2)[v] * theta
             return s._replace(away=s.away - both[:, None] * velocity)
 
         if velocity.any():
-            yield Cause("late", v, np.zeros((1, 2 if v < 0 else 1)), late)
+            yield Cause("late", v, np.zeros((1, 2 if v < 0 else 1)), sigma_t)
 
 
 def _image_causes(centre: FloatArray | None) -> Iterator[Cause]:
@@ -387,7 +387,7 @@ def _camera_causes(evidence: Evidence) -> Iterator[Cause]:
 def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
     """Causes on the tool: its markers, tags, and all of them."""
     twists, m = evidence._errors.twists, len(numbers)
-    shown: BoolArray = np.any(evidence.seen, axis=(0, 1))
+    visible: BoolArray = np.any(evidence.seen, axis=(0, 1))
     d = len(twists)
 
     def displaced(s: Changed, theta: FloatArray, which: IntArray) -> Changed:
@@ -413,7 +413,7 @@ def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
         def loose(s: Changed, theta: FloatArray, which: IntArray = which) -> Changed:
             return displaced(s, theta, which)
 
-        if shown[which].any() and len(tags) > 1:
+        if visible[which].any() and len(tags) > 1:
             yield Cause(
                 kind="tag",
                 which=int(which[0]),
@@ -421,7 +421,7 @@ def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
                 change=loose,
                 markers=tuple(which.tolist()),
             )
-    for j in np.flatnonzero(shown):
+    for j in np.flatnonzero(visible):
 
         def moved(s: Changed, theta: FloatArray, j: int = int(j)) -> Changed:
             M = s.M.copy()

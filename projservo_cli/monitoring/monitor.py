@@ -109,12 +109,12 @@ class ImageMonitor:
         calibration: Calibration,
         sigma_px: float,
         max_observations: int,
-        shown: IntArray | None = None,
+        visible: IntArray | None = None,
         image_size: FloatArray | None = None,
     ) -> None:
         self._all = len(calibration.M)
-        shown = np.arange(self._all) if shown is None else shown
-        self._shown = shown[even_choice(len(shown), _MOST_TESTED)]
+        visible = np.arange(self._all) if visible is None else visible
+        self._shown = visible[even_choice(len(visible), _MOST_TESTED)]
         self.calibration = calibration.with_markers(self._shown)
         known = image_size is not None and bool(np.isfinite(image_size).all())
         self._centre = 0.5 * (np.asarray(image_size) - 1.0) if known else None
@@ -153,7 +153,7 @@ class ImageMonitor:
         t: FloatArray,
         q: FloatArray,
         q_dot: FloatArray,
-        late: FloatArray,
+        sigma_t: FloatArray,
         images: FloatArray,
         fresh: BoolArray,
         *,
@@ -176,10 +176,12 @@ class ImageMonitor:
         self._first = q[0].copy() if self._first is None else self._first
         at_rest = bool(np.abs(q - self._first).max() <= _AT_REST)
         for v in np.flatnonzero(fresh):
-            uncertain = max(float(late[v]), LEAST_ERROR)
+            uncertain = max(float(sigma_t[v]), LEAST_ERROR)
             self._pairing.add(
                 int(v),
-                Frame(t=float(t[v]), q=q[v], q_dot=q_dot[v], late=uncertain, image=images[v], noise=noise[v]),
+                Frame(
+                    t=float(t[v]), q=q[v], q_dot=q_dot[v], sigma_t=uncertain, image=images[v], noise=noise[v]
+                ),
             )
         self._pairing.reach(t)
         while not self.fault and (pair := self._pairing.next(at_rest)) is not None:
@@ -223,7 +225,7 @@ class ImageMonitor:
         disagrees = tested.disagrees or self._crowd_is_fault()
         if not disagrees:
             free = [columns_of_marker(self._errors, j) for j in self._forgiven]
-            since = self._detector.significant(self.observations, pair.late, free, self.pending)
+            since = self._detector.significant(self.observations, pair.sigma_t, free, self.pending)
         if not disagrees and since is None:
             self.agreeing = 1 + self.agreeing * lasts
             self._agreed += 1
@@ -247,8 +249,8 @@ class ImageMonitor:
         found = self._explanations(self._since_onset(), self._before)
         best = found[0]
         explains, views = self._explains(best), len({one.view for one in self._since_onset()})
-        anew = not set(best.cause.markers) <= set(self._forgiven)
-        if explains and anew and self._is_edge(best, views):
+        unforgiven = not set(best.cause.markers) <= set(self._forgiven)
+        if explains and unforgiven and self._is_edge(best, views):
             self._forgiven += best.cause.markers
             self._off = 0
             return
@@ -273,9 +275,9 @@ class ImageMonitor:
         which it came are forgotten, and those in which it goes are not kept.
         """
         count, memory = residual.seen.sum(axis=1), self._detector.memory
-        most = np.max([count, *(one.residual.seen.sum(axis=1) for one in self._kept[-_REMEMBERED:])], axis=0)
-        hidden = bool((count < _COVERED * most).any())
-        whole = bool((count >= most).all() and not aside.any())
+        peak = np.max([count, *(one.residual.seen.sum(axis=1) for one in self._kept[-_REMEMBERED:])], axis=0)
+        hidden = bool((count < _COVERED * peak).any())
+        whole = bool((count >= peak).all() and not aside.any())
         was = bool(self._kept) and self._kept[-1].covered
         goes = was and not whole and any(one.hidden for one in self._recent)
         if hidden and not was:
@@ -321,8 +323,8 @@ class ImageMonitor:
         if not found:  # markers that the chosen observations do not show
             return found
         # Where even the best leaves more than chance does, the unit is what that leaves.
-        least = min(found, key=lambda one: one.left)
-        self._unit = max(1.0, least.left / max(1.0, evidence.rows - least.theta.size))
+        minimum = min(found, key=lambda one: one.left)
+        self._unit = max(1.0, minimum.left / max(1.0, evidence.rows - minimum.theta.size))
         found = [one._replace(gain=one.gain / self._unit, left=one.left / self._unit) for one in found]
         found.sort(key=lambda one: -one.score)
         if found[0].cause.kind != "marker":
@@ -396,13 +398,13 @@ class ImageMonitor:
         residual = self._kept[-1].residual
         rms = np.sqrt(np.square(residual.r).sum() / max(2.0 * residual.seen.sum(), 1.0))
         off = f"images are {rms:.3g} px rms per coordinate off their prediction by the calibration"
-        least = 0.0 if found[0].cause.markers else _LEAST_PART * self._evidence_now.off_px
-        if not self._explains(found[0]) or found[0].changed_px < least:
+        minimum = 0.0 if found[0].cause.markers else _LEAST_PART * self._evidence_now.off_px
+        if not self._explains(found[0]) or found[0].changed_px < minimum:
             return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
         # A mirrored reading near zero is a small slip: with backlash, images do not separate them.
-        most = self._by_chance(self._evidence_now) / self._unit
+        maximum = self._by_chance(self._evidence_now) / self._unit
         simpler = (one for one in found if not one.theta.size and contains(found[0].cause, one.cause))
-        said = [found[0], *(one for one in simpler if one.left <= most), *_rivals(found)[1:]]
+        said = [found[0], *(one for one in simpler if one.left <= maximum), *_rivals(found)[1:]]
         names = [sentence(one, self.calibration) for one in said[:2]]
         return f"{off}: {'; or '.join(names)}"
 

@@ -123,11 +123,11 @@ class ErrorModel:
         m, n = len(calibration.M), len(calibration.H_hat_0)
         self.calibration, self.scene = calibration, parameters_from(calibration)
         self.errors, self.e = calibration.errors, calibration.sqrt_cov_shared.shape[1] + 3 * m
-        bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
-        self._least = max(bent, MIN_SIGMA)
+        nonlinear = _BEYOND_FIRST_ORDER * calibration.sigma_px
+        self._least = max(nonlinear, MIN_SIGMA)
         self._sigma = max(sigma_px, self._least)
         self._stated = self._sigma / max(calibration.sigma_px, MIN_SIGMA) * (calibration.sigma_scale or 1.0)
-        self.bias_px = max(calibration.model_px, bent)
+        self.bias_px = max(calibration.model_px, nonlinear)
         sigma_q = calibration.sigma_q or 0.0
         if calibration.sigma_q_interval is not None:
             sigma_q = max(sigma_q, float(calibration.sigma_q_interval[1]))
@@ -169,15 +169,15 @@ class ErrorModel:
         for part in (r, B, F):
             part[~seen] = 0.0
         F = F.reshape(rows, -1)
-        J_q, late = F[:, :n], F[:, 2 * n : 2 * n + 2] * pair.late
+        J_q, sigma_t = F[:, :n], F[:, 2 * n : 2 * n + 2] * pair.sigma_t
         # Errors of joints are the same in both views, but for their motion between both frames.
-        new = np.concatenate([J_q * self.sigma_q, late], axis=1)
+        new = np.concatenate([J_q * self.sigma_q, sigma_t], axis=1)
         if abs(pair.t[0] - pair.t[1]) > _AT_ONCE_S:
             left = np.arange(rows)[:, None] < rows // 2
             between = J_q * pair.curved
             new = np.concatenate([new, between * left, between * ~left], axis=1)
         # An instant so uncertain that the arm moves on a curve: half the square of the angle.
-        bend = 0.5 * np.abs(pair.q_dot).sum(axis=1).max() * (late @ pair.late)
+        bend = 0.5 * np.abs(pair.q_dot).sum(axis=1).max() * (sigma_t @ pair.sigma_t)
         R = new @ new.T + np.diag(np.repeat(noise.ravel(), 2) ** 2 + bend**2)
         return Residual(
             seen=seen, noise=noise, predicted=predicted, r=r.ravel(), B=B.reshape(rows, -1), F=F, R=R
@@ -264,13 +264,13 @@ class ErrorModel:
         off = cho_solve((root, True), sums.normal[: self.e, -1], check_finite=False)
         return bool(off @ off > chdtri(self.e, 1e-4))
 
-    def lasting(self, seconds: float, late: FloatArray) -> FloatArray:
+    def persistent_prior(self, seconds: float, sigma_t: FloatArray) -> FloatArray:
         """Information (2 n + 2, 2 n + 2) on errors of joints, their drift with time, and of instants.
 
         Over that time joints are off by a straight line, its middle and its slope by what lasts.
         """
         n = len(self.sigma_q)
-        weight = np.diag((_LASTING * np.concatenate([self.sigma_q, self.sigma_q, late])) ** -2.0)
+        weight = np.diag((_LASTING * np.concatenate([self.sigma_q, self.sigma_q, sigma_t])) ** -2.0)
         line = np.eye(2 * n + 2)
         line[:n, n : 2 * n] = 0.5 * seconds * np.eye(n)
         line[n : 2 * n, n : 2 * n] = max(seconds, LEAST_ERROR) / np.sqrt(12.0) * np.eye(n)
@@ -454,10 +454,10 @@ class _Reduced(NamedTuple):
     """Normal equations of faults since an onset without nuisance errors: a Schur complement."""
 
     normal: FloatArray  # (f + 1, f + 1) of what may be wrong, and of the residual
-    least: FloatArray  # (f + 1,) its diagonal at least
+    minimum: FloatArray  # (f + 1,) its diagonal at least
     root: FloatArray  # (e, e) of the information on errors of the calibration
     along: FloatArray  # (e, f) what may be wrong along these
-    beside: IntArray  # (k,) columns of lasting errors of joints and instants
+    nuisance: IntArray  # (k,) columns of lasting errors of joints and instants
     solved: FloatArray  # (k, f) and what may be wrong along those
     line: FloatArray  # (f, f) to time from the onset
 
@@ -466,7 +466,7 @@ class _Reduced(NamedTuple):
         e = len(self.root)
         found = self.line @ rows[e:]
         found -= self.along.T @ solve_triangular(self.root, rows[:e], lower=True, check_finite=False)
-        return np.asarray(found - self.solved.T @ found[self.beside])
+        return np.asarray(found - self.solved.T @ found[self.nuisance])
 
 
 class Tested(NamedTuple):
@@ -526,14 +526,14 @@ class Detector:
 
         part : (2 m,) its detections.
         """
-        shown, out = residual.seen & part.reshape(aside.shape), aside.reshape(-1)
-        allowed = _MOST_ASIDE * shown.sum(axis=1)
-        while ((aside & shown).sum(axis=1) <= allowed).all():
-            left = np.flatnonzero(shown.ravel() & ~out)
+        visible, out = residual.seen & part.reshape(aside.shape), aside.reshape(-1)
+        allowed = _MOST_ASIDE * visible.sum(axis=1)
+        while ((aside & visible).sum(axis=1) <= allowed).all():
+            left = np.flatnonzero(visible.ravel() & ~out)
             rows = (2 * left[:, None] + np.arange(2)).ravel()
             if not self._beyond(S, r, rows[None], residual)[0]:
                 return False
-            square = beside_others(S[np.ix_(rows, rows)], r[rows])
+            square = relative_to_others(S[np.ix_(rows, rows)], r[rows])
             if square.max() <= _OFF_ALONE:
                 return True
             out[left[np.argmax(square)]] = True
@@ -544,11 +544,13 @@ class Detector:
         seen = np.repeat(residual.seen.ravel(), 2)[parts]
         bias = np.repeat((self._errors.bias_px / residual.noise.ravel()) ** 2, 2)[parts]
         bias = bias + _UNUSUAL**2 * (1.0 - self.memory.fresh)
-        most = self._most_once[seen.sum(axis=1)] + np.sqrt((seen * bias).sum(axis=1))
+        maximum = self._most_once[seen.sum(axis=1)] + np.sqrt((seen * bias).sum(axis=1))
         gain = gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
-        return np.asarray(gain > most**2)
+        return np.asarray(gain > maximum**2)
 
-    def significant(self, count: int, late: FloatArray, free: list[IntArray], thorough: bool) -> Sums | None:
+    def significant(
+        self, count: int, sigma_t: FloatArray, free: list[IntArray], thorough: bool
+    ) -> Sums | None:
         """Sums before the likeliest onset of residuals beyond chance, if there is one.
 
         count : of observations so far; late : (2,) deviation of instants, s; free : columns of markers that
@@ -561,17 +563,17 @@ class Detector:
         tail = self._chance / (count + _SOON) / len(self._sizes)
         by_chance = np.sqrt(chdtri(self._sizes, tail))
         found: Sums | None = None
-        most = 0.0
+        maximum = 0.0
         for length in lengths if thorough else lengths[[count % len(lengths)]]:
             since = min(onsets, key=lambda sums: abs(total.views - length - sums.views))
             excess = float(
-                self._excess(since, total, self._reduced(since, total, late, free), by_chance).max()
+                self._excess(since, total, self._reduced(since, total, sigma_t, free), by_chance).max()
             )
-            if excess > most:
-                found, most = since, excess
+            if excess > maximum:
+                found, maximum = since, excess
         return found
 
-    def _reduced(self, since: Sums, total: Sums, late: FloatArray, free: list[IntArray]) -> _Reduced:
+    def _reduced(self, since: Sums, total: Sums, sigma_t: FloatArray, free: list[IntArray]) -> _Reduced:
         """Normal equations of faults since an onset without errors of the calibration and lasting ones."""
         e, f, n = self._errors.e, self._errors.f, len(self._errors.sigma_q)
         line = np.eye(f)
@@ -579,22 +581,22 @@ class Detector:
         across = (total.normal - since.normal)[:, e:]
         across[:, :f] = across[:, :f] @ line.T
         across[e:-1] = line @ across[e:-1]
-        least = RIDGE * across[e:].diagonal()
+        minimum = RIDGE * across[e:].diagonal()
         across[:e, -1] = total.normal[:e, -1]
         root = self._errors.root(total)
         along = solve_triangular(root, across[:e], lower=True, check_finite=False)
         normal = across[e:] - along.T @ along
-        beside = np.concatenate([np.arange(2 * n + 2), *free]).astype(np.int64)
-        weight = np.diag(np.maximum(least[beside], RIDGE))
-        weight[: 2 * n + 2, : 2 * n + 2] = self._errors.lasting(total.t - since.t, late)
-        solved = np.linalg.solve(normal[np.ix_(beside, beside)] + weight, normal[beside])
-        normal -= normal[:, beside] @ solved
+        nuisance = np.concatenate([np.arange(2 * n + 2), *free]).astype(np.int64)
+        weight = np.diag(np.maximum(minimum[nuisance], RIDGE))
+        weight[: 2 * n + 2, : 2 * n + 2] = self._errors.persistent_prior(total.t - since.t, sigma_t)
+        solved = np.linalg.solve(normal[np.ix_(nuisance, nuisance)] + weight, normal[nuisance])
+        normal -= normal[:, nuisance] @ solved
         return _Reduced(
             normal=normal,
-            least=least,
+            minimum=minimum,
             root=root,
             along=along[:, :f],
-            beside=beside,
+            nuisance=nuisance,
             solved=solved[:, :f],
             line=line,
         )
@@ -624,9 +626,9 @@ class Detector:
         corners = np.maximum(2.0 * touched @ (seen > 0.0), 4.0)  # coordinates of a view
         worst = (1.0 - memory.fresh) * chdtri(corners, _LASTING_CORNERS) / corners * share * (touched @ seen)
         one = (total.weight_squares - since.weight_squares) / weight**2  # what one view is of all
-        beside = self._root_gains(reduced, (1.0 - one) * memory.persistent * spread)
+        nuisance = self._root_gains(reduced, (1.0 - one) * memory.persistent * spread)
         limits = [by_chance[beyond] + np.sqrt(bias[beyond] + part * worst) for part in (1.0, one)]
-        excess[beyond] = np.maximum(gained[beyond] - limits[0], beside[beyond] - limits[1])
+        excess[beyond] = np.maximum(gained[beyond] - limits[0], nuisance[beyond] - limits[1])
         return excess
 
     def _root_gains(self, reduced: _Reduced, more: FloatArray | float) -> FloatArray:
@@ -634,15 +636,15 @@ class Detector:
         normal, gain = reduced.normal, np.zeros(len(self._sizes))
         covariance = normal[:-1, :-1] + more
         for which, columns in self._by_size:
-            gain[which] = gains(covariance, normal[:-1, -1], columns, reduced.least[:-1])[0]
+            gain[which] = gains(covariance, normal[:-1, -1], columns, reduced.minimum[:-1])[0]
         return np.sqrt(gain)
 
 
 def gains(
-    normal: FloatArray, right: FloatArray, parts: IntArray, least: FloatArray | float
+    normal: FloatArray, right: FloatArray, parts: IntArray, minimum: FloatArray | float
 ) -> tuple[FloatArray, FloatArray]:
     """bᵀ A⁻¹ b (h,) and A⁻¹ b (h, p) for parts (h, p) of A x = b, its diagonal not below a minimum."""
-    size = np.sqrt(np.maximum(np.maximum(normal.diagonal(), least), 1e-300))[parts]
+    size = np.sqrt(np.maximum(np.maximum(normal.diagonal(), minimum), 1e-300))[parts]
     blocks = normal[parts[:, :, None], parts[:, None, :]] / (size[:, :, None] * size[:, None, :])
     b = right[parts] / size
     x = np.linalg.solve(blocks + RIDGE * np.eye(parts.shape[1]), b[..., None])[..., 0]
@@ -652,12 +654,12 @@ def gains(
 def _greatest(spread: FloatArray, reduced: _Reduced, part: IntArray) -> float:
     """Greatest ratio of a covariance (f, f) to that of the score of a direction."""
     own, other = reduced.normal[np.ix_(part, part)], spread[np.ix_(part, part)]
-    size = np.sqrt(np.maximum(own.diagonal(), np.maximum(reduced.least[part], 1e-300)))
+    size = np.sqrt(np.maximum(own.diagonal(), np.maximum(reduced.minimum[part], 1e-300)))
     unit = np.outer(size, size)
     return float(eigh(other / unit, own / unit + _RANK * np.eye(len(part)), eigvals_only=True)[-1])
 
 
-def beside_others(S: FloatArray, r: FloatArray) -> FloatArray:
+def relative_to_others(S: FloatArray, r: FloatArray) -> FloatArray:
     """Return χ² (k,) of each detection given all others, of residuals r (2 k,) with covariance S.
 
     Errors of joints move all of them: one by itself hardly shows its own error.

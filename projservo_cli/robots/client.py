@@ -91,7 +91,7 @@ class Known(NamedTuple):
 
     # pixels (k, 2, m, 2) of the markers of the calibration at joints (k, n), rad or m
     predicted: Callable[[FloatArray], FloatArray]
-    shown: IntArray  # (k,) markers that the loop is shown among those that the robot observes, the face first
+    visible: IntArray  # (k,) markers of the loop, by their places in the observations, the face first
     order: IntArray  # (m,) index there of each marker of the calibration, −1 where it is not observed
     sigma_px: float  # noise of the pixels
     sigma_q: FloatArray  # (n,) deviation of joint readings, rad or m; 0 where none shows
@@ -125,8 +125,8 @@ class DrivenRobot:
     def __init__(self, robot: PluginRobot, plant: Plant, known: Known, monitor: ImageMonitor | None) -> None:
         self.robot, self.steered, self.plant = robot, Steered(robot), plant
         self.known, self.monitor = known, monitor
-        self.markers = len(known.shown)
-        self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.shown])
+        self.markers = len(known.visible)
+        self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.visible])
         self._instants = Delays(known.predicted, known.delays, known.sigma_px, known.timeout_s, known.sigma_q)
         self._carried = np.zeros((2, self.markers, 2))
         self.q = np.zeros(len(plant.limits.lower))
@@ -163,10 +163,10 @@ class DrivenRobot:
         """Pixels (2, k, 2) of the markers shown as they will be at rest, NaN where unseen; all are tested."""
         reading, history, order = self.steered.reading, self.steered.history, self.known.order
         images = np.where((order < 0)[:, None], np.nan, reading.s[:, order])
-        shown, stated = self.known.shown, None
+        visible, stated = self.known.visible, None
         if reading.sigma_px is not None:
             stated = reading.sigma_px[:, order]
-            self.weight = weights(reading.sigma_px[:, shown], reading.s[:, shown])
+            self.weight = weights(reading.sigma_px[:, visible], reading.s[:, visible])
         frames = self._instants.update(reading.t_view, images, history)
         q_then = history.at(frames.t)
         if self.monitor is not None:
@@ -186,7 +186,7 @@ class DrivenRobot:
             carries = not np.array_equal(q, q_then[view])
             self._carried[view] = there[view] - then[view][view] if carries else 0.0
         self.delays.append(self._instants.mean)
-        return np.ascontiguousarray(reading.s[:, shown]) + self._carried
+        return np.ascontiguousarray(reading.s[:, visible]) + self._carried
 
     def _leave_out(self, rejected: BoolArray, alike: bool) -> None:
         """Leave sightings (2, k) that are off by themselves out of the fit of the law.
@@ -236,9 +236,9 @@ class DrivenRobot:
             self.give_up()
         return self.disturbance
 
-    def _agreed(self, looks: int) -> bool:
+    def _agreed(self, observations: int) -> bool:
         """Whether enough of a number of observations agree."""
-        agreeing = looks if self.monitor is None else self.monitor.agreeing
+        agreeing = observations if self.monitor is None else self.monitor.agreeing
         return agreeing >= WINDOW and not self.pending
 
     def agrees(self) -> str:

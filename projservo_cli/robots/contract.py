@@ -156,7 +156,7 @@ class PluginRobot:
 
     def read(self) -> Reading:
         """Joints and pixels of one observation."""
-        before, answer, frames = self._ask("read", self._look)
+        before, answer, frames = self._ask("read", self._reading)
         self._last = self._checked(self._time(before), answer)
         if frames is not None and not (
             isinstance(frames, np.ndarray)
@@ -177,7 +177,7 @@ class PluginRobot:
             )
         return self._last
 
-    def _look(self) -> tuple[Any, Any, Any]:
+    def _reading(self) -> tuple[Any, Any, Any]:
         """Time of the clock, the observation, and its frames."""
         return self._now(), self.robot.read(), getattr(self.robot, "frames", None)
 
@@ -187,22 +187,22 @@ class PluginRobot:
 
     def truth(self) -> FloatArray | None:
         """True pose (4, 4) of the tool, m, or true joints (n,), rad or m; None where unknown."""
-        tell = getattr(self.robot, "truth", None)
-        if tell is None:
+        method = getattr(self.robot, "truth", None)
+        if method is None:
             return None
-        answer = self._ask("truth", tell)
+        answer = self._ask("truth", method)
         shape = (4, 4) if np.ndim(answer) == 2 else (self._joints,)
         return self._numbers("truth() gave numbers", answer, shape, finite=True)
 
     def health(self) -> dict[str, float | str]:
         """Return the measurements of the robot on itself, such as its voltage, by name; may be empty."""
-        tell = getattr(self.robot, "health", None)
-        return {} if tell is None else dict(self._ask("health", tell))
+        method = getattr(self.robot, "health", None)
+        return {} if method is None else dict(self._ask("health", method))
 
     def identity(self) -> str:
         """Return a text that changes with the meaning of the readings; may be empty."""
-        tell = getattr(self.robot, "identity", None)
-        return "" if tell is None else "".join(str(self._ask("identity", tell)).split())
+        method = getattr(self.robot, "identity", None)
+        return "" if method is None else "".join(str(self._ask("identity", method)).split())
 
     def require_identity(self, recorded: str) -> None:
         """Refuse a robot whose readings mean something else than when they were recorded; a WorkFailed."""
@@ -359,8 +359,8 @@ class PluginRobot:
                 raise WorkFailed(f"{self.name}: {what}: one clock must stamp all of them")
         if sigma is not None:
             sigma = self._numbers("read() gave sigma_px", sigma, (2, self._markers))
-            told = sigma[np.isfinite(s[..., 0])]
-            if not ((told > 0.0) & (told < math.inf)).all():
+            stated = sigma[np.isfinite(s[..., 0])]
+            if not ((stated > 0.0) & (stated < math.inf)).all():
                 raise WorkFailed(f"{self.name}: read() gave a sigma_px that is no positive number")
         return Reading(
             q=q, s=s, t_q=before if np.isnan(times[0]) else float(times[0]), t_view=times[1:], sigma_px=sigma

@@ -255,8 +255,8 @@ class _View:
         """Instant of a fresh image, s, among all; each delay has its chance."""
         assert self._log_chance is not None
         misfit = self._misfit(image, nominal - _DELAYS, history)
-        least = max(float(misfit.min()), self.error_px**2)
-        chance = np.exp(-0.5 * _COUNTED * np.maximum(misfit / least - 1.0, 0.0))
+        minimum = max(float(misfit.min()), self.error_px**2)
+        chance = np.exp(-0.5 * _COUNTED * np.maximum(misfit / minimum - 1.0, 0.0))
         before = self._blur @ np.exp(self._log_chance - self._log_chance.max())
         t = nominal - float(_DELAYS[np.argmax(chance * before)])
         self._log_chance += np.log(self._blur @ chance + _LEAST_CHANCE)

@@ -24,7 +24,7 @@ class Readings(NamedTuple):
         return np.array([turn(value) if letter == "R" else float(value) for value, letter in pairs])
 
 
-class Pace(NamedTuple):
+class SpeedLimits(NamedTuple):
     """Speed and acceleration limits of joints: per s and per s², rad (revolute) and m (prismatic)."""
 
     revolute: float = math.inf
@@ -66,14 +66,14 @@ class JointSettings(NamedTuple):
     widened: float | None  # the limits are what joints cover in the data, widened by this share of it
     unit: str  # in which somebody gave readings of revolute joints, deg or rad
     known: int  # of how many joints readings were given; 0 where nobody did
-    pace: Pace = Pace()
+    speeds: SpeedLimits = SpeedLimits()
 
     def joints(self, default_types: str = "", calibration: Calibration | None = None) -> Joints:
         """Joints of the robot; of ``default_types``, else revolute ones, where their types are unknown.
 
         calibration : whose data give limits where they are taken from there; without, none are.
         """
-        types, pace = self.types or default_types or "R" * self.known, self.pace
+        types, pace = self.types or default_types or "R" * self.known, self.speeds
         lower, upper = self._limits(types, calibration)
         slides = [kind == "P" for kind in types]
         speed = np.where(slides, pace.prismatic, pace.revolute)

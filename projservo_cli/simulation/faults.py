@@ -156,9 +156,9 @@ class Points(NamedTuple):
         if moved is not None:
             M = M.copy()
             M[self.truth.number.index(moved[0]), :3] += self.truth.robot.base_tool[:3, :3] @ moved[1]
-        shown = [self.see(joints, M)[view] for joints in q]
-        noise = self.sigma_px * rng.standard_normal(shown[0].shape)
-        return np.asarray(np.mean(shown, axis=0) + noise), None
+        mean_pixels = [self.see(joints, M)[view] for joints in q]
+        noise = self.sigma_px * rng.standard_normal(mean_pixels[0].shape)
+        return np.asarray(np.mean(mean_pixels, axis=0) + noise), None
 
 
 class _Servos(Protocol):
@@ -507,10 +507,10 @@ class _Camera:
         if befell is not None and step >= befell.at_step:
             moved = befell.marker, np.array(befell.by)
         many = _EXPOSED if self._faults.exposure_s else 1
-        instants = middle + self._faults.exposure_s * ((np.arange(many) + 0.5) / many - 0.5)
+        times = middle + self._faults.exposure_s * ((np.arange(many) + 0.5) / many - 0.5)
         rng = world.random(self._view, _BEFORE + k)
         rng.standard_normal()  # that of the jitter
-        q = np.array([self._joints.at(t) for t in instants])
+        q = np.array([self._joints.at(t) for t in times])
         pixels, sigma = world.eyes.capture(self._view, q, moved, rng)
         if (knocked := events.camera_moved) is not None and step >= knocked.at_step:
             pixels += knocked.by_px[self._view]

@@ -121,8 +121,8 @@ def shows_face(plant: Plant, H: Mat4, pixel: FloatArray) -> bool:
 def rig_distance(plant: Plant, M: FloatArray) -> float:
     """Distance of the centre of the face M (m, 4) from the middle of the optical centres, m."""
     middle = axpy(1.0, vec(plant.O[0]), vec(plant.O[1]))
-    way = axpy(-0.5, middle, center_of(M, plant.center))
-    return math.sqrt(dot(way, way))
+    distance = axpy(-0.5, middle, center_of(M, plant.center))
+    return math.sqrt(dot(distance, distance))
 
 
 class AnalyticPlant:

@@ -80,8 +80,8 @@ def estimate(
     def hold_out(solution: Solution, noise_px: float) -> None:
         """Cross-validate the solution while it is at hand."""
         assert asked.cross_validate is not None
-        tell = partial(progress, "cross-validation")
-        held_out.append(cross_validate(solution, noise_px, asked.cross_validate, seen.seed, tell))
+        on_progress = partial(progress, "cross-validation")
+        held_out.append(cross_validate(solution, noise_px, asked.cross_validate, seen.seed, on_progress))
 
     calibration = calibrate(
         seen.record,

@@ -133,8 +133,8 @@ def path_to(
         stands = still.joints(robot.observe())
         yield robot.reading
         away = np.abs(q - robot.reading.q) - np.abs(q - begun)
-        held = np.abs(robot.target - robot.reading.q) >= bounds.lead * (1.0 - 1e-6)
-        if (away > bounds.lead).any() or (stands and held.any()):
+        at_bound = np.abs(robot.target - robot.reading.q) >= bounds.lead * (1.0 - 1e-6)
+        if (away > bounds.lead).any() or (stands and at_bound.any()):
             break
     else:
         yield from at_rest(robot.reading, robot.hold, settle_s, what)
@@ -156,7 +156,9 @@ def path_to(
         )
 
 
-def at_rest(reading: Reading, look: Callable[[], Reading], settle_s: float, what: str) -> Iterator[Reading]:
+def at_rest(
+    reading: Reading, observe: Callable[[], Reading], settle_s: float, what: str
+) -> Iterator[Reading]:
     """Read once per period until joints and images stand still, and yield each reading."""
     still, first = _Standstill(settle_s), reading.t_q
     while not still.all(reading):
@@ -165,12 +167,12 @@ def at_rest(reading: Reading, look: Callable[[], Reading], settle_s: float, what
                 f"{what}: {still.moving or 'the robot'} does not come to rest within {_PATIENCE_S:g} s: look "
                 "for what vibrates, creeps or flickers"
             )
-        reading = look()
+        reading = observe()
         yield reading
 
 
 def averaged(
-    reading: Reading, look: Callable[[], Reading], wanted: int
+    reading: Reading, observe: Callable[[], Reading], wanted: int
 ) -> tuple[Reading, FloatArray, FloatArray]:
     """Return the mean of readings of a robot at rest, with a number of frames of each view, each once.
 
@@ -178,18 +180,18 @@ def averaged(
     not show are NaN. Returns the mean; sums (2, m) of the squares by which pixels are off it, px²; how many
     frames (2, m) show a marker, 0 where it is NaN.
     """
-    looks, frames = [reading], [[_frame(reading, view)] for view in (0, 1)]
+    readings, frames = [reading], [[_frame(reading, view)] for view in (0, 1)]
     for _ in range(_WAITED * wanted):
         if min(map(len, frames)) >= wanted:
             break
-        looks.append(look())
-        for view, new in enumerate(looks[-1].new_views(looks[-2])):
+        readings.append(observe())
+        for view, new in enumerate(readings[-1].new_views(readings[-2])):
             if new and len(frames[view]) < wanted:
-                frames[view].append(_frame(looks[-1], view))
+                frames[view].append(_frame(readings[-1], view))
     s, sigma, squares, count = (np.stack(both) for both in zip(*map(_mean, frames), strict=True))
-    q = looks[0].q + np.mean([seen.q - looks[0].q for seen in looks], axis=0)
-    told = reading.sigma_px if reading.sigma_px is None or len(looks) == 1 else sigma
-    return looks[-1]._replace(q=q, s=s, sigma_px=told), squares, count
+    q = readings[0].q + np.mean([seen.q - readings[0].q for seen in readings], axis=0)
+    stated = reading.sigma_px if reading.sigma_px is None or len(readings) == 1 else sigma
+    return readings[-1]._replace(q=q, s=s, sigma_px=stated), squares, count
 
 
 def _frame(reading: Reading, view: int) -> FloatArray:
@@ -329,9 +331,9 @@ def connected(scenario: RunScenario, law: str, given: Robot | None = None) -> Dr
     monitor = None
     if not scenario.untested:
         noise = scenario.given.stop.innovation_threshold * scenario.noise_px
-        shown = np.flatnonzero(np.isin(calibration.marker, scenario.observed))
-        looks = scenario.limits.max_steps + 1 + WINDOW
-        monitor = ImageMonitor(calibration, noise, looks, shown, plant.image_size)
+        visible = np.flatnonzero(np.isin(calibration.marker, scenario.observed))
+        readings = scenario.limits.max_steps + 1 + WINDOW
+        monitor = ImageMonitor(calibration, noise, readings, visible, plant.image_size)
     return DrivenRobot(robot, plant, _known_of(scenario, contract, calibration, law), monitor)
 
 
@@ -356,7 +358,7 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
     numbers = scenario.observed
     return Known(
         predicted=partial(predict, calibration),
-        shown=np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
+        visible=np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
         order=np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
         sigma_px=scenario.noise_px,
         sigma_q=scenario.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),

@@ -195,11 +195,11 @@ def kept_out(found: Found, task: Task, trajectory: Trajectory, spread: Spread) -
 def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: JointSearch) -> Found:
     """A path through joint space; the linear motion where there is none."""
     c = _joint_constraints(reaching, task, trajectory, search.spread)
-    aim = GoalFeatures(task.A_star, undistort(reaching.model.lens, task.s_star), search.sigma)
+    target = GoalFeatures(task.A_star, undistort(reaching.model.lens, task.s_star), search.sigma)
     how = SearchLimits(
         trajectory.max_search_samples, trajectory.search_seed, trajectory.max_goal_configurations
     )
-    path = find_path(c, aim, reaching.q_start, search.goal_joints, how)
+    path = find_path(c, target, reaching.q_start, search.goal_joints, how)
     if path.timing is None:
         linear = given("linear", reaching, trajectory._replace(duration_s=None), 1.0)
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.n_samples, np.nan)

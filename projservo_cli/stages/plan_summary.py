@@ -156,8 +156,8 @@ def _along(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _corners_of(timed: TimedPath) -> FloatArray:
     """When each rounded stretch begins and ends (k, 2), s: where q'' is not zero."""
-    bent = np.r_[False, (timed.ddq != 0.0).any(axis=1), False]
-    return timed.time[np.flatnonzero(bent[1:] != bent[:-1])].reshape(-1, 2)
+    curved = np.r_[False, (timed.ddq != 0.0).any(axis=1), False]
+    return timed.time[np.flatnonzero(curved[1:] != curved[:-1])].reshape(-1, 2)
 
 
 def _relaxed(c: Constraints, ends: Mapping[str, FloatArray]) -> Iterator[str]:
@@ -213,14 +213,14 @@ def _no_path_reason(path: JointPath) -> str:
         what = "a joint limit" if worst == JOINTS else _stopped(path, worst)
         return f"the start is already at or beyond {what}"
     failed = path.failures[:MARGINS]
-    most = [
+    main_reasons = [
         f"{_stopped(path, int(i))} ({failed[i] / failed.sum():.0%})"
         for i in np.argsort(-failed, kind="stable")[:_TOLD]
         if failed[i] > 0
     ]
     return (
         f"no path to any of {len(path.goals)} goal configurations was found, in {path.draws} "
-        f"samples; what stopped most: {', '.join(most)}"
+        f"samples; what stopped most: {', '.join(main_reasons)}"
     )
 
 

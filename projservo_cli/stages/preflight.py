@@ -99,22 +99,22 @@ def _robot_of(inputs: RecordingInputs) -> PluginRobot:
 
 def _seen(robot: PluginRobot, inputs: RecordingInputs, progress: Progress) -> Seen:
     """Look for a while at a robot that stands where it is."""
-    period, looks = robot.bounds.period, [robot.read()]
+    period, readings = robot.bounds.period, [robot.read()]
     wanted = max(_MIN_LOOKS, round(_LOOK_S / period))
-    while len(looks) < wanted:
+    while len(readings) < wanted:
         time.sleep(period)
-        looks.append(robot.read())
-        progress("look", len(looks), wanted)
-    s, scatter = (np.stack(both) for both in zip(*(_mean(looks, view) for view in range(2)), strict=True))
+        readings.append(robot.read())
+        progress("look", len(readings), wanted)
+    s, scatter = (np.stack(both) for both in zip(*(_mean(readings, view) for view in range(2)), strict=True))
     own = robot.robot
     cameras = own.cameras if isinstance(own, CameraRobot) else []
     views = [view for view in own.views if view is not None] if isinstance(own, CameraRobot) else []
     return Seen(
         marker=inputs.numbers,
         face=inputs.face,
-        q=np.mean([look.q for look in looks], axis=0),
+        q=np.mean([look.q for look in readings], axis=0),
         s=s,
-        sigma=looks[-1].sigma_px,
+        sigma=readings[-1].sigma_px,
         scatter=scatter,
         limits=robot.bounds.limits,
         units=robot.bounds.units,
@@ -124,9 +124,9 @@ def _seen(robot: PluginRobot, inputs: RecordingInputs, progress: Progress) -> Se
     )
 
 
-def _mean(looks: Sequence[Reading], view: int) -> tuple[FloatArray, FloatArray]:
+def _mean(readings: Sequence[Reading], view: int) -> tuple[FloatArray, FloatArray]:
     """Mean (m, 2) of the new frames of a view, NaN where most show no marker, and scatter (m,), px."""
-    new = [looks[0], *(b for a, b in pairwise(looks) if b.new_views(a)[view])]
+    new = [readings[0], *(b for a, b in pairwise(readings) if b.new_views(a)[view])]
     s = np.array([look.s[view] for look in new])
     often = 2 * np.isfinite(s[..., 0]).sum(axis=0) > len(s)
     mean, scatter = np.full(s.shape[1:], np.nan), np.full(s.shape[1], np.nan)

@@ -58,7 +58,7 @@ class _Recording:
     marker: IntArray  # (m,) numbers of the markers
     done: dict[int, Reading] = field(default_factory=dict)  # the poses that are done
     # Frames in motion towards poses that are done, by the number of the motion: that of the pose, from 1.
-    ways: dict[int, list[Reading]] = field(default_factory=dict)
+    motion_readings: dict[int, list[Reading]] = field(default_factory=dict)
     found: int = 0  # how many of them an earlier call recorded
     identity: str = ""  # of the robot that recorded them
     why: str = "none yet"  # why there is something to record; empty where there is nothing
@@ -96,7 +96,7 @@ class _Recording:
         return float(np.sqrt(squares / freedom)) if freedom > 0.0 else None
 
     @property
-    def told(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """Summary as JSON values."""
         return {
             "table": self.path.resolve(),
@@ -120,11 +120,11 @@ class _Recording:
         Frames in motion follow, with negative numbers of poses, of the longest motions.
         """
         rest = sorted(self.done.items())
-        motions = sorted(self.ways, key=lambda k: len(self.ways[k]), reverse=True)
-        way = [(k, reading) for k in motions for reading in self.ways[k]][:_MOST_MOVING]
-        rows = [reading for _, reading in (*rest, *way)]
-        pose = [*(k for k, _ in rest), *range(-1, -1 - len(way), -1)]
-        moving = [*(0 for _ in rest), *(k for k, _ in way)]
+        motions = sorted(self.motion_readings, key=lambda k: len(self.motion_readings[k]), reverse=True)
+        in_motion = [(k, reading) for k in motions for reading in self.motion_readings[k]][:_MOST_MOVING]
+        rows = [reading for _, reading in (*rest, *in_motion)]
+        pose = [*(k for k, _ in rest), *range(-1, -1 - len(in_motion), -1)]
+        moving = [*(0 for _ in rest), *(k for k, _ in in_motion)]
         timed = np.isfinite([reading.t_q for reading in rows]).any()
         sigma = [reading.sigma_px for reading in rows if reading.sigma_px is not None]
         return Observation(
@@ -132,7 +132,7 @@ class _Recording:
             marker=self.marker,
             q=np.array([reading.q for reading in rows]),
             images=np.array([reading.s for reading in rows]),
-            moving=np.array(moving, dtype=np.int64) if way else None,
+            moving=np.array(moving, dtype=np.int64) if in_motion else None,
             t_q=np.array([reading.t_q for reading in rows]) if timed else None,
             t_view=np.array([reading.t_view for reading in rows]) if timed else None,
             sigma=np.array(sigma) if len(sigma) == len(rows) else None,
@@ -240,9 +240,9 @@ def new_recording(
     return recording
 
 
-def _resumed(empty: _Recording, most: FloatArray) -> _Recording:
+def _resumed(empty: _Recording, maximum: FloatArray) -> _Recording:
     """The poses of an interrupted recording taken over, at most so far (n,) from where they were to be."""
-    recording = replace(empty, done={}, ways={})
+    recording = replace(empty, done={}, motion_readings={})
     path, remedy = recording.path, "choose another table, or replace it with --force"
     recording.identity = identity_in(path)
     if recording_of(path) != recording.key:
@@ -260,10 +260,10 @@ def _resumed(empty: _Recording, most: FloatArray) -> _Recording:
         sigma = None if table.sigma is None else table.sigma[k][:, column]
         reading = Reading(table.q[k], table.images[k][:, column], t_q[k], t_view[k], sigma)
         if moving[k] > 0:
-            recording.ways.setdefault(int(moving[k]), []).append(reading)
+            recording.motion_readings.setdefault(int(moving[k]), []).append(reading)
             continue
         known = 0 <= pose < len(recording.targets)
-        if not known or (np.abs(table.q[k] - recording.targets[pose]) > most).any():
+        if not known or (np.abs(table.q[k] - recording.targets[pose]) > maximum).any():
             raise _OutdatedError(f"{path}: pose {pose} is none of those to be recorded; {remedy}")
         recording.done[pose] = reading
     recording.found = len(recording.done)
@@ -444,9 +444,9 @@ class _Sight:
                 )
         if blind.any():
             view, other = (VIEWS[i] for i in np.argsort(~blind))
-            most = int(seen.sum(axis=2).max())
+            count = int(seen.sum(axis=2).max())
             return (
-                f"the {view} camera sees none of the {total} markers {where}, the {other} one {most}: turn "
+                f"the {view} camera sees none of the {total} markers {where}, the {other} one {count}: turn "
                 "it towards them, and look at its light and focus"
             )
         often = -(-len(s) // 2)
@@ -494,7 +494,7 @@ def _recorded(
         for pose in recording.done:  # those of a call before
             sight.after(pose)
 
-    def look() -> Reading:
+    def observe() -> Reading:
         """A look after a period."""
         recording.commands += 1
         return steered.hold()
@@ -503,9 +503,9 @@ def _recorded(
         seen = list(path_to(steered, recording.targets[pose], settle_s, "record", fit))
         fit = None
         recording.commands += len(seen)
-        recording.done[pose], squares, count = averaged(steered.reading, look, trials.averaged_frames)
+        recording.done[pose], squares, count = averaged(steered.reading, observe, trials.averaged_frames)
         recording.scatter += squares.sum(), 2.0 * np.maximum(count - 1, 0).sum()
-        recording.ways[pose + 1] = _moving(seen, settle_s)
+        recording.motion_readings[pose + 1] = _moving(seen, settle_s)
         if sight is not None:
             sight.after(pose)
         yield pose

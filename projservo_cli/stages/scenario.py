@@ -171,20 +171,20 @@ class Scenario:
         The body is fitted to both by the deviations of their pixels, whichever is the larger. Markers of the
         face that frames do not show are predicted from those that they show.
         """
-        numbers, shown_images, given = self.numbers, self.exact, self._given
-        start, sigma = self._frames(shown_images.q_start, (seed, START_FRAMES))
+        numbers, seen_images, given = self.numbers, self.exact, self._given
+        start, sigma = self._frames(seen_images.q_start, (seed, START_FRAMES))
         if given is None:
             goal, there = self._frames(self.goal_joints[0], (seed, GOAL_FRAMES))
         else:
-            goal, there = shown_images.s_star, np.array(given.deviations(numbers))
+            goal, there = seen_images.s_star, np.array(given.deviations(numbers))
         sigma = np.fmax(sigma, there)
-        start = self._with_face("task.start", start, shown_images.q_start)
-        shown_images = shown_images._replace(s_start=start, s_star=self._with_face("task.goal", goal, None))
-        if not len(shown_images.body.M):
-            return shown_images
+        start = self._with_face("task.start", start, seen_images.q_start)
+        seen_images = seen_images._replace(s_start=start, s_star=self._with_face("task.goal", goal, None))
+        if not len(seen_images.body.M):
+            return seen_images
         weight = weights(sigma, sigma[..., None])
         weight[np.isnan(sigma)] = _GUESSED
-        return shown_images._replace(body=shown_images.body._replace(weight=weight))
+        return seen_images._replace(body=seen_images.body._replace(weight=weight))
 
     def _frames(self, q: FloatArray, drawn: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Pixels (2, b, 2) in rendered frames at joints (n,), rad or m, and their deviations (2, b)."""
@@ -398,8 +398,8 @@ def _simulated_ends(
         return task.goal.turn.joints(robot, truth.P, q)
 
     numbers = tuple(truth.number[i] for i in truth.face), pins
-    shown_images, q_goal = _task_images(task, types, numbers, center, images, turn)
-    return shown_images, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal), q_goal
+    seen_images, q_goal = _task_images(task, types, numbers, center, images, turn)
+    return seen_images, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal), q_goal
 
 
 def _task_images(
@@ -462,10 +462,10 @@ def _predicted_ends(
             )
         return task.goal.turn.joints(inputs.arm, inputs.P, q)
 
-    shown_images, q_goal = _task_images(
+    seen_images, q_goal = _task_images(
         task, joints.types, (numbers[:m], numbers[m:]), inputs.center, images, turn
     )
-    return shown_images, _unknown(np.full((4, 4), np.nan)), q_goal
+    return seen_images, _unknown(np.full((4, 4), np.nan)), q_goal
 
 
 def plant_of(truth: Truth, q_start: FloatArray, *, opaque: bool) -> Plant:

@@ -108,7 +108,7 @@ def teach(
             raise InputError(f"--at: {wrong}: choose others")
         robot = simulated_robot(driven, joints, _put_to(inputs, driven.robot, np.array(at)))
 
-    def look() -> Reading:
+    def observe() -> Reading:
         """A look after a period, in which a simulated robot holds where it was put to."""
         if at is None:
             time.sleep(period)
@@ -125,11 +125,11 @@ def teach(
             robot.by_hand("hold")
         if wait is not None:
             wait("take your hands away")
-        first, reading = robot.read(), look()
+        first, reading = robot.read(), observe()
         if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
-            reading = [reading, *at_rest(reading, look, inputs.settle_s, "teach")][-1]
+            reading = [reading, *at_rest(reading, observe, inputs.settle_s, "teach")][-1]
         stood = reading.q if moved is None else moved
-        mean, squares, count = averaged(reading, look, frames)
+        mean, squares, count = averaged(reading, observe, frames)
         since = "while images were taken" if moved is None else "since the arm was held again"
         _require_still(robot.bounds, stood, robot.read().q, since)
     sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
@@ -161,8 +161,8 @@ def _put_to(inputs: TeachInputs, simulated: SimulatedRobot, q: FloatArray) -> Fa
     """Move the simulated robot to rest at joints (n,), rad or m, from one side, so that backlash shows."""
     arm, drawn = simulated.truth.robot, (inputs.seed, TAUGHT_NOISE)
     aside = generator(*drawn).choice((-_BESIDE, _BESIDE), len(q))
-    beside = np.clip(q + aside, arm.limits.lower, arm.limits.upper)
-    robot = robot_by_itself(simulated, beside, inputs.noise_px, drawn)
+    aside = np.clip(q + aside, arm.limits.lower, arm.limits.upper)
+    robot = robot_by_itself(simulated, aside, inputs.noise_px, drawn)
     for second in range(1, 1 + _AT_REST_S):
         robot.command(q, np.zeros_like(q), float(second))
     return robot

@@ -202,15 +202,15 @@ def test_what_one_camera_shows_later_is_no_fault_of_the_other(arm):
     q, q_dot = arm.way(5)
     true = q.copy()
     true[20:, 2] += np.radians(3.0)
-    s, late = noisy(arm.images(at_once(true)), 5), 5
+    s, sigma_t = noisy(arm.images(at_once(true)), 5), 5
     test = ImageMonitor(arm.calibration, SIGMA, LOOKS)
-    for k in range(late, len(q)):
-        rows = [k, k - late]
-        t, shown = PERIOD * np.array(rows), np.stack([s[k, 0], s[k - late, 1]])
+    for k in range(sigma_t, len(q)):
+        rows = [k, k - sigma_t]
+        t, shown = PERIOD * np.array(rows), np.stack([s[k, 0], s[k - sigma_t, 1]])
         if said := test.observe(t, q[rows], q_dot[rows], np.zeros(2), shown, np.ones(2, dtype=bool)):
             break
     assert "joint 3 slipped" in said
-    assert 20 + late < k < 20 + late + 2 * WINDOW
+    assert 20 + sigma_t < k < 20 + sigma_t + 2 * WINDOW
 
 
 def slipped(joint):
@@ -388,16 +388,16 @@ def test_a_camera_that_moves_by_two_pixels_in_motion_is_named_before_the_end(arm
 def test_errors_of_corners_excuse_only_what_joints_in_error_do_not_cover(arm, way, shift):
     """Both cameras moved alike, where joints are uncertain by 0.003 rad: most of a score is theirs."""
     errors = ErrorModel(arm.with_joint_noise(0.003).calibration, SIGMA)
-    detector, late = Detector(errors, LOOKS), np.full(2, statistics.LEAST_ERROR)
+    detector, sigma_t = Detector(errors, LOOKS), np.full(2, statistics.LEAST_ERROR)
     q = arm.way(way)[0][[0, STEPS // 2, -1]]
     s = arm.images(at_once(q))
     s[..., 0] += shift
     noise = np.full((2, len(arm.scene.M)), SIGMA)
     for k in range(len(q)):
         t, both, still = np.full(2, PERIOD * k), at_once(q)[k], np.zeros((2, 6))
-        look = FramePair(t=t, q=both, q_dot=still, late=late, images=s[k], noise=noise, curved=still[0])
+        look = FramePair(t=t, q=both, q_dot=still, sigma_t=sigma_t, images=s[k], noise=noise, curved=still[0])
         detector.memory.keep(errors.residual(look), PERIOD * k, True)
-    assert (detector.significant(len(q), late, [], True) is not None) == bool(shift)
+    assert (detector.significant(len(q), sigma_t, [], True) is not None) == bool(shift)
 
 
 def test_looks_in_which_a_hand_comes_and_goes_are_not_kept(arm):
