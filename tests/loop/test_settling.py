@@ -62,7 +62,7 @@ def test_beside_the_goal_the_joints_hide_what_is_left():
     )
     assert ruled == NO_PROGRESS
     assert "set-points moved by no more than 0.0002" in stall.reason
-    assert "coarse readings hide what is left" in stall.reason
+    assert "coarse readings hide the rest" in stall.reason
 
 
 def test_instants_at_which_the_arm_was_held_count_for_nothing():

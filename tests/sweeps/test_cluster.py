@@ -75,7 +75,7 @@ def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(clu
     code, _, err = processes.finish(process)
     assert code == 1
     assert "2 workers of tcp://127.0.0.1" in err
-    assert "the connection to the scheduler is lost; what was stored until then is kept" in err
+    assert "the connection to the scheduler is lost; results stored until then are kept" in err
     assert "Traceback" not in err, err
     stored = len(processes.parts(out))
     assert 8 <= stored < 2 * processes.RUNS / processes.CHUNK
