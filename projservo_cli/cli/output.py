@@ -294,20 +294,22 @@ def _of_laws(value: dict[str, Any]) -> Iterator[str]:
 
     known = any(trace["position_error_mm"] is not None for trace in value["laws"])
     keys = ("position_error_mm", "rotation_error_deg", "center_deviation_mm")
-    heads = "position mm", "rotation deg", "path deviation mm"
+    words, units = ("position", "rotation", "path deviation"), ("mm", "deg", "mm")
     if not known:
-        keys, heads = ("image_error_px", "estimated_position_error_mm", ""), ("image px", "about mm", "")
+        keys = "image_error_px", "estimated_position_error_mm", ""
+        words, units = ("image", "about", ""), ("px", "mm", "")
     errors = "true errors" if known else "image errors"
     yield f"servo: {errors} at the end, self-occluded steps left/right"
-    first, second, last = heads
-    titles = f"  {'law':<20}{'verdict':<15}{'steps':>5}{first:>13}{second:>14}{'occluded':>10}{last:>19}"
-    yield titles.rstrip()
+    first, second, last = words
+    yield f"{'':<42}{first:>9}{second:>9}{last:>19}".rstrip()
+    first, second, last = units
+    yield f"  {'law':<20}{'verdict':<15}{'steps':>5}{first:>9}{second:>9}{'occluded':>9}{last:>10}".rstrip()
     for trace in value["laws"]:
         first, second, last = (_number(trace[key]) if key else "" for key in keys)
         yield (
             f"  {name_of(trace['law'], trace['mode']):<20}{trace['verdict']:<15}{trace['steps']:>5}"
-            f"{first:>13}{second:>14}"
-            f"{trace['self_occluded_steps_left']:>6}/{trace['self_occluded_steps_right']:<3}{last:>19}"
+            f"{first:>9}{second:>9}"
+            f"{trace['self_occluded_steps_left']:>5}/{trace['self_occluded_steps_right']:<3}{last:>10}"
         ).rstrip()
     for name, said in _NOTES.items():
         for reason in dict.fromkeys(trace[name] for trace in value["laws"] if trace[name]):

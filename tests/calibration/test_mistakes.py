@@ -38,7 +38,7 @@ def test_tracks_of_something_else_are_told_with_the_reason(mistake, why):
     told = findings(calibrated(mistaken))["rejected"]
     truth = np.flatnonzero((mistaken.kind == KINDS.index(mistake)).sum(axis=0) > 1)
     assert set(told["tracks"][why]) == set(truth.tolist())
-    assert told["sightings"] <= 3
+    assert told["observations"] <= 3
     assert told["poses"] == []
 
 

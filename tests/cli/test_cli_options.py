@@ -132,7 +132,7 @@ USAGE = {
     "other and stage": (["equations", "calibrate"], "unexpected extra argument (calibrate)"),
     "run twice": (["show", "a", "-o", "b"], "one run"),
     "validate without run": (["validate", "--data", "t.csv"], "needs a run"),
-    "validate without data": (["validate", "out"], "'--data'"),
+    "validate without data": (["validate", "out"], "--data TABLE"),
     "threads": (["servo", "-j", "0"], "-j"),
     "unit": (["calibrate", "--data", "t.csv", "--joint-unit", "grad"], "--joint-unit"),
     "image size without height": (

@@ -44,7 +44,7 @@ def test_an_outdated_recording_is_made_anew_and_what_rests_on_it(projservo, stag
 
 
 def test_an_interrupted_recording_goes_on_in_the_chain(projservo, stages, monkeypatch):
-    def lose_patience(console, what, done, total):
+    def lose_patience(console, what, done, total, note=""):
         if (what, done) == ("record", 5):
             raise KeyboardInterrupt
 

@@ -304,14 +304,15 @@ def test_without_a_truth_the_table_tells_errors_in_the_images(projservo, stages,
     told = {"image_error_px": 0.25, "estimated_position_error_mm": 0.5}
     monkeypatch.setattr(stages, "servo", lambda *given: replace(drive(*given), **told))
     answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", "exact")
-    head, columns, row = answer.out.splitlines()[:3]
+    head, words, columns, row = answer.out.splitlines()[:4]
     assert head == "servo: image errors at the end, self-occluded steps left/right"
-    assert columns.split() == ["law", "verdict", "steps", "image", "px", "about", "mm", "occluded"]
+    assert columns.split() == ["law", "verdict", "steps", "px", "mm", "occluded"]
+    assert words.split() == ["image", "about"]
     assert row.split() == ["exact", "converged", "3", "0.25", "0.5", "3/3"]
     told |= {"position_error_mm": 2.0, "estimated_position_error_mm": None}
     answer = projservo("servo", "-o", "out", "--law", "exact", "--force")
     assert answer.out.startswith("servo: true errors at the end")
-    assert answer.out.splitlines()[2].split() == ["exact", "converged", "3", "2", "-", "3/3", "-"]
+    assert answer.out.splitlines()[3].split() == ["exact", "converged", "3", "2", "-", "3/3", "-"]
 
 
 def test_what_a_robot_or_law_prints_is_no_data(projservo, stages, monkeypatch):

@@ -166,7 +166,7 @@ def test_a_plan_without_time_or_joints_is_refused():
     plan.q[50:] = np.nan
     with pytest.raises(WorkFailed, match="cannot follow"):
         followed(sc.model, sc.task(), plan, GAINS.period, 1.0)
-    with pytest.raises(WorkFailed, match=r"duration_s 0\.1: the joint-speed limit"):
+    with pytest.raises(WorkFailed, match=r"duration_s 0\.1: the minimum within the joint-speed limit"):
         planned(sc, duration=0.1)
 
 

@@ -155,8 +155,8 @@ def check_commands(folder, names, read):
         found["calibrate"]
     )
     assert {"name", "type", "excitation", "poorly_observable"} <= set(found["calibrate"]["joints"][0])
-    assert told["plan"] - {"least", "mu"} <= set(found["plan"])
-    assert {"least", "mu"} == set(found["plan"]["margins"]["joints"])
+    assert told["plan"] - {"min", "mu"} <= set(found["plan"])
+    assert {"min", "mu"} == set(found["plan"]["margins"]["joints"])
     assert cli.run(["record", "-c", "configs/ur5.yaml", "--output", "trials.csv", "--json"]) == 0
     assert told["record"] == set(json.loads(read()))
     assert cli.run(["validate", "results/ur5", "--data", "trials.csv", "--json"]) == 0

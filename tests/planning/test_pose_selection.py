@@ -112,7 +112,7 @@ def test_what_cannot_be_suggested_says_why(robot, few, region):
     vague = dataclasses.replace(
         calibration, sqrt_cov_shared=off.shared, sqrt_cov_marker=off.marker, sqrt_cov_own=off.own
     )
-    with pytest.raises(WorkFailed, match="as far as the calibration can tell"):
+    with pytest.raises(WorkFailed, match="by this calibration"):
         suggest(vague, observation, region, region, 1, np.random.default_rng(0))
     bare = dataclasses.replace(calibration, sqrt_cov_shared=np.full((2, 2), np.nan), method="closed_form")
     with pytest.raises(InputError, match="the method closed_form has not"):

@@ -73,7 +73,7 @@ def test_curves_are_of_the_plan_and_above_what_is_asked(material, data):
     for text, end, views in zip(plan.relaxed_constraints, ("start", "goal"), ("left", "right"), strict=True):
         assert text.startswith(f"relaxed at the {end}: limit of joint 3 0.4")
         assert f"width of the face in the {views} image" in text
-        assert text.count("instead of 8 px") == 1
+        assert text.count("(8 px required)") == 1
 
 
 def test_between_its_corners_the_way_is_straight(material):

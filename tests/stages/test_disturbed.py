@@ -43,7 +43,7 @@ def test_a_robot_that_is_struck_by_nothing_goes_as_the_ideal_one_does(driven):
         assert other.steps == pytest.approx(ideal.steps, abs=5)
         assert other.position_error_mm == pytest.approx(ideal.position_error_mm, abs=0.1)
         assert other.center_deviation_mm == pytest.approx(ideal.center_deviation_mm, abs=1.0)
-        assert np.abs(other.delay[-1]).max() < 0.005
+        assert np.abs(other.latency[-1]).max() < 0.005
 
 
 @pytest.mark.volume

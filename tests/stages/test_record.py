@@ -68,7 +68,7 @@ def test_recording_then_calibrating_is_calibrating(projservo):
         np.testing.assert_array_equal(getattr(two, name), getattr(one, name), err_msg=name)
 
 
-def lose_patience(console, what, done, total):
+def lose_patience(console, what, done, total, note=""):
     if (what, done) == ("record", 5):
         raise KeyboardInterrupt
 
@@ -311,7 +311,7 @@ class Shaking(Arm):
     ("kind", "message"),
     [
         (Stuck, r"joint 1 was sent to 4.18.* rad and stands at 3.7 rad, 0.48\d rad short"),
-        (Backwards, r"joint 2 was sent to -1.678.*went away from there, from -1.378.* rad: look at its sign"),
+        (Backwards, r"joint 2 was sent to -1.678.*moved away from there, from -1.378.* rad: check its sign"),
         (Shaking, r"joint 6 does not come to rest within 20 s"),
     ],
 )

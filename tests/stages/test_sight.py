@@ -103,14 +103,14 @@ def noisy(*overrides):
 def test_the_body_is_the_default_but_for_the_laws_that_need_points():
     example, calibration, planned = noisy()
     body = servo.run(example.config, calibration, planned, "exact")
-    assert body.observation == "body"
+    assert body.features == "body"
     assert (body.views_used == 20).all()
     assert body.s.shape == (body.steps + 1, 2, 4, 2)
     # 26 fits of 34 degrees of freedom; the calibration's own noise adds a little.
     assert np.sqrt(np.mean(body.fit_px**2)) == pytest.approx(0.5, rel=0.15)
     assert np.sqrt(np.mean(body.prediction_px**2)) == pytest.approx(0.55, rel=0.2)
     stacked = servo.run(example.config, calibration, planned, "stacked")
-    assert stacked.observation == "points"
+    assert stacked.features == "points"
     assert np.isnan(stacked.fit_px).all()
     assert np.isnan(stacked.prediction_px).all()
     assert (body.s[0] == stacked.s[0]).all()  # the same noise for every law
@@ -156,7 +156,7 @@ def test_a_body_that_cannot_be_known_says_what_to_set():
     example, calibration, _ = calibrated()
     across = np.linalg.svd(calibration.a_inf[None])[2][1]
     stretch = np.repeat(np.outer(across, across)[None], 6, axis=0)
-    with pytest.raises(WorkFailed, match=r"control\.observation: points"):
+    with pytest.raises(WorkFailed, match=r"control\.features: points"):
         scenario_of(example.config, replace(calibration, H_hat_0=stretch))
 
 

@@ -110,7 +110,7 @@ def test_a_file_that_was_not_taught_is_refused(tmp_path):
     path.write_text("images: {markers: [0, 1, 2, 3], left: [[1, 2]], right: [[1, 2]]}", encoding="utf-8")
     with pytest.raises(InputError, match=r"task\.goal\.images\.left: 1 entries for 4 markers"):
         config(f"task.goal={path}")
-    with pytest.raises(InputError, match=r"task\.start: .*tells no joints"):
+    with pytest.raises(InputError, match=r"task\.start: .*has no joints"):
         config(f"task.start={path}")
 
 

@@ -138,7 +138,7 @@ def config_of(rig, task, table, options):
         },
         "task": {"start": here, "goal": goal},
         # A search that comes to nothing takes most of the time of a run otherwise.
-        "trajectory": {"profile": "auto", "search": {"samples": 3000}},
+        "trajectory": {"profile": "auto", "search": {"max_samples": 3000}},
         "stop": {"max_steps": 600},
         "control": {"laws": ["exact"], "mode": "track", "joint_speed_limit_deg_s": 60},
     }

@@ -137,7 +137,7 @@ def test_what_no_run_can_be_made_of_is_refused_before_any_is(given, message):
         ("runs: 5\n", "base: is missing"),
         (
             "base: paper.yaml\nrandom: {control.gain_t: {uniform: [3, 1]}}\n",
-            "a least value below the largest",
+            "a minimum below the maximum",
         ),
         ("base: paper.yaml\nrandom: {control.gain_t: {}}\n", "exactly one of uniform"),
         ("base: paper.yaml\ngrid: {law: []}\n", "grid.law"),

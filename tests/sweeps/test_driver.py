@@ -79,7 +79,7 @@ def test_the_table_opens_in_xarray_and_pandas(whole):
         "stacked": processes.RUNS,
     }
     with xarray.open_dataset(folder / "sweep.h5", group=f"traces/{processes.RUNS}") as trace:
-        assert trace.sizes["instant"] == ours["steps"][processes.RUNS] + 1
+        assert trace.sizes["time"] == ours["steps"][processes.RUNS] + 1
         assert trace.attrs["law"] == "stacked"
 
 
