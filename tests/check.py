@@ -53,8 +53,11 @@ WHOLE: dict[str, Check] = {
     "tests": ([*PYTEST, "--cov-append", "--cov-report=term", "--cov-fail-under=90"], {}),
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
-# Forty minutes: only where it is asked for by name.
-STUDIES: dict[str, Check] = {"rendered": ([PYTHON, "-m", "tests.studies.rendered"], {})}
+# Forty and three minutes: only by name. The emulator of the tutorial needs a processor for itself.
+STUDIES: dict[str, Check] = {
+    "rendered": ([PYTHON, "-m", "tests.studies.rendered"], {}),
+    "tutorial": ([PYTHON, "-m", "pytest", "-q", "tests/studies/so101_tutorial.py"], {}),
+}
 
 
 def run(name: str, check: Check) -> bool:

@@ -150,7 +150,7 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
     for text in value["advice"]:
         yield wrapped(f"advice: {text}", "  ")
     yield (
-        f"  residual {value['rms_px']:.4g} px rms a point, sigma {value['sigma_px']:.4g} px a coordinate, "
+        f"  residual {value['rms_px']:.4g} px a point, sigma {value['sigma_px']:.4g} px a coordinate, "
         f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s"
     )
     for view, terms in (value["lens"] or {}).items():  # at the radius of the view, half the image size

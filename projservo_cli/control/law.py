@@ -65,7 +65,7 @@ class Gains(NamedTuple):
     ratio_rp : λ_r/λ_p of ``direct_two``.
     gain : of the classical laws, 1/s.
     period : control period, s.
-    delta : share of τ_0 that one pure translation may use.
+    visibility_fraction : fraction of τ_0 that one pure translation may use.
     limits : of the joints, (n,) each: ``lower`` and ``upper``, rad or m, at which a path ends, ``speed``,
         per s, and ``acceleration``, per s²; infinite for none.
     substeps : whether a step is sent in the parts it was solved in.

@@ -455,7 +455,7 @@ class _Sight:
             half = "" if len(s) == 1 else ", half of them or more"
             return (
                 f"both cameras see only {shared} of the {total} markers {where}{half} ({_LEAST_SHARED} at "
-                "minimum): turn the tool towards both cameras, and remove what occludes it"
+                "least): turn the tool towards both cameras, and remove what occludes it"
             )
         return ""
 

@@ -89,7 +89,7 @@ def test_a_joint_that_stays_at_the_end_of_its_lead_is_not_following():
 
 @pytest.mark.parametrize(
     ("read", "what"),
-    [(lambda k: 0.2, "coarse set-points, or friction"), (lambda k: 0.2 + 0.004 * (k % 20 > 9), "play")],
+    [(lambda k: 0.2, "coarse set-points, or friction"), (lambda k: 0.2 + 0.004 * (k % 20 > 9), "backlash")],
 )
 def test_a_robot_that_gains_nothing_is_given_up_with_a_cause(read, what):
     ruled, stall, k = judged(
