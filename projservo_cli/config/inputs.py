@@ -213,8 +213,8 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
     driven = Driven(robot, _following(config, plant.speed_scale), _endless(config))
     delay = None if plant.time_offset_s is None else (plant.time_offset_s.left, plant.time_offset_s.right)
     settle_s = plant.settle_s if plan.truth is None else None
-    table = _file(config, "table", files) if plan.truth is None else None
-    identity = "" if table is None or not Path(table.path).is_file() else identity_in(table.path)
+    table = config.data.table if config.data is not None and plan.truth is None else ""
+    identity = identity_in(table) if table and Path(table).is_file() else ""
     return Contract(driven, events_of(config), plant.timeout_s, delay, settle_s, identity)
 
 

@@ -59,7 +59,7 @@ class Arm:
         self.rendered = rendered_model(scene_of(self.config))
         self._model = copy.copy(self.rendered.model)
         self._model.opt.timestep = STEP_S
-        self._places, self._rates = self.rendered.places, self.rendered.rates
+        self._places, self._rates = self.rendered.positions, self.rendered.rates
         q = np.radians(np.array(q_deg, dtype=float))
         self._data, self.n = self.rendered.begin(self._model, q), len(q)
         inertia, load = self._heaviest()
