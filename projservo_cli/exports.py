@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.kinematic_errors import JointError
 from projservo_cli.geometry.lens import distort
-from projservo_cli.geometry.metric import Body, Metric, rigid_inverse
+from projservo_cli.geometry.metric import Body, Metric
+from projservo_cli.geometry.rigid import rigid_inverse
 from projservo_cli.records import VIEWS, FloatArray
 
 # Arrays that move along with the cameras.

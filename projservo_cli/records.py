@@ -19,6 +19,7 @@ BoolArray = npt.NDArray[np.bool_]
 ByteArray = npt.NDArray[np.uint8]
 
 VIEWS = ("left", "right")
+MM = 1e3  # mm in a metre
 CORNERS = 4  # of a tag: corner k of tag t is marker 4 t + k
 # Reasons of rejected markers: a marker stands still in the images, is of another body, slips, or hardly any
 # of its readings fits.

@@ -26,14 +26,8 @@ from scipy.sparse import csr_array
 from projservo_cli.calibration.detections import RAYLEIGH, Detections, per_block
 from projservo_cli.calibration.prediction import CAMERA, LENS, Parameters, image_points
 from projservo_cli.geometry.lens import K1, distort
+from projservo_cli.geometry.rigid import cross_matrix
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray
-
-
-def cross_matrix(w: FloatArray) -> FloatArray:
-    """Matrices (…, 3, 3) of the cross products with w (…, 3)."""
-    W = np.zeros((*w.shape, 3))
-    W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
-    return W - W.swapaxes(-1, -2)
 
 
 def _axis_of(H_hat: FloatArray) -> FloatArray:

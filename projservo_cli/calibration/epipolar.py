@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
 from projservo_cli.calibration.detections import MAD, MIN_SIGMA, Detections, medians
+from projservo_cli.geometry.rigid import homogeneous
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Residual, in standard deviations, above which correspondences and detections are outliers.
@@ -179,11 +180,6 @@ def _core_square(ratio: FloatArray) -> float:
 def _deviation(r: FloatArray, floor: float) -> float:
     """Robust standard deviation of residuals about zero, at least ``floor``."""
     return max(float(np.median(np.abs(r))) / MAD, floor)
-
-
-def homogeneous(pixels: FloatArray) -> FloatArray:
-    """Append a one to each row."""
-    return np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1)
 
 
 def _normalization(pixels: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.adjustment import LeastSquares, cross_matrix
+from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.detections import MAD, Detections, per_block
 from projservo_cli.calibration.epipolar import (
     Epipolar,
@@ -20,6 +20,7 @@ from projservo_cli.calibration.epipolar import (
 )
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.geometry.rigid import cross_matrix
 from projservo_cli.records import (
     PRISMATIC,
     REVOLUTE,

@@ -7,17 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.metric import (
-    Metric,
-    base_frame,
-    base_joints,
-    exponentials,
-    rigid,
-    rigid_inverse,
-    screws,
-    twists,
-)
+from projservo_cli.geometry.metric import Metric, base_frame, base_joints, directions
+from projservo_cli.geometry.rigid import exponentials, rigid, rigid_inverse, screws, twists
 from projservo_cli.records import BoolArray, FloatArray, InputError
 
 # Errors of axes that any model has, of machining and assembly, rad and m.
@@ -92,7 +85,7 @@ def _moved(base: FloatArray, x: FloatArray, given: FloatArray, prismatic: BoolAr
     n = len(given)
     zeros = np.zeros(n)
     zeros[1 : n - 1] = x[6:]
-    T = rigid(x[:3], x[3:6]) @ base
+    T = rigid(Rotation.from_rotvec(x[:3]), x[3:6]) @ base
     moved, steps = np.empty_like(given), exponentials(given, prismatic, zeros)
     for i in range(n):
         moved[i] = screws(T @ twists(given[i]) @ rigid_inverse(T))
@@ -102,10 +95,7 @@ def _moved(base: FloatArray, x: FloatArray, given: FloatArray, prismatic: BoolAr
 
 def _differences(found: FloatArray, model: FloatArray, prismatic: BoolArray, near: FloatArray) -> FloatArray:
     """Differences (…, n, 6) of directions, and of lines at their points nearest to ``near`` (3,), m."""
-    d = np.where(prismatic[:, None], found[..., 3:], found[..., :3])
-    d0 = np.where(prismatic[:, None], model[:, 3:], model[:, :3])
-    d = d / np.linalg.norm(d, axis=-1, keepdims=True)
-    d0 = d0 / np.linalg.norm(d0, axis=-1, keepdims=True)
+    d, d0 = directions(found, prismatic), directions(model, prismatic)
     p, p0 = np.cross(found[..., :3], found[..., 3:]), np.cross(model[:, :3], model[:, 3:])
     at = p0 + d0 * ((near - p0) * d0).sum(axis=-1, keepdims=True)
     offset = p - at

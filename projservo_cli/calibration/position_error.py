@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.metric import Metric
-from projservo_cli.records import FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import MM, FloatArray, InputError, IntArray, WorkFailed
 
 # Number of unknowns between both frames: scale, pose, and the point on the tool.
 _UNKNOWNS = 10
@@ -15,7 +15,6 @@ _UNKNOWNS = 10
 _MIN_POSITIONS = 6
 # Number of parts that a table is divided into when it is fitted itself.
 _PARTS = 5
-_MM_PER_M = 1e3
 
 
 class Positions(NamedTuple):
@@ -123,13 +122,13 @@ def position_errors(
         parts = [(np.flatnonzero(of == k), table.rows(of != k)) for k in range(min(_PARTS, len(of)))]
     found = [_held_out(metric, table.rows(at), rest, arm_std_m) for at, rest in parts if rest is not None]
     error, C = (np.concatenate(part) for part in zip(*found, strict=True))
-    distance = _MM_PER_M * np.linalg.norm(error, axis=1)
+    distance = MM * np.linalg.norm(error, axis=1)
     square = np.einsum("ki,kij,kj->k", error, np.linalg.inv(C), error)
     return {
         "count": len(distance),
         "rms_mm": float(np.sqrt((distance**2).mean())),
         "median_mm": float(np.median(distance)),
         "max_mm": float(distance.max()),
-        "predicted_rms_mm": float(_MM_PER_M * np.sqrt(np.trace(C, axis1=1, axis2=2).mean())),
+        "predicted_rms_mm": float(MM * np.sqrt(np.trace(C, axis1=1, axis2=2).mean())),
         "mahalanobis": float(square.mean() / 3.0),
     }

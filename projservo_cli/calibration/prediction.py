@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible
+from projservo_cli.geometry.rigid import sine_and_versine
 from projservo_cli.records import (
     BoolArray,
     Calibration,
@@ -28,18 +29,13 @@ CAMERA = 12
 LENS = 2
 
 
-def _sine_and_versine(prismatic: BoolArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Coefficients (K, n) of Ĥ and Ĥ² in [RH00] eqs. (4), (5) at joints (K, n) from the reference."""
-    return np.where(prismatic, q, np.sin(q)), np.where(prismatic, 0.0, 2.0 * np.sin(0.5 * q) ** 2)
-
-
 def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
     """Displacements exp(q Ĥ) (n, K, 4, 4) of operators (n, 4, 4) at joints (K, n), [RH00] eqs. (4), (5).
 
     Joint values are from the reference, rad or m.
     """
     squared = H_hat @ H_hat
-    sine, versine = (part.T[..., None, None] for part in _sine_and_versine(prismatic, q))
+    sine, versine = (part.T[..., None, None] for part in sine_and_versine(prismatic, q))
     return np.eye(4) + sine * H_hat[:, None] + versine * squared[:, None]
 
 
@@ -157,7 +153,7 @@ class Parameters:
             J[v, ..., v * CAMERA : (v + 1) * CAMERA] = images.by_camera[v]
             if images.by_lens is not None:
                 J[v, ..., lenses + v * LENS : lenses + (v + 1) * LENS] = images.by_lens[v]
-        parts = _sine_and_versine(self.prismatic, q)
+        parts = sine_and_versine(self.prismatic, q)
         sine, versine = (part[pose_of].T[..., None, None, None] for part in parts)
         for i, (s, c, H) in enumerate(zip(sine, versine, self.H_hat, strict=True)):
             D, Y = images.by_point[i], images.points[i + 1]

@@ -21,8 +21,9 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.lens import distort, undistort
+from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid_inverse, screws, twists
 from projservo_cli.geometry.stereo import triangulate_points
-from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError
+from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError
 
 # Step of the differences that propagate covariances, in standard deviations of the calibration.
 _STEP = 0.05
@@ -34,7 +35,6 @@ _PARALLEL = 0.05
 _UNDETERMINED = 0.3
 # Singular value of the invariance, over the largest, below which a second form is invariant too.
 _SECOND_FORM = 1e-6
-_MM_PER_M = 1e3
 _ALL_PARALLEL = (
     "metric: within their noise all revolute axes are parallel, which leaves the stretch along them open: a "
     "revolute joint about another direction would fix it"
@@ -88,50 +88,6 @@ class Body(NamedTuple):
         return distort(self.lens[..., None, :, :], m[..., :2] / m[..., 2:])
 
 
-def homogeneous(points: FloatArray) -> FloatArray:
-    """Points (…, 3) with a fourth coordinate of one."""
-    return np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
-
-
-def twists(axes: FloatArray) -> FloatArray:
-    """Twists (…, 4, 4) of screws (…, 6)."""
-    result = np.zeros((*axes.shape[:-1], 4, 4))
-    result[..., :3, :3] = -np.cross(axes[..., None, :3], np.eye(3))
-    result[..., :3, 3] = axes[..., 3:]
-    return result
-
-
-def screws(H_hat: FloatArray) -> FloatArray:
-    """Screws (…, 6) of twists (…, 4, 4)."""
-    skew = 0.5 * (H_hat[..., :3, :3] - H_hat[..., :3, :3].swapaxes(-1, -2))
-    w = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
-    return np.concatenate([w, H_hat[..., :3, 3]], axis=-1)
-
-
-def exponentials(axes: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
-    """Displacements (…, n, 4, 4) of screws (…, n, 6) by readings (…, n), [RH00] eqs. (4), (5)."""
-    H = twists(axes)
-    sine = np.where(prismatic, q, np.sin(q))[..., None, None]
-    versine = np.where(prismatic, 0.0, 2.0 * np.sin(0.5 * q) ** 2)[..., None, None]
-    return np.asarray(np.eye(4) + sine * H + versine * (H @ H))
-
-
-def rigid(rotation_vector: FloatArray, shift: FloatArray) -> FloatArray:
-    """Rigid displacement (4, 4) by a rotation vector (3,), rad, and a shift (3,), m."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(rotation_vector).as_matrix(), shift
-    return T
-
-
-def rigid_inverse(T: FloatArray) -> FloatArray:
-    """Inverse of rigid displacements (…, 4, 4)."""
-    R = T[..., :3, :3].swapaxes(-1, -2)
-    result = np.zeros_like(T)
-    result[..., :3, :3], result[..., 3, 3] = R, 1.0
-    result[..., :3, 3] = -(R @ T[..., :3, 3, None])[..., 0]
-    return result
-
-
 def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
     """Homographies (…, 4, 4) from the projective frame to one in which operators (…, n, 4, 4) are twists.
 
@@ -168,7 +124,7 @@ def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
     return np.concatenate([np.linalg.solve(A, D), a_inf[..., None, :]], axis=-2)
 
 
-def _directions(axes: FloatArray, prismatic: BoolArray) -> FloatArray:
+def directions(axes: FloatArray, prismatic: BoolArray) -> FloatArray:
     """Unit directions (…, n, 3) of axes, or of translations."""
     d = np.where(prismatic[:, None], axes[..., 3:], axes[..., :3])
     return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
@@ -179,7 +135,7 @@ def base_joints(axes: FloatArray, prismatic: BoolArray) -> tuple[int, int, int]:
 
     Raises InputError if all revolute axes are parallel.
     """
-    d = _directions(axes, prismatic)
+    d = directions(axes, prismatic)
     sine = np.linalg.norm(np.cross(d[:, None], d[None]), axis=-1)
     turning = np.flatnonzero(~prismatic)
     off = turning[sine[turning[0], turning] > _PARALLEL]
@@ -190,7 +146,7 @@ def base_joints(axes: FloatArray, prismatic: BoolArray) -> tuple[int, int, int]:
 
 def base_frame(axes: FloatArray, prismatic: BoolArray, joints: tuple[int, int, int]) -> FloatArray:
     """Pose (…, 4, 4) of the base frame of screws (…, n, 6) at readings of zero, by ``base_joints``."""
-    d, (k, i, j) = _directions(axes, prismatic), joints
+    d, (k, i, j) = directions(axes, prismatic), joints
     w, u = axes[..., i, :3], axes[..., j, :3]
     p, r = np.cross(w, axes[..., i, 3:]), np.cross(u, axes[..., j, 3:])
     normal = np.cross(w, u)
@@ -428,7 +384,7 @@ class Metric:
     def position_std(self, q: npt.ArrayLike) -> FloatArray:
         """Standard deviations (…, 3) of the position of the tool along the axes of the base frame, mm."""
         C = self.pose_covariance(q)[..., 3:, 3:]
-        return _MM_PER_M * np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
+        return MM * np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
 
     def triangulate(self, pixels: npt.ArrayLike) -> FloatArray:
         """Points (…, 3) of the base frame, m, by raw pixels (2, …, 2) of both views.

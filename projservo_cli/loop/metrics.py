@@ -7,11 +7,10 @@ from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mu
 from projservo_cli.geometry.jit import composed, merged, njit
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.loop.step import CONVERGED, Log
-from projservo_cli.records import FloatArray
+from projservo_cli.records import MM, FloatArray
 from projservo_cli.simulation.ideal import Ends, Plant, shows_face
 from projservo_cli.task.face import center_of
 
-MM = 1e3
 _ROUND_OFF = 1e-9  # rad or m, by which a joint at its limit may seem to be beyond
 SUBSAMPLES = 50  # points of a joint step at which the deviation between samples is measured
 

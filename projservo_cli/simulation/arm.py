@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import forward_kinematics
+from projservo_cli.geometry.rigid import rigid
 from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 
 METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
@@ -61,13 +62,6 @@ def roll_axis(P: FloatArray) -> tuple[FloatArray, FloatArray]:
 def twist(w: Sequence[float], v: Sequence[float]) -> FloatArray:
     """4×4 twist of an angular velocity w (rad) and a velocity v of the origin (m)."""
     return np.array([[0.0, -w[2], w[1], v[0]], [w[2], 0.0, -w[0], v[1]], [-w[1], w[0], 0.0, v[2]], [0.0] * 4])
-
-
-def rigid(R: Rotation, t: Sequence[float] | FloatArray) -> FloatArray:
-    """4×4 displacement of a rotation and a translation (3,), m."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R.as_matrix(), t
-    return T
 
 
 def about_axis(point: FloatArray, direction: FloatArray, theta: float) -> FloatArray:

@@ -16,12 +16,12 @@ from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span
 from projservo_cli.laws import CODES, REGULATE, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.metrics import MM, Ended, Summary, angle_between, path_deviation, summarize
+from projservo_cli.loop.metrics import Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
-from projservo_cli.records import Calibration, FloatArray, IntArray, Model, Plan, Trace, WorkFailed
+from projservo_cli.records import MM, Calibration, FloatArray, IntArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.results import ImageModel
 from projservo_cli.robots import plugins
 from projservo_cli.robots.client import DrivenRobot
