@@ -35,11 +35,14 @@ class _Link(NamedTuple):
 
     x: FloatArray  # (10,)
 
-    def place(self, metric: Metric, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions (K, 3) by the arm, and changes (c, K, 3) by errors of the calibration, m."""
+    def turned(self, vectors: FloatArray) -> FloatArray:
+        """Vectors (…, 3) of the base frame in the frame of the instrument, m."""
         A = np.exp(self.x[0]) * Rotation.from_rotvec(self.x[1:4]).as_matrix()
-        at, changes = metric.points(q, self.x[7:])
-        return at @ A.T + self.x[4:7], changes @ A.T
+        return np.asarray(vectors @ A.T)
+
+    def positions(self, T: FloatArray) -> FloatArray:
+        """Positions (K, 3) of the point by poses (K, 4, 4) of the tool, m."""
+        return self.turned(T[:, :3, :3] @ self.x[7:] + T[:, :3, 3]) + self.x[4:7]
 
 
 def _fit_link(metric: Metric, table: Positions) -> _Link:
@@ -48,7 +51,7 @@ def _fit_link(metric: Metric, table: Positions) -> _Link:
     Raises WorkFailed if the table does not determine them.
     """
     T = metric.pose(table.q)
-    R, t = T[:, :3, :3], T[:, :3, 3]
+    t = T[:, :3, 3]
     centered, target = t - t.mean(axis=0), table.xyz - table.xyz.mean(axis=0)
     U, s, Vt = np.linalg.svd(target.T @ centered)  # Umeyama 1991, with the point at the tool's origin
     turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
@@ -58,8 +61,7 @@ def _fit_link(metric: Metric, table: Positions) -> _Link:
     start = np.r_[np.log(scale), Rotation.from_matrix(rotation).as_rotvec(), shift, np.zeros(3)]
 
     def residual(x: FloatArray) -> FloatArray:
-        A = np.exp(x[0]) * Rotation.from_rotvec(x[1:4]).as_matrix()
-        return np.asarray(((R @ x[7:] + t) @ A.T + x[4:7] - table.xyz).ravel())
+        return np.asarray((_Link(x).positions(T) - table.xyz).ravel())
 
     found = least_squares(residual, start, x_scale="jac")
     J = np.asarray(found.jac)
@@ -68,11 +70,11 @@ def _fit_link(metric: Metric, table: Positions) -> _Link:
     return _Link(found.x)
 
 
-def _jacobian(metric: Metric, link: _Link, q: FloatArray) -> FloatArray:
-    """Derivative (3 K, 10) of the positions by the link."""
+def _jacobian(T: FloatArray, link: _Link) -> FloatArray:
+    """Derivative (3 K, 10) of the positions at poses (K, 4, 4) of the tool by the link."""
     step = 1e-6
     columns = [
-        (_Link(link.x + d).place(metric, q)[0] - _Link(link.x - d).place(metric, q)[0]).ravel() / (2.0 * step)
+        (_Link(link.x + d).positions(T) - _Link(link.x - d).positions(T)).ravel() / (2.0 * step)
         for d in step * np.eye(_UNKNOWNS)
     ]
     return np.stack(columns, axis=1)
@@ -87,13 +89,14 @@ def _held_out(
             f"{len(fit.q)} positions to fit: scale, pose and point need {_MIN_POSITIONS} or more"
         )
     link = _fit_link(metric, fit)
-    (_, of_fit), (found, changes) = link.place(metric, fit.q), link.place(metric, table.q)
-    carry = _jacobian(metric, link, table.q) @ np.linalg.pinv(_jacobian(metric, link, fit.q))
+    T_fit, T = metric.pose(fit.q), metric.pose(table.q)
+    of_fit, changes = (link.turned(metric.point_changes(q, link.x[7:])) for q in (fit.q, table.q))
+    carry = _jacobian(T, link) @ np.linalg.pinv(_jacobian(T_fit, link))
     own = np.repeat(np.sqrt(fit.sigma**2 + arm_std_m**2), 3)
     left = changes.reshape(len(changes), -1) - of_fit.reshape(len(of_fit), -1) @ carry.T
     both = np.concatenate([left.T, carry * own], axis=1).reshape(len(table.q), 3, -1)
     noise = (table.sigma**2 + arm_std_m**2)[:, None, None] * np.eye(3)
-    return found - table.xyz, both @ both.swapaxes(1, 2) + noise
+    return link.positions(T) - table.xyz, both @ both.swapaxes(1, 2) + noise
 
 
 def position_errors(

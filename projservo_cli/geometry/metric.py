@@ -254,7 +254,9 @@ def _length_of(body: Body, between: Scale, marker: list[int], prismatic: BoolArr
     """Length (…) that is known, in the unit of bodies. Raises InputError if there is none such."""
     if between == "joint":
         if not prismatic.any():
-            raise InputError("metric: no joint is prismatic, so none has readings in metres: give length_m")
+            raise InputError(
+                "metric: no joint is prismatic, so none reads metres: give a known length and its ends"
+            )
         return np.asarray(np.linalg.norm(body.axes[..., int(np.argmax(prismatic)), 3:], axis=-1))
     if between == "cameras":
         centers = body.camera_poses()[..., :3, 3]
@@ -434,14 +436,14 @@ class Metric:
             raise InputError(f"metric: no covariance of {name!r}: choose one of {', '.join(parts)}")
         return parts[name]()
 
-    def points(self, q: FloatArray, point: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Positions (K, 3) of a tool's point (3,) at readings (K, n), m, and changes (c, K, 3) by errors."""
+    def point_changes(self, q: FloatArray, point: FloatArray) -> FloatArray:
+        """Changes (c, K, 3), m, by independent errors of a point (3,) of the tool at readings (K, n)."""
 
-        def of(body: Body) -> FloatArray:
+        def position(body: Body) -> FloatArray:
             T = body.tool_poses(self.prismatic, q)
             return np.asarray(T[..., :3, :3] @ point + T[..., :3, 3])
 
-        return of(self.body), self._changes(of)
+        return self._changes(position)
 
     def _changes(
         self,
