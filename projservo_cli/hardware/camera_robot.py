@@ -132,15 +132,33 @@ class CameraRobot:
     def remarks(self) -> list[str]:
         """Return the faults of the last frames, in words: dark, clipped or blurred ones."""
         visible = [(name, view) for name, view in zip(VIEWS, self.views, strict=True) if view is not None]
-        return [f"the {name} image {what}" for name, view in visible for what in wrong_with(view.frame.grey)]
+        return [
+            f"the {name} image {what}"
+            for name, view in visible
+            for what in exposure_of(view.frame.grey).faults()
+        ]
 
 
 class Exposure(NamedTuple):
     """Exposure and sharpness of a frame."""
 
     mean: float  # grey value
+    brightest: float  # grey value
     clipped: float  # share of pixels that are white
     blur_px: float  # standard deviation of the blur of its sharpest edges; NaN where it has none
+
+    def faults(self) -> list[str]:
+        """Return what is wrong with the frame, each with its remedy; empty for a sound one."""
+        wrong = []
+        if self.brightest < _DARK:
+            wrong.append("is black: take the cap off, or look whether its shutter is closed")
+        elif self.mean < _DARK:
+            wrong.append(f"is dark (grey {self.mean:.0f} of 255 on average): add light, or raise exposure_ms")
+        if self.clipped > _CLIPPED_SHARE:
+            wrong.append(f"is saturated: {self.clipped:.0%} of it is white: lower exposure_ms, or the light")
+        if self.blur_px > _BLURRED:
+            wrong.append(f"is blurred by {self.blur_px:.1f} px ({_BLURRED:g} at most): focus it on the tags")
+        return wrong
 
 
 def exposure_of(grey: ByteArray) -> Exposure:
@@ -158,19 +176,4 @@ def exposure_of(grey: ByteArray) -> Exposure:
     c, s = contrast.ravel()[steepest], slope.ravel()[steepest]
     edges = c > _DARK
     blur = float(np.median(c[edges] / s[edges])) / math.sqrt(2.0 * math.pi) if edges.sum() > 20 else math.nan
-    return Exposure(float(grey.mean()), float((grey >= _WHITE).mean()), blur)
-
-
-def wrong_with(grey: ByteArray) -> list[str]:
-    """Return the fault of a frame with its remedy; empty for a sound one."""
-    found = exposure_of(grey)
-    wrong = []
-    if grey.max() < _DARK:
-        wrong.append("is black: take the cap off, or look whether its shutter is closed")
-    elif found.mean < _DARK:
-        wrong.append(f"is dark (grey {found.mean:.0f} of 255 on average): add light, or raise exposure_ms")
-    if found.clipped > _CLIPPED_SHARE:
-        wrong.append(f"is saturated: {found.clipped:.0%} of it is white: lower exposure_ms, or the light")
-    if found.blur_px > _BLURRED:
-        wrong.append(f"is blurred by {found.blur_px:.1f} px ({_BLURRED:g} at most): focus it on the tags")
-    return wrong
+    return Exposure(float(grey.mean()), float(grey.max()), float((grey >= _WHITE).mean()), blur)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.detection import MIN_CELL, Corners, TagFinder, dictionaries
-from projservo_cli.hardware.camera_robot import View, exposure_of, wrong_with
+from projservo_cli.hardware.camera_robot import View, exposure_of
 from projservo_cli.hardware.cameras import Camera, stable_name
 from projservo_cli.records import CORNERS, ByteArray, FloatArray, JointLimits, in_unit
 
@@ -86,7 +86,7 @@ def _of_camera(camera: Camera) -> Iterator[Finding]:
         what = f"device {camera.settings.source} may get another number when it is plugged in again"
         yield Finding(WARNING, where, what, f"set cameras.{camera.name}.source: {name}")
     light = exposure_of(grey)
-    for wrong in wrong_with(grey):
+    for wrong in light.faults():
         what, _, remedy = wrong.rpartition(": ")
         yield Finding(FAULT if "black" in wrong else WARNING, where, f"its image {what}", remedy)
     white, blur = f"{light.clipped:.1%} white", f"edges blurred by {light.blur_px:.1f} px"

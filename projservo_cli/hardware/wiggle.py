@@ -104,7 +104,7 @@ def _columns(rows: Sequence[tuple[int, float, Reading]]) -> tuple[IntArray, Floa
 
 
 class _Signal(NamedTuple):
-    """Return the motion of the markers of a view along its main direction, rms."""
+    """Motion of the markers of a view along its main direction, rms."""
 
     t: FloatArray  # (f,) stamps of new frames, s
     p: FloatArray  # (f,) px

@@ -25,7 +25,7 @@ _LOOK_S, _MIN_LOOKS = 1.5, 8
 
 
 class Checked(NamedTuple):
-    """Findings."""
+    """Findings of a preflight, and what they rest on."""
 
     findings: tuple[Finding, ...]
     seen: Seen | None  # None where robot or cameras did not open

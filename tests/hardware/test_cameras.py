@@ -13,7 +13,7 @@ pytest.importorskip("cv2")
 
 from projservo_cli.detection import TagFinder
 from projservo_cli.hardware import cameras
-from projservo_cli.hardware.camera_robot import CameraRobot, wrong_with
+from projservo_cli.hardware.camera_robot import CameraRobot, exposure_of
 from projservo_cli.hardware.cameras import Camera
 from projservo_cli.records import WorkFailed
 from projservo_cli.robots.settings import CameraSettings, StereoSettings
@@ -184,11 +184,11 @@ def test_autofocus_and_exposure_that_a_driver_does_not_fix_are_said():
 
 
 def test_black_dark_saturated_and_blurred_images_are_said():
-    assert wrong_with(SEEN) == []
-    assert "is black" in wrong_with(np.full_like(SEEN, 3))[0]
-    assert "is dark" in wrong_with(picture(light=0.1))[0]
-    assert "is saturated: 9" in wrong_with(picture(light=1.8))[0]
-    (blurred,) = wrong_with(picture(blur=4.0))
+    assert exposure_of(SEEN).faults() == []
+    assert "is black" in exposure_of(np.full_like(SEEN, 3)).faults()[0]
+    assert "is dark" in exposure_of(picture(light=0.1)).faults()[0]
+    assert "is saturated: 9" in exposure_of(picture(light=1.8)).faults()[0]
+    (blurred,) = exposure_of(picture(blur=4.0)).faults()
     assert "is blurred by 3" in blurred
 
 
