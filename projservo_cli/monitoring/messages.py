@@ -3,7 +3,7 @@
 import numpy as np
 
 from projservo_cli.monitoring.hypotheses import Explanation
-from projservo_cli.records import CORNERS, VIEWS, Calibration
+from projservo_cli.records import CORNERS, VIEWS, Calibration, FloatArray
 
 # By so much a link may flex under its load, rad, which looks like a joint that slipped.
 _FLEXIBLE = np.radians(1.0)
@@ -15,6 +15,11 @@ def group_of(found: Explanation) -> tuple[str, int]:
     if kind in ("shifted", "camera", "cameras"):
         return ("camera", which) if which >= 0 else ("rig", -1)
     return kind, which
+
+
+def is_slight(angles: FloatArray) -> bool:
+    """Whether angles, rad, are such as a link flexes by under its load."""
+    return bool(np.abs(angles).max() <= _FLEXIBLE)
 
 
 def sentence(found: Explanation, calibration: Calibration) -> str:
@@ -84,5 +89,5 @@ def _slipped(i: int, amount: float, calibration: Calibration) -> str:
     far = f"{1e3 * amount:.2g} mm" if slides else f"{np.degrees(amount):.2g} deg"
     alike = " or the base turned likewise" if i == 0 else ""
     alike += " or the tool turned likewise in its holder" if i == len(calibration.H_hat_0) - 1 else ""
-    alike += " or its link flexes" if not slides and abs(amount) <= _FLEXIBLE else ""
+    alike += " or its link flexes" if not slides and is_slight(np.array([amount])) else ""
     return f"joint {i + 1} slipped by {far}{alike}; home it again, or recalibrate"

@@ -15,7 +15,7 @@ from projservo_cli.monitoring.hypotheses import (
     is_possible,
     together,
 )
-from projservo_cli.monitoring.messages import group_of, sentence
+from projservo_cli.monitoring.messages import group_of, is_slight, sentence
 from projservo_cli.monitoring.statistics import (
     LEAST_ERROR,
     WINDOW,
@@ -405,6 +405,8 @@ class ImageMonitor:
         maximum = self._by_chance(self._evidence_now) / self._unit
         simpler = (one for one in found if not one.theta.size and contains(found[0].cause, one.cause))
         said = [found[0], *(one for one in simpler if one.left <= maximum), *_rivals(found)[1:]]
+        if len({one.view for one in self._since_onset()}) == 1:
+            said += _as_rigid(found)
         names = [sentence(one, self.calibration) for one in said[:2]]
         return f"{off}: {'; or '.join(names)}"
 
@@ -447,6 +449,18 @@ def _rivals(found: list[Explanation]) -> list[Explanation]:
         if near and group_of(one) not in [group_of(other) for other in rivals]:
             rivals.append(one)
     return rivals
+
+
+def _as_rigid(found: list[Explanation]) -> list[Explanation]:
+    """Links that flex by a little, where a rigid motion of both cameras is the likeliest cause.
+
+    In one posture deflections of six joints are any rigid motion: their parameters cost more, and show less
+    in one posture than in several.
+    """
+    if group_of(found[0]) != ("rig", -1):
+        return []
+    flexible = [one for one in found if one.cause.kind == "flexible" and is_slight(one.theta)]
+    return [one for one in flexible if one.gain >= found[0].gain]
 
 
 def _all_but(seen: BoolArray, marker: int) -> BoolArray:

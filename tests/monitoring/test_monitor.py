@@ -400,6 +400,19 @@ def test_errors_of_corners_excuse_only_what_joints_in_error_do_not_cover(arm, wa
     assert (detector.significant(len(q), sigma_t, [], True) is not None) == bool(shift)
 
 
+@pytest.mark.parametrize("seed", [5, 16])
+def test_in_one_posture_links_that_flex_are_said_beside_cameras_that_moved_alike(arm, seed):
+    """Small deflections of six joints are a rigid motion there; what is far off is none."""
+    q = np.repeat(arm.way(seed)[0][:1], REST + 10, axis=0)
+    deflection = np.radians(np.random.default_rng([seed, 17]).uniform(-0.6, 0.6, q.shape[1]))
+    small = first_alarm(arm, q, noisy(arm.images(at_once(q + deflection)), seed))[1]
+    assert "both cameras were moved alike" in small
+    assert "links flex" in small
+    large = first_alarm(arm, q, noisy(arm.images(at_once(q)), seed) + np.array([40.0, -40.0]))[1]
+    assert "both cameras were moved alike" in large
+    assert "flex" not in large
+
+
 def test_looks_in_which_a_hand_comes_and_goes_are_not_kept(arm):
     """It hides three markers of a view, then all but three, and three again; pulled corners hardly show."""
     q, _ = arm.way(3)

@@ -69,7 +69,7 @@ SEED, HOLD_DEG = 2029, 0.2  # of a set-point that holds the arm where it stands
 SPREAD_DEG, ROLL_DEG, INSIDE_PX, FEWEST_TAGS = 18.0, 50.0, 30.0, 3  # of tasks around the home posture
 # What a run takes before it moves and after its plan has ended, s, about; verdicts that blame nobody.
 BEFORE_S, AFTER_S = 0.6, 1.0
-BLAMELESS = ("converged", "no progress", "no progress", "max steps")
+BLAMELESS = ("converged", "no progress", "max steps")
 AXES, SIGNS, VIEWS = (0, 1, 2), (-1, 1), ((0,), (1,), (0, 1))
 CAMERA = [
     level
