@@ -11,10 +11,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PYTHON = sys.executable
 BIN = Path(PYTHON).parent
-PYTEST = [
-    *(PYTHON, "-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "--benchmark-disable"),
-    "--cov=projservo_cli",
-]
+PYTEST = [PYTHON, "-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "--benchmark-disable"]
 SPHINX = [
     PYTHON,
     "-m",
@@ -28,10 +25,11 @@ SPHINX = [
     "docs",
     "build/docs",
 ]
-# Modules whose functions are compiled, tested once more without the compiler: the same bits, indices that
-# are looked at, and lines that coverage can count.
+# Modules whose functions are compiled, tested once more without the compiler: the same bits, and indices
+# that are looked at.
 MATHEMATICS = [f"tests/{folder}" for folder in ("geometry", "task", "control", "loop", "simulation")]
 NOT_COMPILED = ("--ignore-glob=*_rendered_*", "--ignore-glob=*_mujoco_*")
+UNCOMPILED = ["-m", "not volume", *NOT_COMPILED, *MATHEMATICS]
 WITHOUT_COMPILER = {"NUMBA_DISABLE_JIT": "1"}
 
 Check = tuple[Sequence[str | Path], dict[str, str]]
@@ -45,16 +43,21 @@ SINGLE: dict[str, Check] = {
 }
 # Each on both processors, or timed.
 WHOLE: dict[str, Check] = {
-    "mathematics without the compiler": (
-        [*PYTEST, "--cov-report=", "-m", "not volume", *NOT_COMPILED, *MATHEMATICS],
-        WITHOUT_COMPILER,
-    ),
-    # The lines of both passes count.
-    "tests": ([*PYTEST, "--cov-append", "--cov-report=term", "--cov-fail-under=90"], {}),
+    "mathematics without the compiler": ([*PYTEST, *UNCOMPILED], WITHOUT_COMPILER),
+    "tests": (PYTEST, {}),
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
-# Forty and three minutes: only by name. The emulator of the tutorial needs a processor for itself.
-STUDIES: dict[str, Check] = {
+# Only by name. Coverage doubles the time of both passes, whose lines add up, one after the other. The
+# emulator of the tutorial needs a processor for itself; the rendered study takes forty minutes.
+BY_NAME: dict[str, Check] = {
+    "coverage without the compiler": (
+        [*PYTEST, "--cov=projservo_cli", "--cov-report=", *UNCOMPILED],
+        WITHOUT_COMPILER,
+    ),
+    "coverage": (
+        [*PYTEST, "--cov=projservo_cli", "--cov-append", "--cov-report=term", "--cov-fail-under=90"],
+        {},
+    ),
     "rendered": ([PYTHON, "-m", "tests.studies.rendered"], {}),
     "tutorial": ([PYTHON, "-m", "pytest", "-q", "tests/studies/so101_tutorial.py"], {}),
 }
@@ -84,14 +87,14 @@ def run(name: str, check: Check) -> bool:
 
 def main(names: Sequence[str]) -> int:
     """Run the named checks, or all, and return how many failed."""
-    known = SINGLE | WHOLE | STUDIES
+    known = SINGLE | WHOLE | BY_NAME
     unknown = [name for name in names if name not in known]
     if unknown:
         print(f"unknown check {unknown[0]!r}: choose among {', '.join(known)}", file=sys.stderr)
         return 2
     names = names or [*SINGLE, *WHOLE]
     passed: dict[str, bool] = {}
-    for group, processors in ((SINGLE, 2), (WHOLE | STUDIES, 1)):
+    for group, processors in ((SINGLE, 2), (WHOLE | BY_NAME, 1)):
         chosen = [name for name in names if name in group]
         with ThreadPoolExecutor(processors) as pool:
             passed |= dict(zip(chosen, pool.map(run, chosen, [group[name] for name in chosen]), strict=True))
