@@ -577,8 +577,8 @@ def _without_unset(value: Any) -> Any:
     return [_without_unset(inner) for inner in value] if isinstance(value, tuple) else value
 
 
-class _Dumper(yaml.SafeDumper):
-    """Dumps without aliases, so that every value stands where it is read."""
+class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
+    """Dumps without aliases, so that every value stands where it is read; by libyaml where it is."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
