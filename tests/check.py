@@ -44,7 +44,7 @@ SINGLE: dict[str, Check] = {
 # Each on both processors, or timed.
 WHOLE: dict[str, Check] = {
     "mathematics without the compiler": ([*PYTEST, *UNCOMPILED], WITHOUT_COMPILER),
-    "tests": (PYTEST, {}),
+    "tests": ([*PYTEST, "--ignore=tests/benchmarks"], {}),
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
 # Only by name. Coverage doubles the time of both passes, whose lines add up, one after the other. The
