@@ -143,7 +143,7 @@ def preflight(
 
     options : sets, move and watch of ``doctor``.
     """
-    from projservo_cli.config.inputs import recording_inputs
+    from projservo_cli.config.inputs import preflight_inputs
     from projservo_cli.files import write_whole
     from projservo_cli.hardware.live_page import page
     from projservo_cli.stages.preflight import check
@@ -155,7 +155,7 @@ def preflight(
         raise click.UsageError("--move: standard input is no terminal, so nobody can be asked; leave it out")
     with option.writing(output):
         checked = check(
-            recording_inputs(settings),
+            preflight_inputs(settings),
             calibration,
             confirmed=(lambda: console.agreed(_QUESTION)) if move else None,
             watch=(lambda robot: _watch(console, settings, robot)) if watch else None,
@@ -186,7 +186,8 @@ def _table(checked: "Checked") -> Iterator[str]:
         if finding.remedy:
             yield wrapped(finding.remedy, " " * len(head))
     faults = sum(finding.level == "fault" for finding in checked.findings)
-    yield "doctor: ready to record" if checked.works else f"doctor: {faults} faults to mend before recording"
+    mend = f"doctor: {faults} fault{'s' * (faults > 1)} to mend before recording"
+    yield "doctor: ready to record" if checked.works else mend
 
 
 def _goal_pixels(settings: "Config") -> "list[FloatArray]":

@@ -57,6 +57,7 @@ from projservo_cli.stages.given import (
     GoalImages,
     Motions,
     PlanInputs,
+    PreflightInputs,
     ReachingTask,
     RecordingInputs,
     ReportInputs,
@@ -104,20 +105,18 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
 def recording_inputs(config: Config) -> RecordingInputs:
     """Return the inputs of a recording."""
     markers, plant = config.markers, config.plant
-    numbers = markers.known if markers is not None else None
     truth = _truth(config, face=False) if plant.simulated else None
-    if markers is None or numbers is None:
-        raise InputError("record needs to know which markers the robot observes: set markers.numbers")
+    numbers = _numbers(config, "record")
+    assert markers is not None
     own = None if plant.simulated else _own(config)
     trials = _trials(config, truth, own, None, speed_scale=plant.speed_scale)
     # A robot that a caller brings along takes the place of the ideal plant too.
     trials = replace(trials, averaged_frames=plant.averaged_frames, settle_s=plant.settle_s)
-    given = plant.options.get("dictionary", markers.dictionary)
     return RecordingInputs(
         trials=trials,
         numbers=numbers,
         face=markers.front or (),
-        dictionary=None if given is None else str(given),
+        dictionary=_dictionary(config),
         tagged=config.cameras is not None
         or (markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None),
         max_steady_state_error_deg=plant.max_steady_state_error_deg,
@@ -126,9 +125,7 @@ def recording_inputs(config: Config) -> RecordingInputs:
 
 def teach_inputs(config: Config) -> TeachInputs:
     """Return the inputs of teaching a pose."""
-    numbers = config.markers.known if config.markers is not None else None
-    if numbers is None:
-        raise InputError("teach needs to know which markers the robot observes: set markers.numbers")
+    numbers = _numbers(config, "teach")
     robot: SimulatedRobot | OwnRobot
     if config.plant.simulated:
         robot = _simulated(config, truth_of(config), None)
@@ -137,6 +134,39 @@ def teach_inputs(config: Config) -> TeachInputs:
     driven = Driven(robot, _following(config, config.plant.speed_scale), _endless(config))
     noise, settle_s = config.noise.servo_px, config.plant.settle_s
     return TeachInputs(driven, joints_of(config), numbers, noise, settle_s, config.seed)
+
+
+def preflight_inputs(config: Config) -> PreflightInputs:
+    """Return the inputs of a preflight. Raises InputError for a simulated robot."""
+    if config.plant.simulated:
+        raise InputError(
+            "doctor -c checks a robot and its cameras, and this one is simulated: set plant.use and cameras"
+        )
+    numbers = _numbers(config, "doctor")
+    assert config.markers is not None
+    return PreflightInputs(
+        robot=_own(config),
+        following=_following(config, config.plant.speed_scale),
+        joints=joints_of(config),
+        numbers=numbers,
+        face=config.markers.front or (),
+        dictionary=_dictionary(config),
+    )
+
+
+def _numbers(config: Config, command: str) -> tuple[int, ...]:
+    """Numbers of the markers that a robot observes. Raises InputError where they are unknown."""
+    numbers = config.markers.known if config.markers is not None else None
+    if numbers is None:
+        raise InputError(f"{command} needs to know which markers the robot observes: set markers.numbers")
+    return numbers
+
+
+def _dictionary(config: Config) -> str | None:
+    """Dictionary of the tags: that of the options of a robot's class, else that of the markers."""
+    markers = config.markers
+    given = config.plant.options.get("dictionary", None if markers is None else markers.dictionary)
+    return None if given is None else str(given)
 
 
 def suggestion_inputs(config: Config) -> SuggestionInputs:

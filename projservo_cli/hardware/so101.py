@@ -208,7 +208,7 @@ class SO101:
     ) -> None:
         self._port, self._ids = port, tuple(ids)
         self._others = () if gripper is None else (gripper,)
-        known = limits is not None and bool(np.isfinite(limits.lower + limits.upper).all())
+        known = limits is not None and bool(np.isfinite([limits.lower, limits.upper]).all())
         self._limits = limits if known else None
         self._opened = self._on = self._released = False
         self._before: dict[int, Measured] = {}  # the last reading

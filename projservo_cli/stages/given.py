@@ -137,6 +137,18 @@ class TeachInputs:
     seed: int
 
 
+@dataclass(frozen=True, eq=False)
+class PreflightInputs:
+    """Inputs of a preflight, which needs neither reference nor task."""
+
+    robot: OwnRobot
+    following: Following
+    joints: JointSettings
+    numbers: tuple[int, ...]  # of the markers
+    face: tuple[int, ...]  # numbers of the markers that must stay visible; may be empty
+    dictionary: str | None  # of the tags; None if not configured
+
+
 class GoalImages(NamedTuple):
     """Pixels of markers at the goal, with how sure they are."""
 

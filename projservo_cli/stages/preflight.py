@@ -12,13 +12,12 @@ from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding, Seen, findings_at_rest
 from projservo_cli.hardware.wiggle import Strokes, findings_of, strokes
 from projservo_cli.monitoring.monitor import detected_fault
-from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.robots.settings import OwnRobot
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import plugin_robot
-from projservo_cli.stages.given import RecordingInputs
+from projservo_cli.stages.given import PreflightInputs
 
 # Time of observation of a robot at rest, s, and minimum number of readings.
 _LOOK_S, _MIN_LOOKS = 1.5, 8
@@ -38,7 +37,7 @@ class Checked(NamedTuple):
 
 
 def check(
-    inputs: RecordingInputs,
+    inputs: PreflightInputs,
     calibration: Calibration | None = None,
     confirmed: Callable[[], bool] | None = None,
     watch: Callable[[PluginRobot], None] | None = None,
@@ -49,9 +48,9 @@ def check(
     calibration : whose images are compared, where there is one.
     confirmed : asks whether joints may be moved by a few degrees; None moves none.
     watch : is called with the open robot, for as long as somebody wants to see its images.
-    Raises InputError where the robot is a simulated one.
     """
-    robot = _robot_of(inputs)
+    joints, dictionary = inputs.joints.joints(), inputs.dictionary or DICTIONARY
+    robot = plugin_robot(inputs.robot, inputs.following.bounds(joints), joints.types, inputs.numbers)
     found: list[Finding] = []
     seen, moved = None, list[Strokes]()
     try:
@@ -59,9 +58,7 @@ def check(
             if watch is not None:
                 watch(robot)
             seen = _seen(robot, inputs, progress)
-            found += findings_at_rest(
-                seen, TagFinder(inputs.dictionary or DICTIONARY), inputs.dictionary or DICTIONARY
-            )
+            found += findings_at_rest(seen, TagFinder(dictionary), dictionary)
             if calibration is not None:
                 found.append(_against(calibration, seen, robot.image_size))
             works = all(finding.level != FAULT for finding in found)
@@ -86,18 +83,7 @@ def check(
     return Checked(tuple(found), seen, tuple(moved))
 
 
-def _robot_of(inputs: RecordingInputs) -> PluginRobot:
-    """The robot of a configuration."""
-    driven = inputs.trials.driven
-    if driven is None or not isinstance(driven.robot, OwnRobot):
-        raise InputError(
-            "doctor -c checks a robot and its cameras, and this one is simulated: set plant.use and cameras"
-        )
-    joints = inputs.trials.joints.joints()
-    return plugin_robot(driven.robot, driven.following.bounds(joints), joints.types, inputs.numbers)
-
-
-def _seen(robot: PluginRobot, inputs: RecordingInputs, progress: Progress) -> Seen:
+def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Seen:
     """Look for a while at a robot that stands where it is."""
     period, readings = robot.bounds.period, [robot.read()]
     wanted = max(_MIN_LOOKS, round(_LOOK_S / period))

@@ -31,7 +31,6 @@ cameras:
   reconnect_s: 20.0
 markers: {{numbers: [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11], face: [0, 1, 2, 3]}}
 robot: {{limits: {{joints: [[-110, 110], [-100, 100], [-97, 97], [-95, 95], [-160, 160]], unit: deg}}}}
-calibration: {{reference: {{joints: [0, 10, -25, 15, 0], unit: deg}}}}
 control: {{joint_speed_limit_deg_s: 60}}
 """
 
