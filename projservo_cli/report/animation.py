@@ -18,7 +18,7 @@ from projservo_cli.report import style
 from projservo_cli.report.figures.frames import frames_of, with_halo
 from projservo_cli.report.figures.images import near_pixels
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
-from projservo_cli.report.figures.scene import pyramids, skeleton
+from projservo_cli.report.figures.scene import plant_pyramids, skeleton
 from projservo_cli.report.page import template
 from projservo_cli.report.report_data import PAGE_FILE, VIEWS, title
 from projservo_cli.simulation.arm import Arm
@@ -95,7 +95,7 @@ def motion_of(
     runs = {name: _driven(robot, plant, markers, trace) for name, trace in traces.items()}
     edges = () if plan.tree_q is None else tree_edges(plan)
     trees = tuple(with_gaps(_centers(plant, q.reshape(-1, q.shape[-1]))) for q in edges)
-    return _Motion(pyramids(plant, start), start, goal, planned, trees, runs)
+    return _Motion(plant_pyramids(plant, start), start, goal, planned, trees, runs)
 
 
 def _sample_times(q: FloatArray) -> IntArray:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.geometry.rigid import homogeneous
 from projservo_cli.records import PRISMATIC, FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, ReportData, registered
@@ -13,6 +14,7 @@ from projservo_cli.simulation.ideal import Plant
 from projservo_cli.task.face import center_of
 
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
+ROBOT: style.LineStyle = {"color": style.BLACK, "linewidth": 2.0, "marker": "o", "markersize": 4}
 _CAMERAS: dict[str, style.LineStyle] = {
     "left camera": {"color": style.BLUE, "linewidth": 1.0},
     "right camera": {"color": style.ORANGE, "linewidth": 1.0},
@@ -29,7 +31,7 @@ def _data(report_data: ReportData) -> Data:
         "robot": skeleton(joint_operators(plant.model, q), robot.joint_types, tool),
         "face_start": (face @ start.T)[:, :3],
     }
-    visible = pyramids(plant, result["face_start"])
+    visible = plant_pyramids(plant, result["face_start"])
     result |= {"cameras": visible[:, 0], "pyramids": visible}
     goals = (trace.goal_pose for trace in report_data.traces.values() if np.isfinite(trace.goal_pose).all())
     if (pose := next(goals, None)) is not None:
@@ -56,19 +58,29 @@ def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArra
     return np.array([*points, tool])
 
 
-def pyramids(plant: Plant, face: FloatArray) -> FloatArray:
-    """Optical centre and image corners (2, 5, 3) of both metric cameras, m.
+def plant_pyramids(plant: Plant, face: FloatArray) -> FloatArray:
+    """Pyramids (2, 5, 3) of the whole images of a plant, by ``pyramids``."""
+    return pyramids(plant.model.P, rectangle(np.full(2, -0.5), plant.image_size - 0.5), face)
 
-    The corners are drawn at a depth in front of the camera that goes by the distance of a face (m, 3).
+
+def pyramids(P: FloatArray, corners: FloatArray, face: FloatArray) -> FloatArray:
+    """Optical centre and image corners (2, 5, 3) of metric cameras P (2, 3, 4), m.
+
+    corners : (2, 4, 2) pixels. They are drawn at a depth in front of the camera that goes by the distance of
+    a face (m, 3).
     """
-    P = plant.model.P
     centers = np.stack([camera_center(camera) for camera in P])[:, None]
     depth = _PYRAMID * float(np.linalg.norm(face.mean(axis=0) - centers.mean(axis=0)))
-    width, height = plant.image_size - 0.5
-    corners = np.array([[-0.5, -0.5, 1], [width, -0.5, 1], [width, height, 1], [-0.5, height, 1]])
     scale = np.linalg.norm(P[:, 2, :3], axis=1) * np.sign(np.linalg.det(P[:, :, :3]))
-    rays = np.linalg.solve(P[:, :, :3], corners.T).swapaxes(1, 2) * scale[:, None, None]
-    return np.concatenate([centers, centers + depth * rays], axis=1)
+    rays = np.linalg.solve(P[:, :, :3], homogeneous(corners).swapaxes(1, 2)).swapaxes(1, 2)
+    return np.concatenate([centers, centers + depth * rays * scale[:, None, None]], axis=1)
+
+
+def rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Corners (2, 4, 2) of the images of both views between pixels low and high (2, 2) or (2,)."""
+    share = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    low, high = (np.broadcast_to(end, (2, 2))[:, None] for end in (low, high))
+    return np.asarray(low + share * (high - low))
 
 
 @registered(
@@ -82,20 +94,11 @@ def pyramids(plant: Plant, face: FloatArray) -> FloatArray:
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """One view in perspective with equal scales."""
-    from matplotlib.ticker import MultipleLocator
-
-    axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
-    axes.patch.set_visible(False)
-    axes.computed_zorder = False
-    robot: style.LineStyle = {"color": style.BLACK, "linewidth": 2.0, "marker": "o", "markersize": 4}
-    axes.plot(*data["robot"].T, **robot)
-    for (center, *corners), line_style in zip(data["pyramids"], _CAMERAS.values(), strict=True):
-        axes.plot(*style.closed(np.stack(corners)).T, **line_style)
-        for corner in corners:
-            axes.plot(*np.stack([center, corner]).T, **line_style)
+    axes = space(figure, data["pyramids"])
+    axes.plot(*data["robot"].T, **ROBOT)
     axes.plot(*style.closed(data["face_start"]).T, **style.START)
-    line_styles = {"robot at the start": robot, "face at the start": style.START}
-    visible = [data["robot"], data["pyramids"].reshape(-1, 3), data["face_start"]]
+    line_styles = {"robot at the start": ROBOT, "face at the start": style.START}
+    visible = [data["robot"], data["face_start"]]
     if "face_goal" in data:
         goal: style.LineStyle = {"color": style.VERMILION, "linestyle": (0, (3, 1))}
         axes.plot(*style.closed(data["face_goal"]).T, **goal)
@@ -103,7 +106,32 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         axes.plot(*data["line"].T, **line)
         line_styles |= {"face at the goal": goal, "straight line of the centre": line}
         visible.append(data["face_goal"])
-    points = np.concatenate(visible)
+    show(axes, figure, data["pyramids"], np.concatenate(visible), line_styles)
+
+
+def space(figure: "style.Figure", rig: FloatArray) -> Any:
+    """Axes in three dimensions with the pyramids (2, 5, 3) of both cameras."""
+    axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
+    axes.patch.set_visible(False)
+    axes.computed_zorder = False
+    for (center, *corners), line_style in zip(rig, _CAMERAS.values(), strict=True):
+        axes.plot(*style.closed(np.stack(corners)).T, **line_style)
+        for corner in corners:
+            axes.plot(*np.stack([center, corner]).T, **line_style)
+    return axes
+
+
+def show(
+    axes: Any,
+    figure: "style.Figure",
+    rig: FloatArray,
+    points: FloatArray,
+    line_styles: dict[str, style.LineStyle],
+) -> None:
+    """Show a rig and points (k, 3) with equal scales, seen from the side of the rig, above a legend."""
+    from matplotlib.ticker import MultipleLocator
+
+    points = np.concatenate([points, rig.reshape(-1, 3)])
     low, high = points.min(axis=0), points.max(axis=0)
     pad = 0.05 * (high - low).max()
     extent = np.stack([low - pad, high + pad], axis=1)
@@ -113,7 +141,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         step = next(step for step, upper in ((0.1, 0.4), (0.25, 0.75), (0.5, np.inf)) if b - a < upper)
         getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(step))
     axes.tick_params(pad=0)
-    towards = data["cameras"].mean(axis=0) - points.mean(axis=0)  # from the side of the rig
+    towards = rig[:, 0].mean(axis=0) - points.mean(axis=0)
     axes.view_init(elev=22, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62)
     figure.set_layout_engine()
     style.legend_below(figure, line_styles | _CAMERAS, 3)
