@@ -55,6 +55,7 @@ from projservo_cli.stages.given import (
     Estimation,
     Goal,
     GoalImages,
+    KnownLengths,
     Motions,
     PlanInputs,
     PreflightInputs,
@@ -254,13 +255,23 @@ def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
     about, trajectory = about_of(config, files.values()), trajectory_of(config)
     formats = config.report.formats
     if not config.has_task:
-        return ReportInputs(about, formats, None, trajectory)
+        return ReportInputs(about, formats, None, trajectory, _known_lengths(config))
     alone = {
         "control": config.control.model_copy(update={"features": "points"}),
         "trajectory": config.trajectory.model_copy(update={"keep_out": ()}),
     }
     extra = servo_inputs(config.idealized.model_copy(update=alone), files)
-    return ReportInputs(about, formats, extra, trajectory)
+    return ReportInputs(about, formats, extra, trajectory, _known_lengths(config))
+
+
+def _known_lengths(config: Config) -> KnownLengths:
+    """Return the lengths on the tool that the configuration knows."""
+    markers = config.markers
+    if markers is None:
+        return KnownLengths((), np.zeros((0, 0)), None, ())
+    numbers = markers.known or ()
+    side = markers.tag_size_m if markers.points is None else None
+    return KnownLengths(numbers, markers.lengths(numbers), side, markers.front or ())
 
 
 def about_of(config: Config, read: Iterable[File] = ()) -> About:

@@ -154,6 +154,31 @@ def base_frame(axes: FloatArray, prismatic: BoolArray, joints: tuple[int, int, i
     return _frame(np.cross(d[..., 0, :], d[..., k, :]), d[..., 0, :], p + along[..., None] * w)
 
 
+def links(axes: FloatArray, prismatic: BoolArray, like: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Angles (…, n - 1), rad, and distances (…, n - 1), m, from each axis to the next, by screws (…, n, 6).
+
+    A translation has no place, so no distance: NaN.
+    like : (n, 6) screws nearby, of which angles and distances are positive; others may be beyond zero.
+    """
+    d, nominal = directions(axes, prismatic), directions(like, prismatic)
+    across, normal = np.cross(d[..., :-1, :], d[..., 1:, :]), np.cross(nominal[:-1], nominal[1:])
+    sine = np.linalg.norm(normal, axis=-1)
+    parallel = sine <= _PARALLEL
+    angle = np.arctan2((across * _unit(normal)).sum(axis=-1), (d[..., :-1, :] * d[..., 1:, :]).sum(axis=-1))
+    way, towards = (np.diff(np.cross(part[..., :3], part[..., 3:]), axis=-2) for part in (axes, like))
+    # Between parallel axes it lies across both, along the way of those nearby.
+    towards = towards - nominal[:-1] * (towards * nominal[:-1]).sum(axis=-1, keepdims=True)
+    sign = np.copysign(1.0, (np.diff(np.cross(like[:, :3], like[:, 3:]), axis=0) * normal).sum(axis=-1))
+    common = np.where(parallel[:, None], _unit(towards), sign[:, None] * _unit(across))
+    distance = (way * common).sum(axis=-1)
+    return angle, np.where(prismatic[:-1] | prismatic[1:], np.nan, distance)
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    """Vectors (…, 3) over their length; zero stays zero."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300))
+
+
 def _off_line(M: FloatArray, face: Sequence[int]) -> int:
     """Index of the marker of a face that is off the line of its first two. Raises InputError if none is."""
     for j in face[2:]:
@@ -380,7 +405,7 @@ class Metric:
         """Covariances (…, 6, 6) of the tool's pose in the base frame: rotation vector, rad; position, m."""
         readings = self._readings(q)
         rows = readings.reshape(-1, readings.shape[-1])
-        of = self._changes(lambda body: body.tool_poses(self.prismatic, rows), _pose_difference)
+        of = self.changes(lambda body: body.tool_poses(self.prismatic, rows), _pose_difference)
         return _covariances(of).reshape(*readings.shape[:-1], 6, 6)
 
     def position_std(self, q: npt.ArrayLike) -> FloatArray:
@@ -406,7 +431,7 @@ class Metric:
         moves = [self.body.pixels(X + step * e) - self.body.pixels(X - step * e) for e in np.eye(3)]
         J = np.moveaxis(np.stack(moves).reshape(3, len(X), 4) / (2.0 * step), 0, -1)
         pinv = np.linalg.pinv(J)
-        moved = self._changes(lambda body: body.pixels(np.broadcast_to(X, (len(body.P), *X.shape))))
+        moved = self.changes(lambda body: body.pixels(np.broadcast_to(X, (len(body.P), *X.shape))))
         of = np.einsum("kij,ckj->cki", pinv, moved.reshape(len(moved), len(X), 4))
         C = _covariances(of) + self.sigma_px**2 * (pinv @ pinv.swapaxes(-1, -2))
         return np.asarray(C.reshape(*s.shape[1:-1], 3, 3))
@@ -425,12 +450,12 @@ class Metric:
         u, v = np.triu_indices(3)
         u, v = u[:5], v[:5]
         parts: dict[str, Callable[[], FloatArray]] = {
-            "K": lambda: self._changes(lambda body: body.intrinsics()[..., u, v]),
-            "lens": lambda: self._changes(lambda body: body.lens[..., 3:]),
-            "poses": lambda: self._changes(lambda body: body.camera_poses(), _pose_difference),
-            "axes": lambda: self._changes(lambda body: body.axes),
-            "markers": lambda: self._changes(lambda body: body.markers),
-            "tool": lambda: self._changes(lambda body: body.tool[:, None], _pose_difference),
+            "K": lambda: self.changes(lambda body: body.intrinsics()[..., u, v]),
+            "lens": lambda: self.changes(lambda body: body.lens[..., 3:]),
+            "poses": lambda: self.changes(lambda body: body.camera_poses(), _pose_difference),
+            "axes": lambda: self.changes(lambda body: body.axes),
+            "markers": lambda: self.changes(lambda body: body.markers),
+            "tool": lambda: self.changes(lambda body: body.tool[:, None], _pose_difference),
         }
         if name not in parts:
             raise InputError(f"metric: no covariance of {name!r}: choose one of {', '.join(parts)}")
@@ -443,9 +468,9 @@ class Metric:
             T = body.tool_poses(self.prismatic, q)
             return np.asarray(T[..., :3, :3] @ point + T[..., :3, 3])
 
-        return self._changes(position)
+        return self.changes(position)
 
-    def _changes(
+    def changes(
         self,
         function: Callable[[Body], FloatArray],
         difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract,

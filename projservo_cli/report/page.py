@@ -114,7 +114,7 @@ def _law_words(trace: Mapping[str, Any]) -> str:
     return f"{title(name_of(trace['law'], trace['mode']))}: {trace['verdict']} after {took}{why}."
 
 
-SECTIONS = ("calibration", "plan", "control")
+SECTIONS = ("calibration", "metric", "plan", "control")
 _MOST_BYTES = 20_000_000  # of a file; figures have some 100,000
 _TYPES = {"svg": "image/svg+xml", "png": "image/png"}  # that a page can show, the best first
 
@@ -147,7 +147,7 @@ def _pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -
         number = str(int(spec.name[3:5]))
         section = "control" if spec.laws or spec.studies or spec.modes or spec.frames else "plan"
         picture = _Picture(prefix + spec.name, number, spec.title, spec.paper, drawing, tuple(links))
-        found[section if spec.task else "calibration"].append(picture)
+        found["metric" if spec.metric else section if spec.task else "calibration"].append(picture)
     return found
 
 
@@ -188,6 +188,7 @@ class _View(NamedTuple):
     laws: list[dict[str, Any]]
     reported: bool
     claims: Sequence[dict[str, Any]]
+    metric: Sequence[dict[str, Any]]
     drift: dict[str, Any] | None
     left_out: dict[str, list[str]]  # by reason
     pictures: dict[str, list[_Picture]]
@@ -213,6 +214,7 @@ def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> _Vie
         laws=[_law(trace, about) for trace in found["servo"]["laws"]] if "servo" in found else [],
         reported=report is not None,
         claims=report.claims if report else (),
+        metric=report.metric if report else (),
         drift=_drift(report) if report else None,
         left_out=left_out,
         pictures=_pictures(run_folder, report.figures if report else (), folder, prefix),

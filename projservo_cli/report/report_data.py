@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.geometry.kinematics import project
+from projservo_cli.geometry.metric import Metric
 from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
@@ -82,6 +83,8 @@ class Fit:
     calibration: Calibration  # the calibration
     observation: Observation  # of the calibration
     held_out: CrossValidation | None = field(default=None, kw_only=True)  # its cross-validation, if any
+    metric: Metric | None = field(default=None, kw_only=True)  # in metres; None where it cannot be had
+    no_metric: str = field(default="", kw_only=True)  # why not
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,11 +167,12 @@ class _FigureSpec:
     goal: bool = False  # whether it needs a known goal pose
     frames: bool = False  # whether it shows frames; it is not omitted if no robot has any
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
+    metric: bool = False  # whether it needs the calibration in metres
 
     def lacking(self, report_data: Fit) -> str:
         """Return the reason why the figure cannot be drawn; empty if it can."""
         if not self.task:
-            return ""
+            return report_data.no_metric if self.metric else ""
         if self.frames and isinstance(report_data, Driven | ReportData):
             filmed = any(trace.frame_index is not None for trace in report_data.traces.values())
             return "" if filmed else "the robot shows no frames"

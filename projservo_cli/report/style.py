@@ -219,6 +219,14 @@ def log_scale(axes: "Axes") -> None:
     axes.yaxis.set_minor_formatter(FuncFormatter(between))
 
 
+def magnification(size: float, wanted: float) -> float:
+    """Factor 1, 2 or 5 times a power of ten that brings a size near to the wanted one; 1 for no size."""
+    if size == 0.0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(wanted / size))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= wanted / size * (1 + 1e-12)))
+
+
 def power_of_ten(exponent: int) -> str:
     """A power of ten as it is written by hand."""
     return "10" + str(exponent).translate(_SUPERSCRIPTS)

@@ -256,6 +256,15 @@ class ServoInputs:
     contract: Contract | None  # None for the ideal plant
 
 
+class KnownLengths(NamedTuple):
+    """Lengths on the tool that somebody measured."""
+
+    numbers: tuple[int, ...]  # of the markers
+    apart: FloatArray  # (m, m) distances between them, m; NaN if unknown
+    tag_size_m: float | None  # side of tags whose places are not known; None without such
+    face: tuple[int, ...]  # numbers of the markers whose frame the tool has; may be empty
+
+
 @dataclass(frozen=True, eq=False)
 class ReportInputs:
     """Inputs of a report, except calibration, plan and runs."""
@@ -264,6 +273,7 @@ class ReportInputs:
     formats: tuple[str, ...]  # of the files of each figure
     extra: ServoInputs | None  # of laws by themselves on the ideal plant; None where there is no task
     trajectory: Trajectory  # requested motion of the plan
+    lengths: KnownLengths
 
 
 class Scenery(NamedTuple):

@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from projservo_cli import provenance
+from projservo_cli.calibration.prediction import error_factor
 from projservo_cli.files import replacing, require_inside, write_whole
-from projservo_cli.records import Report, Trace, WorkFailed
+from projservo_cli.geometry.metric import Metric, Scale
+from projservo_cli.records import Calibration, InputError, Report, Trace, WorkFailed
 from projservo_cli.report import style
 from projservo_cli.report.animation import motion_of, write_animation, write_view
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures import FIGURES
+from projservo_cli.report.figures.metric import chosen_poses, metric_rows
 from projservo_cli.report.figures.path_deviation import drift_rows, study_numbers
 from projservo_cli.report.page import write_page
 from projservo_cli.report.report_data import (
@@ -28,7 +31,7 @@ from projservo_cli.report.report_data import (
     Studies,
 )
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.given import ReportInputs, Scenery
+from projservo_cli.stages.given import KnownLengths, ReportInputs, Scenery
 from projservo_cli.stages.scenario import plant_of
 from projservo_cli.stages.studies import (
     LAMBDAS,
@@ -59,6 +62,7 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
     """
     left_out: list[dict[str, str]] = []
     report_data: Fit = Fit(run.calibration, run.observation.at_rest, held_out=run.cross_validation)
+    metric, no_metric = in_metres(run.calibration, inputs.lengths)
     studies, share, distance, claims = None, np.zeros(0), np.zeros(0), []
     if inputs.extra is not None:
         bench = comparison_of(inputs.extra, run.calibration, run.plan)
@@ -73,11 +77,15 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
         report_data = Driven(
             run.calibration, run.observation.at_rest, run.plan, run.traces, held_out=run.cross_validation
         )
+    report_data = replace(report_data, metric=metric, no_metric=no_metric)
     figures = draw_all(report_data, directory, inputs.formats, left_out, progress)
+    observed = report_data.observation.q
+    poses = None if metric is None else chosen_poses(metric, observed, run.calibration.q_reference)
     report = Report(
         figures=tuple(figures),
         omitted=tuple(left_out),
         claims=tuple(claims),
+        metric=() if metric is None or poses is None else tuple(metric_rows(metric, poses)),
         step_limit_deg=STEP_LIMIT_DEG,
         share=share,
         composition_mm=1e3 * distance,
@@ -91,6 +99,28 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
     made = Result("", run.configuration, provenance.collect(seed=inputs.about.seed), {}, {"": report})
     write_page(replace(run, results={**run.results, "report": made}), inputs.about)
     return report
+
+
+def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | None, str]:
+    """A calibration in metres by the longest known length, or why there is none."""
+    at = np.flatnonzero(np.isin(known.numbers, calibration.marker))
+    apart = np.nan_to_num(known.apart[np.ix_(at, at)], nan=0.0)
+    length_m: float | None = None
+    between: Scale = "joint"
+    if known.tag_size_m is not None:
+        length_m, between = known.tag_size_m, "tags"
+    elif apart.any():
+        i, j = np.unravel_index(int(np.argmax(apart)), apart.shape)
+        length_m, between = float(apart[i, j]), (known.numbers[at[i]], known.numbers[at[j]])
+    elif not calibration.prismatic.any():
+        return None, "no length on the tool is known: set markers.positions_m or markers.tag_size_m"
+    if not calibration.has_covariance or not calibration.sqrt_cov_shared.size:
+        return None, f"the method {calibration.method} has no covariance: use bundle_adjustment"
+    factor, face = error_factor(calibration), known.face or None
+    try:
+        return Metric.of(calibration, factor, length_m=length_m, between=between, face=face), ""
+    except InputError as error:
+        return None, str(error)
 
 
 @contextmanager

@@ -6,12 +6,14 @@ from functools import lru_cache
 import numpy as np
 
 from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.config.inputs import report_inputs
 from projservo_cli.laws import LAW_SPECS, LAWS, name_of
 from projservo_cli.records import PRISMATIC, Calibration
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import ReportData
 from projservo_cli.robots.client import FrameRecorder
 from projservo_cli.stages import studies
+from projservo_cli.stages.report import in_metres
 from tests.configured import record
 from tests.fake_records import fake
 from tests.known import configured, driven, known_scenario, planned
@@ -53,6 +55,8 @@ def case(name="paper", steps=SHORT, whole=False):
     observation = record.simulate(config, true)
     calibration = known(config, true, model, observation.q)
     numbers = tuple(true.number[i] for i in true.face)
+    metric, why = in_metres(calibration, report_inputs(config).lengths)
+    assert not why
     plant = scenario.plant_of("exact")
     return (
         config,
@@ -68,6 +72,7 @@ def case(name="paper", steps=SHORT, whole=False):
             traces,
             extra,
             trajectory=scenario.inputs.trajectory,
+            metric=metric,
         ),
     )
 

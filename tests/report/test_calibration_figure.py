@@ -199,9 +199,9 @@ def test_a_recorded_run_without_a_task_is_reported_on_with_its_calibration(tmp_p
     assert (made.figures, made.claims) == (("figures/fig13_calibration.svg",), ())
     assert (tmp_path / made.figures[0]).read_bytes().startswith(b"<?xml")
     assert [entry["what"] for entry in made.omitted] == [
-        spec.name for spec in SPECS.values() if spec.task and not spec.frames
+        spec.name for spec in SPECS.values() if (spec.task or spec.metric) and not spec.frames
     ]
-    assert all("task" in entry["reason"] for entry in made.omitted)
+    assert all("task" in entry["reason"] or "no length" in entry["reason"] for entry in made.omitted)
 
 
 def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_their_plan(tmp_path):
@@ -240,7 +240,8 @@ def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_t
     told = report_on(run, tmp_path)
     assert told.figures == ("figures/fig13_calibration.svg", "figures/fig17_frames.svg")
     assert {entry["reason"] for entry in told.omitted} == {
-        "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
+        "no model of robot and cameras is known that could be drawn: set robot, rig and markers",
+        "no length on the tool is known: set markers.positions_m or markers.tag_size_m",
     }
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f"directTHREE: {trace.verdict} after {trace.steps} steps" in page

@@ -67,7 +67,7 @@ def test_headings_sections_language_and_title(page):
     assert html.attributes["lang"] == "en"
     assert next(page.all("title")).text == "projservo: paper"
     assert len(list(page.all("h1"))) == len(list(page.all("main"))) == 1
-    sections = ["run", "calibration", "plan", "control", "claims", "left-out"]
+    sections = ["run", "calibration", "metric", "plan", "control", "claims", "left-out"]
     assert [h.attributes["id"] for h in page.all("h2")] == sections
     assert all("scope" in th.attributes for th in page.all("th"))
 

@@ -20,6 +20,9 @@ from projservo_cli.report.figures import (
     joint_space as joint_space,
 )
 from projservo_cli.report.figures import (
+    metric as metric,
+)
+from projservo_cli.report.figures import (
     parts as parts,
 )
 from projservo_cli.report.figures import (

@@ -91,7 +91,9 @@ def _data(fit: Fit) -> Data:
             for kind, of_kind in zip(_KINDS, (*positions, others), strict=True)
         }
     extent = max(float(np.ptp(seen[:, v][read[:, v]], axis=0).max()) for v in (0, 1))
-    result["factor"] = np.array(_magnification(result["residual"], extent))
+    residual = result["residual"]
+    rms = float(np.sqrt(2.0 * np.mean(residual**2))) if residual.size else 0.0
+    result["factor"] = np.array(style.magnification(rms, _ARROW * extent))
     return result
 
 
@@ -197,16 +199,6 @@ def _expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
     variance σ² − p²; D. A. Belsley, E. Kuh, R. E. Welsch, "Regression Diagnostics", 1980, section 2.1.
     """
     return np.asarray(np.sqrt(np.maximum(sigma**2 - predicted**2, 0.0)))
-
-
-def _magnification(residual: FloatArray, extent: float) -> float:
-    """Factor 1, 2 or 5 times a power of ten that makes the rms of residuals (N,) visible in an extent, px."""
-    rms = float(np.sqrt(2.0 * np.mean(residual**2))) if residual.size else 0.0
-    if rms == 0.0:
-        return 1.0
-    wanted = _ARROW * extent / rms
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= wanted * (1.0 + 1e-12)))
 
 
 @registered(

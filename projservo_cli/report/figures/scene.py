@@ -137,7 +137,7 @@ def show(
     extent = np.stack([low - pad, high + pad], axis=1)
     for name, (a, b) in zip("xyz", extent, strict=True):
         getattr(axes, f"set_{name}lim")(a, b)
-        getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 10)
+        getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 14)
         step = next(step for step, upper in ((0.1, 0.4), (0.25, 0.75), (0.5, np.inf)) if b - a < upper)
         getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(step))
     axes.tick_params(pad=0)

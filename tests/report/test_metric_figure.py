@@ -1,0 +1,68 @@
+"""Cameras, axes and tool in metres on the page: against the data sheet of the arm, and where they lack."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from projservo_cli.config.inputs import report_inputs
+from projservo_cli.geometry.metric import links
+from projservo_cli.report.figures.metric import chosen_poses, metric_rows
+from projservo_cli.stages.report import in_metres
+from tests.configured import calibrate, truth_of
+from tests.known import configured
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    """UR5, calibrated from 0.5 px, its observations and what the configuration knows of lengths."""
+    config = configured("ur5")
+    observation, calibration, *_ = calibrate.run(config)
+    return config, observation.at_rest, calibration, report_inputs(config).lengths
+
+
+def test_rows_agree_with_the_data_sheet_within_their_deviations(calibrated):
+    config, observation, calibration, lengths = calibrated
+    metric, why = in_metres(calibration, lengths)
+    assert why == ""
+    q = chosen_poses(metric, observation.q, calibration.q_reference)
+    assert len(np.unique(q, axis=0)) == 5
+    rows = {row["quantity"]: row for row in metric_rows(metric, q)}
+    # Angles and lengths of a UR5, of its maker; the distance of the cameras as configured.
+    centers = [-np.linalg.solve(P[:, :3], P[:, 3]) for P in truth_of(config).P]
+    expected = {"distance of the cameras": 1e3 * np.linalg.norm(np.subtract(*centers))}
+    for joint, angle, distance in (
+        *((2, 90.0, 0.0), (3, 0.0, 425.0), (4, 0.0, 392.25)),
+        *((5, 90.0, 0.0), (6, 90.0, 0.0)),
+    ):
+        name = f"joint {joint}, axis from that of joint {joint - 1}"
+        expected |= {f"{name}, angle": angle, f"{name}, distance": distance}
+    off = [(rows[name]["value"][0] - value) / rows[name]["deviation"][0] for name, value in expected.items()]
+    assert np.square(off).sum() < chi2.ppf(0.999, len(off))
+
+
+def test_without_a_length_or_a_covariance_the_reason_is_said(calibrated):
+    _, _, calibration, lengths = calibrated
+    unknown = lengths._replace(apart=np.full_like(lengths.apart, np.nan))
+    assert in_metres(calibration, unknown) == (
+        None,
+        "no length on the tool is known: set markers.positions_m or markers.tag_size_m",
+    )
+    closed = calibrate.run(configured("paper", "calibration.method=closed_form", "noise.calibration_px=0"))[1]
+    paper = report_inputs(configured("paper")).lengths
+    assert "has no covariance: use bundle_adjustment" in in_metres(closed, paper)[1]
+
+
+def test_links_are_angles_and_common_normals_with_signs_nearby():
+    """Screws whose links are known by construction, and changes of first order through zero."""
+    #                 along z        parallel, 0.3 off      across, crossing 0.2 above
+    axes = np.array(
+        [[0, 0, 1, 0, 0, 0], [0, 0, 1, 0, -0.3, 0], [1, 0, 0, 0, 0.2, -0.1], [0, 0, 0, 0, 1, 0]], dtype=float
+    )
+    prismatic = np.array([False, False, False, True])
+    angle, distance = links(axes, prismatic, axes)
+    assert angle == pytest.approx([0.0, np.pi / 2, np.pi / 2])
+    assert distance[:2] == pytest.approx([0.3, 0.1])
+    assert np.isnan(distance[2])
+    moved = axes.copy()
+    moved[2, 5] = 0.1  # to the other side of the second axis
+    assert links(moved, prismatic, axes)[1][1] == pytest.approx(-0.1)
