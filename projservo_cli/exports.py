@@ -16,6 +16,8 @@ from projservo_cli.records import VIEWS, FloatArray
 
 # Arrays that move along with the cameras.
 _MOVED = ("lens", "poses", "axes", "tool", "markers")
+# Deviations beyond which the links of a model contradict the known length.
+_CONTRADICTED = 4.0
 # Limits of a URDF joint that no calibration knows: N m or N, and rad/s or m/s.
 _EFFORT, _SPEED = 100.0, 1.0
 
@@ -203,6 +205,16 @@ def metric_object(metric: Metric) -> dict[str, Any]:
 def to_json(metric: Metric, more: Mapping[str, Any]) -> str:
     """The metric as JSON."""
     return json.dumps({**metric_object(metric), **more}, indent=1, allow_nan=False) + "\n"
+
+
+def length_words(share: float, std: float) -> Iterator[str]:
+    """Yield what is wrong with the known length, where the links of a model contradict it."""
+    if abs(share) > _CONTRADICTED * std:
+        wrong = "short" if share > 0.0 else "long"
+        yield (
+            f"the known length is {100.0 * abs(share):.2g} % ± {100.0 * std:.1g} % too {wrong} for the links "
+            "of the model, so all errors below are wrong: measure it again, or check the model"
+        )
 
 
 def kinematic_words(errors: Sequence[JointError], joint_types: str) -> Iterator[str]:

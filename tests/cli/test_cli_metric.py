@@ -121,15 +121,15 @@ def matrix(screw):
     return H
 
 
-def wrong_model(true, q, zero):
-    """A URDF of screws (n, 6) at readings q, whose zeros are off and whose third link is 3 mm too long."""
+def wrong_model(true, q, zero, link_m=0.003):
+    """A URDF of screws (n, 6) at readings q, whose zeros are off and whose third link is too long."""
     T, last, lines = np.eye(4), np.zeros(3), ['<robot name="wrong"><link name="l0"/>']
     for i, screw in enumerate(true):
         H = T @ matrix(screw) @ np.linalg.inv(T)
         w, v = np.array([H[2, 1], H[0, 2], H[1, 0]]), H[:3, 3]
         place = np.cross(w, v) + w * (w @ last)
         if i == 3:
-            place += 0.003 * (place - last) / np.linalg.norm(place - last)
+            place += link_m * (place - last) / np.linalg.norm(place - last)
         lines.append(
             f'<link name="l{i + 1}"/><joint name="j{i}" type="continuous"><parent link="l{i}"/>'
             f'<child link="l{i + 1}"/><origin xyz="{" ".join(map(str, place - last))}"/>'
@@ -149,9 +149,30 @@ def test_zeros_and_links_of_a_wrong_model_are_found(ur5, reference_truth, tmp_pa
     file.write_text(wrong_model(true, q, zero))
     capsys.readouterr()
     export(ur5, tmp_path, "ros", "--nominal", str(file), "--json")
-    errors = {e["joint"]: e for e in json.loads(capsys.readouterr().out)["nominal"]}
+    answer = json.loads(capsys.readouterr().out)
+    errors = {e["joint"]: e for e in answer["nominal"]}
+    assert abs(answer["length_error"]) < 4.0 * answer["length_error_std"]
     for joint in (2, 3, 4, 5):
         found, std = np.degrees([errors[joint]["zero"], errors[joint]["zero_std"]])
         assert abs(found - np.degrees(zero[joint - 1])) < 3.5 * std
     assert errors[1]["zero"] is None
     assert errors[6]["zero"] is None
+
+
+@pytest.mark.parametrize(("factor", "word"), [(0.98, "short"), (1.0, ""), (1.02, "long")])
+def test_links_of_a_model_contradict_a_length_that_is_wrong(
+    ur5, reference_truth, tmp_path, capsys, factor, word
+):
+    """By 2 % of 249 mm, 5 mm, told within four of its deviations; a length that is right is none."""
+    true = np.array([[*s["w"], *s["v"]] for s in reference_truth("ur5")["screws"]])
+    file = tmp_path / "model.urdf"
+    file.write_text(wrong_model(true, np.array(reference_truth("ur5")["q_reference"]), np.zeros(6), 0.0))
+    length = ["--metric", str(factor * float(KNOWN[1])), "--between", "2,8", "--nominal", str(file)]
+    capsys.readouterr()
+    assert run(["export", str(ur5), "--to", "json", "-o", str(tmp_path / "out"), *length]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert (f"too {word} for the links of the model" in text) == bool(word)
+    assert ("known length" in text) == bool(word)
+    value = json.loads(next((tmp_path / "out").iterdir()).read_text())
+    expected = 1.0 / factor - 1.0
+    assert abs(value["length_error"] - expected) < 4.0 * value["length_error_std"]
