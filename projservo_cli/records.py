@@ -673,7 +673,9 @@ class Report:
     omitted: tuple[dict[str, str], ...] = _scalar(about="omitted figures and studies, each with the reason")
     claims: tuple[dict[str, Any], ...] = _scalar(about="claim, source, measured, criterion, holds")
     metric: tuple[dict[str, Any], ...] = _scalar(
-        about="quantity, value, deviation, unit of cameras, axes and tool; empty without a known length"
+        about="quantity, value, deviation, unit of cameras, axes and tool; empty without a known length",
+        default=(),
+        kw_only=True,
     )
     step_limit_deg: float = _scalar("deg", "joint motion per step of the limited runs")
     gain_per_step: FloatArray = _array("gain_per_step", about="fraction of the error corrected in one step")

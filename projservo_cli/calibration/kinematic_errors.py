@@ -47,7 +47,10 @@ def _fitted(metric: Metric, given: FloatArray) -> _Fit:
     prismatic, n = metric.prismatic, len(metric.joint_types)
     types = "".join("R" if w.any() else "P" for w in given[:, :3])
     if types != metric.joint_types:
-        raise InputError(f"the model's joints are {types}, the calibrated ones {metric.joint_types}")
+        raise InputError(
+            f"the model's joints are {types}, the calibrated ones {metric.joint_types}: choose the link of "
+            "the tool as its tip"
+        )
     near = metric.pose(np.zeros(n))[:3, 3]
 
     def left(x: FloatArray, found: FloatArray, scale: float = 1.0) -> FloatArray:

@@ -97,7 +97,10 @@ class FeetechBus:
             back = self.read([*values], address, len(next(iter(values.values()))))
             values = {number: row for number, row in values.items() if back[number].values != row}
         if values:
-            raise WorkFailed(f"servo {min(values)} refuses the value written to its register {address}")
+            raise WorkFailed(
+                f"servo {min(values)} refuses the value written to its register {address}: switch the supply "
+                "off and on, then run the command again"
+            )
 
     def _asked(self, ids: Sequence[int], address: int, size: int) -> tuple[dict[int, Reply], set[int]]:
         """Replies to one request by servo, and the servo of which something arrived that is no reply."""

@@ -126,9 +126,11 @@ class SweepTable:
             raise InputError(f"{path}: there is no table of a sweep; make one with projservo sweep")
         with opened(path, _AGAIN, unchanged=True) as file:
             if "schema" not in file.attrs or attribute(file, "schema") != _SCHEMA:
-                raise InputError(f"{path}: not the table of a sweep")
+                raise InputError(f"{path}: not the table of a sweep; name a folder that projservo sweep made")
             if attribute(file, "schema_version") != SCHEMA_VERSION:
-                raise InputError(f"{path}: written by another version of projservo; use another sweep")
+                raise InputError(
+                    f"{path}: another version of projservo made it; run it again: projservo sweep --force"
+                )
             found = ((name, attribute(file, name)) for name in file.attrs)
             is_json = ("{", "[")
             self.attributes = {k: json.loads(v) if str(v).startswith(is_json) else v for k, v in found}
