@@ -5,6 +5,7 @@ import os
 import re
 import time
 import types
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -54,12 +55,12 @@ def through_all(span=75.0):
     return [np.clip(q, -130.0, 130.0) for q in ends]
 
 
-@pytest.fixture
-def bench(tmp_path, monkeypatch):
-    """An emulated arm with its cameras, and somebody who presses Enter."""
-    monkeypatch.chdir(tmp_path)
-    clock = Clock(RATE)
-    monkeypatch.setattr(so101.tempfile, "gettempdir", lambda: str(tmp_path))
+@contextmanager
+def benched(folder, monkeypatch, rate=RATE, rate_hz=15.0):
+    """An emulated arm with its cameras, and somebody who presses Enter, in a folder."""
+    monkeypatch.chdir(folder)
+    clock = Clock(rate)
+    monkeypatch.setattr(so101.tempfile, "gettempdir", lambda: str(folder))
     # Compiling and importing take the bus, which is in this process, its turn for seconds.
     monkeypatch.setattr(feetech, "_PATIENCE_S", 5.0)
     monkeypatch.setattr(so101.SO101, "now", staticmethod(clock.now))
@@ -73,17 +74,35 @@ def bench(tmp_path, monkeypatch):
 
     monkeypatch.setattr("sys.stdin", types.SimpleNamespace(isatty=lambda: True, readline=enter))
     arm = Arm(clock, START, Mechanics())
+    with Bus(arm) as bus, Cameras(arm, Optics(rate_hz=rate_hz)) as cameras:
+        monkeypatch.setattr(so101, "candidate_ports", lambda: [bus.port])
+        yield types.SimpleNamespace(arm=arm, bus=bus, cameras=cameras, script=script, folder=folder)
+
+
+def configure(bench, shorter):
+    """Put the streams of the emulator, and what makes its recording short, into arm.yaml."""
+    file = bench.folder / "arm.yaml"
+    text = file.read_text()
+    for before, after in shorter.items():
+        assert before in text
+        text = text.replace(before, after)
+    text = text.replace("source: 0", f"source: '{bench.cameras.left}'")
+    file.write_text(text.replace("source: 2", f"source: '{bench.cameras.right}'"))
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch):
+    """An emulated arm on its bench."""
     try:
-        with Bus(arm) as bus, Cameras(arm, Optics(rate_hz=15.0)) as cameras:
-            monkeypatch.setattr(so101, "candidate_ports", lambda: [bus.port])
-            yield types.SimpleNamespace(arm=arm, bus=bus, cameras=cameras, script=script, folder=tmp_path)
+        with benched(tmp_path, monkeypatch) as found:
+            yield found
     except InputError as error:
         pytest.skip(str(error))
 
 
 @pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="plans and drives")
 def test_ten_commands_lead_from_an_empty_folder_to_the_taught_goal(bench, capsys):
-    arm, file = bench.arm, bench.folder / "arm.yaml"
+    arm = bench.arm
     acts = {
         "limits": [None, by_hand(arm, *through_all())],
         "teach --start": [None, by_hand(arm, START), None],
@@ -102,12 +121,7 @@ def test_ten_commands_lead_from_an_empty_folder_to_the_taught_goal(bench, capsys
         with capsys.disabled():
             print(f"{words[0]} {time.monotonic() - begun:.0f} s", flush=True)
         if words[0] == "init":
-            text = file.read_text()
-            for before, after in SHORTER.items():
-                assert before in text
-                text = text.replace(before, after)
-            text = text.replace("source: 0", f"source: '{bench.cameras.left}'")
-            file.write_text(text.replace("source: 2", f"source: '{bench.cameras.right}'"))
+            configure(bench, SHORTER)
         if words[0] == "servo":
             bench.reached = arm.link.copy()
     assert "torque is on: the arm holds" in printed["servo"].err
