@@ -47,8 +47,9 @@ WHOLE: dict[str, Check] = {
     "tests": ([*PYTEST, "--ignore=tests/benchmarks"], {}),
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
-# Only by name. Coverage doubles the time of both passes, whose lines add up, one after the other. The
-# emulator of the tutorial needs a processor for itself; the rendered study takes forty minutes.
+# Only by name. Coverage doubles the time of the first pass and adds a fifth to the second; lines of both add
+# up, one after the other. The emulator of the tutorial needs a processor for itself; the rendered study takes
+# forty minutes.
 BY_NAME: dict[str, Check] = {
     "coverage without the compiler": (
         [*PYTEST, "--cov=projservo_cli", "--cov-report=", *UNCOMPILED],
