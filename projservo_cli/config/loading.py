@@ -28,9 +28,11 @@ from projservo_cli.simulation.mjcf import read_mjcf
 from projservo_cli.simulation.urdf import read_urdf
 
 try:  # of a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
+    from yaml import CSafeDumper as _Emitter
     from yaml import CSafeLoader as _Parser
-except ImportError:
-    from yaml import SafeLoader as _Parser  # type: ignore[assignment]  # either will do
+except ImportError:  # either will do
+    from yaml import SafeDumper as _Emitter  # type: ignore[assignment]
+    from yaml import SafeLoader as _Parser  # type: ignore[assignment]
 
 _PHRASES = {
     "missing": "is missing",
@@ -577,8 +579,8 @@ def _without_unset(value: Any) -> Any:
     return [_without_unset(inner) for inner in value] if isinstance(value, tuple) else value
 
 
-class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[misc]
-    """Dumps without aliases, so that every value stands where it is read; by libyaml where it is."""
+class _Dumper(_Emitter):
+    """Dumps without aliases, so that every value stands where it is read."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
