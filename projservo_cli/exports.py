@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.kinematic_errors import JointError
+from projservo_cli.calibration.kinematic_errors import KinematicErrors
 from projservo_cli.geometry.lens import distort
 from projservo_cli.geometry.metric import Body, Metric
 from projservo_cli.geometry.rigid import rigid_inverse
@@ -207,25 +207,25 @@ def to_json(metric: Metric, more: Mapping[str, Any]) -> str:
     return json.dumps({**metric_object(metric), **more}, indent=1, allow_nan=False) + "\n"
 
 
-def length_words(share: float, std: float) -> Iterator[str]:
-    """Yield what is wrong with the known length, where the links of a model contradict it."""
-    if abs(share) > _CONTRADICTED * std:
-        wrong = "short" if share > 0.0 else "long"
+def kinematic_words(errors: KinematicErrors, joint_types: str) -> Iterator[str]:
+    """Yield a known length that is wrong, then what to mend in a model: zeros of joints, then axes.
+
+    Of each the most significant come first.
+    """
+    if abs(errors.length) > _CONTRADICTED * errors.length_std:
+        wrong = "short" if errors.length > 0.0 else "long"
+        share, std = 100.0 * abs(errors.length), 100.0 * errors.length_std
         yield (
-            f"the known length is {100.0 * abs(share):.2g} % ± {100.0 * std:.1g} % too {wrong} for the links "
-            "of the model, so all errors below are wrong: measure it again, or check the model"
+            f"the known length is {share:.2g} % ± {std:.1g} % too {wrong} for the links of the model, so all "
+            "errors below are wrong: measure it again, or check the model"
         )
-
-
-def kinematic_words(errors: Sequence[JointError], joint_types: str) -> Iterator[str]:
-    """Yield what to mend in a model, most significant first: zeros of joints, then axes."""
-    zeros = [one for one in errors if one.zero is not None and one.zero_std is not None]
+    zeros = [one for one in errors.joints if one.zero is not None and one.zero_std is not None]
     for one in sorted(zeros, key=lambda one: -abs((one.zero or 0.0) / (one.zero_std or 1.0))):
         scale, unit = (1e3, " mm") if joint_types[one.joint - 1] == "P" else (float(np.degrees(1.0)), "°")
         zero, std = scale * (one.zero or 0.0), scale * (one.zero_std or 0.0)
         summary = f"joint {one.joint}: zero off by {round(zero, 2) + 0.0:+.2f}{unit} ± {std:.2f}{unit}"
         yield summary.replace("-", "\N{MINUS SIGN}")
-    for one in sorted(errors, key=lambda one: -one.offset_m / max(one.offset_std_m, 1e-12)):
+    for one in sorted(errors.joints, key=lambda one: -one.offset_m / max(one.offset_std_m, 1e-12)):
         yield (
             f"joint {one.joint}: axis off by {1e3 * one.offset_m:.2f} mm ± {1e3 * one.offset_std_m:.2f} mm, "
             f"{np.degrees(one.tilt_rad):.3f}° ± {np.degrees(one.tilt_std_rad):.3f}°"

@@ -31,19 +31,24 @@ class JointError(NamedTuple):
     tilt_std_rad: float  # rad
 
 
-class _Fit(NamedTuple):
-    """Model fitted to the calibrated axes, whitened residuals and their derivatives."""
+class KinematicErrors(NamedTuple):
+    """Errors of a model against the calibrated arm."""
 
-    x: FloatArray  # (6 + n - 2,) base and inner zeros
-    J: FloatArray  # (6 n, 6 + n - 2)
-    root: FloatArray  # (6 n, 6 n) inverse root of the covariance of differences
-    remains: FloatArray  # (6 n,) differences after the fit, not whitened
-    errors: FloatArray  # (6 n, c) their changes by independent errors of the calibration
-    to_scale: FloatArray  # (6 n,) whitened derivative by the scale of the model's lengths
+    joints: list[JointError]
+    length: float  # share by which the known length is too short for the links of the model
+    length_std: float  # its standard deviation, which grows with what the model leaves beyond its own errors
 
 
-def _fitted(metric: Metric, given: FloatArray) -> _Fit:
-    """Fit the base and the inner zeros of a model, as ``kinematic_errors`` says."""
+def kinematic_errors(metric: Metric, given: FloatArray) -> KinematicErrors:
+    """Compare a model with the calibrated arm, joint by joint, and its links with the known length.
+
+    The base and the zeros of the inner joints are fitted first, weighted by the covariance of the axes and by
+    0.5 mm and 0.5 mrad for the links of any model. What remains are errors of axes.
+
+    metric : of the calibration, in metres.
+    given : (n, 6) screws of the model at readings of zero, rad and m.
+    Raises InputError if the joint types differ.
+    """
     prismatic, n = metric.prismatic, len(metric.joint_types)
     types = "".join("R" if w.any() else "P" for w in given[:, :3])
     if types != metric.joint_types:
@@ -51,12 +56,13 @@ def _fitted(metric: Metric, given: FloatArray) -> _Fit:
             f"the model's joints are {types}, the calibrated ones {metric.joint_types}: choose the link of "
             "the tool as its tip"
         )
+    base = rigid_inverse(base_frame(given, prismatic, base_joints(given, prismatic)))
     near = metric.pose(np.zeros(n))[:3, 3]
 
-    def left(x: FloatArray, found: FloatArray, scale: float = 1.0) -> FloatArray:
-        sized = given * np.where(prismatic[:, None], 1.0, [1.0, 1.0, 1.0, scale, scale, scale])
-        base = rigid_inverse(base_frame(sized, prismatic, base_joints(sized, prismatic)))
-        model = _moved(base, x, sized, prismatic)
+    def left(
+        x: FloatArray, found: FloatArray, base: FloatArray = base, given: FloatArray = given
+    ) -> FloatArray:
+        model = _moved(base, x, given, prismatic)
         return _differences(found, model, prismatic, near).reshape(*found.shape[:-2], 6 * n)
 
     x, change = np.zeros(6 + max(n - 2, 0)), _STEP * metric.deviations("axes")
@@ -68,28 +74,13 @@ def _fitted(metric: Metric, given: FloatArray) -> _Fit:
         return np.asarray(root @ left(x, axes))
 
     fit = least_squares(weighted, x, x_scale="jac")
-    ends = (left(fit.x, axes, 1.0 + sign * _STEP) for sign in (1, -1))
-    to_scale = root @ np.subtract(*ends) / (2.0 * _STEP)
-    return _Fit(fit.x, np.asarray(fit.jac), root, left(fit.x, axes), E, to_scale)
-
-
-def kinematic_errors(metric: Metric, given: FloatArray) -> list[JointError]:
-    """Compare a model with the calibrated arm, joint by joint.
-
-    The base and the zeros of the inner joints are fitted first, weighted by the covariance of the axes and by
-    0.5 mm and 0.5 mrad for the links of any model. What remains are errors of axes.
-
-    metric : of the calibration, in metres.
-    given : (n, 6) screws of the model at readings of zero, rad and m.
-    Raises InputError if the joint types differ.
-    """
-    fit, n = _fitted(metric, given), len(given)
-    J, root, E = fit.J, fit.root, fit.errors
+    J = np.asarray(fit.jac)
+    pinv = np.linalg.pinv(J)
     std = np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))
-    remains = fit.remains.reshape(n, 2, 3)
-    changed = (E - np.linalg.solve(root, J @ (np.linalg.pinv(J) @ root @ E))).reshape(n, 2, 3, -1)
+    remains = left(fit.x, axes).reshape(n, 2, 3)
+    changed = (E - np.linalg.solve(root, J @ (pinv @ root @ E))).reshape(n, 2, 3, -1)
     size, size_std = np.linalg.norm(remains, axis=2), np.linalg.norm(changed, axis=(2, 3))
-    return [
+    joints = [
         JointError(
             joint=i + 1,
             zero=float(fit.x[5 + i]) if 0 < i < n - 1 else None,
@@ -101,21 +92,30 @@ def kinematic_errors(metric: Metric, given: FloatArray) -> list[JointError]:
         )
         for i in range(n)
     ]
+    ends = (left(fit.x, axes, *_scaled(base, given, prismatic, 1.0 + sign * _STEP)) for sign in (1, -1))
+    by_scale = root @ np.subtract(*ends) / (2.0 * _STEP)
+    return KinematicErrors(joints, *_length_error(np.asarray(fit.fun), J, by_scale - J @ (pinv @ by_scale)))
 
 
-def length_error(metric: Metric, given: FloatArray) -> tuple[float, float]:
-    """Share by which the known length is too short for the links of a model, and its standard deviation.
+def _scaled(
+    base: FloatArray, given: FloatArray, prismatic: BoolArray, factor: float
+) -> tuple[FloatArray, FloatArray]:
+    """Base (4, 4) and screws (n, 6) of a model whose lengths are multiplied by a factor."""
+    base, given = base.copy(), given.copy()
+    base[:3, 3] *= factor
+    given[~prismatic, 3:] *= factor
+    return base, given
 
-    The deviation grows with what the model leaves beyond its own errors. Arguments as of
-    ``kinematic_errors``.
+
+def _length_error(r: FloatArray, J: FloatArray, across: FloatArray) -> tuple[float, float]:
+    """Error of the known length and its deviation, by whitened residuals (6 n,) of a fit and its J.
+
+    across : (6 n,) their derivative by the scale of the model, less what the fit makes up for.
     """
-    fit = _fitted(metric, given)
-    r = fit.root @ fit.remains
-    across = fit.to_scale - fit.J @ (np.linalg.pinv(fit.J) @ fit.to_scale)
     information = float(across @ across)
     share = float(across @ r) / information
     beyond = r - share * across
-    degrees = max(len(r) - np.linalg.matrix_rank(fit.J) - 1, 1)
+    degrees = max(len(r) - int(np.linalg.matrix_rank(J)) - 1, 1)
     return share, float(np.sqrt(max(1.0, float(beyond @ beyond) / degrees) / information))
 
 

@@ -165,7 +165,7 @@ def _in_metres(
 ) -> tuple[str, dict[str, Any], list[str]]:
     """Return the text of a file in metres, its JSON object, and its summary in words."""
     from projservo_cli import exports
-    from projservo_cli.calibration.kinematic_errors import kinematic_errors, length_error
+    from projservo_cli.calibration.kinematic_errors import kinematic_errors
     from projservo_cli.config import load_config
     from projservo_cli.files import text_of
     from projservo_cli.results import ImageModel
@@ -178,13 +178,10 @@ def _in_metres(
     words: list[str] = []
     if nominal is not None:
         model = urdf_axes(str(nominal), tip, text_of(nominal, "a URDF", _MAX_BYTES))
-        errors, (share, share_std) = kinematic_errors(metric, model), length_error(metric, model)
-        value["nominal"] = [error._asdict() for error in errors]
-        value |= {"length_error": share, "length_error_std": share_std}
-        words += [
-            *exports.length_words(share, share_std),
-            *exports.kinematic_words(errors, metric.joint_types),
-        ]
+        errors = kinematic_errors(metric, model)
+        value["nominal"] = [error._asdict() for error in errors.joints]
+        value |= {"length_error": errors.length, "length_error_std": errors.length_std}
+        words += exports.kinematic_words(errors, metric.joint_types)
     if to == "opencv":
         found = exports.opencv_cameras(metric)
         value |= {"delta_chi2": found.delta_chi2, "lens_rms_px": found.lens_rms_px}

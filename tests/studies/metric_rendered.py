@@ -66,7 +66,7 @@ def study(name, seed):
     a, b = 0, int(np.argmax(np.linalg.norm(M[:, :3] - M[0, :3], axis=1)))
     ends = (int(c.marker[a]), int(c.marker[b]))
     m = c.metric(float(np.linalg.norm(M[a, :3] - M[b, :3])), ends)
-    found = [e.zero for e in kinematic_errors(m, model)]
+    found = [e.zero for e in kinematic_errors(m, model).joints]
     zeros = np.degrees([found[i] - ZEROS[i] for i in (2, 4)])
     columns = [observation.marker.tolist().index(number) for number in c.marker.tolist()]
     images = observation.images[:, :, columns]

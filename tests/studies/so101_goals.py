@@ -40,7 +40,7 @@ def goals(truth, count):
 
 
 def said(words):
-    """Exit code of a command, and the last line that it printed."""
+    """Exit code of a command, and the end of what it printed."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
         code = run(words)
