@@ -17,7 +17,7 @@ def group_of(found: Explanation) -> tuple[str, int]:
     return kind, which
 
 
-def is_slight(angles: FloatArray) -> bool:
+def is_slight(angles: FloatArray | float) -> bool:
     """Whether angles, rad, are such as a link flexes by under its load."""
     return bool(np.abs(angles).max() <= _FLEXIBLE)
 
@@ -89,5 +89,5 @@ def _slipped(i: int, amount: float, calibration: Calibration) -> str:
     far = f"{1e3 * amount:.2g} mm" if slides else f"{np.degrees(amount):.2g} deg"
     alike = " or the base turned likewise" if i == 0 else ""
     alike += " or the tool turned likewise in its holder" if i == len(calibration.H_hat_0) - 1 else ""
-    alike += " or its link flexes" if not slides and is_slight(np.array([amount])) else ""
+    alike += " or its link flexes" if not slides and is_slight(amount) else ""
     return f"joint {i + 1} slipped by {far}{alike}; home it again, or recalibrate"
