@@ -107,7 +107,7 @@ class ImageModel(Displayable, Calibration):
         if not return_std:
             return pixels[0] if single else pixels
         if not self.has_covariance or not self.sqrt_cov_shared.size:
-            raise InputError(f"return_std: the method {self.method} has no covariance; use bundle_adjustment")
+            raise InputError(f"return_std: the method {self.method} has no covariance: use bundle_adjustment")
         sigma = np.sqrt(prediction_variance(self, rows))
         return (pixels[0], sigma[0]) if single else (pixels, sigma)
 
@@ -193,7 +193,7 @@ class ImageModel(Displayable, Calibration):
             or the method has no covariance.
         """
         if not self.has_covariance or not self.sqrt_cov_shared.size:
-            raise InputError(f"metric: the method {self.method} has no covariance; use bundle_adjustment")
+            raise InputError(f"metric: the method {self.method} has no covariance: use bundle_adjustment")
         return Metric.of(
             self,
             error_factor(self),

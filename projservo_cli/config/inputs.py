@@ -253,15 +253,15 @@ def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
     """Return the inputs of a report: the whole configuration, which its page prints, and the extra runs."""
     files = files_of(config) if files is None else files
     about, trajectory = about_of(config, files.values()), trajectory_of(config)
-    formats = config.report.formats
+    formats, lengths = config.report.formats, _known_lengths(config)
     if not config.has_task:
-        return ReportInputs(about, formats, None, trajectory, _known_lengths(config))
+        return ReportInputs(about, formats, None, trajectory, lengths)
     alone = {
         "control": config.control.model_copy(update={"features": "points"}),
         "trajectory": config.trajectory.model_copy(update={"keep_out": ()}),
     }
     extra = servo_inputs(config.idealized.model_copy(update=alone), files)
-    return ReportInputs(about, formats, extra, trajectory, _known_lengths(config))
+    return ReportInputs(about, formats, extra, trajectory, lengths)
 
 
 def _known_lengths(config: Config) -> KnownLengths:

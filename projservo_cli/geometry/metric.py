@@ -166,9 +166,9 @@ def links(axes: FloatArray, prismatic: BoolArray, like: FloatArray) -> tuple[Flo
     parallel = sine <= _PARALLEL
     angle = np.arctan2((across * _unit(normal)).sum(axis=-1), (d[..., :-1, :] * d[..., 1:, :]).sum(axis=-1))
     way, towards = (np.diff(np.cross(part[..., :3], part[..., 3:]), axis=-2) for part in (axes, like))
+    sign = np.copysign(1.0, (towards * normal).sum(axis=-1))
     # Between parallel axes it lies across both, along the way of those nearby.
     towards = towards - nominal[:-1] * (towards * nominal[:-1]).sum(axis=-1, keepdims=True)
-    sign = np.copysign(1.0, (np.diff(np.cross(like[:, :3], like[:, 3:]), axis=0) * normal).sum(axis=-1))
     common = np.where(parallel[:, None], _unit(towards), sign[:, None] * _unit(across))
     distance = (way * common).sum(axis=-1)
     return angle, np.where(prismatic[:-1] | prismatic[1:], np.nan, distance)

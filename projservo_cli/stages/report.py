@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from projservo_cli import provenance
-from projservo_cli.calibration.prediction import error_factor
 from projservo_cli.files import replacing, require_inside, write_whole
 from projservo_cli.geometry.metric import Metric, Scale
 from projservo_cli.records import Calibration, InputError, Report, Trace, WorkFailed
@@ -30,6 +29,7 @@ from projservo_cli.report.report_data import (
     ReportData,
     Studies,
 )
+from projservo_cli.results import ImageModel
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.given import KnownLengths, ReportInputs, Scenery
 from projservo_cli.stages.scenario import plant_of
@@ -79,13 +79,11 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
         )
     report_data = replace(report_data, metric=metric, no_metric=no_metric)
     figures = draw_all(report_data, directory, inputs.formats, left_out, progress)
-    observed = report_data.observation.q
-    poses = None if metric is None else chosen_poses(metric, observed, run.calibration.q_reference)
     report = Report(
         figures=tuple(figures),
         omitted=tuple(left_out),
         claims=tuple(claims),
-        metric=() if metric is None or poses is None else tuple(metric_rows(metric, poses)),
+        metric=() if metric is None else tuple(metric_rows(metric, chosen_poses(metric, report_data))),
         step_limit_deg=STEP_LIMIT_DEG,
         share=share,
         composition_mm=1e3 * distance,
@@ -114,11 +112,8 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
         length_m, between = float(apart[i, j]), (known.numbers[at[i]], known.numbers[at[j]])
     elif not calibration.prismatic.any():
         return None, "no length on the tool is known: set markers.positions_m or markers.tag_size_m"
-    if not calibration.has_covariance or not calibration.sqrt_cov_shared.size:
-        return None, f"the method {calibration.method} has no covariance: use bundle_adjustment"
-    factor, face = error_factor(calibration), known.face or None
     try:
-        return Metric.of(calibration, factor, length_m=length_m, between=between, face=face), ""
+        return ImageModel.of(calibration).metric(length_m, between, face=known.face or None), ""
     except InputError as error:
         return None, str(error)
 

@@ -7,6 +7,7 @@ from scipy.stats import chi2
 from projservo_cli.config.inputs import report_inputs
 from projservo_cli.geometry.metric import links
 from projservo_cli.report.figures.metric import chosen_poses, metric_rows
+from projservo_cli.report.report_data import Fit
 from projservo_cli.stages.report import in_metres
 from tests.configured import calibrate, truth_of
 from tests.known import configured
@@ -24,7 +25,7 @@ def test_rows_agree_with_the_data_sheet_within_their_deviations(calibrated):
     config, observation, calibration, lengths = calibrated
     metric, why = in_metres(calibration, lengths)
     assert why == ""
-    q = chosen_poses(metric, observation.q, calibration.q_reference)
+    q = chosen_poses(metric, Fit(calibration, observation))
     assert len(np.unique(q, axis=0)) == 5
     rows = {row["quantity"]: row for row in metric_rows(metric, q)}
     # Angles and lengths of a UR5, of its maker; the distance of the cameras as configured.

@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.geometry.metric import Metric, links
-from projservo_cli.geometry.rigid import exponentials, twists
-from projservo_cli.records import MM, PRISMATIC, REVOLUTE, VIEWS, FloatArray
+from projservo_cli.geometry.rigid import twists
+from projservo_cli.records import MM, VIEWS, FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.figures.scene import ROBOT, pyramids, rectangle, show, skeleton, space
 from projservo_cli.report.report_data import Data, Fit, registered
@@ -17,10 +18,11 @@ _SHOWN = 0.05  # size of the ellipsoids as they are drawn, over the distance of 
 _ELLIPSOID: style.LineStyle = {"color": style.VERMILION, "linewidth": 0.8}
 
 
-def chosen_poses(metric: Metric, q: FloatArray, q_reference: FloatArray) -> FloatArray:
-    """Five readings (5, n) of those in the data (K, n): nearest to the reference, then the farthest tools."""
+def chosen_poses(metric: Metric, fit: Fit) -> FloatArray:
+    """Five readings (5, n) of those in the data: nearest to the reference, then the farthest tools."""
+    q = fit.observation.q
     positions = metric.pose(q)[:, :3, 3]
-    chosen = [int(np.argmin(np.abs(q - q_reference).sum(axis=1)))]
+    chosen = [int(np.argmin(np.abs(q - fit.calibration.q_reference).sum(axis=1)))]
     while len(chosen) < min(_POSES, len(q)):
         away = np.linalg.norm(positions[:, None] - positions[chosen], axis=2).min(axis=1)
         chosen.append(int(np.argmax(away)))
@@ -55,18 +57,15 @@ def metric_rows(metric: Metric, q: FloatArray) -> list[dict[str, Any]]:
     row("distance of the cameras", MM * distance, MM * between[:, None], "mm")
     axes, prismatic = metric.axes, metric.prismatic
     angle, length = links(axes, prismatic, axes)
-    angles, lengths = (
-        metric.changes(lambda body, k=k: links(body.axes, prismatic, axes)[k])  # type: ignore[misc]
-        for k in (0, 1)
-    )
+    changes = metric.changes(lambda body: np.stack(links(body.axes, prismatic, axes), axis=-1))
     for i in range(len(angle)):
         name = f"joint {i + 2}, axis from that of joint {i + 1}"
-        row(f"{name}, angle", np.degrees(angle[i]), np.degrees(angles[:, i : i + 1]), "°")
+        row(f"{name}, angle", np.degrees(angle[i]), np.degrees(changes[:, i, :1]), "°")
         if np.isfinite(length[i]):
-            row(f"{name}, distance", MM * length[i], MM * lengths[:, i : i + 1], "mm")
+            row(f"{name}, distance", MM * length[i], MM * changes[:, i, 1:], "mm")
+    of_tools = metric.point_changes(q, np.zeros(3))
     for k, T in enumerate(metric.pose(q)):
-        changes = metric.point_changes(q[k : k + 1], np.zeros(3))[:, 0]
-        row(f"tool at pose {k + 1}", MM * T[:3, 3], MM * changes, "mm")
+        row(f"tool at pose {k + 1}", MM * T[:3, 3], MM * of_tools[:, k], "mm")
     return rows
 
 
@@ -74,12 +73,11 @@ def _data(report_data: Fit) -> Data:
     """Arm at the first of five poses, cameras, and 95 % regions of the tool at all of them, m."""
     metric = report_data.metric
     assert metric is not None
-    q = chosen_poses(metric, report_data.observation.q, report_data.calibration.q_reference)
+    q = chosen_poses(metric, report_data)
     tools = metric.pose(q)[:, :3, 3]
-    H = twists(metric.axes)
-    before = np.concatenate([np.eye(4)[None], exponentials(metric.axes, metric.prismatic, q[0])])
-    G = np.stack([np.linalg.multi_dot([np.eye(4), *before[: i + 1]]) for i in range(len(H))])
-    kinds = np.where(metric.prismatic, PRISMATIC, REVOLUTE)
+    arm = report_data.calibration.model()._replace(
+        H_hat_0=twists(metric.axes), q_reference=np.zeros(q.shape[1])
+    )
     seen = report_data.observation.images
     low, high = np.nanmin(seen, axis=(0, 2)), np.nanmax(seen, axis=(0, 2))
     spread, axes = np.linalg.eigh(metric.pose_covariance(q)[:, 3:, 3:])
@@ -92,7 +90,7 @@ def _data(report_data: Fit) -> Data:
         "position_std_mm": metric.position_std(q),
         "semi_axes": semi_axes,
         "factor": np.array(style.magnification(float(radius.max()), _SHOWN * extent)),
-        "robot": skeleton(G @ H @ np.linalg.inv(G), kinds, tools[0]),
+        "robot": skeleton(joint_operators(arm, q[0]), arm.joint_types, tools[0]),
         "pyramids": pyramids(metric.body.P, rectangle(low, high), tools),
     }
 
