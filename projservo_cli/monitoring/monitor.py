@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
+from projservo_cli.calibration.prediction import predict
 from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
@@ -27,7 +28,7 @@ from projservo_cli.monitoring.statistics import (
     columns_of_marker,
     is_same_view,
 )
-from projservo_cli.records import VIEWS, BoolArray, Calibration, FloatArray, IntArray
+from projservo_cli.records import CORNERS, VIEWS, BoolArray, Calibration, FloatArray, IntArray
 
 # Markers that are tested, at most.
 _MOST_TESTED = 40
@@ -427,6 +428,9 @@ def detected_fault(
 ) -> str:
     """Return what changed since the calibration, by images of one posture at rest; empty for nothing.
 
+    One tag that is off by itself by less than ``_LEAST_MOVED_PX`` is no change: one view of the tool does not
+    tell a tag that moved from one that is bent, or under a slant.
+
     q : (n,) joint readings there, rad or m; images : (2, b, 2) pixels of the markers with the numbers
     marker (b,), NaN where unseen, those that the calibration does not know among them; image_size : (2,) px.
     """
@@ -435,10 +439,37 @@ def detected_fault(
     known = np.isin(marker, calibration.marker)
     pixels = np.full((2, len(calibration.marker), 2), np.nan)
     pixels[:, calibration.indices_of(marker[known])] = images[:, known]
-    monitor = ImageMonitor(calibration, calibration.sigma_px, _SINGLE, image_size=image_size)
-    rest, instants = np.zeros((2, len(q))), np.zeros(2)
-    monitor.observe(instants, np.stack([q, q]), rest, instants, pixels, np.ones(2, dtype=np.bool_))
-    return monitor.give_up()
+    rest, instants, new = np.zeros((2, len(q))), np.zeros(2), np.ones(2, dtype=np.bool_)
+
+    def fault_of(pixels: FloatArray) -> str:
+        monitor = ImageMonitor(calibration, calibration.sigma_px, _SINGLE, image_size=image_size)
+        monitor.observe(instants, np.stack([q, q]), rest, instants, pixels, new)
+        return monitor.give_up()
+
+    fault = fault_of(pixels)
+    if not fault:
+        return ""
+    tag = _off_alone(pixels - predict(calibration, q[None])[0], calibration.marker)
+    return fault if fault_of(np.where(tag[:, None], np.nan, pixels)) else ""
+
+
+def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:
+    """Markers (m,) of the tag that is the farthest off (2, m, 2), px; none where that is far, or most of all.
+
+    Errors of joints move all of them: a tag is off against the median of the others.
+    """
+    seen: BoolArray = np.isfinite(off[..., 0])
+    tags = numbers // CORNERS
+    worst, farthest = np.zeros(len(numbers), dtype=np.bool_), 0.0
+    for tag in np.unique(tags):
+        one = np.isin(tags, tag)
+        if (2 * seen[:, one].sum(axis=1) >= seen.sum(axis=1)).any() or not seen[:, one].any():
+            continue
+        against = off[:, one] - np.nanmedian(off[:, ~one], axis=1, keepdims=True)
+        rms = float(np.sqrt(np.nanmean(np.square(against).sum(axis=-1))))
+        if rms > farthest:
+            worst, farthest = one, rms
+    return worst if farthest < _LEAST_MOVED_PX else np.zeros_like(worst)
 
 
 def _rivals(found: list[Explanation]) -> list[Explanation]:
