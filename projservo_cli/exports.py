@@ -8,11 +8,13 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.calibration.detections import MIN_SIGMA
 from projservo_cli.calibration.kinematic_errors import KinematicErrors
-from projservo_cli.geometry.lens import distort
+from projservo_cli.calibration.prediction import predict
+from projservo_cli.geometry.lens import distort, undistort
 from projservo_cli.geometry.metric import Body, Metric
 from projservo_cli.geometry.rigid import rigid_inverse
-from projservo_cli.records import VIEWS, FloatArray
+from projservo_cli.records import VIEWS, Calibration, FloatArray
 
 # Arrays that move along with the cameras.
 _MOVED = ("lens", "poses", "axes", "tool", "markers")
@@ -27,8 +29,14 @@ class OpenCV(NamedTuple):
 
     body: Body  # without lenses
     distortion: FloatArray  # (2, 5) k1, k2, p1, p2, k3
-    delta_chi2: float  # increase of the squared residuals over the squared noise, for no skew
+    skew_chi2: float  # increase of the squared residuals over the squared noise, for no skew
+    lens_chi2: float  # the same for its lens, all else as it is
     lens_rms_px: float  # difference between both lenses where markers were seen, px
+
+    @property
+    def delta_chi2(self) -> float:
+        """Increase of the squared residuals over the squared noise, px²/px², at most."""
+        return self.skew_chi2 + self.lens_chi2
 
     def pixels(self, points: FloatArray) -> FloatArray:
         """Pixels (K, 2, 2) of points (K, 3) of the base frame, by view."""
@@ -38,11 +46,13 @@ class OpenCV(NamedTuple):
         return np.asarray(straight + distorted[..., 0].reshape(straight.shape) * focal)
 
 
-def opencv_cameras(metric: Metric) -> OpenCV:
+def opencv_cameras(metric: Metric, calibration: Calibration) -> OpenCV:
     """Return the maximum-likelihood robot and rig with cameras without skew, and OpenCV's lens.
 
-    All else moves along by the covariance. The lens is fitted to the calibrated one over its radius, within
-    which markers were seen; its two terms of tangential distortion carry it to the principal point.
+    All else moves along by the covariance. The lens is fitted to the calibrated one where markers were seen;
+    its two terms of tangential distortion carry it to the principal point.
+
+    calibration : that of the metric; one that kept no detections has a lens fitted over its radius.
     """
     K, of_K = metric.K, metric.deviations("K")
     skew = of_K[..., 1]
@@ -59,8 +69,27 @@ def opencv_cameras(metric: Metric) -> OpenCV:
     tool = _shifted(metric.body.tool, change["tool"][0])
     straight = lens * [1.0, 1.0, 1.0, 0.0, 0.0]
     body = Body(K @ rigid_inverse(rigs)[:, :3], straight, axes, tool, metric.markers + change["markers"])
-    coefficients, rms = zip(*(_fitted_lens(K[v], lens[v]) for v in (0, 1)), strict=True)
-    return OpenCV(body, np.array(coefficients), float(e @ e), float(np.sqrt(np.mean(np.square(rms)))))
+    seen = _straight_detections(calibration)
+    coefficients, off = zip(*(_fitted_lens(K[v], lens[v], seen[v]) for v in (0, 1)), strict=True)
+    mean = float(np.concatenate(off).mean())  # px², of a detection
+    count = 0.5 * calibration.dof
+    return OpenCV(
+        body=body,
+        distortion=np.array(coefficients),
+        skew_chi2=float(e @ e),
+        lens_chi2=count * mean / max(metric.sigma_px, MIN_SIGMA) ** 2,
+        lens_rms_px=float(np.sqrt(mean)),
+    )
+
+
+def _straight_detections(calibration: Calibration) -> list[FloatArray]:
+    """Undistorted pixels (k, 2) of the detections of each view, as predicted; (0, 2) where none are kept."""
+    if calibration.corner_q is None or calibration.corner_squares is None or calibration.lens is None:
+        return [np.zeros((0, 2))] * 2
+    seen = np.isfinite(calibration.corner_squares).swapaxes(0, 1).reshape(2, -1)
+    pixels = predict(calibration, calibration.corner_q).swapaxes(0, 1).reshape(2, -1, 2)
+    straight = undistort(calibration.lens, np.ascontiguousarray(pixels))
+    return [straight[v, seen[v]] for v in (0, 1)]
 
 
 def _normalized(K: FloatArray, pixels: FloatArray) -> FloatArray:
@@ -78,19 +107,23 @@ def _terms(x: FloatArray) -> FloatArray:
     return np.stack([*radial[:2], p1, p2, radial[2]], axis=-1)
 
 
-def _fitted_lens(K: FloatArray, lens: FloatArray) -> tuple[FloatArray, float]:
-    """Coefficients (5,) of OpenCV's lens nearest to a lens (5,), and the difference that is left, rms px."""
+def _fitted_lens(K: FloatArray, lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (5,) of OpenCV's lens nearest to a lens (5,), and squares (k,) of what is left, px².
+
+    pixels : (k, 2) undistorted, at which it is fitted; without any, the disk within the radius of the lens.
+    """
     if not lens[3:].any():
-        return np.zeros(5), 0.0
-    radius, angle = np.meshgrid(np.linspace(0.1, 1.0, 10), np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False))
-    pixels = lens[:2] + lens[2] * (radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
-    pixels = pixels.reshape(-1, 2)
+        return np.zeros(5), np.zeros(1)
+    if not len(pixels):
+        disk = np.meshgrid(np.linspace(0.1, 1.0, 10), np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False))
+        radius, angle = (part.reshape(-1, 1) for part in disk)
+        pixels = lens[:2] + lens[2] * radius * np.hstack([np.cos(angle), np.sin(angle)])
     focal = np.diag(K)[:2]
     A = (_terms(_normalized(K, pixels)) * focal[:, None]).reshape(-1, 5)
     target = (distort(lens, pixels) - pixels).ravel()
     scale = np.linalg.norm(A, axis=0)
     found = np.linalg.lstsq(A / scale, target)[0] / scale
-    return found, float(np.sqrt(2.0 * np.mean((A @ found - target) ** 2)))
+    return found, np.square(A @ found - target).reshape(-1, 2).sum(axis=1)
 
 
 def _shifted(T: FloatArray, change: FloatArray) -> FloatArray:

@@ -183,10 +183,11 @@ def _in_metres(
         value |= {"length_error": errors.length, "length_error_std": errors.length_std}
         words += exports.kinematic_words(errors, metric.joint_types)
     if to == "opencv":
-        found = exports.opencv_cameras(metric)
+        found = exports.opencv_cameras(metric, calibration)
         value |= {"delta_chi2": found.delta_chi2, "lens_rms_px": found.lens_rms_px}
-        lens = f", OpenCV's lens {found.lens_rms_px:.2g} px" if calibration.lens is not None else ""
-        words.insert(0, f"cameras without skew cost Δχ² {found.delta_chi2:.3g} (2 on average){lens}")
+        words.insert(0, f"cameras without skew cost Δχ² {found.skew_chi2:.3g} (2 on average)")
+        if calibration.lens is not None:
+            words[0] += f", OpenCV's lens {found.lens_chi2:.2g} ({found.lens_rms_px:.2g} px rms)"
         return exports.opencv_yaml(found, config.image_size_px), value, words
     if to == "urdf":
         names = [name or f"joint_{i}" for i, name in enumerate(config.joint_names, 1)]
