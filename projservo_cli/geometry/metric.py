@@ -33,6 +33,8 @@ _PROBE = 1e-4
 _PARALLEL = 0.05
 # Relative deviation of the invariant form above which the data do not determine it.
 _UNDETERMINED = 0.3
+# Relative difference of the sides of a square tag, as noise leaves it on small ones, at most.
+_UNEQUAL_SIDES = 0.15
 # Singular value of the invariance, over the largest, below which a second form is invariant too.
 _SECOND_FORM = 1e-6
 _ALL_PARALLEL = (
@@ -295,11 +297,32 @@ def _length_of(body: Body, between: Scale, marker: list[int], prismatic: BoolArr
         raise InputError(f"metric: between {between!r}: give two markers, tags, cameras or joint")
     else:
         sides = [(int(between[0]), int(between[1]))]
-        if unknown := [number for number in sides[0] if number not in marker]:
-            raise InputError(f"metric: marker {unknown[0]} is not in the calibration; markers: {marker}")
-    ends = np.array([[marker.index(end) for end in side] for side in sides])
+    ends = np.array([_known_indices(side, marker) for side in sides])
     apart = body.markers[..., ends[:, 0], :] - body.markers[..., ends[:, 1], :]
-    return np.asarray(np.linalg.norm(apart, axis=-1).mean(axis=-1))
+    lengths = np.linalg.norm(apart, axis=-1)
+    if between == "tags":
+        _require_squares(lengths[0], sides)
+    return np.asarray(lengths.mean(axis=-1))
+
+
+def _known_indices(numbers: Sequence[int], marker: list[int]) -> list[int]:
+    """Indices of markers by their numbers. Raises InputError for one that the calibration has not."""
+    if unknown := [number for number in numbers if number not in marker]:
+        raise InputError(f"metric: marker {unknown[0]} is not in the calibration; markers: {marker}")
+    return [marker.index(number) for number in numbers]
+
+
+def _require_squares(lengths: FloatArray, sides: Sequence[tuple[int, int]]) -> None:
+    """Refuse sides (4 t,) of tags that are no squares: their markers are numbered like tags, and are none."""
+    by_tag = lengths.reshape(-1, 4)
+    unequal = by_tag.max(axis=1) / by_tag.min(axis=1) - 1.0
+    worst = int(np.argmax(unequal))
+    if unequal[worst] > _UNEQUAL_SIDES:
+        first = sides[4 * worst][0]
+        raise InputError(
+            f"metric: markers {first} to {first + 3} are no tag: their sides differ by "
+            f"{100.0 * unequal[worst]:.3g} %, more than {100.0 * _UNEQUAL_SIDES:g} %; name two markers"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,6 +351,11 @@ class Metric:
         face: Sequence[int] | None = None,
     ) -> "Metric":
         """Upgrade a calibration, by the factor of its covariance; the rest as for ``ImageModel.metric``."""
+        if between == "joint" and length_m is not None:
+            raise InputError(
+                f"metric: length_m {length_m!r} without its ends: name them, such as two markers; a prismatic "
+                "joint sets the scale by its readings, and takes no length"
+            )
         length = (1.0 if between == "joint" else math.nan) if length_m is None else float(length_m)
         if not 0.0 < length < np.inf or not 0.0 <= length_std_m < np.inf:
             raise InputError(
@@ -335,7 +363,7 @@ class Metric:
                 "and a deviation that is not negative"
             )
         marker = c.marker.tolist()
-        chosen = range(len(marker)) if face is None else c.indices_of([n for n in face if n in marker])
+        chosen = range(len(marker)) if face is None else _known_indices(face, marker)
         lens = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2) if c.lens is None else c.lens
         models = _Projective.around(c, lens, factor)
         try:
@@ -414,27 +442,30 @@ class Metric:
         return MM * np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
 
     def triangulate(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Points (…, 3) of the base frame, m, by raw pixels (2, …, 2) of both views.
+        """Points (…, m, 3) of the base frame, m, by raw pixels (…, 2, m, 2), views left and right.
 
-        Raises InputError for pixels of another shape, WorkFailed if two rays determine no finite point.
+        NaN where a view has no pixels. Raises InputError for pixels of another shape, WorkFailed if two rays
+        determine no finite point.
         """
-        s = self._pixels(pixels)
-        straight = undistort(self.body.lens, s.reshape(2, -1, 2))
-        points = triangulate_points(self.body.P, np.array([0.0, 0.0, 0.0, 1.0]), straight)
-        return points[:, :3].reshape(*s.shape[1:-1], 3)
+        s, seen, shape = self._pixels(pixels)
+        points = np.full((len(seen), 3), np.nan)
+        a_inf = np.array([0.0, 0.0, 0.0, 1.0])
+        points[seen] = triangulate_points(self.body.P, a_inf, undistort(self.body.lens, s))[:, :3]
+        return points.reshape(*shape, 3)
 
     def triangulation_covariance(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Covariances (…, 3, 3) of triangulated points, m², with the noise of their pixels."""
-        s = self._pixels(pixels)
-        X = self.triangulate(s).reshape(-1, 3)
+        """Covariances (…, m, 3, 3) of triangulated points, m², with the noise of their pixels."""
+        _, seen, shape = self._pixels(pixels)
+        X = self.triangulate(pixels).reshape(-1, 3)[seen]
         step = _PROBE * np.linalg.norm(self.poses[0, :3, 3] - X, axis=1)[:, None]
         moves = [self.body.pixels(X + step * e) - self.body.pixels(X - step * e) for e in np.eye(3)]
         J = np.moveaxis(np.stack(moves).reshape(3, len(X), 4) / (2.0 * step), 0, -1)
         pinv = np.linalg.pinv(J)
         moved = self.changes(lambda body: body.pixels(np.broadcast_to(X, (len(body.P), *X.shape))))
         of = np.einsum("kij,ckj->cki", pinv, moved.reshape(len(moved), len(X), 4))
-        C = _covariances(of) + self.sigma_px**2 * (pinv @ pinv.swapaxes(-1, -2))
-        return np.asarray(C.reshape(*s.shape[1:-1], 3, 3))
+        C = np.full((len(seen), 3, 3), np.nan)
+        C[seen] = _covariances(of) + self.sigma_px**2 * (pinv @ pinv.swapaxes(-1, -2))
+        return C.reshape(*shape, 3, 3)
 
     def covariance(self, name: str) -> FloatArray:
         """Covariance of an array: K, lens, poses, axes, markers or tool.
@@ -491,11 +522,15 @@ class Metric:
         return readings
 
     @staticmethod
-    def _pixels(pixels: npt.ArrayLike) -> FloatArray:
+    def _pixels(pixels: npt.ArrayLike) -> tuple[FloatArray, BoolArray, tuple[int, ...]]:
+        """Pixels (2, s, 2) of points that both views show, which of all (N,) they are, and all's shape."""
         s = np.asarray(pixels, dtype=np.float64)
-        if s.ndim < 2 or s.shape[0] != 2 or s.shape[-1] != 2:
-            raise InputError(f"pixels of shape {s.shape}: expected (2, …, 2), left and right")
-        return s
+        if s.ndim < 3 or s.shape[-3] != 2 or s.shape[-1] != 2:
+            raise InputError(f"pixels of shape {s.shape}: expected (…, 2, m, 2), left and right view")
+        views = np.moveaxis(s, -3, 0)
+        flat = np.ascontiguousarray(views.reshape(2, -1, 2))
+        seen: BoolArray = np.isfinite(flat[0, :, 0]) & np.isfinite(flat[1, :, 0])
+        return flat[:, seen], seen, views.shape[1:-1]
 
 
 def _covariances(changes: FloatArray) -> FloatArray:

@@ -112,8 +112,9 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
         length_m, between = float(apart[i, j]), (known.numbers[at[i]], known.numbers[at[j]])
     elif not calibration.prismatic.any():
         return None, "no length on the tool is known: set markers.positions_m or markers.tag_size_m"
+    face = [number for number in known.face if number in calibration.marker]
     try:
-        return ImageModel.of(calibration).metric(length_m, between, face=known.face or None), ""
+        return ImageModel.of(calibration).metric(length_m, between, face=face or None), ""
     except InputError as error:
         return None, str(error)
 

@@ -85,11 +85,18 @@ def test_points_are_triangulated_where_the_arm_puts_them(frame):
     arm = robot(ELBOW, "RRRR")
     m = calibrated(arm, frame).metric(0.3, "cameras")
     q = np.array([[0.2, 0.1, -0.3, 0.4], [-0.1, 0.2, 0.1, -0.5]])
-    s = np.moveaxis(arm.images(q), 1, 0)
+    s = arm.images(q)
     T = m.pose(q)
     expected = np.einsum("kij,mj->kmi", T[:, :3, :3], m.markers) + T[:, None, :3, 3]
     np.testing.assert_allclose(m.triangulate(s), expected, atol=1e-9)
+    np.testing.assert_allclose(m.triangulate(s[1]), expected[1], atol=1e-9)
     assert m.triangulation_covariance(s).shape == (2, 4, 3, 3)
+    s[0, 1, 2] = np.nan  # unseen on the right
+    expected[0, 2] = np.nan
+    np.testing.assert_allclose(m.triangulate(s), expected, atol=1e-9)
+    assert np.isnan(m.triangulation_covariance(s)).all(axis=(2, 3)).sum() == 1
+    with pytest.raises(InputError, match="left and right view"):
+        m.triangulate(s[:, :1])
 
 
 def test_a_prismatic_joint_has_the_scale(frame):
@@ -121,12 +128,24 @@ MIRROR = np.diag([-1.0, 1.0, 1.0])
         (robot(ELBOW, "RRRR"), (0.1, (10, 10)), "give two markers"),
         (robot(ELBOW, "RRRR"), (), "no joint is prismatic"),
         (robot(ELBOW, "RRRR"), (0.06, "tags"), "no tag has all its corners"),
+        (robot((prismatic(Z), *ELBOW[1:]), "PRRR"), (0.3,), "0.3 without its ends"),
     ],
 )
 def test_what_has_no_metric_says_so(arm, known, said, frame):
     with pytest.raises(InputError, match=said) as error:
         calibrated(arm, frame).metric(*known)
     assert "\n" not in str(error.value)
+
+
+def test_markers_that_are_numbered_like_a_tag_are_none(frame):
+    c = dataclasses.replace(calibrated(robot(ELBOW, "RRRR"), frame), marker=np.arange(4))
+    with pytest.raises(InputError, match="markers 0 to 3 are no tag: their sides differ by"):
+        c.metric(0.06, "tags")
+
+
+def test_an_unknown_marker_of_the_face_is_named(frame):
+    with pytest.raises(InputError, match="marker 99 is not in the calibration"):
+        calibrated(robot(ELBOW, "RRRR"), frame).metric(0.3, "cameras", face=[0, 10, 20, 99])
 
 
 def test_two_axes_that_noise_alone_makes_skew_have_no_metric():
