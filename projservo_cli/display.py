@@ -15,11 +15,8 @@ _WIDTH = 100  # maximum length of a line, characters
 _TWO_TURNS = 4.0 * np.pi  # rad; no joint of an arm with stops turns that far from its zero
 
 
-class Displayable:
-    """Mixin that gives a record a short text, a table for notebooks, and labelled arrays.
-
-    A subclass has ``summary``, and is a dataclass derived from its record too.
-    """
+class Printed:
+    """Mixin that gives an object a short text, and a table for notebooks. A subclass has ``summary``."""
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name: eleven entries at most."""
@@ -37,6 +34,13 @@ class Displayable:
             f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in self.summary().items()
         )
         return f"<table><caption>{type(self).__name__}</caption>{''.join(rows)}</table>"
+
+
+class Displayable(Printed):
+    """Mixin that gives a record labelled arrays too.
+
+    A subclass is a dataclass derived from its record.
+    """
 
     def to_xarray(self) -> Any:
         """Return all arrays and scalars as a Dataset, as in the run file, with coordinates.

@@ -20,6 +20,8 @@ from projservo_cli.records import VIEWS, Calibration, FloatArray
 _MOVED = ("lens", "poses", "axes", "tool", "markers")
 # Deviations beyond which the links of a model contradict the known length.
 _CONTRADICTED = 4.0
+# Deviation of an axis that rounding leaves, m.
+_ROUNDING = 1e-9
 # Limits of a URDF joint that no calibration knows: N m or N, and rad/s or m/s.
 _EFFORT, _SPEED = 100.0, 1.0
 
@@ -172,10 +174,10 @@ def _points(metric: Metric) -> FloatArray:
     return np.array(points)
 
 
-def urdf(metric: Metric, names: Sequence[str]) -> str:
-    """The arm, its tool and both cameras as a URDF.
+def urdf(metric: Metric, names: Sequence[str], limits: FloatArray) -> str:
+    """The arm, its tool and both cameras as a URDF, with limits (n, 2) of its joints, rad or m.
 
-    All link frames are parallel to the base at readings of zero. Limits of joints are the readings found.
+    All link frames are parallel to the base at readings of zero.
     """
     places, prismatic = _points(metric), metric.prismatic
     links = ["base_link", *(f"link_{i + 1}" for i in range(len(places))), "tool"]
@@ -187,7 +189,7 @@ def urdf(metric: Metric, names: Sequence[str]) -> str:
     last = np.zeros(3)
     for i, (place, screw) in enumerate(zip(places, metric.axes, strict=True)):
         kind, axis = ("prismatic", screw[3:]) if prismatic[i] else ("revolute", screw[:3])
-        low, high = metric.range[i].tolist()
+        axis, (low, high) = axis / np.linalg.norm(axis), limits[i].tolist()
         lines += [
             f'  <joint name={quoteattr(names[i])} type="{kind}">',
             f'    <parent link="{links[i]}"/><child link="{links[i + 1]}"/>',
@@ -238,6 +240,20 @@ def metric_object(metric: Metric) -> dict[str, Any]:
 def to_json(metric: Metric, more: Mapping[str, Any]) -> str:
     """The metric as JSON."""
     return json.dumps({**metric_object(metric), **more}, indent=1, allow_nan=False) + "\n"
+
+
+def reading_words(metric: Metric) -> Iterator[str]:
+    """Yield the prismatic joints whose readings contradict the known length."""
+    of_axes = metric.deviations("axes")
+    for i in np.flatnonzero(metric.prismatic):
+        v = metric.axes[i, 3:]
+        size = float(np.linalg.norm(v))
+        std = float(np.linalg.norm(of_axes[:, i, 3:] @ v)) / size
+        if abs(size - 1.0) > _CONTRADICTED * max(std, _ROUNDING):
+            yield (
+                f"joint {i + 1} moves {size:.4g} ± {std:.1g} m for each m of its readings: check the known "
+                "length"
+            )
 
 
 def kinematic_words(errors: KinematicErrors, joint_types: str) -> Iterator[str]:

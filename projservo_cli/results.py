@@ -3,17 +3,22 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple, Self, overload
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Self, cast, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration import predict, prediction_variance, residual_statistics
+from projservo_cli.calibration.kinematic_errors import KinematicErrors, in_model_frames, kinematic_errors
 from projservo_cli.calibration.prediction import error_factor, joint_derivative
-from projservo_cli.display import Displayable, require_radians
+from projservo_cli.display import Displayable, Printed, require_radians
+from projservo_cli.files import text_of
 from projservo_cli.geometry.kinematics import project as pixels_of
-from projservo_cli.geometry.metric import Metric, Scale
+from projservo_cli.geometry.metric import Metric, Scale, links
 from projservo_cli.records import (
+    MM,
+    VIEWS,
     Calibration,
     CrossValidation,
     FloatArray,
@@ -24,9 +29,11 @@ from projservo_cli.records import (
     Plan,
     Trace,
 )
+from projservo_cli.simulation.urdf import UrdfChain, urdf_chain
 from projservo_cli.task.trajectory import Trajectory
 
 _AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
+_MAX_BYTES = 10_000_000  # maximum size of a URDF
 _AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there
 
 
@@ -175,7 +182,7 @@ class ImageModel(Displayable, Calibration):
         *,
         length_std_m: float = 0.0,
         face: Sequence[int] | None = None,
-    ) -> Metric:
+    ) -> "MetricModel":
         """Return cameras, axes and markers in metres, in the base frame of the arm, with covariances.
 
         Parameters
@@ -194,7 +201,7 @@ class ImageModel(Displayable, Calibration):
         """
         if not self.has_covariance or not self.sqrt_cov_shared.size:
             raise InputError(f"metric: the method {self.method} has no covariance: use bundle_adjustment")
-        return Metric.of(
+        return MetricModel.of(
             self,
             error_factor(self),
             length_m=length_m,
@@ -253,6 +260,85 @@ class ImageModel(Displayable, Calibration):
             )
         require_radians("joint readings", readings, self.joint_types)
         return np.atleast_2d(readings), readings.ndim == 1
+
+
+class MetricModel(Printed, Metric):
+    """A calibration in metres, in the base frame of the arm: its arrays, and functions with covariances.
+
+    Arrays: ``K`` (2, 3, 3) intrinsic matrices, px; ``lens`` (2, 5) centre u, v and radius, px, then k1, k2;
+    ``poses`` (2, 4, 4) of both cameras in the base, z forward and y down, m; ``axes`` (n, 6) screws of the
+    joints at readings of zero, w rad and v m, per rad or m; ``markers`` (m, 3) in the tool frame, m. Of each
+    ``covariance`` (name).
+
+    The base frame has z along joint 1 and x along z × the direction of the first joint that is not parallel
+    to it, at readings of zero; its origin is on the first revolute axis, at its common normal with the first
+    revolute one that is not parallel. The tool frame has its origin at the mean of the face, x from its first
+    marker to its second, and z across them and the next that is off their line. ``in_frames_of`` takes those
+    of a model instead. Covariances are those of the calibration, to first order, with those of frames and of
+    the known length.
+    """
+
+    def in_frames_of(self, urdf: str | Path, tip: str | None = None) -> "MetricModel":
+        """Return the same in the base of a model, with the tool in that of a link of it.
+
+        The base is where the model fits the calibrated axes best, after the zeros of its inner joints. Those
+        of the first and the last joint no image knows: they are as in the model.
+
+        Parameters
+        ----------
+        urdf : file of the model.
+        tip : link that carries the tool; by default the last one.
+
+        Raises
+        ------
+        InputError
+            If the file is no URDF, the link is not in it, or its joints are of other types.
+        """
+        chain = _urdf_chain(urdf, tip)
+        return cast(MetricModel, in_model_frames(self, chain.axes, chain.tip))
+
+    def errors_of(self, urdf: str | Path, tip: str | None = None) -> KinematicErrors:
+        """Return the errors of a model: zeros of joints, then axes, each with its standard deviation.
+
+        Parameters
+        ----------
+        urdf, tip : as for ``in_frames_of``.
+
+        Returns
+        -------
+        ``joints``, for each ``joint``, ``zero`` (rad or m to add to readings before the model takes them,
+        None for the first and the last joint), ``offset_m`` and ``tilt_rad`` of its axis; and ``length``, the
+        share by which the known length is too short for the links of the model.
+
+        Raises
+        ------
+        InputError
+            As for ``in_frames_of``.
+        """
+        return kinematic_errors(self, _urdf_chain(urdf, tip).axes)
+
+    def summary(self) -> dict[str, str]:
+        """Return a summary in words, by name."""
+        places, of_poses = self.poses[:, :3, 3], self.covariance("poses")[:, 3:, 3:]
+        focal, of_K = self.K[:, (0, 1), (0, 1)], np.sqrt(self.covariance("K")[:, 0, 0])
+        found = {"joints": self.joint_types, "markers": f"{len(self.marker)}"}
+        for v, view in enumerate(VIEWS):
+            at, std = ", ".join(f"{x:.4g}" for x in places[v]), MM * np.sqrt(np.trace(of_poses[v]))
+            found[f"{view} camera"] = (
+                f"at ({at}) m ± {std:.2g} mm, focal length {focal[v].mean():.5g} ± {of_K[v]:.2g} px"
+            )
+        distances = links(self.axes, self.prismatic, self.axes)[1]
+        found["links"] = ", ".join("–" if np.isnan(d) else f"{d:.4g}" for d in distances) + " m between axes"
+        return found
+
+    def _readings(self, q: npt.ArrayLike) -> FloatArray:
+        readings = super()._readings(q)
+        require_radians("joint readings", readings, self.joint_types)
+        return readings
+
+
+def _urdf_chain(urdf: str | Path, tip: str | None) -> UrdfChain:
+    return urdf_chain(str(urdf), tip, text_of(Path(urdf), "a URDF", _MAX_BYTES))
 
 
 class Scene(NamedTuple):

@@ -12,9 +12,8 @@ from projservo_cli import api, records
 from projservo_cli.config import Config
 from projservo_cli.control.law import Gains
 from projservo_cli.experiment import Experiment
-from projservo_cli.geometry.metric import Metric
 from projservo_cli.observations import Observations
-from projservo_cli.results import ImageModel
+from projservo_cli.results import ImageModel, MetricModel
 from projservo_cli.robots.contract import Robot
 from projservo_cli.stages.servo import LawSetup, PluginLaw
 from projservo_cli.sweeps.study import Study
@@ -27,7 +26,10 @@ INTERFACE: dict[Any, tuple[str, ...]] = {
     api.record: (),
     api.calibrate: (),
     ImageModel: ("predict", "jacobian", "score", "covariance", "metric", "project", "plot"),
-    Metric: (),
+    MetricModel: (
+        *("pose", "pose_covariance", "position_std", "triangulate", "triangulation_covariance"),
+        *("covariance", "in_frames_of", "errors_of"),
+    ),
     api.plan: (),
     api.servo: (),
     api.sweep: (),

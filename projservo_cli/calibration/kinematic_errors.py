@@ -3,14 +3,15 @@
 The zeros of the first and the last joint are gauge: they move base and tool, which no image knows.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.metric import Metric, base_frame, base_joints, directions
-from projservo_cli.geometry.rigid import exponentials, rigid, rigid_inverse, screws, twists
+from projservo_cli.geometry.metric import Body, Metric, base_frame, base_joints, directions
+from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid, rigid_inverse, screws, twists
 from projservo_cli.records import BoolArray, FloatArray, InputError
 
 # Errors of axes that any model has, of machining and assembly, rad and m.
@@ -39,46 +40,67 @@ class KinematicErrors(NamedTuple):
     length_std: float  # its standard deviation, which grows with what the model leaves beyond its own errors
 
 
+class _ModelFit:
+    """Fit of a model's base and inner zeros to the calibrated axes.
+
+    Weighted by the covariance of the axes and by 0.5 mm and 0.5 mrad for the links of any model.
+    Raises InputError if the joint types differ.
+    """
+
+    def __init__(self, metric: Metric, given: FloatArray) -> None:
+        prismatic, n = metric.prismatic, len(metric.joint_types)
+        types = "".join("R" if w.any() else "P" for w in given[:, :3])
+        if types != metric.joint_types:
+            raise InputError(
+                f"the model's joints are {types}, the calibrated ones {metric.joint_types}: choose the link "
+                "of the tool as its tip"
+            )
+        self.given, self.prismatic, self.axes = given, prismatic, metric.axes
+        self._near = metric.pose(np.zeros(n))[:3, 3]
+        self._base = rigid_inverse(base_frame(given, prismatic, base_joints(given, prismatic)))
+        x, change = np.zeros(6 + max(n - 2, 0)), _STEP * metric.deviations("axes")
+        ends = (self.left(x, self.axes + sign * change) for sign in (1, -1))
+        self.E = (np.subtract(*ends) / (2.0 * _STEP)).T  # (6 n, c) by errors of the calibration
+        self.root = np.linalg.inv(np.linalg.cholesky(self.E @ self.E.T + np.diag(np.tile(_LINK_STD**2, n))))
+
+        def weighted(x: FloatArray) -> FloatArray:
+            return np.asarray(self.root @ self.left(x, self.axes))
+
+        fit = least_squares(weighted, x, x_scale="jac")
+        self.x, self.residual, self.J = fit.x, np.asarray(fit.fun), np.asarray(fit.jac)
+        self.pinv = np.linalg.pinv(self.J)
+
+    def left(self, x: FloatArray, found: FloatArray, factor: float = 1.0) -> FloatArray:
+        """Differences (…, 6 n) of axes (…, n, 6) from those of the model, its lengths times a factor."""
+        base, given = self._base.copy(), self.given.copy()
+        base[:3, 3] *= factor
+        given[~self.prismatic, 3:] *= factor
+        model = _moved(_placed(base, x), x, given, self.prismatic)
+        return _differences(found, model, self.prismatic, self._near).reshape(*found.shape[:-2], -1)
+
+    def bases_and_zeros(self, axes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Poses (B, 4, 4) of the model's base and its zeros (B, n) for axes (B, n, 6) near the calibrated."""
+        off = self.left(self.x, axes) - self.left(self.x, self.axes)
+        x = self.x - off @ (self.pinv @ self.root).T
+        zeros = np.zeros((len(x), len(self.given)))
+        zeros[:, 1:-1] = x[:, 6:]
+        return np.array([_placed(self._base, row) for row in x]), zeros
+
+
 def kinematic_errors(metric: Metric, given: FloatArray) -> KinematicErrors:
     """Compare a model with the calibrated arm, joint by joint, and its links with the known length.
 
-    The base and the zeros of the inner joints are fitted first, weighted by the covariance of the axes and by
-    0.5 mm and 0.5 mrad for the links of any model. What remains are errors of axes.
+    The base and the zeros of the inner joints are fitted first. What remains are errors of axes.
 
     metric : of the calibration, in metres.
     given : (n, 6) screws of the model at readings of zero, rad and m.
     Raises InputError if the joint types differ.
     """
-    prismatic, n = metric.prismatic, len(metric.joint_types)
-    types = "".join("R" if w.any() else "P" for w in given[:, :3])
-    if types != metric.joint_types:
-        raise InputError(
-            f"the model's joints are {types}, the calibrated ones {metric.joint_types}: choose the link of "
-            "the tool as its tip"
-        )
-    base = rigid_inverse(base_frame(given, prismatic, base_joints(given, prismatic)))
-    near = metric.pose(np.zeros(n))[:3, 3]
-
-    def left(
-        x: FloatArray, found: FloatArray, base: FloatArray = base, given: FloatArray = given
-    ) -> FloatArray:
-        model = _moved(base, x, given, prismatic)
-        return _differences(found, model, prismatic, near).reshape(*found.shape[:-2], 6 * n)
-
-    x, change = np.zeros(6 + max(n - 2, 0)), _STEP * metric.deviations("axes")
-    E = ((left(x, metric.axes + change) - left(x, metric.axes - change)) / (2.0 * _STEP)).T
-    root = np.linalg.inv(np.linalg.cholesky(E @ E.T + np.diag(np.tile(_LINK_STD**2, n))))
-    axes = metric.axes
-
-    def weighted(x: FloatArray) -> FloatArray:
-        return np.asarray(root @ left(x, axes))
-
-    fit = least_squares(weighted, x, x_scale="jac")
-    J = np.asarray(fit.jac)
-    pinv = np.linalg.pinv(J)
+    fit, n = _ModelFit(metric, given), len(given)
+    J, E, pinv = fit.J, fit.E, fit.pinv
     std = np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))
-    remains = left(fit.x, axes).reshape(n, 2, 3)
-    changed = (E - np.linalg.solve(root, J @ (pinv @ root @ E))).reshape(n, 2, 3, -1)
+    remains = fit.left(fit.x, fit.axes).reshape(n, 2, 3)
+    changed = (E - np.linalg.solve(fit.root, J @ (pinv @ fit.root @ E))).reshape(n, 2, 3, -1)
     size, size_std = np.linalg.norm(remains, axis=2), np.linalg.norm(changed, axis=(2, 3))
     joints = [
         JointError(
@@ -92,19 +114,34 @@ def kinematic_errors(metric: Metric, given: FloatArray) -> KinematicErrors:
         )
         for i in range(n)
     ]
-    ends = (left(fit.x, axes, *_scaled(base, given, prismatic, 1.0 + sign * _STEP)) for sign in (1, -1))
-    by_scale = root @ np.subtract(*ends) / (2.0 * _STEP)
-    return KinematicErrors(joints, *_length_error(np.asarray(fit.fun), J, by_scale - J @ (pinv @ by_scale)))
+    ends = (fit.left(fit.x, fit.axes, 1.0 + sign * _STEP) for sign in (1, -1))
+    by_scale = fit.root @ np.subtract(*ends) / (2.0 * _STEP)
+    return KinematicErrors(joints, *_length_error(fit.residual, J, by_scale - J @ (pinv @ by_scale)))
 
 
-def _scaled(
-    base: FloatArray, given: FloatArray, prismatic: BoolArray, factor: float
-) -> tuple[FloatArray, FloatArray]:
-    """Base (4, 4) and screws (n, 6) of a model whose lengths are multiplied by a factor."""
-    base, given = base.copy(), given.copy()
-    base[:3, 3] *= factor
-    given[~prismatic, 3:] *= factor
-    return base, given
+def in_model_frames(metric: Metric, given: FloatArray, tip: FloatArray) -> Metric:
+    """Express a metric in the base of a model, and its tool in that of the model's tip.
+
+    The base is where it fits the calibrated axes best; the tip is where the model has it, with the zeros that
+    were found. Covariances include those of both.
+
+    given : (n, 6) screws of the model at readings of zero, rad and m; tip : (4, 4) its tip there, m.
+    Raises InputError if the joint types differ.
+    """
+    fit, bodies = _ModelFit(metric, given), metric.bodies
+    base, zeros = fit.bases_and_zeros(bodies.axes)
+    inverse, tips = rigid_inverse(base), np.broadcast_to(np.eye(4), base.shape)
+    moved = exponentials(given[None], metric.prismatic, zeros)
+    for i in range(len(given)):
+        tips = tips @ moved[:, i]
+    tips = tips @ tip
+    axes = screws(inverse[:, None] @ twists(bodies.axes) @ base[:, None])
+    axes[:, metric.prismatic, :3] = 0.0
+    to_tip = rigid_inverse(tips) @ inverse @ bodies.tool
+    markers = (homogeneous(bodies.markers) @ to_tip.swapaxes(-1, -2))[..., :3]
+    return dataclasses.replace(
+        metric, bodies=Body(bodies.P @ base[:, None], bodies.lens, axes, tips, markers)
+    )
 
 
 def _length_error(r: FloatArray, J: FloatArray, across: FloatArray) -> tuple[float, float]:
@@ -119,13 +156,17 @@ def _length_error(r: FloatArray, J: FloatArray, across: FloatArray) -> tuple[flo
     return share, float(np.sqrt(max(1.0, float(beyond @ beyond) / degrees) / information))
 
 
+def _placed(base: FloatArray, x: FloatArray) -> FloatArray:
+    """Base (4, 4) of a model that moves by x[:6]: a rotation vector and a shift."""
+    return rigid(Rotation.from_rotvec(x[:3]), x[3:6]) @ base
+
+
 def _moved(base: FloatArray, x: FloatArray, given: FloatArray, prismatic: BoolArray) -> FloatArray:
-    """Screws (n, 6) of a model whose base moves by x[:6] and whose inner zeros move by the rest."""
+    """Screws (n, 6) of a model at a base (4, 4), whose inner zeros move by x[6:]."""
     n = len(given)
     zeros = np.zeros(n)
     zeros[1 : n - 1] = x[6:]
-    T = rigid(Rotation.from_rotvec(x[:3]), x[3:6]) @ base
-    moved, steps = np.empty_like(given), exponentials(given, prismatic, zeros)
+    T, moved, steps = base, np.empty_like(given), exponentials(given, prismatic, zeros)
     for i in range(n):
         moved[i] = screws(T @ twists(given[i]) @ rigid_inverse(T))
         T = T @ steps[i]

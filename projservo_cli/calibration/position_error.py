@@ -82,8 +82,8 @@ def _jacobian(T: FloatArray, link: _Link) -> FloatArray:
 
 def _held_out(
     metric: Metric, table: Positions, fit: Positions, arm_std_m: float
-) -> tuple[FloatArray, FloatArray]:
-    """Errors (K, 3), m, of positions held out of a fit, and their covariances (K, 3, 3), m²."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Errors (K, 3), m, of positions held out of a fit, covariances (K, 3, 3), m², and its scale (1,)."""
     if len(fit.q) < _MIN_POSITIONS:
         raise InputError(
             f"{len(fit.q)} positions to fit: scale, pose and point need {_MIN_POSITIONS} or more"
@@ -96,7 +96,7 @@ def _held_out(
     left = changes.reshape(len(changes), -1) - of_fit.reshape(len(of_fit), -1) @ carry.T
     both = np.concatenate([left.T, carry * own], axis=1).reshape(len(table.q), 3, -1)
     noise = (table.sigma**2 + arm_std_m**2)[:, None, None] * np.eye(3)
-    return link.positions(T) - table.xyz, both @ both.swapaxes(1, 2) + noise
+    return link.positions(T) - table.xyz, both @ both.swapaxes(1, 2) + noise, np.exp(link.x[:1])
 
 
 def position_errors(
@@ -111,7 +111,8 @@ def position_errors(
         and each is compared after a fit to the others.
     arm_std_m : deviation of the arm that no image shows, m a coordinate.
     Returns ``count, rms_mm, median_mm, max_mm`` of distances; ``predicted_rms_mm`` by the covariance, and
-    ``mahalanobis``, the mean square of errors over it a coordinate.
+    ``mahalanobis``, the mean square of errors over it a coordinate; and ``length_m``, the distance of the
+    markers ``between`` by the fitted scale, which are the farthest apart.
     Raises InputError if there are too few positions, WorkFailed if they do not determine the ten numbers.
     """
     parts = [(np.arange(len(table.q)), fit)]
@@ -124,8 +125,10 @@ def position_errors(
         of = np.arange(len(table.q)) % _PARTS
         parts = [(np.flatnonzero(of == k), table.rows(of != k)) for k in range(min(_PARTS, len(of)))]
     found = [_held_out(metric, table.rows(at), rest, arm_std_m) for at, rest in parts if rest is not None]
-    error, C = (np.concatenate(part) for part in zip(*found, strict=True))
+    error, C, scale = (np.concatenate(part) for part in zip(*found, strict=True))
     distance = MM * np.linalg.norm(error, axis=1)
+    apart = np.linalg.norm(metric.markers[:, None] - metric.markers, axis=-1)
+    i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(apart)), apart.shape))
     square = np.einsum("ki,kij,kj->k", error, np.linalg.inv(C), error)
     return {
         "count": len(distance),
@@ -134,4 +137,6 @@ def position_errors(
         "max_mm": float(distance.max()),
         "predicted_rms_mm": float(MM * np.sqrt(np.trace(C, axis1=1, axis2=2).mean())),
         "mahalanobis": float(square.mean() / 3.0),
+        "between": [metric.marker[i], metric.marker[j]],
+        "length_m": float(scale.mean() * apart[i, j]),
     }

@@ -288,7 +288,13 @@ def _validate(
             "validate: {count} positions",
             "  error mm: rms {rms_mm:.3g}, median {median_mm:.3g}, largest {max_mm:.3g}",
             "  covariance: rms {predicted_rms_mm:.3g} mm, mean squared error over it {mahalanobis:.3g}",
+            "  scale: markers {between[0]} and {between[1]} are {length_m:.5g} m apart by these positions",
         )
+        if value["mahalanobis"] > _FAR:
+            console.say(
+                f"validate: squared errors are {value['mahalanobis']:.3g} times their covariance: are these "
+                "the same robot and joint readings, and x, y, z in m? --arm-std-mm adds errors beyond images"
+            )
         console.report({"run": found.path.resolve(), **value}, [text.format_map(value) for text in lines])
         return
     observation = read_table(data, calibration.joint_types, joint_unit)

@@ -91,7 +91,6 @@ def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: b
     console.report(value, [f"compare: {len(runs)} runs: {output}"])
 
 
-_MAX_BYTES = 10_000_000  # maximum size of a URDF
 _KINDS = {"opencv": "cameras.yaml", "urdf": "robot.urdf", "json": "metric.json", "ros": "cameras.launch.xml"}
 
 
@@ -114,6 +113,13 @@ _KINDS = {"opencv": "cameras.yaml", "urdf": "robot.urdf", "json": "metric.json",
 @click.option(
     "--nominal", metavar="URDF", type=option.PATH, help="Model of the arm, whose zeros and axes are compared."
 )
+@click.option(
+    "--frames",
+    type=click.Choice(["own", "model"]),
+    default="own",
+    show_default=True,
+    help="Base and tool frame: by the joints and the face, or those of --nominal.",
+)
 @click.option("--tip", metavar="LINK", help="Link of the model that carries the tool. Default: the last one.")
 @option.explained
 def _export(
@@ -127,6 +133,7 @@ def _export(
     between: str | None,
     metric_std: float,
     nominal: Path | None,
+    frames: str,
     tip: str | None,
 ) -> None:
     """Write a run as tables, or its cameras and arm in metres.
@@ -137,7 +144,8 @@ def _export(
     The other kinds are in metres, by a known length: opencv both cameras for cv2.FileStorage, urdf the arm,
     ros static transforms of the cameras, json all numbers with their covariances.
 
-    With --nominal it lists the errors of zeros and axes of a model, the most significant first.
+    With --nominal it lists the errors of zeros and axes of a model, the most significant first. With --frames
+    model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip.
     """
     from projservo_cli.store import load
 
@@ -153,35 +161,45 @@ def _export(
         return
     from projservo_cli.files import write_whole
 
+    if frames == "model" and nominal is None:
+        raise click.UsageError("--frames model needs the model: --nominal URDF")
     option.require_new(folder, force=force)
-    content, value, words = _in_metres(found, to, (metric, between, metric_std), nominal, tip)
+    model = None if nominal is None else (nominal, tip, frames == "model")
+    content, value, words = _in_metres(found, to, (metric, between, metric_std), model)
     file = write_whole(folder / _KINDS[to], content)
     value = {"run": found.path.resolve(), "files": [file.resolve()], **value}
     console.report(value, [f"export: {file}", *(wrapped(line, "  ") for line in words)])
 
 
 def _in_metres(
-    run: Any, to: str, length: tuple[float | None, str | None, float], nominal: Path | None, tip: str | None
+    run: Any,
+    to: str,
+    length: tuple[float | None, str | None, float],
+    model: tuple[Path, str | None, bool] | None,
 ) -> tuple[str, dict[str, Any], list[str]]:
-    """Return the text of a file in metres, its JSON object, and its summary in words."""
+    """Return the text of a file in metres, its JSON object, and its summary in words.
+
+    model : a URDF, its tip, and whether its frames are taken.
+    """
+    import numpy as np
+
     from projservo_cli import exports
-    from projservo_cli.calibration.kinematic_errors import kinematic_errors
     from projservo_cli.config import load_config
-    from projservo_cli.files import text_of
+    from projservo_cli.config.inputs import joints_of
     from projservo_cli.results import ImageModel
-    from projservo_cli.simulation.urdf import urdf_axes
 
     calibration, config = ImageModel.of(run.calibration), load_config(run.path, text=run.configuration)
     length_m, ends, std = length
     metric = calibration.metric(length_m, _ends(ends or "joint"), length_std_m=std)
     value: dict[str, Any] = {}
-    words: list[str] = []
-    if nominal is not None:
-        model = urdf_axes(str(nominal), tip, text_of(nominal, "a URDF", _MAX_BYTES))
-        errors = kinematic_errors(metric, model)
+    words = [*exports.reading_words(metric)]
+    if model is not None:
+        errors = metric.errors_of(*model[:2])
         value["nominal"] = [error._asdict() for error in errors.joints]
         value |= {"length_error": errors.length, "length_error_std": errors.length_std}
         words += exports.kinematic_words(errors, metric.joint_types)
+        if model[2]:
+            metric = metric.in_frames_of(*model[:2])
     if to == "opencv":
         found = exports.opencv_cameras(metric, calibration)
         value |= {"delta_chi2": found.delta_chi2, "lens_rms_px": found.lens_rms_px}
@@ -192,7 +210,12 @@ def _in_metres(
     if to == "urdf":
         names = [name or f"joint_{i}" for i, name in enumerate(config.joint_names, 1)]
         names += [f"joint_{i}" for i in range(len(names) + 1, len(metric.joint_types) + 1)]
-        return exports.urdf(metric, names), value, words
+        known = joints_of(config).joints(metric.joint_types, calibration).limits
+        limits = np.stack([known.lower, known.upper], axis=1)
+        if not np.isfinite(limits).all():
+            words.append("where limits of joints are unknown, they are the readings of the trial motions")
+        limits = np.where(np.isfinite(limits), limits, metric.range)
+        return exports.urdf(metric, names, limits), value, words
     return exports.static_transforms(metric) if to == "ros" else exports.to_json(metric, value), value, words
 
 

@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -349,12 +349,12 @@ class Metric:
         between: Scale = "joint",
         length_std_m: float = 0.0,
         face: Sequence[int] | None = None,
-    ) -> "Metric":
+    ) -> Self:
         """Upgrade a calibration, by the factor of its covariance; the rest as for ``ImageModel.metric``."""
         if between == "joint" and length_m is not None:
             raise InputError(
-                f"metric: length_m {length_m!r} without its ends: name them, such as two markers; a prismatic "
-                "joint sets the scale by its readings, and takes no length"
+                f"metric: length_m {length_m!r} without its ends: name them, such as two markers; readings "
+                "of a prismatic joint set the scale by themselves"
             )
         length = (1.0 if between == "joint" else math.nan) if length_m is None else float(length_m)
         if not 0.0 < length < np.inf or not 0.0 <= length_std_m < np.inf:
@@ -424,28 +424,82 @@ class Metric:
         return self.body.markers
 
     def pose(self, q: npt.ArrayLike) -> FloatArray:
-        """Poses (…, 4, 4) of the tool in the base frame at readings (…, n), rad or m."""
+        """Poses of the tool in the base frame, [RH00] eq. (6).
+
+        Parameters
+        ----------
+        q : (…, n) joint readings, rad or m.
+
+        Returns
+        -------
+        (…, 4, 4) poses, m.
+
+        Raises
+        ------
+        InputError
+            If the readings have another number of joints, are not finite or look like degrees.
+        """
         readings = self._readings(q)
         T = self.body.tool_poses(self.prismatic, readings.reshape(-1, readings.shape[-1]))
         return T.reshape(*readings.shape[:-1], 4, 4)
 
     def pose_covariance(self, q: npt.ArrayLike) -> FloatArray:
-        """Covariances (…, 6, 6) of the tool's pose in the base frame: rotation vector, rad; position, m."""
+        """Covariances of the pose of the tool in the base frame.
+
+        Parameters
+        ----------
+        q : (…, n) joint readings, rad or m.
+
+        Returns
+        -------
+        (…, 6, 6): rotation vector, rad, then position, m.
+
+        Raises
+        ------
+        InputError
+            If the readings have another number of joints, are not finite or look like degrees.
+        """
         readings = self._readings(q)
         rows = readings.reshape(-1, readings.shape[-1])
         of = self.changes(lambda body: body.tool_poses(self.prismatic, rows), _pose_difference)
         return _covariances(of).reshape(*readings.shape[:-1], 6, 6)
 
     def position_std(self, q: npt.ArrayLike) -> FloatArray:
-        """Standard deviations (…, 3) of the position of the tool along the axes of the base frame, mm."""
+        """Standard deviations of the position of the tool along the axes of the base frame.
+
+        Parameters
+        ----------
+        q : (…, n) joint readings, rad or m.
+
+        Returns
+        -------
+        (…, 3) deviations, mm.
+
+        Raises
+        ------
+        InputError
+            If the readings have another number of joints, are not finite or look like degrees.
+        """
         C = self.pose_covariance(q)[..., 3:, 3:]
         return MM * np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
 
     def triangulate(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Points (…, m, 3) of the base frame, m, by raw pixels (…, 2, m, 2), views left and right.
+        """Points of the base frame by their pixels in both views.
 
-        NaN where a view has no pixels. Raises InputError for pixels of another shape, WorkFailed if two rays
-        determine no finite point.
+        Parameters
+        ----------
+        pixels : (…, 2, m, 2) raw pixels, views left and right as ``predict`` has them; NaN where unseen.
+
+        Returns
+        -------
+        (…, m, 3) points, m; NaN where a view has no pixels.
+
+        Raises
+        ------
+        InputError
+            For pixels of another shape.
+        WorkFailed
+            If two rays determine no finite point.
         """
         s, seen, shape = self._pixels(pixels)
         points = np.full((len(seen), 3), np.nan)
@@ -454,7 +508,21 @@ class Metric:
         return points.reshape(*shape, 3)
 
     def triangulation_covariance(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Covariances (…, m, 3, 3) of triangulated points, m², with the noise of their pixels."""
+        """Covariances of triangulated points, with the noise of their pixels.
+
+        Parameters
+        ----------
+        pixels : as for ``triangulate``.
+
+        Returns
+        -------
+        (…, m, 3, 3), m²; NaN where a view has no pixels.
+
+        Raises
+        ------
+        InputError, WorkFailed
+            As for ``triangulate``.
+        """
         _, seen, shape = self._pixels(pixels)
         X = self.triangulate(pixels).reshape(-1, 3)[seen]
         step = _PROBE * np.linalg.norm(self.poses[0, :3, 3] - X, axis=1)[:, None]
@@ -468,11 +536,22 @@ class Metric:
         return C.reshape(*shape, 3, 3)
 
     def covariance(self, name: str) -> FloatArray:
-        """Covariance of an array: K, lens, poses, axes, markers or tool.
+        """Covariance of an array.
 
+        Parameters
+        ----------
+        name : ``K``, ``lens``, ``poses``, ``axes``, ``markers`` or ``tool``.
+
+        Returns
+        -------
         Of ``K`` (2, 5, 5): fx, skew, cx, fy, cy, px; of ``lens`` (2, 2, 2): k1, k2; of ``poses`` (2, 6, 6):
         rotation vector, rad, and position, m, in the base frame; of ``axes`` (n, 6, 6); of ``markers``
         (m, 3, 3), m²; of ``tool`` (1, 6, 6), its pose at readings of zero.
+
+        Raises
+        ------
+        InputError
+            For another name.
         """
         return _covariances(self.deviations(name))
 

@@ -7,7 +7,7 @@ import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -66,23 +66,37 @@ def read_urdf(path: str, tip: str, text: str) -> dict[str, Any]:
     return arm_screws(joints, np.zeros(len(joints)), T)
 
 
-def urdf_axes(path: str, tip: str | None, text: str) -> FloatArray:
-    """Screws (n, 6) of a URDF's joints at readings of zero, from its root to a link, by default the last one.
+class UrdfChain(NamedTuple):
+    """Joints of a URDF from its root to a link, at readings of zero."""
+
+    root: str  # name of the first link
+    axes: FloatArray  # (n, 6) screws, rad and m
+    tip: FloatArray  # (4, 4) pose of the link, m
+
+
+def urdf_chain(path: str, tip: str | None, text: str) -> UrdfChain:
+    """Joints of a URDF from its root to a link, by default the last one.
 
     Raises InputError as ``read_urdf``, or if several links are last.
     """
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise InputError(f"{path}: not XML: {error}") from error
+    joints, links = root.findall("joint"), [link.get("name", "") for link in root.findall("link")]
+    above = {
+        _of(joint, "child", "link", "", path): _of(joint, "parent", "link", "", path) for joint in joints
+    }
     if tip is None:
-        try:
-            root = ET.fromstring(text)
-        except ET.ParseError as error:
-            raise InputError(f"{path}: not XML: {error}") from error
-        parents = {_of(joint, "parent", "link", "", path) for joint in root.findall("joint")}
-        ends = [name for link in root.findall("link") if (name := link.get("name", "")) not in parents]
+        ends = [name for name in links if name not in above.values()]
         if len(ends) != 1:
-            raise InputError(f"{path}: has {len(ends)} last links ({listed(ends)}): name one with --tip")
+            raise InputError(f"{path}: has {len(ends)} last links ({listed(ends)}): name one as the tip")
         tip = ends[0]
-    joints = read_urdf(path, tip, text)["joints"]
-    return np.array([[*joint["w"], *joint["v"]] for joint in joints])
+    arm, first = read_urdf(path, tip, text), tip
+    while first in above:
+        first = above.pop(first)
+    axes = np.array([[*joint["w"], *joint["v"]] for joint in arm["joints"]])
+    return UrdfChain(first, axes, np.array(arm["base_tool"]))
 
 
 def joint_screw(

@@ -175,5 +175,7 @@ def test_the_metric_agrees_with_a_laser_tracker(shared_data, tmp_path):
     with_arm = position_errors(metric, test, train, 0.078e-3 / np.sqrt(3.0))
     assert with_arm["mahalanobis"] <= 1.5
     assert position_errors(metric, test)["rms_mm"] <= 0.23
+    # The same plate by the tracker as by a scale fitted to other poses.
+    assert position_errors(metric, train)["length_m"] == pytest.approx(by_images["length_m"], rel=1e-3)
     with pytest.raises(InputError, match="is in both tables"):
         position_errors(metric, test, test)

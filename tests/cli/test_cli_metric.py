@@ -1,6 +1,8 @@
 """Files in metres, read by other people's code, and positions against a table: from the command line."""
 
 import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli import exports, store
 from projservo_cli.cli import run
+from projservo_cli.records import InputError
 from projservo_cli.results import ImageModel
-from projservo_cli.simulation.urdf import urdf_axes
+from projservo_cli.simulation.urdf import urdf_chain
 
 KNOWN = ["--metric", "0.2492990172463582", "--between", "2,8"]
 
@@ -96,8 +99,34 @@ def test_yourdfpy_reads_the_arm_and_predicts_the_same_pixels(ur5, metric, tmp_pa
 
 def test_the_own_reader_finds_the_same_axes(ur5, metric, tmp_path):
     file = export(ur5, tmp_path, "urdf")
-    axes = urdf_axes(str(file), "tool", file.read_text())
+    axes = urdf_chain(str(file), "tool", file.read_text()).axes
     np.testing.assert_allclose(axes, metric.axes, atol=1e-12)
+
+
+def test_limits_of_the_configuration_are_those_of_the_urdf(tmp_path, capsys):
+    """A prismatic joint among them, whose readings set the scale; without limits, those of the trials."""
+    table, out = tmp_path / "trials.csv", tmp_path / "out"
+    stanford = str(Path(__file__).parents[2] / "configs" / "stanford.yaml")
+    assert run(["record", "-c", stanford, "--output", str(table)]) == 0
+    config = ["-c", stanford, "--data", str(table)]
+    for name, more in (("known", config), ("unknown", ["--data", str(table), "--joints", "RRPRRR"])):
+        assert run(["calibrate", *more, "-o", str(tmp_path / name)]) == 0
+        capsys.readouterr()
+        assert run(["export", str(tmp_path / name), "--to", "urdf", "-o", str(out), "--force"]) == 0
+        assert ("readings of the trial motions" in capsys.readouterr().out) == (name == "unknown")
+        chain = ET.fromstring((out / "robot.urdf").read_text()).findall("joint")
+        limits = np.array(
+            [[float(joint.find("limit").get(end)) for end in ("lower", "upper")] for joint in chain[:6]]
+        )
+        axis = np.array(chain[2].find("axis").get("xyz").split(), dtype=float)
+        assert np.linalg.norm(axis) == pytest.approx(1.0, abs=1e-12)
+        wide = np.ptp(limits, axis=1)
+        assert (wide[0] > 5.0) == (name == "known")
+    assert (
+        run(["export", str(tmp_path / "known"), "--to", "urdf", "--metric", "0.3", "-o", str(out), "--force"])
+        == 2
+    )
+    assert "without its ends" in capsys.readouterr().err
 
 
 def test_ros_gets_the_poses_of_the_cameras(ur5, metric, tmp_path):
@@ -157,6 +186,37 @@ def test_zeros_and_links_of_a_wrong_model_are_found(ur5, reference_truth, tmp_pa
         assert abs(found - np.degrees(zero[joint - 1])) < 3.5 * std
     assert errors[1]["zero"] is None
     assert errors[6]["zero"] is None
+
+
+def face_pixels(metric):
+    return np.array([pixels_at(metric, T) for T in metric.pose(Q)])
+
+
+def test_cameras_come_in_the_base_of_a_model(ur5, reference_truth, tmp_path, capsys):
+    """Of one whose zeros and a link are wrong: cameras where they are, and the same pixels as before."""
+    truth = reference_truth("ur5")
+    q, true = np.array(truth["q_reference"]), np.array([[*s["w"], *s["v"]] for s in truth["screws"]])
+    file, zero = tmp_path / "model.urdf", np.radians([0.0, 0.0, -2.0, 0.0, 1.0, 0.0])
+    file.write_text(wrong_model(true, q, zero, 0.0))
+    model = ["--nominal", str(file), "--frames", "model"]
+    found = json.loads(export(ur5, tmp_path, "json", *model).read_text())
+    for v, view in enumerate(("left", "right")):
+        P = np.array(truth[f"camera_{view}"])
+        center = -np.linalg.solve(P[:, :3], P[:, 3])
+        off = np.array(found["poses"])[v, :3, 3] - center
+        C = np.array(found["poses_covariance"])[v, 3:, 3:]
+        assert off @ np.linalg.solve(C, off) < 16.3  # once in a thousand
+        assert np.sqrt(np.trace(C)) < 8e-3
+    m = ImageModel.of(store.load(ur5).calibration).metric(float(KNOWN[1]), (2, 8))
+    there = m.in_frames_of(file)
+    np.testing.assert_allclose(face_pixels(there), face_pixels(m), atol=1e-9)
+    capsys.readouterr()
+    assert run(["export", str(ur5), "--to", "ros", *KNOWN, "--frames", "model"]) == 2
+    assert "--nominal URDF" in capsys.readouterr().err
+    with pytest.raises(InputError, match="degrees"):
+        m.pose(np.degrees(Q))
+    assert "left camera" in repr(m)
+    assert len(repr(m).splitlines()) < 12
 
 
 @pytest.mark.parametrize(("factor", "word"), [(0.98, "short"), (1.0, ""), (1.02, "long")])
