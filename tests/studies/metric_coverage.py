@@ -2,7 +2,8 @@
 
 Each draw is a calibration of a simulated arm at 0.5 px from its own trial motions, and a length between the
 two markers farthest apart, known to 0.2 %. Prints, for each arm, the share of regions that hold the truth: of
-the intrinsics and the pose of each camera, of each axis, and of tool positions within the data's range.
+the intrinsics and the pose of each camera, in the own frames and in those of the true model, of each axis, and
+of tool positions within the data's range.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import numpy as np
 from scipy.stats import chi2
 
 import projservo_cli as projservo
+from projservo_cli.calibration.kinematic_errors import in_model_frames
 from projservo_cli.config.inputs import truth_of
 from projservo_cli.geometry.metric import Metric
 from projservo_cli.records import WorkFailed
@@ -72,6 +74,13 @@ def flat(K):
     return K[:, (0, 0, 0, 1, 1), (0, 1, 2, 1, 2)]
 
 
+def off(T, T0):
+    """Errors (k, 6) of poses (k, 4, 4): small rotation, and shift."""
+    R = np.swapaxes(T[:, :3, :3] @ T0[:, :3, :3].swapaxes(1, 2), 0, 2)
+    half = np.stack([R[1, 2] - R[2, 1], R[2, 0] - R[0, 2], R[0, 1] - R[1, 0]], axis=1)
+    return np.concatenate([0.5 * half, (T - T0)[:, :3, 3]], axis=1)
+
+
 def draw(config, seed):
     """Whether the regions of one draw hold the truth, by name; None if the calibration fails."""
     rng = np.random.default_rng(seed)
@@ -85,14 +94,12 @@ def draw(config, seed):
     m = c.metric(length + std * rng.standard_normal(), between, length_std_m=std)
     exact = true_metric(truth, c, (length, between))
     q = rng.uniform(*m.range.T, size=(POSES, len(c.joint_types)))
-    turn = m.poses[:, :3, :3] @ exact.poses[:, :3, :3].swapaxes(1, 2)
-    R = np.swapaxes(turn, 0, 2)
-    half = np.stack([R[1, 2] - R[2, 1], R[2, 0] - R[0, 2], R[0, 1] - R[1, 0]], axis=1)
-    pose = np.concatenate([0.5 * half, (m.poses - exact.poses)[:, :3, 3]], axis=1)
+    there = in_model_frames(m, exact.axes, exact.body.tool)
     position = (m.pose(q) - exact.pose(q))[:, :3, 3]
     return {
         "K": held(flat(m.K) - flat(exact.K), m.covariance("K")),
-        "poses": held(pose, m.covariance("poses")),
+        "poses": held(off(m.poses, exact.poses), m.covariance("poses")),
+        "in model": held(off(there.poses, exact.poses), there.covariance("poses")),
         "axes": held(m.axes - exact.axes, m.covariance("axes")),
         "markers": held(m.markers - exact.markers, m.covariance("markers")),
         "positions": held(position, m.pose_covariance(q)[:, 3:, 3:]),
