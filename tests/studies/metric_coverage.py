@@ -1,9 +1,9 @@
 """Whether 95 % regions of the metric hold the truth: ``python -m tests.studies.metric_coverage [ARM …]``.
 
-Each draw is a calibration of a simulated arm at 0.5 px from its own trial motions, and a length between the
-two markers farthest apart, known to 0.2 %. Prints, for each arm, the share of regions that hold the truth: of
-the intrinsics and the pose of each camera, in the own frames and in those of the true model, of each axis, and
-of tool positions within the data's range.
+Each draw is a calibration of a simulated arm at 0.5 px from its own trial motions, and a length between
+the two markers farthest apart, known to 0.2 %. Prints for each arm the share of regions that hold the truth:
+of the intrinsics and the pose of each camera, in the own frames and in those of the true model, of each axis,
+and of tool positions within the data's range.
 """
 
 import argparse

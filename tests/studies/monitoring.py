@@ -1,6 +1,6 @@
 """Whether what befalls a robot is seen and named: whole runs of a stand-in through the public stages.
 
-    python -m tests.studies.monitoring [--cells before during faults sound] [--runs 300] [-o runs.csv]
+    python -m tests.studies.monitoring [--cells before during faults sound] [--runs 300] [--blind] [-o FILE]
 
 Runs are drawn by seed from a fractional design: faults of a cell x arms x corners x backlash x latency x kind
 of goal. Each rig is calibrated once from a recording of its own. Numbers of runs are of each cell; of faults
@@ -22,8 +22,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 
 from projservo_cli.config import load_config
+from projservo_cli.monitoring.statistics import ErrorModel
 from projservo_cli.records import WorkFailed
 from tests.configured import calibrate, plan, record, servo
 from tests.monitoring.stand_in import ARMS, KINDS, LAST, StandIn, seen, tool_pose
@@ -67,6 +69,7 @@ PAIRS = (
 )
 SEED, HOLD_DEG = 2029, 0.2  # of a set-point that holds the arm where it stands
 SPREAD_DEG, ROLL_DEG, INSIDE_PX, FEWEST_TAGS = 18.0, 50.0, 30.0, 3  # of tasks around the home posture
+GROWS = 0.2  # px of noise for each that images are off, where the test is blinded
 # What a run takes before it moves and after its plan has ended, s, about; verdicts that blame nobody.
 BEFORE_S, AFTER_S = 0.6, 1.0
 BLAMELESS = ("converged", "no progress", "max steps")
@@ -327,6 +330,21 @@ def driven(job):
     return rows
 
 
+def blinded(job):
+    """Rows of runs in which the noise of pixels grows with what images are off, as it once did."""
+    test = ErrorModel.residual
+
+    def residual(errors, pair):
+        one = test(errors, pair)
+        seen = np.repeat(one.seen.ravel(), 2)
+        off = GROWS * float(np.sqrt(np.square(one.r[seen]).mean())) if seen.any() else 0.0
+        return one._replace(R=one.R + off**2 * np.eye(len(one.r)), noise=np.hypot(one.noise, off))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ErrorModel, "residual", residual)
+        return driven(job)
+
+
 def off_mm(there):
     """How far the tool of the last run is from a pose, mm."""
     return 1e3 * float(np.linalg.norm(LAST[0].pose()[:3, 3] - there[:3, 3]))
@@ -426,6 +444,7 @@ def main():
     parser.add_argument("--cells", nargs="+", choices=cells, default=list(cells))
     parser.add_argument("--runs", type=int, default=300, help="of each cell, fault and sound kind of corners")
     parser.add_argument("--corners", nargs="+", choices=KINDS, default=list(KINDS))
+    parser.add_argument("--blind", action="store_true", help="with noise that grows: the study must fail")
     parser.add_argument("--against", type=Path, help="an earlier table of as many runs, to compare with")
     parser.add_argument("-o", "--output", type=Path, default=Path("monitoring_study.csv"), help="every run")
     given = parser.parse_args()
@@ -437,7 +456,7 @@ def main():
     with open(given.output, "w", encoding="utf-8", newline="") as file:
         table = csv.DictWriter(file, COLUMNS)
         table.writeheader()
-        for rows in in_two_processes(driven, jobs, "rigs"):
+        for rows in in_two_processes(blinded if given.blind else driven, jobs, "rigs"):
             table.writerows(rows)
             file.flush()
             every += rows
