@@ -45,7 +45,7 @@ _LEFT = 0.15
 # Share of the pixels that images are off by which a cause changes them at least: backlash that is
 # more than the calibration found is no turn of a camera by the rest.
 _LEAST_PART = 0.2
-# A corner that is off by less, px, in one view of the tool is an edge that the finder took for another.
+# A corner that is off by less, px, from one side of the tool may be an edge that the finder took for another.
 _LEAST_MOVED_PX = 1.0
 # Share of the markers that a view saw shortly before: one that sees less is covered by something.
 _COVERED = 0.5
@@ -249,9 +249,8 @@ class ImageMonitor:
             return
         found = self._explanations(self._since_onset(), self._before)
         best = found[0]
-        explains, views = self._explains(best), len({one.view for one in self._since_onset()})
-        unforgiven = not set(best.cause.markers) <= set(self._forgiven)
-        if explains and unforgiven and self._is_edge(best, views):
+        explains, unforgiven = self._explains(best), not set(best.cause.markers) <= set(self._forgiven)
+        if explains and unforgiven and self._is_edge(best, self._since_onset()):
             self._forgiven += best.cause.markers
             self._off = 0
             return
@@ -361,16 +360,19 @@ class ImageMonitor:
         rows, lasting = evidence.rows, 1.0 - self._detector.memory.fresh
         return float((1.0 + lasting) * rows + 3.0 * np.sqrt(2.0 * rows) + evidence.bias)
 
-    def _is_edge(self, found: Explanation, views: int) -> bool:
+    def _is_edge(self, found: Explanation, kept: list[_Kept]) -> bool:
         """Whether what seems to have moved is perhaps an edge that a finder took for that of a marker.
 
-        views : of the tool that showed it.
+        An edge is off alike as long as the tag is seen from one side.
+        kept : observations that showed it.
         """
         if not found.cause.markers:
             return False
         seen = self._evidence_now.seen[:, :, list(found.cause.markers)]
         alone = seen.all(axis=1).sum() <= 0.5 * seen.any(axis=1).sum()
-        return bool(alone) or (found.min_px < _LEAST_MOVED_PX and views < WINDOW)
+        if alone or found.min_px >= _LEAST_MOVED_PX:
+            return bool(alone)
+        return self._errors.slants(np.array([one.pair.q.mean(axis=0) for one in kept])) < WINDOW
 
     def _judge_markers(self) -> None:
         """Name markers that both views show off by themselves for long."""
@@ -388,7 +390,7 @@ class ImageMonitor:
             if not found:
                 continue
             best, views = found[0], len({one.view for one in kept})
-            lasts = (both[j] or views >= WINDOW) and not self._is_edge(best, views)
+            lasts = (both[j] or views >= WINDOW) and not self._is_edge(best, kept)
             if lasts and best.score > _CLEAR and self._explains(best):
                 moved.append(best)
         if moved:

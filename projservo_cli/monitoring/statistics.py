@@ -198,6 +198,16 @@ class ErrorModel:
         found = (near * squares).sum(axis=(2, 3)) + _PRIOR_SIGHTINGS * self._typical
         return np.asarray(np.maximum(found / (near.sum(axis=(2, 3)) + _PRIOR_SIGHTINGS), 1.0))
 
+    def slants(self, q: FloatArray) -> int:
+        """Number of sides from which the tool was seen at joints (K, n), apart enough for new errors of corners."""
+        rays = _rays(self.scene, self.directions, q - self.calibration.q_reference).reshape(len(q), -1, 3)
+        sides: list[FloatArray] = []
+        for ray in rays:
+            apart = (2.0 * (1.0 - np.abs((ray * side).sum(axis=1)).mean()) for side in sides)
+            if all(square > _SLANT**2 for square in apart):
+                sides.append(ray)
+        return len(sides)
+
     def _fault_derivative(
         self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, pair: FramePair
     ) -> FloatArray:
