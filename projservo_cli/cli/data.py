@@ -236,7 +236,7 @@ def _detect(
 @click.option(
     "--arm-std-mm",
     metavar="MM",
-    type=click.FloatRange(0.0, 1000.0),
+    type=option.NumberRange(0.0, 1000.0),
     default=0.0,
     help="Deviation of the arm that no image shows, a coordinate, beyond the covariance.",
 )

@@ -34,7 +34,7 @@ _BODIES = ("roof", "plate")
 @click.option(
     "--size-mm",
     metavar="S",
-    type=click.FloatRange(5.0, 190.0),
+    type=option.NumberRange(5.0, 190.0),
     default=_SIZE_MM,
     show_default=True,
     help="Side of the black square of each tag.",

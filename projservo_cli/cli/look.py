@@ -100,7 +100,10 @@ _KINDS = {"opencv": "cameras.yaml", "urdf": "robot.urdf", "json": "metric.json",
 @option.force(help="Replace existing files.")
 @click.option("--to", type=click.Choice(["csv", *_KINDS]), default="csv", help="Kind of files.")
 @click.option(
-    "--metric", metavar="M", type=float, help="A known length, m, for all kinds but csv. See --between."
+    "--metric",
+    metavar="M",
+    type=option.NUMBER,
+    help="A known length, m, for all kinds but csv. See --between.",
 )
 @click.option(
     "--between",
@@ -108,7 +111,7 @@ _KINDS = {"opencv": "cameras.yaml", "urdf": "robot.urdf", "json": "metric.json",
     help="Ends of the length: two markers, or tags (their sides), or cameras. Default: a prismatic joint's.",
 )
 @click.option(
-    "--metric-std", metavar="M", type=float, default=0.0, help="Standard deviation of the length, m."
+    "--metric-std", metavar="M", type=option.NUMBER, default=0.0, help="Standard deviation of the length, m."
 )
 @click.option(
     "--nominal", metavar="URDF", type=option.PATH, help="Model of the arm, whose zeros and axes are compared."

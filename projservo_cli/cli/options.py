@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import math
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -20,6 +21,24 @@ if TYPE_CHECKING:
 _Function = Callable[..., Any]
 
 PATH = click.Path(path_type=Path)
+
+
+class _Finite(click.types.FloatParamType):
+    """A finite number; click takes NaN, in ranges as well, since it compares with no limit."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Read a number, and refuse one that is not finite."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{number} is not a finite number.", param, ctx)
+        return number
+
+
+class NumberRange(_Finite, click.FloatRange):
+    """A number within limits."""
+
+
+NUMBER = _Finite()
 _RESULTS = Path("results")
 _TRIALS = "trials.csv"  # in the folder of a run: the default table of a recording
 _KEYS = {  # that options stand for
@@ -52,7 +71,7 @@ joint_unit = click.option(
 )
 dry_run = click.option("-n", "--dry-run", is_flag=True, help="Say what would be done, do nothing.")
 speed_scale = click.option(
-    "--speed-scale", metavar="S", type=float, help="Scale every command by S, above 0 and at most 1."
+    "--speed-scale", metavar="S", type=NUMBER, help="Scale every command by S, above 0 and at most 1."
 )
 
 
@@ -98,7 +117,9 @@ _OF_STAGES = (
     click.option("--data", metavar="TABLE", type=click.Path(), help="Calibrate from this table (CSV)."),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
     joint_unit,
-    click.option("--noise-px", metavar="S", type=float, help="Pixel noise of the table. Default: estimated."),
+    click.option(
+        "--noise-px", metavar="S", type=NUMBER, help="Pixel noise of the table. Default: estimated."
+    ),
     click.option("--lens", is_flag=True, help="Estimate radial lens distortion, two coefficients a camera."),
     click.option(
         "--image-size",

@@ -66,6 +66,16 @@ def test_a_flag_takes_a_value_in_all_commands_or_in_none():
                 assert takes.setdefault(option.opts[-1], option.is_flag) == option.is_flag
 
 
+@pytest.mark.parametrize("given", ["nan", "inf"])
+def test_options_of_numbers_take_finite_ones_alone(given):
+    options = {option.opts[-1]: option for command in main.commands.values() for option in command.params}
+    numbers = [option for option in options.values() if isinstance(option.type, click.types.FloatParamType)]
+    assert len(numbers) > 5
+    for option in numbers:
+        with pytest.raises(click.BadParameter, match=given):
+            option.type.convert(given, option, None)
+
+
 def test_help_names_all_commands_and_version_is_printed(projservo):
     text = projservo("--help").out
     assert all(f"  {name} " in text for name in main.commands)
