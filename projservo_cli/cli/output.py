@@ -183,6 +183,10 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
 
 
 _ONE_JOINT = "one joint: how it moves images is known; directions and lengths in space take more joints"
+_NO_LIMITS = (
+    "no joint limits are known here: give them with -c or robot.limits, or leave out what your robot cannot "
+    "reach"
+)
 _EXAMPLES = 3  # of each kind of rejected observations
 
 
@@ -257,7 +261,7 @@ def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:
         yield f"  {row['from_pose']:>9}" + "".join(f"{d:>+9.1f}" for d in way) + f"{then:>9.3g}"
     yield f"  joints of these poses: {value['suggestions_file']} ({value['suggestions_unit']}, m)"
     if not value["suggestions_limited"]:
-        yield "  joint limits are not known here: leave out what your robot cannot reach"
+        yield wrapped(_NO_LIMITS, "  ")
 
 
 def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:

@@ -440,6 +440,8 @@ def _announce(console: Console, chain: Any) -> None:
 
 def _suggestions(chain: Any, count: int) -> dict[str, Any]:
     """Further poses for the calibration, as JSON values; their list is written next to the run."""
+    import numpy as np
+
     from projservo_cli.config.inputs import suggestion_inputs
     from projservo_cli.records import WorkFailed
     from projservo_cli.stages.calibrate import suggest_motions
@@ -451,11 +453,12 @@ def _suggestions(chain: Any, count: int) -> dict[str, Any]:
     except WorkFailed as error:
         return {"suggestions": [], "suggestions_reason": str(error)}
     keys = ("q", "from_pose", "delta", "variance_before", "variance_after")
+    limits = given.joints.joints(calibration.joint_types).limits
     return {
         "suggestions": [{key: getattr(one, key) for key in keys} for one in found],
         "suggestions_file": path.resolve(),
         "suggestions_unit": given.unit,
-        "suggestions_limited": chain.config.robot is not None,
+        "suggestions_limited": bool(np.isfinite(limits.lower).any()),
     }
 
 

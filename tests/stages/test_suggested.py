@@ -54,6 +54,7 @@ def test_asking_again_costs_no_calibration_and_says_the_same(projservo):
     words = projservo("calibrate", "--suggest", "2", "-o", "run").out
     assert "q3 mm" in words
     assert f"{one.json['suggestions'][0]['variance_after'] ** 0.5:.3g}" in words
+    assert "no joint limits" not in words
     assert "suggestions" not in projservo("calibrate", "-o", "run", "--json").json
 
 
@@ -70,5 +71,18 @@ def test_a_table_in_degrees_gets_suggestions_in_degrees(projservo):
     table = ("--data", "deg.csv", "--joints", "RRPRRR", "--joint-unit", "deg")
     answer = projservo("calibrate", *table, "-o", "run", "--suggest", "1", "--json")
     assert answer.json["suggestions_unit"] == "deg"
+    assert answer.json["suggestions_limited"] is False
     motions = read_joint_list("run/suggestions.csv", "RRPRRR", "deg")
     np.testing.assert_allclose(motions.q[0], answer.json["suggestions"][0]["q"], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("limits", "known"),
+    [("{from_data: 0.1}", False), ("{joints: [[-3,3],[-3,3],[0,1],[-3,3],[-3,3],[-3,3]], unit: rad}", True)],
+)
+def test_suggestions_without_joint_limits_say_where_to_give_them(projservo, limits, known):
+    assert projservo("record", *STANFORD, "-o", "t.csv", "-q").code == 0
+    table = ("--data", "t.csv", "--joints", "RRPRRR", "--set", f"robot.limits={limits}")
+    answer = projservo("calibrate", *table, "-o", "run", "--suggest", "1")
+    assert answer.code == 0, answer.err
+    assert ("give them with -c or robot.limits" in " ".join(answer.out.split())) != known
