@@ -79,15 +79,16 @@ def pandas() -> Any:
     return found
 
 
-def require_radians(name: str, q: FloatArray, joint_types: str) -> None:
+def require_radians(
+    name: str, q: FloatArray, joint_types: str, remedy: str = "convert with numpy.radians"
+) -> None:
     """Raise InputError for joint readings (..., n) with a revolute one that can hardly be in rad."""
     turning = np.array([letter == "R" for letter in joint_types])
     beyond = np.argwhere((np.abs(q) > _TWO_TURNS) & turning)
     if beyond.size:
         value = q[tuple(beyond[0])]
         raise InputError(
-            f"{name}: joint {beyond[0][-1] + 1} at {value:g} is more than two turns in rad: degrees? convert "
-            "with numpy.radians"
+            f"{name}: joint {beyond[0][-1] + 1} at {value:g} is more than two turns in rad: degrees? {remedy}"
         )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from projservo_cli.config import inputs as given
 from projservo_cli.config import load_config
 from projservo_cli.report import page
+from projservo_cli.robots.settings import Readings
 from projservo_cli.simulation import faults
 from projservo_cli.simulation.cameras import Frames
 from projservo_cli.simulation.scene import rendered_model
@@ -105,8 +106,9 @@ def checked(config, calibration, taught):
     return teaching.checked(given.plan_inputs(config), calibration, taught)
 
 
-def teach(config, *more):
-    return teaching.teach(given.teach_inputs(config), *more)
+def teach(config, frames, at=None, *more):
+    readings = None if at is None else Readings(tuple(at), "rad")
+    return teaching.teach(given.teach_inputs(config), frames, readings, *more)
 
 
 def require_face(config, taught):

@@ -60,7 +60,7 @@ def _teach(
     code 1.
     """
     from projservo_cli.config import plain_yaml
-    from projservo_cli.config.inputs import joints_of, plan_inputs, teach_inputs
+    from projservo_cli.config.inputs import plan_inputs, teach_inputs
     from projservo_cli.files import write_whole
     from projservo_cli.records import InputError, WorkFailed
     from projservo_cli.robots.settings import Readings
@@ -72,8 +72,7 @@ def _teach(
     put = None
     if at is not None:
         try:
-            values = tuple(float(value) for value in at.split(","))
-            put = Readings(values, at_unit).values(joints_of(settings).joints().types).tolist()
+            put = Readings(tuple(float(value) for value in at.split(",")), at_unit)
         except ValueError as error:
             raise InputError(f"--at {at}: expected a number for each joint, with commas") from error
     calibration = option.calibration_of(run, settings)

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration import predict
+from projservo_cli.display import require_radians
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
-from projservo_cli.robots.settings import OwnRobot, Readings
+from projservo_cli.robots.settings import Joints, OwnRobot, Readings
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.external_robot import at_rest, averaged, plugin_robot, simulated_robot
@@ -84,15 +85,15 @@ class _Checked(NamedTuple):
 def teach(
     inputs: TeachInputs,
     frames: int,
-    at: Sequence[float] | None = None,
+    at: Readings | None = None,
     wait: Callable[[str], None] | None = None,
 ) -> _Taught:
     """Look where the robot stands, and average so many frames of each camera.
 
-    at : joints (n,) that a simulated robot is put to, rad or m.
+    at : joints that a simulated robot is put to.
     wait : asks the user to act, and returns afterwards; None without a user, so that
         the arm is not released.
-    Raises InputError if ``at`` is missing or beyond a limit; WorkFailed if the robot fails.
+    Raises InputError if ``at`` is missing, does not fit or is beyond a limit; WorkFailed if the robot fails.
     """
     joints, driven, period = inputs.joints.joints(), inputs.driven, inputs.driven.following.period
     moved = None
@@ -104,16 +105,15 @@ def teach(
     else:
         if at is None:
             raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
-        if wrong := joints.limit_passed(np.array(at)):
-            raise InputError(f"--at: {wrong}: choose others")
-        robot = simulated_robot(driven, joints, _put_to(inputs, driven.robot, np.array(at)))
+        q = _within_limits(at, joints)
+        robot = simulated_robot(driven, joints, _put_to(inputs, driven.robot, q))
 
     def observe() -> Reading:
         """A look after a period, in which a simulated robot holds where it was put to."""
         if at is None:
             time.sleep(period)
         else:
-            robot.command(np.array(at), np.zeros(len(at)), robot.now() + period)
+            robot.command(q, np.zeros_like(q), robot.now() + period)
         return robot.read()
 
     with at_rest_after(robot):
@@ -143,6 +143,20 @@ def teach(
         moved=None if moved is None else mean.q - moved,
         bounds=robot.bounds,
     )
+
+
+def _within_limits(at: Readings, joints: Joints) -> FloatArray:
+    """The joints (n,) of ``--at``, rad or m. Raises InputError where the robot cannot be put there."""
+    if len(at.joints) != len(joints.types):
+        raise InputError(f"--at: {len(at.joints)} numbers for {len(joints.types)} joints: give one for each")
+    q = at.values(joints.types)
+    for i in np.flatnonzero(~np.isfinite(q)).tolist():
+        raise InputError(f"--at: joint {i + 1} is {q[i]}: give a finite number")
+    if wrong := joints.limit_passed(q):
+        if at.unit == "rad":
+            require_radians("--at", q, joints.types, "set --at-unit deg")
+        raise InputError(f"--at: {wrong}: choose others")
+    return q
 
 
 def _require_still(bounds: Bounds, before: FloatArray, after: FloatArray, since: str) -> None:

@@ -122,9 +122,19 @@ def test_a_goal_is_taught_and_told(projservo, tmp_path, monkeypatch):
     assert (tmp_path / "goal.yaml").read_text() == text
     start = projservo(*hobby, *at, "--start")
     assert (start.code, "set task.start: start.yaml" in start.out) == (0, True)
-    for wrong, told in ((("--at", "1,2"), "a number for each joint"), ((), "give the joints")):
+    for wrong, told in (
+        ((), "give the joints"),
+        (("--at", "1,2,x"), "a number for each joint"),
+        (("--at", "1,2"), "2 numbers for 5 joints"),
+        (("--at", "0,0,0,0,nan"), "--at: joint 5 is nan"),
+        (("--at", "inf,0,0,0,0"), "--at: joint 1 is inf"),
+        (("--at", "20,-5,5,-10,80"), "--at-unit deg"),
+        (("--at", "0,0,0,0,9"), "beyond its limits"),
+        (("--at", "900,0,0,0,0", "--at-unit", "deg"), "beyond its limits"),
+    ):
         refused = projservo(*hobby, *wrong, "-o", "other.yaml")
-        assert (refused.code, told in refused.err) == (2, True)
+        assert (refused.code, refused.out, refused.err.count("\n")) == (2, "", 1)
+        assert told in refused.err
     assert not (tmp_path / "other.yaml").exists()
 
 
