@@ -16,7 +16,7 @@ from projservo_cli.config import Config, load_config, shipped, to_yaml
 from projservo_cli.config.inputs import joints_of, trajectory_of
 from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
-from projservo_cli.laws import CODES, law_and_mode
+from projservo_cli.laws import CODES, law_and_mode, mode_in
 from projservo_cli.progress import Bar
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Report, WorkFailed
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
@@ -427,6 +427,8 @@ def law_target(name: str) -> str:
     """The law of a name: built in, or ``module:Class``; an InputError that lists them where there is none."""
     target = name if name in CODES else plugins.target_of("law", name)
     if target is None:
+        if told := mode_in(name):
+            raise InputError(f"law {name}: {told}")
         valid = ", ".join((*CODES, *plugins.registered("law")))
         raise InputError(f"law {name}: no such law; laws: {valid}, or module:Class")
     return target

@@ -62,6 +62,14 @@ def law_and_mode(name: str) -> tuple[str, str]:
     return _NAMES.get(name, (name, REGULATE))
 
 
+def mode_in(name: str) -> str:
+    """Tell, where a name given as a law is that of a run in another mode, what to set instead; else empty."""
+    law, mode = law_and_mode(name)
+    if mode == REGULATE:
+        return ""
+    return f"is the run of {law} in mode {mode}: name {law}, with --set control.mode=[{mode}]"
+
+
 def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
     """Names of the runs of laws, each in those of the modes that it has.
 

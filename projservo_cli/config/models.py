@@ -34,7 +34,7 @@ from projservo_cli.config.robot import (
     are_degrees,
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
-from projservo_cli.laws import LAW_SPECS, LAWS, REGULATE
+from projservo_cli.laws import LAW_SPECS, LAWS, REGULATE, mode_in
 from projservo_cli.nominal import Number, Vector3
 from projservo_cli.records import LIMITS_MISSING, InputError
 from projservo_cli.robots import plugins
@@ -170,6 +170,8 @@ def _law(name: str) -> str:
     if target is None and ":" in name:
         raise ValueError("must be module:Class, such as my_laws:Law")
     if target is None:
+        if told := mode_in(name):
+            raise ValueError(told)
         valid = ", ".join(map(repr, (*LAWS, *plugins.registered("law"))))
         raise PydanticCustomError("literal_error", "is not one of them", {"expected": valid})
     return target

@@ -138,6 +138,14 @@ USAGE = {
     "noise of validate": (["validate", "x", "--noise-px", "1"], "--noise-px: not used by validate"),
     "data of equations": (["equations", "--data", "t.csv"], "--data: not used by equations"),
     "unknown law": (["servo", "--law", "direct_four"], "laws: direct_three, direct_two, stacked"),
+    "law with its mode": (
+        ["servo", "--law", "exact_track"],
+        "--law exact_track: is the run of exact in mode track: name exact, with --set control.mode=[track]",
+    ),
+    "key of a law with its mode": (
+        ["servo", "-c", "tiny.yaml", "--set", "control.laws=[stacked_image_track]"],
+        "control.laws.0: is the run of stacked in mode image_track: name stacked, with --set control.mode",
+    ),
     "stage and other": (["calibrate", "validate"], "validate stands alone"),
     "other and stage": (["equations", "calibrate"], "unexpected extra argument (calibrate)"),
     "run twice": (["show", "a", "-o", "b"], "one run"),
