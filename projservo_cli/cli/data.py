@@ -267,10 +267,12 @@ def _validate(
     target = option.one_run("validate", run, output)
     if target is None:
         raise click.UsageError("validate needs a run: projservo validate RUN --data TABLE")
-    if (data is None) == (metric is None):
-        raise click.UsageError("validate needs --data TABLE, or else --metric TABLE")
     if metric is None and (fit is not None or arm_std_mm):
         raise click.UsageError("--fit and --arm-std-mm are for --metric, which is not given")
+    if data is None and metric is None:
+        raise click.UsageError("validate needs --data TABLE, or else --metric TABLE")
+    if data is not None and metric is not None:
+        raise click.UsageError("--data and --metric: validate takes one of them; leave the other out")
     from projservo_cli.calibration import residual_statistics
     from projservo_cli.config import load_config
     from projservo_cli.store import load

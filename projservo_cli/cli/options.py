@@ -267,8 +267,10 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
         value = os.path.abspath(given) if name in ("data", "init") else given
         found.append(Override(flag, key, value))
     if (size := options.get("image_size")) is not None:  # such as 1280x1024
-        sides = size.lower().replace("x", ", ")
-        found.append(Override.parse(f"data.image_size_px=[{sides}]", f"--image-size {size}"))
+        flag, sides = f"--image-size {size}", size.lower().split("x")
+        if len(sides) != 2 or not all(side.strip().isdecimal() for side in sides):
+            raise click.UsageError(f"{flag}: expected width x height in px, such as 1280x1024")
+        found.append(Override(flag, "data.image_size_px", [int(side) for side in sides]))
     if (goal := options.get("goal")) is not None:
         named = goal if goal.endswith((".yaml", ".yml")) else f"{goal}.yaml"
         found.append(Override(f"--goal {goal}", "task.goal", named))

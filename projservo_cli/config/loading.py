@@ -547,7 +547,8 @@ def _displayed(value: Any) -> str:
 
 def _nearest(word: object, valid: Sequence[str]) -> str:
     """The end of a message: the nearest valid word, or all of them."""
-    close = difflib.get_close_matches(str(word)[:80], valid, n=1, cutoff=0.5)
+    given = str(word)[:80]
+    close = difflib.get_close_matches(given, valid, n=1) or [one for one in valid if one.startswith(given)]
     return f"did you mean {close[0]}?" if close else f"valid: {', '.join(valid)}"
 
 

@@ -33,7 +33,11 @@ def _axis(value: Any) -> Any:
     """Values are those of the key of the name of the axis; a mapping adds further keys to each."""
     if isinstance(value, dict) and not {*_Linked.model_fields} & {*value}:
         return {"keys": [""], "values": list(value), "also": value}
-    return {"keys": [""], "values": value} if isinstance(value, list) else value
+    if isinstance(value, list):
+        return {"keys": [""], "values": value}
+    if not isinstance(value, dict):
+        raise ValueError("must be a list of values")
+    return value
 
 
 _Values = Annotated[tuple[Plain, ...], Field(min_length=1)]

@@ -151,12 +151,18 @@ USAGE = {
     "run twice": (["show", "a", "-o", "b"], "one run"),
     "validate without run": (["validate", "--data", "t.csv"], "needs a run"),
     "validate without data": (["validate", "out"], "--data TABLE"),
+    "validate with both": (
+        ["validate", "out", "--data", "t.csv", "--metric", "t.csv"],
+        "--data and --metric: validate takes one of them",
+    ),
+    "fit of no positions": (["validate", "out", "--fit", "t.csv"], "are for --metric, which is not given"),
     "threads": (["servo", "-j", "0"], "-j"),
     "unit": (["calibrate", "--data", "t.csv", "--joint-unit", "grad"], "--joint-unit"),
     "image size without height": (
         ["calibrate", "--data", "t.csv", "--image-size", "1280"],
-        "--image-size 1280: ",
+        "--image-size 1280: expected width x height in px, such as 1280x1024",
     ),
+    "image size in words": (["calibrate", "--data", "t.csv", "--image-size", "axb"], "such as 1280x1024"),
     "lens of show": (["show", "--lens"], "--lens: not used by show"),
     "record without table": (["record", "-c", "tiny.yaml"], "'--output'"),
     "unit of no motions": (["record", "-o", "u.csv", "--joint-unit", "deg"], "--motions"),
@@ -181,6 +187,7 @@ USAGE = {
     ),
     "joints of no table": ([*TINY, "--joints", "RR"], "--joints RR: data.table: is missing"),
     "override of nothing": ([*TINY, "--set", "sed=1"], "--set sed=1: sed: unknown key; did you mean"),
+    "override of nothing alike": ([*TINY, "--set", "foo=1"], "--set foo=1: foo: unknown key; valid: "),
     "a file for a folder": ([*TINY, "-o", "t.csv/out"], "t.csv/out"),
     "a folder below a file": (
         ["calibrate", "-o", "t.csv/out"],

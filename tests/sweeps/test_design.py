@@ -143,6 +143,10 @@ def test_what_no_run_can_be_made_of_is_refused_before_any_is(given, message):
         ("base: paper.yaml\ngrid: {law: []}\n", "grid.law"),
         ("base: paper.yaml\ngrid: {control.gain: [1, 1]}\n", "a value stands there twice"),
         (
+            "base: paper.yaml\ngrid: {control.gain: 0.5}\n",
+            "grid.control.gain: must be a list of values, not 0.5",
+        ),
+        (
             "base: paper.yaml\ngrid: {law: {exact: 5}}\n",
             "grid.law.also.exact: must be a mapping",
         ),
