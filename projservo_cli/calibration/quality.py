@@ -253,7 +253,10 @@ def assess(
             advice.insert(0, "look for joint readings that lag behind the images")
     outliers, suspects, swaps = rejected
     limit, many = "noise", outliers > _MAX_OUTLIERS * solution.used.shape[1]
-    outlier_advice = f"{outliers} observations were rejected as outliers: check the detection of markers"
+    what = "1 observation was rejected as an outlier"
+    if outliers != 1:
+        what = f"{outliers} observations were rejected as outliers"
+    outlier_advice = f"{what}: check the detection of markers"
     if many:
         advice.append(outlier_advice)
     if words := _describe_joint_noise(solution):
@@ -271,9 +274,8 @@ def assess(
     elif many:
         limit = "outliers"
     if suspects:
-        advice.append(
-            f"{suspects} joint readings disagree with the images: check how poses and images are paired"
-        )
+        what = "1 joint reading disagrees" if suspects == 1 else f"{suspects} joint readings disagree"
+        advice.append(f"{what} with the images: check how poses and images are paired")
     if swaps:
         times = f"{swaps} times" if swaps > 1 else "once"
         advice.append(f"{times} a marker was seen under the number of another: check the numbering")

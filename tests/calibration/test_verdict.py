@@ -94,6 +94,17 @@ def test_many_outliers_limit():
     assert "limited by outliers" in calibrate(found, "RRR", source="recorded").reason
 
 
+def test_what_is_wrong_once_is_told_of_one():
+    robot = random_robot("RRR", np.random.default_rng(3), markers=6)
+    q = trials(robot, 8)
+    found = robot.observe(q, SIGMA, np.random.default_rng(2))
+    found.images[5, 0, 2] += 40.0
+    found.q[11, 0] += 0.1
+    told = " ".join(calibrate(found, "RRR", source="recorded").advice)
+    assert "1 observation was rejected as an outlier: " in told
+    assert "1 joint reading disagrees with the images: " in told
+
+
 @pytest.mark.parametrize(
     ("span", "prismatic", "needed", "text"),
     [
