@@ -34,7 +34,7 @@ _BODIES = ("roof", "plate")
 @click.option(
     "--size-mm",
     metavar="S",
-    type=option.NumberRange(5.0, 190.0),
+    type=option.NumberRange(5.0, 150.0),
     default=_SIZE_MM,
     show_default=True,
     help="Side of the black square of each tag.",
@@ -83,13 +83,15 @@ def _tags(
             f"--numbers: is for --kind single; a {kind} has the tags of markers.tags: {kind}"
         )
     output = output or Path("tags.pdf")
+    if output.suffix.lower() != ".pdf":
+        raise click.UsageError(f"{output}: name a PDF to write, such as {output.stem or 'tags'}.pdf")
     option.require_new(output, force=force)
     finder, margin = TagFinder(dictionary), GROUND * size_mm
     size_m = round(1e-3 * size_mm, 6)
     own = "" if dictionary == "4X4_50" else f", dictionary: {dictionary}"
     if kind == "single":
-        wanted = None if numbers is None else list(sheets.numbers_of(numbers))
-        net = sheets.single(wanted, finder.known, margin, paper)
+        wanted = None if numbers is None else sheets.numbers_of(numbers)
+        net = sheets.single(wanted, finder.known, size_mm, margin, paper)
         corners = f"[{', '.join(str(4 * net.tags[0].number + k) for k in range(4))}, ...]"
         keys = f"markers: {{numbers: {corners}, tag_size_m: {size_m:g}{own}}}"
     else:

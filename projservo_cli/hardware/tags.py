@@ -2,7 +2,8 @@
 
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -57,6 +58,7 @@ class Net(NamedTuple):
     lines: tuple[_Line, ...]
     size: FloatArray  # (2,) width and height, mm
     labels: tuple[tuple[str, FloatArray], ...]  # what stands where, mm
+    fixed: FloatArray  # (2,) the part of the size that does not grow with the tags, mm
 
 
 def unfolded(numbers: Sequence[int], poses: FloatArray) -> Net:
@@ -97,8 +99,8 @@ def unfolded(numbers: Sequence[int], poses: FloatArray) -> Net:
             ("glue", corner + 0.76 * width * 0.5 * (rays[0] + rays[1])),
             ("base", width * 1.5 * out + 0.5 * _FLAP * out),
         ]
-    side = 3.0 * width + 2.0 * _FLAP
-    return Net(tuple(tags), tuple(lines), np.array([side, side]), tuple(labels))
+    flaps = np.full(2, 2.0 * _FLAP)
+    return Net(tuple(tags), tuple(lines), 3.0 * width + flaps, tuple(labels), flaps)
 
 
 def plate(numbers: Sequence[int], poses: FloatArray, margin_mm: float) -> Net:
@@ -109,22 +111,28 @@ def plate(numbers: Sequence[int], poses: FloatArray, margin_mm: float) -> Net:
     corners = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
     label_at = [np.array([math.copysign(half[0] + 3.0, c[0]), c[1]]) for c in at]
     labels = tuple((f"{number}", place) for number, place in zip(numbers, label_at, strict=True))
-    return Net(tags, (_Line(corners, fold=False),), 2.0 * half + [12.0, 0.0], labels)
+    beside = np.array([12.0, 0.0])
+    return Net(tags, (_Line(corners, fold=False),), 2.0 * half + beside, labels, beside)
 
 
-def single(numbers: Sequence[int] | None, known: int, margin_mm: float, paper: str) -> Net:
+def single(numbers: Sequence[int] | None, known: int, size_mm: float, margin_mm: float, paper: str) -> Net:
     """Tags in rows, each to be cut out, with bright margins up to a width ``margin_mm``.
 
     numbers : of the tags; None for as many of the ``known`` ones as the paper takes.
+    size_mm : side of the black square of each.
     """
-    pitch = margin_mm + _GAP
-    columns, rows = (max(0, int((room + _GAP) // pitch)) for room in _room(paper))
+    columns, rows = _grid(paper, margin_mm)
     wanted = range(min(known, columns * rows)) if numbers is None else numbers
-    if not columns * rows >= len(wanted) > 0:
+    asked = max(1, len(wanted))
+    if columns * rows < asked:
+        share, smaller = margin_mm / size_mm, range(int(size_mm), 0, -1)
+        fitting = [f"{mm} mm at most" for mm in smaller if math.prod(_grid(paper, share * mm)) >= asked]
+        remedies = [*fitting[:1], *["fewer --numbers"] * (asked > 1)]
         raise InputError(
-            f"--size-mm: {paper} takes {columns * rows} tags with margins of {margin_mm:.3g} mm, not "
-            f"{max(1, len(wanted))}: take smaller tags or fewer --numbers"
+            f"--size-mm {size_mm:g}: {paper} takes {columns * rows} tags with margins of {margin_mm:.3g} mm, "
+            f"not {asked}: take {' or '.join(remedies)}"
         )
+    pitch = margin_mm + _GAP
     columns = min(columns, len(wanted))
     count = -(-len(wanted) // columns)
     place = [
@@ -135,7 +143,13 @@ def single(numbers: Sequence[int] | None, known: int, margin_mm: float, paper: s
     square = 0.5 * margin_mm * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
     lines = tuple(_Line(tag.center + square, fold=False) for tag in tags)
     labels = tuple((f"{tag.number}", tag.center - [0.0, 0.5 * pitch]) for tag in tags)
-    return Net(tags, lines, pitch * np.array([columns, count]) - _GAP, labels)
+    return Net(tags, lines, pitch * np.array([columns, count]) - _GAP, labels, np.zeros(2))
+
+
+def _grid(paper: str, margin_mm: float) -> tuple[int, int]:
+    """Columns and rows of single tags that paper takes."""
+    columns, rows = (int((room + _GAP) // (margin_mm + _GAP)) for room in _room(paper))
+    return columns, rows
 
 
 def _room(paper: str) -> tuple[float, float]:
@@ -157,7 +171,7 @@ def sheet(net: Net, finder: TagFinder, size_mm: float, paper: str, head: Sequenc
     width, height = PAPERS[paper]
     room = np.array(_room(paper))
     if (net.size > room + 1e-9).any():
-        share = float((room / net.size).min())
+        share = float(((room - net.fixed) / (net.size - net.fixed)).min())
         raise InputError(
             f"--size-mm {size_mm:g}: the tags take {net.size[0]:.0f} x {net.size[1]:.0f} mm, and {paper} has "
             f"{room[0]:.0f} x {room[1]:.0f} mm for them: take about {math.floor(share * size_mm)} mm"
@@ -222,10 +236,18 @@ def pdf(figure: "Figure") -> bytes:
     return buffer.getvalue()
 
 
-def numbers_of(text: str) -> Iterator[int]:
-    """Numbers of tags such as ``0-4,7``; an InputError where they are none."""
+def numbers_of(text: str) -> list[int]:
+    """Numbers of tags such as ``0-4,7``; an InputError where they are none, or one stands there twice."""
+    found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
         if not first.isdecimal() or (dash and not (last.isdecimal() and int(last) >= int(first))):
             raise InputError(f"--numbers {text}: expected numbers of tags such as 0-4,7")
-        yield from range(int(first), int(last if dash else first) + 1)
+        found += range(int(first), int(last if dash else first) + 1)
+    number, times = Counter(found).most_common(1)[0]
+    if times > 1:
+        raise InputError(
+            f"--numbers {text}: tag {number} stands there {times} times: name it once, since detect leaves "
+            "out a tag that an image shows twice"
+        )
+    return found

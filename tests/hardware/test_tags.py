@@ -1,6 +1,7 @@
 """The command tags: true scale for the detector of the project, and a net that folds to the roof."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -86,10 +87,16 @@ def test_triangles_of_the_net_close_the_gaps_of_the_tilted_roof():
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (("--kind", "roof", "--size-mm", "60"), "a4 has 194 x 225 mm for them: take about 45 mm"),
+        (("--kind", "roof", "--size-mm", "60"), "a4 has 194 x 225 mm for them: take about 44 mm"),
+        (("--size-mm", "150"), "a4 takes 0 tags with margins of 200 mm, not 1: take 145 mm at most"),
+        (("--numbers", "3,2-4"), "--numbers 3,2-4: tag 3 stands there 2 times"),
         (("--numbers", "3,60"), "there is no tag 60 in the dictionary, which has tags 0 to 49"),
         (("--numbers", "3,a"), "expected numbers of tags such as 0-4,7"),
-        (("--numbers", "0-40"), "a4 takes 16 tags with margins of 40 mm, not 41: take smaller tags"),
+        (
+            ("--numbers", "0-40"),
+            "a4 takes 16 tags with margins of 40 mm, not 41: take 19 mm at most or fewer --numbers",
+        ),
+        (("--numbers", "0-4000"), "not 4001: take fewer --numbers"),
         (("--kind", "roof", "--numbers", "3"), "--numbers: is for --kind single"),
         (("--dictionary", "4X4"), "--dictionary 4X4: unknown; valid: 4X4_100"),
     ],
@@ -99,3 +106,18 @@ def test_a_sheet_that_cannot_be_is_refused(projservo, tmp_path, given, words):
     assert answer.code == 2
     assert words in answer.err
     assert not (tmp_path / "tags.pdf").exists()
+
+
+@pytest.mark.parametrize("kind", ["single", "plate", "roof"])
+@pytest.mark.parametrize("paper", tags.PAPERS)
+def test_the_largest_size_that_a_refusal_names_fits(projservo, tmp_path, kind, paper):
+    given = ("tags", "-o", tmp_path / "tags.pdf", "--kind", kind, "--paper", paper, "--size-mm")
+    most = re.search(r"take (?:about )?(\d+) mm", projservo(*given, "150").err)
+    assert projservo(*given, most[1]).code == 0
+    assert projservo(*given, int(most[1]) + 1, "--force").code == 2
+
+
+def test_a_sheet_is_a_pdf_by_its_name(projservo, tmp_path):
+    answer = projservo("tags", "-o", tmp_path / "sheet.png")
+    assert (answer.code, "such as sheet.pdf" in answer.err) == (2, True)
+    assert list(tmp_path.iterdir()) == []
