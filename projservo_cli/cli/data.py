@@ -91,12 +91,16 @@ def _teach(
             console.report(value, ["teach: failed; no file was written"])
             raise WorkFailed(f"teach: {reason}") from error
         write_whole(output, _TAUGHT + plain_yaml(taught.as_goal()))
-    _print_taught(console, output, taught, check, key="task.start" if start else "task.goal")
+    # Names are relative to the configuration, in the file and with --set.
+    beside = config is not None and Path(config).resolve().parent == output.resolve().parent
+    told = f"{'task.start' if start else 'task.goal'}: {output.name if beside else output.resolve()}"
+    _print_taught(console, output, taught, check, told)
     if check is not None and not check.reached:
         raise WorkFailed(f"{output}: by the calibration, {check.reason}")
 
 
-def _print_taught(console: Console, path: Path, taught: Any, check: Any, *, key: str) -> None:
+def _print_taught(console: Console, path: Path, taught: Any, check: Any, told: str) -> None:
+    """Print what was taught, how it agrees with the calibration, and the key ``told`` that takes it."""
     import numpy as np
 
     value = {
@@ -123,7 +127,7 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, *, key:
         far = ", ".join(f"{number} ({side}) by {px:.3g} px" for number, side, px in check.far)
         words.append(wrapped(check.reason, "  "))
         words.append(wrapped(f"markers that disagree with the calibration: {far or 'none'}", "  "))
-    console.report(value, [*words, f"set {key}: {path}"])
+    console.report(value, [*words, f"set {told}"])
 
 
 @main.command(

@@ -62,7 +62,8 @@ override = click.option(
     "sets",
     metavar="A.B=V",
     multiple=True,
-    help="Override a value of the configuration; V is YAML. Repeatable.",
+    help="Override a value of the configuration; V is YAML, files are relative to the configuration. "
+    "Repeatable.",
 )
 joint_unit = click.option(
     "--joint-unit",

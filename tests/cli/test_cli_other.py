@@ -120,8 +120,6 @@ def test_a_goal_is_taught_and_told(projservo, tmp_path, monkeypatch):
     assert (again.code, "goal.yaml: exists already" in again.err) == (2, True)
     assert projservo(*hobby, *at, "--force", "-q").code == 0
     assert (tmp_path / "goal.yaml").read_text() == text
-    start = projservo(*hobby, *at, "--start")
-    assert (start.code, "set task.start: start.yaml" in start.out) == (0, True)
     for wrong, told in (
         ((), "give the joints"),
         (("--at", "1,2,x"), "a number for each joint"),
@@ -145,14 +143,28 @@ def test_what_names_its_goal_and_start_before_they_are_taught_teaches_them(projs
     own["calibration"] = own.get("calibration", {}) | {"reference": own["task"]["start"]}
     own["task"] = {"start": "start.yaml", "goal": "goal.yaml"}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(own), encoding="utf-8")
-    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "1", "-q")
+    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "1")
     lacking = projservo("plan", "-c", "own.yaml", "-n")
     assert (lacking.code, "start.yaml" in lacking.err) == (2, True)
     for start in (("--start",), ()):
         answer = projservo("teach", "-c", "own.yaml", *at, *start)
         assert answer.code == 0, answer.err
+        assert answer.out.endswith(f"set task.{'start: start' if start else 'goal: goal'}.yaml\n")
     task = load_config("own.yaml").task
     assert task.start == task.goal.images.joints
+
+
+@pytest.mark.parametrize("key", ["goal", "start"])
+def test_what_is_taught_elsewhere_is_told_as_the_configuration_takes_it(
+    projservo, tmp_path, monkeypatch, key
+):
+    monkeypatch.chdir(tmp_path)
+    hobby, flags = ("-c", ROOT / "configs" / "hobby.yaml"), ("--start",) * (key == "start")
+    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "1")
+    told = projservo("teach", *hobby, *at, *flags).out.splitlines()[-1]
+    value = told.removeprefix("set ").replace(": ", "=")
+    assert value == f"task.{key}={tmp_path / key}.yaml"
+    assert projservo("plan", *hobby, "--set", value, "-n").code == 0
 
 
 def test_what_cannot_be_taught_is_an_object_with_exit_code_1(projservo, tmp_path, monkeypatch):
