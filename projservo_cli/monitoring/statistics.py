@@ -199,7 +199,7 @@ class ErrorModel:
         return np.asarray(np.maximum(found / (near.sum(axis=(2, 3)) + _PRIOR_SIGHTINGS), 1.0))
 
     def slants(self, q: FloatArray) -> int:
-        """Number of sides from which the tool was seen at joints (K, n), apart enough for new errors of corners."""
+        """Number of sides from which the tool was seen at joints (K, n), apart as far as corners err anew."""
         rays = _rays(self.scene, self.directions, q - self.calibration.q_reference).reshape(len(q), -1, 3)
         sides: list[FloatArray] = []
         for ray in rays:

@@ -37,6 +37,7 @@ _CURVES: tuple[tuple[str, Any, str], ...] = (
     (ORANGE, (0, (5, 1.5, 1, 1.5)), "D"),
     (GREEN, (0, (3, 3)), "v"),
     (PURPLE, (0, (3, 1, 1, 1, 1, 1)), "P"),
+    (SKY, (0, (8, 2)), "X"),  # of the seventh joint
 )
 
 # How the face at the start and at the goal look in every figure.

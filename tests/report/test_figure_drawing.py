@@ -91,6 +91,11 @@ def test_names_follow_the_numbers_of_the_paper():
     assert [int(name[3:5]) for name in NAMES] == list(range(19))
 
 
+@pytest.mark.parametrize("part", ["color", "linestyle", "marker"])
+def test_curves_of_seven_joints_differ_in_each_part_of_their_look(part):
+    assert len({str(style.curve(i, marker=True)[part]) for i in range(7)}) == 7
+
+
 def test_importing_figures_does_not_import_matplotlib():
     import subprocess
     import sys

@@ -195,4 +195,4 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
         for panel in row:
             panel.set_ylim(np.min(limits), np.max(limits))
     line_styles = {f"$q_{i + 1}$": style.curve(i) for i in range(len(prismatic))} | {"limit": line}
-    style.legend_below(figure, line_styles, min(len(line_styles), 7))
+    style.legend_below(figure, line_styles, min(len(line_styles), 8))
