@@ -188,7 +188,7 @@ def test_a_sweep_in_memory_compares_classes_and_laws(config):
     class Slow(Resolved):
         gain = 0.5
 
-    studies = [ps.sweep(config, laws=[Slow, Resolved, "exact"], tasks=4, seed=3) for _ in range(2)]
+    studies = [ps.sweep(config, laws=[Slow, Resolved, "exact"], tasks=2, seed=3) for _ in range(2)]
     for name, values in studies[0].table.items():
         np.testing.assert_array_equal(values, studies[1].table[name])
     study = studies[0]
@@ -198,11 +198,11 @@ def test_a_sweep_in_memory_compares_classes_and_laws(config):
     assert 0.0 <= low <= study.success()[2]["success_rate"] <= high <= 1.0
     (pair,) = study.paired(Slow, "exact")
     assert pair["laws"] == ["Slow", "exact"]
-    assert pair["both"] + sum(pair["only"]) + pair["neither"] == pair["pairs"] == 4
+    assert pair["both"] + sum(pair["only"]) + pair["neither"] == pair["pairs"] == 2
     with pytest.raises(ps.InputError, match="no law direct_two in this sweep; laws: Slow, Resolved, exact"):
         study.paired("direct_two", "exact")
     with pytest.raises(ps.InputError, match=r"other processes cannot import .*Slow: put it into a module"):
-        ps.sweep(config, laws=[Slow], tasks=4, workers=2)
+        ps.sweep(config, laws=[Slow], tasks=2, workers=2)
     assert set(study.to_frame().columns) == set(study.table)
 
 
