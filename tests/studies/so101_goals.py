@@ -1,6 +1,6 @@
 """Taught goals of an emulated SO-101: how near the arm comes to where it was when each was taught.
 
-    python -m tests.studies.so101_goals [GOALS] [--rate 0.5]
+    python -m tests.studies.so101_goals [GOALS] [--fps 30] [--rate 0.25]
 
 One recording and calibration by the commands of the tutorial, of an arm with 1° of hysteresis that is read,
 0.2° of backlash that is not, 2° of sag and images 80 ms late. Then for each goal the arm is put there by
@@ -52,12 +52,13 @@ def main():
     """Print the error of each goal, and a summary."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("goals", nargs="?", type=int, default=GOALS)
-    parser.add_argument("--rate", type=float, default=0.5, help="of the emulated clock; slower is safer")
+    parser.add_argument("--fps", type=float, default=30.0, help="frames a second of both cameras")
+    parser.add_argument("--rate", type=float, default=0.25, help="of the emulated clock; slower is safer")
     given = parser.parse_args()
     with (
         tempfile.TemporaryDirectory() as folder,
         pytest.MonkeyPatch.context() as patch,
-        benched(Path(folder), patch, given.rate) as bench,
+        benched(Path(folder), patch, given.rate, given.fps) as bench,
     ):
         _driven(bench, given.goals)
 
