@@ -1,6 +1,7 @@
 """Observations of a robot by two cameras, with all inputs of a calibration besides the pixels."""
 
 import dataclasses
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -202,7 +203,7 @@ def _read(text: str, joint_types: str | None, joint_unit: str | None) -> Observa
             return read_table(path, joint_types, joint_unit)
         except InputError as error:
             message = str(error).replace(str(path), _TABLE)
-            raise InputError(message.replace("--joint-unit deg", "joint_unit='deg'")) from error
+            raise InputError(re.sub(r"--joint-unit (\w+)", r"joint_unit='\1'", message)) from error
 
 
 def rows_of(q: npt.ArrayLike, n: int) -> FloatArray:

@@ -244,6 +244,8 @@ def in_radians(
 
     where, option : file or argument of the readings, and option of the unit, for messages.
     """
+    if unit not in (None, "deg", "rad"):
+        raise InputError(f"{where}: joint_unit {unit!r}: give deg or rad")
     revolute = np.array([letter in "Rr" for letter in joint_types])
     if unit == "deg":
         return np.where(revolute, np.radians(q), q)

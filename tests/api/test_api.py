@@ -358,6 +358,7 @@ def test_what_does_not_fit_a_calibration_is_said_in_a_sentence(config, made, cal
         ({"pixels": np.zeros((4, 3, 2))}, r"pixels of shape \(4, 3, 2\): expected \(K, 2, m, 2\)"),
         ({"pixels": "here"}, "pixels: no array of numbers"),
         ({"q": np.full((4, 6), 90.0)}, "they look like degrees; give joint_unit='deg'"),
+        ({"joint_unit": "degrees"}, "q: joint_unit 'degrees': give deg or rad"),
         ({"joint_types": "RRR"}, "joint_types: 'RRR': expected 6 letters R or P"),
         ({"marker": [1, 1, 2]}, "marker: expected 3 different whole numbers"),
         ({"sigma": np.zeros((4, 2, 3))}, "sigma: must be positive wherever a marker is seen"),
@@ -385,6 +386,11 @@ def test_arrays_tables_and_frames_hold_the_same(made, tmp_path):
     np.testing.assert_allclose(degrees.q, observations.q, atol=1e-12)
     with pytest.raises(ps.InputError, match=r"table:1: the header lacks the column\(s\) marker"):
         ps.Observations.from_frame(observations.to_frame().drop(columns="marker"))
+    columns = dict(observations.to_frame())
+    with pytest.raises(ps.InputError, match="joint_unit='deg', or joint_unit='rad' if they are"):
+        ps.Observations.from_frame(columns | {"q1": columns["q1"] + 90.0})
+    with pytest.raises(ps.InputError, match="table: joint_unit 'degrees': give deg or rad"):
+        ps.Observations.from_frame(columns, joint_unit="degrees")
 
 
 def test_results_print_themselves_in_few_lines(config, made):
