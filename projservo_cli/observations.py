@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.calibration.estimate import require_size_and_noise
 from projservo_cli.display import Displayable, checked_array, pandas
 from projservo_cli.records import FloatArray, InputError, Observation
 from projservo_cli.tables import in_radians, read_table, to_csv, write_table
@@ -44,6 +45,10 @@ class Observations(Displayable, Observation):
     source: str = "recorded"
     exact: bool = False
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse an image size or a noise that is none."""
+        require_size_and_noise(self.image_size, self.noise_px)
 
     @classmethod
     def of(cls, observation: Observation, **known: Any) -> "Observations":
@@ -88,7 +93,8 @@ class Observations(Displayable, Observation):
         Raises
         ------
         InputError
-            When an array has another shape, readings are not finite or look like degrees.
+            When an array has another shape, readings are not finite or look like degrees, or an image size
+            or a noise is none.
         """
         seen = checked_array("pixels", pixels, (None, 2, None, 2), "(K, 2, m, 2)")
         readings = checked_array("q", q, (len(seen), None), f"({len(seen)}, n), a row for each pose")
@@ -140,7 +146,7 @@ class Observations(Displayable, Observation):
         Raises
         ------
         InputError
-            If a column is missing, or a row is not valid.
+            If a column is missing, a row is not valid, or an image size or a noise is none.
         """
         if isinstance(table, (str, Path)):
             found = read_table(table, joint_types, joint_unit)

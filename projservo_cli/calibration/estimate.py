@@ -4,6 +4,8 @@ import dataclasses
 import time
 from collections.abc import Callable
 from functools import partial
+from numbers import Real
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -28,7 +30,7 @@ from projservo_cli.calibration.projective import Projective, closed_form_operato
 from projservo_cli.calibration.quality import WEAK_NOISE, assess, cross_validate
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.geometry.lens import K1
-from projservo_cli.records import Calibration, Errors, InputError, Observation
+from projservo_cli.records import VIEWS, Calibration, Errors, InputError, Observation
 
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
@@ -51,8 +53,12 @@ _PARTS = 3
 _MUCH = 0.1
 # Share of rejected detections, explained ones included, above which a fit rejects much.
 _MAX_REJECTED = 0.4
-# Maximum share of pixels outside the images, as outliers may be.
-_STRAYS = 0.01
+# Maximum share of the pixels of a view outside its image, as outliers may be.
+_STRAYS = 0.1
+# That for an estimation of the lens, whose middle is that of the image.
+_LENS_STRAYS = 0.01
+# Distance beyond the border of an image, px, within which a search for corners may place one.
+_BEYOND_PX = 1.0
 # Maximum number of lines of advice.
 _MAX_ADVICE = 5
 # Maximum number of markers that a message names.
@@ -109,10 +115,7 @@ def calibrate(
         raise InputError(f"calibration method {method!r}: choose one of {', '.join(_METHODS)}")
     if source not in ("simulated", "recorded"):
         raise InputError(f"calibration source {source!r}: choose simulated or recorded")
-    if sigma_px is not None and not 0.0 < sigma_px < np.inf:
-        raise InputError(f"pixel noise {sigma_px!r}: give a positive number, or none to estimate it")
-    if image_size is not None and not all(0.0 < length < np.inf for length in image_size):
-        raise InputError(f"image size {image_size!r}: give a positive width and height, px")
+    require_size_and_noise(image_size, sigma_px)
     if seed < 0:
         raise InputError(f"seed {seed!r}: give a whole number that is not negative")
     if joint_noise is not None and not 0.0 <= joint_noise < np.inf:
@@ -127,8 +130,8 @@ def calibrate(
     with threadpool_limits(limits=1):
         detections = Detections.of(observation, joint_types)
         require_motion(detections)
-        if lens and image_size is not None:
-            _require_size(detections, image_size)
+        if image_size is not None:
+            _require_inside(detections, image_size, _LENS_STRAYS if lens else _STRAYS)
         require_images(detections, sigma_px)
         rng = np.random.default_rng(seed)
         epipolar = Epipolar.of(detections, rng)
@@ -153,15 +156,39 @@ def calibrate(
     return dataclasses.replace(result, source=source, seconds=seconds)
 
 
-def _require_size(detections: Detections, size: tuple[int, int]) -> None:
-    """Refuse an image size, width and height in px, that holds fewer than 99 of 100 pixels seen."""
-    seen = detections.pixels[detections.seen]
-    if np.mean(((seen >= -0.5) & (seen <= np.array(size) - 0.5)).all(axis=1)) < 1.0 - _STRAYS:
-        low, high = np.percentile(seen, [1, 99], axis=0)
-        raise InputError(
-            f"image size {size[0]}x{size[1]} px: markers were seen at u from {low[0]:.0f} to {high[0]:.0f}, "
-            f"v from {low[1]:.0f} to {high[1]:.0f}; give the size of the images, width before height"
-        )
+def require_size_and_noise(image_size: Any, sigma_px: Any) -> None:
+    """Refuse a width and height of images, px, or a noise of pixels, px, that are none; None is unknown."""
+    if sigma_px is not None and not _is_positive(sigma_px):
+        raise InputError(f"pixel noise {sigma_px!r}: give a positive number, or none to estimate it")
+    if image_size is not None:
+        lengths = tuple(image_size) if np.iterable(image_size) else ()
+        if len(lengths) != 2 or not all(map(_is_positive, lengths)):
+            raise InputError(f"image size {image_size!r}: give a positive width and height, px")
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, Real) and 0.0 < float(value) < np.inf
+
+
+def _require_inside(detections: Detections, size: tuple[int, int], strays: float) -> None:
+    """Refuse an image size, width and height in px, with more than a share of a view's pixels outside."""
+    beyond, pixels = 0.5 + _BEYOND_PX, detections.pixels
+    inside = ((pixels >= -beyond) & (pixels <= np.array(size) - 1.0 + beyond)).all(axis=2)
+    outside = detections.seen & ~inside
+    for view, name in enumerate(VIEWS):
+        seen = detections.seen[view]
+        share = float(outside[view].sum() / max(seen.sum(), 1.0))
+        if share > strays:
+            i = int(np.argmax(outside[view]))
+            u, v = pixels[view, i]
+            low, high = np.percentile(pixels[view, seen], [1, 99], axis=0)
+            marker, pose = detections.marker[detections.marker_of[i]], detections.pose[detections.pose_of[i]]
+            raise InputError(
+                f"image size {size[0]}x{size[1]} px: {100.0 * share:.3g} % of the pixels of the {name} view "
+                f"are outside, more than {100.0 * strays:g} %, such as u {u:.1f}, v {v:.1f} of marker "
+                f"{marker} at pose {pose}; that view saw markers at u from {low[0]:.0f} to {high[0]:.0f}, "
+                f"v from {low[1]:.0f} to {high[1]:.0f}: give the size of the images, width before height"
+            )
 
 
 def _maximum_likelihood(

@@ -34,6 +34,9 @@ CASES = {
     "markers in a table": (shaped(marker=OBSERVATION.marker[:, None]), "RPR", {}, "one dimension"),
     "three views": (shaped(images=OBSERVATION.images[:, [0, 1, 1]]), "RPR", {}, "two views"),
     "no image": (OBSERVATION, "RPR", {"image_size": (0, 0)}, "positive width"),
+    "width alone": (OBSERVATION, "RPR", {"image_size": (1280,)}, "positive width and height"),
+    "negative height": (OBSERVATION, "RPR", {"image_size": (1280, -1024)}, "positive width and height"),
+    "small images": (OBSERVATION, "RPR", {"image_size": (100, 100)}, "% of the pixels of the left view are"),
     "negative seed": (OBSERVATION, "RPR", {"seed": -1}, "seed -1"),
     "method": (OBSERVATION, "RPR", {"method": "best"}, "bundle_adjustment, closed_form"),
     "source": (OBSERVATION, "RPR", {"source": "dreamt"}, "simulated or recorded"),
@@ -52,6 +55,20 @@ def test_calibrate_refuses(name):
         calibrate(observation, types, **{"source": "recorded", **given})
     assert word in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("lens", "allowed"), [(False, 6), (True, 0)])
+def test_few_pixels_of_a_view_may_be_outside_its_image(lens, allowed):
+    given = {"source": "recorded", "lens": lens}
+    # Of the 65 of a view 6.5 may be outside, or 0.65. The border is half a pixel beyond the middle of the
+    # last one, and corners may be found a pixel farther.
+    u = np.sort(OBSERVATION.images[..., 0].swapaxes(0, 1).reshape(2, -1), axis=1).max(axis=0)[::-1]
+    width = u - 0.5 + 1e-6
+    calibrate(OBSERVATION, "RPR", image_size=(width[allowed], 1024), **given)
+    with pytest.raises(
+        InputError, match=r" view are outside, .*, such as u [78][0-9.]+, v [0-9.]+ of marker "
+    ):
+        calibrate(OBSERVATION, "RPR", image_size=(width[allowed + 1], 1024), **given)
 
 
 @pytest.fixture(scope="module")
