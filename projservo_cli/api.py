@@ -382,13 +382,16 @@ def sweep(
         "name": config.name,
         "base": [f"{config.name}.yaml"],
         "seed": seed,
-        "runs": runs or tasks or _WITHOUT_TASKS,
+        "runs": _WITHOUT_TASKS if runs is None else runs,
         "grid": axes,
         "random": dict(random or {}),
         "calibrations": calibrations,
         "tasks": None if tasks is None else {"random": tasks},
     }
-    design = Design(sweep_of(values), ((config.name, to_yaml(config)),))
+    asked = sweep_of(values)
+    if runs is None and asked.tasks is not None:
+        asked = asked.model_copy(update={"runs": asked.tasks.random})
+    design = Design(asked, ((config.name, to_yaml(config)),))
     require_sound(design)
     # A law without source has no key: its stored results cannot be matched to it.
     begin = force or not all(design.sources.values())

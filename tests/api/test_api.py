@@ -203,6 +203,7 @@ def test_a_sweep_in_memory_compares_classes_and_laws(config):
         study.paired("direct_two", "exact")
     with pytest.raises(ps.InputError, match=r"other processes cannot import .*Slow: put it into a module"):
         ps.sweep(config, laws=[Slow], tasks=2, workers=2)
+    assert len(study.table["run"]) == 3 * 2
     assert set(study.to_frame().columns) == set(study.table)
 
 
@@ -313,6 +314,11 @@ def test_a_stored_run_starts_no_code_that_it_names(config, tmp_path):
             "calibration.lens='yes': calibration.lens: ",
         ),
         (lambda c: ps.load("configs/ur5.yaml"), "a configuration, which Config.load reads"),
+        (lambda c: ps.sweep(c, laws=["exact"], runs=0), "^sweep: runs: must be at least 1, not 0$"),
+        (
+            lambda c: ps.sweep(c, laws=["exact"], tasks=-1),
+            "^sweep: tasks.random: must be at least 1, not -1$",
+        ),
         (lambda c: ps.sweep(c, laws=[]), "sweep: name one law or more"),
         (lambda c: ps.sweep(c, laws=["best"]), "law best: no such law; laws: direct_three"),
         (lambda c: ps.sweep(c, laws=["exact"], grid={"noise.servo": [0]}), "noise.servo: unknown key"),
