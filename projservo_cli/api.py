@@ -32,7 +32,7 @@ from projservo_cli.experiment import (
     scene_of,
 )
 from projservo_cli.files import working_in
-from projservo_cli.laws import CODES, REGULATE, law_and_mode, name_of
+from projservo_cli.laws import CODES, REGULATE, law_and_mode, name_of, names_of
 from projservo_cli.observations import Observations, rows_of
 from projservo_cli.records import Calibration, InputError, JointList, Plan
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
@@ -283,7 +283,7 @@ def servo(
     plan: Plan,
     law: str | Callable[[Any], Any] = "exact",
     *,
-    mode: str = REGULATE,
+    mode: str | None = None,
     robot: Any = None,
 ) -> RunTrace:
     """Drive a law in closed loop from the start of the task to its verdict.
@@ -293,7 +293,8 @@ def servo(
     config : of the robot that is driven, and of when a run ends.
     calibration, plan : what ``calibrate`` and ``plan`` made.
     law : the name of a law, ``module:Class``, or a class or function that makes one of its setup.
-    mode : ``regulate``, ``track`` or ``image_track``.
+    mode : ``regulate``, ``track`` or ``image_track``; by default that of the name, such as ``exact_track``,
+        else ``regulate``.
     robot : an object of the contract to drive, instead of the robot of the configuration.
 
     Returns
@@ -304,7 +305,7 @@ def servo(
     Raises
     ------
     InputError
-        When there is no such law or mode, or the configuration lacks a key.
+        When there is no such law, it has no such mode, or the configuration lacks a key.
     WorkFailed
         When the run could not begin: the goal is out of reach, or the images of a robot disagree with the
         calibration.
@@ -314,15 +315,17 @@ def servo(
         raise InputError(f"law {law!r:.40}: expected a name, or a class or function that makes a law")
     if isinstance(law, str):
         name, of_name = law_and_mode(law)
+        if mode not in (None, of_name) and of_name != REGULATE:
+            raise InputError(f"servo: law {law} is {name} in mode {of_name}, not {mode!r}: leave mode out")
         given, name = driving.Given(None, robot), law_target(name)
-        mode = mode if of_name == REGULATE else of_name
     else:
-        given, name = driving.Given(law, robot), plugins.name_of(law)
-    asked = config.replace({"control.mode": mode})
+        given, name, of_name = driving.Given(law, robot), plugins.name_of(law), REGULATE
+    asked = config.replace({"control.mode": [of_name if mode is None else mode]})
+    (name,) = names_of((name,), asked.control.mode)
     if robot is not None:
         asked = _with_robot(asked, robot)
     _say_compilation()
-    trace = driving.run(servo_inputs(asked), calibration, plan, name_of(name, mode), given)
+    trace = driving.run(servo_inputs(asked), calibration, plan, name, given)
     return RunTrace.of(trace, asked.face_numbers)
 
 

@@ -159,6 +159,11 @@ def test_a_trace_is_that_of_the_chain_and_of_a_class_like_that_of_its_name(confi
     _, calibration, plan = made
     run = ps.Experiment(config).make("servo")
     alike(ps.servo(config, calibration, plan), run.traces["exact"], Trace)
+    tracks = [{"law": "exact_track"}, {"law": "exact_track", "mode": "track"}, {"mode": "track"}]
+    first, *others = (ps.servo(config, calibration, plan, **given) for given in tracks)
+    assert (first.law, first.mode) == ("exact", "track")
+    for other in others:
+        alike(first, other, Trace)
     own = ps.servo(config, calibration, plan, law=Resolved)
     named = ps.servo(config, calibration, plan, law=f"{__name__}:Resolved")
     alike(own, named, Trace)
@@ -349,6 +354,18 @@ def test_what_makes_no_sense_is_said_in_a_sentence(config, call, message):
         (lambda c, k, p: ps.servo(c, k, p, law="exakt"), "law exakt: no such law; laws: direct_three"),
         (lambda c, k, p: ps.servo(c, k, p, law=3), "law 3: expected a name, or a class or function"),
         (lambda c, k, p: ps.servo(c, k, p, mode="follow"), "'follow' is not one of them; valid: regulate"),
+        (
+            lambda c, k, p: ps.servo(c, k, p, law="stacked", mode="track"),
+            "^control.mode track: stacked has no such mode, only regulate and image_track; laws that have",
+        ),
+        (
+            lambda c, k, p: ps.servo(c, k, p, law=Resolved, mode="track"),
+            r"^control.mode track: .*:Resolved has no such mode, only regulate; ",
+        ),
+        (
+            lambda c, k, p: ps.servo(c, k, p, law="exact_track", mode="regulate"),
+            "^servo: law exact_track is exact in mode track, not 'regulate': leave mode out$",
+        ),
         (lambda c, k, p: k.predict(np.full(6, 90.0)), "joint readings: joint 1 at 90 is more than two turns"),
     ],
 )
