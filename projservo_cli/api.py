@@ -33,7 +33,7 @@ from projservo_cli.experiment import (
 )
 from projservo_cli.files import working_in
 from projservo_cli.laws import CODES, REGULATE, law_and_mode, name_of, names_of
-from projservo_cli.observations import Observations, rows_of
+from projservo_cli.observations import Observations, require_observations, rows_of
 from projservo_cli.records import Calibration, InputError, JointList, Plan
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.robots import plugins
@@ -53,6 +53,7 @@ from projservo_cli.sweeps.folder import Folder, run_sweep
 from projservo_cli.sweeps.study import Study
 
 _WITHOUT_TASKS = 20  # default runs of a cell
+_NO_LAW = "law {!r:.40}: expected a name, or a class or function that makes a law"
 
 
 def simulate(
@@ -212,11 +213,7 @@ def calibrate(
     WorkFailed
         When the observations do not support a calibration: which joint or marker, and why.
     """
-    if not isinstance(observations, Observations):
-        raise InputError(
-            f"calibrate: observations of type {type(observations).__name__}; make them with "
-            "Observations.from_arrays or Observations.from_frame"
-        )
+    require_observations("calibrate", observations)
     given = {
         "calibration.method": method,
         "calibration.lens": lens,
@@ -312,7 +309,7 @@ def servo(
     """
     _require_config("servo", config, calibration)
     if not (isinstance(law, str) or callable(law)):
-        raise InputError(f"law {law!r:.40}: expected a name, or a class or function that makes a law")
+        raise InputError(_NO_LAW.format(law))
     if isinstance(law, str):
         name, of_name = law_and_mode(law)
         if mode not in (None, of_name) and of_name != REGULATE:
@@ -376,11 +373,13 @@ def sweep(
     _require_config("sweep", config)
     if not (isinstance(workers, int) and workers > 0):
         raise InputError(f"workers={workers!r}: give a whole number of one or more")
-    named = [(one if isinstance(one, str) else one.__name__, _law_of_sweep(one, workers)) for one in laws]
+    if isinstance(laws, (str, type)) or not np.iterable(laws):
+        raise InputError(f"sweep: laws {laws!r:.40}: give a list of them, such as laws=['exact']")
+    named = [(_law_of_sweep(one, workers), one if isinstance(one, str) else one.__name__) for one in laws]
     if not named:
         raise InputError("sweep: name one law or more")
     _require_guard(workers)
-    axes = {**(grid or {}), "law": [target for _, target in named]}
+    axes = {**(grid or {}), "law": [target for target, _ in named]}
     values = {
         "name": config.name,
         "base": [f"{config.name}.yaml"],
@@ -404,7 +403,7 @@ def sweep(
         stack.enter_context(working_in(folder.path, "parts", "calibrations"))
         say = listener.say if path is not None else listener.detail
         run_sweep(design, folder, Engine(workers), listener.progress, say, force=begin)
-        study = Study(SweepTable(folder.table), {target: name for name, target in named})
+        study = Study(SweepTable(folder.table), dict(named))
     study.path = None if path is None else folder.table
     return study
 
@@ -427,6 +426,10 @@ def load(path: str | Path) -> Experiment | Study:
     InputError
         When there is none, it is cut short, or another version made it.
     """
+    if not isinstance(path, (str, Path)):
+        raise InputError(
+            f"load: a path of type {type(path).__name__}: give the folder of a run or of a sweep"
+        )
     target = Path(path)
     if target.suffix in (".yaml", ".yml"):
         raise InputError(f"{path}: a configuration, which Config.load reads; load opens the folder of a run")
@@ -498,6 +501,8 @@ def _goal(config: Config, joint_types: str, goal: Any) -> Any:
 
 def _law_of_sweep(law: str | type, workers: int) -> str:
     """A law as the grid of a sweep names it; classes of this process are found again by that name."""
+    if not (isinstance(law, str) or hasattr(law, "__qualname__")):
+        raise InputError(_NO_LAW.format(law))
     if isinstance(law, str):
         name, mode = law_and_mode(law)
         return law if name in CODES else name_of(law_target(name), mode)

@@ -92,6 +92,14 @@ def require_radians(
         )
 
 
+def numbers_in(name: str, given: npt.ArrayLike, said: str) -> FloatArray:
+    """Convert to an array of numbers; an InputError for anything else, with the shape as it is ``said``."""
+    try:
+        return np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: no array of numbers; expected shape {said}") from error
+
+
 def checked_array(
     name: str, given: npt.ArrayLike, shape: Sequence[int | None], said: str, *, finite: bool = False
 ) -> FloatArray:
@@ -100,10 +108,7 @@ def checked_array(
     said : the shape, for messages.
     Raises InputError, naming the array and the shapes.
     """
-    try:
-        array = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: no array of numbers; expected shape {said}") from error
+    array = numbers_in(name, given, said)
     fits = array.ndim == len(shape) and all(
         size > 0 if wanted is None else size == wanted
         for size, wanted in zip(array.shape, shape, strict=False)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration.estimate import require_size_and_noise
-from projservo_cli.display import Displayable, checked_array, pandas
+from projservo_cli.display import Displayable, checked_array, numbers_in, pandas
 from projservo_cli.records import FloatArray, InputError, Observation
 from projservo_cli.tables import in_radians, read_table, to_csv, write_table
 
@@ -68,7 +68,7 @@ class Observations(Displayable, Observation):
         q: npt.ArrayLike,
         pixels: npt.ArrayLike,
         *,
-        joint_types: str | None = None,
+        joint_types: str | Sequence[str] | None = None,
         joint_unit: str | None = None,
         marker: Sequence[int] | None = None,
         pose: Sequence[int] | None = None,
@@ -101,7 +101,7 @@ class Observations(Displayable, Observation):
         if not np.isfinite(readings).all():
             raise InputError("q: holds a number that is not finite; leave such poses out")
         n, m = readings.shape[1], seen.shape[2]
-        types = _types_of(joint_types, n)
+        types = _types_of(joint_types, n) or "R" * n
         numbers = _numbers("marker", marker, m), _numbers("pose", pose, len(seen))
         readings = in_radians("q", types, numbers[1], readings, joint_unit, "joint_unit={!r}")
         one = np.isfinite(seen).sum(axis=-1) == 1
@@ -128,7 +128,7 @@ class Observations(Displayable, Observation):
         cls,
         table: Any,
         *,
-        joint_types: str | None = None,
+        joint_types: str | Sequence[str] | None = None,
         joint_unit: str | None = None,
         image_size: tuple[int, int] | None = None,
         noise_px: float | None = None,
@@ -148,11 +148,12 @@ class Observations(Displayable, Observation):
         InputError
             If a column is missing, a row is not valid, or an image size or a noise is none.
         """
+        types = _types_of(joint_types)
         if isinstance(table, (str, Path)):
-            found = read_table(table, joint_types, joint_unit)
+            found = read_table(table, types, joint_unit)
         else:
-            found = _read(_text_of(table), joint_types, joint_unit)
-        return cls.of(found, joint_types=joint_types, image_size=image_size, noise_px=noise_px)
+            found = _read(_text_of(table), types, joint_unit)
+        return cls.of(found, joint_types=types, image_size=image_size, noise_px=noise_px)
 
     def to_frame(self) -> Any:
         """Return the observation table as a pandas table; an InputError without pandas."""
@@ -177,10 +178,15 @@ class Observations(Displayable, Observation):
         }
 
 
-def _types_of(given: str | None, n: int) -> str:
-    types = "R" * n if given is None else given.upper()
-    if len(types) != n or set(types) - {"R", "P"}:
-        raise InputError(f"joint_types: {given!r}: expected {n} letters R or P, one a joint")
+def _types_of(given: str | Sequence[str] | None, n: int | None = None) -> str | None:
+    """Letters of the types of joints, of which there are n where that is known; None where none are given."""
+    if given is None:
+        return None
+    letters = [*given] if np.iterable(given) else [given]
+    types = "".join(map(str, letters)).upper()
+    if set(types) - {"R", "P"} or len(types) != (len(types) if n is None else n):
+        some = "letters" if n is None else f"{n} letters"
+        raise InputError(f"joint_types: {given!r}: expected {some} R or P, one a joint")
     return types
 
 
@@ -214,6 +220,14 @@ def _read(text: str, joint_types: str | None, joint_unit: str | None) -> Observa
 
 def rows_of(q: npt.ArrayLike, n: int) -> FloatArray:
     """Joint readings (K, n), rad or m, from rows or from one; an InputError for anything else."""
-    given = np.asarray(q, dtype=np.float64) if not isinstance(q, np.ndarray) else q
-    rows = np.atleast_2d(given)
-    return checked_array("q", rows, (None, n), f"(K, {n}), rad or m", finite=True)
+    said = f"(K, {n}), rad or m"
+    return checked_array("q", np.atleast_2d(numbers_in("q", q, said)), (None, n), said, finite=True)
+
+
+def require_observations(what: str, given: Any, kind: type[Observation] = Observations) -> None:
+    """Raise InputError unless observations are of their kind."""
+    if not isinstance(given, kind):
+        raise InputError(
+            f"{what}: observations of type {type(given).__name__}; make them with "
+            "Observations.from_arrays or Observations.from_frame"
+        )

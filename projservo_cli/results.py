@@ -12,10 +12,11 @@ import numpy.typing as npt
 from projservo_cli.calibration import predict, prediction_variance, residual_statistics
 from projservo_cli.calibration.kinematic_errors import KinematicErrors, in_model_frames, kinematic_errors
 from projservo_cli.calibration.prediction import error_factor, joint_derivative
-from projservo_cli.display import Displayable, Printed, require_radians
+from projservo_cli.display import Displayable, Printed, numbers_in, require_radians
 from projservo_cli.files import text_of
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.geometry.metric import Metric, Scale, links
+from projservo_cli.observations import require_observations
 from projservo_cli.records import (
     MM,
     VIEWS,
@@ -155,8 +156,9 @@ class ImageModel(Displayable, Calibration):
         Raises
         ------
         InputError
-            If the readings have another number of joints, are not finite or look like degrees.
+            If it is no observation, or the readings have another number of joints or are not finite.
         """
+        require_observations("score", observation, Observation)
         return residual_statistics(self, observation)
 
     def covariance(self) -> FloatArray:
@@ -226,7 +228,7 @@ class ImageModel(Displayable, Calibration):
         InputError
             If the points have not four coordinates.
         """
-        A = np.asarray(points, dtype=np.float64)
+        A = numbers_in("points", points, "(..., 4)")
         if A.ndim == 0 or A.shape[-1] != 4:
             raise InputError(f"points of shape {A.shape}: expected four homogeneous coordinates each")
         depth = np.einsum("vj,...j->v...", self.P[:, 2], A)
@@ -252,8 +254,8 @@ class ImageModel(Displayable, Calibration):
         }
 
     def _rows(self, q: npt.ArrayLike) -> tuple[FloatArray, bool]:
-        readings = np.asarray(q, dtype=np.float64)
         n = len(self.joint_types)
+        readings = numbers_in("joint readings", q, f"({n},) or (K, {n})")
         if readings.ndim not in (1, 2) or readings.shape[-1] != n or not np.isfinite(readings).all():
             raise InputError(
                 f"joint readings of shape {readings.shape}: expected {n} finite numbers, or rows of them"

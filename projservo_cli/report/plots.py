@@ -4,8 +4,17 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from projservo_cli.records import Calibration, CrossValidation, Observation, Plan, Trace, position_limits
+from projservo_cli.records import (
+    Calibration,
+    CrossValidation,
+    InputError,
+    Observation,
+    Plan,
+    Trace,
+    position_limits,
+)
 from projservo_cli.report import figures, style
 from projservo_cli.report.figures.images import draw_image_errors
 from projservo_cli.report.report_data import Fit, title
@@ -59,9 +68,14 @@ def of_trace(trace: Trace, markers: tuple[int, ...]) -> "Figure":
 
 
 def placed(figure: "Figure", axes: Any) -> Any:
-    """Return a figure, or the axes in whose place it is shown as a picture."""
+    """Return a figure, or the axes in whose place it is shown as a picture.
+
+    Raises InputError for anything else than axes, such as the array that ``subplots`` gives.
+    """
     if axes is None:
         return figure
+    if not isinstance(axes, Axes):
+        raise InputError(f"plot: ax of type {type(axes).__name__}: give one axes of a figure")
     figure.set_dpi(2.0 * axes.figure.dpi)
     figure.canvas.draw()
     canvas: Any = figure.canvas

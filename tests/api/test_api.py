@@ -318,6 +318,8 @@ def test_a_stored_run_starts_no_code_that_it_names(config, tmp_path):
             lambda c: ps.calibrate(ps.simulate(c), lens="yes"),
             "calibration.lens='yes': calibration.lens: ",
         ),
+        (lambda c: ps.simulate(c, "here"), r"q: no array of numbers; expected shape \(K, 6\), rad or m"),
+        (lambda c: ps.load(5), "load: a path of type int: give the folder of a run or of a sweep"),
         (lambda c: ps.load("configs/ur5.yaml"), "a configuration, which Config.load reads"),
         (lambda c: ps.sweep(c, laws=["exact"], runs=0), "^sweep: runs: must be at least 1, not 0$"),
         (
@@ -325,6 +327,10 @@ def test_a_stored_run_starts_no_code_that_it_names(config, tmp_path):
             "^sweep: tasks.random: must be at least 1, not -1$",
         ),
         (lambda c: ps.sweep(c, laws=[]), "sweep: name one law or more"),
+        (lambda c: ps.sweep(c, laws="exact"), r"sweep: laws 'exact': give a list of them, such as laws=\["),
+        (lambda c: ps.sweep(c, laws=Resolved), "sweep: laws <class .* give a list of them"),
+        (lambda c: ps.sweep(c, laws=[3]), "law 3: expected a name, or a class or function that makes a law"),
+        (lambda c: ps.sweep(c, laws=[Resolved, Resolved]), "grid.law: a value stands there twice"),
         (lambda c: ps.sweep(c, laws=["best"]), "law best: no such law; laws: direct_three"),
         (lambda c: ps.sweep(c, laws=["exact"], grid={"noise.servo": [0]}), "noise.servo: unknown key"),
     ],
@@ -366,6 +372,11 @@ def test_what_makes_no_sense_is_said_in_a_sentence(config, call, message):
             lambda c, k, p: ps.servo(c, k, p, law="exact_track", mode="regulate"),
             "^servo: law exact_track is exact in mode track, not 'regulate': leave mode out$",
         ),
+        (lambda c, k, p: k.predict("here"), r"joint readings: no array of numbers; expected shape \(6,\) or"),
+        (lambda c, k, p: k.project("here"), r"points: no array of numbers; expected shape \(..., 4\)"),
+        (lambda c, k, p: k.score({"q1": [0.0]}), "score: observations of type dict; make them with"),
+        (lambda c, k, p: k.score(np.zeros((2, 4, 2))), "score: observations of type ndarray; make them with"),
+        (lambda c, k, p: p.plot(np.zeros(2)), "plot: ax of type ndarray: give one axes of a figure"),
         (lambda c, k, p: k.predict(np.full(6, 90.0)), "joint readings: joint 1 at 90 is more than two turns"),
     ],
 )
@@ -390,6 +401,8 @@ def test_what_does_not_fit_a_calibration_is_said_in_a_sentence(config, made, cal
         ({"noise_px": 0}, "pixel noise 0: give a positive number, or none to estimate it"),
         ({"noise_px": float("nan")}, "pixel noise nan: give a positive number"),
         ({"noise_px": "a"}, "pixel noise 'a': give a positive number"),
+        ({"joint_types": list("RRR")}, r"joint_types: \['R', 'R', 'R'\]: expected 6 letters R or P"),
+        ({"joint_types": 6}, "joint_types: 6: expected 6 letters R or P"),
         ({"marker": [1, 1, 2]}, "marker: expected 3 different whole numbers"),
         ({"sigma": np.zeros((4, 2, 3))}, "sigma: must be positive wherever a marker is seen"),
     ],
@@ -411,6 +424,12 @@ def test_arrays_tables_and_frames_hold_the_same(made, tmp_path):
     tables = tmp_path / "table.csv", observations.to_frame(), dict(observations.to_frame())
     for one in (shuffled, *map(ps.Observations.from_frame, tables)):
         alike(one, table, Observation)
+    for types in ("rrrrrr", [*"RRRRRR"], np.array([*"rRrRrR"])):
+        arrays = ps.Observations.from_arrays(observations.q, observations.images, joint_types=types)
+        frame = ps.Observations.from_frame(observations.to_frame(), joint_types=types)
+        assert arrays.joint_types == frame.joint_types == "RRRRRR"
+    with pytest.raises(ps.InputError, match="joint_types: 'RRRRRX': expected letters R or P, one a joint"):
+        ps.Observations.from_frame(observations.to_frame(), joint_types="RRRRRX")
     q, pixels = np.degrees(observations.q), observations.images
     degrees = ps.Observations.from_arrays(q, pixels, joint_unit="deg")
     np.testing.assert_allclose(degrees.q, observations.q, atol=1e-12)
