@@ -403,7 +403,10 @@ def sweep(
         stack.enter_context(working_in(folder.path, "parts", "calibrations"))
         say = listener.say if path is not None else listener.detail
         run_sweep(design, folder, Engine(workers), listener.progress, say, force=begin)
-        study = Study(SweepTable(folder.table), dict(named))
+        table, names = SweepTable(folder.table), dict(named)
+        for law, failure in table.failures.items():
+            listener.say(f"law {names.get(law, law)}: {failure.told(law)}")
+        study = Study(table, names)
     study.path = None if path is None else folder.table
     return study
 

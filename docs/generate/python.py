@@ -33,7 +33,7 @@ INTERFACE: dict[Any, tuple[str, ...]] = {
     api.plan: (),
     api.servo: (),
     api.sweep: (),
-    Study: ("table", "traces", "success", "paired", "to_frame", "to_xarray"),
+    Study: ("table", "traces", "failures", "success", "paired", "to_frame", "to_xarray"),
     Experiment: ("make", "results", "calibration", "plan", "traces", "report"),
     api.load: (),
     records.InputError: (),

@@ -47,6 +47,7 @@ def _sweep(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the processes to come, from their beginning
     from projservo_cli.config import load_sweep
     from projservo_cli.files import working_in
+    from projservo_cli.store.sweep_table import SweepTable
     from projservo_cli.sweeps.design import read_design
     from projservo_cli.sweeps.engine import Cluster, Engine
     from projservo_cli.sweeps.folder import Folder, run_sweep
@@ -68,6 +69,8 @@ def _sweep(
         except KeyboardInterrupt:
             console.say(f"{folder.table}: the runs done so far; the same command goes on with the others")
             raise
+        for law, failure in SweepTable(folder.table).failures.items():
+            console.say(f"law {law}: {failure.told(law)}")
     table = folder.table.resolve() if folder.table.exists() else None
     value = {
         "sweep": folder.path.resolve(),

@@ -2,9 +2,9 @@
 
 import json
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -31,15 +31,44 @@ TABLE = "sweep.h5"
 _ROWS = 16_384  # of a chunk of the file
 _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 _TRACES = "traces"
+_FAILURES = "failures"
 
 Array = npt.NDArray[Any]
 # Name, NumPy type, unit and description of a column.
 Heading = tuple[str, str, str, str]
 
 
-def write_part(path: Path, columns: Mapping[str, Array], traces: Mapping[int, Trace]) -> None:
-    """Write rows and traces of a part atomically."""
+class Failure(NamedTuple):
+    """Runs of a law that failed or did not start."""
+
+    runs: int  # how many they are
+    first: int  # number of the first of them
+    reason: str  # why that one did, in words
+
+    def told(self, law: str) -> str:
+        """Return it in words, without the name of the law in the reason."""
+        runs = "1 run" if self.runs == 1 else f"{self.runs} runs"
+        why = self.reason.removeprefix(f"law {law}: ")
+        return f"{runs} failed or did not start, first run {self.first}: {why}"
+
+
+def merge_failures(found: dict[str, Failure], more: Iterable[tuple[str, Failure]]) -> None:
+    """Add the failures of further runs, by the names of their laws; of the reasons the first one stays."""
+    for law, one in more:
+        known = found.get(law, one._replace(runs=0))
+        earlier = min(known, one, key=lambda failure: failure.first)
+        found[law] = earlier._replace(runs=known.runs + one.runs)
+
+
+def write_part(
+    path: Path,
+    columns: Mapping[str, Array],
+    traces: Mapping[int, Trace],
+    failures: Mapping[str, Failure] | None = None,
+) -> None:
+    """Write rows, traces and failures of a part atomically."""
     with new_file(path) as file:
+        file.attrs[_FAILURES] = json.dumps(failures or {})
         if traces:
             with labelled(file) as groups:
                 for run, trace in traces.items():
@@ -58,6 +87,10 @@ def assemble(
     with new_file(path, size) as new, labelled(new) as file:
         file.attrs.update({"schema": _SCHEMA, "schema_version": SCHEMA_VERSION})
         file.attrs.update({name: encoded(value) for name, value in attributes.items()})
+        failures: dict[str, Failure] = {}
+        for part in parts:
+            merge_failures(failures, _failures(part))
+        file.attrs[_FAILURES] = json.dumps(failures)
         for name, dtype, units, about in headings:
             data = _new_column(file, name, np.dtype(dtype), rows, **_PACKED)
             data.attrs["long_name"] = about
@@ -112,6 +145,12 @@ def _blocks(file: "h5netcdf.File", parts: Sequence[Path], names: Sequence[str]) 
             waiting = []
 
 
+def _failures(part: Path) -> Iterator[tuple[str, Failure]]:
+    with opened(part, _AGAIN) as file:
+        found = attribute(file, _FAILURES, dict)
+    return ((law, Failure(*one)) for law, one in found.items())
+
+
 def _rows(part: Path) -> int:
     with opened(part, _AGAIN, unchanged=True) as file:
         return len(file["run"])
@@ -135,6 +174,8 @@ class SweepTable:
             is_json = ("{", "[")
             self.attributes = {k: json.loads(v) if str(v).startswith(is_json) else v for k, v in found}
             self.names = tuple(self.attributes["columns"])
+            told = self.attributes.get(_FAILURES, {})
+            self.failures = {law: Failure(*one) for law, one in told.items()}  # by law
             self.rows = len(file["run"])
             self.traces = tuple(sorted(map(int, file.get(_TRACES, ()))))  # numbers of runs
 

@@ -290,9 +290,9 @@ def _make_parts(design: Design, folder: Folder, engine: Engine, status: _Status,
     progress("runs", 0, left)
     parts = (part(*pair) for pair in folder.missing(design, chunk))
     with closing(engine.completed(run_part, parts, threads=threads)) as made_parts:
-        for columns, traces in made_parts:
+        for columns, traces, failures in made_parts:
             first, last = int(columns["run"][0]), int(columns["run"][-1]) + 1
-            write_part(folder.part(first, last), columns, traces)
+            write_part(folder.part(first, last), columns, traces, failures)
             done += last - first
             progress("runs", done, left)
 

@@ -14,7 +14,7 @@ from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.laws import BODY_LAWS, CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Setting, Trials
 from projservo_cli.loop.compiled import Course
-from projservo_cli.loop.step import RUNNING, VERDICTS
+from projservo_cli.loop.step import FAILED, RUNNING, VERDICTS
 from projservo_cli.records import Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.given import PlanInputs, ServoInputs
@@ -22,10 +22,14 @@ from projservo_cli.stages.plan import rotation_sense
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive, sense_is_enough
 from projservo_cli.steps import key_of
+from projservo_cli.store.sweep_table import Failure, merge_failures
 from projservo_cli.sweeps.design import RUNS, Design, name_of_run
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
 ALL_VERDICTS = (*VERDICTS, NOT_CALIBRATED, NOT_STARTED)
+# Reason of a compiled run that did not start.
+_UNMEASURED = "its images of start and goal do not show the task"
+_LONGEST = 300  # characters of a reason that is kept
 NONE = -1  # in columns of counts, where a run did not begin
 
 
@@ -125,10 +129,11 @@ class Part(NamedTuple):
 
 
 class _Made(NamedTuple):
-    """Rows of a part, and the traces that are kept."""
+    """Rows of a part, the traces that are kept, and why runs failed or did not start."""
 
     columns: _Columns
     traces: dict[int, Trace]
+    failures: dict[str, Failure]  # by the name of the law
 
 
 def run_part(part: Part) -> _Made:
@@ -137,6 +142,7 @@ def run_part(part: Part) -> _Made:
     runs = np.arange(part.first, part.last)
     table = _numbered(design, runs)
     traces: dict[int, Trace] = {}
+    failures: dict[str, Failure] = {}
     wanted = set(design.sweep.traces)
     with threadpool_limits(1):  # with more, sums may be taken in another order
         for these in _alike(design, runs):
@@ -152,15 +158,20 @@ def run_part(part: Part) -> _Made:
             _put(table, rows, {"usable": int(calibration.usable)})
             config = design.config(first)
             given, name = servo_inputs(config), name_of_run(config)
+            reasons: dict[int, str] = {}
             if is_compiled(design, given, name):
-                _put(table, rows, _measured(given, name, calibration, table["seed"][rows]))
+                measured, why = _measured(given, name, calibration, table["seed"][rows])
+                _put(table, rows, measured)
+                reasons = dict(zip(these.tolist(), why, strict=True))
                 these = np.array([run for run in these if run in wanted], dtype=np.int64)
             for run in these.tolist():
-                row, trace = _run(design, run, calibration, keep=run in wanted)
+                row, trace, reasons[run] = _run(design, run, calibration, keep=run in wanted)
                 _put(table, np.array([run - part.first]), row)
                 if trace is not None:
                     traces[run] = trace
-    return _Made(table, traces)
+            failed = (Failure(1, run, reason[:_LONGEST]) for run, reason in reasons.items() if reason)
+            merge_failures(failures, ((name, one) for one in failed))
+    return _Made(table, traces, failures)
 
 
 def _alike(design: Design, runs: IntArray) -> Iterator[IntArray]:
@@ -200,18 +211,20 @@ def _put(table: _Columns, rows: IntArray, values: Mapping[str, Any]) -> None:
         table[name][rows] = value.encode() if isinstance(value, str) else value
 
 
-def _measured(given: ServoInputs, name: str, calibration: Calibration, seeds: IntArray) -> dict[str, Any]:
-    """Return the measured values of compiled runs, by column."""
+def _measured(
+    given: ServoInputs, name: str, calibration: Calibration, seeds: IntArray
+) -> tuple[dict[str, Any], Sequence[str]]:
+    """Return the measured values of compiled runs, by column, and why each did not start, if so."""
     try:
         numbers = _numbers_of(run_scenario(given, calibration), name, seeds.tolist())
-    except WorkFailed:
-        return {"verdict": NOT_STARTED}
+    except WorkFailed as error:
+        return {"verdict": NOT_STARTED}, [str(error)] * len(seeds)
     found: dict[str, Any] = {name: numbers[:, i] for i, name in enumerate(NUMBERS)}
     for name in _COUNTS:
         found[name] = np.where(numbers[:, VERDICT] < 0, NONE, found[name])
     found["success"] = found["success"] == 1.0
     found["verdict"] = [_SAID.get(int(code), NOT_STARTED.encode()) for code in numbers[:, VERDICT]]
-    return found
+    return found, ["" if code in _SAID else _UNMEASURED for code in numbers[:, VERDICT].tolist()]
 
 
 # Noise is drawn for this number of steps, and for this multiple if a run is longer.
@@ -276,8 +289,8 @@ def _plan(given: PlanInputs, calibration: Calibration, calibration_key: str) -> 
 
 def _run(
     design: Design, run: int, calibration: Calibration, *, keep: bool
-) -> tuple[dict[str, Any], Trace | None]:
-    """Return the measured values of one run, by column, and its trace if it is kept."""
+) -> tuple[dict[str, Any], Trace | None, str]:
+    """Return the measured values of one run, by column, its trace if it is kept, and why it failed, if so."""
     config = design.config(run)
     given, name, (cell, _, number, _) = servo_inputs(config), name_of_run(config), design.numbers(run)
     try:
@@ -286,9 +299,9 @@ def _run(
             made = drive(scenario, rotation_sense(scenario), name)
         else:
             made = drive(scenario, _plan(given.plan, calibration, design.calibration_key(cell, number)), name)
-    except WorkFailed:
-        return {"verdict": NOT_STARTED}, None
+    except WorkFailed as error:
+        return {"verdict": NOT_STARTED}, None, str(error)
     row = {"verdict": made.verdict, "steps": made.steps, **made.summary._asdict()}
     if design.sweep.between_samples:
         row[BETWEEN.name] = made.deviation_mm()
-    return row, made.trace() if keep else None
+    return row, made.trace() if keep else None, made.why if made.verdict == VERDICTS[FAILED] else ""

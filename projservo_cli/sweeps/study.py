@@ -11,7 +11,7 @@ import numpy.typing as npt
 from projservo_cli.display import Displayable, pandas
 from projservo_cli.records import InputError
 from projservo_cli.results import RunTrace
-from projservo_cli.store.sweep_table import SweepTable
+from projservo_cli.store.sweep_table import Failure, SweepTable
 from projservo_cli.sweeps.statistics import Rows, of_runs, paired
 
 
@@ -44,6 +44,11 @@ class Study(Displayable):
     def traces(self) -> Mapping[int, RunTrace]:
         """Traces that were kept, by the number of their run."""
         return self._traces
+
+    @property
+    def failures(self) -> Mapping[str, Failure]:
+        """Runs that failed or did not start, by law: how many ``runs``, the ``first`` and its ``reason``."""
+        return {self._names.get(law, law): one for law, one in self._rows.table.failures.items()}
 
     def success(self) -> list[dict[str, Any]]:
         """Return for each cell its values, ``runs``, ``successes``, ``success_rate`` and its interval.
@@ -100,11 +105,14 @@ class Study(Displayable):
         """Return a summary in words, by name."""
         cells = self.success()
         values = {"runs": f"{len(self.table['run'])} in {len(cells)} cells"}
-        for cell in cells[:_SHOWN]:
+        failures = [*self._rows.table.failures.items()][:_SHOWN_FAILURES]
+        values |= {f"failures of {self._names.get(law, law)}": one.told(law) for law, one in failures}
+        shown = _SHOWN - len(failures)
+        for cell in cells[:shown]:
             low, high = cell["success_interval"]
             place = ", ".join(f"{name} {cell[name]}" for name, _ in self._rows.axes)
             values[place] = f"{cell['success_rate']:.1%} of {cell['runs']} succeed ({low:.1%} to {high:.1%})"
-        return values | ({"more": f"{len(cells) - _SHOWN} cells"} if len(cells) > _SHOWN else {})
+        return values | ({"more": f"{len(cells) - shown} cells"} if len(cells) > shown else {})
 
     def _laws(self) -> Sequence[str]:
         return next((values for name, values in self._rows.axes if name == "law"), [])
@@ -113,4 +121,5 @@ class Study(Displayable):
         return values | ({"law": self._names.get(values["law"], values["law"])} if "law" in values else {})
 
 
-_SHOWN = 9  # cells that are printed
+_SHOWN = 9  # cells and failures that are printed
+_SHOWN_FAILURES = 3

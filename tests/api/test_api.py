@@ -223,6 +223,53 @@ def test_a_sweep_in_a_folder_is_continued_but_never_that_of_a_class_without_sour
         ps.sweep(config, laws=["exact"], runs=4, path=tmp_path / "sweep")
 
 
+class Lost(Resolved):
+    """A law of no numbers."""
+
+    def __call__(self, s, q):
+        return q * np.nan
+
+
+class Broken(Resolved):
+    """A law with an error in its source, which shows at its third call."""
+
+    calls = 0
+
+    def __call__(self, s, q):
+        self.calls += 1
+        return super().__call__(s, q) if self.calls < 3 else {}["gain"]
+
+
+def test_a_sweep_says_why_laws_failed(config, tmp_path, capsys):
+    grid = {"noise.servo_px": [0.1 * k for k in range(4)]}
+    study = ps.sweep(config, laws=[Lost, Broken, "exact"], runs=2, grid=grid, path=tmp_path)
+    reasons = {
+        "Lost": "gave array([nan, nan, nan, nan, nan, nan]): expected 6 finite joint velocities, or None",
+        "Broken": "failed: KeyError: 'gain' (test_api.py:",
+    }
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 2
+    sweep = f"{{base: {ROOT / 'configs' / 'ur5.yaml'}, runs: 2, grid: {{law: ['{__name__}:Broken']}}}}"
+    (tmp_path / "again.yaml").write_text(sweep, encoding="utf-8")
+    command = ["sweep", "-c", str(tmp_path / "again.yaml"), "-j", "1", "-o", str(tmp_path / "again")]
+    assert cli.run(command) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"law {__name__}:Broken: 2 runs failed or did not start, first run 0: {reasons['Broken']}" in said
+    stored = ps.load(tmp_path)
+    for (law, reason), line in zip(reasons.items(), told, strict=True):
+        first = study.table["run"][study.table["law"] == law][0]
+        assert line.startswith(f"law {law}: 8 runs failed or did not start, first run {first}: {reason}")
+        assert study.summary()[f"failures of {law}"] in line
+        assert f"failures of {law} " in repr(study)
+        assert study.failures[law][:2] == (8, first)
+        assert study.failures[law] == stored.failures[f"{__name__}:{law}"]
+    assert len(study.summary()) <= 11
+    verdicts = {law: set(study.table["verdict"][study.table["law"] == law]) for law in (*reasons, "exact")}
+    assert verdicts["Lost"] == {"not started"}
+    assert verdicts["Broken"] == {"failed"}
+    assert not verdicts["exact"] & {"not started", "failed"}
+
+
 SCRIPT = """
 import numpy as np
 import projservo_cli as ps

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, Trace
-from projservo_cli.store.sweep_table import SweepTable, assemble, write_part
+from projservo_cli.store.sweep_table import Failure, SweepTable, assemble, merge_failures, write_part
 from tests.fake_records import fake
 
 HEADINGS = [("run", "i8", "1", "number"), ("law", "S7", "1", "text"), ("error", "f8", "px", "of the image")]
@@ -22,7 +22,8 @@ def parts(tmp_path):
         columns = {"run": run, "law": LAWS[run % 3].astype("S9"), "error": 0.5 * run}
         traces = {first: fake(Trace, first)} if first else {}
         found.append(tmp_path / f"{first}.part.h5")
-        write_part(found[-1], columns, traces)
+        failures = {"exact": Failure(2, first + 3, f"reason {first}")} if first != 30_000 else {}
+        write_part(found[-1], columns, traces, failures)
     return found
 
 
@@ -42,6 +43,15 @@ def test_what_was_in_the_parts_is_in_the_table(table):
     np.testing.assert_array_equal(found.trace(30_001).q, fake(Trace, 30_001).q)
     with pytest.raises(InputError, match="trace of run 7 was not kept"):
         found.trace(7)
+
+
+def test_failures_of_all_parts_are_counted_and_the_reason_is_that_of_the_first_run(table):
+    assert SweepTable(table).failures == {"exact": (4, 3, "reason 0")}
+    found = {}
+    merge_failures(
+        found, [("a", Failure(1, 7, "later")), ("b", Failure(1, 0, "b")), ("a", Failure(2, 5, "a"))]
+    )
+    assert found == {"a": (3, 5, "a"), "b": (1, 0, "b")}
 
 
 def test_a_part_that_changed_costs_no_table(table, parts):

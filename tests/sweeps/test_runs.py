@@ -114,11 +114,16 @@ def test_runs_that_cannot_begin_have_a_verdict_and_no_numbers():
     assert made.columns["verdict"].tolist() == [b"not calibrated"] * 2
     assert made.columns["usable"].tolist() == [0, 0]
     limits = {"task.start_offset": {"joints": [0, 0, 300, 0, 0, 0], "unit": "deg"}}
-    made = run_part(part_of(design(runs=1, set=limits)))
-    assert made.columns["verdict"].tolist() == [b"not started"] * 2
+    made = run_part(part_of(design(runs=2, set=limits, traces=[1])))
+    assert {law: (count, run) for law, (count, run, _) in made.failures.items()} == {
+        "direct_two": (2, 0),
+        "stacked": (2, 2),
+    }
+    assert all("joint 3 would be at" in reason for _, _, reason in made.failures.values())
+    assert made.columns["verdict"].tolist() == [b"not started"] * 4
     assert np.isnan(made.columns["position_error_mm"]).all()
-    assert made.columns["steps"].tolist() == [-1, -1]
-    assert made.columns["success"].tolist() == [0, 0]
+    assert made.columns["steps"].tolist() == [-1] * 4
+    assert made.columns["success"].tolist() == [0] * 4
 
 
 @pytest.mark.volume
@@ -152,9 +157,11 @@ def test_noise_for_fewer_instants_changes_nothing(monkeypatch):
 @pytest.mark.volume
 def test_a_run_whose_images_show_nothing_has_a_verdict_and_no_numbers():
     """Images so noisy that markers have no place leave nothing to count."""
-    made = run_part(part_of(design(runs=3, set={"noise.servo_px": 3000.0}))).columns
+    part = run_part(part_of(design(runs=3, set={"noise.servo_px": 3000.0})))
+    made = part.columns
     lost = made["verdict"] == b"not started"
     assert lost.any()
+    assert sum(failure.runs for failure in part.failures.values()) == lost.sum()
     assert (made["steps"][lost] == -1).all()
     assert np.isnan(made["effort"][lost]).all()
 
