@@ -22,7 +22,7 @@ from projservo_cli.config.inputs import (
     recording_inputs,
     servo_inputs,
 )
-from projservo_cli.display import checked_array, require_radians
+from projservo_cli.display import checked_array, numbers_in, require_radians
 from projservo_cli.experiment import (
     Experiment,
     compilation,
@@ -308,6 +308,8 @@ def servo(
         calibration.
     """
     _require_config("servo", config, calibration)
+    if not isinstance(plan, Plan):
+        raise InputError(f"servo: plan of type {type(plan).__name__}: make one with plan")
     if not (isinstance(law, str) or callable(law)):
         raise InputError(_NO_LAW.format(law))
     if isinstance(law, str):
@@ -492,12 +494,12 @@ def _goal(config: Config, joint_types: str, goal: Any) -> Any:
         return str(Path(goal).resolve())
     if isinstance(goal, Mapping):
         return dict(goal)
-    if np.ndim(goal) == 1:
+    m = len(config.face_numbers)
+    shape = f"({n},) joint readings, or (2, {m}, 2) pixels of markers.face"
+    if numbers_in("goal", goal, shape).ndim == 1:
         joints = checked_array("goal", goal, (n,), f"({n},) joint readings, rad or m", finite=True)
         require_radians("goal", joints, joint_types)
         return {"joints": {"joints": joints.tolist(), "unit": "rad"}}
-    m = len(config.face_numbers)
-    shape = f"({n},) joint readings, or (2, {m}, 2) pixels of markers.face"
     left, right = checked_array("goal", goal, (2, m, 2), shape, finite=True).tolist()
     return {"images": {"left": left, "right": right}}
 

@@ -336,6 +336,8 @@ def load_config(
 
 def shipped(name: pathlib.Path | str) -> pathlib.Path:
     """The file of a configuration: a path, or the name of one that is shipped, such as ``ur5``."""
+    if not isinstance(name, (str, pathlib.Path)):
+        raise InputError(f"a configuration of type {type(name).__name__}: give the path of a file, or a name")
     path, package = pathlib.Path(name), pathlib.Path(__file__).resolve().parent.parent
     if path.suffix or path.parent != pathlib.Path() or path.exists():
         return path
