@@ -61,7 +61,7 @@ def plain(hint: Any) -> str:
 def commands() -> Iterator[str]:
     """The commands, with what each takes."""
     for name, command in main.commands.items():
-        with click.Context(main, info_name="projservo") as group:
+        with click.Context(main, info_name="projservo", **main.context_settings) as group:
             context = click.Context(command, group, info_name=name)
         summary, *paragraphs = inspect.cleandoc(command.help or "").split("\n\n")
         yield from ("", f"## projservo {name}", "", text(summary), "")
