@@ -427,8 +427,8 @@ def law_target(name: str) -> str:
     """The law of a name: built in, or ``module:Class``; an InputError that lists them where there is none."""
     target = name if name in CODES else plugins.target_of("law", name)
     if target is None:
-        if told := mode_in(name):
-            raise InputError(f"law {name}: {told}")
+        if remedy := mode_in(name):
+            raise InputError(f"law {name}: {remedy}")
         valid = ", ".join((*CODES, *plugins.registered("law")))
         raise InputError(f"law {name}: no such law; laws: {valid}, or module:Class")
     return target

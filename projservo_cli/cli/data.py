@@ -92,15 +92,15 @@ def _teach(
             raise WorkFailed(f"teach: {reason}") from error
         write_whole(output, _TAUGHT + plain_yaml(taught.as_goal()))
     # Names are relative to the configuration, in the file and with --set.
-    beside = config is not None and Path(config).resolve().parent == output.resolve().parent
-    told = f"{'task.start' if start else 'task.goal'}: {output.name if beside else output.resolve()}"
-    _print_taught(console, output, taught, check, told)
+    is_relative = config is not None and Path(config).resolve().parent == output.resolve().parent
+    setting = f"{'task.start' if start else 'task.goal'}: {output.name if is_relative else output.resolve()}"
+    _print_taught(console, output, taught, check, setting)
     if check is not None and not check.reached:
         raise WorkFailed(f"{output}: by the calibration, {check.reason}")
 
 
-def _print_taught(console: Console, path: Path, taught: Any, check: Any, told: str) -> None:
-    """Print what was taught, how it agrees with the calibration, and the key ``told`` that takes it."""
+def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting: str) -> None:
+    """Print what was taught, how it agrees with the calibration, and the setting of the file."""
     import numpy as np
 
     value = {
@@ -127,7 +127,7 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, told: s
         far = ", ".join(f"{number} ({side}) by {px:.3g} px" for number, side, px in check.far)
         words.append(wrapped(check.reason, "  "))
         words.append(wrapped(f"markers that disagree with the calibration: {far or 'none'}", "  "))
-    console.report(value, [*words, f"set {told}"])
+    console.report(value, [*words, f"set {setting}"])
 
 
 @main.command(

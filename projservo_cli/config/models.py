@@ -170,8 +170,8 @@ def _law(name: str) -> str:
     if target is None and ":" in name:
         raise ValueError("must be module:Class, such as my_laws:Law")
     if target is None:
-        if told := mode_in(name):
-            raise ValueError(told)
+        if remedy := mode_in(name):
+            raise ValueError(remedy)
         valid = ", ".join(map(repr, (*LAWS, *plugins.registered("law"))))
         raise PydanticCustomError("literal_error", "is not one of them", {"expected": valid})
     return target

@@ -111,8 +111,8 @@ def plate(numbers: Sequence[int], poses: FloatArray, margin_mm: float) -> Net:
     corners = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
     label_at = [np.array([math.copysign(half[0] + 3.0, c[0]), c[1]]) for c in at]
     labels = tuple((f"{number}", place) for number, place in zip(numbers, label_at, strict=True))
-    beside = np.array([12.0, 0.0])
-    return Net(tags, (_Line(corners, fold=False),), 2.0 * half + beside, labels, beside)
+    label = np.array([12.0, 0.0])
+    return Net(tags, (_Line(corners, fold=False),), 2.0 * half + label, labels, label)
 
 
 def single(numbers: Sequence[int] | None, known: int, size_mm: float, margin_mm: float, paper: str) -> Net:

@@ -199,7 +199,7 @@ class ErrorModel:
         return np.asarray(np.maximum(found / (near.sum(axis=(2, 3)) + _PRIOR_SIGHTINGS), 1.0))
 
     def slants(self, q: FloatArray) -> int:
-        """Number of sides from which the tool was seen at joints (K, n), apart as far as corners err anew."""
+        """Number of sides, between which corners err differently, that joints (K, n) show of the tool."""
         rays = _rays(self.scene, self.directions, q - self.calibration.q_reference).reshape(len(q), -1, 3)
         sides: list[FloatArray] = []
         for ray in rays:

@@ -45,7 +45,7 @@ class Failure(NamedTuple):
     first: int  # number of the first of them
     reason: str  # why that one did, in words
 
-    def told(self, law: str) -> str:
+    def words(self, law: str) -> str:
         """Return it in words, without the name of the law in the reason."""
         runs = "1 run" if self.runs == 1 else f"{self.runs} runs"
         why = self.reason.removeprefix(f"law {law}: ")
@@ -174,8 +174,8 @@ class SweepTable:
             is_json = ("{", "[")
             self.attributes = {k: json.loads(v) if str(v).startswith(is_json) else v for k, v in found}
             self.names = tuple(self.attributes["columns"])
-            told = self.attributes.get(_FAILURES, {})
-            self.failures = {law: Failure(*one) for law, one in told.items()}  # by law
+            stored = self.attributes.get(_FAILURES, {})
+            self.failures = {law: Failure(*one) for law, one in stored.items()}  # by law
             self.rows = len(file["run"])
             self.traces = tuple(sorted(map(int, file.get(_TRACES, ()))))  # numbers of runs
 
