@@ -106,10 +106,13 @@ class Console:
             return False
 
     def wait(self, text: str) -> None:
-        """Tell somebody at the terminal to do something, and wait for the Enter key."""
+        """Ask the user to act, and wait for the Enter key. Raises InputError where there is no terminal."""
         self._bar.close()
         click.echo(wrapped(f"{text}, then press Enter"), err=True)
-        sys.stdin.readline()
+        if sys.stdin.readline() == "":
+            from projservo_cli.records import InputError
+
+            raise InputError("standard input ended before Enter was pressed: run this at a terminal")
 
     def progress(self, what: str, done: int, total: int, note: str = "") -> None:
         """Move a progress bar; silent where standard error is not a terminal."""

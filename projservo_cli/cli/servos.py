@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -13,8 +13,10 @@ from projservo_cli.cli.group import main
 from projservo_cli.cli.output import Console
 
 if TYPE_CHECKING:
-    from projservo_cli.config import Config
     from projservo_cli.hardware.so101 import Servos
+
+
+_MAX_BYTES = 1_000_000  # maximum size of a configuration
 
 
 @main.command("limits", epilog="Example: projservo limits -c arm.yaml")
@@ -36,13 +38,14 @@ def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
     joint, and presses Enter. The limits go into the file under robot.limits; its comments and other keys
     stay. Nothing is ever moved beyond them.
     """
-    from projservo_cli.config import load_config
     from projservo_cli.config.editing import with_limits
     from projservo_cli.files import write_whole
     from projservo_cli.hardware import joint_limits
 
-    path = Path(config)
-    with _servos(console, load_config(path, teaching=True)) as servos:
+    path = Path(config).resolve()  # the file itself where the name is a link
+    text = _text_of(config)
+    with_limits(text, [], config)  # before somebody moves the arm for it
+    with _servos(console, config, text) as servos:
         joint_limits.require_known(shift, len(servos.ids))
         console.wait("take hold of the arm: it will be released")
         servos.release()
@@ -50,10 +53,37 @@ def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
             servos, _entered(console, "move joint after joint through all that is allowed, ten seconds each")
         )
         limits = joint_limits.limits_deg(servos, moved, shift)
-    write_whole(path, with_limits(path.read_text(encoding="utf-8"), limits, config))
+    written = with_limits(text, limits, config)
+    _require_limits(written, limits, config)
+    write_whole(path, written)
     words = [f"limits: joint {k} {low:g} to {high:g} deg" for k, (low, high) in enumerate(limits, 1)]
-    value = {"configuration": path.resolve(), "limits_deg": limits, "shifted": sorted(shift)}
-    console.report(value, [*words, f"written to {path}: robot.limits"])
+    value = {"configuration": path, "limits_deg": limits, "shifted": sorted(shift)}
+    console.report(value, [*words, f"written to {config}: robot.limits"])
+
+
+def _text_of(config: str) -> str:
+    from projservo_cli.files import text_of
+
+    return text_of(Path(config), "a configuration", _MAX_BYTES)
+
+
+def _require_limits(text: str, limits_deg: list[tuple[float, float]], config: str) -> None:
+    """Raise InputError where an edited configuration does not have these limits, with what to write."""
+    from projservo_cli.config import load_config
+    from projservo_cli.records import InputError
+
+    pairs = [[low, high] for low, high in limits_deg]
+    try:
+        robot = load_config(config, text=text, teaching=True).robot
+        limits = robot.limits.joints if robot is not None and robot.limits is not None else None
+        wrong = "" if [*map(list, limits or ())] == pairs else config
+    except InputError as error:
+        wrong = str(error)
+    if wrong:
+        raise InputError(
+            f"{wrong}: the limits were found and not written: put them under robot yourself, limits: "
+            f"{{joints: {pairs}, unit: deg}}"
+        )
 
 
 @main.command("release", epilog="Example: projservo release -c arm.yaml")
@@ -64,41 +94,54 @@ def _release(console: Console, *, config: str) -> None:
 
     Switches the torque of all its servos off, the gripper's too. The arm falls where nobody holds it.
     """
-    from projservo_cli.config import load_config
+    from projservo_cli.records import WorkFailed
 
-    with _servos(console, load_config(config, teaching=True)) as servos:
+    with _servos(console, config, _text_of(config), whole=False) as servos:
         console.wait("take hold of the arm, and of what its gripper holds: they will be released")
         servos.release(all_of_them=True)
-    console.report({"released": list(servos.all)}, ["release: done"])
+        lost = ", ".join(map(servos.name, sorted(servos.lost)))
+    console.report({"released": servos.alive}, ["release: done" if not lost else "release: not of all"])
+    if lost:
+        raise WorkFailed(f"release: no answer from {lost}: look at the cable to it, or switch the supply off")
 
 
 @contextmanager
-def _servos(console: Console, config: "Config") -> Iterator["Servos"]:
-    """Connect to the servos of a configuration, and report at the end whether their torque is on."""
+def _servos(console: Console, config: str, text: str, *, whole: bool = True) -> Iterator["Servos"]:
+    """Connect to the servos of a configuration, and report at the end whether their torque is on.
+
+    whole : whether all servos must answer.
+    """
+    from projservo_cli.config.editing import plant_of
     from projservo_cli.hardware.so101 import SO101, connected, torque_reported
-    from projservo_cli.records import InputError, WorkFailed
+    from projservo_cli.records import InputError
     from projservo_cli.robots import plugins
 
-    name = plugins.short_name(config.plant.use or "")
-    if name != "so101":
-        raise InputError(f"plant {name or 'simulated'}: is no arm of bus servos: set plant: so101")
-    options: dict[str, Any] = dict(config.plant.options)
-    with connected(SO101(**options)) as servos:
+    use, options = plant_of(text, config)
+    if (name := plugins.short_name(use)) != "so101":
+        raise InputError(f"plant {name}: is no arm of bus servos: set plant: so101")
+    arm = plugins.called("plant", name, SO101, (), options)
+    with connected(arm, whole=whole) as servos:
         try:
             yield servos
-        except WorkFailed as error:
-            raise WorkFailed(f"{error}; nothing was written") from error
         finally:
-            console.say(torque_reported(servos))
+            console.say(torque_reported(servos)[0])
 
 
 def _entered(console: Console, what: str) -> Callable[[], bool]:
     """Ask the user to act; return a function that tells whether Enter came since."""
-    came = threading.Event()
+    came, obstacles = threading.Event(), list[BaseException]()
 
     def ask() -> None:
-        console.wait(what)
+        try:
+            console.wait(what)
+        except BaseException as error:  # raised where somebody waits for Enter
+            obstacles.append(error)
         came.set()
 
+    def done() -> bool:
+        if obstacles:
+            raise obstacles[0]
+        return came.is_set()
+
     threading.Thread(target=ask, daemon=True).start()
-    return came.is_set
+    return done

@@ -34,6 +34,24 @@ def with_limits(text: str, limits_deg: Sequence[tuple[float, float]], where: str
     return f"{text[:at]}limits: {value}{divider if robot.value else ''}{text[at:]}"
 
 
+def plant_of(text: str, where: str) -> tuple[str, dict[str, Any]]:
+    """Return the plant of a configuration and its options, whatever else the text holds.
+
+    An arm can be released, and its limits be found, with a file that has other faults.
+    where : of the text, for messages. Raises InputError for a text that is no mapping.
+    """
+    try:
+        values = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"{where}: {' '.join(str(error).split())}") from error
+    plant = values.get("plant") if isinstance(values, dict) else None
+    if isinstance(plant, str):
+        return plant, {}
+    options = plant.get("options") if isinstance(plant, dict) else None
+    name = plant.get("use") if isinstance(plant, dict) else None
+    return str(name or "simulated"), dict(options) if isinstance(options, dict) else {}
+
+
 def _value(node: yaml.MappingNode, key: str) -> Any:
     """Return the node of a key; None where there is none."""
     return next((value for name, value in node.value if name.value == key), None)

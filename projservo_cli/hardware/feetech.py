@@ -58,15 +58,19 @@ class FeetechBus:
     def __init__(self, port: str, now: Any = time.monotonic, sleep: Any = time.sleep) -> None:
         self.port, self.now, self.sleep = port, now, sleep
         self._lock, self._failed, self._reply_s = threading.RLock(), 0, _REPLY_S
+        self.read_at = now()  # middle of the last request, s
         self._serial = _opened(port)
 
     def close(self) -> None:
         """Let go of the port."""
         self._serial.close()
 
-    def read(self, ids: Sequence[int], address: int, size: int) -> dict[int, Reply]:
+    def read(
+        self, ids: Sequence[int], address: int, size: int, *, together: bool = False
+    ) -> dict[int, Reply]:
         """Return so many bytes, 15 at most, of the memory of each servo; silent ones are asked again.
 
+        together : all are asked again, so that all replies are of ``read_at``.
         Raises ServoSilent, or PortLost.
         """
         found: dict[int, Reply] = {}
@@ -75,8 +79,8 @@ class FeetechBus:
         while missing := [i for i in ids if i not in found]:
             if self.now() > end:
                 raise ServoSilent(missing, sorted(garbled.intersection(missing)))
-            replies, broken = self._asked(missing, address, size)
-            found |= replies
+            replies, broken = self._asked([*ids] if together else missing, address, size)
+            found = replies if together else found | replies
             garbled |= broken
         return {i: found[i] for i in ids}
 
@@ -110,12 +114,14 @@ class FeetechBus:
             self._checked(self._serial.reset_input_buffer)
             self._send(_SYNC_READ, bytes([start, longer, *ids]))
             found: dict[int, Reply] = {}
-            heard, end = b"", self.now() + self._reply_s
+            before = self.now()
+            heard, end = b"", before + self._reply_s
             while len(found) < len(ids) and self.now() < end:
                 heard += self._received()
                 for number, status, values in _packets(heard):
                     if number in ids and len(values) == longer:
                         found[number] = Reply(status, values[address - start :][:size])
+            self.read_at = 0.5 * (before + self.now())
             missing = {*ids} - {*found}
             self._failed += bool(missing)
             slower = 2.0 if missing else 0.5

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.hardware.so101 import COUNT, MIDDLE, TURN, Servos
+from projservo_cli.hardware.so101 import COUNT, MIDDLE, TURN, Registers, Servos
 from projservo_cli.records import InputError, WorkFailed
 
 # Pause between readings, s, and readings whose median counts: a false one is none.
@@ -44,24 +44,51 @@ def limits_deg(
     """Return lowest and highest angle of each joint, deg, within where it was moved.
 
     shift : joints, from 1, whose servos may store an offset, so that no range crosses the end of their turn.
-    Raises WorkFailed for a joint that was hardly moved, or whose range crosses that end.
+    Raises WorkFailed for a joint that was hardly moved, whose range crosses that end, or which its servo
+    keeps from most of it.
     """
-    for k, i in enumerate(servos.ids, 1):
-        if wrong := _unusable(moved[i], k, shift):
-            raise WorkFailed(f"{servos.name(i)} {wrong}")
     kept = servos.registers()
-    found = []
-    for i in servos.ids:
+    for k, i in enumerate(servos.ids, 1):
+        if wrong := _unusable(moved[i], k, shift) or _kept_from(moved[i], kept[i]):
+            raise WorkFailed(f"{servos.name(i)} {wrong}")
+    found, shifted = [], list[int]()
+    for k, i in enumerate(servos.ids, 1):
         low, high = moved[i]
-        if low < 0 or high >= TURN:
+        if _crosses(moved[i]):
             by = round(0.5 * (low + high)) - MIDDLE
-            servos.shift(i, by)
+            try:
+                servos.shift(i, by)
+            except WorkFailed as error:
+                words = f"; joints {shifted} store a new offset: record again" if shifted else ""
+                raise WorkFailed(f"{error}{words}") from error
+            shifted.append(k)
             low, high = low - by, high - by
         low, high = max(low, kept[i].lowest), min(high, kept[i].highest)
         least, most = (math.degrees((x - MIDDLE) * COUNT) for x in (low, high))
         tenths = math.ceil(10.0 * (least + _WITHIN_DEG)), math.floor(10.0 * (most - _WITHIN_DEG))
         found.append((tenths[0] / 10.0, tenths[1] / 10.0))
     return found
+
+
+def _crosses(moved: Moved) -> bool:
+    """Whether a range crosses the end of the turn of its servo."""
+    return moved.lowest < 0 or moved.highest >= TURN
+
+
+def _kept_from(moved: Moved, kept: Registers) -> str:
+    """Return how the limits that a servo stores cut the range of its joint; empty where they hardly do.
+
+    Those of a servo that is shifted must be those of a whole turn: its counts will mean other angles.
+    """
+    cut = max(kept.lowest - moved.lowest, moved.highest - kept.highest)
+    whole = kept.lowest <= 0 and kept.highest >= TURN - 1
+    if whole or (not _crosses(moved) and math.degrees(cut * COUNT) <= _WITHIN_DEG):
+        return ""
+    return (
+        f"stores limits of its own, {kept.lowest} to {kept.highest} counts (registers 9 and 11), and was "
+        f"moved from {moved.lowest} to {moved.highest}: set them to 0 and {TURN - 1} with the tool of its "
+        "maker, and run projservo limits again"
+    )
 
 
 def _unusable(moved: Moved, joint: int, shift: Sequence[int]) -> str:
@@ -74,7 +101,7 @@ def _unusable(moved: Moved, joint: int, shift: Sequence[int]) -> str:
         )
     if span >= math.degrees(TURN * COUNT):
         return f"was moved by {span:.0f}°, a whole turn or more: its limits must be within one"
-    if (moved.lowest < 0 or moved.highest >= TURN) and joint not in shift:
+    if _crosses(moved) and joint not in shift:
         return (
             "was moved over the end of its turn, where servos go the long way round: leave that place "
             f"out, or run projservo limits --shift {joint}, which stores an offset in its servo"

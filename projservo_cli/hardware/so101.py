@@ -30,13 +30,15 @@ _MODEL, _LOWEST, _OFFSET, _TORQUE, _GOAL, _LOCK, _PRESENT = 3, 9, 31, 40, 42, 55
 _STS3215 = 777  # register 3
 _MULTI_TURN = 0x10  # bit of register 18
 _OFFSET_SIGN = 0x800  # bit of register 31
+_OVERLOADED = 0x20  # bit of the status, until a servo gets another set-point
 # Each bit of the status of a servo in words, with the remedy.
 _WRONG = {
     0x01: "its supply has {volts:.1f} V ({least:.1f} to {most:.1f} V): look at the supply",
     0x02: "its angle sensor fails: replace it",
     0x04: "it is too hot, {heat} °C: let it cool",
     0x08: "its current is too high: free it",
-    0x20: "it is overloaded, and pushes with a fifth of its torque: free it from its obstacle",
+    _OVERLOADED: "it is overloaded, and pushes with a fifth of its torque: free it from its obstacle, "
+    "then start again",
 }
 # Fastest that somebody turns a joint, or a servo does, rad/s, and what readings scatter, rad; more is no
 # reading.
@@ -79,29 +81,35 @@ class Servos:
 
     port : its name; ``auto`` for the only one on which all of them answer.
     ids : of the joints, base to tool; others : of further servos, such as a gripper.
+    whole : whether all must answer; else some may be lost.
     Raises InputError where the port cannot be opened, servos are missing, or are of another kind.
     """
 
-    def __init__(self, port: str, ids: Sequence[int], others: Sequence[int] = (), **clock: Any) -> None:
+    def __init__(
+        self, port: str, ids: Sequence[int], others: Sequence[int] = (), *, whole: bool = True, **clock: Any
+    ) -> None:
         self.ids, self.all = (*ids,), (*ids, *others)
         if len({*self.all}) < len(self.all) or not all(0 < i < 254 for i in self.all):
             raise InputError(f"plant.options: ids {[*self.all]} must be numbers from 1 to 253, each once")
         self.bus = FeetechBus(_port_of(self.all, **clock) if port == "auto" else port, **clock)
         self.lost: set[int] = set()  # servos that get no further writes
         try:
-            found = {i: reply.values for i, reply in self._first().items()}
+            found = {i: reply.values for i, reply in self._first(whole).items()}
         except BaseException:
             self.bus.close()
             raise
         self.volts = {i: (0.1 * values[12], 0.1 * values[11]) for i, values in found.items()}
 
-    def _first(self) -> Mapping[int, Any]:
+    def _first(self, whole: bool) -> Mapping[int, Any]:
         """Read the first registers of all servos; an InputError for missing, double and other ones."""
         where = f"port {self.bus.port}:"
         try:
-            found = self.bus.read(self.all, _MODEL, 13)
+            found = self.bus.read(self.alive, _MODEL, 13)
         except ServoSilent as error:
-            there = [i for i in self.all if i not in error.silent]
+            there = [i for i in self.alive if i not in error.silent]
+            if there and not whole:
+                self.lost |= {*error.silent}
+                return self._first(whole)
             if error.garbled:
                 raise InputError(
                     f"{where} answers of servo {error.garbled[0]} are garbled, those of {there} are not: "
@@ -133,7 +141,7 @@ class Servos:
 
     def measured(self) -> dict[int, Measured]:
         """Return what each servo measures that is not lost."""
-        found = self.bus.read(self.alive, _PRESENT, 8).items()
+        found = self.bus.read(self.alive, _PRESENT, 8, together=True).items()
         return {i: Measured(_number(x), 0.1 * x[6], x[7], status) for i, (status, x) in found}
 
     def registers(self) -> dict[int, Registers]:
@@ -170,8 +178,10 @@ class Servos:
         """Store an offset by which a servo reads so many counts less; its torque must be off."""
         offset = max((self.registers()[number].offset + by + MIDDLE) % TURN - MIDDLE, 1 - MIDDLE)
         self.bus.store(_LOCK, {number: b"\0"})
-        self.bus.store(_OFFSET, {number: _two(abs(offset) | (_OFFSET_SIGN if offset < 0 else 0))})
-        self.bus.store(_LOCK, {number: b"\1"})
+        try:
+            self.bus.store(_OFFSET, {number: _two(abs(offset) | (_OFFSET_SIGN if offset < 0 else 0))})
+        finally:
+            self.bus.store(_LOCK, {number: b"\1"})
 
     def described(self, error: WorkFailed) -> str:
         """Tell which joints may fall where the bus fails; nothing more is written to them."""
@@ -206,7 +216,12 @@ class SO101:
         gripper: int | None = 6,
         limits: JointLimits | None = None,
     ) -> None:
-        self._port, self._ids = port, tuple(ids)
+        numbers = () if isinstance(ids, str) or not np.iterable(ids) else tuple(ids)
+        if not numbers or not all(isinstance(i, int) for i in numbers):
+            raise InputError(f"plant.options.ids {ids!r}: give the ids of the servos, such as [1, 2, 3]")
+        if gripper is not None and not isinstance(gripper, int):
+            raise InputError(f"plant.options.gripper {gripper!r}: give the id of its servo, or null")
+        self._port, self._ids = port, numbers
         self._others = () if gripper is None else (gripper,)
         known = limits is not None and bool(np.isfinite([limits.lower, limits.upper]).all())
         self._limits = limits if known else None
@@ -216,10 +231,21 @@ class SO101:
         self._sent: dict[int, int] = {}  # set-points, counts
         self.registers: dict[int, Registers] = {}
 
-    def connect(self) -> Servos:
-        """Connect to the servos, which no other process may have."""
-        self._servos = Servos(self._port, self._ids, self._others, now=self.now, sleep=self.sleep)
-        self._lease = _Lease(self._servos.bus.port)
+    def connect(self, *, whole: bool = True) -> Servos:
+        """Connect to the servos, which no other process may have; ``whole`` where all must answer."""
+        self._servos = Servos(
+            self._port, self._ids, self._others, whole=whole, now=self.now, sleep=self.sleep
+        )
+        try:
+            self._lease = _Lease(self._servos.bus.port)
+        except BaseException:
+            self._servos.bus.close()
+            raise
+        if self._lease.before:
+            _say(
+                f"process {self._lease.before} was ended while it moved this arm: servos went on to their "
+                "last set-points; going on from where the arm stands"
+            )
         return self._servos
 
     def open(self) -> None:
@@ -231,11 +257,6 @@ class SO101:
             if wrong := self._unfit(i, self.registers[i]):
                 raise InputError(f"{self._servos.name(i)}: {wrong}")
         self._read()
-        if killed := self._lease.killed:
-            _say(
-                f"process {killed} was ended while it moved this arm: servos went on to their last "
-                "set-points; going on from where the arm stands"
-            )
 
     def identity(self) -> str:
         """Registers on which the meaning of readings hangs: a recording holds as long as they do."""
@@ -249,9 +270,8 @@ class SO101:
 
     def joints(self) -> tuple[FloatArray, float]:
         """Joint readings (n,), rad, and when they were read, s."""
-        before = self.now()
         found = self._read()
-        return np.array([found[i].angle for i in self._ids]), 0.5 * (before + self.now())
+        return np.array([found[i].angle for i in self._ids]), self._servos.bus.read_at
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Send the set-points; at the first, torque comes on. A released arm is sent nothing."""
@@ -268,15 +288,17 @@ class SO101:
         self._sent |= counts
 
     def hold(self) -> None:
-        """Hold the arm where it stands."""
+        """Hold the arm where it stands; a gripper that holds keeps its grip."""
         self._require_limits()
         self._lease.moving()
-        self._sent = {i: one.at for i, one in self._read().items()}
+        grips = {i for i, on in self._servos.torque().items() if on and i in self._others}
+        self._sent = {i: one.at for i, one in self._read().items() if i not in grips}
         self._servos.enable(self._sent, self._speeds())
         self._on, self._released = True, False
         self.sleep(_SWITCH_S)
-        for i, one in self._read().items():
-            turned = abs(one.at - self._sent[i]) * COUNT
+        there = self._read()
+        for i, sent in self._sent.items():
+            turned = abs(there[i].at - sent) * COUNT
             if turned > _LEAP:
                 raise WorkFailed(
                     f"{self._servos.name(i)} turned by {_deg(turned)} when its torque came on ({_deg(_LEAP)} "
@@ -296,7 +318,8 @@ class SO101:
         for _ in self._servos.all:  # a servo that fails is left out of the next reading
             try:
                 there = {i: one.at for i, one in self._read().items()}
-                moving = {i: at for i, at in there.items() if abs(at - self._sent[i]) * COUNT > _LEAP}
+                sent = {i: at for i, at in self._sent.items() if i in there}
+                moving = {i: there[i] for i, at in sent.items() if abs(there[i] - at) * COUNT > _LEAP}
                 self._servos.send(moving, self._speeds())
                 return
             except WorkFailed as error:
@@ -307,9 +330,10 @@ class SO101:
         """Release the port, and report whether the arm holds."""
         if self._opened:
             self._opened = False
-            _say(torque_reported(self._servos))
+            words, known = torque_reported(self._servos)
+            _say(words)
             self._servos.bus.close()
-            self._lease.end()
+            self._lease.end(moves=self._on and not known)
 
     def _keeps(self, number: int) -> tuple[int, int]:
         """Least and most counts that a servo goes to; over 4095 it goes the long way round."""
@@ -361,21 +385,21 @@ class SO101:
 
         The first one counts where a second agrees with it.
         """
-        found, told = dict[int, Measured](), ""
+        found, wrong = dict[int, Measured](), ""
         for _ in range(_REPEATS):
             try:
                 found = self._servos.measured()
             except (ServoSilent, PortLost) as error:
                 raise WorkFailed(self._servos.described(error)) from error
             now = self.now()
-            told = self._leapt(found, now - self._read_at) or self._faulty(found)
-            agreed = not told and bool(self._before)
+            wrong = self._leapt(found, now - self._read_at) or self._faulty(found)
+            agreed = not wrong and bool(self._before)
             if agreed or not self._agreed:
                 self._before, self._read_at, self._agreed = found, now, agreed
             if agreed:
                 return found
         self._servos.lost |= {i for i, one in found.items() if one.status}
-        raise WorkFailed(told)
+        raise WorkFailed(wrong)
 
     def _leapt(self, found: Mapping[int, Measured], seconds: float) -> str:
         """Return the joint whose reading is impossible since the last one; empty for none."""
@@ -396,18 +420,19 @@ class SO101:
     def _faulty(self, found: Mapping[int, Measured]) -> str:
         """Return the servo that reports a fault, with the remedy; empty for none."""
         for i, one in found.items():
-            for bit, told in _WRONG.items():
-                if one.status & bit:
+            for bit, words in _WRONG.items():
+                # The first set-point ends an overload of before.
+                if one.status & bit and (self._on or bit != _OVERLOADED):
                     least, most = self._servos.volts[i]
-                    what = told.format(volts=one.volts, heat=one.heat, least=least, most=most)
+                    what = words.format(volts=one.volts, heat=one.heat, least=least, most=most)
                     return f"{self._servos.name(i)}: {what}; it is sent nothing more, and may sink"
         return ""
 
 
 @contextmanager
-def connected(arm: SO101) -> Iterator[Servos]:
-    """Connect to the servos of an arm alone, which is not driven."""
-    servos = arm.connect()
+def connected(arm: SO101, *, whole: bool = True) -> Iterator[Servos]:
+    """Connect to the servos of an arm alone, which is not driven; ``whole`` where all must answer."""
+    servos = arm.connect(whole=whole)
     try:
         yield servos
     finally:
@@ -415,24 +440,24 @@ def connected(arm: SO101) -> Iterator[Servos]:
         arm._lease.end()
 
 
-def torque_reported(servos: Servos) -> str:
-    """Tell whether torque is on, at the end of whatever was done with an arm."""
+def torque_reported(servos: Servos) -> tuple[str, bool]:
+    """Report whether torque is on, at the end of whatever was done with an arm, and whether that is known."""
     try:
         on = servos.torque()
     except (ServoSilent, PortLost):
-        return "whether torque is on is not known, since servos do not answer: hold the arm"
-    holding = [i for i in servos.ids if on.get(i)]
+        return "whether torque is on is not known, since servos do not answer: hold the arm", False
+    holding, known = [i for i in servos.ids if on.get(i)], not servos.lost
     if not holding:
-        return "torque is off: nothing holds the arm"
+        return "torque is off: nothing holds the arm", known
     if len(holding) < len(servos.ids):
-        return f"torque is on in {', '.join(map(servos.name, holding))} alone: hold the arm"
-    return "torque is on: the arm holds where it is; projservo release lets go of it"
+        return f"torque is on in {', '.join(map(servos.name, holding))} alone: hold the arm", known
+    return "torque is on: the arm holds where it is; projservo release lets go of it", known
 
 
 class _Lease:
-    """The port of an arm, which one process has; and a note that outlives it where it is killed.
+    """The port of an arm, which one process has; and a note that outlives it where it ends in motion.
 
-    ``killed``: number of a process that was ended while it moved the arm; empty for none.
+    ``before``: number of a process that was ended while it moved the arm; empty for none.
     """
 
     def __init__(self, port: str) -> None:
@@ -445,31 +470,54 @@ class _Lease:
             self._lock.acquire()
         except Timeout as error:
             raise InputError(f"port {port}: another projservo drives this arm: wait for its end") from error
-        self.killed = ""
+        except OSError as error:
+            raise self._of_another(Path(self._lock.lock_file), error) from error
+        self.before = ""
         with suppress(OSError):
-            self.killed = self._note.read_text(encoding="ascii").strip()
+            self.before = self._note.read_text(encoding="ascii").strip()
+
+    @staticmethod
+    def _of_another(file: Path, error: OSError) -> InputError:
+        return InputError(
+            f"{file}: {error.strerror or error}: another user, such as root, drove this arm: remove the file"
+        )
 
     def moving(self) -> None:
         """Note that this process moves the arm."""
-        self._note.write_text(f"{os.getpid()}\n", encoding="ascii")
+        try:
+            self._note.write_text(f"{os.getpid()}\n", encoding="ascii")
+        except OSError as error:
+            raise self._of_another(self._note, error) from error
 
-    def end(self) -> None:
-        """Forget it."""
-        self._note.unlink(missing_ok=True)
+    def end(self, *, moves: bool = False) -> None:
+        """End the lease, and the note, except where the arm may still move."""
+        if not moves:
+            with suppress(OSError):
+                self._note.unlink(missing_ok=True)
         self._lock.release()
 
 
 def _port_of(ids: Sequence[int], **clock: Any) -> str:
-    """Return the only port on which all servos answer; an InputError lists the ports."""
-    ports, fitting = candidate_ports(), []
+    """Return the only port on which all servos answer; an InputError lists the ports, each with its obstacle.
+
+    A single port is the one: what is wrong with its servos is found later.
+    """
+    ports, fitting, obstacles = candidate_ports(), [], []
+    if len(ports) == 1:
+        return ports[0]
     for port in ports:
-        with suppress(InputError, WorkFailed):
+        try:
             bus = FeetechBus(port, **clock)
-            try:
-                bus.read(ids, _MODEL, 2)
-                fitting.append(port)
-            finally:
-                bus.close()
+        except InputError as error:
+            obstacles.append(str(error))
+            continue
+        try:
+            bus.read(ids, _MODEL, 2)
+            fitting.append(port)
+        except WorkFailed as error:
+            obstacles.append(f"port {port}: {error}")
+        finally:
+            bus.close()
     if len(fitting) == 1:
         return fitting[0]
     remedy = "set plant.options.port"
@@ -479,8 +527,8 @@ def _port_of(ids: Sequence[int], **clock: Any) -> str:
         )
     if ports:
         raise InputError(
-            f"servos {[*ids]} all answer on none of {', '.join(ports)}: switch the supply on; {remedy} "
-            "to the port of the arm, which says more"
+            f"servos {[*ids]} all answer on none of {len(ports)} ports: switch the supply on, or {remedy} to "
+            f"the port of the arm; {'; '.join(obstacles)}"
         )
     raise InputError(f"there is no serial port on USB: plug the arm in, or {remedy}")
 

@@ -84,6 +84,8 @@ def called(kind: str, target: str, found: Any, arguments: Sequence[Any], options
         pass  # a class in C does not show its arguments; the call itself checks them
     try:
         result = found(*arguments, **options)
+    except InputError:  # says itself which option is wrong
+        raise
     except Exception as error:
         raise WorkFailed(f"{where}: cannot be made: {what_failed(error)}") from error
     _require_methods(where, result, kind)

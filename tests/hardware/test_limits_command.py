@@ -113,6 +113,58 @@ def test_release_lets_go_and_says_so(arm, capsys):
     assert not any(servo.on for servo in arm.bus.servos.values())
 
 
+def test_all_that_answer_are_released_and_the_others_named(arm, capsys):
+    """With limits the wrong way round in the file, which nothing else takes."""
+    text = arm.file.read_text()
+    arm.file.write_text(with_limits(text, [(10.0, -10.0)] * 5, "arm.yaml"))
+    for servo in arm.bus.servos.values():
+        servo.write(40, b"\1")
+    arm.bus.faults.missing = (2, 6)
+    arm.script += [lambda: "\n"]
+    assert run(["release", "-c", "arm.yaml"]) == 1
+    assert "no answer from joint 2 (servo 2), servo 6" in capsys.readouterr().err
+    assert [i for i, servo in arm.bus.servos.items() if servo.on] == [2, 6]
+
+
+@pytest.mark.parametrize(
+    ("registers", "said"),
+    [((0, 0), "stores limits of its own, 0 to 0 counts"), ((2500, 4095), "2500 to 4095")],
+)
+def test_limits_that_a_servo_stores_are_named_where_they_cut(arm, capsys, registers, said):
+    for address, value in zip((9, 11), registers, strict=True):
+        arm.bus.servos[2].put(address, 2, value)
+    arm.script += [lambda: "\n", moved(arm.bus, [(-15.0, 15.0)] * 5)]
+    before = arm.file.read_text()
+    assert run(["limits", "-c", "arm.yaml"]) == 1
+    assert said in capsys.readouterr().err
+    assert arm.file.read_text() == before
+
+
+@pytest.mark.parametrize("command", ["limits", "release"])
+def test_nobody_at_the_terminal_lets_go_of_no_arm(arm, capsys, command):
+    for servo in arm.bus.servos.values():
+        servo.write(40, b"\1")
+    arm.script += [lambda: ""]
+    assert run([command, "-c", "arm.yaml"]) == 2
+    assert "standard input ended before Enter" in " ".join(capsys.readouterr().err.split())
+    assert all(servo.on for servo in arm.bus.servos.values())
+
+
+def test_a_slip_in_the_options_is_one_line(arm, capsys):
+    arm.file.write_text("plant: {use: so101, options: {prot: auto}}\n")
+    assert run(["release", "-c", "arm.yaml"]) == 2
+    assert "plant.options" in capsys.readouterr().err
+
+
+def test_limits_that_the_file_would_not_hold_are_printed(arm, capsys):
+    """A comment on the line of the key would take them in."""
+    text = arm.file.read_text()
+    arm.file.write_text(text + "\nrobot:\n  limits: # of May\n    joints: [[1, 2]]\n    unit: deg\n")
+    arm.script += [lambda: "\n", moved(arm.bus, [(-15.0, 15.0)] * 5)]
+    assert run(["limits", "-c", "arm.yaml"]) == 2
+    assert "put them under robot yourself" in " ".join(capsys.readouterr().err.split())
+
+
 def test_only_an_arm_of_bus_servos_is_released(tmp_path, capsys):
     assert run(["release", "-c", "configs/hobby.yaml"]) == 2
     assert "plant simulated: is no arm of bus servos: set plant: so101" in capsys.readouterr().err

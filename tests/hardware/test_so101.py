@@ -311,8 +311,11 @@ def test_the_port_of_the_leader_is_told_from_that_of_the_arm(rig, opened, monkey
         InputError, match=r"arms answer on .* and .*: one may be the leader: set plant.options.port"
     ):
         SO101().open()
+    monkeypatch.setattr(so101, "candidate_ports", lambda: [other.port, "/nowhere"])
+    with pytest.raises(InputError, match=r"all answer on none of 2 ports.*do not answer; .*no such port"):
+        SO101().open()
     monkeypatch.setattr(so101, "candidate_ports", lambda: [other.port])
-    with pytest.raises(InputError, match=r"all answer on none of .*: switch the supply on"):
+    with pytest.raises(InputError, match="no servo answers: switch the supply on"):
         SO101().open()
     monkeypatch.setattr(so101, "candidate_ports", list)
     with pytest.raises(InputError, match="no serial port on USB"):
@@ -380,3 +383,68 @@ def test_two_processes_do_not_drive_one_arm(opened):
     bus, _ = opened()
     with pytest.raises(InputError, match=r"another program has it|another projservo drives this arm"):
         SO101(bus.port).open()
+
+
+def test_readings_have_the_time_of_the_reply_and_not_of_requests_without_one(opened, rig):
+    bus, arm = opened(rig(Faults(silent=0.05)))
+    late = []
+    for _ in range(60):
+        _, t = arm.joints()
+        instants = [max(at for at, _ in bus.servos[i].reads) for i in range(1, 6)]
+        late.append(max(instants) - t)
+    assert np.abs(late).max() < 0.02
+
+
+def test_an_overload_of_before_ends_with_the_first_set_point(opened):
+    bus, arm = opened()
+    arm.hold()
+    arm.close()
+    bus.servos[2].overload = True
+    again = opened(bus)[1]
+    again.joints()
+    again.hold()
+    assert not bus.servos[2].overload
+    bus.servos[2].overload = True
+    with pytest.raises(WorkFailed, match=r"joint 2 .* is overloaded"):
+        again.joints()
+
+
+def test_a_gripper_that_holds_keeps_its_grip(opened, rig):
+    bus = rig()
+    bus.servos[6].write(GOAL, (1000).to_bytes(2, "little"))
+    arm = opened(bus)[1]
+    before = len(bus.servos[6].moments)
+    arm.hold()
+    assert len(bus.servos[6].moments) == before
+    assert len(bus.servos[5].moments) == 1
+
+
+def test_the_next_start_says_so_after_a_cable_was_drawn_in_motion(opened, rig, capsys):
+    bus, arm = opened()
+    arm.hold()
+    port = bus.port
+    bus.cut_usb()
+    arm.close()
+    assert "whether torque is on is not known" in capsys.readouterr().err
+    (note,) = so101.Path(so101.tempfile.gettempdir()).glob("*.moving")
+    assert note.read_text().strip() == str(os.getpid())
+    other = rig()
+    note.rename(note.with_name("projservo" + other.port.replace("/", "-") + ".moving"))
+    opened(other)
+    assert "was ended while it moved this arm" in capsys.readouterr().err
+    assert port
+
+
+def test_a_lock_of_another_user_is_named(rig, monkeypatch):
+    def refused(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("filelock.FileLock.acquire", refused)
+    with pytest.raises(InputError, match=r"projservo-dev-pts.*lock: Permission denied: another user"):
+        SO101(rig().port).open()
+
+
+@pytest.mark.parametrize("options", [{"ids": 5}, {"ids": "1-5"}, {"ids": []}, {"gripper": "none"}])
+def test_ids_that_are_none_are_refused(options):
+    with pytest.raises(InputError, match=r"plant.options.(ids|gripper) .*: give"):
+        SO101(**options)
