@@ -159,7 +159,7 @@ def preflight(
         checked = check(
             preflight_inputs(settings),
             calibration,
-            confirmed=(lambda: console.agreed(_QUESTION)) if move else None,
+            confirmed=(lambda way: console.agreed(_QUESTION.format(way=way))) if move else None,
             watch=(lambda robot: _watch(console, settings, robot)) if watch else None,
             progress=console.progress,
         )
@@ -175,8 +175,8 @@ def preflight(
 
 
 _QUESTION = (
-    "doctor will move each joint by 3° to either side, one after the other. Is the arm free all around, with "
-    "room to each limit?"
+    "doctor will move each joint by {way} to either side, one after the other. Is the arm free all around, "
+    "with room to each limit?"
 )
 
 

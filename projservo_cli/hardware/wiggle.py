@@ -7,13 +7,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from projservo_cli.calibration.detections import per_rad
 from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding
 from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.pacing import Steered
 
+# Angles are of revolute joints. Prismatic ones go the lengths that make as much of a difference to images.
 # How far a joint goes to each side, and how fast: quick strokes show the latency, slow ones the hysteresis.
-REACH, _QUICK, _SLOW = math.radians(3.0), math.radians(20.0), math.radians(5.0)
+_REACH, _QUICK, _SLOW = math.radians(3.0), math.radians(20.0), math.radians(5.0)
 # Minimum motion from one end to the other, rad, and distance kept from limits.
 _LEAST_WAY, _KEPT = math.radians(2.0), math.radians(0.5)
 # Pause after each stroke, s, and the part at its end in which all stands still.
@@ -41,21 +43,41 @@ class Strokes(NamedTuple):
     """Readings of a robot while one joint went to and fro."""
 
     joint: int  # from 0
+    slides: bool  # whether it is prismatic
     end: IntArray  # (k,) number of the stroke of each reading
-    target: FloatArray  # (k,) rad or m
+    target: FloatArray  # (k,) rad, as is q
     readings: tuple[Reading, ...]
     given_up: str  # why it was broken off; empty where it was not
 
     @property
     def q(self) -> FloatArray:
-        """Readings (k,) of the joint, rad or m."""
-        return np.array([reading.q[self.joint] for reading in self.readings])
+        """Readings (k,) of the joint, rad; of a prismatic one angles that make as much of a difference."""
+        return np.array([reading.q[self.joint] for reading in self.readings]) / _unit(self.slides)
 
     def rest(self, stroke: int) -> list[int]:
         """Indices of the readings at rest at the end of a stroke."""
         rows = np.flatnonzero(self.end == stroke)
         last = self.readings[rows[-1]].t_q
         return [int(k) for k in rows if self.readings[k].t_q > last - _STILL_S]
+
+
+def _unit(slides: bool) -> float:
+    """Motion of a joint, rad or m, that makes as much of a difference as one rad of a revolute one."""
+    return float(per_rad(np.array(slides)))
+
+
+def _text(angle: float, slides: bool) -> str:
+    """Write an angle, rad, in degrees, or the length that it stands for in mm, to a tenth."""
+    value = 1e3 * angle * _unit(slides) if slides else math.degrees(angle)
+    return f"{round(value, 1):g}{' mm' if slides else '°'}"
+
+
+def reach_of(types: str) -> str:
+    """Return how far joints of these types, R or P each, go to either side, in words."""
+    turns, slides = _text(_REACH, False), _text(_REACH, True)
+    if "P" not in types:
+        return turns
+    return f"{turns}, prismatic ones by {slides}," if "R" in types else slides
 
 
 # Ends of the strokes, in reaches, and whether they are quick. The last three end in the middle from below, at
@@ -73,15 +95,17 @@ def strokes(steered: Steered, joint: int) -> Strokes | str:
     q = steered.observe().q
     for _ in range(math.ceil(_PAUSE_S / bounds.period)):
         steered.hold()
-    low = max(-REACH, bounds.limits.lower[joint] + _KEPT - q[joint])
-    high = min(REACH, bounds.limits.upper[joint] - _KEPT - q[joint])
-    if high - low < _LEAST_WAY or not low < 0.0 < high:
-        return f"it has no room for {math.degrees(_LEAST_WAY):g}°: move it away from its limit by hand"
+    slides = [*bounds.units][joint : joint + 1] == ["m"]
+    unit = _unit(slides)
+    low = max(-_REACH * unit, bounds.limits.lower[joint] + _KEPT * unit - q[joint])
+    high = min(_REACH * unit, bounds.limits.upper[joint] - _KEPT * unit - q[joint])
+    if high - low < _LEAST_WAY * unit or not low < 0.0 < high:
+        return f"it has no room for {_text(_LEAST_WAY, slides)}: move it away from its limit by hand"
     middle = float(steered.target[joint])
     rows: list[tuple[int, float, Reading]] = []
     for number, (end, quick) in enumerate(_STROKES):
         goal = middle + (high if end > 0 else low if end < 0 else 0.0)
-        speed = min(_QUICK if quick else _SLOW, float(bounds.limits.speed[joint]))
+        speed = min((_QUICK if quick else _SLOW) * unit, float(bounds.limits.speed[joint]))
         begun, from_q = float(steered.target[joint]), float(steered.reading.q[joint])
         pauses = math.ceil(_PAUSE_S / bounds.period)
         while pauses > 0:
@@ -90,12 +114,12 @@ def strokes(steered: Steered, joint: int) -> Strokes | str:
             step[joint] = math.copysign(min(abs(left), speed * bounds.period), left)
             steered.command(step, bounds.period)
             pauses -= left == 0.0 or bool(steered.set_point.short[joint])
-            rows.append((number, float(steered.target[joint]), steered.observe()))
+            rows.append((number, float(steered.target[joint]) / unit, steered.observe()))
         way, gone = abs(goal - begun), abs(float(steered.reading.q[joint]) - from_q)
         if number in _HELD and gone < _HELD[number] * way:
             what = f"went {bounds.text(joint, gone, 2)} of {bounds.text(joint, way, 2)}"
-            return Strokes(joint, *_columns(rows), what)
-    return Strokes(joint, *_columns(rows), "")
+            return Strokes(joint, slides, *_columns(rows), what)
+    return Strokes(joint, slides, *_columns(rows), "")
 
 
 def _columns(rows: Sequence[tuple[int, float, Reading]]) -> tuple[IntArray, FloatArray, tuple[Reading, ...]]:
@@ -239,12 +263,12 @@ def _of_servo(one: Strokes, fits: Sequence[_Fit]) -> Iterator[Finding]:
     sag = float((one.target - one.q)[below + above].mean())
     best = [int(np.argmin(fit.squares)) for fit in fits]
     backlash = float(np.mean([fit.backlash[k] for fit, k in zip(fits, best, strict=True)])) if fits else 0.0
-    parts = [f"{name} {math.degrees(x):.1f}°" for name, x in (("hysteresis", hysteresis), ("sag", abs(sag)))]
+    both = (("hysteresis", hysteresis), ("sag", abs(sag)))
+    parts = [f"{name} {_text(x, one.slides)}" for name, x in both]
     if fits:
         hidden = abs(sag) > 2.0 * _NOTABLE and backlash < _NOTABLE
-        parts.append(
-            "backlash hidden by gravity" if hidden else f"backlash {math.degrees(max(backlash, 0.0)):.1f}°"
-        )
+        size = "hidden by gravity" if hidden else _text(max(backlash, 0.0), one.slides)
+        parts.append(f"backlash {size}")
     wide = max(hysteresis, backlash) > _WIDE
     remedy = (
         "teach goals by images, which backlash does not move; look for a loose horn or screw" if wide else ""

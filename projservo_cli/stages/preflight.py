@@ -10,7 +10,7 @@ import numpy as np
 from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding, Seen, findings_at_rest
-from projservo_cli.hardware.wiggle import Strokes, findings_of, strokes
+from projservo_cli.hardware.wiggle import Strokes, findings_of, reach_of, strokes
 from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.records import Calibration, FloatArray, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
@@ -39,14 +39,14 @@ class Checked(NamedTuple):
 def check(
     inputs: PreflightInputs,
     calibration: Calibration | None = None,
-    confirmed: Callable[[], bool] | None = None,
+    confirmed: Callable[[str], bool] | None = None,
     watch: Callable[[PluginRobot], None] | None = None,
     progress: Progress = silent,
 ) -> Checked:
     """Open robot and cameras, look, and close them.
 
     calibration : whose images are compared, where there is one.
-    confirmed : asks whether joints may be moved by a few degrees; None moves none.
+    confirmed : asks whether joints may be moved, by so much to either side in words; None moves none.
     watch : is called with the open robot, for as long as somebody wants to see its images.
     """
     joints, dictionary = inputs.joints.joints(), inputs.dictionary or DICTIONARY
@@ -66,7 +66,7 @@ def check(
                 found.append(
                     Finding(WARNING, "joints", "were not moved: something above is a fault", "mend it first")
                 )
-            elif confirmed is not None and confirmed():
+            elif confirmed is not None and confirmed(reach_of(joints.types)):
                 steered = Steered(robot)
                 for joint in range(len(seen.q)):
                     one = strokes(steered, joint)

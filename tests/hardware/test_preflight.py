@@ -5,6 +5,7 @@ import json
 import urllib.request
 from types import SimpleNamespace
 
+import click
 import cv2
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from projservo_cli.hardware.live_page import LivePage
 from projservo_cli.hardware.preflight import view_angle_deg
 from projservo_cli.stages import calibrate, preflight
 from tests.hardware.streams import Stream, picture
-from tests.hardware.wiggled import Faults, findings
+from tests.hardware.wiggled import Faults, Rail, findings
 
 LEFT = picture(at=(60.0, 80.0), numbers=(0, 1, 2), side=50.0, step=75.0)
 CONFIGURATION = """\
@@ -243,6 +244,45 @@ def test_motions_name_what_a_recording_would_fail_at(faults, where, words):
     (fault,) = (one for one in found if one.level == "fault")
     assert fault.where == where
     assert words in f"{fault.text}: {fault.remedy}"
+
+
+RAIL = """\
+name: rail
+plant: {{use: "tests.hardware.wiggled:Rail"{options}}}
+data: {{table: rail.csv, joints: RP}}
+markers: {{numbers: [0, 1, 2, 3, 4, 5, 6, 7], face: [0, 1, 2, 3]}}
+robot: {{limits: {{joints: {limits}, unit: deg}}}}
+control: {{joint_speed_limit_deg_s: 40, prismatic_speed_limit_m_s: 0.5}}
+"""
+
+
+@pytest.fixture
+def rail(projservo, tmp_path, monkeypatch):
+    """Function that checks and moves a joint that turns and one that slides; answer, findings, questions."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    asked = []
+    monkeypatch.setattr(click, "confirm", lambda question, **_: asked.append(question) or True)
+
+    def check(limits="[[-90, 90], [-0.5, 0.5]]", options=""):
+        (tmp_path / "rail.yaml").write_text(RAIL.format(limits=limits, options=options), encoding="utf-8")
+        answer = projservo("doctor", "-c", "rail.yaml", "--move", "--json")
+        return answer, answer.json["findings"], asked
+
+    return check
+
+
+def test_a_joint_that_slides_moves_by_millimetres_and_reports_them(rail):
+    answer, found, asked = rail()
+    assert answer.code == 0
+    assert "move each joint by 3°, prismatic ones by 15.7 mm, to either side" in asked[0]
+    t, turned, slid = np.array(Rail.last.sent).T
+    assert np.degrees([turned.min(), turned.max()]) == pytest.approx([-3.0, 3.0])
+    assert [slid.min(), slid.max()] == pytest.approx([-0.0157, 0.0157], abs=1e-4)
+    assert np.abs(np.diff(slid) / np.diff(t)).max() == pytest.approx(0.3 * np.radians(20.0), rel=0.01)
+    text = {one["where"]: one["text"] for one in found}
+    assert text["joint 1"] == "hysteresis 0°, sag 0°, backlash 0°"
+    assert text["joint 2"] == "hysteresis 0 mm, sag 0 mm, backlash 0 mm"
 
 
 def test_a_live_page_serves_both_images_to_this_machine_alone():

@@ -87,6 +87,34 @@ class Wiggled:
         pass
 
 
+class Rail:
+    """A joint that turns and one that slides, at once where they are sent, and two tags that both move."""
+
+    def __init__(self):
+        self.q, self.time, self.sent = np.zeros(2), 0.0, []
+        type(self).last = self
+
+    def now(self):
+        return self.time
+
+    def open(self):
+        pass
+
+    def command(self, target, speed, due):
+        self.q, self.time = target.copy(), due
+        self.sent.append((due, *target))
+
+    def read(self):
+        s = 100.0 + 10.0 * np.arange(32.0).reshape(2, 8, 2) + [600.0 * self.q[0], 2000.0 * self.q[1]]
+        return self.q, s, self.time, self.time, self.time
+
+    def stop(self):
+        pass
+
+    def close(self):
+        pass
+
+
 def findings(faults, **given):
     """Findings of the motions of all joints of such an arm."""
     config = load_config("configs/hobby.yaml", SETTINGS)
