@@ -56,13 +56,18 @@ class Seen:
     health: Mapping[str, float | str] = field(default_factory=dict)  # such as the voltage
 
 
-def findings_at_rest(seen: Seen, finder: TagFinder, dictionary: str) -> Iterator[Finding]:
-    """All findings at rest; ``dictionary``: name of that of the ``finder``."""
+def findings_at_rest(
+    seen: Seen, finder: TagFinder, dictionary: str, *, moves: bool = False
+) -> Iterator[Finding]:
+    """All findings at rest.
+
+    dictionary : name of that of the ``finder``; moves : whether joints are to move next, which need limits.
+    """
     for camera, view in zip(seen.cameras, seen.views, strict=True):
         yield from _of_camera(camera)
         yield from _of_tags(camera.name, view, seen, finder, dictionary)
     yield from _of_both(seen)
-    yield from _of_joints(seen)
+    yield from _of_joints(seen, FAULT if moves else WARNING)
 
 
 def _of_camera(camera: Camera) -> Iterator[Finding]:
@@ -234,8 +239,11 @@ def _directions(pixels: FloatArray, sigma: FloatArray) -> list[FloatArray]:
     return [np.array([*side, z]), np.array([*-side, z])]
 
 
-def _of_joints(seen: Seen) -> Iterator[Finding]:
-    """Readings within their limits, and the measurements of the arm itself."""
+def _of_joints(seen: Seen, endless: str) -> Iterator[Finding]:
+    """Readings within their limits, and the measurements of the arm itself.
+
+    endless : level of a joint without limits.
+    """
     lower, upper = seen.limits.lower, seen.limits.upper
     readings = ", ".join(in_unit(x, unit, 4) for x, unit in zip(seen.q.tolist(), seen.units, strict=True))
     yield Finding(FINE, "joints", f"read {readings}")
@@ -243,7 +251,7 @@ def _of_joints(seen: Seen) -> Iterator[Finding]:
         low, high = (in_unit(float(limit[i]), unit, 4) for limit in (lower, upper))
         if not np.isfinite([lower[i], upper[i]]).all():
             yield Finding(
-                WARNING, f"joint {i + 1}", "has no limits", "set robot.limits, or run projservo limits"
+                endless, f"joint {i + 1}", "has no limits", "set robot.limits.joints, or run projservo limits"
             )
         elif not lower[i] <= x <= upper[i]:
             what = f"reads {in_unit(x, unit, 4)}, beyond its limits {low} to {high}"

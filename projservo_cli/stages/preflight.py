@@ -45,11 +45,11 @@ def check(
 ) -> Checked:
     """Open robot and cameras, look, and close them.
 
-    calibration : whose images are compared, where there is one.
+    calibration : whose images are compared, where there is one, and whose data may give limits.
     confirmed : asks whether joints may be moved, by so much to either side in words; None moves none.
     watch : is called with the open robot, for as long as somebody wants to see its images.
     """
-    joints, dictionary = inputs.joints.joints(), inputs.dictionary or DICTIONARY
+    joints, dictionary = inputs.joints.joints("", calibration), inputs.dictionary or DICTIONARY
     robot = plugin_robot(inputs.robot, inputs.following.bounds(joints), joints.types, inputs.numbers)
     found: list[Finding] = []
     seen, moved = None, list[Strokes]()
@@ -58,7 +58,7 @@ def check(
             if watch is not None:
                 watch(robot)
             seen = _seen(robot, inputs, progress)
-            found += findings_at_rest(seen, TagFinder(dictionary), dictionary)
+            found += findings_at_rest(seen, TagFinder(dictionary), dictionary, moves=confirmed is not None)
             if calibration is not None:
                 found.append(_against(calibration, seen, robot.image_size))
             works = all(finding.level != FAULT for finding in found)

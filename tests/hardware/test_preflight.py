@@ -251,7 +251,7 @@ name: rail
 plant: {{use: "tests.hardware.wiggled:Rail"{options}}}
 data: {{table: rail.csv, joints: RP}}
 markers: {{numbers: [0, 1, 2, 3, 4, 5, 6, 7], face: [0, 1, 2, 3]}}
-robot: {{limits: {{joints: {limits}, unit: deg}}}}
+robot: {{limits: {limits}}}
 control: {{joint_speed_limit_deg_s: 40, prismatic_speed_limit_m_s: 0.5}}
 """
 
@@ -264,9 +264,10 @@ def rail(projservo, tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(click, "confirm", lambda question, **_: asked.append(question) or True)
 
-    def check(limits="[[-90, 90], [-0.5, 0.5]]", options=""):
+    def check(limits="{joints: [[-90, 90], [-0.5, 0.5]], unit: deg}", options=""):
         (tmp_path / "rail.yaml").write_text(RAIL.format(limits=limits, options=options), encoding="utf-8")
         answer = projservo("doctor", "-c", "rail.yaml", "--move", "--json")
+        assert answer.code < 2, answer.err
         return answer, answer.json["findings"], asked
 
     return check
@@ -283,6 +284,17 @@ def test_a_joint_that_slides_moves_by_millimetres_and_reports_them(rail):
     text = {one["where"]: one["text"] for one in found}
     assert text["joint 1"] == "hysteresis 0°, sag 0°, backlash 0°"
     assert text["joint 2"] == "hysteresis 0 mm, sag 0 mm, backlash 0 mm"
+
+
+def test_a_joint_without_limits_is_a_fault_and_nothing_moves(rail, tmp_path):
+    answer, found, asked = rail(limits="{from_data: 0.1}")
+    assert (answer.code, asked, Rail.last.sent) == (1, [], [])
+    assert (tmp_path / "preflight.html").exists()
+    assert [one["where"] for one in found if (one["level"], one["text"]) == ("fault", "has no limits")] == [
+        "joint 1",
+        "joint 2",
+    ]
+    assert found[-1]["text"] == "were not moved: something above is a fault"
 
 
 def test_a_live_page_serves_both_images_to_this_machine_alone():
