@@ -138,7 +138,7 @@ def _signal(moved: Strokes, view: int) -> _Signal:
     """Motion of the markers of a view in all of its new frames."""
     readings = moved.readings
     new = [k for k in range(1, len(readings)) if readings[k].new_views(readings[k - 1])[view]]
-    s = np.array([readings[k].s[view] for k in new]).reshape(len(new), -1, 2)
+    s = np.array([readings[k].s[view] for k in new]).reshape(len(new), len(readings[0].s[view]), 2)
     stamps = np.array(
         [readings[k].t_q if np.isnan(readings[k].t_view[view]) else readings[k].t_view[view] for k in new]
     )
@@ -215,6 +215,7 @@ def _direction(t_q: FloatArray, q: FloatArray, t: FloatArray, passing: float) ->
 def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Finding]:
     """Findings of the strokes of all joints; numbers : of the markers."""
     still, total = [], np.zeros((2, len(_LATENCIES)))
+    most = np.zeros(2)  # motion of each image, px
     for one in moved:
         signals = [_signal(one, view) for view in range(2)]
         fits = [_passed(one, signal) for signal in signals]
@@ -225,7 +226,8 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
             )
             yield Finding(FAULT, f"joint {one.joint + 1}", f"{one.given_up}: it is held or too weak", remedy)
             continue
-        span = max(np.ptp(signal.p) if len(signal.p) else 0.0 for signal in signals)
+        spans = [np.ptp(signal.p) if len(signal.p) else 0.0 for signal in signals]
+        most, span = np.maximum(most, spans), max(spans)
         if span < _MOVES_PX:
             still.append(one.joint)
         else:
@@ -233,8 +235,11 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
                 total[view] += 0.0 if fit is None else fit.squares
         yield from _of_servo(one, [fit for fit in fits if fit is not None] if span >= _MOVES_PX else [])
     yield from _of_still(still, len(moved))
-    for name, squares in zip(VIEWS, total, strict=True):
-        if squares.any():
+    for name, squares, px in zip(VIEWS, total, most, strict=True):
+        if px < _MOVES_PX <= most.max():
+            what = f"its tags moved by {px:.1f} px with the joints ({_MOVES_PX:g} at least)"
+            yield Finding(FAULT, f"{name} camera", what, "look whether its image is live, and of this arm")
+        elif squares.any():
             latency = _minimum(squares)
             remedy = (
                 "look for what queues frames: a hub, a network, a slow machine"
@@ -244,7 +249,8 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
             yield Finding(
                 WARNING if remedy else FINE, f"{name} camera", f"latency {1e3 * latency:.0f} ms", remedy
             )
-    yield from _of_loose_tags(moved, numbers)
+    if most.max() >= _MOVES_PX:
+        yield from _of_loose_tags(moved, numbers)
 
 
 def _minimum(squares: FloatArray) -> float:

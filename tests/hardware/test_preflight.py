@@ -297,6 +297,22 @@ def test_a_joint_without_limits_is_a_fault_and_nothing_moves(rail, tmp_path):
     assert found[-1]["text"] == "were not moved: something above is a fault"
 
 
+@pytest.mark.parametrize(
+    ("frozen", "where", "words"),
+    [
+        ("[0, 1]", "joints 1, 2", "turned, and no tag moved: look whether the tags are on this arm"),
+        ("[1]", "right camera", "its tags moved by 0.0 px with the joints (1 at least): look whether"),
+    ],
+)
+def test_a_camera_that_repeats_one_frame_is_named(rail, tmp_path, frozen, where, words):
+    answer, found, _ = rail(options=f", options: {{frozen: {frozen}}}")
+    (fault,) = (one for one in found if one["level"] == "fault")
+    assert (answer.code, fault["where"]) == (1, where)
+    assert words in f"{fault['text']}: {fault['remedy']}"
+    assert (frozen == "[1]") == any(one["where"] == "tags" for one in found)
+    assert (tmp_path / "preflight.html").exists()
+
+
 def test_a_live_page_serves_both_images_to_this_machine_alone():
     page = LivePage("arm <1>")
     assert page.url.startswith("http://127.0.0.1:")

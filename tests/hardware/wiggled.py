@@ -90,8 +90,9 @@ class Wiggled:
 class Rail:
     """A joint that turns and one that slides, at once where they are sent, and two tags that both move."""
 
-    def __init__(self):
+    def __init__(self, frozen=()):
         self.q, self.time, self.sent = np.zeros(2), 0.0, []
+        self.frozen = [*frozen]  # views, 0 or 1, of which one frame is repeated
         type(self).last = self
 
     def now(self):
@@ -106,7 +107,9 @@ class Rail:
 
     def read(self):
         s = 100.0 + 10.0 * np.arange(32.0).reshape(2, 8, 2) + [600.0 * self.q[0], 2000.0 * self.q[1]]
-        return self.q, s, self.time, self.time, self.time
+        stamps, still = np.full(2, self.time), s - s[0, 0] + 100.0
+        s[self.frozen], stamps[self.frozen] = still[self.frozen], 0.0
+        return self.q, s, self.time, *stamps
 
     def stop(self):
         pass
