@@ -12,7 +12,7 @@ from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding, Seen, findings_at_rest
 from projservo_cli.hardware.wiggle import Strokes, findings_of, reach_of, strokes
 from projservo_cli.monitoring.monitor import detected_fault
-from projservo_cli.records import Calibration, FloatArray, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages import Progress, silent
@@ -77,7 +77,9 @@ def check(
                     else:
                         moved.append(one)
                 found += findings_of(moved, seen.marker)
-    except WorkFailed as error:
+    except (InputError, WorkFailed) as error:
+        if isinstance(error, InputError) and seen is None:
+            raise
         what, _, remedy = str(error).partition(": look ")
         found.append(Finding(FAULT, "robot and cameras", what, f"look {remedy}" if remedy else ""))
     return Checked(tuple(found), seen, tuple(moved))

@@ -313,6 +313,12 @@ def test_a_camera_that_repeats_one_frame_is_named(rail, tmp_path, frozen, where,
     assert (tmp_path / "preflight.html").exists()
 
 
+def test_a_robot_that_refuses_to_move_leaves_the_findings_at_rest(rail, tmp_path):
+    answer, found, _ = rail(options=", options: {refuses: true}")
+    assert (answer.code, found[-1]["text"]) == (1, "nothing was moved")
+    assert "share 8 of 8 markers" in (tmp_path / "preflight.html").read_text(encoding="utf-8")
+
+
 def test_a_live_page_serves_both_images_to_this_machine_alone():
     page = LivePage("arm <1>")
     assert page.url.startswith("http://127.0.0.1:")

@@ -7,6 +7,7 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import recording_inputs, truth_of
 from projservo_cli.hardware import wiggle
+from projservo_cli.records import InputError
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from tests.configured import bounds_of, joints_of
@@ -90,7 +91,8 @@ class Wiggled:
 class Rail:
     """A joint that turns and one that slides, at once where they are sent, and two tags that both move."""
 
-    def __init__(self, frozen=()):
+    def __init__(self, frozen=(), refuses=False):
+        self.refuses = refuses
         self.q, self.time, self.sent = np.zeros(2), 0.0, []
         self.frozen = [*frozen]  # views, 0 or 1, of which one frame is repeated
         type(self).last = self
@@ -102,6 +104,8 @@ class Rail:
         pass
 
     def command(self, target, speed, due):
+        if self.refuses:
+            raise InputError("nothing was moved: look at its key")
         self.q, self.time = target.copy(), due
         self.sent.append((due, *target))
 
