@@ -71,7 +71,7 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds) -> Robot:
     A class that takes an argument ``limits`` is given those of its joints.
     """
     options = dict(own.options)
-    if "limits" not in options and plugins.takes("plant", own.target, "limits"):
+    if takes_limits(own):
         options["limits"] = bounds.limits
     if own.cameras is not None:
         arm: Arm = plugins.make("plant", own.target, (), options)
@@ -94,6 +94,11 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds) -> Robot:
             f"plant {own.target}: has joints(), which brings no pixels: configure cameras, left and right"
         )
     return robot
+
+
+def takes_limits(own: OwnRobot) -> bool:
+    """Whether the class of a robot is made with the limits of its joints."""
+    return "limits" not in own.options and plugins.takes("plant", own.target, "limits")
 
 
 def _require_no_turn_off(bounds: Bounds, q: FloatArray) -> None:

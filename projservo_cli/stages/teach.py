@@ -15,7 +15,7 @@ from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
 from projservo_cli.robots.settings import Joints, OwnRobot, Readings
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.external_robot import at_rest, averaged, plugin_robot, simulated_robot
+from projservo_cli.stages.external_robot import at_rest, averaged, plugin_robot, simulated_robot, takes_limits
 from projservo_cli.stages.given import Goal, GoalImages, PlanInputs, ReachingTask, TeachInputs
 from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
 
@@ -93,7 +93,8 @@ def teach(
     at : joints that a simulated robot is put to.
     wait : asks the user to act, and returns afterwards; None without a user, so that
         the arm is not released.
-    Raises InputError if ``at`` is missing, does not fit or is beyond a limit; WorkFailed if the robot fails.
+    Raises InputError if ``at`` is missing, does not fit or is beyond a limit, or an arm without limits would
+    have to hold; WorkFailed if the robot fails.
     """
     joints, driven, period = inputs.joints.joints(), inputs.driven, inputs.driven.following.period
     moved = None
@@ -102,6 +103,8 @@ def teach(
             raise InputError("--at is where a simulated robot is put to; move yours by hand")
         bounds = driven.following.bounds(joints)
         robot = plugin_robot(driven.robot, bounds, joints.types, inputs.numbers)
+        if wait is not None and robot.lets_go and takes_limits(driven.robot):
+            _require_limits(joints)
     else:
         if at is None:
             raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
@@ -143,6 +146,15 @@ def teach(
         moved=None if moved is None else mean.q - moved,
         bounds=robot.bounds,
     )
+
+
+def _require_limits(joints: Joints) -> None:
+    """Refuse with an InputError to release an arm that would not hold again without limits."""
+    for i in np.flatnonzero(~np.isfinite([joints.limits.lower, joints.limits.upper]).all(axis=0)).tolist():
+        raise InputError(
+            f"teach: joint {i + 1} has no limits, without which the arm would not hold again: nothing was "
+            "released; run projservo limits -c FILE first, or set robot.limits.joints"
+        )
 
 
 def _within_limits(at: Readings, joints: Joints) -> FloatArray:

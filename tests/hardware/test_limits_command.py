@@ -104,6 +104,14 @@ def test_a_range_over_the_end_of_a_turn_is_refused_or_shifted(arm, capsys):
     assert abs(high - low - 148.0) < 1.5
 
 
+def test_an_arm_without_limits_is_not_released_to_be_taught(arm, capsys):
+    assert run(["teach", "--start", "-c", "arm.yaml"]) == 2
+    error = capsys.readouterr().err
+    assert "joint 1 has no limits, without which the arm would not hold again: nothing was released" in error
+    assert "run projservo limits -c FILE first" in error
+    assert error.count("\n") == 1
+
+
 def test_release_lets_go_and_says_so(arm, capsys):
     for servo in arm.bus.servos.values():
         servo.write(40, b"\1")
