@@ -80,7 +80,9 @@ def _teach(
     with option.writing(output):
         try:
             taught = stage.teach(teach_inputs(settings), frames, put, console.wait if asks else None)
-            if not start:
+            if start:
+                stage.require_start(taught)
+            else:
                 stage.require_face(settings.face_numbers, taught)
             check = None
             if calibration is not None and not start:
@@ -95,6 +97,11 @@ def _teach(
     is_relative = config is not None and Path(config).resolve().parent == output.resolve().parent
     setting = f"{'task.start' if start else 'task.goal'}: {output.name if is_relative else output.resolve()}"
     _print_taught(console, output, taught, check, setting)
+    if start and taught.unseen:
+        console.say(
+            "teach: a recording starts with these markers unseen: turn the tool until both cameras see all "
+            "tags, and teach again with --force"
+        )
     if check is not None and not check.reached:
         raise WorkFailed(f"{output}: by the calibration, {check.reason}")
 
@@ -115,7 +122,9 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
     value |= dict.fromkeys(("off_px", "far", "reached", "reason")) if check is None else check._asdict()
     left, right = taught.frames
     certain = f", to {np.nanmax(taught.sigma):.3g} px" if np.isfinite(taught.sigma).any() else ""
-    words = [f"teach: {len(taught.marker)} markers from {left} images left and {right} right{certain}"]
+    known, shared = len(taught.marker), taught.shared
+    count = f"{known} markers" if shared == known else f"{shared} of {known} markers in both views,"
+    words = [f"teach: {count} from {left} images left and {right} right{certain}"]
     if taught.moved is not None:
         i = int(np.abs(taught.moved).argmax())
         words.append(

@@ -23,7 +23,7 @@ _MIN_ANGLE_DEG, _GOOD_ANGLE_DEG = 4.0, 10.0
 # Standard deviations of a corner by which perspective must move it to show the side of a tilt.
 _CERTAIN = 4.0
 # Markers that both cameras must see: a turn about a line through two shows in no image.
-_MIN_SHARED = 3
+MIN_SHARED = 3
 # Distance from a limit at which a joint has no room, rad.
 _ROOM = math.radians(1.0)
 
@@ -160,9 +160,9 @@ def _of_both(seen: Seen) -> Iterator[Finding]:
     """Markers that both cameras see, the face among them, and whether the views differ enough for depth."""
     visible = np.isfinite(seen.s[..., 0])
     shared = int(visible.all(axis=0).sum())
-    if visible.any(axis=1).all() and shared < _MIN_SHARED:
+    if visible.any(axis=1).all() and shared < MIN_SHARED:
         remedy = "turn the tool towards both cameras, or move them"
-        what = f"share {shared} of {len(seen.marker)} markers ({_MIN_SHARED} at least)"
+        what = f"share {shared} of {len(seen.marker)} markers ({MIN_SHARED} at least)"
         yield Finding(FAULT, "both images", what, remedy)
     elif shared:
         yield Finding(FINE, "both images", f"share {shared} of {len(seen.marker)} markers")

@@ -16,6 +16,7 @@ from projservo_cli.calibration.detections import per_rad
 from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
 from projservo_cli.files import write_whole
 from projservo_cli.hardware.live_page import annotated, recording_page
+from projservo_cli.hardware.preflight import MIN_SHARED
 from projservo_cli.records import (
     CORNERS,
     VIEWS,
@@ -44,7 +45,6 @@ _MOST_MOVING = 200  # frames in motion in a table
 
 # Draws of one pose, of which each reaches less far, and the shares of markers that must be within both
 # images, and look towards both cameras.
-_LEAST_SHARED = 3  # markers that both cameras see: a turn about a line through two shows in no image
 _DRAWS, _SHRINKING, _LEAST_SEEN, _LEAST_FACING = 100, 0.98, 0.75, 0.5
 
 
@@ -451,10 +451,10 @@ class _Sight:
             )
         often = -(-len(s) // 2)
         shared = int((seen.all(axis=1).sum(axis=0) >= often).sum())
-        if shared < _LEAST_SHARED:
+        if shared < MIN_SHARED:
             half = "" if len(s) == 1 else ", half of them or more"
             return (
-                f"both cameras see only {shared} of the {total} markers {where}{half} ({_LEAST_SHARED} at "
+                f"both cameras see only {shared} of the {total} markers {where}{half} ({MIN_SHARED} at "
                 "least): turn the tool towards both cameras, and remove what occludes it"
             )
         return ""

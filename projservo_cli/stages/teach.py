@@ -10,6 +10,7 @@ import numpy as np
 
 from projservo_cli.calibration import predict
 from projservo_cli.display import require_radians
+from projservo_cli.hardware.preflight import MIN_SHARED
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
 from projservo_cli.robots.settings import Joints, OwnRobot, Readings
@@ -37,6 +38,11 @@ class _Taught:
     frames: IntArray  # (2,) how many there were of each view
     moved: FloatArray | None  # (n,) by how much joints moved when they were held again; None if never
     bounds: Bounds  # of the robot, with the units of its joints
+
+    @property
+    def shared(self) -> int:
+        """How many markers both cameras see."""
+        return int(np.isfinite(self.s[..., 0]).all(axis=0).sum())
 
     @property
     def unseen(self) -> list[tuple[int, str]]:
@@ -223,6 +229,16 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
         for view, k in np.argwhere(off > _FAR * math.sqrt(2.0) * noise).tolist()
     ]
     return _Checked(off, far, reached, reason)
+
+
+def require_start(taught: _Taught) -> None:
+    """Refuse a start from which nothing can be recorded, since both cameras see too little; a WorkFailed."""
+    if taught.shared < MIN_SHARED:
+        known, (left, right) = len(taught.marker), np.isfinite(taught.s[..., 0]).sum(axis=1)
+        raise WorkFailed(
+            f"teach: both cameras see {taught.shared} of {known} markers ({MIN_SHARED} at least; "
+            f"left {left}, right {right}): turn the tool towards both cameras, and look at light and focus"
+        )
 
 
 def require_face(face: Sequence[int], taught: _Taught) -> None:

@@ -180,6 +180,29 @@ def test_what_cannot_be_taught_is_an_object_with_exit_code_1(projservo, tmp_path
     assert not (tmp_path / "goal.yaml").exists()
 
 
+def test_a_start_that_cameras_do_not_see_is_refused_and_one_in_part_named(projservo, tmp_path, monkeypatch):
+    def teach(*given):
+        taught = original(*given)
+        taught.s[0, : -seen or None] = np.nan
+        return taught
+
+    monkeypatch.chdir(tmp_path)
+    original = teaching.teach
+    monkeypatch.setattr(teaching, "teach", teach)
+    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "1")
+    asked = ("teach", "--start", "-c", ROOT / "configs" / "hobby.yaml", *at)
+    for seen in (0, 2):
+        refused = projservo(*asked)
+        words = f"both cameras see {seen} of 8 markers (3 at least; left {seen}, right 8): turn the tool"
+        assert (refused.code, words in refused.err) == (1, True)
+        assert not (tmp_path / "start.yaml").exists()
+    seen = 6
+    answer = projservo(*asked)
+    assert answer.code == 0
+    assert answer.out.startswith("teach: 6 of 8 markers in both views, from 1 images left and 1 right")
+    assert "until both cameras see all tags, and teach again" in " ".join(answer.err.split())
+
+
 def test_what_is_taught_beside_a_run_is_of_its_configuration(projservo, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = load_config(ROOT / "configs" / "hobby.yaml", ["plant.averaged_frames=2"])
