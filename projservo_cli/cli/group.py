@@ -1,5 +1,7 @@
 """The command ``projservo``: one group whose stages chain, and the exit codes of errors."""
 
+import atexit
+import contextlib
 import difflib
 import inspect
 import io
@@ -144,7 +146,10 @@ class _Group(click.Group):
         if _COMPLETE in os.environ:
             sys.exit(shell_complete(self, {}, "projservo", _COMPLETE, os.environ[_COMPLETE]))
         sys.unraisablehook = _raise_again
-        sys.exit(run(sys.argv[1:] if args is None else args))
+        ended: list[int] = []
+        atexit.register(_abandon_threads, ended)  # the first to be registered is the last to be called
+        ended.append(run(sys.argv[1:] if args is None else args))
+        sys.exit(ended[0])
 
 
 main = _Group(
@@ -216,6 +221,18 @@ def _complain(text: str, code: int) -> int:
     for line in text.splitlines():
         click.echo(f"projservo: {visible(line)}", err=True)
     return code
+
+
+def _abandon_threads(ended: Sequence[int]) -> None:
+    """Leave with the exit code while a thread still waits, such as for a camera that gives nothing.
+
+    If it came back to C++ while the interpreter ends, it would abort the process: exit code 134.
+    """
+    if ended and any(thread.daemon for thread in threading.enumerate()):
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):
+                stream.flush()
+        os._exit(ended[0])
 
 
 def _raise_again(lost: "sys.UnraisableHookArgs") -> None:

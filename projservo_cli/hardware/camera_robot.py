@@ -116,9 +116,11 @@ class CameraRobot:
         self.arm.command(target, speed, due)
 
     def stop(self) -> None:
-        """Bring the arm to rest."""
+        """Bring the arm to rest; where cameras are still awaited, end that, and the arm is never opened."""
         if self._begun:
             self.arm.stop()
+        else:
+            self._end_cameras()
 
     def close(self) -> None:
         """Let go of the arm, and of both cameras in any case."""
@@ -126,8 +128,13 @@ class CameraRobot:
             if self._begun:
                 self.arm.close()
         finally:
+            self._end_cameras()  # both, before either is waited for
             for camera in self.cameras:
                 camera.close()
+
+    def _end_cameras(self) -> None:
+        for camera in self.cameras:
+            camera.end()
 
     def remarks(self) -> list[str]:
         """Return the faults of the last frames, in words: dark, clipped or blurred ones."""

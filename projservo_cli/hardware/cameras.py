@@ -40,6 +40,8 @@ _RETRY_S = 0.2
 _OPEN_MS, _READ_MS = 5000, 1000
 # Time within which the first frame must come: webcams settle their exposure, s.
 _FIRST_S = 8.0
+# Most time for which a closed camera is waited for, s: of a read, and most of an attempt to open.
+_CLOSE_S = 3.0
 # Codes of VIDIOC_QUERYCAP and offsets in its struct v4l2_capability (videodev2.h).
 _QUERYCAP, _SIZE_OF, _BUS, _CAPS = 0x80685600, 104, slice(48, 80), 88
 # Capability of nodes that give pictures (V4L2_CAP_VIDEO_CAPTURE, and of several planes).
@@ -72,6 +74,7 @@ class Camera:
         self._refused = ""  # why no frame of it will do
         self._came = threading.Condition()
         self._closing = threading.Event()
+        self._grabbing: threading.Thread | None = None
 
     @property
     def where(self) -> str:
@@ -81,9 +84,15 @@ class Camera:
     def open(self) -> None:
         """Connect, and wait for the first frame; WorkFailed if there is none."""
         capture = self._connected()
-        threading.Thread(target=self._grab_always, args=(capture,), daemon=True, name=self.name).start()
+        # A daemon: a read that never returns must not keep the process alive.
+        self._grabbing = threading.Thread(
+            target=self._grab_always, args=(capture,), daemon=True, name=self.name
+        )
+        self._grabbing.start()
         with self._came:
-            self._came.wait_for(lambda: self._frame is not None or self._refused, _FIRST_S)
+            self._came.wait_for(
+                lambda: self._frame is not None or self._refused or self._closing.is_set(), _FIRST_S
+            )
         if self._refused or self._frame is None:
             self.close()
             device = _device(self.settings.source)
@@ -122,9 +131,20 @@ class Camera:
         stamps = list(self._stamps)
         return (len(stamps) - 1) / (stamps[-1] - stamps[0]) if len(stamps) > 2 else math.nan
 
-    def close(self) -> None:
-        """Let go of the camera."""
+    def end(self) -> None:
+        """Read no more frames, and end the wait of ``open``; returns at once."""
         self._closing.set()
+        with self._came:
+            self._came.notify_all()
+
+    def close(self) -> None:
+        """Let go of the camera, and wait until the thread that grabs it has ended.
+
+        At the end of the interpreter a thread that comes back from OpenCV would abort the process.
+        """
+        self.end()
+        if self._grabbing is not None:
+            self._grabbing.join(_CLOSE_S)
 
     def _grab_always(self, capture: Any) -> None:
         """Keep the newest frame until the camera is closed; connect again where it is lost."""

@@ -90,6 +90,12 @@ def test_a_camera_that_is_lost_is_named_within_two_seconds(stream, camera):
     assert time.monotonic() - begun < 2.5  # 1.9 s, but other programs share the machine
 
 
+def test_a_closed_camera_is_read_no_more(stream, camera):
+    shown = camera(stream(lambda: SEEN, 2.0).url)
+    shown.close()
+    assert not shown._grabbing.is_alive()
+
+
 def test_frames_of_another_size_are_refused(stream, camera):
     with pytest.raises(
         WorkFailed, match=r"gives frames of 320 x 240 px, not the 640 x 480 of cameras.left.size"

@@ -2,6 +2,11 @@
 
 import html
 import json
+import os
+import signal
+import socket
+import subprocess
+import sys
 import urllib.request
 from types import SimpleNamespace
 
@@ -17,6 +22,7 @@ from projservo_cli.detection import TagFinder
 from projservo_cli.hardware.live_page import LivePage
 from projservo_cli.hardware.preflight import view_angle_deg
 from projservo_cli.stages import calibrate, preflight
+from tests.conftest import ROOT
 from tests.hardware.streams import Stream, picture
 from tests.hardware.wiggled import Faults, Rail, findings
 
@@ -173,6 +179,54 @@ def test_a_camera_that_does_not_open_ends_in_a_fault_with_its_name(doctor, projs
     assert (answer.code, "doctor checks a robot with -c alone" in answer.err) == (2, True)
     answer = projservo("doctor", "-c", "arm.yaml", "--move")
     assert (answer.code, "nobody can be asked" in answer.err) == (2, True)
+
+
+@pytest.fixture
+def process(tmp_path):
+    """Function that starts doctor before two cameras in a process of its own, as people do."""
+    images = seen_from(-0.12), seen_from(0.12)
+    left, right = (Stream(lambda image=image: image, 10.0) for image in images)
+    started = []
+
+    def start(right_source=right.url):
+        text = CONFIGURATION.format(left=left.url, right=right_source, rate=10, options="")
+        (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
+        command = "from projservo_cli.cli import main; main()"
+        started.append(
+            subprocess.Popen(
+                [sys.executable, "-c", command, "doctor", "-c", "arm.yaml"],
+                cwd=tmp_path,
+                env=os.environ | {"PYTHONPATH": str(ROOT)},
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        )
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.kill()
+        one.communicate()
+    left.close()
+    right.close()
+
+
+def test_a_command_with_cameras_ends_with_its_own_exit_code(process):
+    out, err = (sound := process()).communicate(timeout=60)
+    assert (sound.returncode, "ready to record" in out, err) == (0, True, "")
+    out, err = (alone := process("nowhere.mp4")).communicate(timeout=60)
+    assert (alone.returncode, "the right camera" in out, err) == (1, True, "")
+
+
+def test_an_interrupt_before_a_silent_camera_ends_in_its_own_exit_code(process):
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        waiting = process(f"http://127.0.0.1:{silent.getsockname()[1]}/right.mjpg")
+        silent.settimeout(60.0)
+        with silent.accept()[0]:
+            waiting.send_signal(signal.SIGINT)
+            _, err = waiting.communicate(timeout=60)
+    assert (waiting.returncode, err.splitlines()[-1]) == (130, "projservo: interrupted")
 
 
 @pytest.fixture(scope="module")
