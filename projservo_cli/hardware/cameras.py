@@ -42,6 +42,12 @@ _OPEN_MS, _READ_MS = 5000, 1000
 _FIRST_S = 8.0
 # Most time for which a closed camera is waited for, s: of a read, and most of an attempt to open.
 _CLOSE_S = 3.0
+# What OpenCV says of a property that a driver does not have.
+_UNKNOWN = -1.0
+# Focus that common webcams round to, and half the steps of exposures that DirectShow has, powers of two.
+_FOCUS_STEP, _EXPOSURE_STEP = 5.0, 0.51
+# Automatic exposures of V4L2: of time and iris, and of time alone (V4L2_CID_EXPOSURE_AUTO).
+_V4L_AUTOMATIC = (0, 3)
 # Codes of VIDIOC_QUERYCAP and offsets in its struct v4l2_capability (videodev2.h).
 _QUERYCAP, _SIZE_OF, _BUS, _CAPS = 0x80685600, 104, slice(48, 80), 88
 # Capability of nodes that give pictures (V4L2_CAP_VIDEO_CAPTURE, and of several planes).
@@ -241,7 +247,7 @@ def _cv() -> Any:
 
 
 def _set_up(capture: Any, settings: CameraSettings) -> Iterator[str]:
-    """Set format, size, rate, exposure and focus of a device; return the refused settings, in words."""
+    """Set format, size, rate, exposure and focus of a device; return what it did not take, in words."""
     cv = _cv()
     capture.set(cv.CAP_PROP_FOURCC, cv.VideoWriter.fourcc(*settings.fourcc))
     if settings.size_px is not None:
@@ -251,21 +257,52 @@ def _set_up(capture: Any, settings: CameraSettings) -> Iterator[str]:
         capture.set(cv.CAP_PROP_FPS, settings.rate_hz)
     capture.set(cv.CAP_PROP_BUFFERSIZE, 1)
     capture.set(cv.CAP_PROP_AUTO_WB, 0)
-    if not capture.set(cv.CAP_PROP_AUTOFOCUS, 0) and capture.get(cv.CAP_PROP_AUTOFOCUS) > 0:
+    capture.set(cv.CAP_PROP_AUTOFOCUS, 0)
+    focuses = settings.focus is None or capture.set(cv.CAP_PROP_FOCUS, settings.focus)
+    v4l = capture.getBackendName() == "V4L2"
+    exposes = settings.exposure_ms is None or _expose(capture, settings.exposure_ms, v4l)
+    # Drivers take settings without a word and keep their own: what they have afterwards counts.
+    if v4l and (code := _code_of(capture.get(cv.CAP_PROP_FOURCC))) not in ("", settings.fourcc):
+        yield f"sends {code}, not the {settings.fourcc} of fourcc: set fourcc: {code}, or take another camera"
+    if capture.get(cv.CAP_PROP_AUTOFOCUS) == 1:
         yield "autofocus is on, and its driver does not switch it off: a camera that refocuses is another one"
-    if settings.focus is not None and not capture.set(cv.CAP_PROP_FOCUS, settings.focus):
-        yield f"its driver does not set the focus to {settings.focus:g}"
+    if settings.focus is not None:
+        focus = capture.get(cv.CAP_PROP_FOCUS)
+        if not focuses or (focus != _UNKNOWN and abs(focus - settings.focus) > _FOCUS_STEP):
+            yield f"its driver does not set the focus to {settings.focus:g}{_instead(focus)}"
     if settings.exposure_ms is None:
         yield "its exposure is automatic: fix it with exposure_ms, below a frame's time"
         return
-    v4l = capture.getBackendName() == "V4L2"
+    if v4l and capture.get(cv.CAP_PROP_AUTO_EXPOSURE) in _V4L_AUTOMATIC:
+        yield "its exposure stays automatic, against exposure_ms: add light, or take another camera"
+        return
+    value = capture.get(cv.CAP_PROP_EXPOSURE)
+    time_ms = value if value in (0, _UNKNOWN) else 0.1 * value if v4l else 1e3 * 2.0**value
+    if not exposes or (time_ms > 0 and abs(math.log2(time_ms / settings.exposure_ms)) > _EXPOSURE_STEP):
+        yield (
+            f"its driver does not fix the exposure at {settings.exposure_ms:g} ms{_instead(time_ms, ' ms')}: "
+            "set an exposure_ms that it takes"
+        )
+
+
+def _expose(capture: Any, exposure_ms: float, v4l: bool) -> bool:
+    """Fix the exposure of a device; whether its driver takes it."""
+    cv = _cv()
     # V4L2: manual is 1, times in 100 µs; DirectShow and Media Foundation: 0.25, times as powers of two, s.
-    manual, exposure = (
-        (1, 10.0 * settings.exposure_ms) if v4l else (0.25, math.log2(1e-3 * settings.exposure_ms))
-    )
+    manual, exposure = (1, 10.0 * exposure_ms) if v4l else (0.25, math.log2(1e-3 * exposure_ms))
     capture.set(cv.CAP_PROP_AUTO_EXPOSURE, manual)
-    if not capture.set(cv.CAP_PROP_EXPOSURE, exposure):
-        yield f"its driver does not fix the exposure at {settings.exposure_ms:g} ms"
+    return bool(capture.set(cv.CAP_PROP_EXPOSURE, exposure))
+
+
+def _code_of(number: float) -> str:
+    """Four letters of a format; empty where its driver does not say it."""
+    code = struct.pack("<I", int(number)).decode("latin-1") if 0 < number < 2**32 else ""
+    return code if code.isascii() and code.isprintable() else ""
+
+
+def _instead(value: float, unit: str = "") -> str:
+    """Words on what a driver has instead of what it was sent; empty where it does not say."""
+    return "" if value in (0, _UNKNOWN) else f", it has {value:.3g}{unit}"
 
 
 def _device(source: int | str) -> Path | None:

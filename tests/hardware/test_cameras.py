@@ -189,6 +189,35 @@ def test_autofocus_and_exposure_that_a_driver_does_not_fix_are_said():
     assert "its exposure is automatic" in automatic
 
 
+class _Ignoring(_Driver):
+    """A device of which the driver takes all settings, and keeps its own."""
+
+    def __init__(self, **kept):
+        super().__init__(set())
+        self.kept = {getattr(cameras._cv(), f"CAP_PROP_{name}"): value for name, value in kept.items()}
+
+    def get(self, key):
+        return self.kept.get(key, super().get(key))
+
+
+def test_settings_that_a_driver_takes_and_ignores_are_said():
+    yuyv = float(cameras._cv().VideoWriter.fourcc(*"YUYV"))
+    settings = CameraSettings(0, exposure_ms=8.0, focus=30.0)
+    ignoring = _Ignoring(FOURCC=yuyv, AUTOFOCUS=1.0, FOCUS=100.0, EXPOSURE=156.0)
+    assert list(cameras._set_up(ignoring, settings)) == [
+        "sends YUYV, not the MJPG of fourcc: set fourcc: YUYV, or take another camera",
+        "autofocus is on, and its driver does not switch it off: a camera that refocuses is another one",
+        "its driver does not set the focus to 30, it has 100",
+        "its driver does not fix the exposure at 8 ms, it has 15.6 ms: set an exposure_ms that it takes",
+    ]
+    (automatic,) = cameras._set_up(_Ignoring(AUTO_EXPOSURE=3.0), settings)
+    assert "its exposure stays automatic" in automatic
+    # What is rounded, or not known, is no difference.
+    assert list(cameras._set_up(_Ignoring(FOCUS=32.0, EXPOSURE=78.0), settings)) == []
+    unknown = dict.fromkeys(("FOURCC", "AUTOFOCUS", "FOCUS", "AUTO_EXPOSURE", "EXPOSURE"), -1.0)
+    assert list(cameras._set_up(_Ignoring(**unknown), settings)) == []
+
+
 def test_black_dark_saturated_and_blurred_images_are_said():
     assert exposure_of(SEEN).faults() == []
     assert "is black" in exposure_of(np.full_like(SEEN, 3)).faults()[0]
