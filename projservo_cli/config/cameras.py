@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import Field, StrictInt, StrictStr, StringConstraints
 
 from projservo_cli.config.robot import Count, Finding, NotNegative, Positive, Section
-from projservo_cli.robots.settings import CameraSettings, StereoSettings
+from projservo_cli.robots.settings import CameraSettings, StereoSettings, device_of
 
 
 class _Source(Section):
@@ -25,6 +25,11 @@ class _Source(Section):
         None, description="of a device, in units of its driver; null leaves it where it stands; no autofocus"
     )
 
+    def contradictions(self) -> Iterator[Finding]:
+        """An index that is text would be taken for a film of that name."""
+        if isinstance(self.source, str) and self.source.isdecimal():
+            yield ("source",), f"is text: an index has no quotes: source: {int(self.source)}"
+
 
 class Cameras(Section):
     """Both cameras, of an arm whose class has joints() in place of read(); projservo finds the tags."""
@@ -38,8 +43,9 @@ class Cameras(Section):
 
     def contradictions(self) -> Iterator[Finding]:
         """One camera twice, or no time to reconnect."""
-        if self.left.source == self.right.source:
-            yield ("right", "source"), "is that of the left camera as well: name the other one"
+        left, right = (device_of(one.source) or one.source for one in (self.left, self.right))
+        if left == right:
+            yield ("right", "source"), f"is {left}, that of the left camera as well: name the other one"
         if self.reconnect_s < self.max_age_s:
             yield ("reconnect_s",), f"must not be below max_age_s, {self.max_age_s:g}"
 

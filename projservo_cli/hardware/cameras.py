@@ -9,7 +9,6 @@ import math
 import os
 import re
 import struct
-import sys
 import threading
 import time
 from collections import deque
@@ -20,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.detection import opencv
-from projservo_cli.records import ByteArray, WorkFailed
-from projservo_cli.robots.settings import CameraSettings
+from projservo_cli.records import ByteArray, InputError, WorkFailed
+from projservo_cli.robots.settings import CameraSettings, device_of
 
 
 class Frame(NamedTuple):
@@ -101,7 +100,7 @@ class Camera:
             )
         if self._refused or self._frame is None:
             self.close()
-            device = _device(self.settings.source)
+            device = device_of(self.settings.source)
             holder = _holder(device) if device is not None else ""
             raise WorkFailed(
                 f"{self.where}: {self._refused or holder or f'gives no frame within {_FIRST_S:g} s'}"
@@ -208,7 +207,7 @@ class Camera:
     def _stamp(self, capture: Any) -> float:
         """When a frame was taken, s: V4L2 stamps buffers on the monotonic clock; else now."""
         now = self._now()
-        if self._now is not time.monotonic or _device(self.settings.source) is None:
+        if self._now is not time.monotonic or device_of(self.settings.source) is None:
             return now
         stamp = 1e-3 * float(capture.get(_cv().CAP_PROP_POS_MSEC))
         self.stamped = 0.0 < now - stamp < _FIRST_S
@@ -217,8 +216,10 @@ class Camera:
     def _connected(self) -> Any:
         """Open its source, and set what can be set; WorkFailed with the reason if it does not open."""
         cv, source = _cv(), self.settings.source
-        device = _device(source)
+        device = device_of(source)
         if device is not None:
+            if device.exists() and not re.fullmatch(r"video\d+", device.name):
+                raise InputError(f"{self.where}: is no camera: name one of the devices: {_listed(_nodes())}")
             if wrong := _wrong_device(device):
                 raise WorkFailed(f"{self.where}: {wrong}")
             capture = cv.VideoCapture(int(device.name.removeprefix("video")), cv.CAP_V4L2)
@@ -305,19 +306,9 @@ def _instead(value: float, unit: str = "") -> str:
     return "" if value in (0, _UNKNOWN) else f", it has {value:.3g}{unit}"
 
 
-def _device(source: int | str) -> Path | None:
-    """Device node of V4L2 that a source is, such as ``/dev/video0``; None for others."""
-    if not sys.platform.startswith("linux"):
-        return None
-    path = Path(f"/dev/video{source}") if isinstance(source, int) else Path(source)
-    if not str(path).startswith("/dev/"):
-        return None
-    return path.resolve() if re.fullmatch(r"video\d+", path.resolve().name) else path
-
-
 def stable_name(source: int | str) -> str:
     """Name of a device that stays when it is plugged in again; empty where there is none or it is given."""
-    device, links = _device(source), Path("/dev/v4l/by-path")
+    device, links = device_of(source), Path("/dev/v4l/by-path")
     if device is None or str(source).startswith("/dev/v4l/") or not links.is_dir():
         return ""
     return next((str(link) for link in sorted(links.iterdir()) if link.resolve() == device), "")
@@ -345,12 +336,15 @@ def _nodes() -> list[Path]:
     return sorted(Path("/dev").glob("video*"))
 
 
+def _listed(nodes: list[Path]) -> str:
+    return ", ".join(map(str, nodes)) or "none: look at the cable"
+
+
 def _wrong_device(device: Path) -> str:
     """Return the reason why a device node gives no pictures, with the remedy; empty if it may."""
     others = _nodes()
     if not device.exists():
-        listed = ", ".join(map(str, others)) or "none: look at the cable"
-        return f"there is no {device}; devices: {listed}"
+        return f"there is no {device}; devices: {_listed(others)}"
     if not os.access(device, os.R_OK | os.W_OK):
         return f"{device} may not be read: sudo usermod -aG video $USER, then log in again"
     found = _capabilities(device)

@@ -1,7 +1,10 @@
 """Settings of a robot: its joints and their limits, its servos, its class and its cameras."""
 
 import math
+import re
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,6 +131,16 @@ class CameraSettings(NamedTuple):
     fourcc: str = "MJPG"  # format in which a device sends frames
     exposure_ms: float | None = None  # None leaves it to the camera
     focus: float | None = None  # in units of the driver; None for where it stands
+
+
+def device_of(source: int | str) -> Path | None:
+    """Device node of V4L2 that a source is, such as ``/dev/video0``; None for others."""
+    if not sys.platform.startswith("linux"):
+        return None
+    path = Path(f"/dev/video{source}") if isinstance(source, int) else Path(source)
+    if not str(path).startswith("/dev/"):
+        return None
+    return path.resolve() if re.fullmatch(r"video\d+", path.resolve().name) else path
 
 
 class StereoSettings(NamedTuple):

@@ -181,6 +181,29 @@ def test_a_camera_that_does_not_open_ends_in_a_fault_with_its_name(doctor, projs
     assert (answer.code, "nobody can be asked" in answer.err) == (2, True)
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="device nodes of Linux")
+@pytest.mark.parametrize(
+    ("left", "right", "words"),
+    [
+        ("0", "/dev/video0", "cameras.right.source: is /dev/video0, that of the left camera as well"),
+        ('"0"', "1", "cameras.left.source: is text: an index has no quotes: source: 0"),
+        (
+            "/dev/null",
+            "1",
+            "the left camera (cameras.left.source: /dev/null): is no camera: name one of the devices: ",
+        ),
+    ],
+    ids=["twice", "quoted", "no camera"],
+)
+def test_a_source_that_is_taken_or_no_camera_is_refused(projservo, tmp_path, monkeypatch, left, right, words):
+    monkeypatch.chdir(tmp_path)
+    text = CONFIGURATION.format(left="L", right="R", rate=30, options="")
+    text = text.replace('"L"', left).replace('"R"', right)
+    (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
+    answer = projservo("doctor", "-c", "arm.yaml")
+    assert (answer.code, answer.err.count("\n"), words in answer.err) == (2, 1, True), answer.err
+
+
 @pytest.fixture
 def process(tmp_path):
     """Function that starts doctor before two cameras in a process of its own, as people do."""
