@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Annotated
 
-from pydantic import Field, StrictInt, StrictStr, StringConstraints
+from pydantic import Field, Strict, StrictInt, StrictStr, StringConstraints
 
 from projservo_cli.config.robot import Count, Finding, NotNegative, Positive, Section
 from projservo_cli.robots.settings import CameraSettings, StereoSettings, device_of
@@ -17,10 +17,12 @@ class _Source(Section):
     )
     size_px: tuple[Count, Count] | None = Field(None, description="width and height; null for its own")
     rate_hz: Positive | None = Field(None, description="frames a second; null for its own")
-    fourcc: Annotated[str, StringConstraints(min_length=4, max_length=4)] = Field(
+    fourcc: Annotated[str, StringConstraints(min_length=4, max_length=4, to_upper=True)] = Field(
         "MJPG", description="format in which a device sends frames; YUYV fills a USB 2 hub with one camera"
     )
-    exposure_ms: Positive | None = Field(None, description="of a device; null leaves it to the camera")
+    exposure_ms: Annotated[float, Strict(), Field(ge=0.1, le=1000)] | None = Field(
+        None, description="of a device; null leaves it to the camera"
+    )
     focus: NotNegative | None = Field(
         None, description="of a device, in units of its driver; null leaves it where it stands; no autofocus"
     )

@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import predict
-from projservo_cli.config import load_config
+from projservo_cli.config import Override, load_config
 from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.detection import TagFinder
 from projservo_cli.hardware.live_page import LivePage
 from projservo_cli.hardware.preflight import view_angle_deg
+from projservo_cli.records import InputError
 from projservo_cli.stages import calibrate, preflight
 from tests.conftest import ROOT
 from tests.hardware.streams import Stream, picture
@@ -202,6 +203,16 @@ def test_a_source_that_is_taken_or_no_camera_is_refused(projservo, tmp_path, mon
     (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
     answer = projservo("doctor", "-c", "arm.yaml")
     assert (answer.code, answer.err.count("\n"), words in answer.err) == (2, 1, True), answer.err
+
+
+def test_an_exposure_in_seconds_is_refused_and_a_format_in_small_letters_is_not(tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text(CONFIGURATION.format(left="l", right="r", rate=30, options=""), encoding="utf-8")
+    for exposure, words in (("0.008", "must be at least 0.1"), ("8000", "must be at most 1000")):
+        with pytest.raises(InputError, match=rf"cameras.left.exposure_ms: {words}"):
+            load_config(path, [Override.parse(f"cameras.left.exposure_ms={exposure}")])
+    found = load_config(path, [Override.parse("cameras.left.fourcc=mjpg")])
+    assert found.cameras.left.fourcc == "MJPG"
 
 
 @pytest.fixture
