@@ -79,7 +79,7 @@ _TICKS = 4096  # in a turn of an encoder that is as coarse as any
 # Accelerations that the profile joint_space takes where no limit is given, deg/s² and m/s².
 _ACCELERATION_DEG_S2, _ACCELERATION_M_S2 = 500.0, 2.0
 _EXPECTED = {
-    "table": "a table",
+    "table": "a table, which projservo record calibrate makes",
     "init": "JSON with screws, cameras and markers",
     "mjcf": "a model of MuJoCo",
 }

@@ -488,6 +488,11 @@ def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> 
                 return
             task["goal"] = {"joints": task.get("start")}
             continue
+        if not path.exists():
+            command = f"projservo teach{' --start' * (key == 'start')} -c FILE -o {base / task[key]}"
+            raise InputError(
+                f"{where}: there is no {path} yet: teach it first, before a recording: {command}"
+            )
         try:
             taught = _Document(text_of(path, "a file that projservo teach wrote", _MAX_BYTES), str(path))
         except InputError as error:

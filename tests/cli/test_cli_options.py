@@ -178,7 +178,7 @@ USAGE = {
     "poses of a plan": (["plan", "--suggest", "3"], "--suggest: not used by plan"),
     "no configuration": (["plan", "-c", "none.yaml"], "none.yaml: cannot be read"),
     "key twice": (["plan", "-c", "twice.yaml"], "projservo: twice.yaml:3:1: seed: the key"),
-    "no table": ([*RECORDED[:2], "none.csv"], "none.csv: cannot be read"),
+    "no table": ([*RECORDED[:2], "none.csv"], "which projservo record calibrate makes"),
     "table cut short": ([*RECORDED[:2], "bad.csv", "-q", "-o", "out"], "bad.csv:2: 4 cells"),
     "other letters": ([*RECORDED, "--joints", "RX"], "--joints RX: data.joints: 'RX' must be"),
     "no noise at all": (
