@@ -27,7 +27,7 @@ def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -
 @main.stage("record", epilog="Example: projservo record -c configs/stanford.yaml --output trials.csv")
 @option.configuration(help="Configuration (YAML). Default: paper.yaml.")
 @option.override
-@option.output(metavar="TABLE", help="Observation table to write (CSV).", required=True)
+@option.output(metavar="TABLE", help="Observation table to write (CSV). Default: data.table.")
 @click.option(
     "--motions",
     metavar="CSV",
@@ -61,7 +61,8 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     from projservo_cli.config.inputs import recording_inputs
     from projservo_cli.stages.record import new_recording
 
-    config, path = option.configured(options["config"], options), options["output"]
+    config = option.configured(options["config"], options)
+    path = options["output"] or _data_table(config)
     poses, given = _motions(config, options), recording_inputs(config)
     recording, reason = new_recording(given, path, motions=poses, force=options["force"]), ""
     if not options["dry_run"]:
@@ -73,6 +74,17 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     if reason:
         click.echo(visible(f"projservo: record: {reason}"), err=True)
     return FAILED if reason else 0
+
+
+def _data_table(config: Any) -> Path:
+    """Return the table of a configuration as one to be recorded."""
+    from projservo_cli.records import InputError
+
+    if config.data is None:
+        raise click.UsageError("record needs a table to write: -o TABLE, or data.table in the configuration")
+    if config.data.joint_unit == "deg":
+        raise InputError("data.joint_unit: record writes rad; leave it out")
+    return Path(config.data.table)
 
 
 def _recording_object(recording: Any, reason: str) -> dict[str, Any]:
@@ -281,17 +293,15 @@ def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
     from projservo_cli.records import InputError
     from projservo_cli.stages.record import new_recording
 
-    if config.data.joint_unit == "deg":
-        raise InputError("data.joint_unit: record writes rad; leave it out")
-    stored = run.results.get("calibrate")
-    table, force = config.data.table, options["force"]
+    path, force, stored = _data_table(config), options["force"], run.results.get("calibrate")
+    table = str(path)
     if stored and stored.inputs.get("table", table) != table and config.plant.simulated and not force:
         raise InputError(
             f"{run.path}: its calibration comes from {stored.inputs['table']} and would be replaced by a "
             "simulated one; choose another folder with -o, or use --force"
         )
     poses = _motions(config, options)
-    return new_recording(recording_inputs(config), Path(table), motions=poses, force=force, redo=True)
+    return new_recording(recording_inputs(config), path, motions=poses, force=force, redo=True)
 
 
 def _asked(

@@ -164,7 +164,7 @@ USAGE = {
     ),
     "image size in words": (["calibrate", "--data", "t.csv", "--image-size", "axb"], "such as 1280x1024"),
     "lens of show": (["show", "--lens"], "--lens: not used by show"),
-    "record without table": (["record", "-c", "tiny.yaml"], "'--output'"),
+    "record without table": (["record", "-c", "tiny.yaml"], "-o TABLE, or data.table"),
     "unit of no motions": (["record", "-o", "u.csv", "--joint-unit", "deg"], "--motions"),
     "images without joints": (["detect", "a", "b", "-o", "u.csv"], "'--joints-csv'"),
     "one run to compare": (["compare", "out"], "two runs"),

@@ -67,6 +67,14 @@ def test_a_table_that_the_configuration_names_is_recorded_there(projservo, stage
     assert (degrees.code, "record writes rad" in degrees.err) == (2, True)
 
 
+def test_record_alone_writes_the_table_of_the_configuration(projservo, stages):
+    alone = projservo("record", "-c", "tiny.yaml", "--set", "data.table=mine.csv", "-q")
+    assert alone.code == 0, alone.err
+    assert len(read_table("mine.csv").pose) == 17
+    again = projservo(*CHAIN, "--data", "mine.csv", "--json")
+    assert (again.json["record"]["recorded"], again.json["record"]["found"]) == (0, 17)
+
+
 def test_what_somebody_recorded_is_not_replaced(projservo, stages):
     own = Path("t.csv").read_bytes()
     answer = projservo(*CHAIN, "--data", "t.csv")
