@@ -421,7 +421,7 @@ class _PlantSettings(Section):
     max_servo_lag_s: NotNegative = Field(0.15, description="maximum lag of a joint behind its set-point")
     max_steady_state_error_deg: NotNegative = Field(
         1.0,
-        description="maximum distance of a joint at rest from its set-point; prismatic joints: 5 mm "
+        description="maximum distance of a joint at rest from its set-point; prismatic joints: 5.24 mm "
         "per degree",
     )
     time_offset_s: Annotated[
