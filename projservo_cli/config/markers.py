@@ -13,7 +13,7 @@ from projservo_cli.nominal import Matrix44, Vector3, not_rigid
 from projservo_cli.records import CORNERS, FloatArray
 
 GROUND = 4.0 / 3.0
-"""How much wider a tag of six cells is with a bright margin of one cell than without."""
+"""Width of a tag of six cells with a bright margin of one cell, over that without."""
 
 _SIZE_M = 0.06  # of tags, where none is given
 _TILT = math.radians(35.0)  # of the four tags around the middle one of a roof

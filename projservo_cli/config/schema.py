@@ -1,4 +1,4 @@
-"""What helps to write a configuration: a commented one to start from, and JSON Schemas for editors."""
+"""Aids to writing a configuration: a commented one to start from, and JSON Schemas for editors."""
 
 import re
 import textwrap

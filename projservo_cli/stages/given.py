@@ -1,4 +1,4 @@
-"""What each stage is given: records of the values that it reads, of which its key is a hash."""
+"""Inputs of each stage: records of the values that it reads, of which its key is a hash."""
 
 import hashlib
 import math

@@ -1,4 +1,4 @@
-"""What plans are made and laws are run in: robot, rig, markers, start and goal, noise.
+"""Setting of plans and laws: robot, rig, markers, start and goal, noise.
 
 A ``Scenario`` is made once from the inputs of a stage and a calibration; a plan is made in one. A
 ``RunScenario`` is one with all that the run of a law takes besides.

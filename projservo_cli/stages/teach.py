@@ -41,7 +41,7 @@ class _Taught:
 
     @property
     def shared(self) -> int:
-        """How many markers both cameras see."""
+        """Number of markers that both cameras see."""
         return int(np.isfinite(self.s[..., 0]).all(axis=0).sum())
 
     @property

@@ -1,4 +1,4 @@
-"""What run number i of a sweep is: an ordinary configuration."""
+"""Run number i of a sweep as an ordinary configuration."""
 
 import hashlib
 import json

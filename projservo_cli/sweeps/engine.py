@@ -1,4 +1,4 @@
-"""Where jobs of a sweep are made: here, in threads or processes of this machine, or on a Dask cluster.
+"""Workers of the jobs of a sweep: here, in threads or processes of this machine, or on a Dask cluster.
 
 Plain ``concurrent.futures`` and ``distributed``: results of joblib pile up where they are stored more slowly
 than made, Ctrl-C prints what its processes were at, and they outlive a sweep that is killed.

@@ -1,4 +1,4 @@
-"""How far the centre drifts from its straight line: for several gains, Fig. 8 of [RH00], and by mode."""
+"""Drift of the centre from its straight line: for several gains, Fig. 8 of [RH00], and by mode."""
 
 from typing import Any
 
