@@ -184,18 +184,15 @@ class Bus:
         return self
 
     def __exit__(self, *_):
-        self._stopping.set()
-        self._thread.join(5.0)
-        for end in (self._ours, self._theirs):
-            with contextlib.suppress(OSError):
-                os.close(end)
+        self.cut_usb()
 
     def cut_usb(self):
-        """Draw the cable: the port is gone."""
-        self._stopping.set()
-        self._thread.join(5.0)
-        os.close(self._ours)
-        os.close(self._theirs)
+        """Draw the cable: the port is gone. Its numbers may be those of another file afterwards."""
+        if not self._stopping.is_set():
+            self._stopping.set()
+            self._thread.join(5.0)
+            os.close(self._ours)
+            os.close(self._theirs)
 
     def cut_supply(self):
         """Switch the supply off: no servo answers, and none holds."""
