@@ -153,7 +153,7 @@ def judged(struck, config, ends, row, calibration):
     trace, why = run_of(with_task(config, ends, row["seed"]), calibration)
     if trace is None:
         return {"verdict": "not started", "reason": why}
-    said = trace.reason.partition("predicts: ")[2]
+    said = trace.reason.partition("by the calibration: ")[2]
     named = trace.verdict == "fault detected" and bool(re.match(struck[1], said)) and "; or " not in said
     told = {"verdict": trace.verdict, "reason": trace.reason, "expected": struck[1], "named": named}
     return told | {"late": trace.steps - row["at"]}
