@@ -35,7 +35,7 @@ def arm(tmp_path, monkeypatch):
         yield types.SimpleNamespace(bus=bus, script=script, file=tmp_path / "arm.yaml")
 
 
-def wait_for_readings(bus, count=4):
+def wait_for_readings(bus, count=8):
     """Wait until servos were read so often, as somebody does who moves slowly."""
     now = bus.clock.now()
     while sum(t > now for t, _ in list(bus.servos[1].reads)) < count:

@@ -392,7 +392,7 @@ def test_readings_have_the_time_of_the_reply_and_not_of_requests_without_one(ope
         _, t = arm.joints()
         instants = [max(at for at, _ in bus.servos[i].reads) for i in range(1, 6)]
         late.append(max(instants) - t)
-    assert np.abs(late).max() < 0.02
+    assert np.abs(late).max() < 0.1  # half of the longest wait for one reply; a silence takes 0.2 s
 
 
 def test_an_overload_of_before_ends_with_the_first_set_point(opened):
