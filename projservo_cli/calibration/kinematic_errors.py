@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.metric import Body, Metric, base_frame, base_joints, directions
+from projservo_cli.geometry.metric import Body, Metric, base_frame, base_joints, directions, in_frame
 from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid, rigid_inverse, screws, twists
 from projservo_cli.records import BoolArray, FloatArray, InputError
 
@@ -82,9 +82,7 @@ class _ModelFit:
         """Poses (B, 4, 4) of the model's base and its zeros (B, n) for axes (B, n, 6) near the calibrated."""
         off = self.left(self.x, axes) - self.left(self.x, self.axes)
         x = self.x - off @ (self.pinv @ self.root).T
-        zeros = np.zeros((len(x), len(self.given)))
-        zeros[:, 1:-1] = x[:, 6:]
-        return np.array([_placed(self._base, row) for row in x]), zeros
+        return np.array([_placed(self._base, row) for row in x]), _zeros_of(x, len(self.given))
 
 
 def kinematic_errors(metric: Metric, given: FloatArray) -> KinematicErrors:
@@ -130,14 +128,9 @@ def in_model_frames(metric: Metric, given: FloatArray, tip: FloatArray) -> Metri
     """
     fit, bodies = _ModelFit(metric, given), metric.bodies
     base, zeros = fit.bases_and_zeros(bodies.axes)
-    inverse, tips = rigid_inverse(base), np.broadcast_to(np.eye(4), base.shape)
-    moved = exponentials(given[None], metric.prismatic, zeros)
-    for i in range(len(given)):
-        tips = tips @ moved[:, i]
-    tips = tips @ tip
-    axes = screws(inverse[:, None] @ twists(bodies.axes) @ base[:, None])
-    axes[:, metric.prismatic, :3] = 0.0
-    to_tip = rigid_inverse(tips) @ inverse @ bodies.tool
+    tips = metric.body._replace(axes=given, tool=tip).tool_poses(metric.prismatic, zeros)
+    axes = in_frame(bodies.axes, metric.prismatic, base)
+    to_tip = rigid_inverse(tips) @ rigid_inverse(base) @ bodies.tool
     markers = (homogeneous(bodies.markers) @ to_tip.swapaxes(-1, -2))[..., :3]
     return dataclasses.replace(
         metric, bodies=Body(bodies.P @ base[:, None], bodies.lens, axes, tips, markers)
@@ -161,12 +154,17 @@ def _placed(base: FloatArray, x: FloatArray) -> FloatArray:
     return rigid(Rotation.from_rotvec(x[:3]), x[3:6]) @ base
 
 
+def _zeros_of(x: FloatArray, n: int) -> FloatArray:
+    """Zeros (…, n) of all joints by fitted numbers (…, 6 + n - 2); those of the ends are gauge."""
+    zeros = np.zeros((*x.shape[:-1], n))
+    zeros[..., 1 : n - 1] = x[..., 6:]
+    return zeros
+
+
 def _moved(base: FloatArray, x: FloatArray, given: FloatArray, prismatic: BoolArray) -> FloatArray:
     """Screws (n, 6) of a model at a base (4, 4), whose inner zeros move by x[6:]."""
     n = len(given)
-    zeros = np.zeros(n)
-    zeros[1 : n - 1] = x[6:]
-    T, moved, steps = base, np.empty_like(given), exponentials(given, prismatic, zeros)
+    T, moved, steps = base, np.empty_like(given), exponentials(given, prismatic, _zeros_of(x, n))
     for i in range(n):
         moved[i] = screws(T @ twists(given[i]) @ rigid_inverse(T))
         T = T @ steps[i]

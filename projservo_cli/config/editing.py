@@ -1,6 +1,6 @@
 """Edits of a configuration file that keep its comments and all other keys."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import yaml
@@ -15,10 +15,7 @@ def with_limits(text: str, limits_deg: Sequence[tuple[float, float]], where: str
     """
     pairs = ", ".join(f"[{low:g}, {high:g}]" for low, high in limits_deg)
     value = f"{{joints: [{pairs}], unit: deg}}"
-    try:
-        root = yaml.compose(text)
-    except yaml.YAMLError as error:
-        raise InputError(f"{where}: {' '.join(str(error).split())}") from error
+    root = _parsed(yaml.compose, text, where)
     if not isinstance(root, yaml.MappingNode):
         raise InputError(f"{where}: expected keys and values such as plant: so101")
     robot = _value(root, "robot")
@@ -38,18 +35,23 @@ def plant_of(text: str, where: str) -> tuple[str, dict[str, Any]]:
     """Return the plant of a configuration and its options, whatever else the text holds.
 
     An arm can be released, and its limits be found, with a file that has other faults.
-    where : of the text, for messages. Raises InputError for a text that is no mapping.
+    where : of the text, for messages. Raises InputError for a text that is no YAML.
     """
-    try:
-        values = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InputError(f"{where}: {' '.join(str(error).split())}") from error
+    values = _parsed(yaml.safe_load, text, where)
     plant = values.get("plant") if isinstance(values, dict) else None
     if isinstance(plant, str):
         return plant, {}
     options = plant.get("options") if isinstance(plant, dict) else None
     name = plant.get("use") if isinstance(plant, dict) else None
     return str(name or "simulated"), dict(options) if isinstance(options, dict) else {}
+
+
+def _parsed(parse: Callable[[str], Any], text: str, where: str) -> Any:
+    """Parse a text. Raises InputError for one that is no YAML."""
+    try:
+        return parse(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"{where}: {' '.join(str(error).split())}") from error
 
 
 def _value(node: yaml.MappingNode, key: str) -> Any:

@@ -156,6 +156,13 @@ def base_frame(axes: FloatArray, prismatic: BoolArray, joints: tuple[int, int, i
     return _frame(np.cross(d[..., 0, :], d[..., k, :]), d[..., 0, :], p + along[..., None] * w)
 
 
+def in_frame(axes: FloatArray, prismatic: BoolArray, frame: FloatArray) -> FloatArray:
+    """Screws (…, n, 6) in a frame, by its poses (…, 4, 4)."""
+    found = screws(rigid_inverse(frame)[..., None, :, :] @ twists(axes) @ frame[..., None, :, :])
+    found[..., prismatic, :3] = 0.0
+    return found
+
+
 def links(axes: FloatArray, prismatic: BoolArray, like: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Angles (…, n - 1), rad, and distances (…, n - 1), m, from each axis to the next, by screws (…, n, 6).
 
@@ -254,9 +261,7 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
     P = models.P @ back[:, None] @ base[:, None]
     P /= np.linalg.norm(P[..., 2, :3], axis=-1)[..., None, None]
     markers = (homogeneous(M) @ rigid_inverse(tool).swapaxes(-1, -2))[..., :3]
-    axes = screws(inverse[:, None] @ twists(axes) @ base[:, None])
-    axes[:, c.prismatic, :3] = 0.0
-    return Body(P, models.lens, axes, inverse @ chain[-1] @ tool, markers)
+    return Body(P, models.lens, in_frame(axes, c.prismatic, base), inverse @ chain[-1] @ tool, markers)
 
 
 def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, FloatArray]:

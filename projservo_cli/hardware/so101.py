@@ -470,14 +470,14 @@ class _Lease:
             self._lock.acquire()
         except Timeout as error:
             raise InputError(f"port {port}: another projservo drives this arm: wait for its end") from error
-        except OSError as error:
+        except PermissionError as error:
             raise self._of_another(Path(self._lock.lock_file), error) from error
         self.before = ""
         with suppress(OSError):
             self.before = self._note.read_text(encoding="ascii").strip()
 
     @staticmethod
-    def _of_another(file: Path, error: OSError) -> InputError:
+    def _of_another(file: Path, error: PermissionError) -> InputError:
         return InputError(
             f"{file}: {error.strerror or error}: another user, such as root, drove this arm: remove the file"
         )
@@ -486,7 +486,7 @@ class _Lease:
         """Note that this process moves the arm."""
         try:
             self._note.write_text(f"{os.getpid()}\n", encoding="ascii")
-        except OSError as error:
+        except PermissionError as error:
             raise self._of_another(self._note, error) from error
 
     def end(self, *, moves: bool = False) -> None:
