@@ -49,7 +49,7 @@ _PHRASES = {
     "less_than_equal": "must be at most {le:g}",
     "too_short": "needs {min_length} or more entries, it has {actual_length}",
     "too_long": "takes at most {max_length} entries",
-    "string_too_short": "must not be empty",
+    "string_too_short": "needs {min_length} or more characters",
     "string_too_long": "takes at most {max_length} characters",
     "value_error": "{error}",
 }

@@ -260,7 +260,10 @@ class SO101:
 
     def identity(self) -> str:
         """Registers on which the meaning of readings hangs: a recording holds as long as they do."""
-        return ";".join(f"{i}:" + "/".join(map(str, self.registers[i])) for i in self._ids)
+        return ";".join(
+            f"servo{i}:{one.lowest}..{one.highest}/phase{one.phase}/offset{one.offset}/mode{one.mode}"
+            for i, one in ((i, self.registers[i]) for i in self._ids)
+        )
 
     def health(self) -> dict[str, float | str]:
         """Return the voltage and temperature of the servo that is worst off."""

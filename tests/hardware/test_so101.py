@@ -107,7 +107,7 @@ def test_readings_are_those_of_the_servos_and_nothing_moves_before_a_command(ope
     np.testing.assert_allclose(q, angles(bus))
     assert abs(t - arm.now()) < 0.1
     assert not bus.writes
-    assert arm.identity().split(";")[0] == "1:0/4095/12/0/0"
+    assert arm.identity().split(";")[0] == "servo1:0..4095/phase12/offset0/mode0"
     assert arm.health() == {"supply_v": 7.4, "hottest_c": 31}
 
 
