@@ -87,8 +87,9 @@ class ImageMonitor:
     Detection and isolation are two things. The monitor tests each observation: whether it disagrees needs no
     cause. While observations disagree they are ``pending``; after ``WINDOW`` of them the arm ``holds``;
     ``WINDOW`` in a row that agree clear them. Meanwhile the monitor fits causes by the images that they
-    predict, and names one that explains them clearly better than others. After sixty observations the fault
-    has no name.
+    predict, and names one that explains them clearly better than others. Where observations since the onset
+    agree by themselves and no cause explains them better than none, what disagreed has passed. After sixty
+    observations the fault has no name.
 
     Sources: R. Isermann, "Fault-Diagnosis Systems", Springer 2006, chapters 2 and 16; D. J. C. MacKay,
     "Bayesian interpolation", Neural Computation 4 (1992) 415–447, for the odds of causes.
@@ -248,6 +249,10 @@ class ImageMonitor:
         if self._off not in _NAMED_AT:
             return
         found = self._explanations(self._since_onset(), self._before)
+        if self._is_chance(found):
+            self._detector.accept()
+            self._off = 0
+            return
         best = found[0]
         explains, unforgiven = self._explains(best), not set(best.cause.markers) <= set(self._forgiven)
         if explains and unforgiven and self._is_edge(best, self._since_onset()):
@@ -296,7 +301,8 @@ class ImageMonitor:
             kept = self._since_onset()
             if any(pair.q_dot.any() for pair, *_ in kept):
                 best = self._explanations(kept, self._before)[0]
-                if best.cause.kind in ("late", "frozen") and self._explains(best):
+                likely = best.score > _CLEAR and self._explains(best)
+                if likely and best.cause.kind in ("late", "frozen"):
                     self.fault = self._message([best])
         self._off = 0
 
@@ -354,6 +360,15 @@ class ImageMonitor:
         """Whether a cause explains most of the residual, with joints in error."""
         left, allowed = self._unit * found.left, self._by_chance(self._evidence_now)
         return bool(found.score > 0.0 and left <= allowed + _LEFT * self._unit * found.gain)
+
+    def _is_chance(self, found: list[Explanation]) -> bool:
+        """Whether observations since the onset agree one by one and together, and no cause explains them better.
+
+        Then windows show what has passed, blur or a hand: a fault stays.
+        """
+        gained = max(self._unit * one.gain - one.cost for one in found)
+        chance = self._by_chance(self._evidence_now)
+        return self._sound >= WINDOW and gained <= 0.0 and self._evidence_now.before <= chance
 
     def _by_chance(self, evidence: Evidence) -> float:
         """χ² of evidence that chance, lasting errors of corners and those of the model may leave."""

@@ -510,6 +510,13 @@ class Detector:
             (which, np.array([errors.parts[i] for i in which]))
             for which in (np.flatnonzero(self._sizes == size) for size in np.unique(self._sizes))
         ]
+        # Excess of each direction at the last test, and what of it was accepted as no fault.
+        self._last = np.full(len(self._sizes), -np.inf)
+        self._accepted = np.zeros(len(self._sizes))
+
+    def accept(self) -> None:
+        """Accept what windows show beyond chance now as no fault: only more of it counts from here on."""
+        self._accepted = np.maximum(self._accepted, self._last)
 
     def tested(self, residual: Residual) -> Tested:
         """Test χ² of each view and each marker in one observation, without detections off by themselves."""
@@ -574,13 +581,14 @@ class Detector:
         by_chance = np.sqrt(chdtri(self._sizes, tail))
         found: Sums | None = None
         maximum = 0.0
+        self._last = np.full(len(self._sizes), -np.inf)
         for length in lengths if thorough else lengths[[count % len(lengths)]]:
             since = min(onsets, key=lambda sums: abs(total.views - length - sums.views))
-            excess = float(
-                self._excess(since, total, self._reduced(since, total, sigma_t, free), by_chance).max()
-            )
-            if excess > maximum:
-                found, maximum = since, excess
+            excess = self._excess(since, total, self._reduced(since, total, sigma_t, free), by_chance)
+            self._last = np.maximum(self._last, excess)
+            most = float((excess - self._accepted).max())
+            if most > maximum:
+                found, maximum = since, most
         return found
 
     def _reduced(self, since: Sums, total: Sums, sigma_t: FloatArray, free: list[IntArray]) -> _Reduced:
