@@ -362,7 +362,7 @@ class ImageMonitor:
         return bool(found.score > 0.0 and left <= allowed + _LEFT * self._unit * found.gain)
 
     def _is_chance(self, found: list[Explanation]) -> bool:
-        """Whether observations since the onset agree one by one and together, and no cause explains them better.
+        """Whether observations since the onset agree, alone and together, and no cause explains them better.
 
         Then windows show what has passed, blur or a hand: a fault stays.
         """

@@ -138,6 +138,7 @@ def _homed_since(bench, capsys):
     written = len(bench.bus.writes)
     assert run(["servo", "-c", "arm.yaml", "--json", "--force"]) == 1
     told = capsys.readouterr()
-    assert re.search(r"readings mean something else .* servo3:.*offset0/mode0 is now servo3:.*offset40/mode0", told.err)
+    changed = r"readings mean something else .* servo3:.*offset0/mode0 is now servo3:.*offset40/mode0"
+    assert re.search(changed, told.err)
     assert json.loads(told.out)
     assert not [row for row in bench.bus.writes[written:] if row[2] == 42]
