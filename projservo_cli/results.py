@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration import predict, prediction_variance, residual_statistics
-from projservo_cli.calibration.kinematic_errors import KinematicErrors, in_model_frames, kinematic_errors
 from projservo_cli.calibration.prediction import error_factor, joint_derivative
 from projservo_cli.display import Displayable, Printed, numbers_in, require_radians
 from projservo_cli.files import text_of
 from projservo_cli.geometry.kinematics import project as pixels_of
-from projservo_cli.geometry.metric import Metric, Scale, links
+from projservo_cli.metric.frame import Metric, Scale, links
+from projservo_cli.metric.kinematic_errors import KinematicErrors, in_model_frames, kinematic_errors
 from projservo_cli.observations import require_observations
 from projservo_cli.records import (
     MM,

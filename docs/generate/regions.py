@@ -13,8 +13,8 @@ from docs.generate import keys, python
 from docs.generate.markdown import table, text
 from projservo_cli import records
 from projservo_cli.cli import main
+from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
-from projservo_cli.equations import REGISTER
 from projservo_cli.loop import step
 from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED
 

@@ -197,7 +197,7 @@ def _detect(
     import numpy as np
 
     from projservo_cli.detection import TagFinder, observe_tags, pair_images
-    from projservo_cli.tables import read_joint_list, write_table
+    from projservo_cli.store.tables import read_joint_list, write_table
 
     option.require_new(output, force=force)
     finder = TagFinder(dictionary)
@@ -289,7 +289,7 @@ def _validate(
     from projservo_cli.calibration import residual_statistics
     from projservo_cli.config import load_config
     from projservo_cli.store import load
-    from projservo_cli.tables import read_table
+    from projservo_cli.store.tables import read_table
 
     found = load(target)
     calibration = found.calibration
@@ -331,9 +331,9 @@ def _position_errors(
     calibration: Any, tables: tuple[Path | None, Path | None], joint_unit: str | None, arm_std_mm: float
 ) -> dict[str, Any]:
     """Statistics of the arm's positions against a table, and against a second one if it is fitted."""
-    from projservo_cli.calibration.position_error import position_errors
+    from projservo_cli.metric.position_error import position_errors
     from projservo_cli.results import ImageModel
-    from projservo_cli.tables import read_positions
+    from projservo_cli.store.tables import read_positions
 
     types = calibration.joint_types
     table, fit = (None if path is None else read_positions(path, types, joint_unit) for path in tables)

@@ -186,10 +186,10 @@ def _in_metres(
     """
     import numpy as np
 
-    from projservo_cli import exports
     from projservo_cli.config import load_config
     from projservo_cli.config.inputs import joints_of
     from projservo_cli.results import ImageModel
+    from projservo_cli.store import exports
 
     calibration, config = ImageModel.of(run.calibration), load_config(run.path, text=run.configuration)
     length_m, ends, std = length
@@ -235,7 +235,7 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
     import numpy as np
 
     from projservo_cli.files import write_whole
-    from projservo_cli.tables import to_csv
+    from projservo_cli.store.tables import to_csv
 
     rows, tables = [], {}
     records = {(n, label): r for n, result in run.results.items() for label, r in result.records.items()}
@@ -271,7 +271,7 @@ def _equations(console: Console) -> None:
 
     Prints number, title, function, test and erratum of every equation.
     """
-    from projservo_cli.equations import REGISTER
+    from projservo_cli.cli.equations import REGISTER
 
     def words() -> Iterator[str]:
         for entry in REGISTER:

@@ -70,7 +70,7 @@ from projservo_cli.stages.given import (
     TeachInputs,
     Trials,
 )
-from projservo_cli.tables import identity_in
+from projservo_cli.store.tables import identity_in
 from projservo_cli.task.face import MIDPOINT
 from projservo_cli.task.trajectory import KeptOut, Trajectory
 

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.geometry.metric import Metric
 from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title_of
+from projservo_cli.metric.frame import Metric
 from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
     WHY_LOST,

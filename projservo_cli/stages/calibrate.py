@@ -23,7 +23,7 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.given import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
 from projservo_cli.stages.record import observed
 from projservo_cli.stages.scenario import SUGGESTIONS, generator
-from projservo_cli.tables import read_table, to_csv
+from projservo_cli.store.tables import read_table, to_csv
 
 
 def run(

@@ -37,7 +37,7 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import averaged, path_to, plugin_robot, simulated_robot
 from projservo_cli.stages.given import RecordingInputs, Trials
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
-from projservo_cli.tables import identity_in, read_table, recording_of, write_table
+from projservo_cli.store.tables import identity_in, read_table, recording_of, write_table
 
 SAVE_EVERY = 1.0  # s; maximum loss by an interruption without warning
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be

@@ -11,7 +11,7 @@ import numpy as np
 
 from projservo_cli import provenance
 from projservo_cli.files import replacing, require_inside, write_whole
-from projservo_cli.geometry.metric import Metric, Scale
+from projservo_cli.metric.frame import Metric, Scale
 from projservo_cli.records import Calibration, InputError, Report, Trace, WorkFailed
 from projservo_cli.report import style
 from projservo_cli.report.animation import motion_of, write_animation, write_view
@@ -43,7 +43,7 @@ from projservo_cli.stages.studies import (
     run_studies,
 )
 from projservo_cli.store import Result
-from projservo_cli.tables import to_csv
+from projservo_cli.store.tables import to_csv
 from projservo_cli.task.face import cyclic_order
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ import pytest
 
 from projservo_cli import cli, store
 from projservo_cli.calibration import calibrate, residual_statistics
-from projservo_cli.calibration.position_error import position_errors
+from projservo_cli.metric.position_error import position_errors
 from projservo_cli.records import InputError
 from projservo_cli.results import ImageModel
-from projservo_cli.tables import read_positions, read_table
+from projservo_cli.store.tables import read_positions, read_table
 from tests.calibration import damage
 
 SIZE = (6000, 4000)

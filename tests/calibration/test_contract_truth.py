@@ -9,7 +9,7 @@ import pytest
 from projservo_cli.calibration import predict
 from projservo_cli.config import load_config
 from projservo_cli.stages import calibrate as calibrating
-from projservo_cli.tables import write_table
+from projservo_cli.store.tables import write_table
 from tests.configured import calibrate as stage
 from tests.configured import truth_of
 

@@ -5,7 +5,7 @@ import pytest
 
 from projservo_cli.calibration import calibrate, predict, prediction_variance
 from projservo_cli.records import Observation
-from projservo_cli.tables import read_table
+from projservo_cli.store.tables import read_table
 from tests.calibration.bound import derivative, robot_of, spread
 
 DRAWS = 4

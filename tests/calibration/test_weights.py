@@ -10,7 +10,7 @@ from projservo_cli.calibration import calibrate, cross_validate, predict, predic
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import Core, Epipolar
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.tables import read_table, write_table
+from projservo_cli.store.tables import read_table, write_table
 from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import around, random_robot, trials
 

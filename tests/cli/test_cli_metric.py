@@ -9,11 +9,12 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from projservo_cli import exports, store
+from projservo_cli import store
 from projservo_cli.cli import run
 from projservo_cli.records import InputError
 from projservo_cli.results import ImageModel
 from projservo_cli.simulation.urdf import urdf_chain
+from projservo_cli.store import exports
 
 KNOWN = ["--metric", "0.2492990172463582", "--between", "2,8"]
 

@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 import projservo_cli.calibration
+from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config import load_config, to_yaml
-from projservo_cli.equations import REGISTER
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import teach as teaching
 from projservo_cli.store import Run, load, save

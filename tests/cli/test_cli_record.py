@@ -4,7 +4,7 @@ from pathlib import Path
 
 from projservo_cli.cli.output import Console
 from projservo_cli.store import load
-from projservo_cli.tables import read_table
+from projservo_cli.store.tables import read_table
 
 CHAIN = ("record", "calibrate", "plan", "-c", "tiny.yaml", "-o", "out")
 TABLE = Path("out/trials.csv")

@@ -11,9 +11,9 @@ from docs.generate import generated, keys, python, regions, regions_of
 from docs.generate.python import INTERFACE
 from projservo_cli import records
 from projservo_cli.cli import main
+from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config import Config
 from projservo_cli.config.schema import json_schema, sweep_schema
-from projservo_cli.equations import REGISTER
 from projservo_cli.sweeps.runs import BETWEEN, MEASURED, NUMBERED
 from tests.documentation.blocks import INDEXES, PAGES, ROOT
 

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.records import JointLimits, Observation, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, at_rest_after
-from projservo_cli.tables import identity_in, recording_of, write_table
+from projservo_cli.store.tables import identity_in, recording_of, write_table
 
 
 def robot_with(**methods):

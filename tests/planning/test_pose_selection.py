@@ -121,7 +121,7 @@ def test_what_cannot_be_suggested_says_why(robot, few, region):
 
 def test_a_recorded_table_gives_poses_near_its_own(shared_data, tmp_path):
     from projservo_cli.config import load_config
-    from projservo_cli.tables import read_table
+    from projservo_cli.store.tables import read_table
     from tests.configured import calibrate as stage
 
     path = shared_data / "ur5" / "trials_0.5px.csv"

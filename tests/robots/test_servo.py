@@ -14,7 +14,7 @@ from projservo_cli.config import load_config
 from projservo_cli.records import Calibration
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.store import load
-from projservo_cli.tables import read_table
+from projservo_cli.store.tables import read_table
 from tests.configured import scenario_of
 from tests.fake_records import fake
 from tests.robots import robots

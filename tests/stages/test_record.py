@@ -12,7 +12,7 @@ from projservo_cli.detection import cells_of
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot
 from projservo_cli.store import load
-from projservo_cli.tables import read_joint_list, read_table
+from projservo_cli.store.tables import read_joint_list, read_table
 from tests.configured import bounds_of, joints_of, plugin_robot, simulate, trial_motions, truth_of
 from tests.configured import record as stage
 

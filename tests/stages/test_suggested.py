@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli import files
-from projservo_cli.tables import read_joint_list, read_table
+from projservo_cli.store.tables import read_joint_list, read_table
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 STANFORD = ("-c", CONFIGS / "stanford.yaml", "--set", "calibration.frames_per_joint=4")

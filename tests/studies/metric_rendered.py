@@ -14,11 +14,11 @@ import numpy as np
 from scipy.linalg import expm
 
 import projservo_cli as projservo
-from projservo_cli.calibration.kinematic_errors import kinematic_errors
 from projservo_cli.geometry.kinematics import forward_kinematics
-from projservo_cli.geometry.metric import base_frame, base_joints
 from projservo_cli.geometry.rigid import exponentials, screws
 from projservo_cli.geometry.stereo import triangulate_points
+from projservo_cli.metric.frame import base_frame, base_joints
+from projservo_cli.metric.kinematic_errors import kinematic_errors
 from tests.configured import truth_of
 from tests.known import configured
 from tests.studies import hand_eye

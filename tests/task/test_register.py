@@ -5,8 +5,8 @@ import types
 
 import pytest
 
+from projservo_cli.cli.equations import REGISTER
 from projservo_cli.control import command
-from projservo_cli.equations import REGISTER
 from projservo_cli.stages import calibrate, plan, servo
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.geometry.kinematics import joint_operators
-from projservo_cli.geometry.metric import Metric, links
 from projservo_cli.geometry.rigid import twists
+from projservo_cli.metric.frame import Metric, links
 from projservo_cli.records import MM, VIEWS, FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.figures.scene import ROBOT, pyramids, rectangle, show, skeleton, space

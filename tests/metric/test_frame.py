@@ -10,10 +10,10 @@ from scipy.stats import chi2
 import projservo_cli as projservo
 from projservo_cli.calibration import calibrate
 from projservo_cli.config.inputs import truth_of
-from projservo_cli.geometry.metric import Metric
+from projservo_cli.metric.frame import Metric
 from projservo_cli.records import Calibration, InputError
 from projservo_cli.results import ImageModel
-from projservo_cli.tables import read_table
+from projservo_cli.store.tables import read_table
 from tests.calibration.simulated_robot import Robot, prismatic, revolute, rig
 from tests.known import configured
 

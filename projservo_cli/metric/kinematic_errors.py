@@ -10,8 +10,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.metric import Body, Metric, base_frame, base_joints, directions, in_frame
 from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid, rigid_inverse, screws, twists
+from projservo_cli.metric.frame import Body, Metric, base_frame, base_joints, directions, in_frame
 from projservo_cli.records import BoolArray, FloatArray, InputError
 
 # Errors of axes that any model has, of machining and assembly, rad and m.

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.calibration.position_error import Positions
 from projservo_cli.files import lines_of, write_whole
+from projservo_cli.metric.position_error import Positions
 from projservo_cli.records import FloatArray, InputError, IntArray, JointList, Observation
 
 _MAX_JOINTS = 64  # maximum number of joints, as in a configuration

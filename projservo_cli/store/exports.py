@@ -9,11 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.detections import MIN_SIGMA
-from projservo_cli.calibration.kinematic_errors import KinematicErrors
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.geometry.lens import distort, undistort
-from projservo_cli.geometry.metric import Body, Metric
 from projservo_cli.geometry.rigid import rigid_inverse
+from projservo_cli.metric.frame import Body, Metric
+from projservo_cli.metric.kinematic_errors import KinematicErrors
 from projservo_cli.records import VIEWS, Calibration, FloatArray
 
 # Arrays that move along with the cameras.

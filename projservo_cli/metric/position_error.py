@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.metric import Metric
+from projservo_cli.metric.frame import Metric
 from projservo_cli.records import MM, FloatArray, InputError, IntArray, WorkFailed
 
 # Number of unknowns between both frames: scale, pose, and the point on the tool.

@@ -334,7 +334,7 @@ def _require_squares(lengths: FloatArray, sides: Sequence[tuple[int, int]]) -> N
 class Metric:
     """A calibration in metres, in the base frame of the arm: its arrays, and functions with covariances.
 
-    Frames are those of the module ``geometry.metric``. Covariances are those of the calibration, to first
+    Frames are those of the module ``metric.frame``. Covariances are those of the calibration, to first
     order, with those of frames and of the known length.
     """
 
