@@ -41,15 +41,15 @@ SINGLE: dict[str, Check] = {
     "format": ([BIN / "ruff", "format", "--check", "."], {}),
     "imports": ([BIN / "lint-imports"], {}),
 }
-# Each on both processors, or timed.
+# Each on both processors, or timed; the emulator of the tutorial takes one, and half of another.
 WHOLE: dict[str, Check] = {
     "mathematics without the compiler": ([*PYTEST, *UNCOMPILED], WITHOUT_COMPILER),
     "tests": ([*PYTEST, "--ignore=tests/benchmarks"], {}),
+    "tutorial": ([PYTHON, "-m", "pytest", "-q", "tests/studies/so101_tutorial.py"], {}),
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
 # Only by name. Coverage doubles the time of the first pass and adds a fifth to the second; lines of both add
-# up, one after the other. The emulator of the tutorial needs a processor for itself; the rendered study takes
-# forty minutes.
+# up, one after the other. The rendered study takes forty minutes.
 BY_NAME: dict[str, Check] = {
     "coverage without the compiler": (
         [*PYTEST, "--cov=projservo_cli", "--cov-report=", *UNCOMPILED],
@@ -60,7 +60,6 @@ BY_NAME: dict[str, Check] = {
         {},
     ),
     "rendered": ([PYTHON, "-m", "tests.studies.rendered"], {}),
-    "tutorial": ([PYTHON, "-m", "pytest", "-q", "tests/studies/so101_tutorial.py"], {}),
 }
 
 

@@ -26,10 +26,16 @@ class Clock:
     """Time of everything that is emulated, s; at a rate below one it passes slower than that of the wall."""
 
     def __init__(self, rate=1.0):
-        self.rate, self._begun = rate, time.monotonic()
+        self.rate, self._since = rate, (time.monotonic(),) * 2
 
     def now(self):
-        return self._begun + (time.monotonic() - self._begun) * self.rate
+        wall, emulated = self._since
+        return emulated + (time.monotonic() - wall) * self.rate
+
+    def slow_down(self, factor):
+        """Go on by this factor of the rate."""
+        self._since = time.monotonic(), self.now()
+        self.rate *= factor
 
     def sleep(self, seconds):
         if seconds > 0.0:

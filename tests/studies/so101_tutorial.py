@@ -19,7 +19,7 @@ from tests.emulated.cameras import Cameras, Optics
 from tests.emulated.servos import Bus
 
 START, GOAL = (0.0, 10.0, -25.0, 15.0, 0.0), (16.0, -2.0, -2.0, -6.0, 35.0)
-RATE = 0.7  # of the emulated clock
+RATE, DRAWING = 0.7, 0.4  # of the emulated clock, and the share of a processor that drawing may take
 # What makes the recording short, and the tags as large as those of the emulator.
 SHORTER = {
     "amplitude_deg: 20": "amplitude_deg: 18",
@@ -75,6 +75,9 @@ def benched(folder, monkeypatch, rate=RATE, rate_hz=15.0):
     monkeypatch.setattr("sys.stdin", types.SimpleNamespace(isatty=lambda: True, readline=enter))
     arm = Arm(clock, START, Mechanics())
     with Bus(arm) as bus, Cameras(arm, Optics(rate_hz=rate_hz)) as cameras:
+        begun = time.process_time()
+        time.sleep(1.0)
+        clock.slow_down(min(1.0, DRAWING / (time.process_time() - begun)))
         monkeypatch.setattr(so101, "candidate_ports", lambda: [bus.port])
         yield types.SimpleNamespace(arm=arm, bus=bus, cameras=cameras, script=script, folder=folder)
 
