@@ -248,11 +248,12 @@ class ImageMonitor:
         self.agreeing = self._agreed = 0
         if self._off not in _NAMED_AT:
             return
-        found = self._explanations(self._since_onset(), self._before)
-        if self._is_chance(found):
+        kept = self._since_onset()
+        if self._has_passed(kept[len(kept) // 2 :]):
             self._detector.accept()
             self._off = 0
             return
+        found = self._explanations(kept, self._before)
         best = found[0]
         explains, unforgiven = self._explains(best), not set(best.cause.markers) <= set(self._forgiven)
         if explains and unforgiven and self._is_edge(best, self._since_onset()):
@@ -361,14 +362,16 @@ class ImageMonitor:
         left, allowed = self._unit * found.left, self._by_chance(self._evidence_now)
         return bool(found.score > 0.0 and left <= allowed + _LEFT * self._unit * found.gain)
 
-    def _is_chance(self, found: list[Explanation]) -> bool:
-        """Whether observations since the onset agree, alone and together, and no cause explains them better.
+    def _has_passed(self, kept: list[_Kept]) -> bool:
+        """Whether the last observations agree, alone and together, and no cause explains them better.
 
-        Then windows show what has passed, blur or a hand: a fault stays.
+        Then windows show what was, blur or a hand: a fault stays.
         """
+        if self._sound < WINDOW:
+            return False
+        found = self._explanations(kept, self._before)
         gained = max(self._unit * one.gain - one.cost for one in found)
-        chance = self._by_chance(self._evidence_now)
-        return self._sound >= WINDOW and gained <= 0.0 and self._evidence_now.before <= chance
+        return gained <= 0.0 and self._evidence_now.before <= self._by_chance(self._evidence_now)
 
     def _by_chance(self, evidence: Evidence) -> float:
         """χ² of evidence that chance, lasting errors of corners and those of the model may leave."""
@@ -442,14 +445,16 @@ def detected_fault(
     marker: IntArray,
     images: FloatArray,
     image_size: FloatArray | None,
+    sigma_px: float = 0.0,
 ) -> str:
     """Return what changed since the calibration, by images of one posture at rest; empty for nothing.
 
-    One tag that is off by itself by less than ``_LEAST_MOVED_PX`` is no change: one view of the tool does not
-    tell a tag that moved from one that is bent, or under a slant.
+    Tags that are off by themselves by less than ``_LEAST_MOVED_PX``, up to half of them, are no change: one
+    view of the tool does not tell a tag that moved from one that is bent, or under a slant.
 
     q : (n,) joint readings there, rad or m; images : (2, b, 2) pixels of the markers with the numbers
-    marker (b,), NaN where unseen, those that the calibration does not know among them; image_size : (2,) px.
+    marker (b,), NaN where unseen, those that the calibration does not know among them; image_size : (2,) px;
+    sigma_px : pixel noise per coordinate where that is more than the calibration's.
     """
     if not calibration.usable or not calibration.has_covariance:
         return ""
@@ -459,15 +464,21 @@ def detected_fault(
     rest, instants, new = np.zeros((2, len(q))), np.zeros(2), np.ones(2, dtype=np.bool_)
 
     def fault_of(pixels: FloatArray) -> str:
-        monitor = ImageMonitor(calibration, calibration.sigma_px, _SINGLE, image_size=image_size)
+        sigma = max(calibration.sigma_px, sigma_px)
+        monitor = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size)
         monitor.observe(instants, np.stack([q, q]), rest, instants, pixels, new)
         return monitor.give_up()
 
     fault = fault_of(pixels)
-    if not fault:
-        return ""
-    tag = _off_alone(pixels - predict(calibration, q[None])[0], calibration.marker)
-    return fault if fault_of(np.where(tag[:, None], np.nan, pixels)) else ""
+    off, tags = pixels - predict(calibration, q[None])[0], calibration.marker // CORNERS
+    doubtful = fault
+    for _ in range(len(np.unique(tags[np.isfinite(off).any(axis=(0, 2))])) // 2):
+        tag = _off_alone(off, calibration.marker)
+        if not doubtful or not tag.any():
+            break
+        off, pixels = (np.where(tag[:, None], np.nan, part) for part in (off, pixels))
+        doubtful = fault_of(pixels)
+    return fault if doubtful else ""
 
 
 def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:

@@ -170,11 +170,12 @@ class ErrorModel:
             part[~seen] = 0.0
         F = F.reshape(rows, -1)
         J_q, sigma_t = F[:, :n], F[:, 2 * n : 2 * n + 2] * pair.sigma_t
-        # Errors of joints are the same in both views, but for their motion between both frames.
+        # Errors of joints are the same in both views, but for their motion between both frames: then readings
+        # are not straight between each other, and round otherwise.
         new = np.concatenate([J_q * self.sigma_q, sigma_t], axis=1)
         if abs(pair.t[0] - pair.t[1]) > _AT_ONCE_S:
             left = np.arange(rows)[:, None] < rows // 2
-            between = J_q * pair.curved
+            between = J_q * np.hypot(pair.curved, np.minimum(np.abs(pair.q[0] - pair.q[1]), self.sigma_q))
             new = np.concatenate([new, between * left, between * ~left], axis=1)
         # An instant so uncertain that the arm moves on a curve: half the square of the angle.
         bend = 0.5 * np.abs(pair.q_dot).sum(axis=1).max() * (sigma_t @ pair.sigma_t)
