@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
+from projservo_cli.calibration.prediction import predict
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
@@ -16,9 +17,11 @@ from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.records import (
     NO_SPREAD,
+    VIEWS,
     Calibration,
     FloatArray,
     InputError,
+    IntArray,
     JointLimits,
     Model,
     Plan,
@@ -38,7 +41,7 @@ from projservo_cli.stages.motions import (
     why_closed,
 )
 from projservo_cli.stages.plan_summary import minimum_of, reason_of, search_summary, verdict_of
-from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.scenario import NEAR_PX, Scenario, joints_showing, scenario_of
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import TaskImages
@@ -78,6 +81,8 @@ def _joint_motions(state: State) -> FloatArray:
 # What noise and calibration may leave of images that the joints can reach, px rms per marker and view.
 LEFT_PX = 3.0
 STAGES = 20
+# A marker may be off by so many times what half of them are allowed.
+_ALONE = 4.0
 
 
 def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: FloatArray) -> None:
@@ -123,15 +128,54 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
 
 
 def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
-    """Refuse goal images with joint readings that the calibration contradicts, with a WorkFailed."""
+    """Refuse goal images that the calibration contradicts, with a WorkFailed.
+
+    Images without joint readings are tested where the arm shows them best.
+    """
     task = scenario.inputs.task
     images = task.goal.images if task is not None else None
-    if images is None or images.joints is None:
+    # What fewer joints cannot show is refused with the plan.
+    if images is None or (images.joints is None and len(calibration.joint_types) < COORDINATES):
         return
-    pixels, q = images.pixels(), images.joints.values(calibration.joint_types)
-    seen = np.swapaxes(np.array([*pixels.values()]), 0, 1)
-    if fault := detected_fault(calibration, q, np.array([*pixels]), seen, scenario.demands.image_size):
-        raise WorkFailed(f"the goal was taught after a change since the calibration: {fault}; teach it again")
+    numbers, seen = np.array([*images.pixels()]), np.swapaxes(np.array([*images.pixels().values()]), 0, 1)
+    sigma = 0.0
+    if images.joints is not None:
+        q, advice = images.joints.values(calibration.joint_types), "teach it again"
+    else:
+        stated = images.sigma_px(scenario.numbers[: scenario.m])
+        sigma = scenario.noise_px if stated is None else stated
+        known = np.isin(numbers, calibration.marker)
+        q = _joints_at(scenario, calibration, numbers[known], seen[:, known], max(NEAR_PX, 2.0 * sigma))
+        advice = (
+            "take the images again, or give their deviations (sigma_left_px and sigma_right_px of "
+            "task.goal.images)"
+        )
+    if fault := detected_fault(calibration, q, numbers, seen, scenario.demands.image_size, sigma):
+        raise WorkFailed(f"the goal was taught after a change since the calibration: {fault}; {advice}")
+
+
+def _joints_at(
+    scenario: Scenario, calibration: Calibration, numbers: IntArray, seen: FloatArray, near_px: float
+) -> FloatArray:
+    """Joints (n,) at which the arm shows goal images (2, b, 2), rad or m.
+
+    Raises WorkFailed where it shows them nowhere, or one marker far from its place.
+    """
+    q, median = joints_showing(calibration, numbers.tolist(), seen, scenario.exact.q_start, near_px)
+    each = np.linalg.norm(predict(calibration, q[None])[0][:, calibration.indices_of(numbers)] - seen, axis=2)
+    again = "check which image is of which camera, and the marker numbers; then take them again"
+    if median > near_px:
+        rms = np.sqrt(np.nanmean(each**2))
+        raise WorkFailed(
+            f"the goal images fit no pose of the arm: the nearest leaves {rms:.3g} px rms a marker; {again}"
+        )
+    view, k = np.unravel_index(int(np.nanargmax(each)), each.shape)
+    if each[view, k] > _ALONE * near_px:
+        raise WorkFailed(
+            f"the goal images fit no pose of the arm: marker {numbers[k]} is {each[view, k]:.3g} px off in "
+            f"the {VIEWS[view]} one, {_ALONE * near_px:.3g} px are allowed; {again}"
+        )
+    return q
 
 
 def plan_task(

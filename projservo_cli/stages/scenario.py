@@ -42,7 +42,7 @@ from projservo_cli.task.target import TaskImages
 _UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera sees
 # Weight of a marker in a fit that is predicted from others. Starts from which joints that show a
 # goal are sought; how near they must come, and how far off it is to be behind a camera, px.
-_GUESSED, _TRIALS, _NEAR_PX, _FAR_PX = 1e-3, 60, 1.0, 1e3
+_GUESSED, _TRIALS, NEAR_PX, _FAR_PX = 1e-3, 60, 1.0, 1e3
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
 TRIAL_POSES, TAUGHT_NOISE, START_FRAMES, GOAL_FRAMES, POSE_NOISE = range(6, 11)
@@ -205,8 +205,10 @@ class Scenario:
         view, k = np.argwhere(unseen)[0]
         known = self.calibration
         if known is not None and np.isfinite(s[..., 0]).sum(axis=1).min() > CORNERS - 1:
-            q = _joints_showing(known, self.numbers, s, self.exact.q_start) if q is None else q
-            if q is not None:
+            off = 0.0
+            if q is None:
+                q, off = joints_showing(known, self.numbers, s, self.exact.q_start)
+            if off <= NEAR_PX:
                 there = predict(known, q[None])[0][:, known.indices_of(self.numbers)]
                 return np.ascontiguousarray(np.where(unseen[..., None], there, s))
         raise WorkFailed(
@@ -259,12 +261,17 @@ class RunScenario(Scenario):
         return noise
 
 
-def _joints_showing(
-    calibration: Calibration, numbers: Sequence[int], s: FloatArray, q_start: FloatArray
-) -> FloatArray | None:
-    """Joints (n,) at which markers are predicted where images (2, b, 2) show them, NaN where unseen.
+def joints_showing(
+    calibration: Calibration,
+    numbers: Sequence[int],
+    s: FloatArray,
+    q_start: FloatArray,
+    near_px: float = NEAR_PX,
+) -> tuple[FloatArray, float]:
+    """Joints (n,) at which markers are predicted where images (2, b, 2) show them, and the median error, px.
 
-    Least squares from joints (n,) and from others about them; None where no start leads near enough.
+    Least squares from joints (n,) and from others about them, until a start leads near enough; else the
+    nearest. s : NaN where unseen.
     """
     places, seen, rng = calibration.indices_of(numbers), np.isfinite(s), np.random.default_rng(0)
 
@@ -272,12 +279,16 @@ def _joints_showing(
         """Return the prediction errors, px; large behind a camera."""
         return np.asarray(np.nan_to_num(predict(calibration, q[None])[0][:, places] - s, nan=_FAR_PX)[seen])
 
+    best, least = q_start, math.inf
     for trial in range(_TRIALS):
         q = q_start + (trial > 0) * rng.uniform(-np.pi, np.pi, len(q_start))
-        found = least_squares(off, q, loss="soft_l1", f_scale=_NEAR_PX)
-        if np.median(np.abs(off(found.x))) <= _NEAR_PX:
-            return np.asarray(found.x)
-    return None
+        found = least_squares(off, q, loss="soft_l1", f_scale=near_px).x
+        median = float(np.median(np.abs(off(found))))
+        if median < least:
+            best, least = found, median
+        if median <= near_px:
+            break
+    return best, least
 
 
 def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> Scenario:
