@@ -271,7 +271,7 @@ def plan(
     described = asked.arm is not None and asked.rig is not None
     described = described and asked.markers is not None and asked.markers.points is not None
     given = plan_inputs(asked, predicted=asked.plant.simulated and not described)
-    return MotionPlan.of(planning.run(given, calibration), scene_of(asked, calibration))
+    return MotionPlan.of(planning.run(given, calibration), scene_of(asked, calibration), (q_start, goal))
 
 
 def servo(
@@ -283,12 +283,13 @@ def servo(
     mode: str | None = None,
     robot: Any = None,
 ) -> RunTrace:
-    """Drive a law in closed loop from the start of the task to its verdict.
+    """Drive a law in closed loop from the start of a task to its verdict.
 
     Parameters
     ----------
     config : of the robot that is driven, and of when a run ends.
-    calibration, plan : what ``calibrate`` and ``plan`` made.
+    calibration : what ``calibrate`` made.
+    plan : what ``plan`` made, whose start and goal are the task.
     law : the name of a law, ``module:Class``, or a class or function that makes one of its setup.
     mode : ``regulate``, ``track`` or ``image_track``; by default that of the name, such as ``exact_track``,
         else ``regulate``.
@@ -302,7 +303,8 @@ def servo(
     Raises
     ------
     InputError
-        When there is no such law, it has no such mode, or the configuration lacks a key.
+        When there is no such law, it has no such mode, the configuration lacks a key, or the plan is of
+        another task.
     WorkFailed
         When the run could not begin: the goal is out of reach, or the images of a robot disagree with the
         calibration.
@@ -319,6 +321,8 @@ def servo(
         given, name = driving.Given(None, robot), law_target(name)
     else:
         given, name, of_name = driving.Given(law, robot), plugins.name_of(law), REGULATE
+    if isinstance(plan, MotionPlan):
+        config = _with_task(config, calibration.joint_types, *plan.asked)
     asked = config.replace({"control.mode": [of_name if mode is None else mode]})
     (name,) = names_of((name,), asked.control.mode)
     if robot is not None:

@@ -357,11 +357,12 @@ class MotionPlan(Displayable, Plan):
     """A plan that shows itself."""
 
     scene: Scene | None = None  # of its figure, if at hand
+    asked: tuple[Any, Any] = (None, None)  # start and goal that it was asked for, None of the configuration
 
     @classmethod
-    def of(cls, plan: Plan, scene: Scene | None = None) -> Self:
+    def of(cls, plan: Plan, scene: Scene | None = None, asked: tuple[Any, Any] = (None, None)) -> Self:
         """Return a record with its functions."""
-        return plan if isinstance(plan, cls) else cls(**_fields_of(plan, Plan), scene=scene)
+        return plan if isinstance(plan, cls) else cls(**_fields_of(plan, Plan), scene=scene, asked=asked)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the motion in both images, its joints and its margins over time, as the report does.

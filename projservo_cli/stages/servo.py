@@ -21,7 +21,17 @@ from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
-from projservo_cli.records import MM, Calibration, FloatArray, IntArray, Model, Plan, Trace, WorkFailed
+from projservo_cli.records import (
+    MM,
+    Calibration,
+    FloatArray,
+    InputError,
+    IntArray,
+    Model,
+    Plan,
+    Trace,
+    WorkFailed,
+)
 from projservo_cli.results import ImageModel
 from projservo_cli.robots import plugins
 from projservo_cli.robots.client import DrivenRobot
@@ -168,6 +178,9 @@ def _reported_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArr
 
 # Maximum residual of a body that agrees with its calibration, over the noise, px.
 _AGREES, _LEAST_NOISE_PX = 4.0, 0.01
+# A plan is of a task where its start, rad or m, and its goal images, px, are the same but for rounding and
+# another calibration of the same rig.
+_SAME_START, _SAME_GOAL_PX = 1e-6, 10.0
 
 
 def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
@@ -264,10 +277,27 @@ def run(
 
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
     given : objects that a caller passes.
-    Raises InputError if a part of the simulation is missing, or the plan to follow has no time; WorkFailed if
-    the goal cannot be reached, or the joints cannot follow the plan and ``refuses`` is set.
+    Raises InputError if a part of the simulation is missing, the plan is of another task, or the plan to
+    follow has no time; WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
+    ``refuses`` is set.
     """
-    return drive(run_scenario(inputs, calibration), plan, name, given=given).trace()
+    scenario = run_scenario(inputs, calibration)
+    _require_its_task(scenario, plan)
+    return drive(scenario, plan, name, given=given).trace()
+
+
+def _require_its_task(scenario: RunScenario, plan: Plan) -> None:
+    """Refuse a plan from another start, or to other goal images, with an InputError."""
+    ends = scenario.ends.by_points()
+    if ends.s_star.shape != plan.s_star.shape or ends.q_start.shape != plan.q_start.shape:
+        what = "it has other joints or markers"
+    elif (away := float(np.abs(ends.q_start - plan.q_start).max())) > _SAME_START:
+        what = f"it starts {away:.3g} rad or m from task.start"
+    elif (off := float(np.abs(ends.s_star - plan.s_star).max())) > _SAME_GOAL_PX:
+        what = f"its goal images are {off:.3g} px from those of task.goal"
+    else:
+        return
+    raise InputError(f"the plan is of another task than the configuration: {what}; plan this task first")
 
 
 def drive(

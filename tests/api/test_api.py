@@ -155,6 +155,38 @@ def test_a_plan_takes_joints_pixels_and_what_was_taught(config, made, tmp_path):
     assert ps.plan(config, calibration, goal=joints).feasible
 
 
+def test_a_run_has_the_start_and_goal_of_its_plan(config, made):
+    _, calibration, plan = made
+    start, goal = plan.q_start + 0.05, plan.q_start + 0.1
+    asked = ps.plan(config, calibration, q_start=start, goal=goal)
+    trace = ps.servo(config, calibration, asked)
+    np.testing.assert_array_equal(trace.q[0], start)
+    assert np.abs(trace.q[-1] - goal).max() < 0.02
+    unasked = dataclasses.replace(asked, asked=(None, None))  # as of another configuration
+    with pytest.raises(ps.InputError, match=r"another task than the configuration: it starts 0\.05 rad"):
+        ps.servo(config, calibration, unasked)
+    other = dataclasses.replace(ps.plan(config, calibration, goal=goal), asked=(None, None))
+    with pytest.raises(ps.InputError, match=r"its goal images are .* px from those of task\.goal"):
+        ps.servo(config, calibration, other)
+
+
+@pytest.mark.parametrize(
+    ("changed", "what"),
+    [
+        (lambda s: s[::-1], "leaves .* px rms a marker"),
+        (lambda s: s + np.array([[[0.0, 20.0]], [[0.0, 0.0]]]), "leaves .* px rms a marker"),
+        (lambda s: s + 15.0 * (np.arange(16).reshape(2, 4, 2) == 4), "marker 2 is .* px off in the left one"),
+    ],
+    ids=["exchanged", "shifted", "one marker"],
+)
+def test_goal_images_without_joints_must_fit_the_calibration(config, made, changed, what):
+    _, calibration, plan = made
+    images = calibration.predict(plan.q_start + 0.1)[:, calibration.indices_of(config.face_numbers)]
+    assert ps.plan(config, calibration, goal=images).feasible
+    with pytest.raises(ps.WorkFailed, match=what):
+        ps.plan(config, calibration, goal=changed(images))
+
+
 def test_a_trace_is_that_of_the_chain_and_of_a_class_like_that_of_its_name(config, made):
     _, calibration, plan = made
     run = ps.Experiment(config).make("servo")
