@@ -222,6 +222,7 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
             visibility_fraction=plan.trajectory.visibility_fraction,
             limits=UNLIMITED,
             substeps=control.substeps == "auto",
+            scale=plant.speed_scale,
         ),
         stop=_taken(StopSettings, stop, at_joint_limit=at_limit, at_border=plant.image_border == "stop"),
         opaque=plant.self_occlusion == "opaque",

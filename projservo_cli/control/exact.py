@@ -163,7 +163,8 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     The joint-speed limit shortens the amplitude along the path, by the first-order joint step, before any
     Newton step, and a position limit ends the step on it: the path itself never changes. Long steps are
     solved in parts of about 2.5°, or if a part fails in more, up to 128. Across a singularity, where no part
-    can be solved, the law takes the first-order step.
+    can be solved, the law takes the first-order step. Where every command is scaled, that share of the
+    displacement is solved, since that of the joint step would leave the path.
 
     With a plan, the displacement is that of the plan in the next period after the correction of the face.
     Along a joint-space path the joints of the plan lead, and the first-order correction is added.
@@ -186,7 +187,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
             state.q_dot[i] /= gains.period
         return OK
     share = speed_share(state.q_dot, gains.limits.speed, gains.period)
-    step = _scaled(whole, share, 1)
+    step = _scaled(whole, share * gains.scale, 1)
     largest = _first_order(step, state)
     count = min(MAX_PARTS, max(1, math.ceil(largest / _PART_STEP)))
     step = _scaled(step, 1.0, count)
@@ -195,7 +196,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
             # Across a singularity only the first-order step remains.
             _first_order(step, state)
             for i in range(q.shape[0]):
-                state.q_dot[i] /= gains.period
+                state.q_dot[i] /= gains.period * gains.scale
             state.share[0], state.parts[0], state.blocked[0] = share, 0, -1
             return OK
         count = min(MAX_PARTS, 2 * count)
@@ -204,7 +205,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     if state.blocked[0] >= 0:
         share *= _up_to_limit(model, task, gains, q, step, state)
     for i in range(q.shape[0]):
-        state.q_dot[i] = (state.path[count, i] - q[i]) / gains.period
+        state.q_dot[i] = (state.path[count, i] - q[i]) / (gains.period * gains.scale)
     state.share[0] = share
     state.parts[0] = count
     return OK

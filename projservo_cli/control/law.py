@@ -69,6 +69,7 @@ class Gains(NamedTuple):
     limits : of the joints, (n,) each: ``lower`` and ``upper``, rad or m, at which a path ends, ``speed``,
         per s, and ``acceleration``, per s²; infinite for none.
     substeps : whether a step is sent in the parts it was solved in.
+    scale : factor of every command, which the loop applies.
     """
 
     gain_t: float
@@ -81,6 +82,7 @@ class Gains(NamedTuple):
     visibility_fraction: float
     limits: JointLimits = UNLIMITED
     substeps: bool = False
+    scale: float = 1.0
 
 
 class Law(NamedTuple):

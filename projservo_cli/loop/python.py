@@ -221,13 +221,16 @@ def _instant(
 def _send(
     law: LoopLaw, plant: _LoopPlant, dq: FloatArray, limits: Limits, period: float, scale: float
 ) -> None:
-    """Send a joint step (n,), or the parts that the law split it into where it is not scaled down.
+    """Send a joint step (n,), or the parts that the law split it into where they lead as far.
 
     A law that keeps to its path bounds its joint steps to first order only; what one exceeds the limit by
     costs time instead of leaving the path.
     """
     path = _optional(law, "path")
-    steps = np.diff(path, axis=0) if len(path) > 2 and scale >= 1.0 and plant.takes_parts else dq[None].copy()
+    in_parts = (
+        len(path) > 2 and plant.takes_parts and np.allclose(path[-1] - path[0], dq, rtol=0.0, atol=1e-9)
+    )
+    steps = np.diff(path, axis=0) if in_parts else dq[None].copy()
     for step in steps:
         minimum = float(np.max(np.abs(step) / (limits.speed * scale)))
         plant.command(step, max(period / len(steps), minimum))
