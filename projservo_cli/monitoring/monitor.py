@@ -358,9 +358,11 @@ class ImageMonitor:
         return Evidence(self._errors, pairs, residuals, weights, before)
 
     def _explains(self, found: Explanation) -> bool:
-        """Whether a cause explains most of the residual, with joints in error."""
+        """Whether a cause explains most of the residual, with joints in error, and changes images enough."""
         left, allowed = self._unit * found.left, self._by_chance(self._evidence_now)
-        return bool(found.score > 0.0 and left <= allowed + _LEFT * self._unit * found.gain)
+        minimum = 0.0 if found.cause.markers else _LEAST_PART * self._evidence_now.off_px
+        explains = found.score > 0.0 and left <= allowed + _LEFT * self._unit * found.gain
+        return bool(explains and found.changed_px >= minimum)
 
     def _has_passed(self, kept: list[_Kept]) -> bool:
         """Whether the last observations agree, alone and together, and no cause explains them better.
@@ -419,8 +421,7 @@ class ImageMonitor:
         residual = self._kept[-1].residual
         rms = np.sqrt(np.square(residual.r).sum() / max(2.0 * residual.seen.sum(), 1.0))
         off = f"images are {rms:.3g} px rms per coordinate off their prediction by the calibration"
-        minimum = 0.0 if found[0].cause.markers else _LEAST_PART * self._evidence_now.off_px
-        if not self._explains(found[0]) or found[0].changed_px < minimum:
+        if not self._explains(found[0]):
             return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
         # A mirrored reading near zero is a small slip: with backlash, images do not separate them.
         maximum = self._by_chance(self._evidence_now) / self._unit
