@@ -429,8 +429,10 @@ class RunTrace(Displayable, Trace):
             "law": self.law if self.mode == "regulate" else f"{self.law}, {self.mode}",
             "verdict": f"{self.verdict}: {self.reason}",
             "steps": f"{self.steps}, {self.steps * self.period:.4g} s",
-            "image error": f"{self.image_error[-1]:.4g} px rms",
+            "image error": f"{self.image_error[-1]:.4g} px rms as seen",
         }
+        if self.features == "body":
+            found["image error"] += f", {self.convergence_error[-1]:.4g} px by all markers"
         if self.position_error_mm is not None:
             found["position error"] = f"{self.position_error_mm:.4g} mm"
         if self.rotation_error_deg is not None:

@@ -48,7 +48,7 @@ VERDICTS = (
     "failed",
     "following error",
 )
-_PLATEAU_FALL = 0.01
+PLATEAU_FALL = 0.01
 # Joint steps below this, rad or m, are none.
 _NO_MOTION = 1e-6
 # A step ends this share of it before a limit, lest rounding take it beyond.
@@ -236,7 +236,7 @@ def _finite(q_dot: FloatArray) -> bool:
 @merged
 def on_plateau(errors: FloatArray, k: int, window: int) -> bool:
     """Whether the image error fell by less than 1 % over the last ``window`` steps."""
-    return bool(k >= window and errors[k] > (1.0 - _PLATEAU_FALL) * errors[k - window])
+    return bool(k >= window and errors[k] > (1.0 - PLATEAU_FALL) * errors[k - window])
 
 
 def plateau_stretch(errors: FloatArray, window: int) -> tuple[int, int] | None:
@@ -244,7 +244,7 @@ def plateau_stretch(errors: FloatArray, window: int) -> tuple[int, int] | None:
 
     errors : (k,) errors that a run is judged by, px; window : of the test, steps.
     """
-    flat = errors[window:] > (1.0 - _PLATEAU_FALL) * errors[:-window]
+    flat = errors[window:] > (1.0 - PLATEAU_FALL) * errors[:-window]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]])))
     if not len(edges):
         return None

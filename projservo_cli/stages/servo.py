@@ -20,7 +20,7 @@ from projservo_cli.loop.metrics import Ended, Summary, angle_between, path_devia
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.settling import StallMonitor
-from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
+from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.records import (
     MM,
     Calibration,
@@ -227,6 +227,19 @@ def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(mean))
 
 
+def _stalled_by(run: _Outcome) -> str:
+    """Return why the image error stopped falling: commands too slow to lower it, or a local minimum."""
+    gains, window = run.scenario.gains, run.scenario.limits.stall_periods
+    limited = float(np.median(run.log.factor[max(0, run.steps - window) : run.steps]))
+    share = min(1.0, max(gains.gain, gains.gain_s) * gains.period * gains.scale * limited)
+    if 1.0 - (1.0 - share) ** window > 2.0 * PLATEAU_FALL:
+        return "a local minimum"
+    return (
+        f"commands are too slow, {share:.2g} of the way in a period; raise plant.speed_scale, the limits of "
+        "joint speeds, control.period_s, or stop.stall_periods"
+    )
+
+
 def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | None]) -> str:
     """Return the reason of the verdict, one sentence."""
     log, steps, limits = run.log, run.steps, run.scenario.limits
@@ -243,7 +256,7 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
         "no progress": f"the robot stands still at an image error of {error:.3g} px: {run.why}"
         if run.why
         else f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
-        f"{limits.stall_periods} steps: a local minimum",
+        f"{limits.stall_periods} steps: {_stalled_by(run)}",
         "following error": f"{run.why}; {' and '.join(left)} are left",
         "max steps": f"no step left; image error {error:.3g} px was still changing",
         "diverged": f"image error {error:.3g} px (at first {first:.3g}) or the distance of the face grew "
