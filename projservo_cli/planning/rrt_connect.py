@@ -86,12 +86,14 @@ def may_start(clearance: FloatArray) -> bool:
 def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
     """Constraints that ask of joints (k, n), and near them, for no more than a share of what those have.
 
-    Their images were measured, so that no deviation of a prediction reduces their margins.
+    Their images were measured, so that no deviation of a prediction reduces their margins. Joints of which
+    that share is as much as is asked for everywhere are asked for no less.
     """
     demands = np.array([margins_at(c, q)[0] for q in ends])
     seen = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
     seen = np.where(np.isfinite(seen), seen, 0.0)
-    demands = np.minimum(c.full, np.where(seen > 0.0, demands - (1.0 - SHARE) * seen, demands - ROUND_OFF))
+    less = np.where(seen > 0.0, demands - (1.0 - SHARE) * seen, demands - ROUND_OFF)
+    demands = np.where(SHARE * demands >= c.full, c.full, np.minimum(c.full, less))
     poor = (demands < c.full).any(axis=1)
     return c._replace(ends=np.ascontiguousarray(ends[poor]), end_demands=np.ascontiguousarray(demands[poor]))
 

@@ -10,6 +10,7 @@ from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.planning.constraints import new_trial, reached, width
 from projservo_cli.planning.margins import FRONT, IMAGE, JOINTS, VISIBILITY, WIDTH
 from projservo_cli.planning.rrt_connect import margins_at, with_ends
+from projservo_cli.records import NO_SPREAD, Spread
 from tests.planning.joint_space_cases import case
 
 
@@ -75,6 +76,21 @@ def test_edges_are_valid_where_dense_samples_are():
         assert margins[:, [JOINTS, VISIBILITY, VISIBILITY + 1, WIDTH, WIDTH + 1]].min() > 0.0
         verdicts.add(share == 1.0)
     assert verdicts == {True, False}
+
+
+def test_ends_that_have_twice_what_is_asked_for_are_asked_for_all_of_it():
+    # Predictions that are off by up to 25 px leave a quarter of the distance from the border.
+    found = case("paper", 3)
+    c = found.c
+    off = c.model.P.copy()
+    off[0, 0] += 25.0 * off[0, 2]
+    twice = (np.stack([part, part]) for part in (c.model.H_hat_0, c.M))
+    c = c._replace(spread=Spread(np.stack([c.model.P, off]), *twice, 0.0, 25.0), full=c.full.copy())
+    there, seen = (margins_at(one, found.q_start)[0] for one in (c, c._replace(spread=NO_SPREAD)))
+    assert 0.0 < there[IMAGE] < 0.5 * seen[IMAGE]
+    c.full[IMAGE], c.full[IMAGE + 1] = full = 0.5 * there[IMAGE], 1e4
+    asked = with_ends(c, found.q_start[None])
+    assert asked.end_demands[0, IMAGE] == full[0]
 
 
 def test_start_and_goal_are_asked_for_no_more_than_they_have():
