@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.canonical import File
-from projservo_cli.records import VIEWS, FloatArray, InputError
+from projservo_cli.records import FARTHEST_M, TWO_TURNS, VIEWS, FloatArray, InputError
 
 _WIDTH = 100  # maximum length of a line, characters
-_TWO_TURNS = 4.0 * np.pi  # rad; no joint of an arm with stops turns that far from its zero
 
 
 class Printed:
@@ -82,13 +81,15 @@ def pandas() -> Any:
 def require_radians(
     name: str, q: FloatArray, joint_types: str, remedy: str = "convert with numpy.radians"
 ) -> None:
-    """Raise InputError for joint readings (..., n) with a revolute one that can hardly be in rad."""
+    """Raise InputError for joint readings (..., n) that can hardly be in rad, or m of a prismatic joint."""
     turning = np.array([letter == "R" for letter in joint_types])
-    beyond = np.argwhere((np.abs(q) > _TWO_TURNS) & turning)
+    beyond = np.argwhere(np.abs(q) > np.where(turning, TWO_TURNS, FARTHEST_M))
     if beyond.size:
-        value = q[tuple(beyond[0])]
+        value, i = q[tuple(beyond[0])], beyond[0][-1]
+        if not turning[i]:
+            raise InputError(f"{name}: joint {i + 1}, prismatic, at {value:g} m: millimetres? divide by 1000")
         raise InputError(
-            f"{name}: joint {beyond[0][-1] + 1} at {value:g} is more than two turns in rad: degrees? {remedy}"
+            f"{name}: joint {i + 1} at {value:g} is more than two turns in rad: degrees? {remedy}"
         )
 
 

@@ -17,6 +17,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from projservo_cli.nominal import Matrix34, Matrix44, Number, Vector3, not_a_screw, not_rigid
+from projservo_cli.records import TWO_TURNS
 
 Positive = Annotated[float, Strict(), Field(gt=0)]
 NotNegative = Annotated[float, Strict(), Field(ge=0)]
@@ -101,12 +102,12 @@ class JointVector(Section):
 
 
 # Limits in rad of two turns to a side or less; those of continuous joints in files are beyond any in degrees.
-_MOST_RAD, _MOST_DEG = 4.0 * math.pi, 1000.0
+_MOST_DEG = 1000.0
 
 
 def are_degrees(low: float, high: float) -> bool:
     """Tell whether limits of a revolute joint that are to be rad look like degrees."""
-    return _MOST_RAD < max(abs(low), abs(high)) <= _MOST_DEG
+    return TWO_TURNS < max(abs(low), abs(high)) <= _MOST_DEG
 
 
 class _Joint(Section):

@@ -22,13 +22,20 @@ import numpy.typing as npt
 
 from projservo_cli.files import lines_of, write_whole
 from projservo_cli.metric.position_error import Positions
-from projservo_cli.records import FloatArray, InputError, IntArray, JointList, Observation
+from projservo_cli.records import (
+    FARTHEST_M,
+    TWO_TURNS,
+    FloatArray,
+    InputError,
+    IntArray,
+    JointList,
+    Observation,
+)
 
 _MAX_JOINTS = 64  # maximum number of joints, as in a configuration
 _MAX_COLUMNS = 10_000  # maximum number of columns
 _MAX_BYTES = 1_000_000_000  # maximum size of a table, far beyond the size of a calibration
 _MAX_CELLS = 12_000_000  # maximum of poses × markers: mistyped pose numbers must not fill the memory
-_TWO_TURNS = 4.0 * math.pi  # rad; no joint of an arm with stops turns that far from its zero
 _PIXELS = ("u_left", "v_left", "u_right", "v_right")  # columns of pixels
 _SIGMAS = ("sigma_left", "sigma_right")  # columns of their standard deviations
 _MOVING = "moving"  # column of the number of a motion
@@ -151,6 +158,11 @@ def read_positions(path: Path | str, joint_types: str, joint_unit: str | None = 
     numbers, values, sigma = zip(*rows, strict=True)
     pose, found = np.array(numbers, dtype=np.int64), np.array(values)
     q = sheet.in_radians(pose, found[:, :-3], joint_unit)
+    if (span := float(np.ptp(found[:, -3:], axis=0).max())) > FARTHEST_M:
+        raise InputError(
+            f"{sheet.file}: positions are {span:.4g} m apart: they look like millimetres; divide x, y, z and "
+            "sigma by 1000"
+        )
     return Positions(pose=pose, q=q, xyz=found[:, -3:], sigma=np.array(sigma))
 
 
@@ -247,9 +259,17 @@ def in_radians(
     if unit not in (None, "deg", "rad"):
         raise InputError(f"{where}: joint_unit {unit!r}: give deg or rad")
     revolute = np.array([letter in "Rr" for letter in joint_types])
+    sliding = np.argwhere(~revolute & (np.abs(q) > FARTHEST_M))
+    if unit != "rad" and sliding.size:
+        k, i = sliding[0]
+        raise InputError(
+            f"{where}: q{i + 1} of pose {pose[k]} is {q[k, i]:g}, of a prismatic joint in m "
+            f"({len(sliding)} such readings): they look like millimetres; divide them by 1000, or give "
+            f"{option.format('rad')} if they are rad and m after all"
+        )
     if unit == "deg":
         return np.where(revolute, np.radians(q), q)
-    beyond = np.argwhere(revolute & (np.abs(q) > _TWO_TURNS))
+    beyond = np.argwhere(revolute & (np.abs(q) > TWO_TURNS))
     if unit is None and beyond.size:
         k, i = beyond[0]
         raise InputError(

@@ -477,6 +477,10 @@ def test_what_does_not_fit_a_calibration_is_said_in_a_sentence(config, made, cal
         ({"pixels": np.zeros((4, 3, 2))}, r"pixels of shape \(4, 3, 2\): expected \(K, 2, m, 2\)"),
         ({"pixels": "here"}, "pixels: no array of numbers"),
         ({"q": np.full((4, 6), 90.0)}, "they look like degrees; give joint_unit='deg'"),
+        (
+            {"q": np.full((4, 6), 0.5) + 150.0 * (np.arange(6) == 2), "joint_types": "RRPRRR"},
+            r"q3 of pose 0 is 150\.5, of a prismatic joint in m \(4 such .*they look like millimetres",
+        ),
         ({"joint_unit": "degrees"}, "q: joint_unit 'degrees': give deg or rad"),
         ({"joint_types": "RRR"}, "joint_types: 'RRR': expected 6 letters R or P"),
         ({"image_size": (1280,)}, r"image size \(1280,\): give a positive width and height, px"),

@@ -9,7 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.records import InputError, Observation
-from projservo_cli.store.tables import read_joint_list, read_table, recording_of, write_table
+from projservo_cli.store.tables import (
+    read_joint_list,
+    read_positions,
+    read_table,
+    recording_of,
+    write_table,
+)
 
 HEADER = "pose,marker,q1,q2,u_left,v_left,u_right,v_right"
 ROWS = ["0,1,0.5,-1,10,20,30,40", "0,0,0.5,-1,11,21,31,41", "7,1,0.25,2e-1,12.5,22,,"]
@@ -121,7 +127,9 @@ def test_readings_that_look_like_degrees_are_refused_with_the_remedy(tmp_path, t
 
 def test_radians_are_never_mistaken_for_degrees(tmp_path):
     path = written(tmp_path, HEADER, *TURNS)
-    assert read_table(path, "RP").q[0].tolist() == [0.5, 370]  # metres, or whatever a slide reads
+    with pytest.raises(InputError, match=r"q2 of pose 0 is 370, of a prismatic joint in m \(2 such readings"):
+        read_table(path, "RP")
+    assert read_table(path, "RP", "rad").q[0].tolist() == [0.5, 370]  # metres, or whatever a slide reads
     assert read_table(path, "RR", "rad").q[0].tolist() == [0.5, 370]  # as the user says
     widest = 2 * 2 * np.pi  # twice the range of a joint that turns fully to both sides
     path = written(tmp_path, HEADER, f"0,1,{widest},{-widest},1,2,3,4")
@@ -154,6 +162,12 @@ def test_bad_lists_of_joints_are_refused_with_the_line(tmp_path):
     for lines, message in BAD_LISTS.values():
         with pytest.raises(InputError, match=message):
             read_joint_list(written(tmp_path, *lines))
+
+
+def test_positions_in_millimetres_are_refused(tmp_path):
+    lines = ["pose,q1,x,y,z", "0,0.1,100,200,300", "1,0.2,150,200,280"]
+    with pytest.raises(InputError, match="positions are 50 m apart: they look like millimetres"):
+        read_positions(written(tmp_path, *lines), "R")
 
 
 def test_a_recording_is_told_by_a_column_of_its_own(tmp_path):
