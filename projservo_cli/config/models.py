@@ -761,7 +761,9 @@ class Settings(Root):
 
     @property
     def has_task(self) -> bool:
-        """Whether there is a robot with a task; a recorded run may be reported on without."""
+        """Whether there is a robot that may do a task; its calibration may be reported on without."""
+        if self.joint_types is not None and len(self.joint_types) == 1:
+            return False  # which reaches no pose
         return not self.recorded or None not in (self.arm, self.rig, self.markers, self.task)
 
     @property

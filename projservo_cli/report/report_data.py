@@ -178,6 +178,8 @@ class _FigureSpec:
             return "" if filmed else "the robot shows no frames"
         if isinstance(report_data, Driven):
             return "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
+        if len(report_data.calibration.joint_types) == 1:
+            return "one joint cannot reach a pose"
         if not isinstance(report_data, ReportData):
             return "the run holds a calibration and no task: set robot, rig, markers and task"
         missing = self._without_run(report_data)

@@ -302,6 +302,10 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
     if task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
     joints = inputs.joints.joints("" if calibration is None else calibration.joint_types, calibration)
+    if len(joints.types) == 1:
+        raise WorkFailed(
+            "one joint cannot reach a pose, which takes two or more: calibrate, validate and report it"
+        )
     sigma_px = inputs.noise_px
     if truth is not None:
         observed = truth.number

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from projservo_cli import Experiment
 from projservo_cli.config import load_config
 from projservo_cli.geometry.kinematics import joint_operators, project
 from projservo_cli.records import WorkFailed
@@ -46,17 +47,32 @@ task:
   goal: {joints: {joints: [10, 10, -20, 10, -60], unit: deg}}
 """
 ARMS = {"seven": "", "lift": LIFT, "five": FIVE}
+# A turntable.
+ONE = """
+robot:
+  dh:
+    joints: [{type: R, d_m: 0.6, a_m: 0.4, limits_deg: [-150, 150]}]
+    tool: [[0, 0, 1, 0.0], [0, 1, 0, 0], [-1, 0, 0, 0.03], [0, 0, 0, 1]]
+task:
+  start: {joints: [-10], unit: deg}
+  goal: {joints: {joints: [10], unit: deg}}
+"""
+
+
+def watched(name, arm, *overrides):
+    """Configuration of an arm that the paper's rig watches."""
+    text = (ROOT / "configs" / "paper.yaml").read_text(encoding="utf-8")
+    rig = text[text.index("\nrig:") : text.index("\ncalibration:")]
+    return load_config(f"{name}.yaml", list(overrides), text=rig + arm)
 
 
 @cache
 def planned(name, *overrides):
-    """Configuration, calibration from noisy images, and plan of an arm that the paper's rig watches."""
+    """Configuration, calibration from noisy images, and plan of an arm."""
     if name == "seven":
         config = load_config(ROOT / "configs" / "seven.yaml", list(overrides))
     else:
-        text = (ROOT / "configs" / "paper.yaml").read_text(encoding="utf-8")
-        rig = text[text.index("\nrig:") : text.index("\ncalibration:")]
-        config = load_config(f"{name}.yaml", list(overrides), text=rig + ARMS[name])
+        config = watched(name, ARMS[name], *overrides)
     _, calibration, _ = calibrate.run(config)
     assert calibration.usable
     return config, calibration, plan.run(config, calibration)
@@ -109,3 +125,13 @@ def test_a_task_beyond_the_joints_is_refused_with_what_is_left(name, axis):
     left = float(str(refusal.value).split("bring the face is ")[1].split()[0])
     whole = np.sqrt(np.mean(np.sum((project(truth.P, M) - truth.images(q, truth.M_face)) ** 2, axis=-1)))
     assert 3.0 < left <= whole
+
+
+def test_one_joint_is_calibrated_and_has_a_page_and_reaches_no_pose(tmp_path):
+    experiment = Experiment(watched("one", ONE), tmp_path).make("calibrate")
+    assert experiment.calibration.usable
+    assert np.isfinite(experiment.calibration.predict([0.1])).all()
+    with pytest.raises(WorkFailed, match="one joint cannot reach a pose, which takes two or more"):
+        experiment.make("servo")
+    assert experiment.make("report").report.figures
+    assert (tmp_path / "report.html").is_file()
