@@ -416,9 +416,10 @@ def claims_of(report_data: ReportData, share: FloatArray, distance: FloatArray) 
         could not be computed.
     """
     found = [*_classical(report_data), _planned(report_data), *_direct(report_data)]
-    if report_data.studies is not None:
+    studies = report_data.studies
+    if studies is not None and all(trace.steps for trace in studies.own.values()):  # a start off the goal
         found += [
-            *_drift_claims(report_data, report_data.studies),
-            *_control_claims(report_data, report_data.studies),
+            *_drift_claims(report_data, studies),
+            *_control_claims(report_data, studies),
         ]
     return [*found, _composition(share, distance)] if len(share) else found

@@ -203,7 +203,8 @@ def aspect(pixels: FloatArray, lower: float = 0.3, upper: float = 1.1) -> float:
 def log_scale(axes: "Axes") -> None:
     """Logarithmic vertical scale with plain powers of ten as labels, about five of them.
 
-    Where it shows fewer than two of them, there are numbers between.
+    Where it shows fewer than two of them, there are numbers between. Values of which none is positive keep
+    their scale.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator
 
@@ -212,6 +213,8 @@ def log_scale(axes: "Axes") -> None:
         few = np.floor(high) - np.ceil(low) < 1.0
         return f"{value:g}" if few and f"{value:e}"[0] in "235" else ""
 
+    if axes.has_data() and not np.isfinite(axes.dataLim.minposy):
+        return
     axes.set_yscale("log", nonpositive="clip")
     axes.yaxis.set_major_locator(LogLocator(numticks=5))
     axes.yaxis.set_major_formatter(

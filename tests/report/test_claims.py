@@ -164,3 +164,12 @@ def test_curves_that_differ_by_the_sense_of_a_half_turn_are_compared_by_size():
     curve = np.pi * 0.9 ** np.arange(20)
     np.testing.assert_allclose(curve_difference(curve, -curve[:15] + 1e-3), np.full(15, 1e-3), rtol=1e-9)
     assert curve_difference(curve, curve).max() == 0
+
+
+def test_runs_that_start_at_the_goal_say_nothing_of_drift_and_decay():
+    material = case()[2]
+    still = {key: dataclasses.replace(run, steps=0, q=run.q[:1]) for key, run in material.studies.own.items()}
+    studies = dataclasses.replace(material.studies, own=still)
+    found = claims_of(dataclasses.replace(material, studies=studies), np.zeros(0), np.zeros(0))
+    assert found
+    assert not any("drift" in claim.claim or "decay" in claim.claim for claim in found)
