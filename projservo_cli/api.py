@@ -442,9 +442,9 @@ def load(path: str | Path) -> Experiment | Study:
     target = Path(path)
     if target.suffix in (".yaml", ".yml"):
         raise InputError(f"{path}: a configuration, which Config.load reads; load opens the folder of a run")
-    folder = target.parent if target.name == TABLE else target
-    if (folder / TABLE).is_file() and not run_path(target).is_file():
-        return Study(SweepTable(folder / TABLE))
+    table = target if target.name == TABLE else target / TABLE
+    if table == target or (table.is_file() and not run_path(target).is_file()):
+        return Study(SweepTable(table))
     return Experiment.of(stored_run(target))
 
 

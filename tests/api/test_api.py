@@ -247,8 +247,8 @@ def test_a_sweep_in_memory_compares_classes_and_laws(config):
 def test_a_sweep_in_a_folder_is_continued_but_never_that_of_a_class_without_source(config, tmp_path):
     first = ps.sweep(config, laws=["exact"], runs=3, path=tmp_path / "sweep")
     done = (tmp_path / "sweep" / "sweep.h5").stat().st_mtime_ns
-    again = ps.load(tmp_path / "sweep")
-    np.testing.assert_array_equal(first.table["steps"], again.table["steps"])
+    for path in (tmp_path / "sweep", tmp_path / "sweep" / "sweep.h5"):
+        np.testing.assert_array_equal(first.table["steps"], ps.load(path).table["steps"])
     ps.sweep(config, laws=["exact"], runs=3, path=tmp_path / "sweep")
     assert (tmp_path / "sweep" / "sweep.h5").stat().st_mtime_ns == done
     with pytest.raises(ps.InputError, match="of another configuration"):
