@@ -42,7 +42,7 @@ _ALL_PARALLEL = (
     "revolute joint about another direction would fix it"
 )
 
-Scale = str | tuple[int, int]
+Scale = str | Sequence[int]
 
 
 class Body(NamedTuple):
@@ -356,6 +356,7 @@ class Metric:
         face: Sequence[int] | None = None,
     ) -> Self:
         """Upgrade a calibration, by the factor of its covariance; the rest as for ``ImageModel.metric``."""
+        between = between if isinstance(between, str) else np.ravel(between).tolist()
         if between == "joint" and length_m is not None:
             raise InputError(
                 f"metric: length_m {length_m!r} without its ends: name them, such as two markers; readings "

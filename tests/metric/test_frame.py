@@ -63,7 +63,7 @@ def frame(rng):
 def test_closed_form_of_an_arm(frame):
     """Axes, link lengths, cameras and poses are those of the drawing, whatever the projective frame."""
     arm = robot(ELBOW, "RRRR", 0.3)
-    m = calibrated(arm, frame).metric(np.linalg.norm(POINTS[0] - POINTS[1]), (0, 10))
+    m = calibrated(arm, frame).metric(np.linalg.norm(POINTS[0] - POINTS[1]), np.array([0, 10]))
     focal = np.array([[1200.0, 0.0, 640.0], [0.0, 1200.0, 512.0], [0.0, 0.0, 1.0]])
     np.testing.assert_allclose(m.K, [focal, focal], rtol=1e-8, atol=1e-7)
     np.testing.assert_allclose(np.linalg.norm(np.diff(m.poses[:, :3, 3], axis=0)), 0.3, rtol=1e-9)
