@@ -420,7 +420,12 @@ def _stored(path: "str | Path | None") -> Run:
 
 def _targets(laws: Sequence[str]) -> tuple[str, ...]:
     """Laws each once, registered names as the classes they stand for; an InputError where there is none."""
-    return tuple(dict.fromkeys(law_target(name) for name in ([laws] if isinstance(laws, str) else laws)))
+    given = [laws] if isinstance(laws, str) or not np.iterable(laws) else laws
+    for law in given:
+        if not isinstance(law, str):
+            named = f", such as {plugins.name_of(law)!r}" if callable(law) else ""
+            raise InputError(f"make: law {law!r:.60}: give the name of a law, or module:Class{named}")
+    return tuple(dict.fromkeys(map(law_target, given)))
 
 
 def law_target(name: str) -> str:

@@ -387,6 +387,10 @@ def test_a_stored_run_starts_no_code_that_it_names(config, tmp_path):
         (lambda c: ps.simulate(c, np.zeros((1, 6)), seed=-1), "calibration.seed: must be at least 0"),
         (lambda c: ps.simulate("ur5"), "simulate: config of type str: read one with Config.load"),
         (lambda c: ps.sweep(c, laws=["exact"], workers=0), "workers=0: give a whole number of one or more"),
+        (
+            lambda c: ps.Experiment(c).make("servo", laws=[Resolved]),
+            "make: law <class .*: give the name of a law, or module:Class, such as '.*test_api:Resolved'",
+        ),
         (lambda c: ps.Experiment(c).plan, r"holds no result of plan; make it first: make\('plan'\)"),
         (lambda c: ps.calibrate(np.zeros(3)), "observations of type ndarray; make them with"),
         (
