@@ -136,7 +136,7 @@ class ImageModel(Displayable, Calibration):
             If the readings have another number of joints, are not finite or look like degrees.
         """
         rows, single = self._rows(q)
-        parts = range(0, len(rows), _AT_ONCE)
+        parts = range(0, max(1, len(rows)), _AT_ONCE)
         J = np.concatenate([joint_derivative(self, rows[k : k + _AT_ONCE]) for k in parts])
         J[np.isnan(predict(self, rows)[..., 0])] = np.nan
         return J[0] if single else J

@@ -140,6 +140,11 @@ def test_what_is_behind_a_camera_has_no_pixels_and_no_derivative(made):
     assert np.isnan(turned.jacobian(q)[:, 1]).all()
 
 
+def test_no_poses_have_no_derivatives(made):
+    calibration, none = made[1], np.zeros((0, 6))
+    assert calibration.jacobian(none).shape == (*calibration.predict(none).shape, 6)
+
+
 def test_a_plan_takes_joints_pixels_and_what_was_taught(config, made, tmp_path):
     _, calibration, plan = made
     same = ps.plan(config, calibration, q_start=plan.q_start)
