@@ -62,7 +62,7 @@ def simulate(
     *,
     seed: int | None = None,
     noise_px: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool = True,
 ) -> Observations:
     """Show the simulated robot of a configuration to its cameras.
 
@@ -74,7 +74,7 @@ def simulate(
         that they share no noise with trials.
     noise_px : standard deviation of a coordinate, px, where points are simulated; by default
         ``noise.calibration_px``.
-    progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
+    progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
 
     Returns
     -------
@@ -118,7 +118,7 @@ def record(
     path: str | Path | None = None,
     motions: npt.ArrayLike | None = None,
     force: bool = False,
-    progress: Progress | None = None,
+    progress: Progress | bool = True,
 ) -> Observations:
     """Drive a robot through the trial motions of a configuration and look at each.
 
@@ -129,7 +129,7 @@ def record(
     path : table (CSV) that grows as the robot goes, and from which an interrupted recording is continued.
     motions : (K, n) further poses after the trial motions, rad or m.
     force : whether to start again, whatever the table holds.
-    progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
+    progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
 
     Returns
     -------
@@ -181,7 +181,7 @@ def calibrate(
     joint_noise_deg: float | None = None,
     noise_px: float | None = None,
     seed: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool = True,
 ) -> ImageModel:
     """Learn the projective kinematics of a robot from what cameras saw of it, [RH00] section 2.
 
@@ -199,7 +199,7 @@ def calibrate(
         that of the observations, else estimated.
     noise_px : standard deviation of a coordinate, px; by default that of the observations, else estimated.
     seed : of the random starts; by default that of the observations.
-    progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
+    progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
 
     Returns
     -------
@@ -345,7 +345,7 @@ def sweep(
     workers: int = 1,
     path: str | Path | None = None,
     force: bool = False,
-    progress: Progress | None = None,
+    progress: Progress | bool = True,
 ) -> Study:
     """Run laws on the same tasks, with the same calibrations and noise, over a grid of values.
 
@@ -362,7 +362,7 @@ def sweep(
     workers : processes; with more than one, laws must be importable there.
     path : folder of the sweep, which is continued there; by default all is kept in memory.
     force : whether to start again, whatever the folder holds.
-    progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
+    progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
 
     Returns
     -------

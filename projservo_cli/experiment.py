@@ -21,7 +21,7 @@ from projservo_cli.progress import Bar
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Report, WorkFailed
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
 from projservo_cli.robots import plugins
-from projservo_cli.stages import Progress
+from projservo_cli.stages import Progress, silent
 from projservo_cli.steps import STAGES, Step, given_to, result_of, steps_for
 from projservo_cli.store import SERVO, Result, Run, load, run_path, save
 
@@ -63,11 +63,11 @@ class _Caller:
 
 
 @contextmanager
-def listening(progress: Progress | None) -> Iterator[_Caller]:
-    """Who follows work that is called from Python: a function, or for None a bar in a terminal."""
+def listening(progress: Progress | bool) -> Iterator[_Caller]:
+    """Who follows work that is called from Python: a function, or for True a bar in a terminal."""
     bar = Bar()
     try:
-        yield _Caller(bar if progress is None else progress, bar)
+        yield _Caller(progress if callable(progress) else silent if progress is False else bar, bar)
     finally:
         bar.close()
 
@@ -233,7 +233,7 @@ class Experiment:
     ----------
     config : a ``Config``, the path of a YAML file, or the name of a shipped configuration.
     path : folder of the run; None keeps all in memory, where no report can be made.
-    progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
+    progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
 
     Raises
     ------
@@ -246,7 +246,7 @@ class Experiment:
         config: "Config | str | Path",
         path: "str | Path | None" = None,
         *,
-        progress: Progress | None = None,
+        progress: Progress | bool = True,
     ) -> None:
         self._config: Config | None = config if isinstance(config, Config) else load_config(shipped(config))
         self._run, self._in_memory = _stored(path), path is None
@@ -257,7 +257,7 @@ class Experiment:
         """The experiment that a stored run is of; no code that it names is ever started by it alone."""
         made = cls.__new__(cls)
         made._config = None
-        made._run, made._in_memory, made._progress, made._may_import = run, False, None, False
+        made._run, made._in_memory, made._progress, made._may_import = run, False, True, False
         return made
 
     def make(self, *stages: str, laws: Sequence[str] = (), force: bool = False) -> "Experiment":

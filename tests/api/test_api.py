@@ -140,6 +140,14 @@ def test_what_is_behind_a_camera_has_no_pixels_and_no_derivative(made):
     assert np.isnan(turned.jacobian(q)[:, 1]).all()
 
 
+@pytest.mark.parametrize("progress", [True, False])
+def test_a_bar_in_a_terminal_can_be_switched_off(config, monkeypatch, capsys, progress):
+    observations = ps.simulate(config)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    ps.calibrate(observations, progress=progress)
+    assert ("calibration" in capsys.readouterr().err) == progress
+
+
 def test_no_poses_have_no_derivatives(made):
     calibration, none = made[1], np.zeros((0, 6))
     assert calibration.jacobian(none).shape == (*calibration.predict(none).shape, 6)
