@@ -339,7 +339,7 @@ def shipped(name: pathlib.Path | str) -> pathlib.Path:
     if not isinstance(name, (str, pathlib.Path)):
         raise InputError(f"a configuration of type {type(name).__name__}: give the path of a file, or a name")
     path, package = pathlib.Path(name), pathlib.Path(__file__).resolve().parent.parent
-    if path.suffix or path.parent != pathlib.Path() or path.exists():
+    if path.suffix or path.parent != pathlib.Path() or path.is_file():
         return path
     folder = package / "configs" if (package / "configs").is_dir() else package.parent / "configs"
     names = sorted(file.stem for file in folder.glob("*.yaml"))

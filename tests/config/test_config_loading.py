@@ -6,11 +6,11 @@ import pytest
 import yaml
 
 from projservo_cli.canonical import encoded
-from projservo_cli.config import Config, Override, load_config, to_yaml
+from projservo_cli.config import Config, Override, load_config, shipped, to_yaml
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.laws import LAWS
 from projservo_cli.records import InputError
-from tests.conftest import SHIPPED
+from tests.conftest import ROOT, SHIPPED
 
 GOOD = """\
 seed: 1
@@ -308,6 +308,12 @@ def test_files_that_are_none(tmp_path):
     assert "cannot be read" in errors(tmp_path)[0]
     (tmp_path / "c.yaml").write_bytes(b"name: \xff")
     assert "not UTF-8" in errors(tmp_path / "c.yaml")[0]
+
+
+def test_a_folder_does_not_stand_for_the_shipped_configuration_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ur5").mkdir()
+    assert shipped("ur5") == ROOT / "configs" / "ur5.yaml"
 
 
 def test_plain_text_means_what_the_core_schema_says():
