@@ -166,6 +166,13 @@ def load(target: Path | str) -> Run:
     """Read a run file. Raises InputError if it is missing, changed, or of another version."""
     path = run_path(target)
     if not path.is_file():
+        from projservo_cli.store.sweep_table import TABLE
+
+        if (path.parent / TABLE).is_file():
+            raise InputError(
+                f"{path.parent}: holds a sweep and no run; see projservo report {path.parent}, or repeat a "
+                f"run of it: projservo servo --from {path.parent}:INDEX"
+            )
         raise InputError(f"{path}: there is no run file; make one with: projservo calibrate -o {path.parent}")
     with opened(path, _REMEDY, unchanged=True) as file:
         if "schema" not in file.attrs or attribute(file, "schema", str) != _SCHEMA:

@@ -226,3 +226,5 @@ def test_runs_that_are_none(projservo, reported, tmp_path):
         assert (answer.code, answer.out) == (2, "")
         assert "cut short" in answer.err
     assert "there is no run file" in projservo("show", "nowhere").err
+    (tmp_path / "out/run.h5").rename(tmp_path / "out/sweep.h5")
+    assert "out: holds a sweep and no run; see projservo report out" in projservo("show", "out").err
