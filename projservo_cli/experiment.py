@@ -25,6 +25,16 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.steps import STAGES, Step, given_to, result_of, steps_for
 from projservo_cli.store import SERVO, Result, Run, load, run_path, save
 
+# Options of the command line in messages, and what takes their place in Python.
+_IN_PYTHON = {
+    " with -o": "",
+    "with --force": "with force=True",
+    "use --force": "use force=True",
+    "with --data": "with data.table",
+    "without --lens": "without lens",
+    "omit --init": "omit init",
+    "check --joints": "check joint_types",
+}
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
 
 
@@ -68,6 +78,12 @@ def listening(progress: Progress | bool) -> Iterator[_Caller]:
     bar = Bar()
     try:
         yield _Caller(progress if callable(progress) else silent if progress is False else bar, bar)
+    except (InputError, WorkFailed) as error:
+        text = str(error)
+        for option, argument in _IN_PYTHON.items():
+            text = text.replace(option, argument)
+        error.args = (text,)
+        raise
     finally:
         bar.close()
 

@@ -10,7 +10,6 @@ that is not parallel to it. Tool frame: origin at the mean of the face, x from i
 z across the plane of the first two and the next that is off their line.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -359,14 +358,16 @@ class Metric:
         between = between if isinstance(between, str) else np.ravel(between).tolist()
         if between == "joint" and length_m is not None:
             raise InputError(
-                f"metric: length_m {length_m!r} without its ends: name them, such as two markers; readings "
-                "of a prismatic joint set the scale by themselves"
+                f"metric: a length of {length_m} m without its ends: name them, such as two markers; "
+                "readings of a prismatic joint set the scale by themselves"
             )
-        length = (1.0 if between == "joint" else math.nan) if length_m is None else float(length_m)
+        if between != "joint" and length_m is None:
+            raise InputError(f"metric: the length between {between} is not given: give it in m")
+        length = 1.0 if length_m is None else float(length_m)
         if not 0.0 < length < np.inf or not 0.0 <= length_std_m < np.inf:
             raise InputError(
-                f"metric: length_m {length_m!r}, length_std_m {length_std_m!r}: give a positive length in m, "
-                "and a deviation that is not negative"
+                f"metric: a length of {length_m} m with a standard deviation of {length_std_m} m: give a "
+                "positive length, and a deviation that is not negative"
             )
         marker = c.marker.tolist()
         chosen = range(len(marker)) if face is None else _known_indices(face, marker)

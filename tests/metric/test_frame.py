@@ -123,12 +123,13 @@ MIRROR = np.diag([-1.0, 1.0, 1.0])
         (robot(ELBOW[1:3], "RR"), (0.3, "cameras"), "all revolute axes are parallel"),
         (robot([prismatic(e) for e in np.eye(3)], "PPP"), (), "without a revolute joint"),
         (robot(ELBOW, "RRRR", cameras=np.array([rig()[0], MIRROR @ rig()[1]])), (0.3, "cameras"), "mirrored"),
-        (robot(ELBOW, "RRRR"), (0.0, "cameras"), "length_m 0.0"),
+        (robot(ELBOW, "RRRR"), (0.0, "cameras"), "a length of 0.0 m with"),
+        (robot(ELBOW, "RRRR"), (None, (0, 10)), r"the length between \[0, 10\] is not given: give it in m"),
         (robot(ELBOW, "RRRR"), (0.1, (0, 7)), "marker 7 is not in the calibration"),
         (robot(ELBOW, "RRRR"), (0.1, (10, 10)), "give two markers"),
         (robot(ELBOW, "RRRR"), (), "no joint is prismatic"),
         (robot(ELBOW, "RRRR"), (0.06, "tags"), "no tag has all its corners"),
-        (robot((prismatic(Z), *ELBOW[1:]), "PRRR"), (0.3,), "0.3 without its ends"),
+        (robot((prismatic(Z), *ELBOW[1:]), "PRRR"), (0.3,), "a length of 0.3 m without its ends"),
     ],
 )
 def test_what_has_no_metric_says_so(arm, known, said, frame):
