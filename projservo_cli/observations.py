@@ -104,11 +104,13 @@ class Observations(Displayable, Observation):
         types = _types_of(joint_types, n) or "R" * n
         numbers = _numbers("marker", marker, m), _numbers("pose", pose, len(seen))
         readings = in_radians("q", types, numbers[1], readings, joint_unit, "joint_unit={!r}")
-        one = np.isfinite(seen).sum(axis=-1) == 1
-        if one.any():
-            k, view, j = np.argwhere(one)[0]
+        wrong = np.isinf(seen).any(axis=-1) | (np.isnan(seen).sum(axis=-1) == 1)
+        if wrong.any():
+            k, view, j = np.argwhere(wrong)[0]
+            u, v = seen[k, view, j]
             raise InputError(
-                f"pixels: one coordinate of marker {j} at pose {k}, view {view} is NaN: both or none"
+                f"pixels: marker {j} at pose {k}, view {view} is at ({u:g}, {v:g}): give two finite "
+                "numbers, or NaN for both"
             )
         stated = None
         if sigma is not None:

@@ -326,9 +326,13 @@ class Expected:
         ratio = self.ratio(solution)
         if self.known and not self.agrees(solution):
             low, high = chi2_band(solution.dof)
+            joints, remedy = "", ""
+            if (noise := solution.joint_noise) is not None and noise.sigma_q > 0.0:
+                joints = f" and {np.degrees(noise.sigma_q):.3g}° rms of joint noise"
+                remedy = "; check joint_noise_deg"
             return (
                 f"the fit does not describe the data: χ² per degree of freedom is {ratio**2:.4g} at "
-                f"{self.sigma_px:g} px of noise, expected within {low:.4g} and {high:.4g}"
+                f"{self.sigma_px:g} px of noise{joints}, expected within {low:.4g} and {high:.4g}{remedy}"
             )
         if ratio > REFUSE_RATIO:
             return (

@@ -79,6 +79,11 @@ def test_joint_noise_is_estimated_where_the_chain_estimates_it():
     assert 0.005 < np.degrees(ps.calibrate(seen).sigma_q) < 0.05
 
 
+def test_joint_noise_that_readings_have_not_is_named(made):
+    with pytest.raises(ps.WorkFailed, match="px of noise and 5° rms of joint noise, expected"):
+        ps.calibrate(made[0], joint_noise_deg=5)
+
+
 def test_poses_have_noise_of_their_own_and_may_have_none(config, made):
     q = made[0].q
     first, second = ps.simulate(config, q), ps.simulate(config, q, seed=7)
@@ -493,6 +498,10 @@ def test_what_does_not_fit_a_calibration_is_said_in_a_sentence(config, made, cal
         ({"q": np.zeros((3, 6))}, r"q of shape \(3, 6\): expected \(4, n\)"),
         ({"pixels": np.zeros((4, 3, 2))}, r"pixels of shape \(4, 3, 2\): expected \(K, 2, m, 2\)"),
         ({"pixels": "here"}, "pixels: no array of numbers"),
+        (
+            {"pixels": np.full((4, 2, 3, 2), np.inf)},
+            r"marker 0 at pose 0, view 0 is at \(inf, inf\): ",
+        ),
         ({"q": np.full((4, 6), 90.0)}, "they look like degrees; give joint_unit='deg'"),
         (
             {"q": np.full((4, 6), 0.5) + 150.0 * (np.arange(6) == 2), "joint_types": "RRPRRR"},
