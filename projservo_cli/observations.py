@@ -13,7 +13,7 @@ import numpy.typing as npt
 from projservo_cli.calibration.estimate import require_size_and_noise
 from projservo_cli.display import Displayable, checked_array, numbers_in, pandas
 from projservo_cli.records import FloatArray, InputError, Observation
-from projservo_cli.store.tables import in_radians, read_table, to_csv, write_table
+from projservo_cli.store.tables import in_radians, or_empty, read_table, to_csv, write_table
 
 _TABLE = "table"  # name in messages of a table that is not a file
 
@@ -194,6 +194,8 @@ def _types_of(given: str | Sequence[str] | None, n: int | None = None) -> str | 
 
 def _numbers(name: str, given: Sequence[int] | None, count: int) -> npt.NDArray[np.int64]:
     numbers = np.arange(count) if given is None else np.asarray(given)
+    if numbers.dtype.kind == "f" and (numbers == np.rint(numbers)).all():
+        numbers = numbers.astype(np.int64)
     if numbers.shape != (count,) or numbers.dtype.kind not in "iu" or len(set(numbers.tolist())) < count:
         raise InputError(f"{name}: expected {count} different whole numbers, not {given!r:.60}")
     return numbers.astype(np.int64)
@@ -203,7 +205,7 @@ def _text_of(table: Any) -> str:
     if hasattr(table, "to_csv"):
         return str(table.to_csv(index=False))
     if isinstance(table, Mapping):
-        return to_csv({name: np.asarray(values) for name, values in table.items()})
+        return to_csv({name: or_empty(np.asarray(values)) for name, values in table.items()})
     raise InputError(
         f"table: a {type(table).__name__}; expected a pandas table, a mapping of columns or a path"
     )
@@ -216,8 +218,14 @@ def _read(text: str, joint_types: str | None, joint_unit: str | None) -> Observa
         try:
             return read_table(path, joint_types, joint_unit)
         except InputError as error:
-            message = str(error).replace(str(path), _TABLE)
+            message = str(error).replace(str(path), _TABLE).replace(f"{_TABLE}:1:", f"{_TABLE}:")
+            message = re.sub(r"\bline (\d+)", _row, re.sub(rf"{_TABLE}:(?=\d)", f"{_TABLE}: line ", message))
             raise InputError(re.sub(r"--joint-unit (\w+)", r"joint_unit='\1'", message)) from error
+
+
+def _row(line: re.Match[str]) -> str:
+    """Row of a frame, which starts at 0, for a line of its file, the second of which it is."""
+    return f"row {int(line[1]) - 2}"
 
 
 def rows_of(q: npt.ArrayLike, n: int) -> FloatArray:

@@ -44,7 +44,7 @@ _IDENTITY = " of "  # in that column, before the identity of the robot
 _XYZ = ("x", "y", "z")  # columns of a position, m
 _RECORDING = "recording"  # column of the recording that a row belongs to
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
-_INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
+_INTEGER = re.compile(r"([+-]?[0-9]{1,18})(\.0*)?")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
@@ -196,23 +196,25 @@ def write_table(
     columns = {"pose": np.repeat(observation.pose, m), "marker": np.tile(observation.marker, K)}
     columns |= {f"q{i}": np.repeat(values, m) for i, values in enumerate(observation.q.T, 1)}
     pixels = np.moveaxis(observation.images, 1, 2).reshape(K * m, 4).T
-    columns |= {name: _or_empty(values) for name, values in zip(_PIXELS, pixels, strict=True)}
+    columns |= {name: or_empty(values) for name, values in zip(_PIXELS, pixels, strict=True)}
     if observation.sigma is not None:
         sigma = np.where(np.isnan(observation.images[..., 0]), np.nan, observation.sigma)
-        columns |= {name: _or_empty(sigma[:, v].ravel()) for v, name in enumerate(_SIGMAS)}
+        columns |= {name: or_empty(sigma[:, v].ravel()) for v, name in enumerate(_SIGMAS)}
     moments = {_MOVING: observation.moving, "t_q": observation.t_q}
     if observation.t_view is not None:
         moments |= dict(zip(_TIMES[1:], observation.t_view.T, strict=True))
     for name, values in moments.items():
         if values is not None:
-            columns[name] = _or_empty(np.repeat(values, m))
+            columns[name] = or_empty(np.repeat(values, m))
     if recording:
         columns[_RECORDING] = np.full(K * m, recording + (_IDENTITY + identity if identity else ""))
     write_whole(Path(path), to_csv(columns))
 
 
-def _or_empty(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Cells of numbers, empty for NaN."""
+def or_empty(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Cells of a column, empty for NaN."""
+    if values.dtype.kind != "f":
+        return values
     return np.where(np.isnan(values), "", values.astype(object))
 
 
@@ -304,10 +306,10 @@ class _Row(dict[str, str]):
         return pixels + sigmas
 
     def integer(self, column: str) -> int:
-        """A whole number of at most 18 digits."""
-        if not _INTEGER.fullmatch(self[column]):
+        """A whole number of at most 18 digits, which pandas may write as 3.0."""
+        if (found := _INTEGER.fullmatch(self[column])) is None:
             raise InputError(f"{self.where}: {column} is {self[column]!r}; expected an integer")
-        return int(self[column])
+        return int(found[1])
 
     def moment(self) -> dict[str, float | None]:
         """Number of the motion and times of a pose, by column; None for an unknown time."""

@@ -548,9 +548,14 @@ def test_arrays_tables_and_frames_hold_the_same(made, tmp_path):
     q, pixels = np.degrees(observations.q), observations.images
     degrees = ps.Observations.from_arrays(q, pixels, joint_unit="deg")
     np.testing.assert_allclose(degrees.q, observations.q, atol=1e-12)
-    with pytest.raises(ps.InputError, match=r"table:1: the header lacks the column\(s\) marker"):
+    with pytest.raises(ps.InputError, match=r"^table: the header lacks the column\(s\) marker"):
         ps.Observations.from_frame(observations.to_frame().drop(columns="marker"))
     columns = dict(observations.to_frame())
+    joined = ps.Observations.from_frame(columns | {"marker": columns["marker"].astype(float)})
+    alike(joined, table, Observation)
+    bare = columns["marker"].where(columns["marker"].index != 3)  # as a join leaves it
+    with pytest.raises(ps.InputError, match="table: row 3: marker is ''; expected"):
+        ps.Observations.from_frame(columns | {"marker": bare})
     with pytest.raises(ps.InputError, match="joint_unit='deg', or joint_unit='rad' if they are"):
         ps.Observations.from_frame(columns | {"q1": columns["q1"] + 90.0})
     with pytest.raises(ps.InputError, match="table: joint_unit 'degrees': give deg or rad"):
