@@ -31,6 +31,7 @@ from projservo_cli.records import (
     Plan,
     Trace,
     WorkFailed,
+    in_unit,
 )
 from projservo_cli.results import ImageModel
 from projservo_cli.robots import plugins
@@ -251,13 +252,15 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
         *([] if turn is None else [f"{turn:.3g} deg of rotation"]),
         f"an image error of {error:.3g} px",
     ]
+    rest = f"{' and '.join(left)} {'are' if len(left) > 1 else 'is'} left"
+    at_limit = in_unit(float(log.read[steps, joint]), run.scenario.joints.units[joint])
     reasons = {
         "converged": f"image error {error:.3g} px is within {within:.3g} px",
         "no progress": f"the robot stands still at an image error of {error:.3g} px: {run.why}"
         if run.why
         else f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
         f"{limits.stall_periods} steps: {_stalled_by(run)}",
-        "following error": f"{run.why}; {' and '.join(left)} are left",
+        "following error": f"{run.why}; {rest}",
         "max steps": f"no step left; image error {error:.3g} px was still changing",
         "diverged": f"image error {error:.3g} px (at first {first:.3g}) or the distance of the face grew "
         f"{limits.diverged_factor:g}-fold",
@@ -265,8 +268,8 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
         "behind camera": f"a face marker passed behind a camera at step {steps}",
         "markers lost": f"the law could not measure the face at step {steps}: a marker was not seen"
         + (f", {limits.max_lost_periods} periods after the last that was" if limits.max_lost_periods else ""),
-        "joint limit": f"joint {joint + 1} stands at its limit, {float(log.read[steps, joint]):.6g} (rad or "
-        f"m), and the task would take it beyond; {' and '.join(left)} are left",
+        "joint limit": f"joint {joint + 1} stands at its limit, {at_limit}, and the task would take it "
+        f"beyond; {rest}",
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
         **dict.fromkeys(("fault detected", "failed"), run.why),
     }

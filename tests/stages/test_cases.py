@@ -101,7 +101,8 @@ def test_the_limit_ends_the_run_at_it(driven):
     trace = driven(turn(90, "robot.dh.joints.3.limits_deg=[20, 400]", "plant.joint_limits=stop"))
     assert (trace.verdict, trace.limit_joint) == ("joint limit", 3)
     assert np.degrees(trace.q[-1, 3]) == pytest.approx(20.0, abs=1e-4)
-    assert "joint 4" in trace.reason
+    assert trace.reason.startswith("joint 4 stands at its limit, 20 deg, and the task would take it beyond; ")
+    assert trace.reason.endswith(" px are left")
     assert 0 < trace.remaining_translation < 1
     assert 0 < trace.remaining_rotation_deg < 90
 
