@@ -369,7 +369,7 @@ def _of_sweep(found: dict[str, Any]) -> Iterator[str]:
         rate = f"{100.0 * cell['success_rate']:.1f} ({low:.0f}-{high:.0f})"
         quantiles = (("steps", 6), ("position_error_mm", 8), ("path_length_ratio", 7))
         medians = ((cell["quantiles"][name]["0.5"], width) for name, width in quantiles)
-        numbers = "".join(f"{'-' if m is None else format(m, '.3g'):>{width}}" for m, width in medians)
+        numbers = "".join(f" {_number(median):>{width - 1}}" for median, width in medians)
         text = "".join(f"{cell[name]!s:<{width}}" for name, width in zip(axes, widths, strict=True))
         converged = 100.0 * cell["converged"] / cell["runs"]
         hidden, outside = 100.0 * cell["self_occluded_rate"], 100.0 * cell["left_image_rate"]

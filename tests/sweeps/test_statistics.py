@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from projservo_cli.cli.output import words_of
 from projservo_cli.records import InputError
 from projservo_cli.store.sweep_table import assemble, write_part
 from projservo_cli.sweeps.folder import Folder
@@ -121,6 +122,13 @@ def test_success_over_a_value_and_within_edges(made):
 
 
 @pytest.mark.volume
+def test_columns_of_tiny_numbers_stay_apart(made):
+    told = made[0]
+    quantiles = {key: {"0.5": 1.23e-10} for key in ("steps", "position_error_mm", "path_length_ratio")}
+    words = [*words_of("sweep", told | {"cells": [told["cells"][0] | {"quantiles": quantiles}]})]
+    assert words[2].split()[-3:] == 3 * ["1.23e-10"]
+
+
 def test_the_report_of_a_sweep(tmp_path):
     """Over two start offsets, with one drawn: every figure there is but noise."""
     offset = "task.start_offset"
