@@ -6,11 +6,13 @@ from scipy.stats import chi2
 
 from projservo_cli.config.inputs import report_inputs
 from projservo_cli.metric.frame import links
+from projservo_cli.report import style
 from projservo_cli.report.figures.metric import chosen_poses, metric_rows
 from projservo_cli.report.report_data import Fit
 from projservo_cli.stages.report import in_metres
 from tests.configured import calibrate, truth_of
 from tests.known import configured
+from tests.report.cases import SPECS
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +69,14 @@ def test_links_are_angles_and_common_normals_with_signs_nearby():
     moved = axes.copy()
     moved[2, 5] = 0.1  # to the other side of the second axis
     assert links(moved, prismatic, axes)[1][1] == pytest.approx(-0.1)
+
+
+def test_a_far_camera_has_few_ticks(calibrated, caplog):
+    """As readings of a prismatic joint in mm put it."""
+    _, observation, calibration, lengths = calibrated
+    fit = Fit(calibration, observation, metric=in_metres(calibration, lengths)[0])
+    data = SPECS["fig18_metric"].data(fit)
+    data["pyramids"] = data["pyramids"] + 2000.0
+    (axes,) = style.drawn(SPECS["fig18_metric"].draw, data, 4.4).axes
+    assert not caplog.messages
+    assert 2 <= len(axes.get_xticks()) <= 10

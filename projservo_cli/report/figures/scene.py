@@ -138,7 +138,8 @@ def show(
     for name, (a, b) in zip("xyz", extent, strict=True):
         getattr(axes, f"set_{name}lim")(a, b)
         getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 14)
-        step = next(step for step, upper in ((0.1, 0.4), (0.25, 0.75), (0.5, np.inf)) if b - a < upper)
+        steps = (step for step, upper in ((0.1, 0.4), (0.25, 0.75), (0.5, 5.0)) if b - a < upper)
+        step = next(steps, 0.2 / style.magnification(b - a, 1.0))
         getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(step))
     axes.tick_params(pad=0)
     towards = rig[:, 0].mean(axis=0) - points.mean(axis=0)
