@@ -203,15 +203,15 @@ def aspect(pixels: FloatArray, lower: float = 0.3, upper: float = 1.1) -> float:
 def log_scale(axes: "Axes") -> None:
     """Logarithmic vertical scale with plain powers of ten as labels, about five of them.
 
-    Where it shows fewer than two of them, there are numbers between. Values of which none is positive keep
-    their scale.
+    Where it shows fewer than two of them, there are numbers between, in half a decade at each tick. Values
+    of which none is positive keep their scale.
     """
     from matplotlib.ticker import FuncFormatter, LogLocator
 
     def between(value: float, _: object) -> str:
         low, high = np.log10(axes.get_ylim())
         few = np.floor(high) - np.ceil(low) < 1.0
-        return f"{value:g}" if few and f"{value:e}"[0] in "235" else ""
+        return f"{value:g}" if few and (high - low < 0.5 or f"{value:e}"[0] in "235") else ""
 
     if axes.has_data() and not np.isfinite(axes.dataLim.minposy):
         return

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from projservo_cli.report import style
@@ -89,6 +90,15 @@ def test_same_input_gives_the_same_bytes():
 def test_names_follow_the_numbers_of_the_paper():
     # 0 the overview, 13 the calibration, 14 the path, 15 the modes, 16 the way, 17 the frames, 18 in metres
     assert [int(name[3:5]) for name in NAMES] == list(range(19))
+
+
+def test_a_logarithmic_scale_of_less_than_half_a_decade_has_several_labels():
+    figure = Figure()
+    axes = figure.subplots()
+    axes.plot([15.0, 20.0])
+    style.log_scale(axes)
+    figure.draw_without_rendering()
+    assert len([label for label in axes.get_yticklabels(which="both") if label.get_text()]) > 4
 
 
 @pytest.mark.parametrize("part", ["color", "linestyle", "marker"])
