@@ -204,6 +204,19 @@ def test_the_overview_counts_hidden_steps_and_errors_from_a_hundred_percent():
     assert (center < s.max(axis=2)).all()
 
 
+def test_of_a_rotation_near_zero_no_share_is_drawn_and_the_legend_says_so_above_the_curves():
+    material = case()[2]
+    trace = material.traces["direct_three"]
+    small = dataclasses.replace(trace, theta_r=np.full(trace.theta_r.shape, np.radians(0.3)))
+    traces = material.traces | {"direct_three": small}
+    data = data_of("overview", dataclasses.replace(material, traces=traces))
+    assert np.isnan(data["theta_r_percent"]).all()
+    control = style.drawn(SPECS["fig00_overview"].draw, data, 6.0).axes[1]
+    legend = control.get_legend()
+    assert legend.get_texts()[1].get_text() == r"$\theta_r$ near 0"
+    assert legend.get_window_extent().y0 >= control.get_window_extent().y1
+
+
 def test_laws_that_follow_the_plan_stand_beside_the_same_that_plan_anew():
     material = case()[2]
     compared = ["stacked", "exact", "exact_track", "stacked_image_track"]

@@ -1,5 +1,7 @@
 """Figs. 4, 7 and 11 of [RH00], and the overview: paths and errors of the markers in both images."""
 
+from typing import Any
+
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
@@ -36,6 +38,8 @@ _SHOWN: dict[str, style.LineStyle] = {
 _IMAGE_WIDTH, _ERRORS_WIDTH = 3.7, 2.1  # inches, of the panels with images and of those next to them
 _ASPECTS = (0.45, 0.9)  # height over width of an image, within: an error panel has its height
 _PERCENT = (1e-2, 200.0)  # shown of a control error: below, noise of the calibration rules
+_NEAR_ZERO = np.radians(1.0)  # rad; a rotation that starts within it may be noise, which is no whole
+_LEGEND_ROOM = 20.0  # points between a panel and its title
 _BAND: style.LineStyle = {"color": style.ORANGE, "linewidth": 5.0, "alpha": 0.55, "solid_capstyle": "butt"}
 _CENTER: style.LineStyle = {"color": style.GREEN, "linewidth": 3.2}
 _ERRORS = (("tau_affine", r"$\tau$"), ("theta_r", r"$\theta_r$"), ("theta_p", r"$\theta_p$"))
@@ -208,6 +212,9 @@ def _data_overview(report_data: ReportData) -> Data:
         "period_s": np.array(direct.period),
         **{f"{name}_percent": np.abs(percent(getattr(direct, name))) for name, _ in _ERRORS},
     }
+    for name in ("theta_r", "theta_p"):
+        if abs(getattr(direct, name)[0]) < _NEAR_ZERO:
+            result[f"{name}_percent"] = np.full(len(direct.tau), np.nan)
     for law in _SHOWN:
         trace = report_data.traces[law]
         hidden = trace.self_occluded
@@ -244,7 +251,7 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
         for view in range(2)
     ]
     aspect = style.aspect(np.concatenate(panels), *_ASPECTS)
-    figure.set_figheight(2.0 * _IMAGE_WIDTH * aspect + 1.75)
+    figure.set_figheight(2.0 * _IMAGE_WIDTH * aspect + 1.75 + _LEGEND_ROOM / 72.0)
     axes = figure.subplots(2, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
     control, image = axes[:, 1]
     for view, (panel, name) in enumerate(zip(axes[:, 0], VIEWS, strict=True)):
@@ -258,14 +265,13 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
         style.image_axes(panel, f"{name} camera", panels[view])
     for index, (name, label) in enumerate(_ERRORS):
         values = data[f"{name}_percent"]
-        if np.isfinite(values).all():
-            t = data["period_s"] * np.arange(len(values))
-            control.plot(t, values, label=label, **style.curve(index))
+        t, shown = data["period_s"] * np.arange(len(values)), label + " near 0" * bool(np.isnan(values[0]))
+        control.plot(t, values, label=shown, **style.curve(index))
     style.log_scale(control)
-    control.set(
-        title=f"control errors, {title_of(DIRECT[0])}", ylabel="error (% of its start)", ylim=_PERCENT
-    )
-    control.legend(loc="upper right")
+    control.set(ylabel="error (% of its start)", ylim=_PERCENT)
+    control.set_title(f"control errors, {title_of(DIRECT[0])}", pad=_LEGEND_ROOM)
+    above: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(_ERRORS)}
+    control.legend(handlelength=1.5, columnspacing=1.0, **above)
     for law, line_style in _SHOWN.items():
         e, hidden = data[f"image_error_{law}"], data[f"hidden_{law}"].any(axis=1)
         t = data["period_s"] * np.arange(len(e))
