@@ -78,6 +78,15 @@ def pandas() -> Any:
     return found
 
 
+def xarray() -> Any:
+    """Return the package xarray. Raises InputError if it is not installed."""
+    try:
+        import xarray as found
+    except ImportError as error:
+        raise InputError("to_xarray needs xarray: pip install '.[tables]'") from error
+    return found
+
+
 def require_radians(
     name: str, q: FloatArray, joint_types: str, remedy: str = "convert with numpy.radians"
 ) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from projservo_cli.config import Config, load_config, shipped, to_yaml
 from projservo_cli.config.inputs import joints_of, trajectory_of
+from projservo_cli.display import Printed
 from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, law_and_mode, mode_in
@@ -242,7 +243,7 @@ def compilation() -> str:
     return "" if any(CACHE_FOLDER.rglob("*.nbi")) else "compiling kernels, once"
 
 
-class Experiment:
+class Experiment(Printed):
     """An experiment in a folder or in memory: its stages are made in order, each once, and resumed.
 
     Parameters
@@ -408,10 +409,10 @@ class Experiment:
         except InputError:
             return None
 
-    def __repr__(self) -> str:
+    def summary(self) -> dict[str, str]:
+        """Return a summary in words, by name."""
         place = "in memory" if self._in_memory else str(self._run.path)
-        made = ", ".join(self._run.results) or "nothing made yet"
-        return f"Experiment ({place}): {made}"
+        return {"path": place, "results": ", ".join(self._run.results) or "nothing made yet"}
 
 
 def scene_of(config: Config, calibration: Calibration) -> Scene:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from projservo_cli.calibration import predict, prediction_variance, residual_statistics
 from projservo_cli.calibration.prediction import error_factor, joint_derivative
-from projservo_cli.display import Displayable, Printed, numbers_in, require_radians
+from projservo_cli.display import Displayable, Printed, numbers_in, require_radians, xarray
 from projservo_cli.files import text_of
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.metric.frame import Metric, Scale, links
@@ -318,6 +318,20 @@ class MetricModel(Printed, Metric):
             As for ``in_frames_of``.
         """
         return kinematic_errors(self, _urdf_chain(urdf, tip).axes)
+
+    def to_xarray(self) -> Any:
+        """Return the arrays as a Dataset, with coordinates; an InputError without xarray."""
+        square, joints = ("row", "coordinate"), [f"q{i + 1}" for i in range(len(self.joint_types))]
+        return xarray().Dataset(
+            {
+                "K": (("view", "image_row", "image_column"), self.K, {"units": "px"}),
+                "lens": (("view", "lens_term"), self.lens, {"units": "px, k1 and k2 1"}),
+                "poses": (("view", *square), self.poses, {"units": "m"}),
+                "axes": (("joint", "screw"), self.axes, {"units": "w rad, v m, per rad or m"}),
+                "markers": (("marker", "axis"), self.markers, {"units": "m"}),
+            },
+            {"view": [*VIEWS], "joint": joints, "marker": self.marker, "axis": [*"xyz"]},
+        )
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""

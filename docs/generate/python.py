@@ -28,7 +28,7 @@ INTERFACE: dict[Any, tuple[str, ...]] = {
     ImageModel: ("predict", "jacobian", "score", "covariance", "metric", "project", "plot"),
     MetricModel: (
         *("pose", "pose_covariance", "position_std", "triangulate", "triangulation_covariance"),
-        *("covariance", "in_frames_of", "errors_of"),
+        *("covariance", "in_frames_of", "errors_of", "to_xarray"),
     ),
     api.plan: (),
     api.servo: (),

@@ -34,6 +34,7 @@ from projservo_cli.config.robot import (
     are_degrees,
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
+from projservo_cli.display import Printed
 from projservo_cli.laws import LAW_SPECS, LAWS, REGULATE, mode_in
 from projservo_cli.nominal import Number, Vector3
 from projservo_cli.records import LIMITS_MISSING, InputError
@@ -697,7 +698,7 @@ def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
         yield ("task",), f"{reason}, or calibration.reference"
 
 
-class Settings(Root):
+class Settings(Printed, Root):
     """Values of all sections, and what follows from them."""
 
     name: FolderName = Field(description="name of the run and of its folder; default: name of the file")
@@ -725,12 +726,15 @@ class Settings(Root):
             if wanted <= sound.keys():
                 yield from rule(**{name: sound[name] for name in wanted})
 
-    def __repr__(self) -> str:
-        parts = [
-            name for name in ("robot", "rig", "markers", "data", "task") if getattr(self, name) is not None
-        ]
-        plant = self.plant.use or "simulated"
-        return f"Config {self.name}: {', '.join(parts)}; plant {plant}; laws {', '.join(self.control.laws)}"
+    def summary(self) -> dict[str, str]:
+        """Return a summary in words, by name."""
+        sections = ("robot", "rig", "markers", "data", "task")
+        return {
+            "name": self.name,
+            "sections": ", ".join(name for name in sections if getattr(self, name) is not None),
+            "plant": self.plant.use or "simulated",
+            "laws": ", ".join(self.control.laws),
+        }
 
     @property
     def arm(self) -> RobotSettings | None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.display import Displayable, pandas
+from projservo_cli.display import Displayable, pandas, xarray
 from projservo_cli.records import InputError
 from projservo_cli.results import RunTrace
 from projservo_cli.store.sweep_table import Failure, SweepTable
@@ -92,11 +92,7 @@ class Study(Displayable):
 
     def to_xarray(self) -> Any:
         """Return the table as a Dataset over ``run``; an InputError without xarray."""
-        try:
-            import xarray
-        except ImportError as error:
-            raise InputError("to_xarray needs xarray: pip install '.[tables]'") from error
-        return xarray.Dataset(
+        return xarray().Dataset(
             {name: ("run", values) for name, values in self.table.items() if name != "run"},
             {"run": self.table["run"]},
         )
