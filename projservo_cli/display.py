@@ -103,11 +103,17 @@ def require_radians(
 
 
 def numbers_in(name: str, given: npt.ArrayLike, said: str) -> FloatArray:
-    """Convert to an array of numbers; an InputError for anything else, with the shape as it is ``said``."""
+    """Convert to an array of real numbers, NaN where masked; an InputError for anything else.
+
+    said : the shape, for messages.
+    """
     try:
-        return np.array(given, dtype=np.float64)
+        values: Any = np.ma.array(given)
+        if values.dtype.kind != "c":
+            return np.array(np.ma.filled(values.astype(np.float64), np.nan))
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: no array of numbers; expected shape {said}") from error
+    raise InputError(f"{name}: complex numbers; expected real ones of shape {said}")
 
 
 def checked_array(

@@ -81,7 +81,8 @@ class Observations(Displayable, Observation):
         Parameters
         ----------
         q : (K, n) joint readings, rad or m unless ``joint_unit`` says deg.
-        pixels : (K, 2, m, 2) raw pixels u, v of each marker in the left and the right image, NaN unseen.
+        pixels : (K, 2, m, 2) raw pixels u, v of each marker in the left and the right image, NaN or masked
+            where unseen.
         joint_types : one letter a joint, R or P; by default all R.
         joint_unit : ``deg`` or ``rad`` of revolute joints; by default rad, and readings beyond two turns are
             refused as a mistaken unit.
@@ -193,7 +194,7 @@ def _types_of(given: str | Sequence[str] | None, n: int | None = None) -> str | 
 
 
 def _numbers(name: str, given: Sequence[int] | None, count: int) -> npt.NDArray[np.int64]:
-    numbers = np.arange(count) if given is None else np.asarray(given)
+    numbers = np.arange(count) if given is None else _unmasked(given)
     if numbers.dtype.kind == "f" and (numbers == np.rint(numbers)).all():
         numbers = numbers.astype(np.int64)
     if numbers.shape != (count,) or numbers.dtype.kind not in "iu" or len(set(numbers.tolist())) < count:
@@ -205,10 +206,15 @@ def _text_of(table: Any) -> str:
     if hasattr(table, "to_csv"):
         return str(table.to_csv(index=False))
     if isinstance(table, Mapping):
-        return to_csv({name: or_empty(np.asarray(values)) for name, values in table.items()})
+        return to_csv({name: or_empty(_unmasked(values)) for name, values in table.items()})
     raise InputError(
         f"table: a {type(table).__name__}; expected a pandas table, a mapping of columns or a path"
     )
+
+
+def _unmasked(values: Any) -> npt.NDArray[Any]:
+    """A column, NaN where it is masked."""
+    return numbers_in("table", values, "(rows,)") if np.ma.is_masked(values) else np.asarray(values)
 
 
 def _read(text: str, joint_types: str | None, joint_unit: str | None) -> Observation:

@@ -20,6 +20,7 @@ from projservo_cli.observations import require_observations
 from projservo_cli.records import (
     MM,
     VIEWS,
+    BoolArray,
     Calibration,
     CrossValidation,
     FloatArray,
@@ -348,9 +349,13 @@ class MetricModel(Printed, Metric):
         return found
 
     def _readings(self, q: npt.ArrayLike) -> FloatArray:
-        readings = super()._readings(q)
+        readings = super()._readings(numbers_in("joint readings", q, f"(…, {len(self.joint_types)})"))
         require_radians("joint readings", readings, self.joint_types)
         return readings
+
+    @staticmethod
+    def _pixels(pixels: npt.ArrayLike) -> tuple[FloatArray, BoolArray, tuple[int, ...]]:
+        return Metric._pixels(numbers_in("pixels", pixels, "(…, 2, m, 2)"))
 
 
 def _urdf_chain(urdf: str | Path, tip: str | None) -> UrdfChain:

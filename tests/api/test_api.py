@@ -498,6 +498,8 @@ def test_what_does_not_fit_a_calibration_is_said_in_a_sentence(config, made, cal
         ({"q": np.zeros((3, 6))}, r"q of shape \(3, 6\): expected \(4, n\)"),
         ({"pixels": np.zeros((4, 3, 2))}, r"pixels of shape \(4, 3, 2\): expected \(K, 2, m, 2\)"),
         ({"pixels": "here"}, "pixels: no array of numbers"),
+        ({"pixels": np.ones((4, 2, 3, 2)) + 1j}, "pixels: complex numbers; expected real ones of shape"),
+        ({"q": np.ma.masked_equal(np.zeros((4, 6)), 0.0)}, "q: holds a number that is not finite"),
         (
             {"pixels": np.full((4, 2, 3, 2), np.inf)},
             r"marker 0 at pose 0, view 0 is at \(inf, inf\): ",
@@ -560,6 +562,22 @@ def test_arrays_tables_and_frames_hold_the_same(made, tmp_path):
         ps.Observations.from_frame(columns | {"q1": columns["q1"] + 90.0})
     with pytest.raises(ps.InputError, match="table: joint_unit 'degrees': give deg or rad"):
         ps.Observations.from_frame(columns, joint_unit="degrees")
+
+
+def test_what_is_masked_is_unseen(made):
+    def masked(values):
+        """Zeros below the mask, as a detector may leave them."""
+        return np.ma.masked_array(np.nan_to_num(values), np.isnan(values))
+
+    observations, calibration, _ = made
+    seen = observations.images.copy()
+    seen[::5, 0, 3] = seen[1::7, :, 2] = np.nan
+    known = ps.Observations.from_arrays(observations.q, seen)
+    alike(ps.Observations.from_arrays(observations.q, masked(seen)), known, Observation)
+    columns = {name: masked(values) for name, values in known.to_frame().items()}
+    alike(ps.Observations.from_frame(columns), known, Observation)
+    metric = calibration.metric(0.3, "cameras")
+    np.testing.assert_array_equal(metric.triangulate(masked(seen)), metric.triangulate(seen))
 
 
 def test_results_print_themselves_in_few_lines(config, made):
