@@ -231,6 +231,8 @@ def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
 def _stalled_by(run: _Outcome) -> str:
     """Return why the image error stopped falling: commands too slow to lower it, or a local minimum."""
     gains, window = run.scenario.gains, run.scenario.limits.stall_periods
+    if run.steps < window:
+        return "a local minimum"
     limited = float(np.median(run.log.factor[max(0, run.steps - window) : run.steps]))
     share = min(1.0, max(gains.gain, gains.gain_s) * gains.period * gains.scale * limited)
     if 1.0 - (1.0 - share) ** window > 2.0 * PLATEAU_FALL:
