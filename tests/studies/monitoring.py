@@ -419,7 +419,8 @@ def tell(rows, before):
                 new, old = np.median(np.array(both), axis=0)
                 print(f"    median of {len(both)} runs {new:.4g} mm, before {old:.4g}")
     for row in rows:
-        bad = row["judged"] in ("wrong", "two") or (row["cell"] == "sound" and row["exit"])
+        alarm = row["cell"] == "sound" and row["verdict"] in ("fault detected", "not started")
+        bad = row["judged"] in ("wrong", "two") or alarm
         if bad:
             print(f"    {row['cell']} {row['number']} {row['corners']} {row['level']}: {row['reason']}"[:260])
 
