@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame
-from projservo_cli.records import ByteArray, FloatArray, InputError, JointLimits, WorkFailed, in_unit
+from projservo_cli.records import VIEWS, ByteArray, FloatArray, InputError, JointLimits, WorkFailed, in_unit
 from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
@@ -22,6 +22,8 @@ STOP_S = 10.0
 # Share of a bound by which rounding may exceed it, and of a period by which an instant may be missed: the
 # time steps of a simulator seldom end where a command is due.
 _ROUND_OFF, _LATE = 1e-9, 0.1
+# Markers that no detector sees at one pixel: a class says so that they are unseen.
+_AT_ONE_PIXEL = 3
 
 
 class Reading(NamedTuple):
@@ -349,6 +351,14 @@ class PluginRobot:
         if np.isinf(s).any():
             raise WorkFailed(f"{self.name}: read() gave an infinite pixel: NaN stands for unseen")
         s[np.isnan(s).any(axis=2)] = np.nan
+        for view, one in zip(VIEWS, s, strict=True):
+            at, count = np.unique(one[np.isfinite(one[:, 0])], axis=0, return_counts=True)
+            if (count >= _AT_ONE_PIXEL).any():
+                u, v = at[np.argmax(count)]
+                raise WorkFailed(
+                    f"{self.name}: read() gave {count.max()} markers of the {view} view at the same pixel, "
+                    f"({u:g}, {v:g}): NaN stands for unseen"
+                )
         times = np.full(3, np.nan)
         for i, name in enumerate(("t_q", "t_left", "t_right")):
             if stamps[i] is not None:
@@ -377,11 +387,18 @@ class PluginRobot:
         sent = q if self._sent is None else self._sent
         # From the last set-point on, which after a pause was held: thinking took a period at most.
         step = bounds.limits.speed * max(0.0, due - max(self._due, self._shown[0] - bounds.period))
+        for i in np.flatnonzero(np.abs(q - sent) > 2.0 * bounds.lead + step).tolist():
+            at, there = (bounds.text(i, values[i]) for values in (q, sent))
+            return f"joint {i + 1} reads {at} where its set-point is {there}: check its unit and its encoder"
         allowed = {
             "beyond its limits": bounds.within_limits(q),
             "too far ahead of the reading": bounds.not_far_ahead(q),
-            # Back towards the reading it may jump: that shortens the path of the robot.
-            "too far from the last one": (np.minimum(sent, q) - step, np.maximum(sent, q) + step),
+            # Back towards the reading it may jump, which shortens the path of the robot, by what a robot
+            # may be behind: a reading that is farther away is wrong.
+            "too far from the last one": (
+                np.maximum(np.minimum(sent, q), sent - bounds.lead) - step,
+                np.minimum(np.maximum(sent, q), sent + bounds.lead) + step,
+            ),
         }
         slack = _ROUND_OFF * (1.0 + np.abs(target))
         for what, (low, high) in allowed.items():

@@ -31,7 +31,7 @@ class Scripted:
     """Answers as told; time passes in commands alone."""
 
     def __init__(self, answer=None):
-        self.s = np.zeros((2, 3, 2))
+        self.s = np.arange(12.0).reshape(2, 3, 2)
         self.answer = ((0.1, 0.2), self.s) if answer is None else answer
         self.sent, self.threads = [], {}
         self.stopped, self.closed = [], []
@@ -84,7 +84,7 @@ def test_sound_answers_are_copied_and_all_calls_come_from_one_thread():
         assert (q.dtype, t_q, sigma.shape) == (np.float64, 1.0, (2, 3))
         np.testing.assert_array_equal(t_view, [np.nan, 3.5])
         assert np.isnan(s[0, 1]).all()  # a marker is seen or not
-        assert robot.s[0, 1, 1] == 0.0
+        assert robot.s[0, 1, 1] == 3.0
         target = np.full(2, 0.04)
         foreign.command(target, np.ones(2), PERIOD)
         target[:] = 7.0
@@ -95,7 +95,7 @@ def test_sound_answers_are_copied_and_all_calls_come_from_one_thread():
     assert {*robot.threads} == {"open", "read", "command", "stop", "close"}
 
 
-S = np.zeros((2, 3, 2))
+S = np.arange(12.0).reshape(2, 3, 2)
 
 
 @pytest.mark.parametrize(
@@ -110,6 +110,7 @@ S = np.zeros((2, 3, 2))
         (np.zeros(2), r"gave ndarray: expected \(q, pixels\), perhaps with t_q, t_left"),
         ((np.zeros(2), S[:, :2]), r"gave pixels of shape \(2, 2, 2\), expected \(2, 3, 2\)"),
         ((np.zeros(2), S + np.inf), r"infinite pixel: NaN stands for unseen"),
+        ((np.zeros(2), 0.0 * S), r"3 markers of the left view at the same pixel, \(0, 0\): NaN stands"),
         ((np.zeros(2), S, np.nan), r"gave t_q as nan: must be finite"),
         ((np.zeros(2), S, None, "now"), r"gave t_left as str"),
         ((np.zeros(2), S, None, None, None, np.zeros((2, 3))), r"a sigma_px that is no positive number"),
@@ -178,6 +179,20 @@ def test_set_points_lead_the_reading_by_so_much_and_stay_within_limits():
         foreign.read()
         with pytest.raises(WorkFailed, match="too far from the last one"):
             foreign.command(np.array([0.1, 0.75]), np.zeros(2), robot.time + PERIOD)
+
+
+def test_a_reading_that_leaps_from_its_set_point_moves_nothing():
+    # Degrees all at once, or a byte that was altered: no law, and no way back, may send the robot there.
+    robot = Scripted(((0.1, 0.2), S))
+    with opened(robot) as foreign:
+        foreign.read()
+        foreign.command(np.array([0.12, 0.2]), np.zeros(2), PERIOD)
+        sent, robot.answer = list(robot.sent), ((5.7, 0.2), S)
+        foreign.read()
+        for target in (5.7, 0.12, 3.0):
+            with pytest.raises(WorkFailed, match=r"joint 1 reads 5.7 rad where its set-point is 0.12 rad"):
+                foreign.command(np.array([target, 0.2]), np.zeros(2), 2 * PERIOD)
+    assert robot.sent == sent
 
 
 def test_clocks_that_jump_or_stand_still_are_named():
