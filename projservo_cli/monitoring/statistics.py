@@ -675,7 +675,10 @@ def _greatest(spread: FloatArray, reduced: _Reduced, part: IntArray) -> float:
     own, other = reduced.normal[np.ix_(part, part)], spread[np.ix_(part, part)]
     size = np.sqrt(np.maximum(own.diagonal(), np.maximum(reduced.minimum[part], 1e-300)))
     unit = np.outer(size, size)
-    return float(eigh(other / unit, own / unit + _RANK * np.eye(len(part)), eigvals_only=True)[-1])
+    try:
+        return float(eigh(other / unit, own / unit + _RANK * np.eye(len(part)), eigvals_only=True)[-1])
+    except np.linalg.LinAlgError:  # of images so far off that rounding is left of a direction
+        return np.inf
 
 
 def relative_to_others(S: FloatArray, r: FloatArray) -> FloatArray:

@@ -22,6 +22,9 @@ STOP_S = 10.0
 # Share of a bound by which rounding may exceed it, and of a period by which an instant may be missed: the
 # time steps of a simulator seldom end where a command is due.
 _ROUND_OFF, _LATE = 1e-9, 0.1
+# A joint that is driven goes from reading to reading at so many times its speed limit, and by so much more
+# (rad or m), at most: one that falls or is pushed goes farther, or one whose reading is wrong.
+_SURGE, _LEAP = 3.0, 0.05
 # Markers that no detector sees at one pixel: a class says so that they are unseen.
 _AT_ONE_PIXEL = 3
 
@@ -139,6 +142,7 @@ class PluginRobot:
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
         self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
         self._last: Reading | None = None
+        self._earlier: Reading | None = None  # the one before the last
         self.frames: ByteArray | None = None  # (2, height, width) last seen, where the robot has them
         self._sent: FloatArray | None = None  # the last set-point (n,)
         self._due = -math.inf  # when it is to be there, s
@@ -159,7 +163,8 @@ class PluginRobot:
     def read(self) -> Reading:
         """Joints and pixels of one observation."""
         before, answer, frames = self._ask("read", self._reading)
-        self._last = self._checked(self._time(before), answer)
+        reading = self._checked(self._time(before), answer)
+        self._earlier, self._last = self._last, reading
         if frames is not None and not (
             isinstance(frames, np.ndarray)
             and frames.dtype == np.uint8
@@ -386,6 +391,8 @@ class PluginRobot:
         q = self._last.q
         sent = q if self._sent is None else self._sent
         # From the last set-point on, which after a pause was held: thinking took a period at most.
+        if self._sent is not None and (leap := self._leap(self._earlier, self._last)):
+            return leap
         step = bounds.limits.speed * max(0.0, due - max(self._due, self._shown[0] - bounds.period))
         for i in np.flatnonzero(np.abs(q - sent) > 2.0 * bounds.lead + step).tolist():
             at, there = (bounds.text(i, values[i]) for values in (q, sent))
@@ -408,6 +415,18 @@ class PluginRobot:
         for i in np.flatnonzero(np.abs(speed) > bounds.limits.speed * (1.0 + _ROUND_OFF)).tolist():
             at, most = (bounds.text(i, values[i]) for values in (speed, bounds.limits.speed))
             return f"the speed of joint {i + 1}, {at}/s, is beyond its limit of {most}/s"
+        return ""
+
+    def _leap(self, before: Reading | None, now: Reading) -> str:
+        """Return which joint read what it cannot have reached since the reading before; empty for none."""
+        if before is None:
+            return ""
+        seconds = max(now.t_q - before.t_q, self.bounds.period)
+        far = _SURGE * self.bounds.limits.speed * seconds + self.bounds.sag + _LEAP
+        for i in np.flatnonzero(np.abs(now.q - before.q) > far).tolist():
+            first, then = (self.bounds.text(i, one.q[i]) for one in (before, now))
+            what = f"joint {i + 1} read {first} and {then} within {seconds:.3g} s"
+            return f"{what}: check its encoder and unit, or what moved it"
         return ""
 
     def _numbers(self, what: str, answer: Any, shape: tuple[int, ...], *, finite: bool = False) -> FloatArray:
