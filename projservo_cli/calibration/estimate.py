@@ -30,7 +30,7 @@ from projservo_cli.calibration.projective import Projective, closed_form_operato
 from projservo_cli.calibration.quality import WEAK_NOISE, assess, cross_validate
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.geometry.lens import K1
-from projservo_cli.records import VIEWS, Calibration, Errors, InputError, Observation
+from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation
 
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
@@ -43,6 +43,11 @@ _DECISIVE_SHARE = 0.5
 _NO_LENS_TAIL = 0.01
 # Minimum share that a fit keeps of the motion of each joint and, if it rejects much, of the detections.
 _KEPT = 0.5
+# Poses in a row of which this share, and this number, are rejected at least where something changed.
+_NEARLY_ALL, _WRONG_RUN = 0.9, 5
+# Joints that are farther than this share of their range from the median have moved; so many poses in which
+# several did, and this share of them, are rejected at least where readings are in the wrong order.
+_MOVED, _WRONG_POSES, _WRONG_SHARE = 0.1, 3, 0.25
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
 _DOUBTED_RATIO = 1.15
 # Maximum held-out over predicted error of a fit that rejects much.
@@ -228,6 +233,7 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     solution, kept = whole.determined()
     try:
         refusal = expected.refusal(solution) or _describe_unmoved(solution)
+        refusal = refusal or _describe_change(solution) or _describe_order(solution)
         if refusal is not None:
             raise Misfit(refusal)
         found = Outliers.of(solution)
@@ -277,6 +283,50 @@ def _describe_unmoved(solution: Solution) -> str | None:
         return None
     i = int(np.argmax(short))
     return f"the fit rejects most motion of joint {i + 1}; check its readings and its type (R or P)"
+
+
+def _lost(solution: Solution) -> BoolArray:
+    """Whether a view (2, K) of a pose is mostly rejected."""
+    detections = solution.problem.detections
+    seen, used = np.zeros((2, 2, len(detections.q)))
+    for view in (0, 1):
+        np.add.at(seen[view], detections.pose_of, detections.seen[view])
+        np.add.at(used[view], detections.pose_of, solution.used[view])
+    return np.asarray(used < _KEPT * seen)
+
+
+def _describe_change(solution: Solution) -> str | None:
+    """Describe poses in a row, at the beginning or the end, that are nearly all rejected, or None."""
+    lost = _lost(solution)
+    views = [("", lost.all(axis=0)), *((f" in the {name} view", lost[v]) for v, name in enumerate(VIEWS))]
+    for where, gone in views:
+        for which, row in (("first", gone), ("last", gone[::-1])):
+            share = np.cumsum(row) / np.arange(1, len(row) + 1)
+            count = int(np.flatnonzero(row & (share >= _NEARLY_ALL)).max(initial=-1)) + 1
+            if max(_WRONG_RUN, _MUCH * len(row)) <= count < len(row):
+                return (
+                    f"the fit rejects nearly all of the {which} {count} poses{where}: a camera, the tool or "
+                    "the readings of the joints changed there; record again, or remove these poses"
+                )
+    return None
+
+
+def _describe_order(solution: Solution) -> str | None:
+    """Describe poses of several joints that are rejected where those of one are not, or None.
+
+    One joint at a time moves alike whichever column its readings are in: only together they show the order.
+    """
+    detections, lost = solution.problem.detections, _lost(solution).all(axis=0)
+    away = np.abs(detections.q - np.median(detections.q, axis=0)) > _MOVED * np.ptp(detections.q, axis=0)
+    several = away.sum(axis=1) > 1
+    wrong, alone = np.count_nonzero(several & lost), np.count_nonzero(~several & lost)
+    count, others = several.sum(), np.count_nonzero(~several)
+    if wrong < _WRONG_POSES or wrong < _WRONG_SHARE * count or alone * count > _WRONG_SHARE * wrong * others:
+        return None
+    return (
+        f"the fit rejects {wrong} of the {count} poses in which several joints move, and {alone} of the "
+        f"{others} others; check the order of the joints (q1, q2, ...) and the readings of these poses"
+    )
 
 
 def _contradiction(whole: Solution, solution: Solution, found: Outliers, epipolar: Epipolar) -> str:

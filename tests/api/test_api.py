@@ -173,6 +173,33 @@ def test_a_plan_takes_joints_pixels_and_what_was_taught(config, made, tmp_path):
     assert ps.plan(config, calibration, goal=joints).feasible
 
 
+@pytest.mark.parametrize(
+    ("changed", "what"),
+    [
+        (
+            lambda q, s: (q[:, [0, 1, 2, 3, 5, 4]], s),
+            r"rejects \d of the 9 poses in which several joints move",
+        ),
+        (
+            lambda q, s: (q, s + 12.0 * bumped(s, 20)),
+            "rejects nearly all of the first 20 poses in the right view",
+        ),
+    ],
+    ids=["exchanged joints", "a camera that was bumped"],
+)
+def test_what_agrees_in_parts_alone_is_not_usable(changed, what):
+    recorded = ps.simulate(ps.Config.load("ur5").replace({"calibration.random_poses": 10}))
+    with pytest.raises(ps.WorkFailed, match=what):
+        ps.calibrate(ps.Observations.from_arrays(*changed(recorded.q, recorded.images)))
+
+
+def bumped(images, count):
+    """Where v of the right view is, in the first poses."""
+    where = np.zeros_like(images)
+    where[:count, 1, :, 1] = 1.0
+    return where
+
+
 def test_a_run_has_the_start_and_goal_of_its_plan(config, made):
     _, calibration, plan = made
     start, goal = plan.q_start + 0.05, plan.q_start + 0.1
