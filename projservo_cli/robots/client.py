@@ -17,12 +17,14 @@ from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
-from projservo_cli.records import BoolArray, ByteArray, FloatArray, IntArray
+from projservo_cli.records import VIEWS, BoolArray, ByteArray, FloatArray, IntArray, WorkFailed
 from projservo_cli.robots.contract import PluginRobot
 from projservo_cli.robots.latency import DelayPrior, Delays, squares_by_joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.simulation.ideal import Plant, observe
 
+# Markers that no detector sees at one pixel.
+_AT_ONE_PIXEL = 3
 # Weight in the fit of a law that a sighting keeps which is off by itself.
 _REJECTED = 1e-3
 # A held arm that so long shows the same image to the bit, s, shows no other: a simulated one without noise.
@@ -162,6 +164,8 @@ class DrivenRobot:
     def observe(self) -> FloatArray:
         """Pixels (2, k, 2) of the markers shown as they will be at rest, NaN where unseen; all are tested."""
         reading, history, order = self.steered.reading, self.steered.history, self.known.order
+        if self.monitor is not None:
+            _require_apart(self.robot.name, reading.s)
         images = np.where((order < 0)[:, None], np.nan, reading.s[:, order])
         visible, stated = self.known.visible, None
         if reading.sigma_px is not None:
@@ -282,6 +286,18 @@ class DrivenRobot:
     def stop(self) -> None:
         """Come to rest."""
         self.robot.stop()
+
+
+def _require_apart(name: str, s: FloatArray) -> None:
+    """Raise WorkFailed for images (2, k, 2) with several markers at one pixel, as zeros for unseen ones."""
+    for view, one in zip(VIEWS, s, strict=True):
+        at, count = np.unique(one[np.isfinite(one[:, 0])], axis=0, return_counts=True)
+        if (count >= _AT_ONE_PIXEL).any():
+            u, v = at[np.argmax(count)]
+            raise WorkFailed(
+                f"{name}: read() gave {count.max()} markers of the {view} view at the same pixel, "
+                f"({u:g}, {v:g}): NaN stands for unseen"
+            )
 
 
 def weights(sigma: FloatArray, s: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame
-from projservo_cli.records import VIEWS, ByteArray, FloatArray, InputError, JointLimits, WorkFailed, in_unit
+from projservo_cli.records import ByteArray, FloatArray, InputError, JointLimits, WorkFailed, in_unit
 from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
@@ -25,8 +25,6 @@ _ROUND_OFF, _LATE = 1e-9, 0.1
 # A joint that is driven goes from reading to reading at so many times its speed limit, and by so much more
 # (rad or m), at most: one that falls or is pushed goes farther, or one whose reading is wrong.
 _SURGE, _LEAP = 3.0, 0.05
-# Markers that no detector sees at one pixel: a class says so that they are unseen.
-_AT_ONE_PIXEL = 3
 
 
 class Reading(NamedTuple):
@@ -356,14 +354,6 @@ class PluginRobot:
         if np.isinf(s).any():
             raise WorkFailed(f"{self.name}: read() gave an infinite pixel: NaN stands for unseen")
         s[np.isnan(s).any(axis=2)] = np.nan
-        for view, one in zip(VIEWS, s, strict=True):
-            at, count = np.unique(one[np.isfinite(one[:, 0])], axis=0, return_counts=True)
-            if (count >= _AT_ONE_PIXEL).any():
-                u, v = at[np.argmax(count)]
-                raise WorkFailed(
-                    f"{self.name}: read() gave {count.max()} markers of the {view} view at the same pixel, "
-                    f"({u:g}, {v:g}): NaN stands for unseen"
-                )
         times = np.full(3, np.nan)
         for i, name in enumerate(("t_q", "t_left", "t_right")):
             if stamps[i] is not None:
@@ -391,7 +381,7 @@ class PluginRobot:
         q = self._last.q
         sent = q if self._sent is None else self._sent
         # From the last set-point on, which after a pause was held: thinking took a period at most.
-        if self._sent is not None and (leap := self._leap(self._earlier, self._last)):
+        if self._sent is not None and (leap := self._leap(self._earlier, self._last, self._sent)):
             return leap
         step = bounds.limits.speed * max(0.0, due - max(self._due, self._shown[0] - bounds.period))
         for i in np.flatnonzero(np.abs(q - sent) > 2.0 * bounds.lead + step).tolist():
@@ -417,13 +407,17 @@ class PluginRobot:
             return f"the speed of joint {i + 1}, {at}/s, is beyond its limit of {most}/s"
         return ""
 
-    def _leap(self, before: Reading | None, now: Reading) -> str:
-        """Return which joint read what it cannot have reached since the reading before; empty for none."""
+    def _leap(self, before: Reading | None, now: Reading, sent: FloatArray) -> str:
+        """Return which joint read what it cannot have reached since the reading before; empty for none.
+
+        Towards the set-point (n,) it may leap: a reading that stood still for a while does.
+        """
         if before is None:
             return ""
         seconds = max(now.t_q - before.t_q, self.bounds.period)
         far = _SURGE * self.bounds.limits.speed * seconds + self.bounds.sag + _LEAP
-        for i in np.flatnonzero(np.abs(now.q - before.q) > far).tolist():
+        leaps = (np.abs(now.q - before.q) > far) & (np.abs(now.q - sent) > np.abs(before.q - sent))
+        for i in np.flatnonzero(leaps).tolist():
             first, then = (self.bounds.text(i, one.q[i]) for one in (before, now))
             what = f"joint {i + 1} read {first} and {then} within {seconds:.3g} s"
             return f"{what}: check its encoder and unit, or what moved it"

@@ -110,7 +110,6 @@ S = np.arange(12.0).reshape(2, 3, 2)
         (np.zeros(2), r"gave ndarray: expected \(q, pixels\), perhaps with t_q, t_left"),
         ((np.zeros(2), S[:, :2]), r"gave pixels of shape \(2, 2, 2\), expected \(2, 3, 2\)"),
         ((np.zeros(2), S + np.inf), r"infinite pixel: NaN stands for unseen"),
-        ((np.zeros(2), 0.0 * S), r"3 markers of the left view at the same pixel, \(0, 0\): NaN stands"),
         ((np.zeros(2), S, np.nan), r"gave t_q as nan: must be finite"),
         ((np.zeros(2), S, None, "now"), r"gave t_left as str"),
         ((np.zeros(2), S, None, None, None, np.zeros((2, 3))), r"a sigma_px that is no positive number"),

@@ -107,6 +107,7 @@ def test_speed_scale_scales_every_command(servo):
         ("raises", 70, r"read() failed: OSError: camera 2 is unplugged (robots.py:"),
         ("command raises", 70, "command() failed: RuntimeError: protective stop"),
         ("hangs", 70, "read() did not return within 0.5 s"),
+        ("zeros", 70, "markers of the left view at the same pixel, (0, 0): NaN stands for unseen"),
     ],
 )
 def test_a_robot_that_fails_ends_the_run_in_one_line(servo, fault, after, message):
