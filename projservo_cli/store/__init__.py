@@ -54,6 +54,7 @@ _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeE
 _STORED = {"float64": ("f", 8), "int64": ("i", 8), "bool": ("i", 1), "uint8": ("u", 1)}
 _Record = TypeVar("_Record", Observation, Calibration, Plan)
 _SCHEMA = "projservo run"  # value of the attribute ``schema``
+SWEEP = "sweep.h5"  # name of the table of a sweep
 SERVO = "servo/"  # prefix of the groups of laws
 # Types of the records of results, by name; with a calibration the others are optional.
 _RECORDS: dict[str, dict[str, type]] = {
@@ -166,9 +167,7 @@ def load(target: Path | str) -> Run:
     """Read a run file. Raises InputError if it is missing, changed, or of another version."""
     path = run_path(target)
     if not path.is_file():
-        from projservo_cli.store.sweep_table import TABLE
-
-        if (path.parent / TABLE).is_file():
+        if (path.parent / SWEEP).is_file():
             raise InputError(
                 f"{path.parent}: holds a sweep and no run; see projservo report {path.parent}, or repeat a "
                 f"run of it: projservo servo --from {path.parent}:INDEX"

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from projservo_cli.records import SIZES, InputError, Trace
 from projservo_cli.store import (
     SCHEMA_VERSION,
+    SWEEP,
     attribute,
     encoded,
     labelled,
@@ -27,7 +28,7 @@ if typing.TYPE_CHECKING:
 
 _SCHEMA = "projservo sweep"
 _AGAIN = "delete it and run the sweep again"
-TABLE = "sweep.h5"
+TABLE = SWEEP
 _ROWS = 16_384  # of a chunk of the file
 _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 _TRACES = "traces"
