@@ -13,6 +13,8 @@ from projservo_cli.records import MM, FloatArray, InputError, IntArray, WorkFail
 _UNKNOWNS = 10
 # Minimum number of positions that a fit takes, three coordinates each, with some to spare.
 _MIN_POSITIONS = 6
+# Axes of a mirrored frame; it is taken for that of the instrument where it leaves less than this of χ².
+_MIRROR, _MIRRORED = np.array([1.0, 1.0, -1.0]), 0.01
 # Number of parts that a table is divided into when it is fitted itself.
 _PARTS = 5
 
@@ -48,26 +50,37 @@ class _Link(NamedTuple):
 def _fit_link(metric: Metric, table: Positions) -> _Link:
     """Fit scale, pose and point on the tool by least squares.
 
-    Raises WorkFailed if the table does not determine them.
+    Raises WorkFailed if the table does not determine them, or is of a frame that is left-handed.
     """
     T = metric.pose(table.q)
-    t = T[:, :3, 3]
-    centered, target = t - t.mean(axis=0), table.xyz - table.xyz.mean(axis=0)
-    U, s, Vt = np.linalg.svd(target.T @ centered)  # Umeyama 1991, with the point at the tool's origin
-    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    scale = float(np.trace(np.diag(s) @ turn) / (centered**2).sum())
-    rotation = U @ turn @ Vt
-    shift = table.xyz.mean(axis=0) - scale * rotation @ t.mean(axis=0)
-    start = np.r_[np.log(scale), Rotation.from_matrix(rotation).as_rotvec(), shift, np.zeros(3)]
-
-    def residual(x: FloatArray) -> FloatArray:
-        return np.asarray((_Link(x).positions(T) - table.xyz).ravel())
-
-    found = least_squares(residual, start, x_scale="jac")
+    found, mirrored = _least_squares(T, table.xyz), _least_squares(T, table.xyz * _MIRROR)
+    if mirrored.cost < _MIRRORED * found.cost:
+        rms = (MM * np.sqrt(2.0 * one.cost / len(table.q)) for one in (found, mirrored))
+        raise WorkFailed(
+            "the frame of the instrument is left-handed: positions are {:.3g} mm rms off, with an axis "
+            "negated {:.3g} mm; negate x, y or z in the table".format(*rms)
+        )
     J = np.asarray(found.jac)
     if np.linalg.matrix_rank(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), tol=1e-6) < _UNKNOWNS:
         raise WorkFailed("the positions do not determine the point on the tool: turn the tool about two axes")
     return _Link(found.x)
+
+
+def _least_squares(T: FloatArray, xyz: FloatArray) -> Any:
+    """Fit of a link to positions (K, 3) at poses (K, 4, 4) of the tool, m."""
+    t = T[:, :3, 3]
+    centered, target = t - t.mean(axis=0), xyz - xyz.mean(axis=0)
+    U, s, Vt = np.linalg.svd(target.T @ centered)  # Umeyama 1991, with the point at the tool's origin
+    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    scale = float(np.trace(np.diag(s) @ turn) / (centered**2).sum())
+    rotation = U @ turn @ Vt
+    shift = xyz.mean(axis=0) - scale * rotation @ t.mean(axis=0)
+    start = np.r_[np.log(scale), Rotation.from_matrix(rotation).as_rotvec(), shift, np.zeros(3)]
+
+    def residual(x: FloatArray) -> FloatArray:
+        return np.asarray((_Link(x).positions(T) - xyz).ravel())
+
+    return least_squares(residual, start, x_scale="jac")
 
 
 def _jacobian(T: FloatArray, link: _Link) -> FloatArray:

@@ -14,7 +14,7 @@ import pytest
 from projservo_cli import cli, store
 from projservo_cli.calibration import calibrate, residual_statistics
 from projservo_cli.metric.position_error import position_errors
-from projservo_cli.records import InputError
+from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.results import ImageModel
 from projservo_cli.store.tables import read_positions, read_table
 from tests.calibration import damage
@@ -179,3 +179,6 @@ def test_the_metric_agrees_with_a_laser_tracker(shared_data, tmp_path):
     assert position_errors(metric, train)["length_m"] == pytest.approx(by_images["length_m"], rel=1e-3)
     with pytest.raises(InputError, match="is in both tables"):
         position_errors(metric, test, test)
+    mirrored = train._replace(xyz=train.xyz * [1.0, -1.0, 1.0])
+    with pytest.raises(WorkFailed, match="the frame of the instrument is left-handed"):
+        position_errors(metric, test, mirrored)
