@@ -207,10 +207,13 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     """
     joints = inputs.joints.joints(calibration.joint_types, calibration)
     start = Readings(tuple(np.clip(taught.q, joints.limits.lower, joints.limits.upper).tolist()), "rad")
+    limits = np.concatenate([joints.limits.lower, joints.limits.upper, joints.limits.speed])
+    # No path is searched for joints whose limits are not known: the arm stands at the goal as it is.
+    profile = "joint_space" if np.isfinite(limits).all() else "linear"
     asked = replace(
         inputs,
         task=ReachingTask(start, None, Goal(images=taught.images)),
-        trajectory=inputs.trajectory._replace(profile="joint_space", keep_out=()),
+        trajectory=inputs.trajectory._replace(profile=profile, keep_out=()),
     )
     try:
         plan = planning.run(asked, calibration)

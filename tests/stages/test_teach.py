@@ -93,6 +93,17 @@ def test_what_does_not_fit_the_calibration_is_told(calibration):
         require_face(config(), taught)
 
 
+def test_a_goal_is_taught_where_limits_of_joints_are_not_known(calibration):
+    # A robot of which the configuration gives no limits; no path is searched, but the images are tested.
+    taught, plain = teach(config(), 10, AT), ("robot=null", "rig=null", "plant.use=tests.robots.robots:Sound")
+    numbers = f"markers={{numbers: {calibration.marker.tolist()}, face: [0, 1, 2, 3]}}"
+    ends = ("task.goal={joints: {joints: [0, 0, 0, 0, 0], unit: deg}}",)
+    given = config(*plain, numbers, *ends, "data={table: none.csv, joints: RRRRR}")
+    assert checked(given, calibration, taught).reached
+    taught.s[1] += [0.0, 8.0]
+    assert "the right camera was moved" in checked(given, calibration, taught).reason
+
+
 @pytest.mark.volume
 def test_a_goal_taught_after_a_camera_was_moved_names_the_camera(calibration):
     taught = teach(config(), 10, AT)
