@@ -23,6 +23,7 @@ from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.records import (
     MM,
+    VIEWS,
     Calibration,
     FloatArray,
     InputError,
@@ -278,7 +279,18 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
     obstruction = ""
     if run.driven is not None and run.verdict != "converged":
         obstruction = obstruction_of(run.driven.robot.robot)
-    return "; ".join(filter(None, (reasons[run.verdict], obstruction)))
+    blind = "" if run.verdict == "converged" else _blind_view(log.s[: steps + 1], limits.stall_periods)
+    return "; ".join(filter(None, (reasons[run.verdict], blind, obstruction)))
+
+
+def _blind_view(s: FloatArray, window: int) -> str:
+    """Say which camera showed no marker in the last images (k, 2, m, 2), and since when; else empty."""
+    for view, name in enumerate(VIEWS):
+        steps = np.flatnonzero(np.isfinite(s[:, view, :, 0]).any(axis=1))
+        last = int(steps[-1]) if steps.size else -1
+        if len(s) - last > window:
+            return f"the {name} camera has shown no marker of the face since step {last + 1}: check it"
+    return ""
 
 
 class Given(NamedTuple):

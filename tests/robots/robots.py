@@ -83,6 +83,8 @@ class Faulty(Sound):
             s[0] += [2.0, -2.5]
         if self.fault == "lost" or (self.fault == "lost for a while" and self.count < self.after + 10):
             s[:] = np.nan
+        if self.fault == "blind":
+            s[0] = np.nan
         if self.fault == "zeros":
             s[0] = 0.0
         if self.fault == "raises":

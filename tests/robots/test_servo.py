@@ -130,6 +130,13 @@ def test_a_robot_that_fails_ends_the_run_in_one_line(servo, fault, after, messag
     assert np.isfinite(trace.s[-1]).all() == fault.startswith("command")
 
 
+def test_a_camera_that_shows_nothing_any_more_is_named(servo):
+    answer = servo(*faulty("blind", 80), "--set", "stop.max_steps=60", "--json", law="exact")
+    (told,) = answer.json["laws"]
+    assert told["verdict"] != "converged"
+    assert "the left camera has shown no marker of the face since step" in told["reason"]
+
+
 def test_a_joint_that_is_blocked_is_named_while_the_run_goes_on(servo):
     answer = servo(*faulty("blocked", 80), "--json", law="exact")
     (told,) = answer.json["laws"]
