@@ -233,7 +233,9 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     solution, kept = whole.determined()
     try:
         refusal = expected.refusal(solution) or _describe_unmoved(solution)
-        refusal = refusal or _describe_change(solution) or _describe_order(solution)
+        if refusal is None:
+            rejected = _rejected_views(solution)
+            refusal = _describe_change(rejected) or _describe_order(solution, rejected)
         if refusal is not None:
             raise Misfit(refusal)
         found = Outliers.of(solution)
@@ -285,7 +287,7 @@ def _describe_unmoved(solution: Solution) -> str | None:
     return f"the fit rejects most motion of joint {i + 1}; check its readings and its type (R or P)"
 
 
-def _lost(solution: Solution) -> BoolArray:
+def _rejected_views(solution: Solution) -> BoolArray:
     """Whether a view (2, K) of a pose is mostly rejected."""
     detections = solution.problem.detections
     seen, used = np.zeros((2, 2, len(detections.q)))
@@ -295,10 +297,15 @@ def _lost(solution: Solution) -> BoolArray:
     return np.asarray(used < _KEPT * seen)
 
 
-def _describe_change(solution: Solution) -> str | None:
-    """Describe poses in a row, at the beginning or the end, that are nearly all rejected, or None."""
-    lost = _lost(solution)
-    views = [("", lost.all(axis=0)), *((f" in the {name} view", lost[v]) for v, name in enumerate(VIEWS))]
+def _describe_change(rejected: BoolArray) -> str | None:
+    """Describe poses in a row, at the beginning or the end, that are nearly all rejected, or None.
+
+    rejected : (2, K) views of poses that mostly are.
+    """
+    views = [
+        ("", rejected.all(axis=0)),
+        *((f" in the {name} view", rejected[v]) for v, name in enumerate(VIEWS)),
+    ]
     for where, gone in views:
         for which, row in (("first", gone), ("last", gone[::-1])):
             share = np.cumsum(row) / np.arange(1, len(row) + 1)
@@ -311,12 +318,13 @@ def _describe_change(solution: Solution) -> str | None:
     return None
 
 
-def _describe_order(solution: Solution) -> str | None:
+def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:
     """Describe poses of several joints that are rejected where those of one are not, or None.
 
     One joint at a time moves alike whichever column its readings are in: only together they show the order.
+    rejected : (2, K) views of poses that mostly are.
     """
-    detections, lost = solution.problem.detections, _lost(solution).all(axis=0)
+    detections, lost = solution.problem.detections, rejected.all(axis=0)
     away = np.abs(detections.q - np.median(detections.q, axis=0)) > _MOVED * np.ptp(detections.q, axis=0)
     several = away.sum(axis=1) > 1
     wrong, alone = np.count_nonzero(several & lost), np.count_nonzero(~several & lost)

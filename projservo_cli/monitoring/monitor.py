@@ -471,15 +471,17 @@ def detected_fault(
         return monitor.give_up()
 
     fault = fault_of(pixels)
+    if not fault:
+        return ""
     off, tags = pixels - predict(calibration, q[None])[0], calibration.marker // CORNERS
-    doubtful = fault
     for _ in range(len(np.unique(tags[np.isfinite(off).any(axis=(0, 2))])) // 2):
         tag = _off_alone(off, calibration.marker)
-        if not doubtful or not tag.any():
+        if not tag.any():
             break
         off, pixels = (np.where(tag[:, None], np.nan, part) for part in (off, pixels))
-        doubtful = fault_of(pixels)
-    return fault if doubtful else ""
+        if not fault_of(pixels):
+            return ""
+    return fault
 
 
 def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:

@@ -137,7 +137,8 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     # What fewer joints cannot show is refused with the plan.
     if images is None or (images.joints is None and len(calibration.joint_types) < COORDINATES):
         return
-    numbers, seen = np.array([*images.pixels()]), np.swapaxes(np.array([*images.pixels().values()]), 0, 1)
+    pixels = images.pixels()
+    numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
     sigma = 0.0
     if images.joints is not None:
         q, advice = images.joints.values(calibration.joint_types), "teach it again"

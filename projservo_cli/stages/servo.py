@@ -234,7 +234,7 @@ def _stalled_by(run: _Outcome) -> str:
     gains, window = run.scenario.gains, run.scenario.limits.stall_periods
     if run.steps < window:
         return "a local minimum"
-    limited = float(np.median(run.log.factor[max(0, run.steps - window) : run.steps]))
+    limited = float(np.median(run.log.factor[run.steps - window : run.steps]))
     share = min(1.0, max(gains.gain, gains.gain_s) * gains.period * gains.scale * limited)
     if 1.0 - (1.0 - share) ** window > 2.0 * PLATEAU_FALL:
         return "a local minimum"
