@@ -180,6 +180,8 @@ def _reported_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArr
 
 # Maximum residual of a body that agrees with its calibration, over the noise, px.
 _AGREES, _LEAST_NOISE_PX = 4.0, 0.01
+# Joints that moved by less in the steps in which an error must fall hardly did, rad or m.
+_HARDLY = 0.01
 # A plan is of a task where its start, rad or m, and its goal images, px, are the same but for rounding and
 # another calibration of the same rig.
 _SAME_START, _SAME_GOAL_PX = 1e-6, 10.0
@@ -230,13 +232,17 @@ def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
 
 
 def _stalled_by(run: _Outcome) -> str:
-    """Return why the image error stopped falling: commands too slow to lower it, or a local minimum."""
+    """Return why the image error stopped falling: commands too slow to lower it, or a local minimum.
+
+    Joints that move on at their limits, as a law asks of them near a singularity, are not slow.
+    """
     gains, window = run.scenario.gains, run.scenario.limits.stall_periods
     if run.steps < window:
         return "a local minimum"
     limited = float(np.median(run.log.factor[run.steps - window : run.steps]))
     share = min(1.0, max(gains.gain, gains.gain_s) * gains.period * gains.scale * limited)
-    if 1.0 - (1.0 - share) ** window > 2.0 * PLATEAU_FALL:
+    moved = np.abs(np.diff(run.log.read[run.steps - window : run.steps + 1], axis=0)).sum(axis=0).max()
+    if 1.0 - (1.0 - share) ** window > 2.0 * PLATEAU_FALL or moved > _HARDLY:
         return "a local minimum"
     return (
         f"commands are too slow, {share:.2g} of the way in a period; raise plant.speed_scale, the limits of "
