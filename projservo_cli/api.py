@@ -191,7 +191,7 @@ def calibrate(
     ----------
     observations : of ``simulate``, ``record``, or of your arrays and tables.
     method : ``bundle_adjustment`` (maximum likelihood) or ``closed_form`` (the paper's closed forms).
-    lens : whether to estimate two coefficients of radial distortion a camera.
+    lens : whether to estimate radial distortion: two coefficients a camera, and its centre where it shows.
     init : JSON file of a robot and rig known beforehand, tried first as a start.
     cross_validate : parts into which poses are divided to predict each from the others; the held-out errors
         are in ``cross_validation``.

@@ -231,8 +231,8 @@ class Calibration:
     # The covariance of all these, as ``Errors`` says; of a method without one they are not finite.
     sqrt_cov_shared: FloatArray = _array(
         "parameter error",
-        about="square root of the covariance of P.ravel(), H_hat_0.ravel() and, if estimated, k1, k2 of "
-        "both lenses, up to the gauge",
+        about="square root of the covariance of P.ravel(), H_hat_0.ravel() and, if estimated, k1, k2 and "
+        "image centre u, v of both lenses, up to the gauge",
     )
     sqrt_cov_marker: FloatArray = _array(
         "marker coordinate error", about="square root of the covariance of M by the same errors"
@@ -328,6 +328,13 @@ class Calibration:
     def errors(self) -> Errors:
         """Errors of P, H_hat_0, lenses and M, in this order."""
         return Errors(self.sqrt_cov_shared, self.sqrt_cov_marker, self.sqrt_cov_own)
+
+    @property
+    def lens_terms(self) -> int:
+        """Number of estimated terms of each lens: 0, k1 and k2, or those and the image centre u, v."""
+        if self.lens is None:
+            return 0
+        return (len(self.sqrt_cov_shared) - self.P.size - self.H_hat_0.size) // 2
 
     @property
     def has_covariance(self) -> bool:

@@ -24,8 +24,8 @@ from scipy.linalg import expm, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
 from projservo_cli.calibration.detections import RAYLEIGH, Detections, per_block
-from projservo_cli.calibration.prediction import CAMERA, LENS, Parameters, image_points
-from projservo_cli.geometry.lens import K1, distort
+from projservo_cli.calibration.prediction import CAMERA, Parameters, image_points
+from projservo_cli.geometry.lens import TERMS, distort
 from projservo_cli.geometry.rigid import cross_matrix
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray
 
@@ -84,13 +84,13 @@ class LeastSquares:
     tau: FloatArray | None = None
 
     @classmethod
-    def of(cls, detections: Detections, q_reference: FloatArray, lens: bool = False) -> "LeastSquares":
+    def of(cls, detections: Detections, q_reference: FloatArray, lens_terms: int = 0) -> "LeastSquares":
         """Problem of fitting detections about the reference joints (n,), rad or m.
 
-        12 parameters a camera, 4 a revolute and 2 a prismatic joint, 3 a marker, 2 a lens.
+        12 parameters a camera, 4 a revolute and 2 a prismatic joint, 3 a marker, ``lens_terms`` a lens.
         """
         joint = 2 * CAMERA + np.concatenate([[0], np.cumsum(np.where(detections.prismatic, 2, 4))])
-        count = LENS if lens else 0
+        count = lens_terms
         shared = int(joint[-1]) + 2 * count
         view = np.arange(2)[:, None]
         parts = (
@@ -117,6 +117,11 @@ class LeastSquares:
         return dataclasses.replace(self, tau=tau)
 
     @property
+    def lens_terms(self) -> int:
+        """Number of parameters of each lens."""
+        return int(self.shared - self.joint[-1]) // 2
+
+    @property
     def by_pose(self) -> bool:
         """Whether joint offsets are eliminated pose by pose, as they outnumber coordinates of markers."""
         return self.tau is not None and self.size - self.shared < self.q.size
@@ -128,7 +133,7 @@ class LeastSquares:
     def of_markers(self, keep: BoolArray) -> "LeastSquares":
         """Select markers (m,)."""
         smaller = LeastSquares.of(
-            self.detections.of_markers(keep), self.q_reference, self.shared > self.joint[-1]
+            self.detections.of_markers(keep), self.q_reference, self.lens_terms
         )
         return smaller.with_noise(self.tau)
 
@@ -160,7 +165,7 @@ class LeastSquares:
             near, far = (D[k] @ (Y[k] @ turn).reshape(-1, 4, len(B)) for k in (i, i + 1))
             blocks.append(near - far)
         if by_lens is not None:
-            blocks.append(by_lens)
+            blocks.append(by_lens[..., : self.lens_terms])
         blocks.append(D[-1][..., :3])
         return np.concatenate(blocks, axis=3) * detections.weight[..., None, None]
 
@@ -192,12 +197,13 @@ class LeastSquares:
         lens = params.lens
         if lens is not None:
             lens = lens.copy()
-            lens[:, K1:] += x[self.joint[-1] : self.shared].reshape(2, LENS)
+            terms = list(TERMS[: self.lens_terms])
+            lens[:, terms] += x[self.joint[-1] : self.shared].reshape(2, -1)
         offsets = params.offsets
         if self.tau is not None and further.size:
             offsets = (0.0 if offsets is None else offsets) + self.tau * further.reshape(self.q.shape)
         P = params.P + x[: 2 * CAMERA].reshape(2, 3, 4)
-        return Parameters(P, H_hat, params.prismatic, M, lens, offsets)
+        return Parameters(P, H_hat, params.prismatic, M, lens, offsets, self.lens_terms)
 
     def gauge(self, params: Parameters) -> FloatArray:
         """Unit directions (size, g) of the parameters that change no image.

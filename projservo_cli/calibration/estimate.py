@@ -26,6 +26,7 @@ from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained
+from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, assess, cross_validate
 from projservo_cli.calibration.time_offset import with_time_offset
@@ -98,7 +99,8 @@ def calibrate(
     source : ``simulated`` (χ² decides against ``sigma_px``) or ``recorded``.
     image_size : width and height, px, for the start of the search; None takes the extent of the data.
     seed : seed of the random starts.
-    lens : whether to estimate two coefficients of radial distortion a camera, about the image centre.
+    lens : whether to estimate two coefficients of radial distortion a camera, about the image centre or,
+        where the images show another one, about that.
     init : robot and rig that ``bundle_adjustment`` tries first as a start; a search follows if that fails.
     joint_noise : standard deviation of joint readings, rad (prismatic × 0.3 m/rad), for
         ``bundle_adjustment``; None estimates it, and takes 0 unless the images show it.
@@ -368,12 +370,12 @@ def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tupl
         if share == 0.0:
             return ()
         return (f"lens distortion would explain {100.0 * share:.0f} % of the squared residuals: try --lens",)
-    k = calibration.lens[:, K1:].ravel()
-    of_lenses = calibration.sqrt_cov_shared[-k.size :]
+    k, terms = calibration.lens[:, K1:].ravel(), calibration.lens_terms
+    of_lenses = calibration.sqrt_cov_shared[-2 * terms :].reshape(2, terms, -1)[:, :LENS].reshape(k.size, -1)
     statistic = k @ np.linalg.solve(of_lenses @ of_lenses.T, k)
     if statistic < chdtri(k.size, _NO_LENS_TAIL):
         return ("the images show no lens distortion: omit --lens",)
-    if not centered:
+    if terms == LENS and not centered:
         return (
             "the lens distortion is centred on the region where markers were seen: give --image-size to "
             "centre it on the image",

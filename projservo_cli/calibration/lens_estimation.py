@@ -10,7 +10,7 @@ from projservo_cli.calibration.detections import MAX_JUDGED, Detections
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import Solution, fit_from
 from projservo_cli.calibration.initialization import Search
-from projservo_cli.calibration.prediction import LENS
+from projservo_cli.calibration.prediction import LENS, Parameters
 from projservo_cli.geometry.lens import before_fold, undistort
 from projservo_cli.records import FloatArray, WorkFailed
 
@@ -23,22 +23,28 @@ _MIN_CHI2 = 1e-20
 
 
 def share_explained(solution: Solution, frame: ImageFrame) -> float:
-    """Share of the squared residuals that a lens would explain; zero with a lens, or if not significant.
-
-    A score test needs no fit: the scores of k1 and k2, orthogonal to the other parameters, give the gain;
-    C. R. Rao, "Large sample tests of statistical hypotheses concerning several parameters", 1948. Errors of
-    a pose's joint readings move all of its images alike, so poses, not detections, are independent draws:
-    H. Hotelling's test of 1931 that the scores of the poses have no mean.
-    """
+    """Share of the squared residuals that a lens would explain; zero with a lens, or if not significant."""
     if solution.params.lens is not None:
         return 0.0
-    solution = solution.thinned(MAX_JUDGED)
+    few = solution.thinned(MAX_JUDGED)
+    share = _share(few, dataclasses.replace(few.params, lens=_undistorted(frame)), LENS)
+    return share if share >= _MIN_SHARE else 0.0
+
+
+def _share(solution: Solution, params: Parameters, terms: int) -> float:
+    """Share of the squared residuals that the last two terms of both lenses explain; zero if by chance.
+
+    A score test needs no fit: the scores, orthogonal to the other parameters, give the gain; C. R. Rao,
+    "Large sample tests of statistical hypotheses concerning several parameters", 1948. Errors of a pose's
+    joint readings move all of its images alike, so poses, not detections, are independent draws: H.
+    Hotelling's test of 1931 that the scores of the poses have no mean.
+    """
     detections = solution.problem.detections
     poses = np.unique(detections.pose_of[solution.used.any(axis=0)])
     K, d = poses.size, 2 * LENS
     if d + 1 >= K:
         return 0.0
-    columns = _cleared_columns(solution, frame)
+    columns = _cleared_columns(solution, params, terms)
     left = solution.problem.whitened(solution.params, solution.raw.reshape(-1, 1), solution.used)
     scores = (columns * left.reshape(solution.raw.shape)).sum(axis=(1, 3))
     by_pose = np.stack([np.bincount(detections.pose_of, score)[poses] for score in scores])
@@ -47,7 +53,7 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
     share = float(total @ np.linalg.lstsq(flat @ flat.T, total)[0]) / max(solution.chi2, _MIN_CHI2)
     square = float(total @ np.linalg.lstsq(K * np.cov(by_pose), total)[0])
     chance = float(fdtri(d, K - d, 1.0 - _TAIL)) * d * (K - 1) / (K - d)
-    return share if square > chance and share >= _MIN_SHARE else 0.0
+    return share if square > chance else 0.0
 
 
 def _undistorted(frame: ImageFrame) -> FloatArray:
@@ -55,15 +61,14 @@ def _undistorted(frame: ImageFrame) -> FloatArray:
     return np.concatenate([frame.center, 0.5 * frame.size[:, None], np.zeros((2, LENS))], axis=1)
 
 
-def _cleared_columns(solution: Solution, frame: ImageFrame) -> FloatArray:
-    """Changes of the images by k1, k2 of both views (4, 2, N, 2), orthogonal to the other parameters."""
-    exact = LeastSquares.of(solution.problem.detections, solution.problem.q_reference, lens=True)
+def _cleared_columns(solution: Solution, params: Parameters, terms: int) -> FloatArray:
+    """Changes of the images by the last two terms of both lenses (4, 2, N, 2), orthogonal to all others."""
+    exact = LeastSquares.of(solution.problem.detections, solution.problem.q_reference, terms)
     problem = exact.with_noise(solution.problem.tau)
-    params = dataclasses.replace(solution.params, lens=_undistorted(frame))
     J = problem.whitened(params, problem.dense(problem.derivative(params), solution.used), solution.used)
     J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    first, last = problem.joint[-1], problem.shared
-    others, lenses = np.delete(J, np.s_[first:last], axis=1), J[:, first:last]
+    tested = (problem.joint[-1] + np.arange(2 * terms).reshape(2, terms)[:, -LENS:]).ravel()
+    others, lenses = np.delete(J, tested, axis=1), J[:, tested]
     left = lenses - others @ np.linalg.lstsq(others, lenses, rcond=None)[0]
     return np.asarray(left.T.reshape(-1, *solution.residual.shape))
 
@@ -71,22 +76,31 @@ def _cleared_columns(solution: Solution, frame: ImageFrame) -> FloatArray:
 def fit_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
     """Fit with radial distortion, and estimate the epipolar geometry of the undistorted detections.
 
-    Inliers are selected again. Raises WorkFailed if the data do not determine the distortion.
+    The distortion is centred on the image, or where the residuals show another centre, on that. Inliers are
+    selected again. Raises WorkFailed if the data do not determine the distortion.
     """
-    detections = solution.problem.detections
-    problem = LeastSquares.of(detections, solution.problem.q_reference, lens=True)
     params = dataclasses.replace(solution.params, lens=_undistorted(search.frame))
-    found = fit_from(problem, params, search.epipolar)
+    found = _fit_terms(solution, params, LENS, search)
     if found is not None:
-        assert found.params.lens is not None
-        unbent, _ = problem.pixels(dataclasses.replace(found.params, lens=None))
-        if before_fold(found.params.lens[:, None], unbent)[found.used].all():
-            straight = undistorted(detections, found.params.lens)
-            return found, Epipolar.of(straight, search.rng)
+        few = found.thinned(MAX_JUDGED)
+        if _share(few, few.params, 2 * LENS) > 0.0:
+            found = _fit_terms(solution, found.params, 2 * LENS, search) or found
+        detections = undistorted(solution.problem.detections, found.params.lens)
+        return found, Epipolar.of(detections, search.rng)
     raise WorkFailed(
         "the images do not determine the distortion of the lenses: record poses with markers all over "
         "both images, or calibrate without --lens"
     )
+
+
+def _fit_terms(solution: Solution, params: Parameters, terms: int, search: Search) -> Solution | None:
+    """Fit some terms of both lenses; None if it fails, or a lens folds within the images."""
+    problem = LeastSquares.of(solution.problem.detections, solution.problem.q_reference, terms)
+    found = fit_from(problem, dataclasses.replace(params, lens_terms=terms), search.epipolar)
+    if found is None or found.params.lens is None:
+        return None
+    unbent, _ = problem.pixels(dataclasses.replace(found.params, lens=None))
+    return found if before_fold(found.params.lens[:, None], unbent)[found.used].all() else None
 
 
 def undistorted(detections: Detections, lens: FloatArray | None) -> Detections:

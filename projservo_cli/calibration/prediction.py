@@ -25,7 +25,7 @@ from projservo_cli.records import (
 
 # Number of parameters of a camera, a 3×4 matrix.
 CAMERA = 12
-# Number of parameters of a lens, k1 and k2.
+# Number of parameters of a lens about a given image centre, k1 and k2; two more are its centre.
 LENS = 2
 
 
@@ -61,7 +61,7 @@ def image_points(P: FloatArray, points: FloatArray) -> FloatArray:
 def projection_derivative(
     P: FloatArray, lens: FloatArray | None, points: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Pixels (2, N, 2) of points (N, 4), and derivatives by image points (2, N, 2, 3) and k1, k2 of a lens.
+    """Pixels (2, N, 2) of points (N, 4), and derivatives by image points (2, N, 2, 3) and terms of a lens.
 
     [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3; then the lenses (2, 5).
     """
@@ -83,7 +83,7 @@ class Images(NamedTuple):
     points: FloatArray  # (n + 1, N, 4) the point behind each joint, entry 0 moved by all joints
     by_camera: FloatArray  # (2, N, 2, 12)
     by_point: FloatArray  # (n + 1, 2, N, 2, 4) by ``points``, for fixed joints before it
-    by_lens: FloatArray | None  # (2, N, 2, 2) by k1 and k2, if there is a lens
+    by_lens: FloatArray | None  # (2, N, 2, 4) by the ``TERMS`` of a lens, if there is one
 
     def by_joint(self, H_hat: FloatArray) -> FloatArray:
         """Derivative (2, N, 2, n) by the joints of operators (n, 4, 4), [RH00] eqs. (7), (19)."""
@@ -102,6 +102,7 @@ class Parameters:
     lens: FloatArray | None = None  # (2, 5) lenses, None without
     # (K, n) true joints less their readings at the poses of a problem, rad or m; None if they are exact
     offsets: FloatArray | None = None
+    lens_terms: int = 0  # number of estimated ``TERMS`` of each lens: 0, k1 and k2, or those and the centre
 
     def predict(self, q: FloatArray) -> FloatArray:
         """Pixels (K, 2, m, 2) of all markers at joints (K, n), [RH00] eqs. (1), (6).
@@ -140,19 +141,19 @@ class Parameters:
     def derivative(self, q: FloatArray, images: Images | None = None) -> tuple[FloatArray, FloatArray]:
         """Derivatives of all markers' pixels by P, H_hat (ravelled), and by the marker's own coordinates.
 
-        Of shapes (K, 2, m, 2, 24 + 16 n), with four more columns for k1 and k2 of both views if there is a
-        lens, and (K, 2, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so
+        Of shapes (K, 2, m, 2, 24 + 16 n), with more columns for the ``lens_terms`` of both views, and
+        (K, 2, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so
         dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of ``everywhere``, if known.
         """
         (K, n), m = q.shape, len(self.M)
         pose_of = np.repeat(np.arange(K), m)
         images = self.everywhere(q) if images is None else images
-        joints, lenses = 2 * CAMERA, 2 * CAMERA + 16 * n
-        J = np.zeros((2, K * m, 2, lenses + (0 if images.by_lens is None else 2 * LENS)))
+        joints, lenses, terms = 2 * CAMERA, 2 * CAMERA + 16 * n, self.lens_terms
+        J = np.zeros((2, K * m, 2, lenses + 2 * terms))
         for v in (0, 1):
             J[v, ..., v * CAMERA : (v + 1) * CAMERA] = images.by_camera[v]
             if images.by_lens is not None:
-                J[v, ..., lenses + v * LENS : lenses + (v + 1) * LENS] = images.by_lens[v]
+                J[v, ..., lenses + v * terms : lenses + (v + 1) * terms] = images.by_lens[v][..., :terms]
         parts = sine_and_versine(self.prismatic, q)
         sine, versine = (part[pose_of].T[..., None, None, None] for part in parts)
         for i, (s, c, H) in enumerate(zip(sine, versine, self.H_hat, strict=True)):
@@ -166,10 +167,10 @@ class Parameters:
     def gauge(self) -> FloatArray:
         """Orthonormal directions (24 + 16 n + 4 m, 18) of P, H_hat, M that change no image.
 
-        They change the frame and the scales of both cameras; with lenses four rows of zeros precede M.
+        They change the frame and the scales of both cameras; rows of zeros for the lenses precede M.
         """
         Z = np.eye(16).reshape(16, 1, 4, 4)
-        lenses = np.zeros((16, 0 if self.lens is None else 2 * LENS))
+        lenses = np.zeros((16, 2 * self.lens_terms))
         parts = -(self.P @ Z), Z @ self.H_hat - self.H_hat @ Z, lenses, self.M @ Z.swapaxes(2, 3)
         frame = np.hstack([part.reshape(16, -1) for part in parts])
         cameras = np.zeros((2, frame.shape[1]))
@@ -180,7 +181,7 @@ class Parameters:
 def parameters_from(calibration: Calibration) -> Parameters:
     """Parameters of a calibration record."""
     c = calibration
-    return Parameters(c.P, c.H_hat_0, c.prismatic, c.M, c.lens)
+    return Parameters(c.P, c.H_hat_0, c.prismatic, c.M, c.lens, lens_terms=c.lens_terms)
 
 
 def _checked(calibration: Calibration, q: FloatArray) -> tuple[Parameters, FloatArray]:
@@ -289,7 +290,7 @@ def dense_pixel_changes(
 def error_factor(calibration: Calibration) -> FloatArray:
     """Factor (24 + 16 n + 4 m, r + 3 m) of the covariance of P, H_hat_0, lenses, M: for few markers.
 
-    The gauge is fixed to errors of minimum norm. With lenses four more rows precede M.
+    The gauge is fixed to errors of minimum norm. Rows of the lenses precede M.
     """
     factor, free = calibration.errors.dense(), parameters_from(calibration).gauge()
     return np.asarray(factor - free @ (free.T @ factor))

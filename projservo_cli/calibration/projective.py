@@ -98,7 +98,8 @@ def _isotropic(params: Parameters, a_inf: FloatArray, moved: FloatArray) -> Proj
     depths = points @ P[:, 2].T
     scale = np.sign(depths.sum(axis=0)) / np.sqrt((depths**2).mean(axis=0))
     P, H_hat = scale[:, None, None] * (P @ back), W @ params.H_hat @ back
-    return Projective(Parameters(P, H_hat, params.prismatic, M @ W.T, params.lens), a_inf @ back, W, scale)
+    moved_frame = replace(params, P=P, H_hat=H_hat, M=M @ W.T, offsets=None)
+    return Projective(moved_frame, a_inf @ back, W, scale)
 
 
 def _require_off_line(params: Parameters, errors: Errors) -> None:

@@ -103,8 +103,8 @@ class _Uncertainty:
                 break
             q = 0.5 * (q + q_reference)
             inside = self.in_region(q)
-        detections, lens = self.problem.detections.everywhere(q, self.which), self.params.lens is not None
-        there = LeastSquares.of(detections, q_reference, lens)
+        detections = self.problem.detections.everywhere(q, self.which)
+        there = LeastSquares.of(detections, q_reference, self.problem.lens_terms)
         common, own = there.predicted(self.params, self.errors)
         inside = inside.swapaxes(1, 2).reshape(2, -1)  # observations are in the order of markers
         marker = np.nonzero(inside)[1] // len(q)
@@ -409,7 +409,7 @@ def _held_out_residuals(
     whole, q_reference = solution.problem.detections, solution.problem.q_reference
     training = whole.of_poses(~held_out)
     known = training.count_of(training.seen) >= _MIN_READINGS
-    lens = solution.params.lens is not None
+    lens = solution.problem.lens_terms
     tau = solution.problem.tau
     problem = LeastSquares.of(training.of_markers(known), q_reference, lens).with_noise(tau)
     require_motion(problem.detections)

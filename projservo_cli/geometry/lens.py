@@ -16,6 +16,8 @@ from projservo_cli.records import BoolArray, FloatArray
 
 # Index of k1 in a lens; k2 follows.
 K1 = 3
+# Indices of the terms of a lens that an adjustment may estimate, in this order: k1, k2, u, v.
+TERMS = (3, 4, 0, 1)
 # Maximum number of Newton steps for an undistorted radius.
 _MAX_STEPS = 50
 # Newton step, over the radius, that is the last: the next would be its square, below round-off.
@@ -174,11 +176,15 @@ def distort_visible(lens: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def distort_derivative(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of distorted pixels by undistorted ones (..., 2, 2), and by k1 and k2 (..., 2, 2)."""
+    """Derivatives of distorted pixels by undistorted ones (..., 2, 2), and by k1, k2, u, v (..., 2, 4).
+
+    A common shift of the image centre and of the undistorted pixel shifts the distorted one alike.
+    """
     x, square = _offsets(lens, pixels)
     k1, k2 = lens[..., 3], lens[..., 4]
     rate = 2.0 * _factor_rate(k1, k2, square)
     by_pixel = rate[..., None, None] * (x[..., :, None] * x[..., None, :])
     by_pixel = by_pixel + _factor(k1, k2, square)[..., None, None] * np.eye(2)
     powers = np.stack([square, square**2], axis=-1)
-    return by_pixel, (lens[..., 2:3] * x)[..., :, None] * powers[..., None, :]
+    by_terms = (lens[..., 2:3] * x)[..., :, None] * powers[..., None, :]
+    return by_pixel, np.concatenate([by_terms, np.eye(2) - by_pixel], axis=-1)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.lens import distort, undistort
+from projservo_cli.geometry.lens import TERMS, distort, undistort
 from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid_inverse, screws, twists
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError
@@ -225,11 +225,11 @@ class _Projective(NamedTuple):
         """The calibration, then pairs off by plus and minus a step of each column of the factor."""
         steps = _STEP * np.concatenate([np.zeros((len(factor), 1)), factor, -factor], axis=1).T
         n, B = len(c.H_hat_0), len(steps)
-        edges = np.cumsum([24, 16 * n, 0 if c.lens is None else 4])
+        edges = np.cumsum([24, 16 * n, 2 * c.lens_terms])
         P, H_hat, k, M = np.split(steps, edges, axis=1)
         lenses = np.tile(lens, (B, 1, 1))
         if c.lens is not None:
-            lenses[..., 3:] += k.reshape(B, 2, 2)
+            lenses[..., list(TERMS[: c.lens_terms])] += k.reshape(B, 2, -1)
         return cls(
             c.P + P.reshape(B, 2, 3, 4), c.H_hat_0 + H_hat.reshape(B, n, 4, 4), lenses,
             c.M + M.reshape(B, -1, 4),

@@ -66,6 +66,24 @@ def test_known_distortion_is_recovered_within_its_uncertainty(fitted):
     assert fitted.outlier.size == 0
 
 
+@pytest.mark.parametrize("size", [IMAGE_SIZE, None])
+def test_a_centre_of_the_lens_elsewhere_is_found(robot, poses, size):
+    """Off the middle of the image by far more than it is uncertain, the centre is estimated too."""
+    lens = LENS + np.array([[80.0, -60.0, 0.0, 0.0, 0.0], [-70.0, 90.0, 0.0, 0.0, 0.0]])
+    found = calibrate(
+        observed(robot, poses, lens), robot.joint_types, source="recorded", image_size=size, lens=True
+    )
+    assert found.lens_terms == 4
+    off = (found.lens[:, :2] - lens[:, :2]).ravel()
+    centers = found.sqrt_cov_shared[-8:].reshape(2, 4, -1)[:, 2:].reshape(4, -1)
+    assert off @ np.linalg.solve(centers @ centers.T, off) < 18.5  # χ² of four, once in a thousand draws
+    q = around(robot, 60, np.random.default_rng(8), angle=0.6, length=0.2)
+    true = lensed(robot.images(q), lens)
+    inside = ((true >= 0.0) & (true <= np.array(IMAGE_SIZE))).all(axis=-1)
+    error = np.sqrt(np.mean((predict(found, q) - true)[inside] ** 2))
+    assert error == pytest.approx(np.sqrt(prediction_variance(found, q)[inside].mean()), rel=0.5)
+
+
 def test_predictions_are_as_good_as_their_variance_says(robot, fitted):
     q = around(robot, 60, np.random.default_rng(8), angle=0.6, length=0.2)
     true = lensed(robot.images(q), LENS)
