@@ -224,13 +224,11 @@ def faults_of(arm):
     s, e, j = arm.joints
     every, late = tuple(i + 1 for i, kind in enumerate(arm.types) if kind == "R"), partial(steps, at=0.8)
     moves, left = partial(partial, move), {(kind, None, "left") for kind in ("camera_drift", "camera_step")}
+    subsets = [some for count in range(1, 7) for some in itertools.combinations(every, count)]
     curved = {(kind, (e,), None) for kind in ("harmonic", "quadratic", "cubic")}  # no kind has two waves
     return {
         "gear": (partial(curve, joints=(e,)), {("scale", (e,), None)}),
-        "gear all": (
-            partial(curve, joints=every),
-            {("scale", i, None) for i in (every, *((i,) for i in every))},
-        ),
+        "gear all": (partial(curve, joints=every), {("scale", some, None) for some in subsets}),
         "gear wrist": (partial(curve, joints=(j,)), {("scale", (j,), None)}),
         "second order": (partial(curve, joints=(s,), power=2), {("quadratic", (s,), None)}),
         "third order": (partial(curve, joints=(e,), power=3), {("cubic", (e,), None)}),
@@ -239,7 +237,7 @@ def faults_of(arm):
         "coupled wrist": (partial(coupling, joint=j - 1, to=j), {("coupling", (j - 1, j), None)}),
         "coupled arm": (partial(coupling, joint=s, to=s + 1), {("coupling", (s, s + 1), None)}),
         "sag": (partial(sag, joints=every), {("sag", None, None)}),
-        "sag of one": (partial(sag, joints=(2,)), {("sag", None, None)}),
+        "sag of one": (partial(sag, joints=(2,)), {("sag", (), None), ("sag", (2,), None)}),
         "joint drifts": (partial(zero, joint=e, when=ramp), {("joint_drift", (e,), None)}),
         "joint warms up": (partial(zero, joint=s, when=saturates), {("joint_drift", (s,), None)}),
         "joint steps": (partial(zero, joint=e, when=steps), {("joint_step", (e,), None)}),
@@ -249,7 +247,7 @@ def faults_of(arm):
         "right steps": (moves(part="views", when=steps, views=(1,)), {("camera_step", None, "right")}),
         "left settles": (moves(part="views", when=settles, views=(0,)), left),
         # Cameras that step alike are a base that steps.
-        "base steps": (moves(part="base", when=steps), {("base", None, None), ("camera_step", None, None)}),
+        "base steps": (moves(part="base", when=steps), {("base", None, None), ("camera_step", None, "")}),
         "tool slips": (moves(part="slip", when=steps), {("tool", None, None)}),
         "tool creeps": (moves(part="slip", when=ramp), {("tool", None, None)}),
         "tag slips": (moves(part="slip", when=steps, tags=(1,)), {("tool", None, None)}),

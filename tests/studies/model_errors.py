@@ -234,7 +234,8 @@ def judged(job):
         row |= {f"{name}_68": np.mean(z < 1.0), f"{name}_95": np.mean(z < 1.96)}
     causes, verdicts = sorted(getattr(found, "model_errors", ()), key=lambda one: -abs(one.effect_px)), [""]
     for one in causes:
-        what = one.kind, tuple(one.joints), one.view
+        both = {"left", "right"} <= {other.view for other in causes if other.kind == one.kind}
+        what = one.kind, tuple(one.joints), "" if both else one.view
         said = any(all(a in (None, b) for a, b in zip(some, what, strict=True)) for some in right)
         same = said or (put is not None and setting.same_images(put_in, what))
         verdicts.append("right" if said else "equivalent" if same else "wrong")
