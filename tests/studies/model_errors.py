@@ -279,14 +279,12 @@ def tables(given):
         yield Job("none", arm, design, kind, 0.0, 1000 + i, 0.0)
 
 
-def tell(rows):
-    """Print the three bars of faults, a line of each fault, and sound tables."""
-    faulty, sound = ([r for r in rows if (r["fault"] == "none") == one] for one in (False, True))
-    print(f"{len(faulty)} tables with faults, {len(sound)} without")
-    accepted, named = [r for r in faulty if r["exit"] == 0], [r for r in faulty if r["judged"]]
+def tell_faults(rows):
+    """Print the three bars of tables with faults, and a line of each fault."""
+    accepted, named = [r for r in rows if r["exit"] == 0], [r for r in rows if r["judged"]]
     for key, what in (("ratio", "stated"), ("ratio_worst", "stated, or what it may be up to")):
-        held = sum(r["exit"] != 0 or r[key] <= 2.0 for r in faulty)
-        print(f"true <= 2 x {what}, or exit code not 0: {rate(held, len(faulty))} % (99)")
+        held = sum(r["exit"] != 0 or r[key] <= 2.0 for r in rows)
+        print(f"true <= 2 x {what}, or exit code not 0: {rate(held, len(rows))} % (99)")
     honest = sum(r["ratio"] >= 1.0 / 3.0 for r in accepted)
     print(f"stated <= 3 x true: {rate(honest, len(accepted))} % of {len(accepted)} accepted (90)")
     good, count = sum(r["judged"] != "wrong" for r in named), Counter(r["judged"] for r in named)
@@ -297,14 +295,22 @@ def tell(rows):
     print(
         f"{'fault':17}{'held %':>7}{'exit 1':>7}  true over stated by size (median)   right equiv. wrong none"
     )
-    for fault in dict.fromkeys(r["fault"] for r in faulty):
-        some = [r for r in faulty if r["fault"] == fault]
+    for fault in dict.fromkeys(r["fault"] for r in rows):
+        some = [r for r in rows if r["fault"] == fault]
         held = 100.0 * np.mean([r["exit"] != 0 or r["ratio"] <= 2.0 for r in some])
         sizes = [[r["ratio"] for r in some if r["size"] == size and r["exit"] == 0] for size in SIZES]
         medians = " ".join(f"{np.median(ratios) if ratios else np.nan:8.2f}" for ratios in sizes)
         count = Counter(r["judged"] for r in some)
         judgements = " ".join(f"{count[one]:6d}" for one in ("right", "equivalent", "wrong", ""))
         print(f"{fault:17}{held:7.1f}{sum(r['exit'] != 0 for r in some):7d} {medians} {judgements}")
+
+
+def tell(rows):
+    """Print what tables with faults, and without, show against the bars."""
+    faulty, sound = ([r for r in rows if (r["fault"] == "none") == one] for one in (False, True))
+    print(f"{len(faulty)} tables with faults, {len(sound)} without")
+    if faulty:
+        tell_faults(faulty)
     for kind in dict.fromkeys(["all", *(r["corners"] for r in sound)]) if sound else ():
         some = [r for r in sound if kind in ("all", r["corners"])]
         usable = [r for r in some if r["exit"] == 0]
@@ -325,20 +331,19 @@ def tell(rows):
     print(f"seconds of the processor for a calibration: {quantiles([r['seconds'] for r in rows])}")
 
 
+WORDS = ("fault", "arm", "design", "corners", "judged", "named", "reason")
 COLUMNS = (
     *(*Job._fields, "effect_px", "exit", "seconds", "predicted_rms_px", "predicted_p99_px"),
-    *(
-        "predicted_worst_px",
-        "true_rms_px",
-        "ratio",
-        "ratio_worst",
-        "true_68",
-        "true_95",
-        "seen_68",
-        "seen_95",
-    ),
-    *("judged", "others_wrong", "named", "reason"),
+    *("predicted_worst_px", "true_rms_px", "ratio", "ratio_worst", "true_68", "true_95", "seen_68"),
+    *("seen_95", "judged", "others_wrong", "named", "reason"),
 )
+
+
+def read_rows(path):
+    """Rows of a study that was made before."""
+    with open(path, encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            yield {name: text if name in WORDS else float(text or "nan") for name, text in row.items()}
 
 
 def main():
@@ -354,7 +359,11 @@ def main():
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--amplitudes", action="store_true", help=f"remake {AMPLITUDES.name}")
     parser.add_argument("-o", "--output", type=Path, default=Path("model_errors_study.csv"), help="every run")
+    parser.add_argument("--read", type=Path, nargs="+", help="tables of earlier runs, to print their summary")
     given = parser.parse_args()
+    if given.read:
+        tell([row for path in given.read for row in read_rows(path)])
+        return
     if given.amplitudes:
         with open(AMPLITUDES, "w", encoding="utf-8", newline="") as file:
             table = csv.writer(file, lineterminator="\n")
