@@ -48,6 +48,7 @@ SIZES = {
     "limit": 2,
     "end": 2,
     "margin_kind": 10,
+    "model_error_column": 4,
 }
 
 
@@ -150,6 +151,37 @@ class Errors(NamedTuple):
         markers = apart(self.marker, self.own, np.arange(m)[:, None], m)
         shared = np.pad(self.shared, ((0, 0), (0, 3 * m)))
         return np.concatenate([shared, markers.reshape(-1, shared.shape[1])])
+
+
+class ModelError(NamedTuple):
+    """Deviation of an arm or a rig from the model, by the residuals of a calibration."""
+
+    kind: str  # scale, quadratic, cubic, harmonic, coupling, sag, joint_drift, joint_step, camera_drift, …
+    joints: tuple[int, ...]  # numbers of the joints, from 1; of a coupling the moved one last
+    view: str  # name of the view, empty for both
+    # of scale and coupling a share, of other readings rad (prismatic × 0.3 m/rad), of others rms px in images
+    estimate: float
+    deviation: float  # standard deviation of the estimate
+    effect_px: float  # rms error of predictions within the joint ranges, per marker and view
+    first: int | None  # number of the pose from which it holds, of a step
+
+    @property
+    def code(self) -> str:
+        """What it is of, in one word: kind, joints and view."""
+        return f"{self.kind}|{','.join(map(str, self.joints))}|{self.view}"
+
+    @property
+    def numbers(self) -> tuple[float, float, float, float]:
+        """Estimate, deviation, effect and first pose, NaN if it holds in all."""
+        return self.estimate, self.deviation, self.effect_px, math.nan if self.first is None else self.first
+
+    @classmethod
+    def of(cls, code: str, numbers: Iterable[float]) -> "ModelError":
+        """Read it back from ``code`` and ``numbers``."""
+        kind, joints, view = code.split("|")
+        estimate, deviation, effect, first = map(float, numbers)
+        which = tuple(int(joint) for joint in joints.split(",") if joint)
+        return cls(kind, which, view, estimate, deviation, effect, None if math.isnan(first) else int(first))
 
 
 def apart(common: FloatArray, own: FloatArray, marker: IntArray, m: int) -> FloatArray:
@@ -318,6 +350,49 @@ class Calibration:
     sigma_scale_interval: FloatArray | None = _array(
         "limit", about="95 % interval of sigma_scale", default=None
     )
+
+    model_error: tuple[str, ...] = _scalar(
+        about="deviations from the model that limit predictions: kind, joints and view of each", default=()
+    )
+    model_error_numbers: FloatArray | None = _array(
+        "model_error_row model_error_column",
+        about="of each its estimate, standard deviation, effect on predictions in px, and first pose",
+        default=None,
+    )
+    model_error_bias: FloatArray | None = _array(
+        "parameter_and_coordinate model_error_row",
+        about="error of P, H_hat_0, lenses and M by each of them, to first order",
+        default=None,
+    )
+    unshown_error: tuple[str, ...] = _scalar(
+        about="the deviation that these data do not show and that would spoil predictions most", default=()
+    )
+    unshown_numbers: FloatArray | None = _array(
+        "model_error_column",
+        about="its usual or smallest detectable size, 0, and its effect in px",
+        default=None,
+    )
+    predicted_recorded_px: float | None = _scalar(
+        "px", "expected error of images at the recorded poses, rms per marker and view", default=None
+    )
+    predicted_worst_px: float | None = _scalar(
+        "px",
+        "expected error within the joint ranges if the deviation is there that these data do not show",
+        default=None,
+    )
+
+    @property
+    def model_errors(self) -> tuple[ModelError, ...]:
+        """Deviations from the model that limit predictions, the largest effect first."""
+        rows = [] if self.model_error_numbers is None else self.model_error_numbers.tolist()
+        return tuple(map(ModelError.of, self.model_error, rows))
+
+    @property
+    def unshown(self) -> ModelError | None:
+        """The deviation that these data do not show and that would spoil predictions most."""
+        if not self.unshown_error or self.unshown_numbers is None:
+            return None
+        return ModelError.of(self.unshown_error[0], self.unshown_numbers.tolist())
 
     def indices_of(self, numbers: Iterable[int]) -> list[int]:
         """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""

@@ -132,9 +132,7 @@ class LeastSquares:
 
     def of_markers(self, keep: BoolArray) -> "LeastSquares":
         """Select markers (m,)."""
-        smaller = LeastSquares.of(
-            self.detections.of_markers(keep), self.q_reference, self.lens_terms
-        )
+        smaller = LeastSquares.of(self.detections.of_markers(keep), self.q_reference, self.lens_terms)
         return smaller.with_noise(self.tau)
 
     def pixels(self, params: Parameters) -> tuple[FloatArray, FloatArray]:

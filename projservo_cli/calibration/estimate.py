@@ -26,6 +26,7 @@ from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained
+from projservo_cli.calibration.model_error import ModelCheck
 from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, assess, cross_validate
@@ -65,6 +66,8 @@ _STRAYS = 0.1
 _LENS_STRAYS = 0.01
 # Distance beyond the border of an image, px, within which a search for corners may place one.
 _BEYOND_PX = 1.0
+# Effect of deviations from the model, over the image size, above which a calibration is not usable.
+_MAX_PREDICTED = 0.01
 # Maximum number of lines of advice.
 _MAX_ADVICE = 5
 # Maximum number of markers that a message names.
@@ -83,6 +86,7 @@ def calibrate(
     lens: bool = False,
     init: Nominal | None = None,
     joint_noise: float | None = 0.0,
+    max_predicted_px: float | None = None,
     fitted: Callable[[Solution, float], None] | None = None,
     progress: Progress = lambda what, done, total: None,
 ) -> Calibration:
@@ -104,6 +108,8 @@ def calibrate(
     init : robot and rig that ``bundle_adjustment`` tries first as a start; a search follows if that fails.
     joint_noise : standard deviation of joint readings, rad (prismatic × 0.3 m/rad), for
         ``bundle_adjustment``; None estimates it, and takes 0 unless the images show it.
+    max_predicted_px : error of predictions by deviations from the model, px, above which the calibration is
+        not usable; None takes 1 % of the image size.
     fitted : called with the solution of ``bundle_adjustment`` and its noise, px.
     progress : called with the current task of ``bundle_adjustment``, how much of it is done, and its total.
 
@@ -125,6 +131,8 @@ def calibrate(
     require_size_and_noise(image_size, sigma_px)
     if seed < 0:
         raise InputError(f"seed {seed!r}: give a whole number that is not negative")
+    if max_predicted_px is not None and not max_predicted_px > 0.0:
+        raise InputError(f"max_predicted_px {max_predicted_px!r}: give a positive number, or none")
     if joint_noise is not None and not 0.0 <= joint_noise < np.inf:
         raise InputError(f"joint noise {joint_noise!r}: give a number that is not negative, or none")
     if lens and method != "bundle_adjustment":
@@ -154,7 +162,12 @@ def calibrate(
             search = Search(
                 problem, epipolar, ImageFrame.of(detections, image_size), rng, progress, joint_noise
             )
-            solution, expected, result = _maximum_likelihood(search, expect, lens, init)
+            limit = (
+                _MAX_PREDICTED * float(search.frame.size.max())
+                if max_predicted_px is None
+                else max_predicted_px
+            )
+            solution, expected, result = _maximum_likelihood(search, expect, lens, init, limit)
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
             fitted(solution, expected.noise_px(solution))
@@ -199,7 +212,7 @@ def _require_inside(detections: Detections, size: tuple[int, int], strays: float
 
 
 def _maximum_likelihood(
-    search: Search, expect: Callable[[Epipolar], Expected], lens: bool, init: Nominal | None
+    search: Search, expect: Callable[[Epipolar], Expected], lens: bool, init: Nominal | None, limit_px: float
 ) -> tuple[Solution, Expected, Calibration]:
     """Maximum-likelihood solution, its expected noise and its record.
 
@@ -215,7 +228,7 @@ def _maximum_likelihood(
             expected = expect(epipolar)
             expected.require_scale()
         solution = fit_joint_noise(solution, expected, search.joint_noise)
-        result = _refined(solution, epipolar, expected, search.frame)
+        result = _refined(solution, epipolar, expected, search.frame, limit_px)
     except Misfit as refused:
         # The joints of a simulation are as configured, so none is at fault.
         cause = "" if expected.known else joint_at_fault(search, REFUSE_RATIO * expected.sigma_px)
@@ -229,7 +242,9 @@ def _maximum_likelihood(
     return solution, expected, dataclasses.replace(result, advice=advice[:_MAX_ADVICE])
 
 
-def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: ImageFrame) -> Calibration:
+def _refined(
+    whole: Solution, epipolar: Epipolar, expected: Expected, frame: ImageFrame, limit_px: float
+) -> Calibration:
     """Record of the maximum-likelihood solution in its projective frame, with its covariance."""
     share = share_explained(whole, frame)
     solution, kept = whole.determined()
@@ -259,7 +274,7 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
         hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         raise Misfit(f"{refused}; {hint}") from None
     errors = solution.errors()
-    record = _record(Projective.of(solution), solution, expected, errors, found, suspicion)
+    record = _record(Projective.of(solution), solution, expected, errors, found, suspicion, limit_px)
     lens = _lens_advice(record, share, frame.known)
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
     if kept.all():
@@ -401,24 +416,29 @@ def _record(
     errors: Errors | None,
     found: Outliers,
     suspicion: str,
+    limit_px: float = np.inf,
 ) -> Calibration:
     """Record of a fit in its projective frame.
 
     errors : of its parameters, None for a method without.
     found : explanations of rejected detections.
     suspicion : likely cause if residuals exceed pixel noise.
+    limit_px : effect of deviations from the model above which the calibration is not usable.
     Raises WorkFailed if a joint is not determined.
     """
     method = "closed_form" if errors is None else "bundle_adjustment"
     problem, detections, params = solution.problem, solution.problem.detections, result.params
+    outlier = outlier_rows(detections, detections.seen & ~solution.used & ~found.explained)
+    counts = (len(outlier), len(found.suspect) + len(found.poses), len(found.id_switches))
+    verdict = assess(solution, errors, expected, counts, suspicion, limit_px)
+    check = verdict.check
     if errors is None:
         m, unknown = len(params.M), np.full(params.P.size + params.H_hat.size, np.nan)
         off = Errors(unknown[:, None], np.full((m, 4, 1), np.nan), np.full((m, 4, 3), np.nan))
     else:
-        off = result.errors(solution, errors).scaled(expected.noise_px(solution))
-    outlier = outlier_rows(detections, detections.seen & ~solution.used & ~found.explained)
-    counts = (len(outlier), len(found.suspect) + len(found.poses), len(found.id_switches))
-    verdict = assess(solution, errors, expected, counts, suspicion)
+        # Deviations hold on average over other poses, with the model's own error.
+        factor = 1.0 if check is None else check.noise_factor * check.predicted_px / check.noise_px
+        off = result.errors(solution, errors).scaled(factor * expected.noise_px(solution))
     operator_defect, trace_defect, plane_defect = result.defects()
     corner_squares, corner_q = solution.corners()
     used_rows, joint_noise = solution.used.any(axis=0), solution.joint_noise
@@ -472,4 +492,19 @@ def _record(
         sigma_q_interval=None if joint_noise is None else joint_noise.interval,
         encoder_counts=joint_noise is not None and joint_noise.ticks,
         model_px=float(np.sqrt(over)),
+        **({} if check is None else _model_fields(result, solution, check)),
     )
+
+
+def _model_fields(result: Projective, solution: Solution, check: ModelCheck) -> dict[str, Any]:
+    """Fields of the record on deviations from the model."""
+    fields: dict[str, Any] = {"predicted_recorded_px": check.recorded_px}
+    if check.unshown is not None:
+        fields["unshown_error"] = (check.unshown.code,)
+        fields["unshown_numbers"] = np.array(check.unshown.numbers)
+        fields["predicted_worst_px"] = float(np.hypot(check.predicted_px, check.unshown.effect_px))
+    if check.errors:
+        fields["model_error"] = tuple(one.code for one in check.errors)
+        fields["model_error_numbers"] = np.array([one.numbers for one in check.errors])
+        fields["model_error_bias"] = result.bias(solution, check.bias)
+    return fields

@@ -52,16 +52,31 @@ class Projective:
         errors : those of ``Solution.errors``.
         Raises WorkFailed if the markers cannot be distinguished from a line.
         """
+        found = self._in_frame(solution, errors)
+        few = even_choice(len(self.params.M), MAX_JUDGED)
+        _require_off_line(replace(self.params, M=self.params.M[few]), found.of(few).scaled(solution.sigma_px))
+        return found
+
+    def bias(self, solution: Solution, bias: FloatArray) -> FloatArray:
+        """Errors (p, k) of P, H_hat, lenses and M by those of the parameters, of ``MAX_JUDGED`` markers.
+
+        Markers beyond follow no error of their own.
+        """
+        m, s = len(self.params.M), solution.problem.shared
+        marker = np.zeros((m, 3, bias.shape[1]))
+        marker[even_choice(m, MAX_JUDGED)] = bias[s:].reshape(-1, 3, bias.shape[1])
+        found = self._in_frame(solution, Errors(bias[:s], marker, np.zeros((m, 3, 0))))
+        return np.concatenate([found.shared, found.marker.reshape(-1, bias.shape[1])])
+
+    def _in_frame(self, solution: Solution, errors: Errors) -> Errors:
+        """Errors of the parameters of a solution, of P, H_hat, lenses and M in this frame."""
         back = np.linalg.inv(self.W)
         cameras = [scale * np.kron(np.eye(3), back.T) for scale in self.camera_scale]
         joints = [(self.W @ moved @ back).reshape(-1, 16).T for moved in moved_operators(solution.params)]
         lenses = np.eye(solution.problem.shared - solution.problem.joint[-1])
         by_marker = self.W[:, :3]
         shared = block_diag(*cameras, *joints, lenses) @ errors.shared
-        found = Errors(shared, by_marker @ errors.marker, by_marker @ errors.own)
-        few = even_choice(len(self.params.M), MAX_JUDGED)
-        _require_off_line(replace(self.params, M=self.params.M[few]), found.of(few).scaled(solution.sigma_px))
-        return found
+        return Errors(shared, by_marker @ errors.marker, by_marker @ errors.own)
 
     def defects(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Defects (n,) of [RH00] section 2: of Ĥ³ = −Ĥ or Ĥ² = 0, of zero trace, of one plane at infinity."""

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -21,6 +22,7 @@ from projservo_cli.calibration.detections import (
 )
 from projservo_cli.calibration.fit import WARN_RATIO, Expected, Solution, fit_inliers
 from projservo_cli.calibration.joint_noise import quantile
+from projservo_cli.calibration.model_error import ModelCheck, describe, examine
 from projservo_cli.calibration.prediction import Parameters, distance_statistics
 from projservo_cli.records import (
     BoolArray,
@@ -55,6 +57,8 @@ _MIN_REACHES = 0.01
 _BISECTIONS = 7
 # Difference of joint readings, rad or m, below which they are equal: a robot holds a joint with jitter.
 _SAME_JOINT = 1e-3
+# Maximum number of deviations from the model that advice names.
+_MAX_NAMED = 3
 # Minimum number of parts in a cross-validation.
 _MIN_FOLDS = 2
 # Minimum number of detections of a marker in the other poses for its prediction.
@@ -92,7 +96,11 @@ class _Uncertainty:
         return np.asarray(((pixels >= low) & (pixels <= high)).all(axis=-1))
 
     def spread(self, q: FloatArray, *, nearer: bool = False) -> FloatArray:
-        """Changes (rows, r) of visible coordinates at poses (K, n) by independent errors of size one.
+        """Changes (rows, r) of visible coordinates at poses (K, n) by independent errors of size one."""
+        return self.predictions(q, nearer=nearer).T
+
+    def predictions(self, q: FloatArray, *, nearer: bool = False) -> "_Predictions":
+        """Predicted images at poses (K, n).
 
         nearer : halve the distance of the poses from the reference until an image is in the region.
         """
@@ -109,7 +117,13 @@ class _Uncertainty:
         inside = inside.swapaxes(1, 2).reshape(2, -1)  # observations are in the order of markers
         marker = np.nonzero(inside)[1] // len(q)
         T = apart(common[inside], own[inside], marker[:, None], self.which.size)
-        return T.reshape(-1, T.shape[-1])
+        return _Predictions(there, inside, T.reshape(-1, T.shape[-1]))
+
+    def within_ranges(self) -> "_Predictions":
+        """Predicted images at random poses, drawn uniformly within the ranges of the joints."""
+        q = self.problem.detections.q
+        poses = np.random.default_rng(0).uniform(q.min(axis=0), q.max(axis=0), (_POSES, q.shape[1]))
+        return self.predictions(poses, nearer=True)
 
     def at(self, i: int, offsets: FloatArray) -> FloatArray:
         """Poses (K, n) with joint i at offsets (K,) from the reference, rad or m."""
@@ -127,6 +141,14 @@ class _Uncertainty:
     def reach(self, i: int) -> float:
         """Reach of joint i at which predictions are judged, rad or m."""
         return REACH_M if self.params.prismatic[i] else REACH_RAD
+
+
+class _Predictions(NamedTuple):
+    """Predicted images of the markers assessed, and their changes by errors of the parameters."""
+
+    there: LeastSquares  # of these images
+    inside: BoolArray  # (2, N) whether an image is in the region
+    T: FloatArray  # (rows, r) changes of coordinates in the region by independent errors of size one
 
 
 def _needed_spans(uncertainty: _Uncertainty, spreads: list[FloatArray]) -> FloatArray:
@@ -166,17 +188,13 @@ def _noise_after_trial(uncertainty: _Uncertainty, i: int, span: float, T: FloatA
     return _rms(np.linalg.solve(root.T, T.T).T)
 
 
-def _predicted_error(uncertainty: _Uncertainty) -> tuple[float, float]:
-    """Expected error of images at random poses, and the bound that 99 of 100 calibrations keep.
+def _predicted_error(spread: FloatArray) -> tuple[float, float]:
+    """Expected error of images with changes (rows, r), and the bound that 99 of 100 calibrations keep.
 
-    Root mean squares of the Euclidean error per marker and view, in units of the pixel noise, over poses
-    drawn uniformly within the ranges of the joints, halved about the reference until an image is in the
-    region. No residual shows the actual error: to first order the error of a maximum-likelihood estimate is
-    independent of the residuals.
+    Root mean squares of the Euclidean error per marker and view, in units of the pixel noise. No residual
+    shows the actual error: to first order the error of a maximum-likelihood estimate is independent of the
+    residuals.
     """
-    q = uncertainty.problem.detections.q
-    poses = np.random.default_rng(0).uniform(q.min(axis=0), q.max(axis=0), (_POSES, q.shape[1]))
-    spread = uncertainty.spread(poses, nearer=True)
     variances = np.linalg.eigvalsh(spread.T @ spread) / max(len(spread) // 2, 1)
     return float(np.sqrt(variances.sum())), float(np.sqrt(quantile(variances, _SURE)))
 
@@ -189,6 +207,7 @@ class Assessment:
     noise: FloatArray  # (n,) noise of images at the reach, in units of the pixel noise; NaN if unknown
     # expected error of images at random poses and its 99th percentile, px; None if unknown
     error: tuple[float, float] | None
+    check: ModelCheck | None  # deviations from the model; None if it is exact, as in a simulation
     usable: bool
     reason: str  # why it is usable or not, and its limiting factor
     advice: tuple[str, ...]  # next steps, first about the limiting factor
@@ -200,27 +219,38 @@ def assess(
     expected: Expected,
     rejected: tuple[int, int, int],
     suspicion: str,
+    max_predicted_px: float = np.inf,
 ) -> Assessment:
     """Assess a fit.
 
     errors : of its parameters; None for the closed form, which has none.
     rejected : numbers of outliers, of suspect joint readings and of exchanged marker numbers.
     suspicion : likely cause if residuals exceed pixel noise.
+    max_predicted_px : effect of deviations from the model on predictions above which it is not usable.
     Raises WorkFailed naming a joint that moves no image, or whose operator is not determined.
     """
     prismatic = solution.params.prismatic
     # Residuals of a method without covariance are its own errors, not noise of the images.
     sigma = expected.sigma_px if errors is None else expected.noise_px(solution)
     span = _require_joints_seen(solution, sigma)
-    noise, error = np.full(len(span), np.nan), None
+    noise, error, check = np.full(len(span), np.nan), None, None
     weak = np.zeros(len(span), dtype=np.bool_)  # by the joints in the data, whatever their noise
     advice: list[str] = []
     if errors is not None:
         uncertainty = _Uncertainty.of(solution, errors)
         spreads = uncertainty.at_reach()
         noise = np.array([_rms(T) for T in spreads])
-        typical, bound = _predicted_error(uncertainty)
+        random = uncertainty.within_ranges()
+        typical, bound = _predicted_error(random.T)
         error = (sigma * typical, sigma * bound)
+        if not expected.known:
+            thinned = solution.thinned(MAX_JUDGED)
+            if thinned is not solution:
+                errors = thinned.errors()
+                random = _Uncertainty.of(thinned, errors).within_ranges()
+            check = examine(thinned, errors, *random, sigma)
+            factor, effect = check.noise_factor, check.effect_px
+            error = (float(np.hypot(factor * error[0], effect)), float(np.hypot(factor * error[1], effect)))
         needed = _needed_spans(uncertainty, spreads)
         i = int(np.argmax(noise))
         if noise[i] > _UNDETERMINED_NOISE:
@@ -244,12 +274,12 @@ def assess(
         # A method for comparison returns its result all the same.
         short = f"the closed_form method explains the images only to {found}"
         return Assessment(
-            span, noise, error, False, f"{short}, {share:.3g} times {wanted}: use bundle_adjustment", ()
+            span, noise, error, None, False, f"{short}, {share:.3g} times {wanted}: use bundle_adjustment", ()
         )
     reason = f"residuals of {found} agree with {wanted}"
     if warned:
         reason = f"more than pixel noise is left: residuals of {found} are {share:.3g} times {wanted}"
-        if "joint readings" in suspicion:
+        if "joint readings" in suspicion and not (check and check.errors):
             advice.insert(0, "look for joint readings that lag behind the images")
     outliers, suspects, swaps = rejected
     limit, many = "noise", outliers > _MAX_OUTLIERS * solution.used.shape[1]
@@ -261,11 +291,11 @@ def assess(
         advice.append(outlier_advice)
     if words := _describe_joint_noise(solution):
         reason = f"{reason}, with joint readings off by {words}"
-        over, effect_px = solution.joint_effect()
+        over, moved_px = solution.joint_effect()
         if over > 1.0:
             limit = "joint readings"
-            effect = f"move images by {effect_px:.3g} px, more than pixel noise"
-            advice.append(f"errors of joint readings {effect}: finer or stiffer joints would help")
+            moved = f"move images by {moved_px:.3g} px, more than pixel noise"
+            advice.append(f"errors of joint readings {moved}: finer or stiffer joints would help")
     if warned or suspicion == "lens":
         limit = suspicion
     elif weak.any():
@@ -273,6 +303,14 @@ def assess(
         limit = "amplitude" if few.any() else "geometry"
     elif many:
         limit = "outliers"
+    usable = True
+    if check is not None and check.errors:
+        sentences = [describe(one, prismatic) for one in check.errors]
+        limit = f"{sentences[0][0]}, which moves predictions by {check.effect_px:.3g} px"
+        advice[:0] = [sentence for _, sentence in sentences[:_MAX_NAMED]]
+        if check.effect_px > max_predicted_px:
+            usable = False
+            limit += f", more than calibration.max_predicted_px = {max_predicted_px:.3g}"
     if suspects:
         what = "1 joint reading disagrees" if suspects == 1 else f"{suspects} joint readings disagree"
         advice.append(f"{what} with the images: check how poses and images are paired")
@@ -281,7 +319,7 @@ def assess(
         advice.append(f"{times} a marker was seen under the number of another: check the numbering")
     if outliers and not many:
         advice.append(outlier_advice)
-    return Assessment(span, noise, error, True, f"{reason}; limited by {limit}", tuple(advice))
+    return Assessment(span, noise, error, check, usable, f"{reason}; limited by {limit}", tuple(advice))
 
 
 def _describe_joint_noise(solution: Solution) -> str:

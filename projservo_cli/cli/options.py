@@ -121,7 +121,9 @@ _OF_STAGES = (
     click.option(
         "--noise-px", metavar="S", type=NUMBER, help="Pixel noise of the table. Default: estimated."
     ),
-    click.option("--lens", is_flag=True, help="Estimate radial lens distortion, and its centre where it shows."),
+    click.option(
+        "--lens", is_flag=True, help="Estimate radial lens distortion, and its centre where it shows."
+    ),
     click.option(
         "--image-size",
         metavar="WxH",

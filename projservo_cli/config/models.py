@@ -272,7 +272,8 @@ class _CalibrationSettings(Section):
         None, description="seed of the noise of the trial motions; null: seed of the run"
     )
     lens: StrictBool = Field(
-        False, description="whether to estimate radial distortion: two coefficients a camera, and its centre where it shows"
+        False,
+        description="whether to estimate radial distortion: two coefficients a camera, and its centre",
     )
 
     def contradictions(self) -> Iterator[Finding]:

@@ -27,7 +27,9 @@ def problem_of(robot: Robot, count: int = 5, unseen: float = 0.0, lens=None):
     readings = Detections.of(observation, robot.joint_types)
     terms = 0 if lens is None else 4
     problem = LeastSquares.of(readings, robot.q_reference, terms)
-    return problem, Parameters(robot.cameras, robot.twists, readings.prismatic, robot.markers, lens, lens_terms=terms)
+    return problem, Parameters(
+        robot.cameras, robot.twists, readings.prismatic, robot.markers, lens, lens_terms=terms
+    )
 
 
 def full_jacobian(problem, J):

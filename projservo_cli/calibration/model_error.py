@@ -1,0 +1,573 @@
+"""Errors of the model: score tests of named nuisances after a fit, and their effect on predictions.
+
+An arm or a rig that is not as the model says leaves residuals. Each nuisance, such as the gear ratio of a
+joint, changes the images by known columns Z to first order. Cleared of all fitted parameters they give its
+amplitude b without a refit (C. R. Rao, "Large sample tests of statistical hypotheses concerning several
+parameters", 1948). The fit absorbs a part of it, so images at other joints are off by (Z* − J* J⁺ Z) b.
+
+Nuisances are selected one by one, by the Bayesian information criterion (G. Schwarz, "Estimating the
+dimension of a model", Annals of Statistics 6(2), 1978). A selected one must be significant both by the F test
+and by a Wald test whose covariance counts each posture once, since the corners of an image share errors
+(K.-Y. Liang, S. Zeger, "Longitudinal data analysis using generalized linear models", Biometrika 73, 1986).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.special import fdtrc
+
+from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.detections import per_rad
+from projservo_cli.calibration.fit import Solution
+from projservo_cli.calibration.prediction import LENS, Images, Parameters
+from projservo_cli.geometry.rigid import cross_matrix
+from projservo_cli.records import VIEWS, BoolArray, Errors, FloatArray, IntArray, ModelError
+
+# Probability of chance above which no nuisance is found.
+_CHANCE = 1e-4
+# Maximum number of nuisances that are found together.
+_MAX_FOUND = 8
+# Number of best candidates of which one must pass both tests.
+_TRIED = 4
+# Number of rounds in which a nuisance found may give way to a better one.
+_ROUNDS = 2
+# Standard deviations of an amplitude that the tests find in half of the cases.
+_DETECTED = 3.9
+# Standard deviations of a variance ratio above which postures share errors.
+_CORRELATED = 3.9
+# Difference of joint readings, rad or m, below which poses are one posture, as of a joint held with jitter.
+_SAME_POSTURE = 2e-3
+# Deviation of an amplitude, in the units of ``_SIZES``, above which the data leave it open.
+_OPEN = 30.0
+# Maximum leverage of the images of a posture, whose residuals say nothing beyond.
+_MAX_LEVERAGE = 0.999
+# Effect over the stated error from which a nuisance that the data could not have shown is told.
+_UNSHOWN = 2.0
+# Usual sizes of each kind, beyond which none is expected unless it is seen: of scale and coupling a share, of
+# other readings rad (prismatic × 0.3 m/rad), of others the rms motion of the images, px.
+_SIZES: dict[str, float] = {
+    "scale": 0.01,
+    "quadratic": float(np.radians(0.3)),
+    "cubic": float(np.radians(0.3)),
+    "harmonic": float(np.radians(0.5)),
+    "coupling": 0.01,
+    "sag": float(np.radians(0.5)),
+    "joint_drift": float(np.radians(0.2)),
+    "joint_step": float(np.radians(0.2)),
+    "camera_drift": 1.0,
+    "camera_step": 1.0,
+    "base": 1.0,
+    "tool": 1.0,
+    "lens": 2.0,
+    "lens_center": 2.0,
+    "focus": 1.0,
+}
+# Kinds whose amplitude is a motion of the images.
+_OF_IMAGES = ("camera_drift", "camera_step", "base", "tool", "lens", "lens_center", "focus")
+_NO_TIME, _DRIFT, _STEP = range(3)
+
+
+class _Nuisance(NamedTuple):
+    """Changes of the images of observations by one thing that the model leaves out."""
+
+    kind: str
+    joints: tuple[int, ...]  # from 0
+    view: int | None
+    columns: FloatArray  # (2, N, 2, d) weighted, by its amplitudes
+    timed: int = _NO_TIME  # whether it drifts or steps over the order of poses
+
+
+class _Extent(NamedTuple):
+    """Ranges of the recorded data, which give nuisances their units."""
+
+    middle: FloatArray  # (n,) of the readings from the reference
+    half: FloatArray  # (n,) half their range
+    center: FloatArray  # (2, 2) of the images, px
+    radius: FloatArray  # (2,) half the size of the images, px
+    depth: FloatArray  # (2, 2) mean and deviation of depths
+
+    @classmethod
+    def of(cls, solution: Solution) -> "_Extent":
+        """Return the ranges of the detections that count."""
+        problem, detections, used = solution.problem, solution.problem.detections, solution.used
+        q, depths = problem.q[np.unique(detections.pose_of)], problem.pixels(solution.params)[1]
+        low, high = (
+            np.stack([end(detections.pixels[v][used[v]], axis=0) for v in (0, 1)]) for end in (np.min, np.max)
+        )
+        depth = np.array([[d[u].mean(), max(d[u].std(), 1e-12)] for d, u in zip(depths, used, strict=True)])
+        half = np.maximum(0.5 * np.ptp(q, axis=0), 1e-9)
+        middle = 0.5 * (q.min(axis=0) + q.max(axis=0))
+        return cls(middle, half, 0.5 * (low + high), 0.5 * (high - low).max(axis=1), depth)
+
+
+def _nuisances(problem: LeastSquares, params: Parameters, extent: _Extent) -> list[_Nuisance]:
+    """Return all nuisances at the observations of a problem, in one order for all problems of a fit."""
+    detections, q = problem.detections, problem.joints(params)
+    images = params.images(q, detections.pose_of, detections.marker_of)
+    found = _of_readings(problem, params, q, extent, images)
+    for v in (0, 1):
+        found += _of_view(problem, params, extent, images, v)
+    center = params.M[:, :3].mean(axis=0)
+    rigid = np.zeros((6, 4, 4))
+    rigid[:3, :3, :3], rigid[3:, :3, 3] = cross_matrix(np.eye(3)), np.eye(3)
+    rigid[:3, :3, 3] = -(rigid[:3, :3, :3] @ center)
+    for kind, last in (("base", 0), ("tool", -1)):
+        motion = np.tensordot(images.points[last], rigid, axes=(1, 2)).swapaxes(1, 2)
+        columns = (images.by_point[last] @ motion) * detections.weight[..., None, None]
+        found += [_Nuisance(kind, (), None, columns, timed) for timed in (_DRIFT, _STEP)]
+    return found
+
+
+def _of_readings(
+    problem: LeastSquares, params: Parameters, q: FloatArray, extent: _Extent, images: Images
+) -> list[_Nuisance]:
+    """Nuisances of joints: curves of readings, coupling, sag under a weight at the tool, drift, step."""
+    detections, n, found = problem.detections, len(params.H_hat), list[_Nuisance]()
+    G = images.by_joint(params.H_hat) * detections.weight[..., None, None]
+    x, unit, loads = (q - extent.middle) / extent.half, per_rad(params.prismatic), _loads(params, q)
+
+    def of_joint(kind: str, i: int, change: FloatArray, *others: int, timed: int = _NO_TIME) -> None:
+        """Add a nuisance that changes readings of joint i by (K, d)."""
+        columns = G[..., [i]] * change[detections.pose_of][:, None]
+        found.append(_Nuisance(kind, (*others, i), None, columns, timed))
+
+    for i in range(n):
+        of_joint("scale", i, q[:, [i]])
+        of_joint("quadratic", i, unit[i] * x[:, [i]] ** 2)
+        of_joint("cubic", i, unit[i] * x[:, [i]] ** 3)
+        if not params.prismatic[i]:
+            of_joint("harmonic", i, np.stack([np.sin(q[:, i]), np.cos(q[:, i])], axis=1))
+            of_joint("sag", i, loads[:, i])
+        for j in range(n):
+            if j != i:
+                of_joint("coupling", i, q[:, [j]] * unit[i] / unit[j], j)
+        of_joint("joint_drift", i, np.full((len(q), 1), unit[i]), timed=_DRIFT)
+        of_joint("joint_step", i, np.full((len(q), 1), unit[i]), timed=_STEP)
+    if n > 1:
+        columns = G * q[detections.pose_of][:, None]
+        found.append(_Nuisance("scale", tuple(range(n)), None, columns))
+    return found
+
+
+def _of_view(
+    problem: LeastSquares, params: Parameters, extent: _Extent, images: Images, v: int
+) -> list[_Nuisance]:
+    """Nuisances of a camera: drift and step of its images, lens or its centre, focus with depth."""
+    detections, found = problem.detections, list[_Nuisance]()
+    pixels, depths = problem.pixels(params)
+    x = (pixels[v] - extent.center[v]) / extent.radius[v]
+
+    def add(kind: str, change: FloatArray, timed: int = _NO_TIME) -> None:
+        """Add a nuisance that changes the images by (N, 2, d)."""
+        columns = np.zeros((*pixels.shape, change.shape[-1]))
+        columns[v] = change * detections.weight[v][:, None, None]
+        found.append(_Nuisance(kind, (), v, columns, timed))
+
+    similarity = np.zeros((len(x), 2, 4))
+    similarity[..., :2], similarity[..., 2] = np.eye(2), x
+    similarity[:, 0, 3], similarity[:, 1, 3] = -x[:, 1], x[:, 0]
+    add("camera_drift", similarity, _DRIFT)
+    add("camera_step", similarity, _STEP)
+    if images.by_lens is None:
+        square = (x**2).sum(axis=1)[:, None, None]
+        add("lens", x[..., None] * np.concatenate([square, square**2], axis=2))
+    elif problem.lens_terms == LENS:
+        add("lens_center", images.by_lens[v][..., LENS:])
+    mean, deviation = extent.depth[v]
+    add("focus", x[..., None] * ((depths[v] - mean) / deviation)[:, None, None])
+    return found
+
+
+def _loads(params: Parameters, q: FloatArray) -> FloatArray:
+    """Return torques (K, n, 3) of a weight at the tool about each joint by the components of gravity.
+
+    The torque of joint i is the velocity of the weight under it, H̄_i Ĥ_i H̄_i⁻¹ applied to the weight, along
+    gravity; a deflection follows it. The largest one of each joint has length one.
+    """
+    center, joints = np.append(params.M[:, :3].mean(axis=0), 1.0), np.arange(q.shape[1])
+    truncated = [params.motion(np.where(joints <= i, q, 0.0)) for i in joints]
+    loads = np.empty((*q.shape, 3))
+    for i, H_bar in enumerate(truncated):
+        behind = np.linalg.solve(H_bar, truncated[-1] @ center[:, None])
+        loads[:, i] = (H_bar @ (params.H_hat[i] @ behind))[:, :3, 0]
+    return np.asarray(loads / np.maximum(np.linalg.norm(loads, axis=2).max(axis=0), 1e-12)[:, None])
+
+
+class _Choice(NamedTuple):
+    """A nuisance by its number, and the pose at which it begins, if it is a step."""
+
+    number: int
+    onset: int
+
+
+class _Tests:
+    """Score tests of nuisances on the whitened residuals of a fit, cleared of its parameters."""
+
+    def __init__(self, solution: Solution, errors: Errors, nuisances: Sequence[_Nuisance]) -> None:
+        problem, params, used = solution.problem, solution.params, solution.used
+        pose_of = np.repeat(np.tile(problem.detections.pose_of, 2), 2)
+        counted = np.flatnonzero(np.repeat(used.ravel(), 2))
+        counted = counted[np.argsort(pose_of[counted], kind="stable")]
+        self.poses, starts = np.unique(pose_of[counted], return_index=True)
+        self.edges = np.append(starts, counted.size)
+        self.nuisances, self.dof = nuisances, max(solution.dof, 1)
+        self.pose = problem.detections.pose
+        self.posture = _postures(problem.q[self.poses])
+
+        def whitened(columns: FloatArray) -> FloatArray:
+            """Rows (L, c) of the detections that count, pose by pose."""
+            return problem.whitened(params, columns, used)[counted]
+
+        # U Uᵀ projects on all that the parameters can do; seen less predicted images r are cleared of it.
+        self.F = errors.dense()
+        self.U = whitened(problem.dense(problem.derivative(params), used)) @ self.F
+        r = -whitened(solution.raw.reshape(-1, 1))[:, 0]
+        self.r = self.r_first = r - self.U @ (self.U.T @ r)
+        flat = [one.columns * used[..., None, None] for one in nuisances]
+        Z = whitened(np.concatenate(flat, axis=3).reshape(4 * used.shape[1], -1))
+        self.parts = np.cumsum([0, *(one.columns.shape[3] for one in nuisances)])
+        self.units = list[FloatArray]()
+        for number, one in enumerate(nuisances):
+            own = slice(*self.parts[number : number + 2])
+            self.units.append(_unit(one.kind, Z[:, own]))
+            Z[:, own] @= self.units[-1]
+        self.Z = Z
+        self.Q = np.zeros((len(r), 0))  # orthonormal columns of the nuisances chosen
+
+    def columns(self, choice: _Choice) -> FloatArray:
+        """Columns (L, d) of a nuisance in units of its usual size."""
+        own = self.Z[:, slice(*self.parts[choice.number : choice.number + 2])]
+        timed = self.nuisances[choice.number].timed
+        if timed == _NO_TIME:
+            return own
+        return own * np.repeat(_over_time(timed, len(self.poses), choice.onset), np.diff(self.edges))[:, None]
+
+    def cleared(self, columns: FloatArray) -> FloatArray:
+        """Columns (L, d) cleared of the parameters and of the nuisances chosen."""
+        columns = columns - self.U @ (self.U.T @ columns)
+        return np.asarray(columns - self.Q @ (self.Q.T @ columns))
+
+    def choose(self, choices: Sequence[_Choice]) -> None:
+        """Clear the residuals of some nuisances."""
+        self.Q = np.zeros((len(self.r), 0))
+        if choices:
+            self.Q = self._known(self.cleared(np.hstack([self.columns(one) for one in choices])))
+        self.r = self.r_first - self.Q @ (self.Q.T @ self.r_first)
+
+    @property
+    def sigma(self) -> float:
+        """Noise that the residuals show, px."""
+        return float(np.sqrt(self.r @ self.r / self.dof))
+
+    def _known(self, cleared: FloatArray) -> FloatArray:
+        """Orthonormal directions (L, k) of cleared columns that the data do not leave open."""
+        values, basis = np.linalg.eigh(cleared.T @ cleared)
+        known = values > max(self.sigma / _OPEN, 1e-9) ** 2
+        return np.linalg.qr(cleared @ basis[:, known])[0]
+
+    def candidates(self) -> list[tuple[float, _Choice]]:
+        """Return the criterion of all nuisances that it prefers to none, best first."""
+        square, rows, K = float(self.r @ self.r), len(self.r), len(self.poses)
+        plain = [number for number, one in enumerate(self.nuisances) if one.timed != _STEP]
+        stack = np.hstack([self.columns(_Choice(number, 0)) for number in plain])
+        s, W = stack.T @ self.r, np.vstack([self.U.T @ stack, self.Q.T @ stack])
+        edges = np.cumsum([0, *(self.units[number].shape[0] for number in plain)])
+        found = []
+
+        def judge(gain: float, choice: _Choice, extra: float) -> None:
+            """Keep a nuisance whose gain in squares is worth its parameters."""
+            criterion = self.dof * np.log1p(-min(gain / max(square, 1e-300), 1.0 - 1e-12))
+            criterion += len(self.units[choice.number]) * np.log(rows) + extra
+            if criterion < 0.0:
+                found.append((float(criterion), choice))
+
+        for number, a, b in zip(plain, edges[:-1], edges[1:], strict=True):
+            gram = stack[:, a:b].T @ stack[:, a:b] - W[:, a:b].T @ W[:, a:b]
+            judge(self._gain(gram, s[a:b]), _Choice(number, 0), 0.0)
+        for number, one in enumerate(self.nuisances):
+            if one.timed == _STEP and K > 2:
+                gains = self._step_gains(number)
+                onset = int(np.argmax(gains)) + 1
+                judge(gains[onset - 1], _Choice(number, onset), 2.0 * np.log(K))
+        return sorted(found)
+
+    def _gain(self, gram: FloatArray, score: FloatArray) -> float:
+        """Squared residuals that cleared columns take away, by their Gram matrix (d, d) and scores (d,)."""
+        values, basis = np.linalg.eigh(gram)
+        return float(((basis.T @ score) ** 2 / np.maximum(values, (self.sigma / _OPEN) ** 2 + 1e-18)).sum())
+
+    def _step_gains(self, number: int) -> list[float]:
+        """Gains of steps at each pose from the second on."""
+        Z, first = self.Z[:, slice(*self.parts[number : number + 2])], self.edges[:-1]
+        s = np.add.reduceat(Z * self.r[:, None], first, axis=0)
+        A = np.add.reduceat(Z[:, :, None] * Z[:, None], first, axis=0)
+        basis = np.hstack([self.U, self.Q])
+        spans = list(zip(first, self.edges[1:], strict=True))
+        W = np.array([basis[a:b].T @ Z[a:b] for a, b in spans])
+        s, A, W = (np.cumsum(part[::-1], axis=0)[::-1][1:] for part in (s, A, W))
+        return [self._gain(*parts) for parts in zip(A - W.swapaxes(1, 2) @ W, s, strict=True)]
+
+    def chance(self, choice: _Choice) -> float:
+        """Probability of chance: the larger of the F test and of the Wald test by postures."""
+        Q = self._known(self.cleared(self.columns(choice)))
+        b, d = Q.T @ self.r, Q.shape[1]
+        left = self.r - Q @ b
+        freedom = float(max(self.dof - d, 1))
+        square = max(float(left @ left), 1e-300)
+        chance = float(fdtrc(d, freedom, float(b @ b) / d / (square / freedom))) if d else 1.0
+        groups, count = np.repeat(self.posture, np.diff(self.edges)), int(self.posture.max()) + 1
+        weight = np.bincount(groups, (Q**2).sum(axis=1), count)
+        freedom = weight.sum() ** 2 / max(float((weight**2).sum()), 1e-300) - d
+        if freedom < 1.0:
+            return 1.0
+        scores = np.stack([np.bincount(groups, column, count) for column in (Q * left[:, None]).T], axis=1)
+        V = scores.T @ scores * count / max(count - 1, 1) + 1e-9 * square / self.dof * np.eye(d)
+        wald = float(b @ np.linalg.solve(V, b)) / d * freedom / (freedom + d - 1.0)
+        tries = len(self.poses) - 1 if choice.onset else 1
+        return tries * max(chance, float(fdtrc(d, freedom, wald)))
+
+    def select(self) -> list[_Choice]:
+        """Choose nuisances one by one, then exchange each for a better one in the presence of the others."""
+        chosen = list[_Choice]()
+        while len(chosen) < _MAX_FOUND and (best := self._best()) is not None:
+            chosen.append(best)
+            self.choose(chosen)
+        for _ in range(_ROUNDS if chosen else 0):
+            before = list(chosen)
+            for one in before:
+                self.choose(others := [other for other in chosen if other != one])
+                best = self._best()
+                chosen = others if best is None else [*others, best]
+            if set(chosen) == set(before):
+                break
+        self.choose(chosen)
+        return chosen
+
+    def _best(self) -> _Choice | None:
+        """Best candidate that is significant, or none."""
+        return next((one for _, one in self.candidates()[:_TRIED] if self.chance(one) < _CHANCE), None)
+
+
+def _unit(kind: str, Z: FloatArray) -> FloatArray:
+    """Amplitudes (d, d) of the usual size of a kind, for columns (L, d): of the images by their rms."""
+    size: float = _SIZES[kind]
+    if kind not in _OF_IMAGES:
+        return size * np.eye(Z.shape[1])
+    count = max(int(np.count_nonzero(np.abs(Z).max(axis=1))), 1)
+    values, basis = np.linalg.eigh(Z.T @ Z / count)
+    return np.asarray(size * basis / np.sqrt(np.maximum(values, 1e-12 * values[-1] + 1e-300)))
+
+
+def _over_time(timed: int, poses: int, onset: int) -> FloatArray:
+    """Amplitudes (K,) over the poses of a drift, from −½ to ½, or of a step at a pose."""
+    if timed == _DRIFT:
+        return np.linspace(-0.5, 0.5, poses)
+    return (np.arange(poses) >= onset).astype(np.float64)
+
+
+def _postures(q: FloatArray) -> IntArray:
+    """Number the posture of each pose (K, n), rad or m: poses that are nearly the same share one."""
+    if len(q) < 2:
+        return np.zeros(len(q), dtype=np.int64)
+    groups = fcluster(linkage(q, "single", "chebyshev"), _SAME_POSTURE, "distance")
+    return np.asarray(groups - 1, dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelCheck:
+    """Errors of predictions, and the deviations from the model that explain them."""
+
+    errors: tuple[ModelError, ...]  # that dominate noise, the largest effect first
+    effect_px: float  # rms error per marker and view at other poses by all of them
+    noise_px: float  # that by noise, with the correlation of the corners of a posture
+    noise_factor: float  # noise_px over that of independent corners
+    recorded_px: float  # rms error at the recorded poses
+    unshown: ModelError | None  # with the largest effect that the data could not have shown
+    bias: FloatArray  # (p, errors) error of the parameters by each of them
+
+    @property
+    def predicted_px(self) -> float:
+        """Expected error at other poses, rms per marker and view, px."""
+        return float(np.hypot(self.noise_px, self.effect_px))
+
+
+def examine(
+    solution: Solution, errors: Errors, there: LeastSquares, inside: BoolArray, T: FloatArray, sigma_px: float
+) -> ModelCheck:
+    """Test a fit for nuisances, and return their effect at other poses.
+
+    solution : fit, of few markers; errors : of its parameters at a noise of one pixel.
+    there : problem of the same markers at the other poses; inside : (2, N) its images that count.
+    T : (rows, r) changes of these images by ``errors``; sigma_px : noise of a coordinate, px.
+    """
+    extent = _Extent.of(solution)
+    tests = _Tests(solution, errors, _nuisances(solution.problem, solution.params, extent))
+    effects = _Effects(tests, _nuisances(there, solution.params, extent), inside, T)
+    independent_px = sigma_px * effects.rms(T.ravel()) * np.sqrt(T.shape[1])
+    chosen = tests.select()
+    found, total, bias = _estimated(tests, effects, chosen)
+    factor = np.sqrt(_design(tests, tests.r, T, sigma_px))
+    at_recorded = sigma_px * np.sqrt(2.0 * np.square(tests.U).sum() / max(len(tests.r), 1))
+    shown = tests.r_first - tests.r
+    if total <= factor * independent_px:  # what noise hides is not told
+        factor = np.sqrt(_design(tests, tests.r_first, T, sigma_px))
+        found, total, bias, shown = [], 0.0, bias[:, :0], np.zeros(1)
+    at_recorded = float(np.hypot(factor * at_recorded, effects.rms(shown)))
+    order = sorted(range(len(found)), key=lambda k: -found[k].effect_px)
+    noise_px = float(factor * independent_px)
+    unshown = effects.unshown({one.number for one in chosen}, sigma_px)
+    if unshown is not None and unshown.effect_px <= _UNSHOWN * np.hypot(noise_px, total):
+        unshown = None
+    named = tuple(found[k] for k in order)
+    return ModelCheck(named, total, noise_px, float(factor), at_recorded, unshown, bias[:, order])
+
+
+def _estimated(
+    tests: _Tests, effects: "_Effects", chosen: Sequence[_Choice]
+) -> tuple[list[ModelError], float, FloatArray]:
+    """Amplitudes of nuisances together, with their effects; the effect of all, px; the bias of parameters."""
+    if not chosen:
+        return [], 0.0, np.zeros((len(tests.F), 0))
+    parts = [tests.columns(one) for one in chosen]
+    Z = np.hstack(parts)
+    cleared = Z - tests.U @ (tests.U.T @ Z)
+    information = cleared.T @ cleared / tests.sigma**2 + np.eye(Z.shape[1]) / _OPEN**2
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    b = covariance @ (cleared.T @ tests.r_first) / tests.sigma**2
+    edges = np.cumsum([0, *(part.shape[1] for part in parts)])
+    own = [slice(*ends) for ends in pairwise(edges.tolist())]
+    moved = [effects.of(one.number, part) @ b[at] for one, part, at in zip(chosen, parts, own, strict=True)]
+    found = []
+    for one, at, change in zip(chosen, own, moved, strict=True):
+        first = int(tests.pose[tests.poses[one.onset]]) if one.onset else None
+        found.append(_described(tests, one.number, b[at], covariance[at, at], effects.rms(change), first))
+    of_images = np.stack([part @ b[at] for part, at in zip(parts, own, strict=True)], axis=1)
+    return found, effects.rms(np.sum(moved, axis=0)), tests.F @ (tests.U.T @ of_images)
+
+
+class _Effects:
+    """Changes of images at other poses by nuisances, less what the fit absorbs of them."""
+
+    def __init__(self, tests: _Tests, there: Sequence[_Nuisance], inside: BoolArray, T: FloatArray) -> None:
+        self.tests, self.there, self.T = tests, there, T
+        self.rows = np.repeat(inside.ravel(), 2)
+
+    def of(self, number: int, Z: FloatArray) -> FloatArray:
+        """Changes (rows, d) at the end of the recording by a nuisance of columns (L, d) in the data."""
+        one = self.there[number]
+        columns = one.columns.reshape(len(self.rows), -1)[self.rows] @ self.tests.units[number]
+        return np.asarray((0.5 if one.timed == _DRIFT else 1.0) * columns - self.T @ (self.tests.U.T @ Z))
+
+    def rms(self, change: FloatArray) -> float:
+        """Root mean square per marker and view of a change (rows,)."""
+        return float(np.sqrt(2.0 / max(len(change), 1)) * np.linalg.norm(change))
+
+    def unshown(self, found: set[int], sigma_px: float) -> ModelError | None:
+        """Nuisance that has the largest effect of those too small for the tests and no larger than usual."""
+        worst: tuple[float, int, FloatArray] | None = None
+        for number, one in enumerate(self.tests.nuisances):
+            if number in found or one.timed != _NO_TIME or (one.kind == "scale" and len(one.joints) > 1):
+                continue
+            Z = self.tests.columns(_Choice(number, 0))
+            W = self.tests.U.T @ Z
+            information = (Z.T @ Z - W.T @ W) / (_DETECTED * sigma_px) ** 2
+            values, basis = np.linalg.eigh(information)
+            root = basis / np.sqrt(1.0 + np.maximum(values, 0.0))
+            _, s, Vt = np.linalg.svd(self.of(number, Z) @ root, full_matrices=False)
+            if worst is None or s[0] > worst[0]:
+                worst = float(s[0]), number, root @ Vt[0]
+        if worst is None:
+            return None
+        effect, number, b = worst
+        effect *= float(np.sqrt(2.0 / max(len(self.T), 1)))
+        return _described(self.tests, number, b, np.zeros((len(b), len(b))), effect, None)
+
+
+def _described(
+    tests: _Tests, number: int, b: FloatArray, covariance: FloatArray, effect: float, first: int | None
+) -> ModelError:
+    """Record of a nuisance of amplitudes b (d,), in units of its usual size, with their covariance."""
+    one, length = tests.nuisances[number], max(float(np.linalg.norm(b)), 1e-300)
+    sign = float(np.sign(b[0])) if len(b) == 1 else 1.0
+    deviation = float(np.sqrt(max(float(b @ covariance @ b), 0.0))) / length
+    joints, view = tuple(i + 1 for i in one.joints), "" if one.view is None else VIEWS[one.view]
+    size = _SIZES[one.kind]
+    if one.kind == "scale":  # of several joints the root mean square
+        size /= np.sqrt(len(joints))
+    return ModelError(one.kind, joints, view, sign * size * length, size * deviation, effect, first)
+
+
+def _design(tests: _Tests, r: FloatArray, T: FloatArray, sigma_px: float) -> float:
+    """Variance of predictions with residuals (L,) correlated within postures, over that of independent ones.
+
+    Residuals are adjusted for leverage (R. Bell, D. McCaffrey, "Bias reduction in standard errors for linear
+    regression with multi-stage samples", Survey Methodology 28, 2002). One where it is not significant.
+    """
+    groups, root = np.repeat(tests.posture, np.diff(tests.edges)), np.linalg.qr(T, mode="r")
+    shown, expected = [], []
+    for posture in range(int(groups.max()) + 1):
+        rows = groups == posture
+        P, s, Vt = np.linalg.svd(tests.U[rows], full_matrices=False)
+        adjusted = s / np.sqrt(1.0 - np.minimum(s**2, _MAX_LEVERAGE)) * (P.T @ r[rows])
+        moved = root @ Vt.T
+        shown.append(float(np.square(moved @ adjusted).sum()))
+        expected.append(sigma_px**2 * float(np.square(moved * s).sum()))
+    e = np.array(expected)
+    ratio, noise = sum(shown) / max(e.sum(), 1e-300), np.sqrt(2.0 * (e**2).sum()) / max(e.sum(), 1e-300)
+    return float(ratio) if ratio > 1.0 + _CORRELATED * noise else 1.0
+
+
+# Of each kind: what limits a fit, and what is wrong; of a joint, two joints or a view.
+_WORDS = {
+    "scale": ("gear of {joints}", "{joints} {turn} {share} {more} than {read}"),
+    "quadratic": (
+        "curve of {joints}",
+        "readings of {joints} follow a curve, by {size} at the ends of the range",
+    ),
+    "cubic": ("curve of {joints}", "readings of {joints} follow a curve, by {size} at the ends of the range"),
+    "harmonic": ("eccentric encoder of {joints}", "readings of {joints} swing by {size} once a turn"),
+    "coupling": ("coupling of {joints}", "joint {0} turns joint {1} by {share} of its own motion"),
+    "sag": ("sag of {joints}", "{joints} sags under load, by up to {size}"),
+    "joint_drift": ("drift of {joints}", "the zero of {joints} drifts by {size} over the recording"),
+    "joint_step": ("step of {joints}", "the zero of {joints} jumps by {size}{first}"),
+    "camera_drift": ("drift of the {view} camera", "the {view} camera drifts, by {size} over the recording"),
+    "camera_step": ("motion of the {view} camera", "the {view} camera moved{first}, by {size}"),
+    "base": (
+        "motion of the base or the cameras",
+        "the base of the arm or both cameras moved{first}, by {size}",
+    ),
+    "tool": ("markers that moved on the tool", "the markers moved on the tool{first}, by {size}"),
+    "lens": ("lens of the {view} camera", "the lens of the {view} camera distorts, by {size}: try --lens"),
+    "lens_center": ("lens of the {view} camera", "the {view} lens is centred elsewhere, by {size}"),
+    "focus": ("focus of the {view} camera", "the {view} image is scaled with depth, by {size}"),
+}
+
+
+def describe(error: ModelError, prismatic: BoolArray) -> tuple[str, str]:
+    """Describe a deviation from the model: what limits a fit, and a sentence on it with its deviation."""
+    i = error.joints[-1] - 1 if error.joints else 0
+    slides, spread = bool(error.joints and prismatic[i]), error.deviation
+    if error.kind in _OF_IMAGES:
+        factor, unit = 1.0, " px"
+    elif error.kind in ("scale", "coupling"):
+        factor, unit = 100.0, " %"
+    else:
+        factor, unit = (
+            (1e3 * float(per_rad(prismatic)[i]), " mm") if slides else (float(np.degrees(1.0)), "°")
+        )
+    size = f"{factor * abs(error.estimate):.2g}{unit}" + (f" ± {factor * spread:.1g}{unit}" if spread else "")
+    several = len(error.joints) > 1
+    names = f"joint{'s' * several} {' and '.join(map(str, error.joints))}"
+    if several and error.kind == "scale":
+        names, several = "all joints", True
+    more = "more or less" if several else "less" if error.estimate < 0.0 else "more"
+    turn = ("move" if slides else "turn") + "s" * (not several)
+    words = {"joints": names, "view": error.view, "size": size, "share": size, "more": more, "turn": turn}
+    words |= {"read": "they read" if several else "it reads"}
+    words |= {"first": "" if error.first is None else f" at pose {error.first}"}
+    limit, sentence = _WORDS[error.kind]
+    return limit.format(*error.joints, **words), sentence.format(*error.joints, **words)
