@@ -179,6 +179,7 @@ def calibrate(
     init: str | Path | None = None,
     cross_validate: int | None = None,
     joint_noise_deg: float | None = None,
+    max_predicted_px: float | None = None,
     noise_px: float | None = None,
     seed: int | None = None,
     progress: Progress | bool = True,
@@ -197,6 +198,8 @@ def calibrate(
         are in ``cross_validation``.
     joint_noise_deg : rms of joint readings less true angles (of prismatic joints × 0.3 m/rad); by default
         that of the observations, else estimated.
+    max_predicted_px : error of predictions by deviations of arm and rig from the model, px, above which the
+        calibration is not usable; by default 1 % of the image size.
     noise_px : standard deviation of a coordinate, px; by default that of the observations, else estimated.
     seed : of the random starts; by default that of the observations.
     progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
@@ -220,6 +223,7 @@ def calibrate(
         "calibration.init": init,
         "calibration.cross_validate": cross_validate,
         "calibration.joint_noise_deg": joint_noise_deg,
+        "calibration.max_predicted_px": max_predicted_px,
         "data.noise_px": noise_px,
         "calibration.seed": seed,
     }
@@ -233,7 +237,9 @@ def calibrate(
     if settings.seed is not None:
         seen = replace(seen, seed=settings.seed)
     file = None if settings.init is None else File.of(settings.init, "JSON with screws, cameras and markers")
-    asked = Estimation(settings.method, settings.lens, file, settings.cross_validate)
+    asked = Estimation(
+        settings.method, settings.lens, file, settings.cross_validate, settings.max_predicted_px
+    )
     with listening(progress) as listener:
         made = calibrating.estimate(seen, asked, progress=listener.progress)
         return ImageModel.of(*made, seen.record)

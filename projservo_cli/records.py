@@ -41,6 +41,7 @@ SIZES = {
     "lens_term": 5,
     "outlier_column": 3,
     "suspect_column": 2,
+    "moved_column": 2,
     "id_switch_column": 3,
     "rejected_marker_column": 2,
     "law": 2,
@@ -302,6 +303,11 @@ class Calibration:
     )
     rejected_poses: IntArray | None = _array(
         "rejected_pose", about="rejected poses without one suspect joint reading", default=None
+    )
+    moved_images: IntArray | None = _array(
+        "moved_row moved_column",
+        about="rejected images that a camera shows that moved: pose, view (0 left, 1 right)",
+        default=None,
     )
     predicted_rms_px: float | None = _scalar(
         "px",

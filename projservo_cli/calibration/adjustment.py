@@ -282,6 +282,11 @@ class JointErrors:
         share = 1.0 - 1.0 / np.sqrt(1.0 + self.square.reshape(-1, 1))
         return np.asarray(rows - self._U @ (share * self.parts(rows)))
 
+    def coloured(self, rows: FloatArray) -> FloatArray:
+        """Give back to whitened rows (4 N, c) the covariance I + G Gᵀ."""
+        share = np.sqrt(1.0 + self.square.reshape(-1, 1)) - 1.0
+        return np.asarray(rows + self._U @ (share * self.parts(rows)))
+
     def undoing(self, change: FloatArray) -> FloatArray:
         """Errors (K, n) of unit variance that best undo a change (2, N, 2) of the images."""
         parts = self.parts(change.ravel()).reshape(self.square.shape)

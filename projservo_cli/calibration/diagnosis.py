@@ -18,7 +18,7 @@ from projservo_cli.calibration.initialization import Search, starting_markers, s
 from projservo_cli.calibration.lens_estimation import undistorted
 from projservo_cli.calibration.prediction import CAMERA, Parameters
 from projservo_cli.geometry.rigid import cross_matrix
-from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
+from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray, WorkFailed
 
 # Median residual, in σ, below which a corrected joint reading explains a pose.
 _CORRECTED = 3.0
@@ -37,6 +37,16 @@ _MIN_OF_POSE = 0.25
 _AGREEING = 5
 # Maximum number of markers in the estimate of noise at free poses.
 _FREED = 150
+# Minimum share of the detections of an image that are rejected where its camera may have moved.
+_MOSTLY = 0.5
+# Minimum number of detections of such an image: two more than its motion has coordinates, to test it.
+_SEEN_OF_IMAGE = 4
+# Maximum motion of such an image, over the spread of its markers.
+_SMALL_MOTION = 0.1
+# Maximum number of runs of poses that a message names.
+_MAX_RUNS = 4
+# Share of the poses that show another motion above which the joint readings are wrong.
+_MANY_POSES = 0.4
 # Number of hypotheses about a joint at fault that are fitted completely.
 _FOLLOWED = 2
 # Number of adjustment steps of the screws by which hypotheses are compared before.
@@ -52,23 +62,28 @@ class Outliers:
     suspect: IntArray  # (S, 2) row of the pose and index of the joint whose reading no image agrees with
     id_switches: IntArray  # (W, 3) row of the pose, index of the marker as numbered and of the true one
     poses: IntArray  # (P,) rows of poses whose images show other joints than those read
+    moved: IntArray  # (V, 2) row of the pose and view of images that a motion of the camera explains
     explained: BoolArray  # (2, N) detections that these explain
 
     @classmethod
     def empty(cls, detections: Detections) -> "Outliers":
         """Return no explanations."""
         rows = np.zeros((0, 3), dtype=np.int64)
-        return cls(rows[:, :2], rows, rows[:, 0], np.zeros_like(detections.seen))
+        return cls(rows[:, :2], rows, rows[:, 0], rows[:, :2], np.zeros_like(detections.seen))
 
     @classmethod
     def of(cls, solution: Solution) -> "Outliers":
-        """Explain rejected detections, first by exchanged marker numbers, then by wrong joint readings."""
+        """Explain rejected detections: exchanged marker numbers, moved cameras, then wrong joint readings."""
         problem, params, used = solution.problem, solution.params, solution.used
         detections, sigma = problem.detections, solution.sigma_px
         out = detections.seen & ~used
         id_switches, explained = _id_switches(problem, params, out, OUTLIER * sigma)
+        moved = _moved_images(solution, out & ~explained)
+        for k, view in moved:
+            here = detections.pose_of == k
+            explained[view, here] |= out[view, here]
         suspects, poses = list[tuple[int, int]](), list[int]()
-        for k in np.flatnonzero(detections.count_at(used) == 0):
+        for k in np.setdiff1d(np.flatnonzero(detections.count_at(used) == 0), moved[:, 0]):
             here = detections.pose_of == k
             pose = dataclasses.replace(detections, seen=detections.seen & ~explained).rows(here)
             rows = np.flatnonzero(pose.seen.any(axis=0))
@@ -82,7 +97,55 @@ class Outliers:
                 explained[:, here] |= out[:, here]
                 poses += [] if joints else [int(k)]
         pairs = np.array(suspects, dtype=np.int64).reshape(-1, 2)
-        return cls(pairs, id_switches, np.array(poses, dtype=np.int64), explained)
+        return cls(pairs, id_switches, np.array(poses, dtype=np.int64), moved, explained)
+
+
+def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
+    """Images (V, 2), pose and view, mostly rejected by ``out`` (2, N), that fit a camera that moved a little.
+
+    It shifts, turns and scales the image, and is small against the spread of its markers, as the motion by a
+    wrong joint is not.
+    """
+    problem, sigma, found = solution.problem, solution.sigma_px, list[tuple[int, int]]()
+    detections = problem.detections
+    residual = problem.with_noise(None).residual(solution.params)
+    residual /= np.maximum(detections.weight[..., None], 1e-300)
+    for view, k in itertools.product((0, 1), np.unique(detections.pose_of[out.any(axis=0)])):
+        rows = np.flatnonzero(detections.seen[view] & (detections.pose_of == k))
+        if rows.size < _SEEN_OF_IMAGE or np.count_nonzero(out[view, rows]) < _MOSTLY * rows.size:
+            continue
+        x = detections.pixels[view, rows] - detections.pixels[view, rows].mean(axis=0)
+        radius = float(np.sqrt((x**2).sum(axis=1).mean()))
+        A = np.zeros((rows.size, 2, 4))
+        A[..., :2], A[..., 2] = np.eye(2), x / radius
+        A[:, 0, 3], A[:, 1, 3] = -x[:, 1] / radius, x[:, 0] / radius
+        off = residual[view, rows]
+
+        def left(b: FloatArray, A: FloatArray = A, off: FloatArray = off) -> FloatArray:
+            """Residuals after a motion of the image by shift, scale and turn b (4,), px."""
+            return np.asarray((off - A @ b).ravel())
+
+        fit = least_squares(left, np.zeros(4), loss="soft_l1", f_scale=sigma)
+        median = float(np.median(np.linalg.norm(fit.fun.reshape(-1, 2), axis=1)))
+        if median <= _CORRECTED * RAYLEIGH * sigma and np.abs(fit.x).max() <= _SMALL_MOTION * radius:
+            found.append((int(k), view))
+    return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+
+def describe_moved(detections: Detections, moved: IntArray) -> str:
+    """Describe images (V, 2) of cameras that moved, by runs of poses in the order of the recording."""
+    present, sentences = np.unique(detections.pose_of), []
+    for view, name in enumerate(VIEWS):
+        at = np.searchsorted(present, np.sort(moved[moved[:, 1] == view, 0]))
+        if not at.size:
+            continue
+        runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
+        words = [" to ".join(map(str, np.unique(detections.pose[present[run[[0, -1]]]]))) for run in runs]
+        settled = f"settled over poses {words.pop(0)}" if at[0] == 0 and runs[0].size > 1 else ""
+        more = f" and {len(words) - _MAX_RUNS} more" if len(words) > _MAX_RUNS else ""
+        later = f"moved at pose{'s' * (at.size > 1)} {', '.join(words[:_MAX_RUNS])}{more}" if words else ""
+        sentences.append(f"the {name} camera {' and '.join(filter(None, (settled, later)))}")
+    return ", ".join(sentences)
 
 
 def _id_switches(
@@ -199,22 +262,25 @@ def describe_unexplained(solution: Solution, found: Outliers, epipolar: Epipolar
 def describe_other_motion(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
     """Describe a motion other than the joint readings that rejected observations agree on; else empty.
 
-    It takes observations that both views agree on, at poses of which the rest is kept.
+    It takes observations that both views agree on, at poses of which the rest is kept. Corners of an image
+    share errors, so it takes a large share of the poses too.
     """
     problem, total = solution.problem, int(solution.problem.detections.both.sum())
-    out, count = _doubtful_observations(solution, found, epipolar), 0
+    out, count, poses = _doubtful_observations(solution, found, epipolar), 0, 0
     for k in np.unique(problem.detections.pose_of[out]):
         rows = np.flatnonzero(out & (problem.detections.pose_of == k))
         if rows.size < _AGREEING:
             continue
         some = rows[:: max(1, rows.size // _MAX_OF_POSE)]
         alone = LeastSquares.of(problem.detections.rows(some), problem.q_reference).with_noise(problem.tau)
-        count += rows.size if _fits_other_joints(alone, solution.params, problem.q, solution.sigma_px) else 0
-    if count <= max(3.0, _MAX_UNEXPLAINED * total):
+        if _fits_other_joints(alone, solution.params, problem.q, solution.sigma_px):
+            count, poses = count + rows.size, poses + 1
+    seen = np.unique(problem.detections.pose_of).size
+    if count <= max(3.0, _MAX_UNEXPLAINED * total) or poses <= _MANY_POSES * seen:
         return ""
     return (
-        f"{count} of {total} observations show other joints than those read; check how poses and images are "
-        "paired, and the joint readings and types (R or P)"
+        f"{count} of {total} observations, at {poses} of {seen} poses, show other joints than those read; "
+        "check how poses and images are paired, and the joint readings and types (R or P)"
     )
 
 

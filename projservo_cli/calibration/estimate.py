@@ -15,6 +15,7 @@ from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.detections import Detections, require_images, require_motion
 from projservo_cli.calibration.diagnosis import (
     Outliers,
+    describe_moved,
     describe_other_motion,
     describe_unexplained,
     joint_at_fault,
@@ -52,6 +53,8 @@ _NEARLY_ALL, _WRONG_RUN = 0.9, 5
 _MOVED, _WRONG_POSES, _WRONG_SHARE = 0.1, 3, 0.25
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
 _DOUBTED_RATIO = 1.15
+# Maximum noise of such a fit over that of bodies that move freely, beyond which no error of it is stated.
+_CONTRADICTED_RATIO = 1.5
 # Maximum held-out over predicted error of a fit that rejects much.
 _DOUBTED_ERROR = 1.3
 # Number of parts in the cross-validation of a fit that rejects much.
@@ -259,11 +262,14 @@ def _refined(
         doubt = describe_unexplained(solution, found, epipolar)
         kept_by = np.sum([solution.used | found.explained, solution.used], axis=(1, 2))
         out, gone = 1.0 - kept_by / whole.problem.detections.seen.sum()
+        much = bool(doubt) or out > _MUCH or gone > _MAX_REJECTED
         suspicion = "lens" if share else "joint readings"
-        if doubt or out > _MUCH or gone > _MAX_REJECTED:
-            why = _contradiction(whole, solution, found, epipolar)
-            if not share and solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:  # not the joints
-                suspicion = "outliers"
+        if much and not share and solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:  # not the joints
+            suspicion = "outliers"
+        errors = solution.errors()
+        record = _record(Projective.of(solution), solution, expected, errors, found, suspicion, limit_px)
+        if much:
+            why = _contradiction(whole, solution, found, epipolar, record.predicted_rms_px or 0.0)
             if why or (doubt and share >= _DECISIVE_SHARE):
                 summary = f"{100.0 * gone:.0f} % of the detections do not fit it, and {why}"
                 summary = describe_other_motion(solution, found, epipolar) or doubt or summary
@@ -273,8 +279,6 @@ def _refined(
             raise
         hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         raise Misfit(f"{refused}; {hint}") from None
-    errors = solution.errors()
-    record = _record(Projective.of(solution), solution, expected, errors, found, suspicion, limit_px)
     lens = _lens_advice(record, share, frame.known)
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
     if kept.all():
@@ -354,7 +358,9 @@ def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:
     )
 
 
-def _contradiction(whole: Solution, solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
+def _contradiction(
+    whole: Solution, solution: Solution, found: Outliers, epipolar: Epipolar, stated_px: float
+) -> str:
     """Describe evidence against a fit that rejects much, and a remedy; empty if there is none.
 
     The noise is that of the images, whatever was given. A fit that leaves more than the noise of the rig must
@@ -365,7 +371,7 @@ def _contradiction(whole: Solution, solution: Solution, found: Outliers, epipola
         return "that is most of them; remove markers that are not on the robot, and check the joint readings"
     if solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:
         ratio = solution.sigma_px / max(epipolar.noise_px, noise_at_free_poses(solution))
-        if ratio > _DOUBTED_RATIO:
+        if ratio > _CONTRADICTED_RATIO:
             return (
                 f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types "
                 "(R or P)"
@@ -374,7 +380,9 @@ def _contradiction(whole: Solution, solution: Solution, found: Outliers, epipola
             return other
     held_out = cross_validate(solution.kept(), solution.sigma_px, _PARTS, 0)
     rms, predicted = held_out.rms_px, held_out.predicted_rms_px
-    if held_out.failed or rms is None or predicted is None or rms > _DOUBTED_ERROR * predicted:
+    if held_out.failed or rms is None or predicted is None:
+        return "the rest does not predict held-out poses; record more poses and more markers"
+    if rms > _DOUBTED_ERROR * np.hypot(predicted, stated_px):
         return "the rest does not predict held-out poses; record more poses and more markers"
     return ""
 
@@ -430,6 +438,7 @@ def _record(
     problem, detections, params = solution.problem, solution.problem.detections, result.params
     outlier = outlier_rows(detections, detections.seen & ~solution.used & ~found.explained)
     counts = (len(outlier), len(found.suspect) + len(found.poses), len(found.id_switches))
+    moved = describe_moved(detections, found.moved)
     verdict = assess(solution, errors, expected, counts, suspicion, limit_px)
     check = verdict.check
     if errors is None:
@@ -450,7 +459,9 @@ def _record(
         joint_types="".join("P" if slides else "R" for slides in detections.prismatic),
         usable=verdict.usable,
         reason=verdict.reason,
-        advice=verdict.advice,
+        advice=(f"{moved}: images that disagree are rejected; fix the cameras", *verdict.advice)
+        if moved
+        else verdict.advice,
         rms_px=solution.rms_px,
         sigma_px=expected.sigma_px,
         corner_squares=corner_squares,
@@ -482,6 +493,7 @@ def _record(
         outlier=outlier,
         suspect=np.stack([detections.pose[found.suspect[:, 0]], found.suspect[:, 1] + 1], axis=1),
         rejected_poses=detections.pose[found.poses],
+        moved_images=np.stack([detections.pose[found.moved[:, 0]], found.moved[:, 1]], axis=1),
         id_switches=np.concatenate(
             [detections.pose[found.id_switches[:, :1]], detections.marker[found.id_switches[:, 1:]]], axis=1
         ),

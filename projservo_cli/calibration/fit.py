@@ -9,8 +9,8 @@ from itertools import islice
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import LeastSquares, fit_offsets, minimize
-from projservo_cli.calibration.detections import RAYLEIGH, even_choice, medians, per_rad
+from projservo_cli.calibration.adjustment import JointErrors, LeastSquares, fit_offsets, minimize
+from projservo_cli.calibration.detections import MAX_JUDGED, RAYLEIGH, even_choice, medians, per_rad
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.initialization import Nominal, Search, starting_markers, starts
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
@@ -72,6 +72,12 @@ _FOCAL_FACTORS = ((1.0,), (1.0, 0.6), (1.6, 0.4, 2.5))
 _SPOILT = 8.0
 # Maximum number of searches a pass, so that data of no robot are refused within seconds.
 _SEARCHES = 5
+
+
+# Error at left-out poses with estimated noise of joints, over that without, up to which it is accepted.
+_NO_WORSE = 1.01
+# Minimum share of the squares of a direction that other poses determine.
+_MIN_LEFT = 1e-2
 
 
 class Misfit(WorkFailed):
@@ -496,7 +502,8 @@ def _degrees_of_freedom(problem: LeastSquares, params: Parameters, used: BoolArr
 def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) -> Solution:
     """Refit with noise of joint readings, rad, as given or estimated by maximum likelihood for None.
 
-    Returns the exact fit if the images show no such noise, or none explains them.
+    Returns the exact fit if the images show no such noise, none explains them, or the exact fit predicts
+    left-out poses better: noise of joints also absorbs what is none, as motions of a camera.
     """
     if given == 0.0 or exact.joint_noise is not None:
         return exact
@@ -518,7 +525,35 @@ def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) ->
         if found is None:
             return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
         solution = dataclasses.replace(found, joint_noise=noise)
+    if given is None and left_out_px(solution) > _NO_WORSE * left_out_px(exact):
+        return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
     return solution
+
+
+def left_out_px(solution: Solution) -> float:
+    """Typical error of images at the joint readings of a pose, by a fit without this pose to first order, px.
+
+    The geometric mean over poses of the median distance, rejected detections included, so that it compares
+    fits that reject different ones. Residuals of detections that count grow by the leverage of their pose:
+    (I − U Uᵀ)⁻¹, with U Uᵀ the projection on what the parameters can do.
+    """
+    few = solution.thinned(MAX_JUDGED)
+    problem, params, detections, used = few.problem, few.params, few.problem.detections, few.used
+    raw = problem.with_noise(None).residual(params)
+    U = problem.whitened(params, problem.dense(problem.derivative(params), used), used) @ few.errors().dense()
+    left = problem.whitened(params, few.raw.reshape(-1, 1), used)[:, 0]
+    pose_of = np.repeat(np.tile(detections.pose_of, 2), 2)
+    for k in np.unique(detections.pose_of):
+        rows = np.flatnonzero(pose_of == k)
+        P, s, _ = np.linalg.svd(U[rows], full_matrices=False)
+        left[rows] += P @ (s**2 / np.maximum(1.0 - s**2, _MIN_LEFT) * (P.T @ left[rows]))
+    if problem.tau is not None:
+        left = JointErrors(problem, params, used, problem.tau).coloured(left[:, None])[:, 0]
+    error = np.where(used[..., None], left.reshape(raw.shape), raw) / detections.weight[..., None]
+    seen = detections.seen
+    group = np.unique(np.broadcast_to(detections.pose_of, seen.shape)[seen], return_inverse=True)[1]
+    distance = np.linalg.norm(error[seen], axis=1)
+    return float(np.exp(np.mean(np.log(medians(distance[:, None], group) + 1e-12))))
 
 
 def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[Solution, str]:

@@ -8,7 +8,7 @@ from scipy.special import fdtri
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.detections import MAX_JUDGED, Detections
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
-from projservo_cli.calibration.fit import Solution, fit_from
+from projservo_cli.calibration.fit import Solution, fit_from, left_out_px
 from projservo_cli.calibration.initialization import Search
 from projservo_cli.calibration.prediction import LENS, Parameters
 from projservo_cli.geometry.lens import before_fold, undistort
@@ -18,6 +18,8 @@ from projservo_cli.records import FloatArray, WorkFailed
 _MIN_SHARE = 0.02
 # Probability that chance explains as much.
 _TAIL = 1e-3
+# Share of rejected detections from which another centre of the lens is tried in any case.
+_MUCH = 0.05
 # Minimum sum of squared residuals, px², against a division by zero.
 _MIN_CHI2 = 1e-20
 
@@ -76,15 +78,19 @@ def _cleared_columns(solution: Solution, params: Parameters, terms: int) -> Floa
 def fit_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
     """Fit with radial distortion, and estimate the epipolar geometry of the undistorted detections.
 
-    The distortion is centred on the image, or where the residuals show another centre, on that. Inliers are
-    selected again. Raises WorkFailed if the data do not determine the distortion.
+    The distortion is centred on the image, or where the residuals show another centre that predicts left-out
+    poses better, on that. Inliers are selected again. Raises WorkFailed if the data do not determine the
+    distortion.
     """
     params = dataclasses.replace(solution.params, lens=_undistorted(search.frame))
     found = _fit_terms(solution, params, LENS, search)
     if found is not None:
         few = found.thinned(MAX_JUDGED)
-        if _share(few, few.params, 2 * LENS) > 0.0:
-            found = _fit_terms(solution, found.params, 2 * LENS, search) or found
+        much = found.used.sum() < (1.0 - _MUCH) * solution.problem.detections.seen.sum()
+        if much or _share(few, few.params, 2 * LENS) > 0.0:
+            freed = _fit_terms(solution, found.params, 2 * LENS, search)
+            if freed is not None and left_out_px(freed) < left_out_px(found):
+                found = freed
         detections = undistorted(solution.problem.detections, found.params.lens)
         return found, Epipolar.of(detections, search.rng)
     raise WorkFailed(

@@ -541,7 +541,7 @@ _WORDS = {
         "the base of the arm or both cameras moved{first}, by {size}",
     ),
     "tool": ("markers that moved on the tool", "the markers moved on the tool{first}, by {size}"),
-    "lens": ("lens of the {view} camera", "the lens of the {view} camera distorts, by {size}: try --lens"),
+    "lens": ("lens of the {view} camera", "the lens of the {view} camera distorts, by {size}"),
     "lens_center": ("lens of the {view} camera", "the {view} lens is centred elsewhere, by {size}"),
     "focus": ("focus of the {view} camera", "the {view} image is scaled with depth, by {size}"),
 }

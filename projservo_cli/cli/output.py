@@ -175,6 +175,11 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
     if value["predicted_rms_px"] is not None:
         rms, bound = _number(value["predicted_rms_px"]), _number(value["predicted_p99_px"])
         text = f"predicted error within the ranges of the joints: {rms} px rms, 99 % below {bound} px"
+        if value["unshown"]:
+            worst, cause = _number(value["predicted_worst_px"]), value["unshown"]["text"]
+            text += f"; up to {worst} px if {cause}, which these poses do not show"
+        if value["predicted_recorded_px"] is not None:
+            text += f"; at poses like those recorded {_number(value['predicted_recorded_px'])} px rms"
         yield wrapped(text, "  ")
     if held_out := value.get("cross_validation"):
         numbers = ("rms_px", "median_px", "p95_px", "predicted_rms_px")

@@ -99,7 +99,13 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
         source = _trials(config, _truth(config, face=False), None, files, speed_scale=1.0)
     noise = None if settings.joint_noise_deg is None else float(np.radians(settings.joint_noise_deg))
-    how = Estimation(settings.method, settings.lens, _file(config, "init", files), settings.cross_validate)
+    how = Estimation(
+        settings.method,
+        settings.lens,
+        _file(config, "init", files),
+        settings.cross_validate,
+        settings.max_predicted_px,
+    )
     return CalibrationInputs(source, how, noise)
 
 

@@ -253,6 +253,11 @@ class _CalibrationSettings(Section):
         le=10_000,
         description="number of folds of the poses, each predicted from the others; null: no cross-validation",
     )
+    max_predicted_px: Positive | None = Field(
+        None,
+        description="error of predictions by deviations of arm and rig from the model above which the "
+        "calibration is not usable, px; null: 1 % of the image size",
+    )
     init: Annotated[str, StringConstraints(min_length=1)] | None = Field(
         None, description="JSON file of a known robot and rig, the first initial guess of the fit"
     )

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.calibration.model_error import describe
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.metric.frame import Metric
@@ -23,6 +24,7 @@ from projservo_cli.records import (
     CrossValidation,
     FloatArray,
     Model,
+    ModelError,
     Observation,
     Plan,
     Trace,
@@ -45,9 +47,13 @@ CLAIMS_FILE = "claims.json"
 NEAREST = tuple(
     CONSTRAINTS[constraint].value for constraint in OF_MOTION
 )  # smallest along the planned motion
-LISTS = ("outliers", "suspect_joint_readings", "id_switches")  # single observations that do not fit
+# Lists of what does not fit: observations, and deviations from the model.
+LISTS = ("outliers", "suspect_joint_readings", "id_switches", "moved_images", "model_errors")
 _COUNTS = ("poses_used", "markers_used")
-_NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")
+_NUMBERS = (
+    *("rms_px", "sigma_px", "chi2_per_dof", "seconds", "predicted_rms_px", "predicted_p99_px"),
+    *("predicted_recorded_px", "predicted_worst_px"),
+)
 
 DIRECT = ("direct_three", "direct_two")
 VIEWS = ("left", "right")
@@ -273,7 +279,7 @@ def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str
     if stage == "calibrate":
         lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *LISTS)}
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
-        return found | {"usable": False, "lens": None, "rejected": None} | numbers | lists
+        return found | {"usable": False, "lens": None, "rejected": None, "unshown": None} | numbers | lists
     if stage == "servo":
         found["laws"] = [_scalars(run.traces[law]) for law in laws]
     return found | {"feasible": False} if stage == "plan" else found
@@ -314,7 +320,16 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
         "time_offset_jitter_s",
     )
     own = {name: getattr(calibration, name) for name in more}
-    return _scalars(calibration) | own | {"joints": joints, "lens": lens} | findings(calibration) | held_out
+    found = _scalars(calibration)
+    del found["model_error"], found["unshown_error"]
+    own["model_errors"] = [_in_words(one, calibration) for one in calibration.model_errors]
+    own["unshown"] = None if calibration.unshown is None else _in_words(calibration.unshown, calibration)
+    return found | own | {"joints": joints, "lens": lens} | findings(calibration) | held_out
+
+
+def _in_words(error: ModelError, calibration: Calibration) -> dict[str, Any]:
+    """Fields of a deviation from the model, and a sentence."""
+    return error._asdict() | {"text": describe(error, calibration.prismatic)[1]}
 
 
 def _plan(run: Run) -> dict[str, Any]:
@@ -333,16 +348,16 @@ def findings(calibration: Calibration) -> dict[str, Any]:
     """Single observations that do not fit, and how many do, as plain lists for people and JSON.
 
     calibration : the record.
-    Returns ``outliers``, ``suspect_joint_readings``, ``id_switches``, ``poses_used``, ``markers_used``, and
-    ``rejected`` by kind: counts of ``observations`` and of ``id_switches``, numbers of the ``tracks``
-    (markers) that are rejected as a whole by reason, and of the ``poses``.
+    Returns ``outliers``, ``suspect_joint_readings``, ``id_switches``, ``moved_images``, ``poses_used``,
+    ``markers_used``, and ``rejected`` by kind: counts of ``observations`` and of ``id_switches``, numbers of
+    the ``tracks`` (markers) that are rejected as a whole by reason, and of the ``poses``.
     """
     outliers, suspects, swaps = (
         rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.id_switches)
     )
-    rejected_tracks, rejected_poses = (
+    rejected_tracks, rejected_poses, moved = (
         [] if rows is None else rows.tolist()
-        for rows in (calibration.rejected_markers, calibration.rejected_poses)
+        for rows in (calibration.rejected_markers, calibration.rejected_poses, calibration.moved_images)
     )
     tracks = {why: [j for j, w in rejected_tracks if w == code] for code, why in enumerate(WHY_LOST)}
     whole = {j for numbers in tracks.values() for j in numbers}
@@ -356,6 +371,7 @@ def findings(calibration: Calibration) -> dict[str, Any]:
         "outliers": [{"pose": p, "marker": m, "view": (*VIEWS, "both")[v]} for p, m, v in outliers],
         "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
         "id_switches": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
+        "moved_images": [{"pose": p, "view": VIEWS[v]} for p, v in moved],
         "poses_used": calibration.poses_used,
         "markers_used": calibration.markers_used,
         "rejected": rejected,

@@ -94,6 +94,7 @@ def estimate(
         lens=asked.lens,
         init=Nominal(**read_nominal(asked.init.path)) if asked.init is not None else None,
         joint_noise=seen.joint_noise,
+        max_predicted_px=asked.max_predicted_px,
         fitted=hold_out if asked.cross_validate is not None else None,
         progress=progress,
     )

@@ -104,6 +104,7 @@ class Estimation:
     lens: bool = False  # whether to estimate radial distortion, two coefficients a camera, and its centre
     init: File | None = None  # JSON of a robot and rig that are tried first as a start
     cross_validate: int | None = None  # parts into which poses are divided to predict each from the others
+    max_predicted_px: float | None = None  # error by deviations from the model that is accepted, px
 
 
 @dataclass(frozen=True, eq=False)
