@@ -432,9 +432,14 @@ class Calibration:
 
     def with_markers(self, indices: IntArray | list[int]) -> "Calibration":
         """The same with some of the markers, by their indices."""
-        few = self.errors.of(indices)
+        few, bias = self.errors.of(indices), self.model_error_bias
+        if bias is not None:
+            first = len(bias) - self.M.size
+            of_markers = bias[first:].reshape(len(self.M), 4, -1)[indices]
+            bias = np.concatenate([bias[:first], of_markers.reshape(-1, bias.shape[1])])
         return replace(
             self,
+            model_error_bias=bias,
             marker=self.marker[indices],
             M=self.M[indices],
             sqrt_cov_marker=few.marker,

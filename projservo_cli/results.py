@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration import predict, prediction_variance, residual_statistics
-from projservo_cli.calibration.prediction import error_factor, joint_derivative
+from projservo_cli.calibration.prediction import error_factor, error_factor_with_model, joint_derivative
 from projservo_cli.display import Displayable, Printed, numbers_in, require_radians, xarray
 from projservo_cli.files import text_of
 from projservo_cli.geometry.kinematics import project as pixels_of
@@ -206,7 +206,7 @@ class ImageModel(Displayable, Calibration):
             raise InputError(f"metric: the method {self.method} has no covariance: use bundle_adjustment")
         return MetricModel.of(
             self,
-            error_factor(self),
+            error_factor_with_model(self),
             length_m=length_m,
             between=between,
             length_std_m=length_std_m,

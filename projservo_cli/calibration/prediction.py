@@ -296,6 +296,15 @@ def error_factor(calibration: Calibration) -> FloatArray:
     return np.asarray(factor - free @ (free.T @ factor))
 
 
+def error_factor_with_model(calibration: Calibration) -> FloatArray:
+    """``error_factor``, with a column for the error that each deviation of arm and rig from the model causes.
+
+    Images err by less: to first order the deviation itself undoes most of it there.
+    """
+    factor, bias = error_factor(calibration), calibration.model_error_bias
+    return factor if bias is None else np.hstack([factor, bias])
+
+
 def joint_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
     """Derivative (K, 2, m, 2, n) of predicted pixels by joints (K, n), px per rad or m."""
     params, q = _checked(calibration, q)
