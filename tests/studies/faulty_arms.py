@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+IMAGE = (1280, 960)  # px
 ASPECT, SKEW, MIDDLE = 1.002, 0.001, np.array([[655.0, 470.0], [628.0, 487.0]])  # of cameras; px
 REACH_M = 0.3  # m of a prismatic joint for a rad
 TILTS = np.radians([-35.0, 0.0, 35.0])  # of three tags side by side
@@ -110,8 +111,9 @@ class World:
         self.unit = np.where(np.array(list(arm.types)) == "P", REACH_M, 1.0)
         self.theta, self.base, self.slip = q.copy(), np.zeros((len(q), 6)), np.zeros((len(q), 6))
         self.views, self.slipping = np.zeros((len(q), 2, 6)), np.ones(len(arm.markers), dtype=bool)
-        self.k, self.center, self.tangential = arm.k.copy(), np.zeros((2, 2)), np.zeros((2, 2))
-        self.focus = np.zeros(2)
+        self.k, self.tangential, self.focus = arm.k.copy(), np.zeros((2, 2)), np.zeros(2)
+        # A lens without a fault is about the middle of the image, px from the principal point.
+        self.center = (np.array(IMAGE) - 1.0) / 2.0 - MIDDLE
 
     def turn(self, joint, by):
         """Turn a joint, from 1, by (K,) rad more than it reads, or slide it."""
@@ -141,11 +143,11 @@ class World:
         for v, P in enumerate(arm.cameras):
             Y = moved(X @ P[:, :3].T + P[:, 3], self.views[:, v])
             x = Y[..., :2] / Y[..., 2:] * (1.0 + self.focus[v] * (Y[..., 2:] / self.near(v) - 1.0))
-            x = x - self.center[v] / arm.focal
+            x = x @ [[1.0, 0.0], [SKEW, ASPECT]] - self.center[v] / arm.focal
             r2, p = (x**2).sum(axis=-1, keepdims=True), self.tangential[v]
             bent = x * (1.0 + self.k[v, 0] * r2 + self.k[v, 1] * r2**2)
             x = bent + 2.0 * (x @ p)[..., None] * x + r2 * p + self.center[v] / arm.focal
-            result.append(arm.focal * x @ [[1.0, 0.0], [SKEW, ASPECT]] + MIDDLE[v])
+            result.append(arm.focal * x + MIDDLE[v])
         return np.stack(result, axis=1)
 
 

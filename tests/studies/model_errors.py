@@ -34,11 +34,11 @@ import projservo_cli as projservo
 from projservo_cli.calibration import predict, prediction_variance
 from tests.monitoring.corners import CornerMap
 from tests.monitoring.stand_in import KINDS
-from tests.studies.faulty_arms import ARMS, FAULTS, WITH_LENS, World, alternatives, chain, faults_of
+from tests.studies.faulty_arms import ARMS, FAULTS, IMAGE, WITH_LENS, World, alternatives, chain, faults_of
 from tests.studies.planning_tables import quantiles, rate
 
 AMPLITUDES = Path(__file__).with_suffix(".csv")
-SEED, NOISE_PX, IMAGE = 47, 0.3, (1280, 960)
+SEED, NOISE_PX = 47, 0.3
 BARREL = -0.3  # k1 of rigs that are calibrated with a lens
 COMBINED, FRAMES, RANDOM, HELD_OUT = 12, 7, 56, 100  # numbers of poses; of frames of each joint
 SIZES, SEEDS, REALISATIONS = (0.3, 1.0, 3.0, 10.0), 10, 5
