@@ -137,8 +137,9 @@ def _of_readings(
 
     for i in range(n):
         of_joint("scale", i, q[:, [i]])
-        of_joint("quadratic", i, unit[i] * x[:, [i]] ** 2)
-        of_joint("cubic", i, unit[i] * x[:, [i]] ** 3)
+        # About another middle the powers mix, so a curve has its lower orders too.
+        of_joint("quadratic", i, unit[i] * x[:, [i]] ** [1, 2])
+        of_joint("cubic", i, unit[i] * x[:, [i]] ** [1, 2, 3])
         if not params.prismatic[i]:
             of_joint("harmonic", i, np.stack([np.sin(q[:, i]), np.cos(q[:, i])], axis=1))
             of_joint("sag", i, loads[:, i])
@@ -526,9 +527,9 @@ _WORDS = {
     "scale": ("gear of {joints}", "{joints} {turn} {share} {more} than {read}"),
     "quadratic": (
         "curve of {joints}",
-        "readings of {joints} follow a curve, by {size} at the ends of the range",
+        "readings of {joints} follow a curve, off by {size} at the ends",
     ),
-    "cubic": ("curve of {joints}", "readings of {joints} follow a curve, by {size} at the ends of the range"),
+    "cubic": ("curve of {joints}", "readings of {joints} follow a curve, off by {size} at the ends"),
     "harmonic": ("eccentric encoder of {joints}", "readings of {joints} swing by {size} once a turn"),
     "coupling": ("coupling of {joints}", "joint {0} turns joint {1} by {share} of its own motion"),
     "sag": ("sag of {joints}", "{joints} sags under load, by up to {size}"),
