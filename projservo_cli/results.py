@@ -152,7 +152,9 @@ class ImageModel(Displayable, Calibration):
         Returns
         -------
         ``count`` of marker-view pairs; ``rms_px``, ``median_px``, ``p95_px`` of their Euclidean distances,
-        None without a pair; ``skipped`` by why.
+        None without a pair; ``stated_px``, the median error that the covariance states there, ``noise_px`` of
+        these images, and ``limit_px``, three times both together, above which the median contradicts the
+        calibration; ``skipped`` by why.
 
         Raises
         ------

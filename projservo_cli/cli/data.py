@@ -10,7 +10,7 @@ from projservo_cli.cli import options as option
 from projservo_cli.cli.group import main
 from projservo_cli.cli.output import Console, wrapped
 
-# Prediction error over the noise that reveals another robot, or other units.
+# Squared error over its covariance that reveals another robot, or other units.
 _FAR = 20.0
 _TAUGHT = "# What both cameras saw: projservo teach. Name this file under task.goal, or task.start.\n"
 
@@ -272,7 +272,8 @@ def _validate(
     """Predict held-out images, or positions, with a calibration.
 
     Compares the pixels of an observation table (--data) with those the calibration of a run predicts at the
-    table's joint readings.
+    table's joint readings. Ends in exit code 1 where their median distance passes three times the stated
+    error and the noise of the images together.
 
     With --metric it compares positions that another instrument measured, such as a laser tracker. Its scale,
     its pose and the place of its point on the tool are fitted to --fit.
@@ -288,6 +289,7 @@ def _validate(
         raise click.UsageError("--data and --metric: validate takes one of them; leave the other out")
     from projservo_cli.calibration import residual_statistics
     from projservo_cli.config import load_config
+    from projservo_cli.records import WorkFailed
     from projservo_cli.store import load
     from projservo_cli.store.tables import read_table
 
@@ -313,18 +315,26 @@ def _validate(
         return
     observation = read_table(data, calibration.joint_types, joint_unit)
     value = {"run": found.path.resolve(), **residual_statistics(calibration, observation)}
-    if value["count"] and value["median_px"] > _FAR * calibration.sigma_px:
-        console.say(
-            f"validate: the median is {value['median_px'] / calibration.sigma_px:.3g} times the noise of "
-            "the calibration: are these the same robot, rig and markers, with joints in the same units?"
-        )
     skipped = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in value["skipped"].items())
     words = [wrapped(f"validate: {value['count']} marker-view pairs; skipped: {skipped}")]
     if value["count"]:
         words.append(
             "  residual px: rms {rms_px:.4g}, median {median_px:.4g}, p95 {p95_px:.4g}".format_map(value)
         )
-    console.report(value, words)
+    if value["limit_px"] is None:
+        console.report(value, words)
+        return
+    allowed = (
+        "{limit_px:.3g} px allowed: 3 times the stated error of {stated_px:.3g} px and the noise of these "
+        "images, {noise_px:.3g} px, together".format_map(value)
+    )
+    console.report(value, [*words, wrapped(f"median {allowed}", "  ")])
+    if value["median_px"] > value["limit_px"]:
+        raise WorkFailed(
+            f"{data}: the images contradict the calibration: median {value['median_px']:.3g} px, {allowed}; "
+            "check that these are the same robot, rig and markers, with joints in the same units; if so, "
+            "calibrate again with such poses among the others"
+        )
 
 
 def _position_errors(

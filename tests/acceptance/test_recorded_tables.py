@@ -157,3 +157,15 @@ def test_a_table_says_the_same_in_any_order(held_out, answer, shared_data, rng, 
     code, value, _ = answer("validate", "other", "--data", shared_data / "ur5" / "validation.csv", "--json")
     # None of the numbers 27 … 90 is one of 0 … 9.
     assert (value["count"], value["skipped"]["unknown_marker"], value["rms_px"]) == (0, 4000, None)
+
+
+@pytest.mark.parametrize("name", ["gear_all_hobby_0.97", "sag6_nocombo_1.0", "wrist_coupling_45_0.05"])
+def test_validate_fails_where_the_arm_is_not_as_modelled(answer, shared_data, name):
+    """Case 20, model errors: the true error at random poses is several times the stated one."""
+    folder = shared_data.parent / "cases" / "20_model_error"
+    if not folder.exists():
+        pytest.skip(f"{folder} is absent")
+    answer("calibrate", "--data", folder / f"{name}.csv", "-o", "out", "--json")
+    code, value, err = answer("validate", "out", "--data", folder / f"{name}_heldout.csv", "--json")
+    assert (code, value["median_px"] > value["limit_px"]) == (1, True)
+    assert "contradict the calibration" in err

@@ -143,9 +143,24 @@ def test_residual_statistics_count_what_they_skip():
         calibration, dataclasses.replace(fresh, images=np.full_like(images, np.nan))
     )
     assert nothing["count"] == 0
-    assert nothing["rms_px"] is None
+    assert nothing["rms_px"] is nothing["limit_px"] is None
     with pytest.raises(InputError, match=r"expected \(poses, 3\)"):
         predict(calibration, q[:, :2])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5, 2.0])
+def test_limit_of_held_out_images_takes_their_own_noise(noise):
+    """Four times the noise of the calibration is no contradiction; a gear that changed since is one."""
+    robot, observation = noisy("RRR")
+    calibration = calibrate(observation, "RRR", sigma_px=0.5)
+    q = around(robot, 30, np.random.default_rng(9))
+    fresh = robot.observe(q, noise, np.random.default_rng(10))
+    found = residual_statistics(calibration, fresh)
+    assert found["noise_px"] == pytest.approx(np.sqrt(2.0) * noise, rel=0.2, abs=1e-6)
+    assert found["median_px"] < 0.5 * found["limit_px"]
+    assert found["limit_px"] == pytest.approx(3.0 * np.hypot(found["stated_px"], found["noise_px"]))
+    geared = residual_statistics(calibration, dataclasses.replace(fresh, q=(1.0 + 0.2 * noise + 0.05) * q))
+    assert geared["median_px"] > geared["limit_px"]
 
 
 def readings_at(robot, q):

@@ -156,6 +156,9 @@ def statistics(monkeypatch):
         "rms_px": 0.5,
         "median_px": 0.25,
         "p95_px": float("nan"),
+        "stated_px": 0.3,
+        "noise_px": 0.4,
+        "limit_px": 1.5,
         "skipped": {"unknown_marker": 1, "behind_camera": 0, "missing": 3},
     }
     monkeypatch.setattr(calibration, "residual_statistics", lambda *_: value)

@@ -27,11 +27,15 @@ def test_validate_prints_the_statistics_of_a_table(projservo, reported, statisti
     told = " ".join(answer.out.split())
     assert "2 marker-view pairs; skipped: 1 unknown marker, 0 behind camera, 3 missing" in told
     assert "median 0.25" in told
-    assert "same robot" not in answer.err
-    statistics["median_px"] = 375.0
-    answer = projservo("validate", "out", "--data", "t.csv", "--json")
-    assert "are these the\nsame robot" in answer.err
-    assert answer.json["median_px"] == 375.0
+    assert "1.5 px allowed: 3 times the stated error of 0.3 px and the noise of these images, 0.4 px" in told
+    assert (answer.code, answer.err) == (0, "")
+    for median, code in ((1.5, 0), (1.51, 1)):
+        statistics["median_px"] = median
+        answer = projservo("validate", "out", "--data", "t.csv", "--json")
+        assert (answer.code, answer.json["median_px"]) == (code, median)
+        assert ("median 1.51 px, 1.5 px allowed" in answer.err) == (code == 1)
+    statistics["limit_px"] = None  # as of a method without covariance, which states no error
+    assert projservo("validate", "out", "--data", "t.csv", "--json").code == 0
     (tmp_path / "one.csv").write_text("pose,marker,q1,u_left,v_left,u_right,v_right\n0,0,1,2,3,4,5\n")
     answer = projservo("validate", "out", "--data", "one.csv")
     assert answer.code == 2
@@ -42,7 +46,12 @@ def test_validate_takes_the_unit_of_the_run_unless_told(projservo, stages, monke
     monkeypatch.setattr(
         projservo_cli.calibration,
         "residual_statistics",
-        lambda calibration, observation: {"count": 0, "skipped": {}, "q": observation.q},
+        lambda calibration, observation: {
+            "count": 0,
+            "skipped": {},
+            "q": observation.q,
+            "limit_px": None,
+        },
     )
     rows = (tmp_path / "t.csv").read_text()
     (tmp_path / "deg.csv").write_text(rows.replace("0.2", "20").replace("0.3", "30"))
