@@ -95,15 +95,15 @@ class Epipolar:
         picks = np.stack([rng.choice(count, 8, replace=False, shuffle=False) for _ in range(_SAMPLES)])
         candidates = _eight_point(a[picks], b[picks])
         judges = np.arange(count) if count <= _JUDGES else rng.choice(count, _JUDGES, replace=False)
-        medians = np.median(np.abs(_sampson(candidates, a[judges], b[judges], weight[:, judges])[0]), axis=1)
+        medians = np.median(np.abs(sampson(candidates, a[judges], b[judges], weight[:, judges])[0]), axis=1)
         F = candidates[np.argmin(medians)]
         for _ in range(10):
-            r, slope = _sampson(F, a, b, weight)
+            r, slope = sampson(F, a, b, weight)
             F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * _deviation(r, 1e-12))) ** 2)))
         F = _refine(F, a, b, weight)
         product = T_.T @ F @ T
         in_pixels: FloatArray = product / float(np.linalg.norm(product))
-        residual, _ = _sampson(in_pixels, homogeneous(left), homogeneous(right), weight)
+        residual, _ = sampson(in_pixels, homogeneous(left), homogeneous(right), weight)
         inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
         if inlier.sum() <= _PARAMETERS:
             raise WorkFailed("the observations of the two cameras share no epipolar geometry: check the rows")
@@ -130,7 +130,7 @@ class Epipolar:
     def within(self, detections: Detections, deviations: float) -> BoolArray:
         """Mask (N,) of observations by both views that obey the geometry to some standard deviations."""
         left, right = homogeneous(detections.pixels)
-        return np.abs(_sampson(self.F, left, right, detections.weight)[0]) <= deviations * self.sigma_px
+        return np.abs(sampson(self.F, left, right, detections.weight)[0]) <= deviations * self.sigma_px
 
 
 class Core(NamedTuple):
@@ -189,7 +189,7 @@ def _normalization(pixels: FloatArray) -> FloatArray:
     return np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, spread]]) / spread
 
 
-def _sampson(
+def sampson(
     F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Signed first-order distances (…, N) of points (N, 3) from F (…, 3, 3), the root of [HZ04] eq. (11.9).
@@ -232,9 +232,9 @@ def _refine(F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArr
         return np.asarray((U @ turn * [np.cos(phi + x[6]), np.sin(phi + x[6]), 0.0]) @ turn_.T @ Vt)
 
     def distances(x: FloatArray) -> FloatArray:
-        return _sampson(turned(x), left, right, weight)[0]
+        return sampson(turned(x), left, right, weight)[0]
 
-    scale = 2.0 * _deviation(_sampson(F, left, right, weight)[0], 1e-12)
+    scale = 2.0 * _deviation(sampson(F, left, right, weight)[0], 1e-12)
     found = least_squares(
         distances, np.zeros(7), "3-point", loss="cauchy", f_scale=scale, ftol=_TIGHT, xtol=_TIGHT, gtol=_TIGHT
     )

@@ -29,6 +29,7 @@ from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained
 from projservo_cli.calibration.model_error import ModelCheck
 from projservo_cli.calibration.prediction import LENS
+from projservo_cli.calibration.numbering import epipolar_geometry
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, assess, cross_validate
 from projservo_cli.calibration.time_offset import with_time_offset
@@ -152,7 +153,7 @@ def calibrate(
             _require_inside(detections, image_size, _LENS_STRAYS if lens else _STRAYS)
         require_images(detections, sigma_px)
         rng = np.random.default_rng(seed)
-        epipolar = Epipolar.of(detections, rng)
+        epipolar = epipolar_geometry(detections, rng)
         expect = partial(Expected.of, sigma_px=sigma_px, source=source, stated_px=detections.stated_px)
         expected = expect(epipolar)
         if not lens:  # else after its estimation, since it bends the epipolar lines

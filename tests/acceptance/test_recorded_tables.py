@@ -169,3 +169,13 @@ def test_validate_fails_where_the_arm_is_not_as_modelled(answer, shared_data, na
     code, value, err = answer("validate", "out", "--data", folder / f"{name}_heldout.csv", "--json")
     assert (code, value["median_px"] > value["limit_px"]) == (1, True)
     assert "contradict the calibration" in err
+
+
+def test_a_tag_whose_corners_begin_further_in_one_view_is_named(answer, shared_data):
+    """Case 23: without the check usable at a stated 0.14 px, while the truth is 18 px."""
+    table = shared_data.parent / "cases/23_tag_turned_in_one_view/tag_corner_order_turned_0.csv"
+    if not table.exists():
+        pytest.skip(f"{table} is absent")
+    code, value, err = answer("calibrate", "--data", table, "-o", "out", "--json")
+    assert (code, value["failed"]) == (1, "calibrate")
+    assert "tag 1: its corners begin 1 further in the right view" in " ".join(err.split())

@@ -1,0 +1,152 @@
+"""Numbers of markers that differ between both views, as of a tag turned or exchanged in one of them.
+
+A robot fits such a table with half of these detections rejected: only the epipolar geometry shows it.
+"""
+
+from contextlib import suppress
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import connected_components
+
+from projservo_cli.calibration.detections import Detections
+from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, sampson
+from projservo_cli.geometry.rigid import homogeneous
+from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation, WorkFailed
+
+# Minimum number of poses at which both views saw a marker, to judge its number.
+_MIN_POSES = 8
+# Share of poses at which a marker misfits the epipolar geometry, above which its number is in doubt.
+_DOUBTED = 0.5
+# Maximum share of the poses at which markers misfit under their true numbers.
+_ALIKE = 0.1
+# Noise of the epipolar geometry, px, above which most of the numbers may be wrong.
+_MUCH_NOISE_PX = 1.0
+# Residual of a corner, in deviations of the geometry of few points, above which it misfits.
+_OF_FEW = 15.0
+# Maximum number of tags whose own geometry is tried.
+_MAX_TAGS = 6
+# Corners of a tag, numbered 4 t to 4 t + 3.
+_CORNERS = 4
+# Maximum number of tags or markers that a message names.
+_EXAMPLES = 3
+
+
+def epipolar_geometry(detections: Detections, rng: np.random.Generator) -> Epipolar:
+    """Estimate the epipolar geometry, and refuse markers whose numbers differ between both views.
+
+    The images do not tell which view is right, and goals are given by numbers, so nothing is renumbered.
+
+    Raises WorkFailed naming the tags or markers, or as ``Epipolar.of`` does.
+    """
+    try:
+        found = Epipolar.of(detections, rng)
+    except WorkFailed:
+        _require_alike(detections, _by_tags(detections))
+        raise
+    order = _true_order(detections, found, OUTLIER)
+    if found.sigma_px > _MUCH_NOISE_PX and (order == np.arange(order.size)).all():
+        order = _by_tags(detections)
+    _require_alike(detections, order)
+    return found
+
+
+def _require_alike(detections: Detections, order: IntArray) -> None:
+    """Refuse an order (m,) of the markers in the right view, unless it is that of the left one."""
+    moved = np.flatnonzero(order != np.arange(order.size))
+    if not moved.size:
+        return
+    number = detections.marker
+    pairs = [(int(number[i]), int(number[order[i]])) for i in moved]
+    raise WorkFailed(
+        f"both views number {moved.size} markers differently at all poses, by the epipolar geometry: "
+        f"{'; '.join(_words(pairs)[:_EXAMPLES])}; number them alike in both views (the images do not tell "
+        "which view is right), or remove them"
+    )
+
+
+def _words(pairs: list[tuple[int, int]]) -> list[str]:
+    """Describe numbers in the left view and in the right one, by tags where they are whole tags."""
+    right, words, rest = dict(pairs), [], []
+    for left, other in pairs:
+        t, u = left // _CORNERS, other // _CORNERS
+        here = [right.get(_CORNERS * t + k, -1) - _CORNERS * u for k in range(_CORNERS)]
+        turn = here[0]
+        if here != [(turn + k) % _CORNERS for k in range(_CORNERS)]:
+            rest.append(f"marker {left} left is marker {other} right")
+        elif left % _CORNERS == 0:
+            by = f"its corners begin {-turn % _CORNERS} further in the right view" if turn else "not turned"
+            words.append(f"tag {t}: {by}" if t == u else f"tag {t} left is tag {u} right, {by}")
+    return [*words, *rest]
+
+
+def _by_tags(detections: Detections) -> IntArray:
+    """Indices (m,) of markers in the right view, by the geometry of single tags, if most numbers are wrong.
+
+    That of the centres of flat tags, where their diagonals cross, holds for any order of their corners; that
+    of one tag for any order of the others.
+    """
+    index = {number: i for i, number in enumerate(detections.marker.tolist())}
+    tags = [n for n in index if n % _CORNERS == 0 and all(n + k in index for k in range(_CORNERS))]
+    corners = [[index[n + k] for k in range(_CORNERS)] for n in tags]
+    which = np.array(corners, dtype=np.int64).reshape(-1, _CORNERS)
+    c = homogeneous(_dense(detections, which.ravel())).reshape(2, -1, len(tags), _CORNERS, 3)
+    center = np.cross(np.cross(c[..., 0, :], c[..., 2, :]), np.cross(c[..., 1, :], c[..., 3, :]))
+    images = (center[..., :2] / center[..., 2:]).swapaxes(0, 1)
+    flat = Observation(detections.pose, np.array(tags), detections.q, images)
+    parts = [Detections.of(flat, "R" * detections.q.shape[1])]
+    parts += [detections.of_markers(np.isin(np.arange(len(index)), of)) for of in which[:_MAX_TAGS]]
+    order = np.arange(len(index))
+    for part in parts:
+        with suppress(WorkFailed):
+            geometry = Epipolar.of(part, np.random.default_rng(0))
+            if geometry.sigma_px < _MUCH_NOISE_PX:
+                order = _true_order(detections, geometry, _OF_FEW)
+        if (order != np.arange(order.size)).any():
+            break
+    return order
+
+
+def _true_order(detections: Detections, epipolar: Epipolar, limit: float) -> IntArray:
+    """Indices (m,) of markers in the right view, of the one assignment that fits the geometry of the rest."""
+    m, both = detections.marker.size, detections.both
+    misfit = both & ~epipolar.within(detections, limit)
+    count = np.bincount(detections.marker_of[both], minlength=m)
+    wrong = np.bincount(detections.marker_of[misfit], minlength=m) > _DOUBTED * count
+    order = np.arange(m)
+    doubted = np.isin(detections.marker // _CORNERS, detections.marker[wrong] // _CORNERS)
+    doubted &= count >= _MIN_POSES  # with the other corners of their tags, which may fit along a line
+    if not (wrong & doubted).any():
+        return order
+    which = np.flatnonzero(doubted)
+    share = _misfits(_dense(detections, which), epipolar.F, limit * epipolar.noise_px)
+    match = linear_sum_assignment(share)[1]
+    graph = np.zeros(share.shape)
+    graph[np.arange(which.size), match] = 1.0
+    cycle = connected_components(graph, directed=False)[1]
+    size = np.bincount(cycle)
+    given = np.bincount(cycle, np.diag(share)) / size
+    found = np.bincount(cycle, share[np.arange(which.size), match]) / size
+    decided: BoolArray = ((given > _DOUBTED) & (found < _ALIKE))[cycle]
+    order[which[decided]] = which[match[decided]]
+    return order
+
+
+def _dense(detections: Detections, which: IntArray) -> FloatArray:
+    """Pixels (2, K, s, 2) of some markers in both views, NaN where unseen."""
+    pixels = np.full((2, len(detections.q), detections.marker.size, 2), np.nan)
+    for v, seen in enumerate(detections.seen):
+        pixels[v, detections.pose_of[seen], detections.marker_of[seen]] = detections.pixels[v, seen]
+    return pixels[:, :, which]
+
+
+def _misfits(pixels: FloatArray, F: FloatArray, limit: float) -> FloatArray:
+    """Shares (s, s) of the poses at which markers of the left view misfit those of the right one."""
+    left, right = homogeneous(pixels)
+    found = np.ones((left.shape[1], right.shape[1]))
+    for i in range(len(found)):
+        r = np.abs(sampson(F, np.broadcast_to(left[:, i : i + 1], right.shape), right, np.ones((2, 1)))[0])
+        count = np.isfinite(r).sum(axis=0)
+        enough = count >= _MIN_POSES
+        found[i, enough] = (r > limit).sum(axis=0)[enough] / count[enough]
+    return found
