@@ -298,6 +298,8 @@ class MetricModel(Printed, Metric):
         ------
         InputError
             If the file is no URDF, the link is not in it, or its joints are of other types.
+        WorkFailed
+            If the model does not describe the arm, as with a joint that turns the other way.
         """
         chain = _urdf_chain(urdf, tip)
         return cast(MetricModel, in_model_frames(self, chain.axes, chain.tip))
@@ -317,7 +319,7 @@ class MetricModel(Printed, Metric):
 
         Raises
         ------
-        InputError
+        InputError, WorkFailed
             As for ``in_frames_of``.
         """
         return kinematic_errors(self, _urdf_chain(urdf, tip).axes)

@@ -1,7 +1,7 @@
 """Projective kinematics from stereo images of trial motions: [RH00] section 2.
 
-``estimate`` runs the steps: pixels (``detections``), geometry of the rig (``epipolar``), equal numbers in both
-views (``numbering``), initial parameters (``initialization``), robust bundle adjustment (``fit``,
+``estimate`` runs the steps: pixels (``detections``), geometry of the rig (``epipolar``), equal numbers in
+both views (``numbering``), initial parameters (``initialization``), robust bundle adjustment (``fit``,
 ``adjustment``), outliers (``diagnosis``), frame and covariance (``projective``), assessment (``quality``).
 ``prediction`` has the forward model, and predicts images and their errors from the result.
 """

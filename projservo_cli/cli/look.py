@@ -148,7 +148,8 @@ def _export(
     ros static transforms of the cameras, json all numbers with their covariances.
 
     With --nominal it lists the errors of zeros and axes of a model, the most significant first. With --frames
-    model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip.
+    model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip. A model
+    that does not describe the arm, as one in which a joint turns the other way, ends in exit code 1.
     """
     from projservo_cli.store import load
 

@@ -342,6 +342,7 @@ class Metric:
     sigma_px: float  # noise of a pixel, px
     bodies: Body  # the model, then pairs off by plus and minus a step of each independent error
     range: FloatArray  # (n, 2) readings in the data, rad or m
+    q_reference: FloatArray  # (n,) readings of the reference, rad or m
 
     @classmethod
     def of(
@@ -393,7 +394,7 @@ class Metric:
             parts = zip(bodies, off, strict=True)
             bodies = Body(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
         moved = np.stack([c.joint_min, c.joint_min + c.excitation], axis=1)
-        return cls(c.joint_types, marker, c.sigma_px, bodies, moved)
+        return cls(c.joint_types, marker, c.sigma_px, bodies, moved, c.q_reference)
 
     @property
     def body(self) -> Body:
@@ -587,6 +588,15 @@ class Metric:
 
         return self.changes(position)
 
+    def in_order(self, axes: FloatArray, order: npt.NDArray[np.int64]) -> FloatArray:
+        """Screws (…, n, 6) at readings of zero if joints followed each other in another order (n,).
+
+        Those at the reference stay, which trial motions of single joints show.
+        """
+        q, prismatic = self.q_reference, self.prismatic
+        there = _carried(axes, prismatic, q)[..., order, :]
+        return _carried(there, prismatic[order], -q[order])
+
     def changes(
         self,
         function: Callable[[Body], FloatArray],
@@ -617,6 +627,15 @@ class Metric:
         flat = np.ascontiguousarray(views.reshape(2, -1, 2))
         seen: BoolArray = np.isfinite(flat[0, :, 0]) & np.isfinite(flat[1, :, 0])
         return flat[:, seen], seen, views.shape[1:-1]
+
+
+def _carried(axes: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
+    """Screws (…, n, 6) after motions by readings (n,) of the joints before each."""
+    T, moved = np.broadcast_to(np.eye(4), (*axes.shape[:-2], 4, 4)), axes.copy()
+    for i, step in enumerate(np.moveaxis(exponentials(axes, prismatic, q), -3, 0)):
+        moved[..., i, :] = screws(T @ twists(axes[..., i, :]) @ rigid_inverse(T))
+        T = T @ step
+    return moved
 
 
 def _covariances(changes: FloatArray) -> FloatArray:

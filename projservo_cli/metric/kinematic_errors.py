@@ -1,9 +1,10 @@
-"""A given model of the arm against the calibrated one: zeros of joints, then errors of axes.
+"""A given model of the arm against the calibrated one: order and senses of joints, zeros, errors of axes.
 
 The zeros of the first and the last joint are gauge: they move base and tool, which no image knows.
 """
 
 import dataclasses
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +13,24 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid, rigid_inverse, screws, twists
 from projservo_cli.metric.frame import Body, Metric, base_frame, base_joints, directions, in_frame
-from projservo_cli.records import BoolArray, FloatArray, InputError
+from projservo_cli.records import MM, BoolArray, FloatArray, InputError, IntArray, WorkFailed
 
 # Errors of axes that any model has, of machining and assembly, rad and m.
 _LINK_STD = np.repeat([5e-4, 5e-4], 3)
 # Step of the differences that propagate covariances, in standard deviations.
 _STEP = 1e-3
+# Maximum zero of a revolute joint, rad, as of a hobby arm homed by eye, and tilt of an axis, rad.
+_MAX_ZERO, _MAX_TILT = np.radians(45.0), np.radians(10.0)
+# Maximum offset of an axis over the distance of the tool from the base, and deviations that it exceeds it by.
+_MAX_OFFSET, _BEYOND = 0.05, 4.0
+# χ² per degree of freedom above which other hypotheses are tried, and the share that a true one leaves of it.
+_DOUBTED, _DECISIVE = 4.0, 0.25
+# Ratio of χ² within which hypotheses are equal, as joint 1 reversed and the zero of joint 2 off by 180°.
+_EQUAL = 1.5
+# Number of angles at which a joint starts, number of starts that are fitted, and their largest ratio of χ².
+_ANGLES, _FITTED, _NEAR_BEST = 72, 8, 30.0
+# Maximum number of joints that turn the other way together.
+_MAX_REVERSED = 3
 
 
 class JointError(NamedTuple):
@@ -44,10 +57,14 @@ class _ModelFit:
     """Fit of a model's base and inner zeros to the calibrated axes.
 
     Weighted by the covariance of the axes and by 0.5 mm and 0.5 mrad for the links of any model.
+
+    senses, order : (n,) −1 for joints that turn the other way, and the calibrated joint of each of the model.
     Raises InputError if the joint types differ.
     """
 
-    def __init__(self, metric: Metric, given: FloatArray) -> None:
+    def __init__(
+        self, metric: Metric, given: FloatArray, senses: IntArray | None = None, order: IntArray | None = None
+    ) -> None:
         prismatic, n = metric.prismatic, len(metric.joint_types)
         types = "".join("R" if w.any() else "P" for w in given[:, :3])
         if types != metric.joint_types:
@@ -55,27 +72,99 @@ class _ModelFit:
                 f"the model's joints are {types}, the calibrated ones {metric.joint_types}: choose the link "
                 "of the tool as its tip"
             )
-        self.given, self.prismatic, self.axes = given, prismatic, metric.axes
+        self.senses = np.ones(n, dtype=np.int64) if senses is None else senses
+        self.given, self.prismatic, self.order = given * self.senses[:, None], prismatic, order
         self._near = metric.pose(np.zeros(n))[:3, 3]
-        self._base = rigid_inverse(base_frame(given, prismatic, base_joints(given, prismatic)))
-        x, change = np.zeros(6 + max(n - 2, 0)), _STEP * metric.deviations("axes")
-        ends = (self.left(x, self.axes + sign * change) for sign in (1, -1))
+        self._base = rigid_inverse(base_frame(self.given, prismatic, base_joints(self.given, prismatic)))
+        self.axes, changes = metric.axes, metric.deviations("axes")
+        if order is not None:
+            self.axes = metric.in_order(metric.axes, order)
+            changes = metric.changes(lambda body: metric.in_order(body.axes, order))
+            self._base = base_frame(self.axes, prismatic, base_joints(self.axes, prismatic)) @ self._base
+        self.x, change = np.zeros(6 + max(n - 2, 0)), _STEP * changes
+        ends = (self.left(self.x, self.axes + sign * change) for sign in (1, -1))
         self.E = (np.subtract(*ends) / (2.0 * _STEP)).T  # (6 n, c) by errors of the calibration
         self.root = np.linalg.inv(np.linalg.cholesky(self.E @ self.E.T + np.diag(np.tile(_LINK_STD**2, n))))
 
-        def weighted(x: FloatArray) -> FloatArray:
-            return np.asarray(self.root @ self.left(x, self.axes))
+    def _weighted(self, x: FloatArray) -> FloatArray:
+        return np.asarray(self.root @ self.left(x, self.axes))
 
-        fit = least_squares(weighted, x, x_scale="jac")
+    @property
+    def chi2(self) -> float:
+        """Sum of squared residuals over their covariance."""
+        return float((self._weighted(self.x) ** 2).sum())
+
+    def fitted(self) -> "_ModelFit":
+        """Fit by least squares from the start."""
+        fit = least_squares(self._weighted, self.x, x_scale="jac")
         self.x, self.residual, self.J = fit.x, np.asarray(fit.fun), np.asarray(fit.jac)
         self.pinv = np.linalg.pinv(self.J)
+        return self
+
+    def aligned(self) -> "_ModelFit":
+        """Start where each joint in turn brings the next axis nearest to the calibrated one."""
+        n = len(self.given)
+        zeros, size = np.zeros(n), float(np.linalg.norm(self._near))
+        for i in np.flatnonzero(~self.prismatic[:-1]):
+            for width in (np.pi, 2.0 * np.pi / _ANGLES):
+                at = np.tile(zeros, (_ANGLES + 1, 1))
+                at[:, i] += width * np.linspace(-1.0, 1.0, _ANGLES + 1)
+                moved = _moved(self._base, at, self.given, self.prismatic)
+                off = _differences(self.axes, moved, self.prismatic, self._near)[:, i + 1]
+                misfit = (off[:, :3] ** 2).sum(axis=1) + (off[:, 3:] ** 2).sum(axis=1) / size**2
+                zeros[i] = at[np.argmin(misfit.round(9) + 1e-6 * np.abs(at[:, i])), i]
+        self._base = self._base @ exponentials(self.given, self.prismatic, zeros)[0]
+        self.x[6:] = zeros[1:-1]
+        return self
+
+    def zeros(self) -> FloatArray:
+        """Zeros (n,), rad or m, those of revolute joints within half a turn."""
+        zeros = _zeros_of(self.x, len(self.given))
+        around = ~self.prismatic & (np.abs(zeros) > np.pi)
+        return np.where(around, (zeros + np.pi) % (2.0 * np.pi) - np.pi, zeros)
+
+    def axis_errors(self) -> tuple[FloatArray, FloatArray]:
+        """Tilts, rad, and offsets, m, of the axes (n, 2), and their deviations."""
+        remains = self.left(self.x, self.axes).reshape(-1, 2, 3)
+        changed = self.E - np.linalg.solve(self.root, self.J @ (self.pinv @ self.root @ self.E))
+        size, std = (
+            np.linalg.norm(remains, axis=2),
+            np.linalg.norm(changed.reshape(-1, 2, 3, changed.shape[1]), axis=(2, 3)),
+        )
+        chord = np.minimum(0.5 * size[:, 0], 1.0)
+        size[:, 0] = 2.0 * np.arctan2(chord, np.sqrt(1.0 - chord**2))
+        return size, std
+
+    def differences(self) -> list[str]:
+        """Describe the discrete differences between the model and the arm: order, senses, far zeros."""
+        words = []
+        if self.order is not None:
+            i, j = np.flatnonzero(self.order != np.arange(len(self.order)))
+            words.append(f"joints {i + 1} and {j + 1} have each other's place in the model")
+        for i in np.flatnonzero(self.senses < 0):
+            verb = "slides" if self.prismatic[i] else "turns"
+            words.append(f"joint {i + 1} {verb} the other way in the model")
+        zeros = np.where(self.prismatic, 0.0, self.zeros())
+        far = np.flatnonzero(np.abs(zeros) > _MAX_ZERO)
+        return words + [f"the zero of joint {i + 1} is off by {np.degrees(zeros[i]):.1f}°" for i in far]
+
+    def implausible(self) -> str:
+        """Describe the axis that is farthest beyond the errors of any model; empty if none is."""
+        size, std = self.axis_errors()
+        limit = np.array([_MAX_TILT, _MAX_OFFSET * float(np.linalg.norm(self._near))]) + _BEYOND * std
+        i, kind = np.unravel_index(int(np.argmax(size / limit)), size.shape)
+        if size[i, kind] <= limit[i, kind]:
+            return ""
+        unit, factor = (" mm", MM) if kind else ("°", float(np.degrees(1.0)))
+        found, allowed = factor * size[i, kind], factor * limit[i, kind]
+        return f"the axis of joint {i + 1} is off by {found:.3g}{unit}, {allowed:.3g}{unit} allowed"
 
     def left(self, x: FloatArray, found: FloatArray, factor: float = 1.0) -> FloatArray:
         """Differences (…, 6 n) of axes (…, n, 6) from those of the model, its lengths times a factor."""
         base, given = self._base.copy(), self.given.copy()
         base[:3, 3] *= factor
         given[~self.prismatic, 3:] *= factor
-        model = _moved(_placed(base, x), x, given, self.prismatic)
+        model = _moved(_placed(base, x), _zeros_of(x, len(given)), given, self.prismatic)
         return _differences(found, model, self.prismatic, self._near).reshape(*found.shape[:-2], -1)
 
     def bases_and_zeros(self, axes: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -85,6 +174,41 @@ class _ModelFit:
         return np.array([_placed(self._base, row) for row in x]), _zeros_of(x, len(self.given))
 
 
+def _model_fit(metric: Metric, given: FloatArray) -> _ModelFit:
+    """Fit a model, and refuse one that another sense, order or far zero of joints would fit better.
+
+    Raises WorkFailed naming it, or the axis that is off, where the model does not describe the arm.
+    """
+    fit = _ModelFit(metric, given).fitted()
+    wrong = fit.implausible() or " and ".join(fit.differences())
+    if not wrong and fit.chi2 <= _DOUBTED * len(fit.residual):
+        return fit
+    n = len(given)
+    few = [which for k in range(_MAX_REVERSED + 1) for which in itertools.combinations(range(n), k)]
+    starts = [_ModelFit(metric, given, np.where(np.isin(range(n), which), -1, 1)) for which in few]
+    for i, j in itertools.combinations(range(n), 2):
+        order = np.arange(n)
+        order[[i, j]] = j, i
+        if metric.prismatic[i] == metric.prismatic[j]:
+            starts.append(_ModelFit(metric, given, order=order))
+    starts = [start.aligned() for start in starts]
+    least = min(start.chi2 for start in starts)
+    near = [start for start in starts if start.chi2 <= _NEAR_BEST * least]
+    near = sorted(near, key=lambda one: (len(one.differences()), one.chi2))[:_FITTED]
+    fits = [one for one in (start.fitted() for start in near) if not one.implausible()]
+    least = min((one.chi2 for one in fits), default=np.inf)
+    equal = [one.differences() for one in fits if one.chi2 <= _EQUAL * least]
+    fewest = min(map(len, equal), default=0)
+    best = sorted(" and ".join(words) for words in equal if len(words) == fewest)  # senses before zeros
+    if fewest and (wrong or least < _DECISIVE * fit.chi2):
+        wrong = " (or, as the axes do not tell, ".join(best[:2]) + ")" * (len(best) > 1)
+    if wrong:
+        raise WorkFailed(
+            f"the model does not describe the arm: {wrong}; mend the model, or name another --tip"
+        )
+    return fit
+
+
 def kinematic_errors(metric: Metric, given: FloatArray) -> KinematicErrors:
     """Compare a model with the calibrated arm, joint by joint, and its links with the known length.
 
@@ -92,18 +216,15 @@ def kinematic_errors(metric: Metric, given: FloatArray) -> KinematicErrors:
 
     metric : of the calibration, in metres.
     given : (n, 6) screws of the model at readings of zero, rad and m.
-    Raises InputError if the joint types differ.
+    Raises InputError if the joint types differ, WorkFailed if the model is not of this arm.
     """
-    fit, n = _ModelFit(metric, given), len(given)
-    J, E, pinv = fit.J, fit.E, fit.pinv
-    std = np.sqrt(np.diag(np.linalg.pinv(J.T @ J)))
-    remains = fit.left(fit.x, fit.axes).reshape(n, 2, 3)
-    changed = (E - np.linalg.solve(fit.root, J @ (pinv @ fit.root @ E))).reshape(n, 2, 3, -1)
-    size, size_std = np.linalg.norm(remains, axis=2), np.linalg.norm(changed, axis=(2, 3))
+    fit, n = _model_fit(metric, given), len(given)
+    std, zeros = np.sqrt(np.diag(np.linalg.pinv(fit.J.T @ fit.J))), fit.zeros()
+    size, size_std = fit.axis_errors()
     joints = [
         JointError(
             joint=i + 1,
-            zero=float(fit.x[5 + i]) if 0 < i < n - 1 else None,
+            zero=float(zeros[i]) if 0 < i < n - 1 else None,
             zero_std=float(std[5 + i]) if 0 < i < n - 1 else None,
             offset_m=float(size[i, 1]),
             offset_std_m=float(size_std[i, 1]),
@@ -114,7 +235,9 @@ def kinematic_errors(metric: Metric, given: FloatArray) -> KinematicErrors:
     ]
     ends = (fit.left(fit.x, fit.axes, 1.0 + sign * _STEP) for sign in (1, -1))
     by_scale = fit.root @ np.subtract(*ends) / (2.0 * _STEP)
-    return KinematicErrors(joints, *_length_error(fit.residual, J, by_scale - J @ (pinv @ by_scale)))
+    return KinematicErrors(
+        joints, *_length_error(fit.residual, fit.J, by_scale - fit.J @ (fit.pinv @ by_scale))
+    )
 
 
 def in_model_frames(metric: Metric, given: FloatArray, tip: FloatArray) -> Metric:
@@ -124,9 +247,9 @@ def in_model_frames(metric: Metric, given: FloatArray, tip: FloatArray) -> Metri
     were found. Covariances include those of both.
 
     given : (n, 6) screws of the model at readings of zero, rad and m; tip : (4, 4) its tip there, m.
-    Raises InputError if the joint types differ.
+    Raises InputError if the joint types differ, WorkFailed if the model is not of this arm.
     """
-    fit, bodies = _ModelFit(metric, given), metric.bodies
+    fit, bodies = _model_fit(metric, given), metric.bodies
     base, zeros = fit.bases_and_zeros(bodies.axes)
     tips = metric.body._replace(axes=given, tool=tip).tool_poses(metric.prismatic, zeros)
     axes = in_frame(bodies.axes, metric.prismatic, base)
@@ -161,20 +284,19 @@ def _zeros_of(x: FloatArray, n: int) -> FloatArray:
     return zeros
 
 
-def _moved(base: FloatArray, x: FloatArray, given: FloatArray, prismatic: BoolArray) -> FloatArray:
-    """Screws (n, 6) of a model at a base (4, 4), whose inner zeros move by x[6:]."""
-    n = len(given)
-    T, moved, steps = base, np.empty_like(given), exponentials(given, prismatic, _zeros_of(x, n))
-    for i in range(n):
-        moved[i] = screws(T @ twists(given[i]) @ rigid_inverse(T))
-        T = T @ steps[i]
-    return moved
+def _moved(base: FloatArray, zeros: FloatArray, given: FloatArray, prismatic: BoolArray) -> FloatArray:
+    """Screws (…, n, 6) of a model at a base (4, 4), whose joints move by zeros (…, n)."""
+    T, moved, steps = base, [], exponentials(given, prismatic, zeros)
+    for i, twist in enumerate(twists(given)):
+        moved.append(screws(T @ twist @ rigid_inverse(T)))
+        T = T @ steps[..., i, :, :]
+    return np.stack(np.broadcast_arrays(*moved), axis=-2)
 
 
 def _differences(found: FloatArray, model: FloatArray, prismatic: BoolArray, near: FloatArray) -> FloatArray:
     """Differences (…, n, 6) of directions, and of lines at their points nearest to ``near`` (3,), m."""
     d, d0 = directions(found, prismatic), directions(model, prismatic)
-    p, p0 = np.cross(found[..., :3], found[..., 3:]), np.cross(model[:, :3], model[:, 3:])
+    p, p0 = np.cross(found[..., :3], found[..., 3:]), np.cross(model[..., :3], model[..., 3:])
     at = p0 + d0 * ((near - p0) * d0).sum(axis=-1, keepdims=True)
     offset = p - at
     offset = offset - d * (offset * d).sum(axis=-1, keepdims=True)

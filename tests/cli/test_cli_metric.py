@@ -1,6 +1,9 @@
 """Files in metres, read by other people's code, and positions against a table: from the command line."""
 
+import dataclasses
 import json
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -10,11 +13,14 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from projservo_cli import store
+from projservo_cli.calibration import calibrate
 from projservo_cli.cli import run
-from projservo_cli.records import InputError
+from projservo_cli.metric.kinematic_errors import kinematic_errors
+from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.results import ImageModel
 from projservo_cli.simulation.urdf import urdf_chain
 from projservo_cli.store import exports
+from projservo_cli.store.tables import read_table
 
 KNOWN = ["--metric", "0.2492990172463582", "--between", "2,8"]
 
@@ -187,6 +193,70 @@ def test_zeros_and_links_of_a_wrong_model_are_found(ur5, reference_truth, tmp_pa
         assert abs(found - np.degrees(zero[joint - 1])) < 3.5 * std
     assert errors[1]["zero"] is None
     assert errors[6]["zero"] is None
+
+
+OTHERS = {
+    "joint 1": ([1], 0.0, "joint 1 turns the other way in the model (or"),
+    "joint 4": ([4], 0.0, "joint 4 turns the other way in the model;"),
+    "two joints": ([2, 5], 0.0, "joint 2 turns the other way in the model and joint 5 turns the other way"),
+    "a zero": ([], 180.0, "the zero of joint 3 is off by"),
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+@pytest.mark.parametrize("more", [[], ["--frames", "model"]], ids=["own", "model"])
+def test_a_model_with_other_senses_or_zeros_is_refused(ur5, reference_truth, tmp_path, capsys, kind, more):
+    reversed_joints, zero, words = OTHERS[kind]
+    truth = reference_truth("ur5")
+    q, true = np.array(truth["q_reference"]), np.array([[*s["w"], *s["v"]] for s in truth["screws"]])
+    sense = np.where(np.isin(np.arange(1, 7), reversed_joints), -1.0, 1.0)
+    file, out = tmp_path / "model.urdf", tmp_path / "out"
+    file.write_text(wrong_model(sense[:, None] * true, sense * q, np.radians(zero) * np.eye(6)[2], 0.0))
+    capsys.readouterr()
+    words_of_model = ["--nominal", str(file), *more]
+    assert run(["export", str(ur5), "--to", "ros", "-o", str(out), *KNOWN, *words_of_model]) == 1
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
+
+
+def in_metres(shared_data, order):
+    """Metric of a table with its columns in another order."""
+    table = read_table(shared_data / "ur5" / "trials_0.5px.csv")
+    found = ImageModel.of(
+        calibrate(dataclasses.replace(table, q=table.q[:, order]), "RRRRRR", source="recorded")
+    )
+    return found.metric(float(KNOWN[1]), (2, 8))
+
+
+def test_joints_of_a_table_in_another_order_than_those_of_the_model(shared_data):
+    """Motions of single joints do not show the order, so that the table itself is usable."""
+    axes = in_metres(shared_data, [0, 1, 2, 3, 4, 5]).axes  # of the true order, as a model
+    for order in ([2, 1, 0, 3, 4, 5], [0, 1, 2, 4, 3, 5]):
+        i, j = (k + 1 for k in range(6) if order[k] != k)
+        exchanged = in_metres(shared_data, order)
+        with pytest.raises(WorkFailed, match=f"joints {i} and {j} have each other's place in the model"):
+            kinematic_errors(exchanged, axes)
+
+
+@pytest.mark.parametrize("joint", range(7))
+def test_case_of_a_model_in_which_a_joint_turns_the_other_way(
+    shared_data, tmp_path, monkeypatch, capsys, joint
+):
+    """Case 02: a model by its own zeros, as it is and with each of its joints reversed."""
+    case = shared_data.parent / "cases" / "02_nominal_sign"
+    if not case.exists():
+        pytest.skip(f"{case} is absent")
+    monkeypatch.chdir(tmp_path)
+    assert run(["calibrate", "--data", str(case / "trials.csv"), "-o", "out", "-q"]) == 0
+    script = [sys.executable, str(case / "model_other_zeros.py"), str(joint)]
+    Path("m.urdf").write_text(subprocess.run(script, capture_output=True, check=True, text=True).stdout)
+    model = ["--nominal", "m.urdf", "--tip", "tool", "--frames", "model"]
+    known = ["--metric", "0.19105", "--between", "0,2"]
+    capsys.readouterr()
+    code = run(["export", "out", *known, "--to", "ros", "-o", "e", *model])
+    told = " ".join(capsys.readouterr().err.split())
+    assert (code, Path("e").exists()) == ((1, False) if joint else (0, True))
+    assert (f"joint {joint} turns the other way in the model" in told) == bool(joint)
 
 
 def face_pixels(metric):
