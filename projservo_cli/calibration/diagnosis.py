@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import islice
@@ -53,6 +54,10 @@ _FOLLOWED = 2
 _SCREW_STEPS = 8
 # Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
 _SIMPLER = 0.1
+# Maximum number of markers in the test of joint types.
+_TYPED = 20
+# Minimum share of the readings by which a prismatic joint does not turn the images, and in deviations of it.
+_STRAIGHT, _SURE = 0.5, 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,15 +334,41 @@ def outlier_rows(detections: Detections, out: BoolArray) -> IntArray:
     return found[np.lexsort(found.T[::-1])].astype(np.int64)
 
 
-def joint_at_fault(search: Search, max_px: float) -> str:
+def straight_joints(solution: Solution) -> list[int]:
+    """Revolute joints that images do not see turn: by their gear, to first order, without a fit.
+
+    A prismatic joint has the same motion as a revolute one with its axis far away that turns by nothing.
+    """
+    solution = solution.determined()[0].thinned(_TYPED)
+    problem, params, used = solution.problem, solution.params, solution.used
+    turned = (problem.joints(params) - problem.q_reference)[problem.detections.pose_of, None]
+    by_gear = (problem.joint_derivative(params) * turned * used[..., None, None]).reshape(
+        -1, turned.shape[-1]
+    )
+    J = problem.dense(problem.derivative(params), used)
+    rows = problem.whitened(params, np.hstack([J, by_gear, solution.raw.reshape(-1, 1)]), used)
+    J, by_gear, left = np.split(rows, [J.shape[1], rows.shape[1] - 1], axis=1)
+    J = J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    apart = by_gear - J @ np.linalg.lstsq(J, by_gear)[0]
+    inverse = np.linalg.pinv(apart)
+    gear, std = -inverse @ left[:, 0], solution.sigma_px * np.linalg.norm(inverse, axis=1)
+    found = ~problem.detections.prismatic & (gear < -_STRAIGHT) & (gear < -_SURE * std)
+    return [int(i) for i in np.flatnonzero(found)]
+
+
+def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None = None) -> str:
     """Describe the one change of one joint with which the model fits the data; empty if none.
 
     A rough fit compares all changes. The best are fitted completely and accepted only if the fit passes as a
     calibration does, with a noise of at most ``max_px``.
+
+    straight : joints that alone may be of the other type.
     """
     detections = search.problem.detections
     few = detections.of_markers(starting_markers(detections, search.epipolar.noise_px, search.rng))
     changes = _hypotheses(few, search.problem.q_reference)
+    if straight is not None:
+        changes = [changes[i] for i in straight]
     candidates = []
     try:
         for done, (words, changed, handicap) in enumerate(changes):
@@ -369,7 +400,8 @@ def _hypotheses(detections: Detections, q_reference: FloatArray) -> list[tuple[s
         flipped = detections.prismatic.copy()
         flipped[i] = not slides
         given, fits = ("prismatic", "revolute") if slides else ("revolute", "prismatic")
-        words = f"by the images joint {i + 1} is {fits}, not {given}: check --joints"
+        letters = "".join("P" if one else "R" for one in flipped)
+        words = f"by the images joint {i + 1} is {fits}, not {given}: check --joints ({letters} would fit)"
         other = dataclasses.replace(detections, prismatic=flipped)
         found.append((words, LeastSquares.of(other, q_reference), _SIMPLER))
     for i in range(len(q_reference) if len(q_reference) > 1 else 0):

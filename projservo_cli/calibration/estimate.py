@@ -22,14 +22,15 @@ from projservo_cli.calibration.diagnosis import (
     noise_at_free_poses,
     outlier_rows,
     rejection_reasons,
+    straight_joints,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
-from projservo_cli.calibration.lens_estimation import fit_lens, share_explained
+from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
 from projservo_cli.calibration.model_error import ModelCheck
-from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.numbering import epipolar_geometry
+from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, assess, cross_validate
 from projservo_cli.calibration.time_offset import with_time_offset
@@ -41,6 +42,8 @@ _METHODS = ("bundle_adjustment", "closed_form")
 _DOUBTFUL_RATIO = 2.0
 # Maximum share of the noise that a change of one joint leaves if that joint is at fault.
 _DOUBTFUL_SHARE = 0.5
+# Maximum noise over that of a fit as given, of one with a joint of the other type for which the images speak.
+_AS_GOOD = 1.05
 # Minimum share of the squared residuals that makes a lens the likely cause of a misfit.
 _DECISIVE_SHARE = 0.5
 # Probability that noise alone exceeds the estimated coefficients of a lens without distortion.
@@ -239,6 +242,12 @@ def _maximum_likelihood(
         if not cause:
             raise
         raise Misfit(f"{cause}; as given, {refused}") from None
+    if not expected.known and (straight := straight_joints(solution)):
+        seen = undistorted(search.problem.detections, solution.params.lens)
+        there = LeastSquares.of(seen, search.problem.q_reference)
+        search = dataclasses.replace(search, problem=there, epipolar=epipolar)
+        if cause := joint_at_fault(search, _AS_GOOD * solution.sigma_px, straight):
+            raise Misfit(f"{cause}; as given, residuals of {solution.sigma_px:.3g} px show no turn of it")
     cause = ""
     if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
         cause = joint_at_fault(search, _DOUBTFUL_SHARE * solution.sigma_px)

@@ -90,9 +90,10 @@ def _by_tags(detections: Detections) -> IntArray:
     tags = [n for n in index if n % _CORNERS == 0 and all(n + k in index for k in range(_CORNERS))]
     corners = [[index[n + k] for k in range(_CORNERS)] for n in tags]
     which = np.array(corners, dtype=np.int64).reshape(-1, _CORNERS)
-    c = homogeneous(_dense(detections, which.ravel())).reshape(2, -1, len(tags), _CORNERS, 3)
+    c = homogeneous(_dense(detections, which.ravel())).reshape(2, len(detections.q), len(tags), _CORNERS, 3)
     center = np.cross(np.cross(c[..., 0, :], c[..., 2, :]), np.cross(c[..., 1, :], c[..., 3, :]))
-    images = (center[..., :2] / center[..., 2:]).swapaxes(0, 1)
+    depth = np.where(center[..., 2:] == 0.0, np.nan, center[..., 2:])  # corners in one spot have no centre
+    images = (center[..., :2] / depth).swapaxes(0, 1)
     flat = Observation(detections.pose, np.array(tags), detections.q, images)
     parts = [Detections.of(flat, "R" * detections.q.shape[1])]
     parts += [detections.of_markers(np.isin(np.arange(len(index)), of)) for of in which[:_MAX_TAGS]]

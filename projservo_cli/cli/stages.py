@@ -409,6 +409,9 @@ def _work(call: _Call) -> int:
     chain.make()
     if (count := call.options.get("suggest")) is not None and not chain.lacks("calibrate"):
         call.beside["calibrate"] = _suggestions(chain, count)
+    if "calibrate" in chain.names:
+        assumed = chain.config.joint_types is None
+        call.beside.setdefault("calibrate", {})["joint_types_assumed"] = assumed
     if (wanted := _extras(call.options)) and not chain.lacks("report"):
         call.beside["report"] = _made_optional(console, chain, wanted)
     from projservo_cli.report.report_data import failed_object, stage_object
@@ -502,7 +505,9 @@ def _findings(call: _Call) -> Iterator[tuple[str, bool]]:
     if "calibrate" in results and not chain.run.calibration.usable:
         reason = " ".join(chain.run.calibration.reason.split())
         yield f"calibrate: the calibration is not usable: {reason}", "calibrate" in chain.names
-    if (beside := call.beside.get("calibrate", {})).get("suggestions") == []:
+    if (beside := call.beside.get("calibrate", {})).get("joint_types_assumed"):
+        yield "calibrate: joint types are not given: all are taken as revolute (--joints)", False
+    if beside.get("suggestions") == []:
         yield f"calibrate: {beside['suggestions_reason']}", True
     yield from _of_runs(chain)
     # Other profiles are those of the paper, of which the margins are only measured.

@@ -179,3 +179,17 @@ def test_a_tag_whose_corners_begin_further_in_one_view_is_named(answer, shared_d
     code, value, err = answer("calibrate", "--data", table, "-o", "out", "--json")
     assert (code, value["failed"]) == (1, "calibrate")
     assert "tag 1: its corners begin 1 further in the right view" in " ".join(err.split())
+
+
+@pytest.mark.parametrize("noise", ["0.0", "0.1", "0.5", "1.0"])
+def test_types_that_are_not_given_are_told_and_tried(answer, shared_data, noise):
+    table = shared_data / "stanford" / f"trials_{noise}px.csv"
+    code, _, err = answer("calibrate", "--data", table, "-o", "out", "--json")
+    told = " ".join(err.split())
+    assert code == 1
+    assert "joint 3 is prismatic, not revolute: check --joints (RRPRRR would fit)" in told
+    table = shared_data / "ur5" / f"trials_{noise}px.csv"
+    for types, assumed in ((), True), (("--joints", "RRRRRR"), False):
+        code, value, err = answer("calibrate", "--data", table, *types, "-o", "other", "--json", "--force")
+        assert (code, value["joint_types_assumed"]) == (0, assumed)
+        assert ("joint types are not given: all are taken as revolute" in err) == assumed

@@ -122,3 +122,17 @@ def test_numbers_that_differ_between_the_views_are_refused(kind, poses):
     with pytest.raises(WorkFailed) as refused:
         calibrated(dataclasses.replace(observation, images=images))
     assert all(text in str(refused.value) for text in words)
+
+
+@pytest.mark.parametrize("kinds", ["RRPRRR", "PRRRRR", "RRRRP"])
+@pytest.mark.parametrize("length", [0.02, 0.05])
+@pytest.mark.parametrize("single", [True, False])
+def test_a_prismatic_joint_that_is_taken_for_revolute_is_named(kinds, length, single):
+    """Its fit passes as usable otherwise, with an axis far away, three to eleven times the stated error."""
+    robot = random_robot(kinds, np.random.default_rng(1))
+    rng = np.random.default_rng(2)
+    poses = trials(robot, length=length) if single else around(robot, 60, rng, length=length)
+    observation = robot.observe(poses, 0.3, rng)
+    with pytest.raises(WorkFailed, match=rf"joint {kinds.index('P') + 1} is prismatic, .*{kinds} would fit"):
+        calibrate(observation, "R" * len(kinds), source="recorded", joint_noise=None)
+    assert calibrate(observation, kinds, source="recorded", joint_noise=None).usable
