@@ -111,7 +111,10 @@ _KINDS = {"opencv": "cameras.yaml", "urdf": "robot.urdf", "json": "metric.json",
     help="Ends of the length: two markers, or tags (their sides), or cameras. Default: a prismatic joint's.",
 )
 @click.option(
-    "--metric-std", metavar="M", type=option.NUMBER, default=0.0, help="Standard deviation of the length, m."
+    "--metric-std",
+    metavar="M",
+    type=option.NUMBER,
+    help="Standard deviation of the length, m. Without it, deviations of lengths leave it out.",
 )
 @click.option(
     "--nominal", metavar="URDF", type=option.PATH, help="Model of the arm, whose zeros and axes are compared."
@@ -134,7 +137,7 @@ def _export(
     to: str,
     metric: float | None,
     between: str | None,
-    metric_std: float,
+    metric_std: float | None,
     nominal: Path | None,
     frames: str,
     tip: str | None,
@@ -149,7 +152,8 @@ def _export(
 
     With --nominal it lists the errors of zeros and axes of a model, the most significant first. With --frames
     model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip. A model
-    that does not describe the arm, as one in which a joint turns the other way, ends in exit code 1.
+    that does not describe the arm, as one in which a joint turns the other way, ends in exit code 1, and so
+    does a known length that contradicts its links or a prismatic joint, or puts a camera beyond 20 m.
     """
     from projservo_cli.store import load
 
@@ -178,7 +182,7 @@ def _export(
 def _in_metres(
     run: Any,
     to: str,
-    length: tuple[float | None, str | None, float],
+    length: tuple[float | None, str | None, float | None],
     model: tuple[Path, str | None, bool] | None,
 ) -> tuple[str, dict[str, Any], list[str]]:
     """Return the text of a file in metres, its JSON object, and its summary in words.
@@ -189,21 +193,30 @@ def _in_metres(
 
     from projservo_cli.config import load_config
     from projservo_cli.config.inputs import joints_of
+    from projservo_cli.records import WorkFailed
     from projservo_cli.results import ImageModel
     from projservo_cli.store import exports
 
     calibration, config = ImageModel.of(run.calibration), load_config(run.path, text=run.configuration)
     length_m, ends, std = length
-    metric = calibration.metric(length_m, _ends(ends or "joint"), length_std_m=std)
-    value: dict[str, Any] = {}
-    words = [*exports.reading_words(metric)]
-    if model is not None:
+    metric = calibration.metric(length_m, _ends(ends or "joint"), length_std_m=std or 0.0)
+    value: dict[str, Any] = {"length_std_m": std}
+    words = []
+    if length_m is not None and std is None:
+        words.append(
+            f"known length {length_m:g} m ± ? (--metric-std): deviations of lengths leave its own out"
+        )
+    wrong = "; ".join(exports.contradictions(metric, None, measured=std is not None))
+    if model is not None and not wrong:
         errors = metric.errors_of(*model[:2])
         value["nominal"] = [error._asdict() for error in errors.joints]
         value |= {"length_error": errors.length, "length_error_std": errors.length_std}
         words += exports.kinematic_words(errors, metric.joint_types)
-        if model[2]:
-            metric = metric.in_frames_of(*model[:2])
+        wrong = "; ".join(exports.contradictions(metric, errors, measured=std is not None))
+    if wrong:
+        raise WorkFailed(f"export: {wrong}; check the known length, in m, and its ends, or the model")
+    if model is not None and model[2]:
+        metric = metric.in_frames_of(*model[:2])
     if to == "opencv":
         found = exports.opencv_cameras(metric, calibration)
         value |= {"delta_chi2": found.delta_chi2, "lens_rms_px": found.lens_rms_px}

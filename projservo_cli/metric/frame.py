@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.geometry.lens import TERMS, distort, undistort
 from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid_inverse, screws, twists
 from projservo_cli.geometry.stereo import triangulate_points
-from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError
+from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, WorkFailed
 
 # Step of the differences that propagate covariances, in standard deviations of the calibration.
 _STEP = 0.05
@@ -267,7 +267,7 @@ def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, Float
     """Upgrades (B, 4, 4) to a right-handed frame, and markers (B, m, 3) there.
 
     Both cameras have the markers in front of them, so each determines the handedness of the frame.
-    Raises InputError if they contradict each other.
+    Raises WorkFailed if they contradict each other.
     """
     M = models.M @ G.swapaxes(-1, -2)
     points = M[..., :3] / M[..., 3:]
@@ -275,7 +275,7 @@ def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, Float
     depth = (P[:, :, 2] @ homogeneous(points).swapaxes(-1, -2)).mean(axis=-1)
     side = np.sign(np.linalg.det(P[..., :3]) * depth)
     if side[0, 0] != side[0, 1]:
-        raise InputError("metric: one camera's images are mirrored: turn its flip off, and record again")
+        raise WorkFailed("metric: one camera's images are mirrored: turn its flip off, and record again")
     flip = np.ones((len(G), 4))
     flip[:, 0] = side[:, 0]
     return flip[:, :, None] * G, points * flip[:, None, :3]

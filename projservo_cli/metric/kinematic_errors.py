@@ -204,7 +204,7 @@ def _model_fit(metric: Metric, given: FloatArray) -> _ModelFit:
         wrong = " (or, as the axes do not tell, ".join(best[:2]) + ")" * (len(best) > 1)
     if wrong:
         raise WorkFailed(
-            f"the model does not describe the arm: {wrong}; mend the model, or name another --tip"
+            f"the model does not describe the arm: {wrong}; mend it, or check --tip and the known length"
         )
     return fit
 

@@ -115,7 +115,7 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
     face = [number for number in known.face if number in calibration.marker]
     try:
         return ImageModel.of(calibration).metric(length_m, between, face=face or None), ""
-    except InputError as error:
+    except (InputError, WorkFailed) as error:
         return None, str(error)
 
 

@@ -300,10 +300,39 @@ def test_links_of_a_model_contradict_a_length_that_is_wrong(
     file.write_text(wrong_model(true, np.array(reference_truth("ur5")["q_reference"]), np.zeros(6), 0.0))
     length = ["--metric", str(factor * float(KNOWN[1])), "--between", "2,8", "--nominal", str(file)]
     capsys.readouterr()
-    assert run(["export", str(ur5), "--to", "json", "-o", str(tmp_path / "out"), *length]) == 0
-    text = " ".join(capsys.readouterr().out.split())
-    assert (f"too {word} for the links of the model" in text) == bool(word)
-    assert ("known length" in text) == bool(word)
-    value = json.loads(next((tmp_path / "out").iterdir()).read_text())
-    expected = 1.0 / factor - 1.0
-    assert abs(value["length_error"] - expected) < 4.0 * value["length_error_std"]
+    out = tmp_path / "out"
+    code = run(["export", str(ur5), "--to", "json", "-o", str(out), *length])
+    err = " ".join(capsys.readouterr().err.split())
+    assert (code, out.exists()) == ((1, False) if word else (0, True))
+    assert (f"too {word} for the links of the model" in err) == bool(word)
+    if not word:
+        value = json.loads((out / "metric.json").read_text())
+        assert abs(value["length_error"]) < 4.0 * value["length_error_std"]
+
+
+def test_a_length_without_its_deviation_is_told_and_one_that_cannot_be_is_refused(ur5, tmp_path, capsys):
+    for std in (None, 0.0001):
+        more = [] if std is None else ["--metric-std", str(std)]
+        found = json.loads(export(ur5, tmp_path, "json", *more, "--force").read_text())
+        assert found["length_std_m"] == std
+        assert ("m ± ? (--metric-std)" in capsys.readouterr().out) == (std is None)
+    out = tmp_path / "mm"
+    assert (
+        run(["export", str(ur5), "--to", "ros", "-o", str(out), "--metric", "249.3", "--between", "2,8"]) == 1
+    )
+    assert "the left camera is" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.03])
+def test_readings_of_a_rail_contradict_a_length_that_is_wrong(shared_data, tmp_path, capsys, factor):
+    table, folder, out = shared_data / "stanford" / "trials_0.1px.csv", tmp_path / "run", tmp_path / "out"
+    assert run(["calibrate", "--data", str(table), "--joints", "RRPRRR", "-o", str(folder)]) == 0
+    m = ImageModel.of(store.load(folder).calibration).metric()  # by the rail
+    length = factor * float(np.linalg.norm(m.markers[2] - m.markers[8]))
+    capsys.readouterr()
+    code = run(
+        ["export", str(folder), "--to", "ros", "-o", str(out), "--metric", str(length), "--between", "2,8"]
+    )
+    assert (code, out.exists()) == ((0, True) if factor == 1.0 else (1, False))
+    assert ("joint 3 moves 1.03 ± " in capsys.readouterr().err) == (factor != 1.0)
