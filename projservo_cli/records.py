@@ -493,6 +493,10 @@ class CrossValidation:
     predicted: FloatArray = _array(
         "pose view marker xy", "px", "standard deviation of the residual from noise and covariance"
     )
+    posture_rms_px: float | None = _scalar("px", "rms residual in folds of like postures", default=None)
+    posture_predicted_px: float | None = _scalar("px", "expected rms of it", default=None)
+    time_rms_px: float | None = _scalar("px", "rms residual in folds of consecutive poses", default=None)
+    time_predicted_px: float | None = _scalar("px", "expected rms of it", default=None)
 
 
 def in_unit(value: float, unit: str, digits: int = 6) -> str:

@@ -388,7 +388,7 @@ def _contradiction(
             )
         if other := describe_other_motion(solution, found, epipolar):
             return other
-    held_out = cross_validate(solution.kept(), solution.sigma_px, _PARTS, 0)
+    held_out = cross_validate(solution.kept(), solution.sigma_px, _PARTS, 0, blocks=False)
     rms, predicted = held_out.rms_px, held_out.predicted_rms_px
     if held_out.failed or rms is None or predicted is None:
         return "the rest does not predict held-out poses; record more poses and more markers"

@@ -1,9 +1,9 @@
 """Quality of a calibration: observability of joints, the verdict in words, and cross-validation."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -61,6 +61,10 @@ _SAME_JOINT = 1e-3
 _MAX_NAMED = 3
 # Minimum number of parts in a cross-validation.
 _MIN_FOLDS = 2
+# Divisions of the poses into blocks besides a random one, and what a larger error there points to.
+_BLOCKS = {"posture": "the model errs between postures", "time": "something changed over the recording"}
+# Held-out over predicted error in blocks, over that of random parts, from which it is told.
+_BLOCK_RATIO = 1.3
 # Minimum number of detections of a marker in the other poses for its prediction.
 _MIN_READINGS = 4
 _OPEN = "the other poses do not determine the robot"
@@ -348,6 +352,7 @@ def cross_validate(
     folds: int,
     seed: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    blocks: bool = True,
 ) -> CrossValidation:
     """Predict every pose from a fit to other poses, and the error of the prediction from its covariance.
 
@@ -361,6 +366,7 @@ def cross_validate(
     folds : number of parts to divide the poses into.
     seed : seed of the division.
     progress : called after each part with the number done and the total.
+    blocks : whether to divide the poses into blocks of posture and of time too.
 
     Returns
     -------
@@ -373,10 +379,68 @@ def cross_validate(
     """
     detections = solution.problem.detections
     part, unit = _divide(detections, folds, np.random.default_rng(seed))
+    names = tuple(_BLOCKS) if blocks else ()
+    total, done = folds * (1 + len(names)), 0
+
+    def on_fold() -> None:
+        """Count a part."""
+        nonlocal done
+        done += 1
+        progress(done, total)
+
+    residual, predicted, failed = _of_parts(solution, part, sigma_px, on_fold)
+    distance = np.linalg.norm(residual, axis=3)
+    statistics = distance_statistics(distance[np.isfinite(distance)])
+    expected = _expected_px(predicted)
+    of_blocks: dict[str, Any] = {}
+    for name in names:
+        apart, spread, _ = _of_parts(solution, _blocks(detections, folds, name), sigma_px, on_fold)
+        length = np.linalg.norm(apart, axis=3)
+        of_blocks[f"{name}_rms_px"] = distance_statistics(length[np.isfinite(length)])["rms_px"]
+        of_blocks[f"{name}_predicted_px"] = _expected_px(spread)
+    return CrossValidation(
+        folds=folds,
+        seed=seed,
+        unit=unit,
+        failed=tuple(failed),
+        reason=_describe_held_out(statistics["rms_px"], expected, len(failed), of_blocks),
+        **statistics,
+        predicted_rms_px=expected,
+        pose=detections.pose,
+        fold=part,
+        marker=detections.marker,
+        residual=residual,
+        predicted=predicted,
+        **of_blocks,
+    )
+
+
+def _expected_px(predicted: FloatArray) -> float | None:
+    """Expected distance, px, root mean square, from deviations (…) of coordinates, NaN if there is none."""
+    # Two coordinates a distance.
+    return float(np.sqrt(2.0 * np.nanmean(predicted**2))) if np.isfinite(predicted).any() else None
+
+
+def _blocks(detections: Detections, folds: int, name: str) -> IntArray:
+    """Part (K,) of each pose, -1 without detections: neighbours in time or along the main axis of joints."""
+    present, part = np.unique(detections.pose_of), np.full(len(detections.q), -1, dtype=np.int64)
+    place = np.arange(present.size, dtype=np.float64)
+    if name == "posture":
+        q = detections.q[present] / np.maximum(np.ptp(detections.q[present], axis=0), _SAME_JOINT)
+        place = (q - q.mean(axis=0)) @ np.linalg.svd(q - q.mean(axis=0), full_matrices=False)[2][0]
+    part[present[np.argsort(place, kind="stable")]] = np.arange(present.size) * folds // present.size
+    return part
+
+
+def _of_parts(
+    solution: Solution, part: IntArray, sigma_px: float, on_fold: Callable[[], None]
+) -> tuple[FloatArray, FloatArray, list[str]]:
+    """Residuals of each part (K,) from a fit to the others, their deviations (K, 2, m, 2), and failures."""
+    detections = solution.problem.detections
     shape = (len(detections.q), 2, detections.marker.size, 2)
     residual, predicted = np.full(shape, np.nan), np.full(shape, np.nan)
     failed = []
-    for fold in range(folds):
+    for fold in range(int(part.max()) + 1):
         try:
             rows, difference, deviation = _held_out_residuals(solution, part == fold, sigma_px)
         except WorkFailed as error:
@@ -386,25 +450,8 @@ def cross_validate(
                 at = np.flatnonzero(rows[v])
                 where = detections.pose_of[at], v, detections.marker_of[at]
                 residual[where], predicted[where] = difference[v, at], deviation[v, at]
-        progress(fold + 1, folds)
-    distance = np.linalg.norm(residual, axis=3)
-    statistics = distance_statistics(distance[np.isfinite(distance)])
-    # Two coordinates a distance.
-    expected = float(np.sqrt(2.0 * np.nanmean(predicted**2))) if statistics["count"] else None
-    return CrossValidation(
-        folds=folds,
-        seed=seed,
-        unit=unit,
-        failed=tuple(failed),
-        reason=_describe_held_out(statistics["rms_px"], expected, len(failed)),
-        **statistics,
-        predicted_rms_px=expected,
-        pose=detections.pose,
-        fold=part,
-        marker=detections.marker,
-        residual=residual,
-        predicted=predicted,
-    )
+        on_fold()
+    return residual, predicted, failed
 
 
 def _divide(detections: Detections, folds: int, rng: np.random.Generator) -> tuple[IntArray, str]:
@@ -471,8 +518,10 @@ def _held_out_residuals(
     return solution.used & place, difference, error
 
 
-def _describe_held_out(rms: float | None, expected: float | None, failed: int) -> str:
-    """Describe how the held-out error compares with the predicted one."""
+def _describe_held_out(
+    rms: float | None, expected: float | None, failed: int, blocks: Mapping[str, Any]
+) -> str:
+    """Describe how the held-out error compares with the predicted one, and where blocks of poses err more."""
     if rms is None or expected is None:
         return "no part could be predicted from the others: record more poses"
     lost = f"; {failed} parts could not be predicted from the others: record more poses" if failed else ""
@@ -480,4 +529,8 @@ def _describe_held_out(rms: float | None, expected: float | None, failed: int) -
     meaning = ""
     if ratio > WARN_RATIO:
         meaning = ": the poses disagree by more than noise, as from joint readings or a lens"
+    for name, cause in _BLOCKS.items():
+        apart, predicted = blocks.get(f"{name}_rms_px"), blocks.get(f"{name}_predicted_px")
+        if apart is not None and predicted is not None and apart > _BLOCK_RATIO * max(ratio, 1.0) * predicted:
+            lost += f"; in blocks of {name} {apart / predicted:.3g} times: {cause}"
     return f"held-out images err {ratio:.3g} times as much as the covariance predicts{meaning}{lost}"

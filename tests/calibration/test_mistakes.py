@@ -84,9 +84,7 @@ def test_sightings_left_out_that_agree_on_other_joints_are_told():
     late[0] = False
     for k, j in np.argwhere(late):
         images[k, :, j] = mistaken.observation.images[k - 1, :, j]
-    with pytest.raises(
-        WorkFailed, match="show other joints than those read; check how poses and"
-    ):
+    with pytest.raises(WorkFailed, match="show other joints than those read; check how poses and"):
         calibrate(dataclasses.replace(mistaken.observation, images=images), "RR", source="recorded")
 
 
