@@ -186,12 +186,11 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
         rms, median, p95, predicted = (_number(held_out[name]) for name in numbers)
         text = f"held out, {held_out['folds']} parts of {held_out['unit']}: rms {rms} px"
         yield wrapped(f"{text} (predicted {predicted}), median {median}, p95 {p95}", "  ")
-        parts = [
-            (name, *(_number(held_out[f"{name}_{key}_px"]) for key in ("rms", "predicted")))
-            for name in _BLOCKS
-        ]
-        text = ", ".join(f"of {name} rms {rms} px (predicted {predicted})" for name, rms, predicted in parts)
-        yield wrapped(f"in blocks {text}", "  ")
+        parts = []
+        for name in ("posture", "time"):
+            rms, predicted = (_number(held_out[f"{name}_{key}_px"]) for key in ("rms", "predicted"))
+            parts.append(f"of {name} rms {rms} px (predicted {predicted})")
+        yield wrapped(f"in blocks {', '.join(parts)}", "  ")
         yield wrapped(held_out["reason"], "  ")
     yield from _of_suggestions(value)
 
