@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.calibration import screened
 from projservo_cli.canonical import File
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
 from projservo_cli.config.inputs import (
@@ -236,7 +237,7 @@ def calibrate(
     asked = Estimation(settings.method, settings.lens, file, settings.cross_validate)
     with listening(progress) as listener:
         made = calibrating.estimate(seen, asked, progress=listener.progress)
-        return ImageModel.of(*made, seen.record)
+        return ImageModel.of(*made, screened(seen.record, seen.joint_types).observation)
 
 
 def plan(

@@ -271,6 +271,15 @@ class Calibration:
     rejected_poses: IntArray | None = _array(
         "rejected_pose", about="rejected poses without one suspect joint reading", default=None
     )
+    placeholders: int = _scalar(about="number of detections that stood for unseen markers", default=0)
+    unseen_poses: IntArray | None = _array(
+        "unseen_pose", about="numbers of poses that no camera saw", default=None
+    )
+    circular_joints: IntArray | None = _array(
+        "circular_joint",
+        about="joints, from 1, whose readings passed a full turn and were unwrapped",
+        default=None,
+    )
     predicted_rms_px: float | None = _scalar(
         "px",
         "expected error of images within the joint ranges, rms per marker and view",

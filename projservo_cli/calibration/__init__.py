@@ -1,9 +1,9 @@
 """Projective kinematics from stereo images of trial motions: [RH00] section 2.
 
-``estimate`` runs the steps: pixels (``detections``), geometry of the rig (``epipolar``), initial parameters
-(``initialization``), robust bundle adjustment (``fit``, ``adjustment``), outliers (``diagnosis``), frame and
-covariance (``projective``), assessment (``quality``). ``prediction`` has the forward model, and predicts
-images and their errors from the result.
+``estimate`` runs the steps: what is no observation (``screening``), pixels (``detections``), geometry of the
+rig (``epipolar``), initial parameters (``initialization``), robust bundle adjustment (``fit``,
+``adjustment``), outliers (``diagnosis``), frame and covariance (``projective``), assessment (``quality``).
+``prediction`` has the forward model, and predicts images and their errors from the result.
 """
 
 from projservo_cli.calibration.estimate import calibrate
@@ -15,6 +15,7 @@ from projservo_cli.calibration.prediction import (
     residual_statistics,
 )
 from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate
+from projservo_cli.calibration.screening import screened
 
 __all__ = [
     "WEAK_NOISE",
@@ -26,4 +27,5 @@ __all__ = [
     "predict",
     "prediction_variance",
     "residual_statistics",
+    "screened",
 ]

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from projservo_cli.calibration.screening import without_placeholders
 from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible
 from projservo_cli.geometry.rigid import sine_and_versine
 from projservo_cli.records import (
@@ -225,23 +226,26 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     calibration : projective kinematics.
     observation : stereo images of the same robot, px; poses in motion do not count.
     Returns ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``skipped``, the numbers
-    of pairs of unknown markers, behind the camera, and missing.
+    of pairs of unknown markers, behind the camera, and missing; and ``advice`` about placeholders, which are
+    missing ones.
     Raises InputError if the readings have another number of joints or are not finite.
     """
     observation = observation.at_rest
+    images, found = without_placeholders(observation.images)
     known = np.isin(observation.marker, calibration.marker)
     numbers = calibration.marker.tolist()
     order = [numbers.index(number) for number in observation.marker[known].tolist()]
     pixels = predict(calibration, observation.q)[:, :, order]
-    seen: BoolArray = np.asarray(np.isfinite(observation.images).all(axis=-1))
+    seen: BoolArray = np.asarray(np.isfinite(images).all(axis=-1))
     ahead = np.isfinite(pixels[..., 0])
-    residual = (pixels - observation.images[:, :, known])[seen[:, :, known] & ahead]
+    residual = (pixels - images[:, :, known])[seen[:, :, known] & ahead]
     return distance_statistics(np.linalg.norm(residual, axis=1)) | {
         "skipped": {
             "unknown_marker": int(seen[:, :, ~known].sum()),
             "behind_camera": int((seen[:, :, known] & ~ahead).sum()),
             "missing": int((~seen).sum()),
-        }
+        },
+        "advice": list(found),
     }
 
 

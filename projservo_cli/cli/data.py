@@ -318,6 +318,8 @@ def _validate(
             f"validate: the median is {value['median_px'] / calibration.sigma_px:.3g} times the noise of "
             "the calibration: are these the same robot, rig and markers, with joints in the same units?"
         )
+    for text in value.get("advice", ()):
+        console.say(f"validate: {text}")
     skipped = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in value["skipped"].items())
     words = [wrapped(f"validate: {value['count']} marker-view pairs; skipped: {skipped}")]
     if value["count"]:

@@ -307,6 +307,7 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
         }
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
     more = (
+        "circular_joints",
         "sigma_q_interval",
         "sigma_scale_interval",
         "time_offset_s",
@@ -335,14 +336,15 @@ def findings(calibration: Calibration) -> dict[str, Any]:
     calibration : the record.
     Returns ``outliers``, ``suspect_joint_readings``, ``id_switches``, ``poses_used``, ``markers_used``, and
     ``rejected`` by kind: counts of ``observations`` and of ``id_switches``, numbers of the ``tracks``
-    (markers) that are rejected as a whole by reason, and of the ``poses``.
+    (markers) that are rejected as a whole by reason, of the ``poses`` and of ``unseen_poses``, and the count
+    of ``placeholders``.
     """
     outliers, suspects, swaps = (
         rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.id_switches)
     )
-    rejected_tracks, rejected_poses = (
+    rejected_tracks, rejected_poses, unseen = (
         [] if rows is None else rows.tolist()
-        for rows in (calibration.rejected_markers, calibration.rejected_poses)
+        for rows in (calibration.rejected_markers, calibration.rejected_poses, calibration.unseen_poses)
     )
     tracks = {why: [j for j, w in rejected_tracks if w == code] for code, why in enumerate(WHY_LOST)}
     whole = {j for numbers in tracks.values() for j in numbers}
@@ -351,6 +353,8 @@ def findings(calibration: Calibration) -> dict[str, Any]:
         "id_switches": len(swaps),
         "tracks": tracks,
         "poses": sorted({p for p, _ in suspects} | set(rejected_poses)),
+        "unseen_poses": unseen,
+        "placeholders": calibration.placeholders,
     }
     return {
         "outliers": [{"pose": p, "marker": m, "view": (*VIEWS, "both")[v]} for p, m, v in outliers],

@@ -11,6 +11,7 @@ from projservo_cli.calibration import (
     Solution,
     calibrate,
     cross_validate,
+    screened,
 )
 from projservo_cli.files import write_whole
 from projservo_cli.nominal import read_nominal
@@ -31,13 +32,14 @@ def run(
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Calibrate from a recorded table or from simulated trial motions.
 
-    Returns the observations, the calibration, and its held-out errors on request.
+    Returns the screened observations, the calibration, and its held-out errors on request.
     """
     source = inputs.source
     seen = recorded(source) if isinstance(source, Table) else simulated(source, progress=progress)
     if inputs.joint_noise is not None:
         seen = replace(seen, joint_noise=inputs.joint_noise)
-    return seen.record, *estimate(seen, inputs.estimation, progress=progress)
+    calibration, held_out = estimate(seen, inputs.estimation, progress=progress)
+    return screened(seen.record, seen.joint_types).observation, calibration, held_out
 
 
 def recorded(table: Table) -> Observations:
