@@ -36,6 +36,7 @@ SIZES = {
     "coordinate": 4,
     "axis": 3,
     "own": 3,
+    "pair_end": 2,
     "part": 3,
     "solution": 2,
     "lens_term": 5,
@@ -280,6 +281,12 @@ class Calibration:
         about="joints, from 1, whose readings passed a full turn and were unwrapped",
         default=None,
     )
+    undecided_order: IntArray | None = _array(
+        "undecided_pair pair_end",
+        about="pairs of joints, from 1, whose order no pose shows; missing where it was not tested",
+        default=None,
+    )
+    order_stated: bool = _scalar(about="whether somebody stated the order of the joints", default=False)
     predicted_rms_px: float | None = _scalar(
         "px",
         "expected error of images within the joint ranges, rms per marker and view",
@@ -332,6 +339,20 @@ class Calibration:
         """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""
         known = self.marker.tolist()
         return [known.index(number) for number in numbers]
+
+    @property
+    def order_advice(self) -> str:
+        """Advice about joints whose order neither poses nor somebody decides; empty if there are none."""
+        if self.undecided_order is None or not self.undecided_order.size or self.order_stated:
+            return ""
+        pairs, joints = self.undecided_order.tolist(), np.unique(self.undecided_order).tolist()
+        names = ", ".join(map(str, joints[:-1])) + f" and {joints[-1]}"
+        if len(pairs) in (2, 3) and len(joints) > len(pairs):
+            names = ", ".join(f"{i} and {j}" for i, j in pairs)
+        return (
+            f"the order of joints {names} is taken from the table; no pose shows it: add poses in which "
+            "several move"
+        )
 
     @property
     def errors(self) -> Errors:

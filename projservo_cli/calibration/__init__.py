@@ -3,12 +3,14 @@
 ``estimate`` runs the steps: what is no observation (``screening``), pixels (``detections``), geometry of the
 rig (``epipolar``), initial parameters (``initialization``), robust bundle adjustment (``fit``,
 ``adjustment``), outliers (``diagnosis``), frame and covariance (``projective``), assessment (``quality``).
-``prediction`` has the forward model, and predicts images and their errors from the result.
+``joint_order`` tests which order of the joints the poses show. ``prediction`` has the forward model, and
+predicts images and their errors from the result.
 """
 
 from projservo_cli.calibration.estimate import calibrate
 from projservo_cli.calibration.fit import Solution, chi2_band
 from projservo_cli.calibration.initialization import Nominal
+from projservo_cli.calibration.joint_order import undecided_pairs
 from projservo_cli.calibration.prediction import (
     predict,
     prediction_variance,
@@ -28,4 +30,5 @@ __all__ = [
     "prediction_variance",
     "residual_statistics",
     "screened",
+    "undecided_pairs",
 ]

@@ -308,6 +308,7 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
     more = (
         "circular_joints",
+        "undecided_order",
         "sigma_q_interval",
         "sigma_scale_interval",
         "time_offset_s",
@@ -315,6 +316,8 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
         "time_offset_jitter_s",
     )
     own = {name: getattr(calibration, name) for name in more}
+    order = calibration.undecided_order
+    own |= {"order_determined": None if order is None else not order.size}
     return _scalars(calibration) | own | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 
 

@@ -12,13 +12,14 @@ from projservo_cli.calibration import (
     calibrate,
     cross_validate,
     screened,
+    undecided_pairs,
 )
 from projservo_cli.files import write_whole
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import Suggestion, suggest
 from projservo_cli.planning.prediction_covariance import Region
-from projservo_cli.records import Calibration, CrossValidation, FloatArray, Observation
+from projservo_cli.records import Calibration, CrossValidation, FloatArray, IntArray, Observation
 from projservo_cli.robots.settings import JointSettings
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.given import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
@@ -50,6 +51,7 @@ def recorded(table: Table) -> Observations:
         image_size=table.image_size,
         noise_px=table.noise_px,
         seed=table.seed,
+        order_stated=table.order_stated,
     )
 
 
@@ -77,11 +79,14 @@ def estimate(
     seen: Observations, asked: Estimation, *, progress: Progress = silent
 ) -> tuple[Calibration, CrossValidation | None]:
     """Return the calibration from observations, and its held-out errors on request."""
-    held_out: list[CrossValidation] = []
+    held_out, undecided = list[CrossValidation](), list[IntArray]()
 
-    def hold_out(solution: Solution, noise_px: float) -> None:
-        """Cross-validate the solution while it is at hand."""
-        assert asked.cross_validate is not None
+    def judge(solution: Solution, noise_px: float) -> None:
+        """Test the order of the joints, and cross-validate, while the solution is at hand."""
+        if seen.source == "recorded":  # a simulated arm knows the order of its joints
+            undecided.append(undecided_pairs(solution, noise_px))
+        if asked.cross_validate is None:
+            return
         on_progress = partial(progress, "cross-validation")
         held_out.append(cross_validate(solution, noise_px, asked.cross_validate, seen.seed, on_progress))
 
@@ -96,10 +101,15 @@ def estimate(
         lens=asked.lens,
         init=Nominal(**read_nominal(asked.init.path)) if asked.init is not None else None,
         joint_noise=seen.joint_noise,
-        fitted=hold_out if asked.cross_validate is not None else None,
+        fitted=judge,
         progress=progress,
     )
-    return replace(calibration, source=seen.source), held_out[0] if held_out else None
+    order = undecided[0] if undecided else None
+    calibration = replace(
+        calibration, source=seen.source, undecided_order=order, order_stated=seen.order_stated
+    )
+    advice = tuple(filter(None, (calibration.order_advice, *calibration.advice)))
+    return replace(calibration, advice=advice), held_out[0] if held_out else None
 
 
 # The range of the recorded readings is widened at each end by this share of itself; for a robot

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from projservo_cli import cli, store
-from tests.conftest import SHARED
+from tests.conftest import ROOT, SHARED
+from tests.robots.robots import CALLS
 
 
 @pytest.fixture
@@ -73,3 +74,60 @@ def test_case_15_sentinel_9999(case, answer):
     assert (code, score["skipped"]["missing"]) == (0, 170)
     assert score["rms_px"] < 1.0
     assert "u = 9999, v = 9999" in err
+
+
+def test_case_01_joint_order(case, answer):
+    folder = case("01_joint_order")
+    code, found, _ = answer("calibrate", "--data", folder / "trials.csv", "-o", "a")
+    assert (code, found["usable"], found["order_determined"]) == (0, True, False)
+    assert [1, 3] in found["undecided_order"]
+    assert found["advice"][0].startswith(
+        "the order of joints 1, 2, 3, 4, 5 and 6 is taken from the table; no pose"
+    )
+    # With the poses in which several move, the exchanged columns show.
+    lines = [
+        *(folder / "trials.csv").read_text(encoding="utf-8").splitlines(),
+        *(
+            f"{500 + int(pose)},{rest}"
+            for pose, rest in (
+                line.split(",", 1)
+                for line in (folder / "held.csv").read_text(encoding="utf-8").splitlines()[101:]
+            )
+        ),
+    ]
+    with open("both.csv", "w", encoding="utf-8") as file:
+        file.write("\n".join(lines) + "\n")
+    code, failed, _ = answer("calibrate", "--data", "both.csv", "-o", "b")
+    assert code == 1
+    assert "joint" in failed["reason"]
+
+
+UR5 = ROOT / "configs" / "ur5.yaml"
+ROBOT = f"plant={{use: 'tests.robots.robots:Sound', options: {{config: {UR5}}}}}"
+TASK = ["--set", "task.goal.joints.joints=[3, -1.7, -0.9, -2, 2, 1]"]
+
+
+def test_a_table_without_an_order_is_planned_with_a_warning_and_drives_no_external_robot(
+    answer, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    recorded = ["-c", UR5, "--set", "calibration.random_poses=0"]
+    assert answer("record", *recorded, "-o", "t.csv")[0] == 0
+    task = ["--data", tmp_path / "t.csv", *TASK]
+    code, found, err = answer("calibrate", "plan", "-c", UR5, *task, "-o", "run")
+    assert code == 0, err
+    assert found["calibrate"]["order_determined"] is False
+    assert "; the order of joints 1, 2, 3, 4, 5 and 6 is taken from the table" in found["plan"]["reason"]
+    drive = ["servo", "-c", UR5, *task, "--set", ROBOT, "--law", "exact", "-o", "run"]
+    CALLS.clear()
+    code, _, err = answer(*drive)
+    assert code == 2, err
+    assert "the order of joints 1, 2, 3, 4, 5 and 6 is taken from the table" in err
+    assert "data.joint_order=stated" in err
+    assert not CALLS
+    stated = [*drive, "--set", "data.joint_order=stated"]
+    code, done, err = answer(*stated)
+    assert code == 0, err
+    assert done["laws"][0]["verdict"] == "converged"
+    plan = store.load("run").plan
+    assert "order of joints" not in plan.reason
