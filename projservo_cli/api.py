@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.calibration import screened
 from projservo_cli.canonical import File
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
 from projservo_cli.config.inputs import (
@@ -236,8 +235,8 @@ def calibrate(
     file = None if settings.init is None else File.of(settings.init, "JSON with screws, cameras and markers")
     asked = Estimation(settings.method, settings.lens, file, settings.cross_validate)
     with listening(progress) as listener:
-        made = calibrating.estimate(seen, asked, progress=listener.progress)
-        return ImageModel.of(*made, screened(seen.record, seen.joint_types).observation)
+        screened, calibration, held_out = calibrating.estimate(seen, asked, progress=listener.progress)
+        return ImageModel.of(calibration, held_out, screened)
 
 
 def plan(

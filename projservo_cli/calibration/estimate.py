@@ -12,7 +12,7 @@ from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.detections import Detections, require_images, require_motion, require_shapes
+from projservo_cli.calibration.detections import Detections, require_images, require_motion
 from projservo_cli.calibration.diagnosis import (
     Outliers,
     describe_other_motion,
@@ -23,12 +23,12 @@ from projservo_cli.calibration.diagnosis import (
     rejection_reasons,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
+from projservo_cli.calibration.few_poses import require_poses
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, assess, cross_validate
-from projservo_cli.calibration.screening import screened
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.geometry.lens import K1
 from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation
@@ -132,13 +132,11 @@ def calibrate(
         )
     begin = time.perf_counter()
     solution = None
-    require_shapes(observation)
-    screening = screened(observation, joint_types)
-    observation = screening.observation
     # The matrices are small: a second thread costs more than it gives.
-    with threadpool_limits(limits=1), screening.told():
+    with threadpool_limits(limits=1):
         detections = Detections.of(observation, joint_types)
         require_motion(detections)
+        require_poses(detections)
         if image_size is not None:
             _require_inside(detections, image_size, _LENS_STRAYS if lens else _STRAYS)
         require_images(detections, sigma_px)
@@ -162,15 +160,7 @@ def calibrate(
             fitted(solution, expected.noise_px(solution))
         if method == "bundle_adjustment":
             result = with_time_offset(result, observation)
-    return dataclasses.replace(
-        result,
-        source=source,
-        seconds=seconds,
-        advice=(*screening.advice, *result.advice)[:_MAX_ADVICE],
-        placeholders=screening.placeholders,
-        unseen_poses=screening.unseen,
-        circular_joints=screening.circular,
-    )
+    return dataclasses.replace(result, source=source, seconds=seconds)
 
 
 def require_size_and_noise(image_size: Any, sigma_px: Any) -> None:
@@ -268,6 +258,7 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
             raise
         hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         raise Misfit(f"{refused}; {hint}") from None
+    require_poses(solution.kept().problem.detections)
     errors = solution.errors()
     record = _record(Projective.of(solution), solution, expected, errors, found, suspicion)
     lens = _lens_advice(record, share, frame.known)

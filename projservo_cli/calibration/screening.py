@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from projservo_cli.calibration.detections import require_shapes
 from projservo_cli.records import FloatArray, IntArray, Observation, WorkFailed
 
 # A full turn, rad.
@@ -48,7 +49,11 @@ class Screening(NamedTuple):
 
 
 def screened(observation: Observation, joint_types: str) -> Screening:
-    """Empty placeholders, drop poses that nobody saw, and unwrap readings; one letter a joint, R or P."""
+    """Empty placeholders, drop poses that nobody saw, and unwrap readings; one letter a joint, R or P.
+
+    Raises InputError if the arrays do not fit each other.
+    """
+    require_shapes(observation)
     images, advice = without_placeholders(observation.images)
     count = int(np.isfinite(observation.images[..., 0]).sum() - np.isfinite(images[..., 0]).sum())
     lost = np.asarray(np.isnan(images)).any(axis=3).reshape(len(images), -1).all(axis=1)

@@ -39,8 +39,7 @@ def run(
     seen = recorded(source) if isinstance(source, Table) else simulated(source, progress=progress)
     if inputs.joint_noise is not None:
         seen = replace(seen, joint_noise=inputs.joint_noise)
-    calibration, held_out = estimate(seen, inputs.estimation, progress=progress)
-    return screened(seen.record, seen.joint_types).observation, calibration, held_out
+    return estimate(seen, inputs.estimation, progress=progress)
 
 
 def recorded(table: Table) -> Observations:
@@ -77,8 +76,9 @@ def simulated(
 
 def estimate(
     seen: Observations, asked: Estimation, *, progress: Progress = silent
-) -> tuple[Calibration, CrossValidation | None]:
-    """Return the calibration from observations, and its held-out errors on request."""
+) -> tuple[Observation, Calibration, CrossValidation | None]:
+    """Return the screened observations, the calibration, and its held-out errors on request."""
+    screening = screened(seen.record, seen.joint_types)
     held_out, undecided = list[CrossValidation](), list[IntArray]()
 
     def judge(solution: Solution, noise_px: float) -> None:
@@ -90,26 +90,34 @@ def estimate(
         on_progress = partial(progress, "cross-validation")
         held_out.append(cross_validate(solution, noise_px, asked.cross_validate, seen.seed, on_progress))
 
-    calibration = calibrate(
-        seen.record,
-        seen.joint_types,
-        method=asked.method,
-        sigma_px=seen.noise_px,
-        source="simulated" if seen.exact else "recorded",
-        image_size=seen.image_size,
-        seed=seen.seed,
-        lens=asked.lens,
-        init=Nominal(**read_nominal(asked.init.path)) if asked.init is not None else None,
-        joint_noise=seen.joint_noise,
-        fitted=judge,
-        progress=progress,
-    )
+    with screening.told():
+        calibration = calibrate(
+            screening.observation,
+            seen.joint_types,
+            method=asked.method,
+            sigma_px=seen.noise_px,
+            source="simulated" if seen.exact else "recorded",
+            image_size=seen.image_size,
+            seed=seen.seed,
+            lens=asked.lens,
+            init=Nominal(**read_nominal(asked.init.path)) if asked.init is not None else None,
+            joint_noise=seen.joint_noise,
+            fitted=judge,
+            progress=progress,
+        )
     order = undecided[0] if undecided else None
     calibration = replace(
-        calibration, source=seen.source, undecided_order=order, order_stated=seen.order_stated
+        calibration,
+        source=seen.source,
+        placeholders=screening.placeholders,
+        unseen_poses=screening.unseen,
+        circular_joints=screening.circular,
+        undecided_order=order,
+        order_stated=seen.order_stated,
     )
-    advice = tuple(filter(None, (calibration.order_advice, *calibration.advice)))
-    return replace(calibration, advice=advice), held_out[0] if held_out else None
+    advice = tuple(filter(None, (*screening.advice, calibration.order_advice, *calibration.advice)))
+    calibration = replace(calibration, advice=advice)
+    return screening.observation, calibration, held_out[0] if held_out else None
 
 
 # The range of the recorded readings is widened at each end by this share of itself; for a robot

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import calibrate, residual_statistics
+from projservo_cli import Observations, calibrate
+from projservo_cli.calibration import residual_statistics
 from projservo_cli.calibration.screening import screened, without_placeholders
 from projservo_cli.records import Observation
 from projservo_cli.report.report_data import findings
@@ -19,12 +20,12 @@ EMPTY = dataclasses.replace(SEEN, images=np.where(GAPS[..., None], np.nan, SEEN.
 
 
 def calibrated(observation, **given):
-    return calibrate(observation, "RRR", source="recorded", **given)
+    return calibrate(Observations.of(observation, joint_types="RRR"), progress=False, **given)
 
 
 def numbers(calibration):
     """All arrays and numbers of a calibration that do not say what was screened."""
-    apart = {"advice", "seconds", "placeholders", "unseen_poses", "circular_joints"}
+    apart = {"advice", "observation", "seconds", "placeholders", "unseen_poses", "circular_joints"}
     return {key: value for key, value in vars(calibration).items() if key not in apart}
 
 
