@@ -273,20 +273,13 @@ class Calibration:
         "rejected_pose", about="rejected poses without one suspect joint reading", default=None
     )
     placeholders: int = _scalar(about="number of detections that stood for unseen markers", default=0)
-    unseen_poses: IntArray | None = _array(
-        "unseen_pose", about="numbers of poses that no camera saw", default=None
-    )
+    unseen_poses: IntArray | None = _array("unseen_pose", about="poses that no camera saw", default=None)
     circular_joints: IntArray | None = _array(
-        "circular_joint",
-        about="joints, from 1, whose readings passed a full turn and were unwrapped",
-        default=None,
+        "circular_joint", about="joints, from 1, whose readings passed a full turn", default=None
     )
     undecided_order: IntArray | None = _array(
-        "undecided_pair pair_end",
-        about="pairs of joints, from 1, whose order no pose shows; missing where it was not tested",
-        default=None,
+        "undecided_pair pair_end", about="pairs of joints, from 1, whose order no pose shows", default=None
     )
-    order_stated: bool = _scalar(about="whether somebody stated the order of the joints", default=False)
     predicted_rms_px: float | None = _scalar(
         "px",
         "expected error of images within the joint ranges, rms per marker and view",
@@ -342,17 +335,12 @@ class Calibration:
 
     @property
     def order_advice(self) -> str:
-        """Advice about joints whose order neither poses nor somebody decides; empty if there are none."""
-        if self.undecided_order is None or not self.undecided_order.size or self.order_stated:
+        """Advice about joints whose order nothing shows; empty if there are none, or it was not tested."""
+        if self.undecided_order is None or not self.undecided_order.size:
             return ""
-        pairs, joints = self.undecided_order.tolist(), np.unique(self.undecided_order).tolist()
-        names = ", ".join(map(str, joints[:-1])) + f" and {joints[-1]}"
-        if len(pairs) in (2, 3) and len(joints) > len(pairs):
-            names = ", ".join(f"{i} and {j}" for i, j in pairs)
-        return (
-            f"the order of joints {names} is taken from the table; no pose shows it: add poses in which "
-            "several move"
-        )
+        *joints, last = np.unique(self.undecided_order).tolist()
+        names = f"the order of joints {', '.join(map(str, joints))} and {last}"
+        return f"{names} is taken from the table; no pose shows it: add poses in which several move"
 
     @property
     def errors(self) -> Errors:

@@ -1,23 +1,20 @@
 """Projective kinematics from stereo images of trial motions: [RH00] section 2.
 
-``estimate`` runs the steps: what is no observation (``screening``), pixels (``detections``), geometry of the
-rig (``epipolar``), initial parameters (``initialization``), robust bundle adjustment (``fit``,
-``adjustment``), outliers (``diagnosis``), frame and covariance (``projective``), assessment (``quality``).
-``joint_order`` tests which order of the joints the poses show. ``prediction`` has the forward model, and
-predicts images and their errors from the result.
+``estimate`` runs the steps: pixels (``detections``), geometry of the rig (``epipolar``), initial parameters
+(``initialization``), robust bundle adjustment (``fit``, ``adjustment``), outliers (``diagnosis``), frame and
+covariance (``projective``), assessment (``quality``). ``prediction`` has the forward model, and predicts
+images and their errors from the result. ``screening`` comes before, ``joint_order`` after.
 """
 
 from projservo_cli.calibration.estimate import calibrate
 from projservo_cli.calibration.fit import Solution, chi2_band
 from projservo_cli.calibration.initialization import Nominal
-from projservo_cli.calibration.joint_order import undecided_pairs
 from projservo_cli.calibration.prediction import (
     predict,
     prediction_variance,
     residual_statistics,
 )
 from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate
-from projservo_cli.calibration.screening import screened
 
 __all__ = [
     "WEAK_NOISE",
@@ -29,6 +26,4 @@ __all__ = [
     "predict",
     "prediction_variance",
     "residual_statistics",
-    "screened",
-    "undecided_pairs",
 ]

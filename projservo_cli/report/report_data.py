@@ -316,8 +316,7 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
         "time_offset_jitter_s",
     )
     own = {name: getattr(calibration, name) for name in more}
-    order = calibration.undecided_order
-    own |= {"order_determined": None if order is None else not order.size}
+    own |= {"order_determined": None if (order := calibration.undecided_order) is None else not order.size}
     return _scalars(calibration) | own | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 
 

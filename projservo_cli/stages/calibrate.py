@@ -11,15 +11,15 @@ from projservo_cli.calibration import (
     Solution,
     calibrate,
     cross_validate,
-    screened,
-    undecided_pairs,
 )
+from projservo_cli.calibration.joint_order import undecided_pairs
+from projservo_cli.calibration.screening import screened
 from projservo_cli.files import write_whole
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import Suggestion, suggest
 from projservo_cli.planning.prediction_covariance import Region
-from projservo_cli.records import Calibration, CrossValidation, FloatArray, IntArray, Observation
+from projservo_cli.records import Calibration, CrossValidation, FloatArray, IntArray, Observation, WorkFailed
 from projservo_cli.robots.settings import JointSettings
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.given import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
@@ -79,18 +79,19 @@ def estimate(
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Return the screened observations, the calibration, and its held-out errors on request."""
     screening = screened(seen.record, seen.joint_types)
-    held_out, undecided = list[CrossValidation](), list[IntArray]()
+    held_out: list[CrossValidation] = []
+    order: list[IntArray] = []
 
     def judge(solution: Solution, noise_px: float) -> None:
         """Test the order of the joints, and cross-validate, while the solution is at hand."""
-        if seen.source == "recorded":  # a simulated arm knows the order of its joints
-            undecided.append(undecided_pairs(solution, noise_px))
-        if asked.cross_validate is None:
-            return
-        on_progress = partial(progress, "cross-validation")
-        held_out.append(cross_validate(solution, noise_px, asked.cross_validate, seen.seed, on_progress))
+        if seen.source == "recorded" and not seen.order_stated:  # a simulated arm knows its order
+            order.append(undecided_pairs(solution, noise_px))
+        if asked.cross_validate is not None:
+            on_progress = partial(progress, "cross-validation")
+            found = cross_validate(solution, noise_px, asked.cross_validate, seen.seed, on_progress)
+            held_out.append(found)
 
-    with screening.told():
+    try:
         calibration = calibrate(
             screening.observation,
             seen.joint_types,
@@ -105,19 +106,18 @@ def estimate(
             fitted=judge,
             progress=progress,
         )
-    order = undecided[0] if undecided else None
+    except WorkFailed as error:
+        raise type(error)("; ".join((str(error), *screening.advice))) from error
     calibration = replace(
         calibration,
         source=seen.source,
         placeholders=screening.placeholders,
         unseen_poses=screening.unseen,
         circular_joints=screening.circular,
-        undecided_order=order,
-        order_stated=seen.order_stated,
+        undecided_order=order[0] if order else None,
     )
-    advice = tuple(filter(None, (*screening.advice, calibration.order_advice, *calibration.advice)))
-    calibration = replace(calibration, advice=advice)
-    return screening.observation, calibration, held_out[0] if held_out else None
+    advice = filter(None, (*screening.advice, calibration.order_advice, *calibration.advice))
+    return screening.observation, replace(calibration, advice=tuple(advice)), next(iter(held_out), None)
 
 
 # The range of the recorded readings is widened at each end by this share of itself; for a robot

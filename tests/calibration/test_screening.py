@@ -91,7 +91,7 @@ def test_poses_that_no_camera_saw_change_nothing_but_the_advice():
     found = calibrated(Observation(pose, SEEN.marker, q, images))
     np.testing.assert_equal(numbers(found), numbers(calibrated(EMPTY)))
     assert findings(found)["rejected"]["unseen_poses"] == [701, 702]
-    assert found.advice[0].startswith("2 poses that no camera saw were dropped (701, 702)")
+    assert found.advice[0].startswith("poses that no camera saw: 2 (701, 702), dropped")
 
 
 @pytest.mark.parametrize("low", [0.0, -180.0, -90.0])
