@@ -241,8 +241,8 @@ def calibrate(
         settings.method, settings.lens, file, settings.cross_validate, settings.max_predicted_px
     )
     with listening(progress) as listener:
-        made = calibrating.estimate(seen, asked, progress=listener.progress)
-        return ImageModel.of(*made, seen.record)
+        screened, calibration, held_out = calibrating.estimate(seen, asked, progress=listener.progress)
+        return ImageModel.of(calibration, held_out, screened)
 
 
 def plan(

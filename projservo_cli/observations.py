@@ -36,6 +36,7 @@ class Observations(Displayable, Observation):
     source : ``simulated`` or ``recorded``.
     exact : whether pixel noise is their only error, so that χ² decides against ``noise_px``.
     seed : seed of the random starts of a calibration.
+    order_stated : whether the order of the joints along the arm is known to be that of q.
     """
 
     joint_types: str = ""
@@ -45,6 +46,7 @@ class Observations(Displayable, Observation):
     source: str = "recorded"
     exact: bool = False
     seed: int = 0
+    order_stated: bool = False
 
     def __post_init__(self) -> None:
         """Refuse an image size or a noise that is none."""

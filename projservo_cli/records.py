@@ -36,6 +36,7 @@ SIZES = {
     "coordinate": 4,
     "axis": 3,
     "own": 3,
+    "pair_end": 2,
     "part": 3,
     "solution": 2,
     "lens_term": 5,
@@ -309,6 +310,14 @@ class Calibration:
         about="rejected images that a camera shows that moved: pose, view (0 left, 1 right)",
         default=None,
     )
+    placeholders: int = _scalar(about="number of detections that stood for unseen markers", default=0)
+    unseen_poses: IntArray | None = _array("unseen_pose", about="poses that no camera saw", default=None)
+    circular_joints: IntArray | None = _array(
+        "circular_joint", about="joints, from 1, whose readings passed a full turn", default=None
+    )
+    undecided_order: IntArray | None = _array(
+        "undecided_pair pair_end", about="pairs of joints, from 1, whose order no pose shows", default=None
+    )
     predicted_rms_px: float | None = _scalar(
         "px",
         "expected error of images within the joint ranges, rms per marker and view",
@@ -404,6 +413,15 @@ class Calibration:
         """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""
         known = self.marker.tolist()
         return [known.index(number) for number in numbers]
+
+    @property
+    def order_advice(self) -> str:
+        """Advice about joints whose order nothing shows; empty if there are none, or it was not tested."""
+        if self.undecided_order is None or not self.undecided_order.size:
+            return ""
+        *joints, last = np.unique(self.undecided_order).tolist()
+        names = f"the order of joints {', '.join(map(str, joints))} and {last}"
+        return f"{names} is taken from the table; no pose shows it: add poses in which several move"
 
     @property
     def errors(self) -> Errors:

@@ -2,8 +2,9 @@
 
 ``estimate`` runs the steps: pixels (``detections``), geometry of the rig (``epipolar``), equal numbers in
 both views (``numbering``), initial parameters (``initialization``), robust bundle adjustment (``fit``,
-``adjustment``), outliers (``diagnosis``), frame and covariance (``projective``), assessment (``quality``).
-``prediction`` has the forward model, and predicts images and their errors from the result.
+``adjustment``), outliers (``diagnosis``), frame and covariance (``projective``), deviations from the model
+(``model_error``), assessment (``quality``). ``prediction`` has the forward model, and predicts images and
+their errors from the result. ``screening`` comes before, ``joint_order`` after.
 """
 
 from projservo_cli.calibration.estimate import calibrate

@@ -68,7 +68,7 @@ class Detections:
 
         Raises InputError if the arrays or the letters do not fit each other, or values are not finite.
         """
-        _require_shapes(observation)
+        require_shapes(observation)
         observation = observation.at_rest
         letters = joint_types.upper()
         n = observation.q.shape[1]
@@ -176,7 +176,7 @@ def per_block(block_of: IntArray, values: FloatArray, count: int) -> FloatArray:
     return np.stack(sums, axis=1).astype(np.float64).reshape(count, *values.shape[1:])
 
 
-def _require_shapes(observation: Observation) -> None:
+def require_shapes(observation: Observation) -> None:
     """Refuse an observation whose arrays do not fit each other, naming the array and its shape."""
     if observation.q.ndim != 2:
         raise InputError(f"joint readings of shape {observation.q.shape}: expected (poses, joints)")

@@ -25,6 +25,7 @@ from projservo_cli.calibration.diagnosis import (
     straight_joints,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
+from projservo_cli.calibration.few_poses import require_poses
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
@@ -152,6 +153,7 @@ def calibrate(
     with threadpool_limits(limits=1):
         detections = Detections.of(observation, joint_types)
         require_motion(detections)
+        require_poses(detections)
         if image_size is not None:
             _require_inside(detections, image_size, _LENS_STRAYS if lens else _STRAYS)
         require_images(detections, sigma_px)
@@ -276,6 +278,7 @@ def _refined(
         suspicion = "lens" if share else "joint readings"
         if much and not share and solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:  # not the joints
             suspicion = "outliers"
+        require_poses(solution.kept().problem.detections)
         errors = solution.errors()
         record = _record(Projective.of(solution), solution, expected, errors, found, suspicion, limit_px)
         if much:

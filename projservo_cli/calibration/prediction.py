@@ -13,6 +13,7 @@ import numpy as np
 
 from projservo_cli.calibration.detections import Detections, per_rad
 from projservo_cli.calibration.epipolar import Epipolar
+from projservo_cli.calibration.screening import without_placeholders
 from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible, undistort
 from projservo_cli.geometry.rigid import sine_and_versine
 from projservo_cli.records import (
@@ -236,15 +237,17 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     Returns ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``stated_px``, the median
     error that the covariance states at these readings, ``noise_px`` of these images and readings, and
     ``limit_px`` of the median by both (None without a covariance); ``skipped``, the numbers of pairs of
-    unknown markers, behind the camera, and missing.
+    unknown markers, behind the camera, and missing; ``advice`` about placeholders, which are missing ones.
     Raises InputError if the readings have another number of joints or are not finite.
     """
     observation = observation.at_rest
+    images, advice = without_placeholders(observation.images)
+    observation = replace(observation, images=images)
     known = np.isin(observation.marker, calibration.marker)
     numbers = calibration.marker.tolist()
     order = [numbers.index(number) for number in observation.marker[known].tolist()]
     pixels = predict(calibration, observation.q)[:, :, order]
-    seen: BoolArray = np.asarray(np.isfinite(observation.images).all(axis=-1))
+    seen: BoolArray = np.asarray(np.isfinite(images).all(axis=-1))
     ahead = np.isfinite(pixels[..., 0])
     compared = seen[:, :, known] & ahead
     found = distance_statistics(np.linalg.norm((pixels - observation.images[:, :, known])[compared], axis=1))
@@ -265,6 +268,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
             "behind_camera": int((seen[:, :, known] & ~ahead).sum()),
             "missing": int((~seen).sum()),
         },
+        "advice": list(advice),
     }
 
 

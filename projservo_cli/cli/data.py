@@ -315,6 +315,8 @@ def _validate(
         return
     observation = read_table(data, calibration.joint_types, joint_unit)
     value = {"run": found.path.resolve(), **residual_statistics(calibration, observation)}
+    for text in value.get("advice", ()):
+        console.say(f"validate: {text}")
     skipped = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in value["skipped"].items())
     words = [wrapped(f"validate: {value['count']} marker-view pairs; skipped: {skipped}")]
     if value["count"]:

@@ -94,7 +94,8 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
     if config.data is not None and table is not None:
         data = config.data
         size = config.image_size_px
-        source = Table(table, config.joint_types, data.joint_unit, size, data.noise_px, _seed(config))
+        stated = data.joint_order == "stated"
+        source = Table(table, config.joint_types, data.joint_unit, size, data.noise_px, _seed(config), stated)
     else:
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
         source = _trials(config, _truth(config, face=False), None, files, speed_scale=1.0)

@@ -303,6 +303,11 @@ class _Data(Section):
         None,
         description="unit of revolute joints; null: rad, and readings that look like degrees are refused",
     )
+    joint_order: Literal["stated"] | None = Field(
+        None,
+        description="stated: q1 ... qN are known to follow each other from base to tool; null: servo drives "
+        "an external robot only if poses show it",
+    )
     noise_px: Positive | None = Field(None, description="pixel noise per coordinate; null: estimated")
     image_size_px: tuple[Count, Count] | None = Field(
         None, description="width and height of the images; null: those of rig, else from the observations"

@@ -313,6 +313,8 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
         }
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
     more = (
+        "circular_joints",
+        "undecided_order",
         "sigma_q_interval",
         "sigma_scale_interval",
         "time_offset_s",
@@ -320,6 +322,7 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
         "time_offset_jitter_s",
     )
     own = {name: getattr(calibration, name) for name in more}
+    own |= {"order_determined": None if (order := calibration.undecided_order) is None else not order.size}
     found = _scalars(calibration)
     del found["model_error"], found["unshown_error"]
     own["model_errors"] = [_in_words(one, calibration) for one in calibration.model_errors]
@@ -350,14 +353,20 @@ def findings(calibration: Calibration) -> dict[str, Any]:
     calibration : the record.
     Returns ``outliers``, ``suspect_joint_readings``, ``id_switches``, ``moved_images``, ``poses_used``,
     ``markers_used``, and ``rejected`` by kind: counts of ``observations`` and of ``id_switches``, numbers of
-    the ``tracks`` (markers) that are rejected as a whole by reason, and of the ``poses``.
+    the ``tracks`` (markers) that are rejected as a whole by reason, of the ``poses`` and of ``unseen_poses``,
+    and the count of ``placeholders``.
     """
     outliers, suspects, swaps = (
         rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.id_switches)
     )
-    rejected_tracks, rejected_poses, moved = (
+    rejected_tracks, rejected_poses, moved, unseen = (
         [] if rows is None else rows.tolist()
-        for rows in (calibration.rejected_markers, calibration.rejected_poses, calibration.moved_images)
+        for rows in (
+            calibration.rejected_markers,
+            calibration.rejected_poses,
+            calibration.moved_images,
+            calibration.unseen_poses,
+        )
     )
     tracks = {why: [j for j, w in rejected_tracks if w == code] for code, why in enumerate(WHY_LOST)}
     whole = {j for numbers in tracks.values() for j in numbers}
@@ -366,6 +375,8 @@ def findings(calibration: Calibration) -> dict[str, Any]:
         "id_switches": len(swaps),
         "tracks": tracks,
         "poses": sorted({p for p, _ in suspects} | set(rejected_poses)),
+        "unseen_poses": unseen,
+        "placeholders": calibration.placeholders,
     }
     return {
         "outliers": [{"pose": p, "marker": m, "view": (*VIEWS, "both")[v]} for p, m, v in outliers],

@@ -12,12 +12,14 @@ from projservo_cli.calibration import (
     calibrate,
     cross_validate,
 )
+from projservo_cli.calibration.joint_order import undecided_pairs
+from projservo_cli.calibration.screening import screened
 from projservo_cli.files import write_whole
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import Suggestion, suggest
 from projservo_cli.planning.prediction_covariance import Region
-from projservo_cli.records import Calibration, CrossValidation, FloatArray, Observation
+from projservo_cli.records import Calibration, CrossValidation, FloatArray, IntArray, Observation, WorkFailed
 from projservo_cli.robots.settings import JointSettings
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.given import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
@@ -31,13 +33,13 @@ def run(
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Calibrate from a recorded table or from simulated trial motions.
 
-    Returns the observations, the calibration, and its held-out errors on request.
+    Returns the screened observations, the calibration, and its held-out errors on request.
     """
     source = inputs.source
     seen = recorded(source) if isinstance(source, Table) else simulated(source, progress=progress)
     if inputs.joint_noise is not None:
         seen = replace(seen, joint_noise=inputs.joint_noise)
-    return seen.record, *estimate(seen, inputs.estimation, progress=progress)
+    return estimate(seen, inputs.estimation, progress=progress)
 
 
 def recorded(table: Table) -> Observations:
@@ -48,6 +50,7 @@ def recorded(table: Table) -> Observations:
         image_size=table.image_size,
         noise_px=table.noise_px,
         seed=table.seed,
+        order_stated=table.order_stated,
     )
 
 
@@ -73,32 +76,49 @@ def simulated(
 
 def estimate(
     seen: Observations, asked: Estimation, *, progress: Progress = silent
-) -> tuple[Calibration, CrossValidation | None]:
-    """Return the calibration from observations, and its held-out errors on request."""
+) -> tuple[Observation, Calibration, CrossValidation | None]:
+    """Return the screened observations, the calibration, and its held-out errors on request."""
+    screening = screened(seen.record, seen.joint_types)
     held_out: list[CrossValidation] = []
+    order: list[IntArray] = []
 
-    def hold_out(solution: Solution, noise_px: float) -> None:
-        """Cross-validate the solution while it is at hand."""
-        assert asked.cross_validate is not None
-        on_progress = partial(progress, "cross-validation")
-        held_out.append(cross_validate(solution, noise_px, asked.cross_validate, seen.seed, on_progress))
+    def judge(solution: Solution, noise_px: float) -> None:
+        """Test the order of the joints, and cross-validate, while the solution is at hand."""
+        if seen.source == "recorded" and not seen.order_stated:  # a simulated arm knows its order
+            order.append(undecided_pairs(solution, noise_px))
+        if asked.cross_validate is not None:
+            on_progress = partial(progress, "cross-validation")
+            found = cross_validate(solution, noise_px, asked.cross_validate, seen.seed, on_progress)
+            held_out.append(found)
 
-    calibration = calibrate(
-        seen.record,
-        seen.joint_types,
-        method=asked.method,
-        sigma_px=seen.noise_px,
-        source="simulated" if seen.exact else "recorded",
-        image_size=seen.image_size,
-        seed=seen.seed,
-        lens=asked.lens,
-        init=Nominal(**read_nominal(asked.init.path)) if asked.init is not None else None,
-        joint_noise=seen.joint_noise,
-        max_predicted_px=asked.max_predicted_px,
-        fitted=hold_out if asked.cross_validate is not None else None,
-        progress=progress,
+    try:
+        calibration = calibrate(
+            screening.observation,
+            seen.joint_types,
+            method=asked.method,
+            sigma_px=seen.noise_px,
+            source="simulated" if seen.exact else "recorded",
+            image_size=seen.image_size,
+            seed=seen.seed,
+            lens=asked.lens,
+            init=Nominal(**read_nominal(asked.init.path)) if asked.init is not None else None,
+            joint_noise=seen.joint_noise,
+            max_predicted_px=asked.max_predicted_px,
+            fitted=judge,
+            progress=progress,
+        )
+    except WorkFailed as error:
+        raise type(error)("; ".join((str(error), *screening.advice))) from error
+    calibration = replace(
+        calibration,
+        source=seen.source,
+        placeholders=screening.placeholders,
+        unseen_poses=screening.unseen,
+        circular_joints=screening.circular,
+        undecided_order=order[0] if order else None,
     )
-    return replace(calibration, source=seen.source), held_out[0] if held_out else None
+    advice = filter(None, (*screening.advice, calibration.order_advice, *calibration.advice))
+    return screening.observation, replace(calibration, advice=tuple(advice)), next(iter(held_out), None)
 
 
 # The range of the recorded readings is widened at each end by this share of itself; for a robot

@@ -94,6 +94,7 @@ class Table(NamedTuple):
     image_size: tuple[int, int] | None  # width and height, px, if they are known
     noise_px: float | None  # standard deviation of a coordinate; None to estimate it
     seed: int  # of random starts
+    order_stated: bool  # whether somebody stated the order of the joints
 
 
 @dataclass(frozen=True)

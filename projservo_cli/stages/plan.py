@@ -124,7 +124,9 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
     if not scenario.untested:
         _require_taught_since(scenario, calibration)
     search = search_of(scenario) if trajectory.needs_covariance else None
-    return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
+    plan = plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
+    order = calibration.order_advice
+    return replace(plan, reason=f"{plan.reason}; {order}") if order else plan
 
 
 def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:

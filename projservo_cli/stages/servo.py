@@ -439,6 +439,10 @@ class _Asked:
         own = scenario.truth is None
         if own and (scenario.calibration is None or not scenario.calibration.usable):
             raise WorkFailed("the calibration is not usable, and no robot is driven with it: calibrate again")
+        if own and scenario.calibration is not None and (order := scenario.calibration.order_advice):
+            raise InputError(
+                f"{order}, or set data.joint_order=stated if it is known; no robot is driven before"
+            )
         controller, driven = (
             self._controller(),
             external_robot.connected(scenario, self.law, self.given.robot),

@@ -1,0 +1,135 @@
+"""Screening of a recording before all geometry: unseen poses, placeholders, and readings that pass a turn."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.calibration.detections import require_shapes
+from projservo_cli.records import FloatArray, IntArray, Observation
+
+# Maximum distance around the circle between both ends of readings that pass a full turn, rad, and in mean
+# spacings of the readings if they leave less than half a turn free.
+_MAX_STEP, _MAX_SPACINGS = np.pi / 3.0, 5.0
+# Probability that readings spread evenly over their range leave so wide a gap by chance.
+_CHANCE = 1e-3
+# Minimum number of detections, or of markers, at one number that no camera saw there.
+_REPEATED, _MARKERS = 3, 4
+# Numbers of a missing pixel at the corner of an image, px, maximum share of others below, minimum frequency.
+_CORNERS, _BELOW, _MORE = (0.0, -1.0), 0.01, 2.0
+# Quartile distances beyond the quartiles above which no detection lies, J. W. Tukey's outer fence.
+_FENCE = 3.0
+# Maximum number of numbers that a message names.
+_EXAMPLES = 3
+
+
+class Screening(NamedTuple):
+    """A recording without what is no observation, and what was found."""
+
+    observation: Observation
+    unseen: IntArray  # numbers of the poses at rest that no camera saw
+    placeholders: int  # number of detections that stood for an unseen marker
+    circular: IntArray  # numbers of the joints, from 1, whose readings passed a full turn
+    advice: tuple[str, ...]  # a line for each kind that was found
+
+
+def screened(observation: Observation, joint_types: str) -> Screening:
+    """Empty placeholders, drop poses that nobody saw, and unwrap readings; one letter a joint, R or P.
+
+    Raises InputError if the arrays do not fit each other.
+    """
+    require_shapes(observation)
+    images, advice = without_placeholders(observation.images)
+    count = int(np.isnan(images[..., 0]).sum() - np.isnan(observation.images[..., 0]).sum())
+    lost = np.asarray(np.isnan(images)).any(axis=3).reshape(len(images), -1).all(axis=1)
+    if observation.moving is not None:
+        lost &= observation.moving == 0
+    if (unseen := observation.pose[lost]).size:
+        numbers = ", ".join(map(str, unseen[:_EXAMPLES])) + ", …" * (unseen.size > _EXAMPLES)
+        advice += (
+            f"poses that no camera saw: {unseen.size} ({numbers}), dropped; look why they show no marker",
+        )
+    kept = dataclasses.replace(observation, images=images).rows(np.asarray(~lost))
+    q, joints = np.array(kept.q, dtype=np.float64), list[int]()
+    for i, letter in enumerate(joint_types.upper()[: q.shape[1]]):
+        if letter == "R" and (turns := _turns(q[:, i])).any():
+            low, high = np.degrees([q[:, i].min(), q[:, i].max()])
+            end = 180 * round((low + high) / 360.0 + 1.0) - 1  # of the convention of the readings
+            q[:, i] += 2.0 * np.pi * turns
+            first, last = np.degrees([q[:, i].min(), q[:, i].max()])
+            joints.append(i + 1)
+            advice += (
+                f"readings of joint {i + 1} pass {end}° to {end - 358}°: taken as {first:.4g}° to "
+                f"{last:.4g}° (a range of {last - first:.3g}°, as given {high - low:.3g}°)",
+            )
+    return Screening(dataclasses.replace(kept, q=q), unseen, count, np.array(joints, dtype=np.int64), advice)
+
+
+def _turns(q: FloatArray) -> FloatArray:
+    """Full turns (K,) to add to readings of a revolute joint, rad, which pass the end of a turn; else zero.
+
+    The readings are cut at the widest gap on the circle. Both ends must be close together around the circle,
+    and the gap must be more than half a turn, or than chance leaves among readings spread over their range.
+    """
+    turn, none = 2.0 * np.pi, np.zeros(len(q))
+    circle = np.unique(np.mod(q, turn))
+    span, m = float(np.ptp(q)) if len(q) else 0.0, circle.size
+    if not turn - _MAX_STEP <= span <= turn + 1e-9 or m < 2:
+        return none
+    gaps, step = np.diff(circle, append=circle[0] + turn), max(turn - span, 0.0)
+    gap, first = float(gaps.max()), circle[(int(np.argmax(gaps)) + 1) % m]
+    if gap < np.pi + 1e-6:
+        chance = (m - 1) * (1.0 - gap / span) ** (m - 2)
+        if chance > _CHANCE or gap < 2.0 * step or step * (m - 1) > _MAX_SPACINGS * (turn - gap):
+            return none
+    turns = np.rint((first + np.mod(q - first + 1e-12, turn) - q) / turn)
+    values, count = np.unique(turns, return_counts=True)
+    return np.asarray(turns - values[np.argmax(count)])
+
+
+def without_placeholders(images: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
+    """Images (K, 2, m, 2) with NaN for numbers that stand for unseen markers, and advice that names them.
+
+    Such a number, as 9999, -1 or 0, repeats exactly over markers and poses: far outside the others or at the
+    corner of the image in one coordinate, as one pixel of two markers in an image, or as a subpixel of many.
+    """
+    at = np.nonzero(np.isfinite(images).all(axis=-1))
+    seen, image, track = images[at], 2 * at[0] + at[1], 2 * at[2] + at[1]
+    found = np.full(seen.shape, np.nan)
+    for c, column in enumerate(seen.T if len(seen) else ()):
+        values, count = np.unique(column, return_counts=True)
+        low, high = np.percentile(values, [25, 75])
+        far = np.abs(values - np.clip(values, low, high)) > _FENCE * (high - low)
+        corner = np.isin(values, _CORNERS) & (np.arange(values.size) < _BELOW * values.size + 1)
+        corner &= count > _MORE * np.median(count)
+        for value in values[(count >= _REPEATED) & (far | corner)]:
+            rows = column == value
+            if rows.sum() < np.isin(track, track[rows]).sum() and np.ptp(image[rows]):  # else it stands still
+                found[rows, c] = value
+    whole = len(seen) == 0 or np.mean(seen == np.rint(seen)) > 0.5
+    _, inverse, count = np.unique(seen @ [1.0, 1.0j], return_inverse=True, return_counts=True)
+    often = np.flatnonzero(count[inverse] >= _REPEATED)
+    often = often[np.argsort(inverse[often], kind="stable")]
+    for rows in np.split(often, np.flatnonzero(np.diff(inverse[often])) + 1):
+        together = np.unique(image[rows], return_counts=True)[1]
+        many = not whole and min(np.unique(at[2][rows]).size, together.size) >= _MARKERS
+        if many or (together > 1).sum() > 1:
+            found[rows] = seen[rows]
+    wrong = np.isfinite(found).any(axis=-1)
+    # A view that shows nothing else shows one spot, which the checks of images refuse by its name.
+    if not wrong.any() or any(wrong[at[1] == view].all() for view in (0, 1)):
+        return images, ()
+    named: dict[str, set[tuple[int, int]]] = {}
+    for label, k, j in zip(found[wrong], at[0][wrong].tolist(), at[2][wrong].tolist(), strict=True):
+        name = ", ".join(f"{axis} = {x:.6g}" for axis, x in zip("uv", label, strict=True) if np.isfinite(x))
+        named.setdefault(name, set()).add((k, j))
+    each = [
+        f"{name} stands in {len(rows)} rows of "
+        + ("several markers and poses" if len({j for _, j in rows}) > 1 else "several poses of one marker")
+        for name, rows in sorted(named.items(), key=lambda item: -len(item[1]))
+    ]
+    more = f"; {len(each) - _EXAMPLES} further numbers" if len(each) > _EXAMPLES else ""
+    images = images.copy()
+    images[tuple(part[wrong] for part in at)] = np.nan
+    why = "no camera saw that, so it was taken as unseen; empty these cells"
+    return images, (f"{'; '.join(each[:_EXAMPLES])}{more}: {why}",)

@@ -1,0 +1,79 @@
+"""Which order of joints along the arm the poses show."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from projservo_cli import Observations, calibrate
+from projservo_cli.records import Observation
+from tests.calibration.simulated_robot import around, random_robot, trials
+
+COMMUTING = {("P", "P")}
+
+
+def pairs(types):
+    """All pairs of joints whose order matters."""
+    n = len(types)
+    return [
+        [i + 1, j + 1] for i in range(n) for j in range(i + 1, n) if (types[i], types[j]) not in COMMUTING
+    ]
+
+
+def seen(robot, q, sigma=0.3):
+    record = robot.observe(q, sigma, np.random.default_rng(2))
+    return Observations.of(record, joint_types=robot.joint_types)
+
+
+def undecided(observations):
+    found = calibrate(observations, progress=False)
+    assert found.usable
+    assert (
+        bool(found.undecided_order.size) == bool(found.order_advice) == (found.order_advice in found.advice)
+    )
+    return found.undecided_order.tolist(), found
+
+
+@pytest.mark.parametrize("types", ["RRRR", "RPRPR", "RRP"])
+def test_single_joint_trials_show_no_order_and_combined_poses_all_of_it(types):
+    robot = random_robot(types, np.random.default_rng(4), markers=8)
+    single, several = trials(robot, 8), around(robot, 4, np.random.default_rng(5))
+    none, found = undecided(seen(robot, single))
+    assert none == pairs(types)
+    assert found.order_advice.startswith("the order of joints 1, 2")
+    assert undecided(seen(robot, np.vstack([single, several])))[0] == []
+    # A true arm with its columns in another order fits as well, and its order is as open.
+    record = robot.observe(single, 0.3, np.random.default_rng(2))
+    exchanged = dataclasses.replace(record, q=record.q[:, ::-1])
+    assert len(undecided(Observations.of(exchanged, joint_types=types[::-1]))[0]) == len(pairs(types))
+
+
+def test_pairs_that_moved_together_are_decided_and_the_others_named():
+    robot = random_robot("RRRR", np.random.default_rng(4), markers=8)
+    two = np.tile(robot.q_reference, (4, 1))
+    two[:, [0, 2]] += np.radians([[20, 15], [-20, 15], [15, -25], [-10, -20]])
+    found, _ = undecided(seen(robot, np.vstack([trials(robot, 8), two])))
+    assert found == [[1, 2], [1, 4], [2, 3], [2, 4], [3, 4]]
+    two[:, 3] += np.radians([30, -20, 10, 25])
+    found, _ = undecided(seen(robot, np.vstack([trials(robot, 8), two])))
+    assert found == [[1, 2], [2, 3], [2, 4]]
+
+
+def test_a_hardly_combined_pose_decides_nothing():
+    """Joints at rest jitter by less than would move the images."""
+    robot = random_robot("RRRR", np.random.default_rng(4), markers=8)
+    q = trials(robot, 8)
+    jitter = np.random.default_rng(1).normal(0.0, 1e-5, q.shape)
+    assert undecided(seen(robot, q + jitter))[0] == pairs("RRRR")
+
+
+def test_a_stated_order_and_that_of_a_simulation_need_no_poses():
+    robot = random_robot("RRR", np.random.default_rng(4), markers=8)
+    observations = seen(robot, trials(robot, 8))
+    stated = calibrate(dataclasses.replace(observations, order_stated=True), progress=False)
+    assert stated.undecided_order is None
+    assert not stated.order_advice
+    simulated = calibrate(dataclasses.replace(observations, source="simulated"), progress=False)
+    assert simulated.undecided_order is None
+    assert not simulated.order_advice
+    assert isinstance(simulated.observation, Observation)

@@ -1,0 +1,134 @@
+"""Recordings with poses nobody saw, placeholders for unseen markers, and readings that pass a full turn."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from projservo_cli import Observations, calibrate
+from projservo_cli.calibration import residual_statistics
+from projservo_cli.calibration.screening import screened, without_placeholders
+from projservo_cli.records import Observation
+from projservo_cli.report.report_data import findings
+from tests.calibration.simulated_robot import around, random_robot, trials
+
+ROBOT = random_robot("RRR", np.random.default_rng(1), markers=8)
+Q = np.vstack([trials(ROBOT, 6), around(ROBOT, 8, np.random.default_rng(5))])
+SEEN = ROBOT.observe(Q, 0.5, np.random.default_rng(2))
+GAPS = np.random.default_rng(3).random(SEEN.images.shape[:3]) < 0.2
+EMPTY = dataclasses.replace(SEEN, images=np.where(GAPS[..., None], np.nan, SEEN.images))
+
+
+def calibrated(observation, **given):
+    return calibrate(Observations.of(observation, joint_types="RRR"), progress=False, **given)
+
+
+def numbers(calibration):
+    """All arrays and numbers of a calibration that do not say what was screened."""
+    apart = {"advice", "observation", "seconds", "placeholders", "unseen_poses", "circular_joints"}
+    return {key: value for key, value in vars(calibration).items() if key not in apart}
+
+
+def filled(u, v, where=GAPS):
+    """Images with placeholders of one or both coordinates, None for another coordinate as good as any."""
+    images = SEEN.images.copy()
+    for c, value in enumerate((u, v)):
+        if value is not None:
+            images[where, c] = value
+    return images
+
+
+@pytest.mark.parametrize(
+    ("u", "v", "words"),
+    [
+        (9999.0, 9999.0, "u = 9999, v = 9999 stands in"),
+        (-1.0, -1.0, "u = -1, v = -1 stands in"),
+        (0.0, 0.0, "u = 0, v = 0 stands in"),
+        (640.0, 480.0, "u = 640, v = 480 stands in"),
+        (-999.0, None, "u = -999 stands in"),
+        (None, 65535.0, "v = 65535 stands in"),
+    ],
+)
+def test_a_placeholder_counts_as_an_empty_cell(u, v, words):
+    found, without = calibrated(dataclasses.replace(SEEN, images=filled(u, v))), calibrated(EMPTY)
+    np.testing.assert_equal(numbers(found), numbers(without))
+    assert found.placeholders == findings(found)["rejected"]["placeholders"] == GAPS.sum()
+    assert found.advice[0].startswith(words)
+    assert f"in {GAPS.any(axis=1).sum()} rows of several markers and poses" in found.advice[0]
+
+
+def test_placeholders_of_one_marker_or_of_several_kinds_and_those_of_held_out_images():
+    one = GAPS & (np.arange(8) == 3)
+    images = filled(-1.0, -1.0)
+    images[one] = 9999.0
+    emptied, (line,) = without_placeholders(images)
+    np.testing.assert_array_equal(np.isnan(emptied[..., 0]), GAPS)
+    assert "u = -1, v = -1 stands" in line
+    assert "u = 9999, v = 9999 stands" in line
+    calibration = calibrated(EMPTY)
+    score, expected = (
+        residual_statistics(calibration, one) for one in (dataclasses.replace(SEEN, images=images), EMPTY)
+    )
+    assert score.pop("advice") == [line]
+    assert expected.pop("advice") == []
+    assert score == expected
+
+
+@pytest.mark.parametrize("step", [1e-9, 0.5, 1.0, 4.0])
+def test_images_on_a_grid_hold_no_placeholders(step):
+    images = step * np.rint(ROBOT.observe(Q, 0.5, np.random.default_rng(7)).images / step)
+    still = images.copy()
+    still[:, :, 2] = [[100.0, 2000.0], [50.0, 2100.0]]  # a marker that stands still is rejected as such
+    copies = np.concatenate([images, images, images, images])  # as are near-identical frames
+    for each in (images, still, copies):
+        assert without_placeholders(each)[0] is each
+
+
+def test_poses_that_no_camera_saw_change_nothing_but_the_advice():
+    q = np.insert(SEEN.q, [0, 9], [[9.0, -8.0, 7.0], [2.0, 2.0, -9.0]], axis=0)
+    images = np.insert(EMPTY.images, [0, 9], np.nan, axis=0)
+    pose = np.insert(SEEN.pose, [0, 9], [701, 702])
+    found = calibrated(Observation(pose, SEEN.marker, q, images))
+    np.testing.assert_equal(numbers(found), numbers(calibrated(EMPTY)))
+    assert findings(found)["rejected"]["unseen_poses"] == [701, 702]
+    assert found.advice[0].startswith("poses that no camera saw: 2 (701, 702), dropped")
+
+
+@pytest.mark.parametrize("low", [0.0, -180.0, -90.0])
+def test_readings_on_a_circle_are_cut_at_the_widest_gap(low):
+    low = np.radians(low)
+    shift = low + np.radians([8.0, 100.0, 200.0]) - SEEN.q.min(axis=0) - np.radians([20.0, 0.0, 0.0])
+    plain = dataclasses.replace(SEEN, q=SEEN.q + shift)  # only joint 1 passes the end of the turn
+    wrapped = dataclasses.replace(plain, q=low + np.mod(plain.q - low, 2.0 * np.pi))
+    found, expected = calibrated(wrapped), calibrated(plain)
+    assert found.circular_joints.tolist() == [1]
+    turns = (found.joint_min - expected.joint_min) / (2.0 * np.pi)
+    np.testing.assert_allclose(turns, np.rint(turns), atol=1e-9)
+    for name in ("excitation", "predicted_rms_px", "prediction_noise", "sigma_px", "rms_px"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6)
+    assert found.advice[0].startswith("readings of joint 1 pass ")
+    held = ROBOT.observe(around(ROBOT, 9, np.random.default_rng(6)), 0.0, np.random.default_rng(0))
+    turned = np.mod(held.q + shift, 2.0 * np.pi)
+    scores = [
+        residual_statistics(one, dataclasses.replace(held, q=q))
+        for one in (found, expected)
+        for q in (held.q + shift, turned)
+    ]
+    assert max(score["rms_px"] for score in scores) == pytest.approx(scores[0]["rms_px"], rel=1e-6)
+    assert scores[0]["rms_px"] < 1.0
+
+
+@pytest.mark.parametrize("kind", ["P", "R"])
+def test_readings_that_turned_that_far_stay(kind):
+    rng = np.random.default_rng(4)
+    columns = {
+        "even": np.linspace(-170.0, 170.0, 20),
+        "random": rng.uniform(-170.0, 170.0, 20),
+        "two turns": rng.uniform(-360.0, 360.0, 20),
+        "two postures": np.r_[rng.normal(-100.0, 5.0, 10), rng.normal(100.0, 5.0, 10)],
+        "half a turn to each side": np.r_[-180.0, np.zeros(18), 180.0],
+    }
+    columns |= {"a slide": np.r_[np.full(10, 1.0), np.full(10, 359.0)]} if kind == "P" else {}
+    q = np.radians(np.stack([*columns.values()], axis=1))
+    seen = Observation(np.arange(20), np.arange(3), q, np.random.default_rng(0).random((20, 2, 3, 2)))
+    assert screened(seen, kind * q.shape[1]).circular.size == 0
