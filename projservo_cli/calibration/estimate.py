@@ -29,11 +29,11 @@ from projservo_cli.calibration.few_poses import require_poses
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
-from projservo_cli.calibration.model_error import ModelCheck
+from projservo_cli.calibration.model_error import ModelCheck, describe
 from projservo_cli.calibration.numbering import epipolar_geometry
 from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.projective import Projective, closed_form_operators
-from projservo_cli.calibration.quality import WEAK_NOISE, assess, cross_validate
+from projservo_cli.calibration.quality import WEAK_NOISE, assess, check_model, cross_validate
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.geometry.lens import K1
 from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation
@@ -288,9 +288,10 @@ def _refined(
                 summary = describe_other_motion(solution, found, epipolar) or doubt or summary
                 raise Misfit(f"the fit does not describe the data: {summary}")
     except Misfit as refused:
-        if share < _DECISIVE_SHARE:
+        if share >= _DECISIVE_SHARE:
+            hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
+        elif not (hint := _deviation(solution, expected)):
             raise
-        hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         raise Misfit(f"{refused}; {hint}") from None
     lens = _lens_advice(record, share, frame.known)
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
@@ -307,6 +308,14 @@ def _refined(
     lost = rejection_reasons(whole, kept)
     lost[:, 0] = detections.marker[lost[:, 0]]
     return dataclasses.replace(record, outlier=outlier, rejected_markers=lost, advice=(*advice, seldom))
+
+
+def _deviation(solution: Solution, expected: Expected) -> str:
+    """Describe the deviation from the model that explains most of a fit that is refused; else empty."""
+    if expected.known or solution.dof <= 0:
+        return ""
+    found = check_model(solution, solution.errors(), expected.noise_px(solution)).errors
+    return f"the residuals look as if {describe(found[0], solution.params.prismatic)[1]}" if found else ""
 
 
 def _describe_unmoved(solution: Solution) -> str | None:

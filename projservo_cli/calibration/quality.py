@@ -203,6 +203,14 @@ def _predicted_error(spread: FloatArray) -> tuple[float, float]:
     return float(np.sqrt(variances.sum())), float(np.sqrt(quantile(variances, _SURE)))
 
 
+def check_model(solution: Solution, errors: Errors, sigma_px: float) -> ModelCheck:
+    """Test a fit for deviations from the model, by at most ``MAX_JUDGED`` markers, at a noise, px."""
+    few = solution.thinned(MAX_JUDGED)
+    if few is not solution:
+        errors = few.errors()
+    return examine(few, errors, *_Uncertainty.of(few, errors).within_ranges(), sigma_px)
+
+
 @dataclass(frozen=True, eq=False)
 class Assessment:
     """Excitation and noise of each joint, and whether the calibration is usable."""
@@ -244,15 +252,10 @@ def assess(
         uncertainty = _Uncertainty.of(solution, errors)
         spreads = uncertainty.at_reach()
         noise = np.array([_rms(T) for T in spreads])
-        random = uncertainty.within_ranges()
-        typical, bound = _predicted_error(random.T)
+        typical, bound = _predicted_error(uncertainty.within_ranges().T)
         error = (sigma * typical, sigma * bound)
         if not expected.known:
-            thinned = solution.thinned(MAX_JUDGED)
-            if thinned is not solution:
-                errors = thinned.errors()
-                random = _Uncertainty.of(thinned, errors).within_ranges()
-            check = examine(thinned, errors, *random, sigma)
+            check = check_model(solution, errors, sigma)
             factor, effect = check.noise_factor, check.effect_px
             error = (float(np.hypot(factor * error[0], effect)), float(np.hypot(factor * error[1], effect)))
         needed = _needed_spans(uncertainty, spreads)

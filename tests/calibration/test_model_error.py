@@ -1,0 +1,129 @@
+"""Deviations of an arm or a rig from the model: found by kind, joint and size, with their effect."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from projservo_cli.calibration import calibrate, predict
+from projservo_cli.calibration.model_error import describe
+from projservo_cli.records import ModelError, WorkFailed
+from tests.calibration.simulated_robot import around, random_robot
+
+SIGMA, K, HELD_OUT, ANGLE = 0.3, 50, 40, 0.7
+TYPES = "RRRRR"
+
+
+def gear(q, i, size):
+    return q + size * q * np.eye(q.shape[1])[i]
+
+
+def coupled(q, i, size):
+    change = np.zeros_like(q)
+    change[:, i] = size * q[:, i - 1]
+    return q + change
+
+
+def stepped(q, i, size):
+    return q + size * (np.arange(len(q)) >= len(q) // 2)[:, None] * np.eye(q.shape[1])[i]
+
+
+def moved(q, i, size):
+    return q + size * np.eye(q.shape[1])[i]
+
+
+def still(q, i, size):
+    return q
+
+
+# Of each fault its size, the state at which predictions are judged, and what is to be named.
+FAULTS = {
+    "gear": (gear, -0.01, gear, lambda i: ("scale", (i + 1,))),
+    "coupling": (coupled, 0.01, coupled, lambda i: ("coupling", (i, i + 1))),
+    "step": (stepped, 0.004, moved, lambda i: ("joint_step", (i + 1,))),
+}
+
+
+def table(robot, fault, i, size, seed):
+    """Observation of an arm with a fault, and the joints as read."""
+    q = robot.q_reference + around(robot, K, np.random.default_rng(seed), angle=ANGLE) - robot.q_reference
+    true = robot.q_reference + fault(q - robot.q_reference, i, size)
+    seen = robot.observe(true, SIGMA, np.random.default_rng(seed + 1))
+    return dataclasses.replace(seen, q=q)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+@settings(max_examples=3, deadline=None, derandomize=True, phases=[Phase.generate])
+@given(seed=st.integers(0, 10_000), i=st.integers(1, len(TYPES) - 1))
+def test_a_fault_is_named_and_its_effect_stated(name, seed, i):
+    """Five deviations of the size, and a factor of two of the error: the bar of the study of model errors."""
+    robot = random_robot(TYPES, np.random.default_rng(seed))
+    fault, size, later, expected = FAULTS[name]
+    found = calibrate(table(robot, fault, i, size, seed), TYPES, source="recorded", joint_noise=None)
+    q = around(robot, HELD_OUT, np.random.default_rng(seed + 2), angle=ANGLE)
+    true = robot.images(robot.q_reference + later(q - robot.q_reference, i, size))
+    error = float(np.sqrt(2.0 * np.mean((predict(found, q) - true) ** 2)))
+    assert error <= 2.0 * found.predicted_rms_px
+    if not found.model_errors:  # what noise hides is not named
+        assert error <= 2.0 * SIGMA
+        return
+    first = found.model_errors[0]
+    assert (first.kind, first.joints) == expected(i)
+    assert abs(first.estimate - size) <= 5.0 * first.deviation + 0.05 * abs(size)
+    assert found.predicted_rms_px <= 3.0 * error
+
+
+@pytest.mark.parametrize("types", ["RRRRR", "RRPRR"])
+def test_a_sound_arm_is_not_blamed(types):
+    for seed in range(4):
+        robot = random_robot(types, np.random.default_rng(seed))
+        found = calibrate(table(robot, still, 0, 0.0, seed), types, source="recorded", joint_noise=None)
+        assert found.usable
+        assert found.model_errors == ()
+        assert "limited by noise" in found.reason
+
+
+def test_near_identical_frames_count_once():
+    """Ten frames of a posture with the same errors of detection tell no more than one."""
+    robot = random_robot(TYPES, np.random.default_rng(5))
+    once = table(robot, still, 0, 0.0, 5)
+    images = np.repeat(once.images, 10, axis=0)
+    images = images + 0.02 * np.random.default_rng(6).standard_normal(images.shape)
+    again = dataclasses.replace(once, pose=np.arange(10 * K), q=np.repeat(once.q, 10, axis=0), images=images)
+    one, ten = (calibrate(seen, TYPES, source="recorded", joint_noise=None) for seen in (once, again))
+    # The variance by 50 postures is known to a quarter.
+    assert ten.predicted_rms_px == pytest.approx(one.predicted_rms_px, rel=0.35)
+
+
+def test_a_refused_fit_names_the_deviation():
+    robot = random_robot(TYPES, np.random.default_rng(0))
+    with pytest.raises(WorkFailed, match=r"joint 2 turns 5 %.* less than it reads"):
+        calibrate(table(robot, gear, 1, -0.05, 0), TYPES, source="recorded", joint_noise=None)
+
+
+def test_a_large_effect_is_not_usable_until_it_is_accepted():
+    robot = random_robot(TYPES, np.random.default_rng(7))
+    seen = table(robot, gear, 2, -0.02, 7)
+    refused = calibrate(seen, TYPES, source="recorded", max_predicted_px=0.1)
+    accepted = calibrate(seen, TYPES, source="recorded", max_predicted_px=1e3)
+    assert (refused.usable, accepted.usable) == (False, True)
+    assert "calibration.max_predicted_px = 0.1" in refused.reason
+    assert "gear of joint 3" in accepted.reason
+    np.testing.assert_array_equal(refused.P, accepted.P)
+
+
+def test_every_kind_has_words_and_a_code():
+    """Sizes are told in per cent, degrees, mm and px, and a code leads back to the record."""
+    from projservo_cli.calibration import model_error
+
+    prismatic = np.array([False, True])
+    for kind in model_error._SIZES:
+        joints = {"coupling": (1, 2), "base": (), "tool": ()}.get(kind, (1,))
+        one = ModelError(kind, joints, "left", -0.02, 0.001, 0.5, 3)
+        assert ModelError.of(one.code, one.numbers) == one
+        limit, sentence = describe(one, prismatic)
+        assert limit
+        assert any(unit in sentence for unit in ("%", "°", "px", "mm"))
+    assert "mm" in describe(ModelError("joint_step", (2,), "", 0.02, 0.001, 0.5, 3), prismatic)[1]
