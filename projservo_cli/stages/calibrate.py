@@ -117,7 +117,7 @@ def estimate(
         circular_joints=screening.circular,
         undecided_order=order[0] if order else None,
     )
-    advice = filter(None, (*screening.advice, calibration.order_advice, *calibration.advice))
+    advice = filter(None, (*calibration.advice, calibration.order_advice, *screening.advice))
     return screening.observation, replace(calibration, advice=tuple(advice)), next(iter(held_out), None)
 
 

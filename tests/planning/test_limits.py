@@ -18,7 +18,7 @@ NEAR = "{joints: [3.5, -1.6, -1.75, 0.15, 1.25, 3.4], unit: rad}"
 FAR = "{joints: [3.8, -1.75, -1.95, 0.4, 1.05, 3.7], unit: rad}"
 MINE = f"""\
 plant: {{use: "tests.robots.robots:Sound", options: {{config: {ROOT / "configs/ur5.yaml"}}}}}
-data: {{table: trials.csv, joints: RRRRRR}}
+data: {{table: trials.csv, joints: RRRRRR, joint_order: stated}}
 markers: {{numbers: [0, 1, 2, 3, 4, 5, 6, 7, 8, 9], face: [0, 1, 2, 3]}}
 task: {{start: {NEAR}, goal: {{joints: {FAR}}}}}
 control: {{laws: [exact], mode: track}}
@@ -69,7 +69,9 @@ def load_joint(config):
 def test_limits_from_a_list(mine):
     pairs = "[[0, 360], [-180, 0], [-180, 0], [-90, 90], [0, 180], [0, 360]]"
     config, calibration = mine(
-        f"robot.limits={{joints: {pairs}, unit: deg}}", "trajectory.profile=joint_space"
+        f"robot.limits={{joints: {pairs}, unit: deg}}",
+        "trajectory.profile=joint_space",
+        "data.joint_order=stated",
     )
     lower = scenario_of(config, calibration).joints.limits.lower
     np.testing.assert_allclose(lower, np.radians([0, -180, -180, -90, 0, 0]))
