@@ -264,10 +264,11 @@ def _refined(
     share = share_explained(whole, frame)
     solution, kept = whole.determined()
     try:
-        refusal = expected.refusal(solution) or _describe_unmoved(solution)
+        refusal = expected.refusal(solution)
         if refusal is None:
             rejected = _rejected_views(solution)
             refusal = _describe_change(rejected) or _describe_order(solution, rejected)
+            refusal = refusal or _describe_unmoved(solution)
         if refusal is not None:
             raise Misfit(refusal)
         found = Outliers.of(solution)

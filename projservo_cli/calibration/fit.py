@@ -525,7 +525,8 @@ def fit_joint_noise(exact: Solution, expected: Expected, given: float | None) ->
         if found is None:
             return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
         solution = dataclasses.replace(found, joint_noise=noise)
-    if given is None and left_out_px(solution) > _NO_WORSE * left_out_px(exact):
+    alone = given is None and expected.refusal(exact) is None  # else noise of joints is all that explains it
+    if alone and left_out_px(solution) > _NO_WORSE * left_out_px(exact):
         return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
     return solution
 
