@@ -169,7 +169,7 @@ class ModelError(NamedTuple):
 
     @property
     def code(self) -> str:
-        """What it is of, in one word: kind, joints and view."""
+        """Kind, joints and view in one word."""
         return f"{self.kind}|{','.join(map(str, self.joints))}|{self.view}"
 
     @property

@@ -4,7 +4,7 @@
 both views (``numbering``), initial parameters (``initialization``), robust bundle adjustment (``fit``,
 ``adjustment``), outliers (``diagnosis``), frame and covariance (``projective``), deviations from the model
 (``model_error``), assessment (``quality``). ``prediction`` has the forward model, and predicts images and
-their errors from the result. ``screening`` comes before, ``joint_order`` after.
+their errors from the result. ``screening`` comes before, ``undecided`` after.
 """
 
 from projservo_cli.calibration.estimate import calibrate

@@ -25,7 +25,6 @@ from projservo_cli.calibration.diagnosis import (
     straight_joints,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
-from projservo_cli.calibration.few_poses import require_poses
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
@@ -35,6 +34,7 @@ from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, assess, check_model, cross_validate
 from projservo_cli.calibration.time_offset import with_time_offset
+from projservo_cli.calibration.undecided import require_poses
 from projservo_cli.geometry.lens import K1
 from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation
 

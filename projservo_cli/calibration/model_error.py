@@ -45,7 +45,7 @@ _SAME_POSTURE = 2e-3
 _OPEN = 30.0
 # Maximum leverage of the images of a posture, whose residuals say nothing beyond.
 _MAX_LEVERAGE = 0.999
-# Effect over the stated error from which a nuisance that the data could not have shown is told.
+# Effect over the stated error from which a nuisance that the data could not have shown is named.
 _UNSHOWN = 2.0
 # Usual sizes of each kind, beyond which none is expected unless it is seen: of scale and coupling a share, of
 # other readings rad (prismatic × 0.3 m/rad), of others the rms motion of the images, px.
@@ -414,7 +414,7 @@ def examine(
     factor = np.sqrt(_design(tests, tests.r, T, sigma_px))
     at_recorded = sigma_px * np.sqrt(2.0 * np.square(tests.U).sum() / max(len(tests.r), 1))
     shown = tests.r_first - tests.r
-    if total <= factor * independent_px:  # what noise hides is not told
+    if total <= factor * independent_px:  # noise hides it
         factor = np.sqrt(_design(tests, tests.r_first, T, sigma_px))
         found, total, bias, shown = [], 0.0, bias[:, :0], np.zeros(1)
     at_recorded = float(np.hypot(factor * at_recorded, effects.rms(shown)))
@@ -451,7 +451,7 @@ def _estimated(
 
 
 class _Effects:
-    """Changes of images at other poses by nuisances, less what the fit absorbs of them."""
+    """Changes of images at other poses by nuisances, less the part that the fit absorbs."""
 
     def __init__(self, tests: _Tests, there: Sequence[_Nuisance], inside: BoolArray, T: FloatArray) -> None:
         self.tests, self.there, self.T = tests, there, T
@@ -522,7 +522,7 @@ def _design(tests: _Tests, r: FloatArray, T: FloatArray, sigma_px: float) -> flo
     return float(ratio) if ratio > 1.0 + _CORRELATED * noise else 1.0
 
 
-# Of each kind: what limits a fit, and what is wrong; of a joint, two joints or a view.
+# Words for each kind: the limit of a fit, and a sentence on it.
 _WORDS = {
     "scale": ("gear of {joints}", "{joints} {turn} {share} {more} than {read}"),
     "quadratic": (
@@ -531,7 +531,7 @@ _WORDS = {
     ),
     "cubic": ("curve of {joints}", "readings of {joints} follow a curve, off by {size} at the ends"),
     "harmonic": ("eccentric encoder of {joints}", "readings of {joints} swing by {size} once a turn"),
-    "coupling": ("coupling of {joints}", "joint {0} turns joint {1} by {share} of its own motion"),
+    "coupling": ("coupling of {joints}", "joint {0} turns joint {1} by {share} of its motion"),
     "sag": ("sag of {joints}", "{joints} sags under load, by up to {size}"),
     "joint_drift": ("drift of {joints}", "the zero of {joints} drifts by {size} over the recording"),
     "joint_step": ("step of {joints}", "the zero of {joints} jumps by {size}{first}"),

@@ -61,9 +61,9 @@ _SAME_JOINT = 1e-3
 _MAX_NAMED = 3
 # Minimum number of parts in a cross-validation.
 _MIN_FOLDS = 2
-# Divisions of the poses into blocks besides a random one, and what a larger error there points to.
+# Divisions of the poses into blocks besides a random one, and the cause of a larger error there.
 _BLOCKS = {"posture": "the model errs between postures", "time": "something changed over the recording"}
-# Held-out over predicted error in blocks, over that of random parts, from which it is told.
+# Held-out over predicted error in blocks, over that of random parts, from which it is named.
 _BLOCK_RATIO = 1.3
 # Minimum number of detections of a marker in the other poses for its prediction.
 _MIN_READINGS = 4

@@ -24,7 +24,7 @@ _EXAMPLES = 3
 
 
 class Screening(NamedTuple):
-    """A recording without what is no observation, and what was found."""
+    """A recording without placeholders and unseen poses, and the findings."""
 
     observation: Observation
     unseen: IntArray  # numbers of the poses at rest that no camera saw

@@ -12,8 +12,8 @@ from projservo_cli.calibration import (
     calibrate,
     cross_validate,
 )
-from projservo_cli.calibration.joint_order import undecided_pairs
 from projservo_cli.calibration.screening import screened
+from projservo_cli.calibration.undecided import undecided_pairs
 from projservo_cli.files import write_whole
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
