@@ -1,4 +1,4 @@
-"""Parts of an arm that recorded poses leave undecided: the order of joints, and all of it where poses are few.
+"""Parts of an arm that recorded poses leave open: the order of joints, and all of it where poses are few.
 
 Joints that move one at a time about one reference show the same images in any order. Two orders differ where
 several joints have moved, by the commutators of their operators. Where poses are few, several arms fit them,
