@@ -469,7 +469,9 @@ def _record(
         off = Errors(unknown[:, None], np.full((m, 4, 1), np.nan), np.full((m, 4, 3), np.nan))
     else:
         # Deviations hold on average over other poses, with the model's own error.
-        factor = 1.0 if check is None else check.noise_factor * check.predicted_px / check.noise_px
+        factor = 1.0
+        if check is not None and check.noise_px > 0.0:
+            factor = check.noise_factor * check.predicted_px / check.noise_px
         off = result.errors(solution, errors).scaled(factor * expected.noise_px(solution))
     operator_defect, trace_defect, plane_defect = result.defects()
     corner_squares, corner_q = solution.corners()
