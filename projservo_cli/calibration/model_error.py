@@ -21,11 +21,11 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.special import fdtrc
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.detections import per_rad
+from projservo_cli.calibration.detections import Detections, per_rad
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.prediction import LENS, Images, Parameters
 from projservo_cli.geometry.rigid import cross_matrix
-from projservo_cli.records import VIEWS, BoolArray, Errors, FloatArray, IntArray, ModelError
+from projservo_cli.records import CORNERS, VIEWS, BoolArray, Errors, FloatArray, IntArray, ModelError
 
 # Probability of chance above which no nuisance is found.
 _CHANCE = 1e-4
@@ -43,6 +43,10 @@ _CORRELATED = 3.9
 _SAME_POSTURE = 2e-3
 # Deviation of an amplitude, in the units of ``_SIZES``, above which the data leave it open.
 _OPEN = 30.0
+# Minimum number of poses before and after a marker slips, and difference of the shares of rejected images.
+_MIN_SLIP, _SLIPPED = 5, 0.75
+# Minimum number of corners of a tag that slip.
+_MIN_CORNERS = 2
 # Maximum leverage of the images of a posture, whose residuals say nothing beyond.
 _MAX_LEVERAGE = 0.999
 # Effect over the stated error from which a nuisance that the data could not have shown is named.
@@ -176,8 +180,11 @@ def _of_view(
     if images.by_lens is None:
         square = (x**2).sum(axis=1)[:, None, None]
         add("lens", x[..., None] * np.concatenate([square, square**2], axis=2))
-    elif problem.lens_terms == LENS:
+    if images.by_lens is not None and problem.lens_terms == LENS:
         add("lens_center", images.by_lens[v][..., LENS:])
+    else:  # of a lens that is estimated with its centre, or not at all: decentring, as by Brown
+        square, axes = (x**2).sum(axis=1)[:, None, None], np.broadcast_to(np.eye(2), (len(x), 2, 2))
+        add("lens_center", square * axes + 2.0 * x[..., None] * x[:, None])
     mean, deviation = extent.depth[v]
     add("focus", x[..., None] * ((depths[v] - mean) / deviation)[:, None, None])
     return found
@@ -272,7 +279,9 @@ class _Tests:
 
     def candidates(self) -> list[tuple[float, _Choice]]:
         """Return the criterion of all nuisances that it prefers to none, best first."""
-        square, rows, K = float(self.r @ self.r), len(self.r), len(self.poses)
+        square, K = float(self.r @ self.r), len(self.poses)
+        # Corners of a posture share errors: between as many observations as postures and as coordinates.
+        penalty = 0.5 * np.log(len(self.r) * max(int(self.posture.max()) + 1, 2))
         plain = [number for number, one in enumerate(self.nuisances) if one.timed != _STEP]
         stack = np.hstack([self.columns(_Choice(number, 0)) for number in plain])
         s, W = stack.T @ self.r, np.vstack([self.U.T @ stack, self.Q.T @ stack])
@@ -282,7 +291,7 @@ class _Tests:
         def judge(gain: float, choice: _Choice, extra: float) -> None:
             """Keep a nuisance whose gain in squares is worth its parameters."""
             criterion = self.dof * np.log1p(-min(gain / max(square, 1e-300), 1.0 - 1e-12))
-            criterion += len(self.units[choice.number]) * np.log(rows) + extra
+            criterion += len(self.units[choice.number]) * penalty + extra
             if criterion < 0.0:
                 found.append((float(criterion), choice))
 
@@ -411,20 +420,63 @@ def examine(
     independent_px = sigma_px * effects.rms(T.ravel()) * np.sqrt(T.shape[1])
     chosen = tests.select()
     found, total, bias = _estimated(tests, effects, chosen)
+    slipped, slip_px = _slipped_tags(solution)
+    total = float(np.hypot(total, slip_px))
     factor = np.sqrt(_design(tests, tests.r, T, sigma_px))
     at_recorded = sigma_px * np.sqrt(2.0 * np.square(tests.U).sum() / max(len(tests.r), 1))
     shown = tests.r_first - tests.r
     if total <= factor * independent_px:  # noise hides it
         factor = np.sqrt(_design(tests, tests.r_first, T, sigma_px))
-        found, total, bias, shown = [], 0.0, bias[:, :0], np.zeros(1)
+        found, total, bias, shown, slipped = [], 0.0, bias[:, :0], np.zeros(1), []
     at_recorded = float(np.hypot(factor * at_recorded, effects.rms(shown)))
     order = sorted(range(len(found)), key=lambda k: -found[k].effect_px)
     noise_px = float(factor * independent_px)
     unshown = effects.unshown({one.number for one in chosen}, sigma_px)
     if unshown is not None and unshown.effect_px <= _UNSHOWN * np.hypot(noise_px, total):
         unshown = None
-    named = tuple(found[k] for k in order)
-    return ModelCheck(named, total, noise_px, float(factor), at_recorded, unshown, bias[:, order])
+    named = (*slipped, *(found[k] for k in order))
+    bias = np.hstack([np.zeros((len(bias), len(slipped))), bias[:, order]])
+    return ModelCheck(named, total, noise_px, float(factor), at_recorded, unshown, bias)
+
+
+def _slipped_tags(solution: Solution) -> tuple[list[ModelError], float]:
+    """Tags of which corners are rejected from a pose on, or up to it, as they moved on the tool; their effect.
+
+    A corner stays where most of its images show it. One that stays where it was before is off at the end, by
+    as much as its rejected images; the effect, px, is rms over all markers.
+    """
+    problem, found, square = solution.problem, list[ModelError](), 0.0
+    detections, number = problem.detections, problem.detections.marker
+    out = detections.seen & ~solution.used
+    far = np.linalg.norm(solution.residual / detections.weight.clip(1e-300)[..., None], axis=2)
+    for tag in np.unique(number // CORNERS):
+        corners = np.flatnonzero(number // CORNERS == tag)
+        slips = [] if corners.size < CORNERS else [_slip(detections, out, int(corner)) for corner in corners]
+        onsets = [onset for onset, _ in slips if onset]
+        if len(onsets) < _MIN_CORNERS or np.ptp(onsets) > _MIN_SLIP:
+            continue
+        onset = int(np.median(onsets))
+        rows = out & np.isin(detections.marker_of, corners)
+        off = float(np.median(far[rows]))
+        at_end = sum(lost_after for _, lost_after in slips)
+        effect = off * float(np.sqrt(at_end / number.size))
+        square += effect**2
+        spread = off / float(np.sqrt(np.count_nonzero(rows)))
+        found.append(ModelError("tool", (), "", off, spread, effect, int(detections.pose[onset])))
+    return found, float(np.sqrt(square))
+
+
+def _slip(detections: Detections, out: BoolArray, marker: int) -> tuple[int, bool]:
+    """Pose at which a marker begins or ceases to be rejected, 0 if none, and whether it is rejected later."""
+    of_marker = detections.seen & (detections.marker_of == marker)
+    seen, lost = (detections.count_at(mask) for mask in (of_marker, of_marker & out))
+    after = np.array([np.cumsum(counts[::-1])[::-1] for counts in (lost, seen)])
+    before = after[:, :1] - after
+    enough = np.minimum(after[1], before[1]) >= _MIN_SLIP * max(int(seen.max()), 1)
+    change = after[0] / np.maximum(after[1], 1) - before[0] / np.maximum(before[1], 1)
+    onset = int(np.argmax(np.where(enough, np.abs(change), -1.0)))
+    slipped = bool(enough[onset]) and abs(change[onset]) > _SLIPPED
+    return (onset, bool(change[onset] > 0.0)) if slipped else (0, False)
 
 
 def _estimated(
@@ -543,7 +595,7 @@ _WORDS = {
     ),
     "tool": ("markers that moved on the tool", "the markers moved on the tool{first}, by {size}"),
     "lens": ("lens of the {view} camera", "the lens of the {view} camera distorts, by {size}"),
-    "lens_center": ("lens of the {view} camera", "the {view} lens is centred elsewhere, by {size}"),
+    "lens_center": ("lens of the {view} camera", "the {view} lens is decentred, by {size}"),
     "focus": ("focus of the {view} camera", "the {view} image is scaled with depth, by {size}"),
 }
 

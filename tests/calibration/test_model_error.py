@@ -127,3 +127,16 @@ def test_every_kind_has_words_and_a_code():
         assert limit
         assert any(unit in sentence for unit in ("%", "°", "px", "mm"))
     assert "mm" in describe(ModelError("joint_step", (2,), "", 0.02, 0.001, 0.5, 3), prismatic)[1]
+
+
+def test_a_tag_that_slips_amid_the_recording_is_named_with_its_pose():
+    """Each corner stays at the place that most of its images show; some of them are off at the end."""
+    robot = random_robot(TYPES, np.random.default_rng(8), markers=12)
+    seen = dataclasses.replace(table(robot, still, 0, 0.0, 8), marker=np.arange(12))
+    moved_robot = dataclasses.replace(robot, markers=robot.markers + [[0.003, 0.0, 0.002, 0.0]])
+    images = seen.images.copy()
+    images[K // 2 :, :, 4:8] += (moved_robot.images(seen.q) - robot.images(seen.q))[K // 2 :, :, 4:8]
+    found = calibrate(dataclasses.replace(seen, images=images), TYPES, source="recorded", joint_noise=None)
+    assert [one.kind for one in found.model_errors] == ["tool"]
+    assert found.model_errors[0].first == pytest.approx(seen.pose[K // 2], abs=4)
+    assert "the markers moved on the tool at pose" in found.advice[0]
