@@ -33,6 +33,8 @@ _CHANCE = 1e-4
 _MAX_FOUND = 8
 # Number of best candidates of which one must pass both tests.
 _TRIED = 4
+# Share of the gain of a nuisance from which one of fewer parameters is preferred.
+_AS_MUCH = 0.98
 # Number of rounds in which a nuisance found may give way to a better one.
 _ROUNDS = 2
 # Standard deviations of an amplitude that the tests find in half of the cases.
@@ -44,7 +46,7 @@ _SAME_POSTURE = 2e-3
 # Deviation of an amplitude, in the units of ``_SIZES``, above which the data leave it open.
 _OPEN = 30.0
 # Minimum number of poses before and after a marker slips, and difference of the shares of rejected images.
-_MIN_SLIP, _SLIPPED = 5, 0.75
+_MIN_SLIP, _SLIPPED = 5, 0.5
 # Minimum number of corners of a tag that slip.
 _MIN_CORNERS = 2
 # Maximum leverage of the images of a posture, whose residuals say nothing beyond.
@@ -277,8 +279,8 @@ class _Tests:
         known = values > max(self.sigma / _OPEN, 1e-9) ** 2
         return np.linalg.qr(cleared @ basis[:, known])[0]
 
-    def candidates(self) -> list[tuple[float, _Choice]]:
-        """Return the criterion of all nuisances that it prefers to none, best first."""
+    def candidates(self) -> list[tuple[float, _Choice, float]]:
+        """Return criterion, nuisance and gain of all that the criterion prefers to none, best first."""
         square, K = float(self.r @ self.r), len(self.poses)
         # Corners of a posture share errors: between as many observations as postures and as coordinates.
         penalty = 0.5 * np.log(len(self.r) * max(int(self.posture.max()) + 1, 2))
@@ -293,7 +295,7 @@ class _Tests:
             criterion = self.dof * np.log1p(-min(gain / max(square, 1e-300), 1.0 - 1e-12))
             criterion += len(self.units[choice.number]) * penalty + extra
             if criterion < 0.0:
-                found.append((float(criterion), choice))
+                found.append((float(criterion), choice, gain))
 
         for number, a, b in zip(plain, edges[:-1], edges[1:], strict=True):
             gram = stack[:, a:b].T @ stack[:, a:b] - W[:, a:b].T @ W[:, a:b]
@@ -358,8 +360,17 @@ class _Tests:
         return chosen
 
     def _best(self) -> _Choice | None:
-        """Best candidate that is significant, or none."""
-        return next((one for _, one in self.candidates()[:_TRIED] if self.chance(one) < _CHANCE), None)
+        """Best candidate that is significant, or the one of fewer parameters that explains nearly as much."""
+        candidates = self.candidates()
+        for _, best, gain in candidates[:_TRIED]:
+            if self.chance(best) >= _CHANCE:
+                continue
+            for _, simple, its_gain in candidates:  # to first order a large gear bends as a curve does
+                fewer = len(self.units[simple.number]) < len(self.units[best.number])
+                if fewer and its_gain >= _AS_MUCH * gain and self.chance(simple) < _CHANCE:
+                    return simple
+            return best
+        return None
 
 
 def _unit(kind: str, Z: FloatArray) -> FloatArray:
@@ -391,7 +402,7 @@ def _postures(q: FloatArray) -> IntArray:
 class ModelCheck:
     """Errors of predictions, and the deviations from the model that explain them."""
 
-    errors: tuple[ModelError, ...]  # that dominate noise, the largest effect first
+    errors: tuple[ModelError, ...]  # tags that slipped, and those that dominate noise, largest effect first
     effect_px: float  # rms error per marker and view at other poses by all of them
     noise_px: float  # that by noise, with the correlation of the corners of a posture
     noise_factor: float  # noise_px over that of independent corners
@@ -427,7 +438,7 @@ def examine(
     shown = tests.r_first - tests.r
     if total <= factor * independent_px:  # noise hides it
         factor = np.sqrt(_design(tests, tests.r_first, T, sigma_px))
-        found, total, bias, shown, slipped = [], 0.0, bias[:, :0], np.zeros(1), []
+        found, total, bias, shown = [], 0.0, bias[:, :0], np.zeros(1)
     at_recorded = float(np.hypot(factor * at_recorded, effects.rms(shown)))
     order = sorted(range(len(found)), key=lambda k: -found[k].effect_px)
     noise_px = float(factor * independent_px)
@@ -440,10 +451,10 @@ def examine(
 
 
 def _slipped_tags(solution: Solution) -> tuple[list[ModelError], float]:
-    """Tags of which corners are rejected from a pose on, or up to it, as they moved on the tool; their effect.
+    """Tags that moved on the tool: corners rejected from a pose on, or up to it; and the effect of all, px.
 
     A corner stays where most of its images show it. One that stays where it was before is off at the end, by
-    as much as its rejected images; the effect, px, is rms over all markers.
+    as much as its rejected images; the effect is rms over all markers.
     """
     problem, found, square = solution.problem, list[ModelError](), 0.0
     detections, number = problem.detections, problem.detections.marker

@@ -313,7 +313,8 @@ def assess(
     usable = True
     if check is not None and check.errors:
         sentences = [describe(one, prismatic) for one in check.errors]
-        limit = f"{sentences[0][0]}, which moves predictions by {check.effect_px:.3g} px"
+        if check.effect_px > 0.0:
+            limit = f"{sentences[0][0]}, which moves predictions by {check.effect_px:.3g} px"
         advice[:0] = [sentence for _, sentence in sentences[:_MAX_NAMED]]
         if check.effect_px > max_predicted_px:
             usable = False
