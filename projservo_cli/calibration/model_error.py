@@ -437,7 +437,7 @@ def examine(
     at_recorded = sigma_px * np.sqrt(2.0 * np.square(tests.U).sum() / max(len(tests.r), 1))
     shown = tests.r_first - tests.r
     if total <= factor * independent_px:  # noise hides it
-        factor = np.sqrt(_design(tests, tests.r_first, T, sigma_px))
+        factor = np.sqrt(_design(tests, tests.r_first, T, sigma_px)) if chosen else factor
         found, total, bias, shown = [], 0.0, bias[:, :0], np.zeros(1)
     at_recorded = float(np.hypot(factor * at_recorded, effects.rms(shown)))
     order = sorted(range(len(found)), key=lambda k: -found[k].effect_px)
@@ -575,11 +575,11 @@ def _design(tests: _Tests, r: FloatArray, T: FloatArray, sigma_px: float) -> flo
     shown, expected = [], []
     for posture in range(int(groups.max()) + 1):
         rows = groups == posture
-        P, s, Vt = np.linalg.svd(tests.U[rows], full_matrices=False)
-        adjusted = s / np.sqrt(1.0 - np.minimum(s**2, _MAX_LEVERAGE)) * (P.T @ r[rows])
-        moved = root @ Vt.T
+        leverage, P = np.linalg.eigh(tests.U[rows] @ tests.U[rows].T)
+        adjusted = P @ (P.T @ r[rows] / np.sqrt(1.0 - np.minimum(leverage, _MAX_LEVERAGE)))
+        moved = root @ tests.U[rows].T
         shown.append(float(np.square(moved @ adjusted).sum()))
-        expected.append(sigma_px**2 * float(np.square(moved * s).sum()))
+        expected.append(sigma_px**2 * float(np.square(moved).sum()))
     e = np.array(expected)
     ratio, noise = sum(shown) / max(e.sum(), 1e-300), np.sqrt(2.0 * (e**2).sum()) / max(e.sum(), 1e-300)
     return float(ratio) if ratio > 1.0 + _CORRELATED * noise else 1.0
