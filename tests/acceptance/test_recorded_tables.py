@@ -187,7 +187,7 @@ def test_a_tag_whose_corners_begin_further_in_one_view_is_named(answer, shared_d
     assert "tag 1: its corners begin 1 further in the right view" in " ".join(err.split())
 
 
-@pytest.mark.parametrize("noise", ["0.0", "0.1", "0.5", "1.0"])
+@pytest.mark.parametrize("noise", ["0.0", "1.0"])
 def test_types_that_are_not_given_are_told_and_tried(answer, shared_data, noise):
     table = shared_data / "stanford" / f"trials_{noise}px.csv"
     code, _, err = answer("calibrate", "--data", table, "-o", "out", "--json")

@@ -124,9 +124,10 @@ def test_numbers_that_differ_between_the_views_are_refused(kind, poses):
     assert all(text in str(refused.value) for text in words)
 
 
-@pytest.mark.parametrize("kinds", ["RRPRRR", "PRRRRR", "RRRRP"])
-@pytest.mark.parametrize("length", [0.02, 0.05])
-@pytest.mark.parametrize("single", [True, False])
+@pytest.mark.parametrize(
+    ("kinds", "length", "single"),
+    [("RRPRRR", 0.02, True), ("PRRRRR", 0.05, True), ("RRRRP", 0.02, False), ("RRRRP", 0.05, True)],
+)
 def test_a_prismatic_joint_that_is_taken_for_revolute_is_named(kinds, length, single):
     """Its fit passes as usable otherwise, with an axis far away, three to eleven times the stated error."""
     robot = random_robot(kinds, np.random.default_rng(1))
