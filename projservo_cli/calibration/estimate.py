@@ -55,7 +55,7 @@ _KEPT = 0.5
 _NEARLY_ALL, _WRONG_RUN = 0.9, 5
 # Joints that are farther than this share of their range from the median have moved; so many poses in which
 # several did, and this share of them, are rejected at least where readings are in the wrong order.
-_MOVED, _WRONG_POSES, _WRONG_SHARE = 0.1, 3, 0.25
+_MOVED, _WRONG_POSES, _WRONG_SHARE = 0.1, 3, 0.5
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
 _DOUBTED_RATIO = 1.15
 # Maximum noise of such a fit over that of bodies that move freely, beyond which no error of it is stated.
@@ -373,7 +373,8 @@ def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:
     several = away.sum(axis=1) > 1
     wrong, alone = np.count_nonzero(several & lost), np.count_nonzero(~several & lost)
     count, others = several.sum(), np.count_nonzero(~several)
-    if wrong < _WRONG_POSES or wrong < _WRONG_SHARE * count or alone * count > _WRONG_SHARE * wrong * others:
+    few = wrong < max(_WRONG_POSES, _WRONG_SHARE * count)
+    if few or alone * count > 0.5 * _WRONG_SHARE * wrong * others:
         return None
     return (
         f"the fit rejects {wrong} of the {count} poses in which several joints move, and {alone} of the "
