@@ -17,6 +17,7 @@ from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution, fit_from, median_px
 from projservo_cli.calibration.initialization import Search, starting_markers, starts, stationary
 from projservo_cli.calibration.lens_estimation import undistorted
+from projservo_cli.calibration.model_error import image_motions
 from projservo_cli.calibration.prediction import CAMERA, Parameters
 from projservo_cli.geometry.rigid import cross_matrix
 from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray, WorkFailed
@@ -121,10 +122,7 @@ def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
             continue
         x = detections.pixels[view, rows] - detections.pixels[view, rows].mean(axis=0)
         radius = float(np.sqrt((x**2).sum(axis=1).mean()))
-        A = np.zeros((rows.size, 2, 4))
-        A[..., :2], A[..., 2] = np.eye(2), x / radius
-        A[:, 0, 3], A[:, 1, 3] = -x[:, 1] / radius, x[:, 0] / radius
-        off = residual[view, rows]
+        A, off = image_motions(x / radius), residual[view, rows]
 
         def left(b: FloatArray, A: FloatArray = A, off: FloatArray = off) -> FloatArray:
             """Residuals after a motion of the image by shift, scale and turn b (4,), px."""

@@ -56,6 +56,8 @@ _NEARLY_ALL, _WRONG_RUN = 0.9, 5
 # Joints that are farther than this share of their range from the median have moved; so many poses in which
 # several did, and this share of them, are rejected at least where readings are in the wrong order.
 _MOVED, _WRONG_POSES, _WRONG_SHARE = 0.1, 3, 0.5
+# Maximum share of the other poses that is rejected there, over that of these.
+_OTHERS_SHARE = 0.25
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
 _DOUBTED_RATIO = 1.15
 # Maximum noise of such a fit over that of bodies that move freely, beyond which no error of it is stated.
@@ -374,7 +376,7 @@ def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:
     wrong, alone = np.count_nonzero(several & lost), np.count_nonzero(~several & lost)
     count, others = several.sum(), np.count_nonzero(~several)
     few = wrong < max(_WRONG_POSES, _WRONG_SHARE * count)
-    if few or alone * count > 0.5 * _WRONG_SHARE * wrong * others:
+    if few or alone * count > _OTHERS_SHARE * wrong * others:
         return None
     return (
         f"the fit rejects {wrong} of the {count} poses in which several joints move, and {alone} of the "

@@ -174,11 +174,8 @@ def _of_view(
         columns[v] = change * detections.weight[v][:, None, None]
         found.append(_Nuisance(kind, (), v, columns, timed))
 
-    similarity = np.zeros((len(x), 2, 4))
-    similarity[..., :2], similarity[..., 2] = np.eye(2), x
-    similarity[:, 0, 3], similarity[:, 1, 3] = -x[:, 1], x[:, 0]
-    add("camera_drift", similarity, _DRIFT)
-    add("camera_step", similarity, _STEP)
+    add("camera_drift", image_motions(x), _DRIFT)
+    add("camera_step", image_motions(x), _STEP)
     if images.by_lens is None:
         square = (x**2).sum(axis=1)[:, None, None]
         add("lens", x[..., None] * np.concatenate([square, square**2], axis=2))
@@ -190,6 +187,14 @@ def _of_view(
     mean, deviation = extent.depth[v]
     add("focus", x[..., None] * ((depths[v] - mean) / deviation)[:, None, None])
     return found
+
+
+def image_motions(x: FloatArray) -> FloatArray:
+    """Return the changes (N, 2, 4) of an image at places (N, 2) from its middle by shift, scale and turn."""
+    motions = np.zeros((len(x), 2, 4))
+    motions[..., :2], motions[..., 2] = np.eye(2), x
+    motions[:, 0, 3], motions[:, 1, 3] = -x[:, 1], x[:, 0]
+    return motions
 
 
 def _loads(params: Parameters, q: FloatArray) -> FloatArray:
