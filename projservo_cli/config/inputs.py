@@ -1,7 +1,7 @@
 """From a configuration to what each stage is given: the values that it reads, and no others.
 
-Every function returns a record, of which the key of the result is a hash. It resolves units,
-defaults that depend on other values and descriptions of robot and rig, is resolved nowhere below.
+Every function returns a record, of which the key of the result is a hash. Units, defaults that depend on
+other values, and descriptions of robot and rig are resolved here and nowhere below.
 """
 
 import math

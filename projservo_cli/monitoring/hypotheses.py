@@ -319,12 +319,12 @@ def _joint_causes(evidence: Evidence) -> Iterator[Cause]:
     yield Cause("flexible", -1, np.zeros((1, n)), lambda s, theta: s._replace(away=s.away + theta))
     for v in (0, 1, -1):
 
-        def sigma_t(s: Changed, theta: FloatArray, v: int = v) -> Changed:
+        def late(s: Changed, theta: FloatArray, v: int = v) -> Changed:
             both = theta if v < 0 else np.eye(2)[v] * theta
             return s._replace(away=s.away - both[:, None] * velocity)
 
         if velocity.any():
-            yield Cause("late", v, np.zeros((1, 2 if v < 0 else 1)), sigma_t)
+            yield Cause("late", v, np.zeros((1, 2 if v < 0 else 1)), late)
 
 
 def _image_causes(centre: FloatArray | None) -> Iterator[Cause]:

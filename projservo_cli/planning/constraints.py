@@ -195,7 +195,7 @@ def twin_of(c: Constraints, j: int) -> Model:
 
 @internal
 def max_error(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
-    """Standard deviation of a coordinate in each image, px, no less than that of any marker of the body."""
+    """Standard deviation of a coordinate in each image, px, at the worst marker along each direction."""
     left = right = c.spread.rest * c.spread.rest
     for j in range(1, c.spread.P.shape[0]):
         twin = twin_of(c, j)

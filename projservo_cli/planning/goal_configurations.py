@@ -28,10 +28,10 @@ from projservo_cli.planning.constraints import (
 from projservo_cli.planning.margins import IMAGE, straight_pixel
 from projservo_cli.records import PRISMATIC, FloatArray
 
-# Newton steps from one start; one that is not near after half of them is given up.
+# Maximum number of Newton steps from one start.
 STEPS = 400
-# Share of the first squares that is left to one that is given up.
-GIVEN_UP = 0.25
+# Step at which a start is given up that still has more than this share of its squares.
+JUDGED_AT, GIVEN_UP = 20, 0.25
 DAMPED = 1e6
 # A Newton step below this, rad or m, is the last: of points, which are near then, and of images.
 NEAR, SETTLED = 1e-3, 1e-7
@@ -145,7 +145,7 @@ def _settled(
     damping = 1e-3
     left = first = _normal_equations_into(c, goal, q, images, scratch)
     for step in range(STEPS):
-        if (step == 20 and left > GIVEN_UP * first and not images) or not _damped_step_into(
+        if (step == JUDGED_AT and left > GIVEN_UP * first and not images) or not _damped_step_into(
             scratch.N, damping, scratch.L
         ):
             break

@@ -2,7 +2,7 @@
 
 The coupled constraint of the paper on μ_t and μ_r, for both cameras, with the image borders, the
 joint limits and the conditioning of the operators. Of all monotone paths from (0, 0, 0) to (1, 1, 1)
-on a lattice of shares μ_t, μ_r, μ_p the one whose smallest share of ``guidance.margins`` is largest is
+on a lattice of shares μ_t, μ_r, μ_p the one whose smallest margin, in shares of the least ones, is largest is
 taken, among equals the quickest.
 """
 

@@ -260,13 +260,13 @@ def _nearest(c: Constraints, tree: Tree, q: FloatArray) -> int:
     best, nearest = math.inf, 0
     n = q.shape[0]
     for k in range(tree.size[0]):
-        max_draws = 0.0
+        seconds = 0.0
         for i in range(n):
-            max_draws = max(max_draws, abs(tree.q[k, i] - q[i]) / c.limits.speed[i])
-            if max_draws >= best:
+            seconds = max(seconds, abs(tree.q[k, i] - q[i]) / c.limits.speed[i])
+            if seconds >= best:
                 break
-        if max_draws < best:
-            best, nearest = max_draws, k
+        if seconds < best:
+            best, nearest = seconds, k
     return nearest
 
 

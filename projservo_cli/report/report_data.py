@@ -242,9 +242,9 @@ def along_line(points: FloatArray, start: FloatArray, goal: FloatArray) -> tuple
     """Way (k,) along the straight line from start to goal and distance (k,) from it, m."""
     length = np.linalg.norm(goal - start)
     direction = (goal - start) / length if length > 0 else np.zeros(3)
-    deviation = (points - start) @ direction
-    off = points - start - deviation[:, None] * direction
-    return deviation, np.asarray(np.linalg.norm(off, axis=1))
+    along = (points - start) @ direction
+    off = points - start - along[:, None] * direction
+    return along, np.asarray(np.linalg.norm(off, axis=1))
 
 
 def curve_difference(first: FloatArray, second: FloatArray) -> FloatArray:
