@@ -191,7 +191,7 @@ class _Desk(NamedTuple):
 class Trials:
     """Runs of a setting, one after the other, in arrays that one run leaves to the next.
 
-    shown : how many markers are shown at the start and at the goal.
+    images : number of markers whose images are given at the start and at the goal.
     Raises WorkFailed if the face has fewer than three markers.
     """
 
@@ -216,7 +216,7 @@ class Trials:
     def numbers(self, images: FloatArray, noise: FloatArray) -> FloatArray:
         """Measure the task, partition it, drive the law to its verdict and sum up: (r, ``NUMBERS``).
 
-        shown : (r, 2, 2, b, 2) images of each run at the start and at the goal, the face first, px.
+        images : (r, 2, 2, b, 2) of each run at the start and at the goal, the face first, px.
         noise : (r, k, 2, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
             short.
         """

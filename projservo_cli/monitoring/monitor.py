@@ -165,7 +165,7 @@ class ImageMonitor:
 
         t : (2,) instants of both frames, s.
         q : (2, n) joint readings then, rad or m; q_dot : (2, n) their velocities, rad/s or m/s.
-        late : (2,) standard deviation of these instants, of the delay and its jitter together, s.
+        sigma_t : (2,) standard deviation of these instants, of the delay and its jitter together, s.
         images : (2, m, 2) raw pixels of the markers of the calibration, NaN where unseen.
         fresh : (2,) whether the frame of a view is new; one that comes twice is no second measurement.
         stated : (2, m) standard deviations of the pixels, px, if the finder states them.

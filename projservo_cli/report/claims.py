@@ -411,7 +411,7 @@ def _to_polyline(points: FloatArray, path: FloatArray) -> FloatArray:
 def claims_of(report_data: ReportData, share: FloatArray, distance: FloatArray) -> list[_Claim]:
     """All claims that this run can speak about, in the order of the paper.
 
-    material : records, truth and extra runs.
+    report_data : records, truth and extra runs.
     share, distance : (k,) shares λ, and how far apart both sides of (22) put the centre, m; empty where that
         could not be computed.
     """
