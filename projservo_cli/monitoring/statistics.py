@@ -571,8 +571,8 @@ class Detector:
     ) -> Sums | None:
         """Sums before the likeliest onset of residuals beyond chance, if there is one.
 
-        count : of observations so far; sigma_t : (2,) deviation of instants, s; free : columns of markers that
-        are known to be off; thorough : test windows of all lengths, not of another one each time.
+        count : of observations so far; sigma_t : (2,) deviation of instants, s; free : columns of markers
+        that are known to be off; thorough : test windows of all lengths, not of another one each time.
         """
         total, onsets = self.memory.total, self.memory.onsets()
         if not onsets or not total.views:
