@@ -10,6 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from filelock import FileLock
+from hypothesis import settings
+
+settings.register_profile("no deadline", deadline=None)  # a busy machine is no failure
+settings.load_profile("no deadline")
 
 # In the background of a shell SIGINT is ignored, and by all children: tests of what it does need it back.
 signal.signal(signal.SIGINT, signal.default_int_handler)

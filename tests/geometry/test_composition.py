@@ -20,7 +20,7 @@ from tests.samples import frame, revolute
 angles = st.floats(-2 * math.pi, 2 * math.pi)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2))
 def test_solutions_are_all_zeros_of_the_equation(p_0, p_s, p_c):
     amplitude = math.hypot(p_s, p_c)
@@ -72,7 +72,7 @@ def composed(H_r, H_p, theta_r, theta_p):
     return theta_s, as_array(H_s)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(angles, angles, st.integers(0, 5))
 def test_one_rotation_equals_two(theta_r, theta_p, seed):
     """Also beyond half a turn, where θ_s exceeds π or the axis changes sides."""

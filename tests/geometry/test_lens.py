@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from projservo_cli.geometry.lens import (
@@ -66,7 +66,6 @@ def test_derivatives_agree_with_differences(k1, k2, rng):
         assert np.abs(numeric - by_lens[..., c]).max() < 1e-6
 
 
-@settings(deadline=None)
 @given(st.integers(-1000, 1000), st.integers(-1000, 1000))
 def test_pixels_are_bent_up_to_where_the_bent_radius_turns(k1, k2):
     k1, k2 = k1 / 1000, k2 / 1000

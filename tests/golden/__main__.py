@@ -1,12 +1,11 @@
 """Keep every number of what projservo ships, and compare two such sets.
 
     OPENBLAS_NUM_THREADS=1 python -m tests.golden make FOLDER [--chains NAME ...] [--keep]
-    python -m tests.golden compare OLD NEW [--renamed]
+    python -m tests.golden compare OLD NEW
 
 ``make`` runs each chain as a command of its own, stores its numbers in FOLDER/NAME.npz, and says whether they
 are those of ``hashes.json``, which ``--keep`` writes anew. Numbers agree to the bit on one machine alone.
-``compare`` ends with exit code 1 where a number is lost, or off by more than 1e-9; ``--renamed`` translates
-the names of OLD by ``renames.csv`` first, and counts texts in other words apart from numbers.
+``compare`` ends with exit code 1 where a number is lost, or off by more than 1e-9.
 """
 
 import argparse
@@ -24,7 +23,6 @@ import yaml
 
 from tests.conftest import ROOT
 from tests.golden.numbers import differences, digest_of, of_file, of_json, plain
-from tests.golden.renames import translated
 
 HASHES = Path(__file__).with_name("hashes.json")
 CONFIGS, DATA = ROOT / "configs", ROOT.parent / "shared" / "data"
@@ -131,7 +129,7 @@ def make(folder: Path, names: list[str], keep: bool) -> int:
     return int(off > 0 and not keep)
 
 
-def compare(old: Path, new: Path, renamed: bool = False) -> int:
+def compare(old: Path, new: Path) -> int:
     """Print how two folders differ; 1 where a number is lost or apart."""
     off = 0
     for path in sorted(old.glob("*.npz")):
@@ -140,7 +138,7 @@ def compare(old: Path, new: Path, renamed: bool = False) -> int:
             off = 1
             continue
         with np.load(path) as before, np.load(new / path.name) as after:
-            told = differences(translated(before) if renamed else dict(before), dict(after))
+            told = differences(dict(before), dict(after))
         print(f"{path.stem}: " + ", ".join(f"{len(names)} {kind}" for kind, names in told.items()))
         for kind in ("apart", "lost", "new"):
             for line in told[kind][:LISTED]:
@@ -160,11 +158,10 @@ def main() -> None:
     comparing = verbs.add_parser("compare")
     comparing.add_argument("old", type=Path)
     comparing.add_argument("new", type=Path)
-    comparing.add_argument("--renamed", action="store_true", help="translate the names of OLD by renames.csv")
     given = parser.parse_args()
     if given.verb == "make":
         sys.exit(make(given.folder, given.chains, given.keep))
-    sys.exit(compare(given.old, given.new, given.renamed))
+    sys.exit(compare(given.old, given.new))
 
 
 if __name__ == "__main__":

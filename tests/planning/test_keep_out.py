@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
 from scipy.spatial import ConvexHull
@@ -22,7 +22,6 @@ from tests.known import configured
 from tests.planning.joint_space_cases import COUNT, case
 
 
-@settings(deadline=None)
 @given(st.integers(3, 9), st.integers(0, 10_000))
 def test_the_distance_from_a_polygon_is_that_to_its_outline(k, seed):
     rng = np.random.default_rng(seed)

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from projservo_cli.control.law import OK
@@ -131,7 +131,6 @@ def on_plateau(error, k, window):
 
 
 @given(st.lists(st.sampled_from([0.5, 0.95, 0.9999, 1.0, 1.01]), max_size=60), st.integers(1, 20))
-@settings(deadline=None)
 def test_a_plateau_is_the_longest_stretch_on_which_the_verdict_would_be_one(factors, window):
     error = np.cumprod([100.0, *factors])
     first, last = plateau_stretch(error, window) or (0, window - 1)

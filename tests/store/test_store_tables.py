@@ -184,7 +184,7 @@ def test_a_recording_is_told_by_a_column_of_its_own(tmp_path):
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.data())
 def test_writing_and_reading_is_exact(tmp_path_factory, data):
     poses = data.draw(st.lists(st.integers(-(10**9), 10**9), min_size=1, max_size=4, unique=True))

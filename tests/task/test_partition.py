@@ -80,7 +80,7 @@ def test_irregular_face(name, m, types):
     check(Split(face(m), CASES[name], frame(5), types))
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     st.lists(st.floats(-3.1, 3.1), min_size=3, max_size=3),
     st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=3),

@@ -45,7 +45,7 @@ def G(request):
     return np.eye(4) if request.param is None else frame(request.param, mirrored=request.param == 2)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(triples, st.floats(0.01, 5), st.integers(0, 3))
 def test_neutral_along_the_ray_of_a_point_of_the_face(place, farther, seed):
     """Along the ray of any of its points, in front of the camera, nearer or farther by any factor."""
@@ -61,7 +61,7 @@ def test_neutral_along_the_ray_of_a_point_of_the_face(place, farther, seed):
     assert there @ O_s / (a @ O_s) == pytest.approx(farther, rel=1e-9)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(triples, angles, st.integers(0, 3))
 def test_neutral_about_any_axis_through_the_optical_center(axis, theta, seed):
     """For the camera whose centre it is; the other camera's margin does change."""
@@ -74,7 +74,7 @@ def test_neutral_about_any_axis_through_the_optical_center(axis, theta, seed):
     assert visibility_angles(a, H_hat, O) is None
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(triples, angles, st.lists(st.floats(-3, 3), min_size=2, max_size=2), st.integers(0, 3))
 def test_neutral_parallel_to_the_face_and_within_its_plane(point, theta, shift, seed):
     """A translation along the face and Ĥ_p about any point of space: both margins stay."""
@@ -134,7 +134,7 @@ def test_margin_coefficients_describe_the_carried_plane(G, rng):
         assert c_0 + c_s * math.sin(theta) + c_c * math.cos(theta) == pytest.approx(wanted, abs=1e-11)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(small, small, small, st.floats(-2 * math.pi, 2 * math.pi))
 def test_least_margin_of_an_arc_by_brute_force(c_0, c_s, c_c, theta):
     """A grid of 4001 angles over at most one turn misses the least value by 1.3e-6 of the amplitude."""
