@@ -166,11 +166,12 @@ class ModelError(NamedTuple):
     deviation: float  # standard deviation of the estimate
     effect_px: float  # rms error of predictions within the joint ranges, per marker and view
     first: int | None  # number of the pose from which it holds, of a step
+    others: tuple[str, ...] = ()  # codes of those that explain the images about as well
 
     @property
     def code(self) -> str:
-        """Kind, joints and view in one word."""
-        return f"{self.kind}|{','.join(map(str, self.joints))}|{self.view}"
+        """Kind, joints and view in one word, and those of the others."""
+        return "/".join([f"{self.kind}|{','.join(map(str, self.joints))}|{self.view}", *self.others])
 
     @property
     def numbers(self) -> tuple[float, float, float, float]:
@@ -180,10 +181,12 @@ class ModelError(NamedTuple):
     @classmethod
     def of(cls, code: str, numbers: Iterable[float]) -> "ModelError":
         """Read it back from ``code`` and ``numbers``."""
-        kind, joints, view = code.split("|")
+        own, *others = code.split("/")
+        kind, joints, view = own.split("|")
         estimate, deviation, effect, first = map(float, numbers)
         which = tuple(int(joint) for joint in joints.split(",") if joint)
-        return cls(kind, which, view, estimate, deviation, effect, None if math.isnan(first) else int(first))
+        begin = None if math.isnan(first) else int(first)
+        return cls(kind, which, view, estimate, deviation, effect, begin, tuple(others))
 
 
 def apart(common: FloatArray, own: FloatArray, marker: IntArray, m: int) -> FloatArray:

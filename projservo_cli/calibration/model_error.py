@@ -38,6 +38,10 @@ _MAX_FOUND = 8
 _TRIED = 4
 # Share of the gain of a nuisance from which one of fewer parameters is preferred.
 _AS_MUCH = 0.995
+# Logarithm of the odds, doubled, below which one nuisance explains the images as well as another: 20 to 1.
+_UNDECIDED = 6.0
+# Maximum number of others that are named beside a nuisance.
+_MAX_OTHERS = 2
 # Number of rounds in which a nuisance found may give way to a better one.
 _ROUNDS = 2
 # Standard deviations of an amplitude that the tests find in half of the cases.
@@ -382,6 +386,21 @@ class _Tests:
         self.choose(chosen)
         return chosen
 
+    def as_likely(self, choice: _Choice, chosen: Sequence[_Choice]) -> tuple[str, ...]:
+        """Codes of other nuisances that explain the images about as well as one of those chosen."""
+        self.choose([other for other in chosen if other != choice])
+        candidates = self.candidates()
+        self.choose(chosen)
+        own = [criterion for criterion, other, _ in candidates if other.number == choice.number]
+        near = [
+            _described(self, other.number, np.zeros(1), np.zeros((1, 1)), 0.0, None)
+            for criterion, other, _ in candidates
+            if own and criterion < own[0] + _UNDECIDED
+        ]
+        named = {_limit(one): one.code for one in near[::-1]}
+        named.pop(_limit(_described(self, choice.number, np.zeros(1), np.zeros((1, 1)), 0.0, None)), None)
+        return tuple(named.values())[::-1][:_MAX_OTHERS]
+
     def _best(self) -> _Choice | None:
         """Best candidate that is significant, or the one of fewer parameters that explains nearly as much."""
         candidates = self.candidates()
@@ -533,7 +552,8 @@ def _estimated(
     found = []
     for one, at, change in zip(chosen, own, moved, strict=True):
         first = int(tests.pose[tests.poses[one.onset]]) if one.onset else None
-        found.append(_described(tests, one.number, b[at], covariance[at, at], effects.rms(change), first))
+        error = _described(tests, one.number, b[at], covariance[at, at], effects.rms(change), first)
+        found.append(error._replace(others=tests.as_likely(one, chosen)))
     of_images = np.stack([part @ b[at] for part, at in zip(parts, own, strict=True)], axis=1)
     return found, effects.rms(np.sum(moved, axis=0)), tests.F @ (tests.U.T @ of_images)
 
@@ -649,14 +669,26 @@ def describe(error: ModelError, prismatic: BoolArray) -> tuple[str, str]:
             (1e3 * float(per_rad(prismatic)[i]), " mm") if slides else (float(np.degrees(1.0)), "°")
         )
     size = f"{factor * abs(error.estimate):.2g}{unit}" + (f" ± {factor * spread:.1g}{unit}" if spread else "")
-    several = len(error.joints) > 1
-    names = f"joint{'s' * several} {' and '.join(map(str, error.joints))}"
-    if several and error.kind == "scale":
-        names, several = "all joints", True
+    several, names = len(error.joints) > 1, _names(error)
     more = "more or less" if several else "less" if error.estimate < 0.0 else "more"
     turn = ("move" if slides else "turn") + "s" * (not several)
     words = {"joints": names, "view": error.view, "size": size, "share": size, "more": more, "turn": turn}
     words |= {"read": "they read" if several else "it reads"}
     words |= {"first": "" if error.first is None else f" at pose {error.first}"}
-    limit, sentence = _WORDS[error.kind]
-    return limit.format(*error.joints, **words), sentence.format(*error.joints, **words)
+    sentence = _WORDS[error.kind][1].format(*error.joints, **words)
+    if error.others:
+        others = [_limit(ModelError.of(code, [0.0, 0.0, 0.0, np.nan])) for code in error.others]
+        sentence += f" (or {', or '.join(others)}: the images do not tell)"
+    return _limit(error), sentence
+
+
+def _names(error: ModelError) -> str:
+    """Name the joints of a deviation."""
+    if len(error.joints) > 1 and error.kind == "scale":
+        return "all joints"
+    return f"joint{'s' * (len(error.joints) > 1)} {' and '.join(map(str, error.joints))}"
+
+
+def _limit(error: ModelError) -> str:
+    """Name a deviation as the limit of a fit."""
+    return _WORDS[error.kind][0].format(*error.joints, joints=_names(error), view=error.view)
