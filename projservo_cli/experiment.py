@@ -124,6 +124,14 @@ class Chain:
         moving = not self.config.plant.simulated and "servo" not in self.names
         return next((step for step in self.steps if step.law and step.why), None) if moving else None
 
+    def replayed(self) -> list[dict[str, Any]]:
+        """Runs of a robot of somebody's that are shown as they were stored: law, plant, and date."""
+        if self.config.plant.simulated or "servo" in self.names:
+            return []
+        stored = [(step.law, self.run.results[step.name]) for step in self.steps if step.law and not step.why]
+        plant = self.config.plant.use
+        return [{"law": law, "plant": plant, "date": one.provenance.get("date")} for law, one in stored]
+
     def code(self) -> list[tuple[str, str]]:
         """Kind and ``module:Class`` of the imports of the steps, of laws and of a robot."""
         servo = [law_and_mode(step.law)[0] for step in self.steps if step.law and step.why]
@@ -138,6 +146,8 @@ class Chain:
         """Make the outdated results, stop at the first failure, keep finished results."""
         if self.failed:
             return
+        for one in self.replayed():
+            self.listener.say("{law}: the stored run of {plant}, recorded {date}".format_map(one))
         self._say_compilation()
         with self._compiling():
             self._make_steps()
@@ -279,6 +289,8 @@ class Experiment(Printed):
 
     def make(self, *stages: str, laws: Sequence[str] = (), force: bool = False) -> "Experiment":
         """Make stages, and those before them that they need; results that are up to date stay.
+
+        A robot that is not simulated is driven again wherever ``servo`` is named.
 
         Parameters
         ----------

@@ -87,7 +87,10 @@ def steps_for(
         sources = _sources(laws, config, run) if "servo" in stages else {}
         for step in _needed(given, sources, stages):
             remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
-            steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
+            why = _reason(step, run, force and step.stage in named, remade)
+            if step.law and "servo" in named and not config.plant.simulated:
+                why = why or "a robot that is not simulated moves whenever it is asked to"
+            steps.append(replace(step, why=why))
         return steps
 
     steps = planned(stages, laws or config.control.laws)

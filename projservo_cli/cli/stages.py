@@ -204,8 +204,8 @@ def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
     default direct_three, direct_two, exact and plug-in laws.
 
     With --set plant=module:Class (or plant in the configuration) an external robot takes the place of the
-    simulated one. It is driven to the start of the task and from there by each law, and stopped on every way
-    out.
+    simulated one. It is driven to the start of the task and from there by each law, in every call, and
+    stopped on every way out.
     """
     return _make(console, stages, options)
 
@@ -414,6 +414,7 @@ def _work(call: _Call) -> int:
         call.beside.setdefault("calibrate", {})["joint_types_assumed"] = assumed
     if (wanted := _extras(call.options)) and not chain.lacks("report"):
         call.beside["report"] = _made_optional(console, chain, wanted)
+    call.beside.setdefault("report", {})["replayed"] = chain.replayed()
     from projservo_cli.report.report_data import failed_object, stage_object
 
     values, joints = {}, chain.config.joint_names

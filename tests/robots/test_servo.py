@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.config import load_config
+import projservo_cli as ps
+from projservo_cli.config import Override, load_config
 from projservo_cli.records import Calibration
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.store import load
@@ -375,6 +376,29 @@ def test_a_report_never_moves_a_robot(servo, projservo):
     assert answer.code == 2
     assert "which moves tests.robots.robots:Sound: run projservo servo first" in answer.err
     assert CALLS == []
+
+
+def test_a_real_robot_moves_whenever_it_is_asked_to_and_a_report_shows_what_is_stored(servo, projservo):
+    asked = servo(*faulty("bumped camera", 70), "--json")
+    assert (asked.code, asked.json["laws"][0]["verdict"]) == (1, "fault detected")
+    for call in range(2):  # what is wrong is mended, and nothing else is said about it
+        CALLS.clear()
+        again = servo(*SOUND, "--json")
+        assert (again.code, again.json["laws"][0]["verdict"]) == (0, "converged"), call
+        assert len(commands()) > 10
+    dry = servo(*SOUND, "-n", "--json").json["steps"]
+    assert [step["stage"] for step in dry if step["why"]] == ["servo"]
+    sent = len(CALLS)
+    shown = projservo("report", "-c", UR5, "-o", "run", *SOUND, "--set", "control.laws=[direct_three]", "--json")
+    assert shown.code == 0, shown.err
+    (stored,) = shown.json["replayed"]
+    date = load("run").results["servo/direct_three"].provenance["date"]
+    assert stored == {"law": "direct_three", "plant": "tests.robots.robots:Sound", "date": date}
+    assert f"the stored run of tests.robots.robots:Sound, recorded {date}" in shown.err.replace("\n", " ")
+    assert len(CALLS) == sent
+    config = load_config(UR5, [Override.parse(SOUND[1])])
+    ps.Experiment(config, "run", progress=False).make("servo", laws=["direct_three"])
+    assert CALLS.count("open") == 1  # of a new object
 
 
 def test_a_robot_is_calibrated_from_what_it_showed(projservo, monkeypatch, tmp_path):
