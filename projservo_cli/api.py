@@ -288,6 +288,7 @@ def servo(
     *,
     mode: str | None = None,
     robot: Any = None,
+    blind: bool = False,
 ) -> RunTrace:
     """Drive a law in closed loop from the start of a task to its verdict.
 
@@ -300,6 +301,7 @@ def servo(
     mode : ``regulate``, ``track`` or ``image_track``; by default that of the name, such as ``exact_track``,
         else ``regulate``.
     robot : an object of the contract to drive, instead of the robot of the configuration.
+    blind : whether a robot may move although cameras show no marker of the calibration.
 
     Returns
     -------
@@ -324,9 +326,9 @@ def servo(
         name, of_name = law_and_mode(law)
         if mode not in (None, of_name) and of_name != REGULATE:
             raise InputError(f"servo: law {law} is {name} in mode {of_name}, not {mode!r}: leave mode out")
-        given, name = driving.Given(None, robot), law_target(name)
+        given, name = driving.Given(None, robot, blind), law_target(name)
     else:
-        given, name, of_name = driving.Given(law, robot), plugins.name_of(law), REGULATE
+        given, name, of_name = driving.Given(law, robot, blind), plugins.name_of(law), REGULATE
     if isinstance(plan, MotionPlan):
         config = _with_task(config, calibration.joint_types, *plan.asked)
     asked = config.replace({"control.mode": [of_name if mode is None else mode]})

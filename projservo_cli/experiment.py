@@ -101,6 +101,7 @@ class Chain:
     recording: Any = None  # the recording before the calibration, if any
     confirm: bool = False  # whether to ask before the first motion
     in_memory: bool = False  # whether results stay in memory
+    blind: bool = False  # whether a robot may move although cameras show nothing
     laws: tuple[str, ...] = field(init=False)  # names of the runs of laws that the steps make or need
     failed: str = ""  # name of the step that failed
     reason: str = ""  # why
@@ -215,7 +216,8 @@ class Chain:
         if step.stage == "servo":
             from projservo_cli.stages import servo
 
-            return (servo.run(given, run.calibration, run.plan, step.law),)
+            asked = servo.Given(blind=self.blind)
+            return (servo.run(given, run.calibration, run.plan, step.law, asked),)
         from projservo_cli.stages import report
 
         return (report.run(given, self.reported(run), run.path.parent, progress=progress),)
@@ -287,7 +289,9 @@ class Experiment(Printed):
         made._run, made._in_memory, made._progress, made._may_import = run, False, True, False
         return made
 
-    def make(self, *stages: str, laws: Sequence[str] = (), force: bool = False) -> "Experiment":
+    def make(
+        self, *stages: str, laws: Sequence[str] = (), force: bool = False, blind: bool = False
+    ) -> "Experiment":
         """Make stages, and those before them that they need; results that are up to date stay.
 
         A robot that is not simulated is driven again wherever ``servo`` is named.
@@ -297,6 +301,7 @@ class Experiment(Printed):
         stages : of ``calibrate``, ``plan``, ``servo`` and ``report``, in their order.
         laws : instead of ``control.laws``: names or ``module:Class``.
         force : whether named stages are made even if they are up to date.
+        blind : whether a robot may move although cameras show no marker of the calibration.
 
         Returns
         -------
@@ -318,16 +323,17 @@ class Experiment(Printed):
             raise InputError("make: a report is written into a folder: give Experiment a path")
         with listening(self._progress) as listener:
             if self._in_memory:
-                return self._make(stages, _targets(laws), force, listener)
+                return self._make(stages, _targets(laws), listener, force=force, blind=blind)
             with working_in(self._run.path.parent, FIGURES):
                 self._run = _stored(self._run.path)  # another process may have written it until now
-                return self._make(stages, _targets(laws), force, listener)
+                return self._make(stages, _targets(laws), listener, force=force, blind=blind)
 
     def _make(
-        self, stages: Sequence[str], laws: Sequence[str], force: bool, listener: Listener
+        self, stages: Sequence[str], laws: Sequence[str], listener: Listener, *, force: bool, blind: bool
     ) -> "Experiment":
         steps = steps_for(self.config, self._run, stages, laws=laws, force=force)
-        chain = Chain(listener, stages, self.config, self._run, steps, in_memory=self._in_memory)
+        memory = self._in_memory
+        chain = Chain(listener, stages, self.config, self._run, steps, in_memory=memory, blind=blind)
         if moving := chain.moves_unasked():
             raise InputError(
                 f"make: {moving.name} moves {self.config.plant.use}: name the stage servo as well"

@@ -185,6 +185,11 @@ def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
 @option.speed_scale
 @option.confirm
 @click.option(
+    "--blind",
+    is_flag=True,
+    help="Move a robot although cameras show no marker of the calibration, so that nothing is compared.",
+)
+@click.option(
     "--goal",
     metavar="NAME",
     help="Go to this taught goal, NAME.yaml next to the configuration, instead of task.goal.",
@@ -329,9 +334,8 @@ def _asked(
     steps = steps_for(config, stored, stages, laws=given, force=options["force"], recording=why)
     if records:
         steps.insert(0, Step("record", "", "", {}, why))
-    chain = Chain(
-        console, names, config, stored, steps, recording=recording, confirm=bool(options.get("confirm"))
-    )
+    confirm, blind = (bool(options.get(name)) for name in ("confirm", "blind"))
+    chain = Chain(console, names, config, stored, steps, recording=recording, confirm=confirm, blind=blind)
     if not options["dry_run"]:
         _require_named(chain, options)
     return _Call(console, options, chain)

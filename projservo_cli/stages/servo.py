@@ -14,6 +14,7 @@ from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, T
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span
+from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.laws import CODES, REGULATE, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import Ended, Summary, angle_between, path_deviation, summarize
@@ -21,6 +22,7 @@ from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
+from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import (
     MM,
     VIEWS,
@@ -66,6 +68,7 @@ class _Outcome:
     unplanned: str = ""  # why it went without the plan that it was to follow
     replannings: tuple[str, ...] = ()  # time and reason of each replanning
     driven: DrivenRobot | None = None  # client of a robot of the contract
+    unseen: str = ""  # which cameras showed nothing before the run, though they were to be compared
 
     @cached_property
     def summary(self) -> Summary:
@@ -98,6 +101,7 @@ class _Outcome:
         simulated = scenario.truth is not None
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
         driven = self.driven
+        lost = _blind_view(log.s[:rows], WINDOW) if driven and self.verdict == "converged" else ""
         if driven is not None:  # the log has the predicted rest of the robot instead of readings
             read = _whole(driven.readings, rows)
         values = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
@@ -146,7 +150,9 @@ class _Outcome:
             center=center if simulated else np.full_like(center, np.nan),
             unplanned=self.unplanned,
             estimated_position_error_mm=_estimated_mm(self, views),
-            untested="" if driven is None else scenario.untested,
+            untested="; ".join(
+                filter(None, ("" if driven is None else scenario.untested, self.unseen or lost))
+            ),
             overruns=None if driven is None else driven.steered.overruns,
             latency=None if driven is None else _whole(driven.delays, rows),
             **({} if driven is None else driven.film.fields()),
@@ -304,6 +310,7 @@ class Given(NamedTuple):
 
     law: Callable[[Any], Any] | None = None  # makes a law of its setup; None for that of the name
     robot: Any = None  # an object of the contract; None for that of the configuration
+    blind: bool = False  # whether a robot may move although cameras show no marker of the calibration
 
 
 def run(
@@ -449,6 +456,7 @@ class _Asked:
         )
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), at_rest_after(driven.robot):
+            unseen = ""
             if own:
                 driven.robot.require_identity(contract.identity)
                 wrong = driven.fits()
@@ -456,11 +464,25 @@ class _Asked:
                     raise WorkFailed(f"the robot did not move, since at the start {wrong}")
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
+                unseen = self._require_images(driven, "the robot did not move, since where it stands", 2)
                 for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
                         raise WorkFailed(f"stopped on the path to the start, since {wrong}")
+                unseen = self._require_images(driven, "stopped at the start of the task, since", 1) or unseen
             driven.begin()
-            return self._in_python(controller, driven, StallMonitor(driven, scenario.limits))
+            run = self._in_python(controller, driven, StallMonitor(driven, scenario.limits))
+            return replace(run, unseen=unseen)
+
+    def _require_images(self, driven: DrivenRobot, what: str, least: int) -> str:
+        """Refuse to move a robot of which so many cameras or more show nothing, unless that was asked for."""
+        unseen, own = driven.unseen(least), driven.robot.robot
+        if unseen and not self.given.blind:
+            seen = "; ".join([unseen, *(own.remarks() if isinstance(own, CameraRobot) else ())])
+            raise WorkFailed(
+                f"{what} {seen}: uncover both cameras and look at their light, or move the arm by hand to "
+                "where they see the tags; --blind (blind=True) drives it without images"
+            )
+        return unseen
 
     def _in_python(
         self, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, stall: StallMonitor | None = None

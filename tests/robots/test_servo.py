@@ -197,6 +197,34 @@ def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
     assert commands()
 
 
+@pytest.mark.parametrize(
+    ("fault", "dark"),
+    [("lost", "neither camera shows a marker"), ("blind", "the left camera shows no marker")],
+)
+@pytest.mark.parametrize("tested", [True, False])
+def test_without_an_image_nothing_moves_unless_that_is_asked_for(servo, fault, dark, tested):
+    sets = [*NEAR, "--set", "stop.max_steps=40"]
+    sets += [] if tested else ["--set", "stop.innovation_threshold=0"]
+    answer = servo(*faulty(fault), *sets, "--json", law="exact")
+    assert answer.code == 1
+    assert dark in answer.json["reason"]
+    assert "--blind" in answer.json["reason"]
+    begun = robots.Sound(UR5).q
+    if fault == "lost":  # one camera alone still tells whether the way to the start may be driven
+        CALLS.clear()
+        servo(*faulty(fault), *sets, "-q", law="exact")
+        assert all((sent.target == begun).all() for sent in commands())
+    told = servo(*faulty(fault), *sets, "--json", "--blind", law="exact").json["laws"][0]
+    assert dark in told["untested"]
+
+
+def test_a_camera_that_is_lost_under_way_is_said_of_a_run_that_converges(servo):
+    answer = servo(*faulty("blind", 75), *NEAR, law="exact")
+    assert answer.code == 0, answer.err
+    assert "converged" in answer.out
+    assert "the left camera has shown no marker" in " ".join(answer.out.split())
+
+
 def test_a_calibration_without_covariance_tests_nothing_and_says_so():
     inputs = SimpleNamespace(tests_images=True)
     bare = fake(Calibration, sqrt_cov_shared=np.full((3, 3), np.nan))
@@ -389,7 +417,9 @@ def test_a_real_robot_moves_whenever_it_is_asked_to_and_a_report_shows_what_is_s
     dry = servo(*SOUND, "-n", "--json").json["steps"]
     assert [step["stage"] for step in dry if step["why"]] == ["servo"]
     sent = len(CALLS)
-    shown = projservo("report", "-c", UR5, "-o", "run", *SOUND, "--set", "control.laws=[direct_three]", "--json")
+    shown = projservo(
+        "report", "-c", UR5, "-o", "run", *SOUND, "--set", "control.laws=[direct_three]", "--json"
+    )
     assert shown.code == 0, shown.err
     (stored,) = shown.json["replayed"]
     date = load("run").results["servo/direct_three"].provenance["date"]
