@@ -118,7 +118,7 @@ class Servos:
             if error.garbled:
                 raise InputError(
                     f"{where} servos answer, but every reply is garbled: two arms share this bus, such as "
-                    "leader and follower, or all servos have one id: unplug one arm, or set the ids one by one"
+                    "leader and follower, or all servos have one id: unplug one arm, or set each id alone"
                 ) from error
             if there:
                 raise InputError(

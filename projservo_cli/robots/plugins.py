@@ -187,8 +187,9 @@ def brings_no_pixels(found: object) -> bool:
 def _sets(found: object, name: str) -> bool:
     """Whether a class may give its objects an attribute as they are made; these are checked then."""
     kinds = found.__mro__ if isinstance(found, type) else ()
-    codes = [getattr(inspect.unwrap(kind.__init__), "__code__", None) for kind in kinds]
-    used = {word for code in codes if code is not None for word in code.co_names}
+    codes = [getattr(vars(kind).get("__init__"), "__code__", None) for kind in kinds]
+    codes += [inner for code in codes if code is not None for inner in code.co_consts]  # comprehensions
+    used = {word for code in codes for word in getattr(code, "co_names", ())}
     return bool(used & {name, "setattr"}) or any("__getattr__" in vars(kind) for kind in kinds)
 
 
