@@ -19,7 +19,15 @@ from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, law_and_mode, mode_in
 from projservo_cli.progress import Bar
-from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Report, WorkFailed
+from projservo_cli.records import (
+    Calibration,
+    CalibrationRefuted,
+    CrossValidation,
+    InputError,
+    Observation,
+    Report,
+    WorkFailed,
+)
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
 from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress, silent
@@ -175,6 +183,8 @@ class Chain:
                     dropped = self._make_result(step)
                 except WorkFailed as error:
                     self.failed, self.reason = step.name, " ".join(str(error).split())
+                    if isinstance(error, CalibrationRefuted):
+                        self._keep(replace(self.run, refuted=self.reason))
                     return
                 if dropped:
                     self.listener.say(f"{', '.join(dropped)}: dropped, their inputs were replaced")
@@ -198,7 +208,13 @@ class Chain:
         place = STAGES.index(step.stage)
         after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
         results = {name: stored for name, stored in run.results.items() if name not in after}
-        self._keep(replace(run, results={**results, step.name: result}))
+        refuted = run.refuted
+        if step.stage == "calibrate":
+            refuted = ""
+        elif step.law and not self.config.plant.simulated:
+            trace = result.records[""]
+            refuted = trace.reason if trace.verdict == "fault detected" else ""
+        self._keep(replace(run, results={**results, step.name: result}, refuted=refuted))
         return after
 
     def _made(self, step: Step, run: Run) -> tuple[Any, ...]:

@@ -79,6 +79,10 @@ class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming err
     """The data were read, but the work they ask for cannot be done (exit code 1)."""
 
 
+class CalibrationRefuted(WorkFailed):
+    """Images or readings of a robot contradict its calibration, and so the recording it was made from."""
+
+
 REVOLUTE = 0
 PRISMATIC = 1
 

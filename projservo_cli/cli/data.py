@@ -75,7 +75,8 @@ def _teach(
             put = Readings(tuple(float(value) for value in at.split(",")), at_unit)
         except ValueError as error:
             raise InputError(f"--at {at}: expected a number for each joint, with commas") from error
-    calibration = option.calibration_of(run, settings)
+    calibrated = option.calibrated_run(run, settings)
+    calibration = None if calibrated is None else calibrated.calibration
     asks = not settings.plant.simulated and sys.stdin.isatty()
     with option.writing(output):
         try:

@@ -15,7 +15,6 @@ from projservo_cli.cli.output import Console
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config, Override
-    from projservo_cli.records import Calibration
     from projservo_cli.store import Run
 
 _Function = Callable[..., Any]
@@ -186,12 +185,12 @@ def configured(
     return found
 
 
-def calibration_of(run: Path | None, config: "Config") -> "Calibration | None":
-    """The calibration of a run, by default of that of the configuration's name; None where none is."""
+def calibrated_run(run: Path | None, config: "Config") -> "Run | None":
+    """The run that is named, by default that of the configuration's name; None without a calibration."""
     found = _stored(run or _RESULTS / config.name)
     if found is None and run is not None:
         raise click.UsageError(f"{run}: there is no run; calibrate first, or leave it out")
-    return found.calibration if found is not None and "calibrate" in found.results else None
+    return found if found is not None and "calibrate" in found.results else None
 
 
 def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Config", "Run"]:

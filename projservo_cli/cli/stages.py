@@ -1,5 +1,6 @@
 """Commands of the stages and of their chain: dry run, work, summary."""
 
+import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,7 @@ from projservo_cli.cli.group import FAILED, main
 from projservo_cli.cli.output import Console, visible, words_of, wrapped
 
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
+_AGAIN = ", and the robot is not moved: --force records all poses again"
 _UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")  # by the report of a sweep
 
 
@@ -65,6 +67,8 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     path = options["output"] or _data_table(config)
     poses, given = _motions(config, options), recording_inputs(config)
     recording, reason = new_recording(given, path, motions=poses, force=options["force"]), ""
+    if not recording.why:
+        console.say(f"record: {path} is up to date{_AGAIN}")
     if not options["dry_run"]:
         with option.writing(path):
             recording = new_recording(given, path, motions=poses, force=options["force"])
@@ -281,6 +285,8 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
 
 def _recorded(call: _Call) -> _Call:
     """Record the pending poses; return the action for the table."""
+    from projservo_cli.store import save
+
     chain = call.chain
     recording, why = chain.recording, chain.recording.why
     if why:
@@ -288,6 +294,8 @@ def _recorded(call: _Call) -> _Call:
     if reason := _drive(call.console, chain.config, recording, confirm=chain.confirm):
         chain.failed, chain.reason = "record", reason
         return call
+    if chain.run.refuted:  # by what the new recording has taken the place of
+        save(replace(chain.run, refuted=""))
     unasked = {**call.options, "confirm": call.options["confirm"] and not why}
     return _asked(call.console, chain.names, unasked, replace(recording, why=""))
 
@@ -305,8 +313,13 @@ def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
             f"{run.path}: its calibration comes from {stored.inputs['table']} and would be replaced by a "
             "simulated one; choose another folder with -o, or use --force"
         )
-    poses = _motions(config, options)
-    return new_recording(recording_inputs(config), path, motions=poses, force=force, redo=True)
+    poses, given = _motions(config, options), recording_inputs(config)
+    found = new_recording(given, path, motions=poses, force=force, redo=True)
+    digest = stored and stored.inputs.get("table_sha256")
+    if not run.refuted or found.why or digest != hashlib.sha256(path.read_bytes()).hexdigest():
+        return found
+    begun = new_recording(given, path, motions=poses, force=True)
+    return replace(begun, why=f"what is there was contradicted: {run.refuted}")
 
 
 def _asked(
@@ -450,7 +463,8 @@ def _announce(console: Console, chain: Any) -> None:
             continue  # it was said before it was made
         needed = "" if step.stage in chain.names else f", needed by {chain.names[-1]}"
         if step.why or not needed:
-            said = f"making ({step.why}{needed})" if step.why else step.status
+            kept = f"{step.status}{_AGAIN}" if step.stage == "record" else step.status
+            said = f"making ({step.why}{needed})" if step.why else kept
             reasons.setdefault(said, []).append(step.name)
     for said, found in reasons.items():
         console.say(f"{', '.join(found)}: {said}")

@@ -94,9 +94,9 @@ def _of_camera(camera: Camera) -> Iterator[Finding]:
     for wrong in light.faults():
         what, _, remedy = wrong.rpartition(": ")
         yield Finding(FAULT if "black" in wrong else WARNING, where, f"its image {what}", remedy)
-    white, blur = f"{light.clipped:.1%} white", f"edges blurred by {light.blur_px:.1f} px"
-    text = f"mean grey {light.mean:.0f} of 255, {white}, {blur}"
-    yield Finding(FINE, where, text)
+    text = f"mean grey {light.mean:.0f} of 255, {light.clipped:.1%} white"
+    sharp = math.isfinite(light.blur_px)
+    yield Finding(FINE, where, f"{text}, edges blurred by {light.blur_px:.1f} px" if sharp else text)
 
 
 def _of_tags(name: str, view: View, seen: Seen, finder: TagFinder, dictionary: str) -> Iterator[Finding]:
@@ -126,9 +126,9 @@ def _of_tags(name: str, view: View, seen: Seen, finder: TagFinder, dictionary: s
     width = {number: _width(tag) for number, tag in there.items()}
     smallest = min(width, key=lambda number: width[number])
     cell = width[smallest] / finder.cells
-    sigma = float(np.nanmedian([tag.sigma for tag in there.values()]))
+    sigma = np.concatenate([tag.sigma[np.isfinite(tag.sigma)] for tag in there.values()])
     sizes = ", ".join(f"{number} ({width[number]:.0f} px)" for number in sorted(there))
-    text = f"tags {sizes}; corners to {sigma:.2g} px"
+    text = f"tags {sizes}" + (f"; corners to {np.median(sigma):.2g} px" if sigma.size else "")
     if cell < _GOOD_CELL:
         limit = MIN_CELL if cell < MIN_CELL else _GOOD_CELL
         level = FAULT if max(width.values()) / finder.cells < MIN_CELL else WARNING

@@ -27,6 +27,7 @@ from projservo_cli.records import (
     MM,
     VIEWS,
     Calibration,
+    CalibrationRefuted,
     FloatArray,
     InputError,
     IntArray,
@@ -461,13 +462,13 @@ class _Asked:
                 driven.robot.require_identity(contract.identity)
                 wrong = driven.fits()
                 if wrong:
-                    raise WorkFailed(f"the robot did not move, since at the start {wrong}")
+                    raise CalibrationRefuted(f"the robot did not move, since at the start {wrong}")
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
                 unseen = self._require_images(driven, "the robot did not move, since where it stands", 2)
                 for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
-                        raise WorkFailed(f"stopped on the path to the start, since {wrong}")
+                        raise CalibrationRefuted(f"stopped on the path to the start, since {wrong}")
                 unseen = self._require_images(driven, "stopped at the start of the task, since", 1) or unseen
             driven.begin()
             run = self._in_python(controller, driven, StallMonitor(driven, scenario.limits))

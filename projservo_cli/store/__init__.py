@@ -90,6 +90,7 @@ class Run:
     path: Path
     configuration: str = ""
     results: Mapping[str, Result] = dataclasses.field(default_factory=dict)
+    refuted: str = ""  # what contradicted the recording of its calibration since, in words
     # Bytes of the last write, and the results in them.
     written: tuple[bytes, Mapping[str, Result]] = dataclasses.field(
         default=(b"", {}), repr=False, compare=False
@@ -149,6 +150,7 @@ def save(run: Run) -> Run:
     stream = io.BytesIO(image)
     with new_file(run.path, image=stream) as new, labelled(new) as file:
         attributes = {"configuration": run.configuration, "order": json.dumps(list(run.results))}
+        attributes["refuted"] = run.refuted
         file.attrs.update({"schema": _SCHEMA, "schema_version": SCHEMA_VERSION, **attributes})
         for name, result in run.results.items():
             if name in written:
@@ -187,7 +189,8 @@ def load(target: Path | str) -> Run:
         _require_names(file, {name.split("/")[0] for name in names})
         sizes = dict(SIZES)
         results = {name: _load_result(_member(file, name), sizes) for name in names}
-        return Run(path, attribute(file, "configuration", str), results)
+        refuted = attribute(file, "refuted", str) if "refuted" in file.attrs else ""
+        return Run(path, attribute(file, "configuration", str), results, refuted)
 
 
 def _load_result(group: h5py.Group, sizes: dict[str, int]) -> Result:

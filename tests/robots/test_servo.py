@@ -447,6 +447,18 @@ def test_a_robot_is_calibrated_from_what_it_showed(projservo, monkeypatch, tmp_p
     assert (refused.code, CALLS) == (2, [])
     assert "is named by the stored run alone, which starts no code" in refused.err
     assert projservo("calibrate", "-o", "run", "--json").json["usable"] == answer.json["calibrate"]["usable"]
+    again = projservo(*chain, "-c", UR5, *SOUND)
+    assert (again.code, CALLS) == (0, [])
+    assert "record: up to date, and the robot is not moved: --force records all poses again" in again.err
+    # A fault that advises to recalibrate leads somewhere: what it contradicts is recorded again, once.
+    few = ["--set", "calibration.frames_per_joint=4", "--law", "exact"]
+    moved = projservo("servo", "-c", UR5, "-o", "run", *few, *faulty("bumped camera"), "--json")
+    assert moved.code == 1
+    assert "the left camera was moved" in moved.json["reason"]
+    for recorded, why in ((37, "what is there was contradicted"), (0, "up to date")):
+        answer = projservo(*chain, "-c", UR5, *SOUND, "--json")
+        assert answer.json["record"]["recorded"] == recorded, answer.err
+        assert f"record: {'making (' * bool(recorded)}{why}" in answer.err
 
 
 def test_record_drives_the_same_robot(projservo, monkeypatch, tmp_path):
