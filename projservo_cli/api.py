@@ -156,7 +156,7 @@ def record(
         if table is not None:
             stack.enter_context(working_in(table.parent, name=f".{table.name}.lock"))
         made = recording.new_recording(given, table, motions=further, force=force)
-        if not made.pending:
+        if not (made.pending or asked.plant.simulated):
             listener.say(f"record: {table} is up to date, and the robot is not moved: use force=True")
         driven = None
         if robot is not None:

@@ -67,7 +67,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     path = options["output"] or _data_table(config)
     poses, given = _motions(config, options), recording_inputs(config)
     recording, reason = new_recording(given, path, motions=poses, force=options["force"]), ""
-    if not recording.why:
+    if not (recording.why or config.plant.simulated):
         console.say(f"record: {path} is up to date{_AGAIN}")
     if not options["dry_run"]:
         with option.writing(path):
@@ -463,7 +463,8 @@ def _announce(console: Console, chain: Any) -> None:
             continue  # it was said before it was made
         needed = "" if step.stage in chain.names else f", needed by {chain.names[-1]}"
         if step.why or not needed:
-            kept = f"{step.status}{_AGAIN}" if step.stage == "record" else step.status
+            again = step.stage == "record" and not chain.config.plant.simulated
+            kept = f"{step.status}{_AGAIN}" if again else step.status
             said = f"making ({step.why}{needed})" if step.why else kept
             reasons.setdefault(said, []).append(step.name)
     for said, found in reasons.items():
