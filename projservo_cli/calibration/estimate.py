@@ -25,10 +25,18 @@ from projservo_cli.calibration.diagnosis import (
     straight_joints,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
-from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
+from projservo_cli.calibration.fit import (
+    CHECK_READINGS,
+    REFUSE_RATIO,
+    Expected,
+    Misfit,
+    Solution,
+    fit_joint_noise,
+    solve,
+)
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
-from projservo_cli.calibration.model_error import ModelCheck, describe
+from projservo_cli.calibration.model_error import ModelCheck, describe, stepped
 from projservo_cli.calibration.numbering import epipolar_geometry
 from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.projective import Projective, closed_form_operators
@@ -295,7 +303,7 @@ def _refined(
             hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         elif not (hint := _deviation(solution, expected)):
             raise
-        raise Misfit(f"{refused}; {hint}") from None
+        raise Misfit(f"{str(refused).removesuffix(CHECK_READINGS)}; {hint}") from None
     lens = _lens_advice(record, share, frame.known)
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
     if kept.all():
@@ -317,8 +325,16 @@ def _deviation(solution: Solution, expected: Expected) -> str:
     """Describe the deviation from the model that explains most of a fit that is refused; else empty."""
     if expected.known or solution.dof <= 0:
         return ""
-    found = check_model(solution, solution.errors(), expected.noise_px(solution)).errors
-    return f"the residuals look as if {describe(found[0], solution.params.prismatic)[1]}" if found else ""
+    errors = check_model(solution, solution.errors(), expected.noise_px(solution)).errors
+    found, firsts = (errors[0] if errors else None), solution.problem.detections.pose
+    if (run := _rejected_run(_rejected_views(solution))) is not None:
+        first = firsts[run[2] if run[1] == "first" else len(firsts) - run[2]]
+    else:
+        first = None if found is None else found.first
+    found = (None if first is None else stepped(solution, int(first))) or found
+    return (
+        "" if found is None else f"the residuals look as if {describe(found, solution.params.prismatic)[1]}"
+    )
 
 
 def _describe_unmoved(solution: Solution) -> str | None:
@@ -343,8 +359,8 @@ def _rejected_views(solution: Solution) -> BoolArray:
     return np.asarray(used < _KEPT * seen)
 
 
-def _describe_change(rejected: BoolArray) -> str | None:
-    """Describe poses in a row, at the beginning or the end, that are nearly all rejected, or None.
+def _rejected_run(rejected: BoolArray) -> tuple[str, str, int] | None:
+    """View, end and number of poses in a row, the first or the last, that are nearly all rejected, or None.
 
     rejected : (2, K) views of poses that mostly are.
     """
@@ -357,11 +373,19 @@ def _describe_change(rejected: BoolArray) -> str | None:
             share = np.cumsum(row) / np.arange(1, len(row) + 1)
             count = int(np.flatnonzero(row & (share >= _NEARLY_ALL)).max(initial=-1)) + 1
             if max(_WRONG_RUN, _MUCH * len(row)) <= count < len(row):
-                return (
-                    f"the fit rejects nearly all of the {which} {count} poses{where}: a camera, the tool or "
-                    "the readings of the joints changed there; record again, or remove these poses"
-                )
+                return where, which, count
     return None
+
+
+def _describe_change(rejected: BoolArray) -> str | None:
+    """Describe poses in a row, at the beginning or the end, that are nearly all rejected, or None."""
+    if (run := _rejected_run(rejected)) is None:
+        return None
+    where, which, count = run
+    return (
+        f"the fit rejects nearly all of the {which} {count} poses{where}: the base, a camera, the tool or "
+        "the readings of the joints changed there; record again, or remove these poses"
+    )
 
 
 def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:

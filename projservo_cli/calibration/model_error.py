@@ -20,7 +20,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.special import fdtrc
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.adjustment import LeastSquares, minimize
 from projservo_cli.calibration.detections import Detections, per_rad
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.prediction import LENS, Images, Parameters
@@ -51,6 +51,8 @@ _MIN_SLIP, _SLIPPED = 5, 0.5
 _MIN_CORNERS = 2
 # Maximum leverage of the images of a posture, whose residuals say nothing beyond.
 _MAX_LEVERAGE = 0.999
+# Maximum share of the squares of what images are off that a step leaves which is named.
+_UNEXPLAINED = 0.2
 # Effect over the stated error from which a nuisance that the data could not have shown is named.
 _UNSHOWN = 2.0
 # Usual sizes of each kind, beyond which none is expected unless it is seen: of scale and coupling a share, of
@@ -453,6 +455,31 @@ def examine(
     named = (*slipped, *(found[k] for k in order))
     bias = np.hstack([np.zeros((len(bias), len(slipped))), bias[:, order]])
     return ModelCheck(named, total, noise_px, float(factor), at_recorded, unshown, bias)
+
+
+def stepped(solution: Solution, first: int) -> ModelError | None:
+    """Return what moved at the pose with a number, of a recording that no single fit describes, or None.
+
+    The part in which all joints move more is fitted; a step explains the other's images as far as it can.
+    """
+    plain, detections = solution.problem.with_noise(None), solution.problem.detections
+    onset = int(np.argmax(detections.pose == first))
+    span = [(np.ptp(part, axis=0) / np.ptp(plain.q, axis=0)).min() for part in np.split(plain.q, [onset])]
+    fitted = (detections.pose_of < onset) == (span[0] > span[1])
+    params = minimize(plain, solution.params, detections.seen & fitted, robust=True).params
+    rows = np.repeat((detections.seen & ~fitted).ravel(), 2)
+    off = plain.residual(params).ravel()[rows]
+    best, left = None, _UNEXPLAINED * float(off @ off)
+    for one in _nuisances(plain, params, _Extent.of(solution)):
+        if one.timed != _STEP:
+            continue
+        Z = one.columns.reshape(len(rows), -1)[rows]
+        b = np.linalg.lstsq(Z, off)[0]
+        if (square := float(np.square(off - Z @ b).sum())) < left:
+            size = float(np.sqrt(np.mean((Z @ b) ** 2)) if one.kind in _OF_IMAGES else -b[0])
+            joints, view = tuple(i + 1 for i in one.joints), "" if one.view is None else VIEWS[one.view]
+            best, left = ModelError(one.kind, joints, view, size, 0.0, abs(size), first), square
+    return best
 
 
 def _slipped_tags(solution: Solution) -> tuple[list[ModelError], float]:
