@@ -47,7 +47,10 @@ def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None
     write_whole(described, _as_text(json_schema()))
     words = (
         f"init: {path}, with {described} for editors",
-        f"next: projservo {'calibrate plan servo report' if arm is None else 'limits'} -c {path}",
+        f"next: projservo calibrate plan servo report -c {path}"
+        if arm is None
+        else f"next: set the sources of both cameras in {path}, then print the tags: "
+        "projservo tags --kind roof --size-mm 30 -o tags.pdf",
     )
     console.report({"configuration": path.resolve(), "schema": described.resolve()}, words)
 

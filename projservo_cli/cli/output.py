@@ -127,7 +127,7 @@ def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> It
     elif stage == "record":
         yield from _of_recording(value)
     elif stage == "calibrate":
-        yield from _of_calibration(value)
+        yield from _of_calibration(value, detailed)
     elif stage == "plan":
         yield from _of_plan(value, detailed)
     elif stage == "servo":
@@ -148,7 +148,27 @@ def _of_recording(value: dict[str, Any]) -> Iterator[str]:
         yield "  spread of the images of a pose: {spread_px:.3g} px per coordinate".format_map(value)
 
 
-def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
+def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
+    px, bound = (_number(value[f"predicted_{name}_px"]) for name in ("rms", "p99"))
+    sound = value["usable"] and value["reason"].endswith(_SOUND) and all(map(_OF_NOISE, value["advice"]))
+    asked = detailed or value["lens"] or value.get("cross_validation") or len(value["joints"]) == 1
+    if sound and value["predicted_rms_px"] is not None and not asked:
+        yield f"calibrate: usable: predicts images to {px} px rms, 99 % below {bound} px (more: -v)"
+        if value["time_offset_s"] is not None:
+            yield wrapped(f"time offset {', '.join(_time_offsets(value))}", "  ")
+    else:
+        yield from _in_detail(value)
+    yield from _of_suggestions(value)
+
+
+# Ends of reasons, and advice, that tell of noise alone, which is nothing to mend.
+_SOUND = ("limited by noise", "limited by joint readings")
+_OF_NOISE = re.compile(
+    r"errors of joint readings move|look for joint readings that lag|\d+ observations? (was|were) rejected"
+).match
+
+
+def _in_detail(value: dict[str, Any]) -> Iterator[str]:
     yield wrapped(f"calibrate: {'usable' if value['usable'] else 'NOT usable'}: {value['reason']}")
     for text in value["advice"]:
         yield wrapped(f"advice: {text}", "  ")

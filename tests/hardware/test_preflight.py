@@ -3,6 +3,7 @@
 import html
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -57,6 +58,7 @@ def doctor(projservo, tmp_path, monkeypatch):
         (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
         answer = projservo("doctor", "-c", "arm.yaml", "--json", *sets)
         told = json.loads(answer.out)["findings"]
+        assert not re.search(r"\bnan\b", answer.out)
         return answer, {
             level: [
                 f"{one['where']}: {one['text']}: {one['remedy']}" for one in told if one["level"] == level
