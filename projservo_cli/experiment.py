@@ -19,15 +19,7 @@ from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, law_and_mode, mode_in
 from projservo_cli.progress import Bar
-from projservo_cli.records import (
-    Calibration,
-    CalibrationRefuted,
-    CrossValidation,
-    InputError,
-    Observation,
-    Report,
-    WorkFailed,
-)
+from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Report, WorkFailed
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
 from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress, silent
@@ -138,7 +130,7 @@ class Chain:
         if self.config.plant.simulated or "servo" in self.names:
             return []
         stored = [(step.law, self.run.results[step.name]) for step in self.steps if step.law and not step.why]
-        plant = self.config.plant.use
+        plant = plugins.short_name(self.config.plant.use or "")
         return [{"law": law, "plant": plant, "date": one.provenance.get("date")} for law, one in stored]
 
     def code(self) -> list[tuple[str, str]]:
@@ -183,7 +175,7 @@ class Chain:
                     dropped = self._make_result(step)
                 except WorkFailed as error:
                     self.failed, self.reason = step.name, " ".join(str(error).split())
-                    if isinstance(error, CalibrationRefuted):
+                    if error.refutes:
                         self._keep(replace(self.run, refuted=self.reason))
                     return
                 if dropped:

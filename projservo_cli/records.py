@@ -76,11 +76,14 @@ class InputError(ValueError):
 
 
 class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming error
-    """The data were read, but the work they ask for cannot be done (exit code 1)."""
+    """The data were read, but the work they ask for cannot be done (exit code 1).
 
+    refutes : whether images or readings of a robot contradict its calibration, and so the recording of it.
+    """
 
-class CalibrationRefuted(WorkFailed):
-    """Images or readings of a robot contradict its calibration, and so the recording it was made from."""
+    def __init__(self, text: str, *, refutes: bool = False) -> None:
+        super().__init__(text)
+        self.refutes = refutes
 
 
 REVOLUTE = 0

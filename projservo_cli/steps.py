@@ -89,7 +89,7 @@ def steps_for(
             remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
             why = _reason(step, run, force and step.stage in named, remade)
             if step.law and "servo" in named and not config.plant.simulated:
-                why = why or "a robot that is not simulated moves whenever it is asked to"
+                why = why or "a real robot moves in every call"
             steps.append(replace(step, why=why))
         return steps
 

@@ -25,15 +25,7 @@ from projservo_cli.calibration.diagnosis import (
     straight_joints,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
-from projservo_cli.calibration.fit import (
-    CHECK_READINGS,
-    REFUSE_RATIO,
-    Expected,
-    Misfit,
-    Solution,
-    fit_joint_noise,
-    solve,
-)
+from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
 from projservo_cli.calibration.model_error import ModelCheck, describe, stepped
@@ -277,7 +269,7 @@ def _refined(
         refusal = expected.refusal(solution)
         if refusal is None:
             rejected = _rejected_views(solution)
-            refusal = _describe_change(rejected) or _describe_order(solution, rejected)
+            refusal = _change(rejected)[1] or _describe_order(solution, rejected)
             refusal = refusal or _describe_unmoved(solution)
         if refusal is not None:
             raise Misfit(refusal)
@@ -303,7 +295,8 @@ def _refined(
             hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         elif not (hint := _deviation(solution, expected)):
             raise
-        raise Misfit(f"{str(refused).removesuffix(CHECK_READINGS)}; {hint}") from None
+        what, _, _ = str(refused).partition("; check the joint readings, their units")
+        raise Misfit(f"{what}; {hint}") from None
     lens = _lens_advice(record, share, frame.known)
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
     if kept.all():
@@ -326,15 +319,11 @@ def _deviation(solution: Solution, expected: Expected) -> str:
     if expected.known or solution.dof <= 0:
         return ""
     errors = check_model(solution, solution.errors(), expected.noise_px(solution)).errors
-    found, firsts = (errors[0] if errors else None), solution.problem.detections.pose
-    if (run := _rejected_run(_rejected_views(solution))) is not None:
-        first = firsts[run[2] if run[1] == "first" else len(firsts) - run[2]]
-    else:
-        first = None if found is None else found.first
-    found = (None if first is None else stepped(solution, int(first))) or found
-    return (
-        "" if found is None else f"the residuals look as if {describe(found, solution.params.prismatic)[1]}"
-    )
+    onset, prismatic = _change(_rejected_views(solution))[0], solution.params.prismatic
+    if not onset and errors and errors[0].first is not None:
+        onset = int(np.argmax(solution.problem.detections.pose == errors[0].first))
+    found = (stepped(solution, onset) if onset else None) or next(iter(errors), None)
+    return "" if found is None else f"the residuals look as if {describe(found, prismatic)[1]}"
 
 
 def _describe_unmoved(solution: Solution) -> str | None:
@@ -359,8 +348,8 @@ def _rejected_views(solution: Solution) -> BoolArray:
     return np.asarray(used < _KEPT * seen)
 
 
-def _rejected_run(rejected: BoolArray) -> tuple[str, str, int] | None:
-    """View, end and number of poses in a row, the first or the last, that are nearly all rejected, or None.
+def _change(rejected: BoolArray) -> tuple[int, str]:
+    """Row from or up to which poses are nearly all rejected, and a sentence on it; 0 and none without.
 
     rejected : (2, K) views of poses that mostly are.
     """
@@ -373,19 +362,11 @@ def _rejected_run(rejected: BoolArray) -> tuple[str, str, int] | None:
             share = np.cumsum(row) / np.arange(1, len(row) + 1)
             count = int(np.flatnonzero(row & (share >= _NEARLY_ALL)).max(initial=-1)) + 1
             if max(_WRONG_RUN, _MUCH * len(row)) <= count < len(row):
-                return where, which, count
-    return None
-
-
-def _describe_change(rejected: BoolArray) -> str | None:
-    """Describe poses in a row, at the beginning or the end, that are nearly all rejected, or None."""
-    if (run := _rejected_run(rejected)) is None:
-        return None
-    where, which, count = run
-    return (
-        f"the fit rejects nearly all of the {which} {count} poses{where}: the base, a camera, the tool or "
-        "the readings of the joints changed there; record again, or remove these poses"
-    )
+                return count if which == "first" else len(row) - count, (
+                    f"the fit rejects nearly all of the {which} {count} poses{where}: the base, a camera, "
+                    "the tool or the readings of joints changed there; record again, or remove these poses"
+                )
+    return 0, ""
 
 
 def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:

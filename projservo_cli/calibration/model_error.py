@@ -457,13 +457,12 @@ def examine(
     return ModelCheck(named, total, noise_px, float(factor), at_recorded, unshown, bias)
 
 
-def stepped(solution: Solution, first: int) -> ModelError | None:
-    """Return what moved at the pose with a number, of a recording that no single fit describes, or None.
+def stepped(solution: Solution, onset: int) -> ModelError | None:
+    """Return what moved at a pose, by its row, of a recording that no single fit describes, or None.
 
     The part in which all joints move more is fitted; a step explains the other's images as far as it can.
     """
     plain, detections = solution.problem.with_noise(None), solution.problem.detections
-    onset = int(np.argmax(detections.pose == first))
     span = [(np.ptp(part, axis=0) / np.ptp(plain.q, axis=0)).min() for part in np.split(plain.q, [onset])]
     fitted = (detections.pose_of < onset) == (span[0] > span[1])
     params = minimize(plain, solution.params, detections.seen & fitted, robust=True).params
@@ -478,7 +477,8 @@ def stepped(solution: Solution, first: int) -> ModelError | None:
         if (square := float(np.square(off - Z @ b).sum())) < left:
             size = float(np.sqrt(np.mean((Z @ b) ** 2)) if one.kind in _OF_IMAGES else -b[0])
             joints, view = tuple(i + 1 for i in one.joints), "" if one.view is None else VIEWS[one.view]
-            best, left = ModelError(one.kind, joints, view, size, 0.0, abs(size), first), square
+            first, left = int(detections.pose[onset]), square
+            best = ModelError(one.kind, joints, view, size, 0.0, abs(size), first)
     return best
 
 

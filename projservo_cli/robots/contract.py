@@ -14,15 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame
-from projservo_cli.records import (
-    ByteArray,
-    CalibrationRefuted,
-    FloatArray,
-    InputError,
-    JointLimits,
-    WorkFailed,
-    in_unit,
-)
+from projservo_cli.records import ByteArray, FloatArray, InputError, JointLimits, WorkFailed, in_unit
 from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
@@ -221,10 +213,11 @@ class PluginRobot:
         """Refuse a robot whose readings mean something else than when they were recorded; a WorkFailed."""
         now = self.identity()
         if recorded and now != recorded:
-            raise CalibrationRefuted(
+            raise WorkFailed(
                 f"{self.name}: nothing was moved: its readings mean something else than in the recording: "
                 f"{_difference(recorded, now)}: was it homed or calibrated since? Record again: projservo "
-                "record calibrate --force"
+                "record calibrate --force",
+                refutes=True,
             )
 
     @property

@@ -27,7 +27,6 @@ from projservo_cli.records import (
     MM,
     VIEWS,
     Calibration,
-    CalibrationRefuted,
     FloatArray,
     InputError,
     IntArray,
@@ -103,6 +102,7 @@ class _Outcome:
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
         driven = self.driven
         lost = _blind_view(log.s[:rows], WINDOW) if driven and self.verdict == "converged" else ""
+        untested = "" if driven is None else scenario.untested
         if driven is not None:  # the log has the predicted rest of the robot instead of readings
             read = _whole(driven.readings, rows)
         values = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
@@ -151,9 +151,7 @@ class _Outcome:
             center=center if simulated else np.full_like(center, np.nan),
             unplanned=self.unplanned,
             estimated_position_error_mm=_estimated_mm(self, views),
-            untested="; ".join(
-                filter(None, ("" if driven is None else scenario.untested, self.unseen or lost))
-            ),
+            untested="; ".join(filter(None, (untested, self.unseen or lost))),
             overruns=None if driven is None else driven.steered.overruns,
             latency=None if driven is None else _whole(driven.delays, rows),
             **({} if driven is None else driven.film.fields()),
@@ -462,13 +460,13 @@ class _Asked:
                 driven.robot.require_identity(contract.identity)
                 wrong = driven.fits()
                 if wrong:
-                    raise CalibrationRefuted(f"the robot did not move, since at the start {wrong}")
+                    raise WorkFailed(f"the robot did not move, since at the start {wrong}", refutes=True)
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
                 unseen = self._require_images(driven, "the robot did not move, since where it stands", 2)
                 for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
-                        raise CalibrationRefuted(f"stopped on the path to the start, since {wrong}")
+                        raise WorkFailed(f"stopped on the path to the start, since {wrong}", refutes=True)
                 unseen = self._require_images(driven, "stopped at the start of the task, since", 1) or unseen
             driven.begin()
             run = self._in_python(controller, driven, StallMonitor(driven, scenario.limits))
