@@ -76,15 +76,15 @@ def _of_camera(camera: Camera) -> Iterator[Finding]:
     rate, asked = camera.rate_hz, camera.settings.rate_hz or _USUAL_HZ
     stamps = "stamped by its driver" if camera.stamped else "stamped when they arrive"
     size = f"{grey.shape[1]} x {grey.shape[0]} px"
-    found = f"{rate:.1f} frames" if math.isfinite(rate) else "fewer than 3 frames"
+    found = f"{rate:.1f}" if math.isfinite(rate) else "fewer than 3"
     if not rate >= _SLOW * asked:
         remedy = (
             "webcams expose longer in the dark: add light, or set exposure_ms below "
             f"{1e3 / asked:.0f}; on one hub with another camera, set fourcc: MJPG"
         )
-        yield Finding(WARNING, where, f"{size}, {found} a second instead of {asked:g}", remedy)
+        yield Finding(WARNING, where, f"{size}, {found} frames a second instead of {asked:g}", remedy)
     else:
-        yield Finding(FINE, where, f"{size}, {found} a second, {stamps}")
+        yield Finding(FINE, where, f"{size}, {found} frames a second, {stamps}")
     for remark in camera.remarks:
         what, _, remedy = remark.partition(": ")
         yield Finding(WARNING, where, what, remedy or "take another camera, or keep it from changing")
