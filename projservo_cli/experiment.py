@@ -224,8 +224,8 @@ class Chain:
         if step.stage == "servo":
             from projservo_cli.stages import servo
 
-            asked = servo.Given(blind=self.blind)
-            return (servo.run(given, run.calibration, run.plan, step.law, asked),)
+            asked = [servo.Given(blind=True)] if self.blind else []
+            return (servo.run(given, run.calibration, run.plan, step.law, *asked),)
         from projservo_cli.stages import report
 
         return (report.run(given, self.reported(run), run.path.parent, progress=progress),)

@@ -82,7 +82,7 @@ class Stages:
         joints = {"joint": len(calibration.q_reference)}
         return fake(Plan, inputs.seed, joints, reason="too near", **given)
 
-    def servo(self, inputs: ServoInputs, calibration: Any, plan: Any, law: str, asked: Any) -> Any:
+    def servo(self, inputs: ServoInputs, calibration: Any, plan: Any, law: str) -> Any:
         self._make(law)
         name, mode = law_and_mode(law)
         given = {"law": name, "mode": mode, "verdict": self.verdicts.get(law, "converged")}
