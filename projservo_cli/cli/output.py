@@ -153,7 +153,7 @@ def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     sound = value["usable"] and value["reason"].endswith(_SOUND) and all(map(_OF_NOISE, value["advice"]))
     asked = detailed or value["lens"] or value.get("cross_validation") or len(value["joints"]) == 1
     if sound and value["predicted_rms_px"] is not None and not asked:
-        yield f"calibrate: usable: predicts images to {px} px rms, 99 % below {bound} px (more: -v)"
+        yield f"calibrate: usable: predicts images to {px} px rms, 99 % below {bound}; more: -v"
         if value["time_offset_s"] is not None:
             yield wrapped(f"time offset {', '.join(_time_offsets(value))}", "  ")
     else:
