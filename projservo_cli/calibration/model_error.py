@@ -439,6 +439,13 @@ def examine(
     chosen = tests.select()
     found, total, bias = _estimated(tests, effects, chosen)
     slipped, slip_px = _slipped_tags(solution)
+    if len(slipped) > 1:  # several tags do not slip at once, but what carries all of them may move
+        detections = solution.problem.detections
+        kept, seen = (detections.count_at(mask) for mask in (solution.used, detections.seen))
+        lost = 1.0 - kept / np.maximum(seen, 1)
+        change = [abs(lost[k:].mean() - lost[:k].mean()) for k in range(1, len(lost))]
+        moved = stepped(solution, 1 + int(np.argmax(change)))
+        slipped = slipped if moved is None else [moved._replace(effect_px=slip_px)]
     total = float(np.hypot(total, slip_px))
     factor = np.sqrt(_design(tests, tests.r, T, sigma_px))
     at_recorded = sigma_px * np.sqrt(2.0 * np.square(tests.U).sum() / max(len(tests.r), 1))
@@ -468,6 +475,7 @@ def stepped(solution: Solution, onset: int) -> ModelError | None:
     params = minimize(plain, solution.params, detections.seen & fitted, robust=True).params
     rows = np.repeat((detections.seen & ~fitted).ravel(), 2)
     off = plain.residual(params).ravel()[rows]
+    weight = np.repeat(detections.weight.ravel(), 2)[rows].clip(1e-300)
     best, left = None, _UNEXPLAINED * float(off @ off)
     for one in _nuisances(plain, params, _Extent.of(solution)):
         if one.timed != _STEP:
@@ -475,7 +483,7 @@ def stepped(solution: Solution, onset: int) -> ModelError | None:
         Z = one.columns.reshape(len(rows), -1)[rows]
         b = np.linalg.lstsq(Z, off)[0]
         if (square := float(np.square(off - Z @ b).sum())) < left:
-            size = float(np.sqrt(np.mean((Z @ b) ** 2)) if one.kind in _OF_IMAGES else -b[0])
+            size = float(np.sqrt(np.mean((Z @ b / weight) ** 2)) if one.kind in _OF_IMAGES else -b[0])
             joints, view = tuple(i + 1 for i in one.joints), "" if one.view is None else VIEWS[one.view]
             first, left = int(detections.pose[onset]), square
             best = ModelError(one.kind, joints, view, size, 0.0, abs(size), first)
