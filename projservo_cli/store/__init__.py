@@ -150,7 +150,8 @@ def save(run: Run) -> Run:
     stream = io.BytesIO(image)
     with new_file(run.path, image=stream) as new, labelled(new) as file:
         attributes = {"configuration": run.configuration, "order": json.dumps(list(run.results))}
-        attributes["refuted"] = run.refuted
+        if run.refuted or "refuted" in file.attrs:
+            attributes["refuted"] = run.refuted
         file.attrs.update({"schema": _SCHEMA, "schema_version": SCHEMA_VERSION, **attributes})
         for name, result in run.results.items():
             if name in written:
