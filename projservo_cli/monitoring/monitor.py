@@ -7,6 +7,7 @@ import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import predict
+from projservo_cli.monitoring.accuracy import Posture
 from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
@@ -189,6 +190,26 @@ class ImageMonitor:
         while not self.fault and (pair := self._pairing.next(at_rest)) is not None:
             self._take(pair)
         return self.fault
+
+    def undetected_mm(self, q: FloatArray, used: BoolArray, posture: Posture) -> float:
+        """Return how far off the face may be at joints (n,) by what no test tells from none, mm.
+
+        used : (2, m) markers of the calibration by which a law measures it, all of them; posture : at q.
+        """
+        if not self._kept:
+            return 0.0
+        used, rest = used[:, self._shown], np.zeros(2)
+        pair = FramePair(
+            t=rest,
+            q=np.stack([q, q]),
+            q_dot=np.zeros((2, len(q))),
+            sigma_t=rest,
+            images=np.where(used[..., None], np.zeros(2), np.nan),
+            noise=np.ones(used.shape),
+            curved=np.zeros(len(q)),
+        )
+        carry = posture.carry(self.calibration.M, used)
+        return self._detector.undetected(carry, self._errors.residual(pair), self._kept[-1].pair.sigma_t)
 
     def give_up(self) -> str:
         """Return the fault that is pending, by the observations so far."""

@@ -21,9 +21,11 @@ from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
+from projservo_cli.monitoring.accuracy import Posture
 from projservo_cli.records import (
     MM,
     VIEWS,
+    BoolArray,
     Calibration,
     FloatArray,
     InputError,
@@ -41,6 +43,7 @@ from projservo_cli.robots.contract import at_rest_after
 from projservo_cli.robots.plugins import what_failed
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.ideal import AnalyticPlant, Plant
+from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import external_robot
 from projservo_cli.stages.given import ServoInputs
 from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
@@ -188,28 +191,33 @@ _SAME_START, _SAME_GOAL_PX = 1e-6, 10.0
 
 
 def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
-    """Estimate how far the face ended from the goal across the lines of sight, mm, by its size in the images.
+    """Estimate how far the face ended from the goal, rms mm: by images, and by what no test tells from none.
 
-    None if the size is unknown, or images disagree with the calibration.
+    None if no length on the face is known, or images disagree with the calibration.
     """
-    scenario, lengths = run.scenario, run.scenario.given.lengths
-    s_star = scenario.ends.by_points().s_star
-    m = s_star.shape[1]
-    s, noise = run.log.s[run.steps, :, :m], [_LEAST_NOISE_PX, scenario.noise_px]
-    if scenario.calibration is not None:
-        noise.append(scenario.calibration.sigma_px)
+    scenario, calibration, m = run.scenario, run.scenario.calibration, run.scenario.m
+    noise = [_LEAST_NOISE_PX, scenario.noise_px, 0.0 if calibration is None else calibration.sigma_px]
     left = _rms(run.log.fit[run.steps, 1:2], 2.0 * views[-1:] - COORDINATES)[0]
     untested = run.driven is not None and scenario.untested
     if run.verdict in ("fault detected", "failed") or untested or left > _AGREES * max(noise):
         return None
-    # The pair of corners with the least foreshortening gives the size of a pixel on the face.
-    span = np.linalg.norm(s[:, :, None] - s[:, None], axis=3)
-    known = np.isfinite(lengths) & (lengths > 0.0)
-    if not known.any() or not np.isfinite(s).all():
+    numbers, q, known = scenario.numbers_of(run.law), run.log.read[run.steps], calibration or scenario.truth
+    assert known is not None
+    M = known.of(numbers) if isinstance(known, Truth) else known.M[known.indices_of(numbers)]
+    s, s_star = run.log.s[run.steps], scenario.images_for(run.law).s_star
+    posture = Posture(scenario.model, q, M[:m], scenario.given.lengths)
+    if not posture.known or not np.isfinite(s[:, :m]).all():
         return None
-    m_per_px = 1.0 / np.max(span[:, known] / lengths[known], axis=1)
-    off = np.sqrt(np.mean(np.sum((s - s_star) ** 2, axis=2), axis=1))
-    return float(MM * math.sqrt(np.mean((m_per_px * off) ** 2)))
+    used: BoolArray = np.isfinite(s + s_star)[..., 0]
+    off = np.where(used[..., None], s - s_star, 0.0).ravel()
+    # By all markers that the law measures with, and by the face itself.
+    measured = (used, used & (np.arange(len(numbers)) < m))
+    parts = [max(float(np.linalg.norm(posture.carry(M, by) @ off)) for by in measured)]
+    if calibration is not None and run.driven is not None and run.driven.monitor is not None:
+        every = np.zeros((2, len(calibration.marker)), dtype=np.bool_)
+        every[:, calibration.indices_of(numbers)] = used
+        parts.append(run.driven.monitor.undetected_mm(q, every, posture))
+    return float(np.linalg.norm(parts))
 
 
 def _replanned(replannings: tuple[str, ...]) -> list[str]:
