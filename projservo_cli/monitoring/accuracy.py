@@ -1,11 +1,22 @@
 """Accuracy of an arrival: pixels by which images are off, or may be, carried to the face in millimetres."""
 
+from dataclasses import replace
+from typing import NamedTuple
+
 import numpy as np
+from scipy.linalg import expm
+from scipy.special import chdtri
 
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.metric.frame import invariant_upgrade
-from projservo_cli.monitoring.statistics import rigid_motions
-from projservo_cli.records import MM, PRISMATIC, BoolArray, FloatArray, InputError, Model
+from projservo_cli.monitoring.frame_pairs import FramePair
+from projservo_cli.monitoring.statistics import TOLD, ErrorModel, rigid_motions
+from projservo_cli.records import MM, PRISMATIC, BoolArray, Calibration, FloatArray, InputError, Model
+
+# Variance of corners from a side that the calibration has not seen, over that of others; chance of a test.
+_UNUSUAL, _CHANCE = 2.0, 1e-4
+# Steps of Gauss and Newton towards a pose, and the change of pixels, px, that ends them.
+_STEPS, _SETTLED_PX = 20, 1e-6
 
 
 class Posture:
@@ -58,3 +69,69 @@ class Posture:
         assert self._moves is not None
         J = np.where(used[..., None, None], self._changes(M)[0], 0.0).reshape(4 * len(M), -1)
         return np.asarray(self._moves.T @ np.linalg.pinv(J))
+
+
+class RigidFit(NamedTuple):
+    """Images of one instant against the calibrated tool in any pose, whether joints reach it or not."""
+
+    rms_px: float  # residual of a coordinate
+    limit_px: float  # of it by chance, with the deviations of the images and of the calibration
+    seen: BoolArray  # (2, m)
+    shift: FloatArray  # (2, 2) by which each image seems to be shifted, u and v, px
+    covariance: FloatArray  # (2, 2, 2) of it
+    excess: float  # the largest χ² of these over its limit by chance
+
+    @property
+    def agrees(self) -> bool:
+        """Whether chance explains what is left, and each shift."""
+        return self.rms_px <= self.limit_px and self.excess <= 1.0
+
+    def off_mm(self, posture: Posture, M: FloatArray) -> float:
+        """Return how far off the face may be, mm, where one of the images is shifted within chance."""
+        carry = posture.carry(M, self.seen).reshape(-1, 2, len(M), 2).sum(axis=2)
+        squares = [
+            np.square(carry[:, v] @ self.shift[v]).sum()
+            + TOLD**2 * np.trace(carry[:, v] @ self.covariance[v] @ carry[:, v].T)
+            for v in (0, 1)
+        ]
+        return float(np.sqrt(max(squares)))
+
+
+def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma: FloatArray) -> RigidFit:
+    """Fit the pose of the tool to images, from joints (n,), rad or m.
+
+    images : (2, m, 2) px of the markers of the calibration, NaN where unseen; sigma : (2, m) deviations.
+    """
+    c, a_inf = calibration, calibration.a_inf
+    twists, seen = rigid_motions(c.H_hat_0, np.linalg.svd(a_inf[None])[2][1:], a_inf), np.isfinite(images)
+    for _ in range(_STEPS):
+        there = Parameters(c.P, c.H_hat_0, c.prismatic, c.M, c.lens).everywhere((q - c.q_reference)[None])
+        J = there.by_point[-1] @ np.moveaxis(c.M @ twists.swapaxes(1, 2), 0, -1)
+        step = np.linalg.lstsq(J[seen], (images - there.pixels)[seen], rcond=None)[0]
+        c = replace(c, M=c.M @ expm(np.tensordot(step, twists, 1)).T)
+        if np.abs(J[seen] @ step).max() < _SETTLED_PX:
+            break
+    errors = ErrorModel(c, c.sigma_px)
+    at = errors.residual(still(q, images, np.maximum(sigma, c.sigma_px)))
+    shown = np.repeat(at.seen.ravel(), 2)
+    inverse = np.linalg.inv((at.R + at.B @ at.B.T)[np.ix_(shown, shown)])
+    J, r = J.reshape(len(shown), -1)[shown], at.r[shown]
+    P = inverse - inverse @ J @ np.linalg.pinv(J.T @ inverse @ J) @ J.T @ inverse
+    freedom, bias = len(r) - J.shape[1], 2.0 * (np.square(errors.bias_px / at.noise) * at.seen).sum()
+    rms = float(np.sqrt(np.mean(r**2)))
+    over = float(r @ P @ r) / (_UNUSUAL * chdtri(freedom, _CHANCE) + bias)
+    shift, covariance, excess = np.zeros((2, 2)), np.zeros((2, 2, 2)), 0.0
+    for v in (0, 1):
+        one = (np.arange(2)[:, None, None] == v) & np.ones(at.seen.shape, dtype=np.bool_)[..., None]
+        F = (one[..., None] * np.eye(2)).reshape(len(shown), 2)[shown]
+        covariance[v] = np.linalg.inv(F.T @ P @ F)
+        shift[v] = covariance[v] @ F.T @ P @ r
+        gain = float(shift[v] @ F.T @ P @ r)
+        excess = max(excess, gain / (_UNUSUAL * chdtri(2, _CHANCE) + bias))
+    return RigidFit(rms, rms / np.sqrt(over), at.seen, shift, covariance, excess)
+
+
+def still(q: FloatArray, images: FloatArray, noise: FloatArray) -> FramePair:
+    """Observation of an arm that stands still at joints (n,), of pixels (2, m, 2) with deviations (2, m)."""
+    none = np.zeros(2)
+    return FramePair(none, np.stack([q, q]), np.zeros((2, len(q))), none, images, noise, np.zeros(len(q)))

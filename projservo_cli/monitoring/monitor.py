@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import predict
-from projservo_cli.monitoring.accuracy import Posture
+from projservo_cli.monitoring.accuracy import Posture, still
 from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
@@ -198,16 +198,8 @@ class ImageMonitor:
         """
         if not self._kept:
             return 0.0
-        used, rest = used[:, self._shown], np.zeros(2)
-        pair = FramePair(
-            t=rest,
-            q=np.stack([q, q]),
-            q_dot=np.zeros((2, len(q))),
-            sigma_t=rest,
-            images=np.where(used[..., None], np.zeros(2), np.nan),
-            noise=np.ones(used.shape),
-            curved=np.zeros(len(q)),
-        )
+        used = used[:, self._shown]
+        pair = still(q, np.where(used[..., None], np.zeros(2), np.nan), np.ones(used.shape))
         carry = posture.carry(self.calibration.M, used)
         return self._detector.undetected(carry, self._errors.residual(pair), self._kept[-1].pair.sigma_t)
 

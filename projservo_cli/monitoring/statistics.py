@@ -49,7 +49,7 @@ _DIFFERENCES, _MEDIAN, _MEDIAN_AT_MOST = 9, 1.386, 5.6
 # χ² of a detection that may be off by itself: once in ten thousand by chance.
 _OFF_ALONE = 18.4
 # Share of the views after which a fault that grows is seen nearly whole; deviations that are told from none.
-_LATE, _TOLD = 2.0 / 3.0, 2.0
+_LATE, TOLD = 2.0 / 3.0, 2.0
 # Share of the markers of a view that may be off one by one before the view itself is.
 _MOST_ASIDE = 0.5
 
@@ -661,25 +661,25 @@ class Detector:
         """Return how far off a measurement may be by what no test tells from none.
 
         Of each direction of a fault but those of joints and instants: what observations show of it since the
-        first, and since two thirds of them, for one that grows, and two deviations of that. The largest is
-        returned: a fault has one cause.
+        first, of a camera also since two thirds of them, since it may drift, and two deviations of that. The
+        largest is returned: a fault has one cause.
 
         carry : (k, 4 m) from changes of pixels to what is measured; at : images where it is measured.
         Source: W. Baarda, "A testing procedure for use in geodetic networks", Delft 1968, on external
         reliability.
         """
-        total, onsets = self.memory.total, self.memory.onsets()
+        total, onsets, n = self.memory.total, self.memory.onsets(), len(self._errors.sigma_q)
         if not onsets:
             return 0.0
         late, greatest = min(onsets, key=lambda sums: abs(sums.views - _LATE * total.views)), 0.0
-        for since in (onsets[0], late):
+        cameras = 2 * n + 2 + 2 * (CAMERA - 1)
+        for since, end in ((onsets[0], self._errors.f), (late, cameras)):
             reduced = self._reduced(since, total, sigma_t, [])
-            corners = (total.seen - since.seen).sum()
-            lasting = (1.0 - _one_of(since, total)) * self.memory.persistent
-            lasting += (total.bias - since.bias).sum() / corners
+            lasting = max(0.0, 1.0 - _one_of(since, total)) * self.memory.persistent
+            lasting += (total.bias - since.bias).sum() / (total.seen - since.seen).sum()
             spread = reduced.normal[:-1, :-1] + lasting * self._spread(since, total, reduced)
             for part in self._errors.parts:
-                if part[0] < 2 * len(self._errors.sigma_q) + 2:
+                if not 2 * n + 2 <= part[0] < end:
                     continue
                 size = np.sqrt(np.maximum(reduced.normal.diagonal(), 1e-300))[part]
                 unit, block = np.outer(size, size), np.ix_(part, part)
@@ -687,7 +687,7 @@ class Detector:
                 found = carry @ at.F[:, part] @ inverse
                 off = np.square(found @ reduced.normal[part, -1]).sum()
                 may = np.trace(found @ spread[block] @ found.T)
-                greatest = max(greatest, float(off + _TOLD**2 * may))
+                greatest = max(greatest, float(off + TOLD**2 * may))
         return float(np.sqrt(greatest))
 
     def _root_gains(self, reduced: _Reduced, more: FloatArray | float) -> FloatArray:

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from projservo_cli.calibration.prediction import predict
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.loop.batch import begin
+from projservo_cli.monitoring.accuracy import RigidFit, rigid_fit
 from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.records import (
@@ -21,7 +21,6 @@ from projservo_cli.records import (
     Calibration,
     FloatArray,
     InputError,
-    IntArray,
     JointLimits,
     Model,
     Plan,
@@ -81,8 +80,8 @@ def _joint_motions(state: State) -> FloatArray:
 # What noise and calibration may leave of images that the joints can reach, px rms per marker and view.
 LEFT_PX = 3.0
 STAGES = 20
-# A marker may be off by so many times what half of them are allowed.
-_ALONE = 4.0
+# Median error, px, of a pose from which that of the tool is fitted where joints cannot show goal images.
+_FROM_PX = 20.0
 
 
 def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: FloatArray) -> None:
@@ -130,16 +129,16 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
 
 
 def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
-    """Refuse goal images that the calibration contradicts, with a WorkFailed.
+    """Refuse goal images that the calibration contradicts or no pose of the tool shows, with a WorkFailed.
 
-    Images without joint readings are tested where the arm shows them best.
+    Images without joint readings are tested where the arm shows them best; what fewer joints than six do not
+    show is said with the plan.
     """
     task = scenario.inputs.task
     images = task.goal.images if task is not None else None
-    # What fewer joints cannot show is refused with the plan.
-    if images is None or (images.joints is None and len(calibration.joint_types) < COORDINATES):
+    if images is None:
         return
-    pixels = images.pixels()
+    pixels, enough = images.pixels(), len(calibration.joint_types) >= COORDINATES
     numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
     sigma = 0.0
     if images.joints is not None:
@@ -148,37 +147,36 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
         stated = images.sigma_px(scenario.numbers[: scenario.m])
         sigma = scenario.noise_px if stated is None else stated
         known = np.isin(numbers, calibration.marker)
-        q = _joints_at(scenario, calibration, numbers[known], seen[:, known], max(NEAR_PX, 2.0 * sigma))
+        near_px = max(NEAR_PX, 2.0 * sigma) if enough else _FROM_PX
+        shown = numbers[known].tolist(), seen[:, known]
+        q, median = joints_showing(calibration, *shown, scenario.exact.q_start, near_px)
         advice = (
             "take the images again, or give their deviations (sigma_left_px and sigma_right_px of "
             "task.goal.images)"
         )
-    if fault := detected_fault(calibration, q, numbers, seen, scenario.demands.image_size, sigma):
+        if enough and median > near_px:
+            raise WorkFailed(
+                f"the goal images fit no pose of the arm: the nearest leaves a median of {median:.3g} px a "
+                "marker; check which image is of which camera, and the marker numbers; then take them again"
+            )
+    size = scenario.demands.image_size
+    tested = images.joints is not None or enough
+    if tested and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
         raise WorkFailed(f"the goal was taught after a change since the calibration: {fault}; {advice}")
+    if calibration.has_covariance and (whole := scenario.goal_pixels) is not None:
+        _require_rigid(rigid_fit(calibration, q, *whole), advice)
 
 
-def _joints_at(
-    scenario: Scenario, calibration: Calibration, numbers: IntArray, seen: FloatArray, near_px: float
-) -> FloatArray:
-    """Joints (n,) at which the arm shows goal images (2, b, 2), rad or m.
-
-    Raises WorkFailed where it shows them nowhere, or one marker far from its place.
-    """
-    q, median = joints_showing(calibration, numbers.tolist(), seen, scenario.exact.q_start, near_px)
-    each = np.linalg.norm(predict(calibration, q[None])[0][:, calibration.indices_of(numbers)] - seen, axis=2)
-    again = "check which image is of which camera, and the marker numbers; then take them again"
-    if median > near_px:
-        rms = np.sqrt(np.nanmean(each**2))
+def _require_rigid(fit: RigidFit, advice: str) -> None:
+    """Refuse goal images of which chance does not explain what the nearest pose of the tool leaves."""
+    if not fit.agrees:
+        view = int(np.argmax(np.linalg.norm(fit.shift, axis=1)))
+        u, v = fit.shift[view]
         raise WorkFailed(
-            f"the goal images fit no pose of the arm: the nearest leaves {rms:.3g} px rms a marker; {again}"
+            f"the goal images fit no pose of the tool: the nearest leaves {fit.rms_px:.3g} px rms a "
+            f"coordinate, their deviations explain {fit.limit_px:.3g} px; most alike is a {VIEWS[view]} image "
+            f"that is shifted by ({u:.2g}, {v:.2g}) px; {advice}"
         )
-    view, k = np.unravel_index(int(np.nanargmax(each)), each.shape)
-    if each[view, k] > _ALONE * near_px:
-        raise WorkFailed(
-            f"the goal images fit no pose of the arm: marker {numbers[k]} is {each[view, k]:.3g} px off in "
-            f"the {VIEWS[view]} one, {_ALONE * near_px:.3g} px are allowed; {again}"
-        )
-    return q
 
 
 def plan_task(

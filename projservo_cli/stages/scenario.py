@@ -148,6 +148,22 @@ class Scenario:
         """Images of the goal that are given."""
         return None if self.inputs.task is None else self.inputs.task.goal.images
 
+    @property
+    def goal_pixels(self) -> tuple[FloatArray, FloatArray] | None:
+        """Images (2, m, 2) that are given of the goal, px, and their deviations (2, m).
+
+        They are of the markers of the calibration, NaN where unseen; zero for unknown deviations. None without
+        such images.
+        """
+        if self._given is None or self.calibration is None:
+            return None
+        numbers, pixels = self.calibration.marker.tolist(), self._given.pixels()
+        images = np.array([pixels.get(number, _UNSEEN) for number in numbers]).swapaxes(0, 1)
+        known = [number in pixels for number in numbers]
+        sigma = np.zeros((2, len(numbers)))
+        sigma[:, known] = np.nan_to_num(self._given.deviations([k for k in numbers if k in pixels]))
+        return images, sigma
+
     def images_at(self, seed: int) -> TaskImages:
         """Start and goal as the images of a seed show them, which are averages."""
         if self.inputs.scene is not None:

@@ -21,7 +21,7 @@ from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
-from projservo_cli.monitoring.accuracy import Posture
+from projservo_cli.monitoring.accuracy import Posture, rigid_fit
 from projservo_cli.records import (
     MM,
     VIEWS,
@@ -217,6 +217,8 @@ def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
         every = np.zeros((2, len(calibration.marker)), dtype=np.bool_)
         every[:, calibration.indices_of(numbers)] = used
         parts.append(run.driven.monitor.undetected_mm(q, every, posture))
+    if calibration is not None and calibration.has_covariance and (goal := scenario.goal_pixels) is not None:
+        parts.append(rigid_fit(calibration, q, *goal).off_mm(posture, calibration.M))
     return float(np.linalg.norm(parts))
 
 
