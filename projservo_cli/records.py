@@ -738,8 +738,15 @@ class Trace:
     )
     estimated_position_error_mm: float | None = _scalar(
         "mm",
-        "estimated distance of the face from the goal across the lines of sight, by its size in "
-        "the images; none if no size is known, or images disagree with the calibration",
+        "estimated distance of the face from the goal, rms: by the images, with undetected_position_error_mm "
+        "and what goal images leave open; none if no length on the face is known, or images disagree with "
+        "the calibration",
+        default=None,
+    )
+    undetected_position_error_mm: float | None = _scalar(
+        "mm",
+        "part of it: by what no test tells from none, at two deviations, such as tags that moved less than "
+        "backlash hides; none if images are not tested",
         default=None,
     )
     success: bool | None = _scalar(

@@ -174,8 +174,8 @@ def _require_rigid(fit: RigidFit, advice: str) -> None:
         u, v = fit.shift[view]
         raise WorkFailed(
             f"the goal images fit no pose of the tool: the nearest leaves {fit.rms_px:.3g} px rms a "
-            f"coordinate, their deviations explain {fit.limit_px:.3g} px; most alike is a {VIEWS[view]} image "
-            f"that is shifted by ({u:.2g}, {v:.2g}) px; {advice}"
+            f"coordinate, their deviations explain {fit.limit_px:.3g} px; most alike is a {VIEWS[view]} "
+            f"image that is shifted by ({u:.2g}, {v:.2g}) px; {advice}"
         )
 
 

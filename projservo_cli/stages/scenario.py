@@ -152,8 +152,8 @@ class Scenario:
     def goal_pixels(self) -> tuple[FloatArray, FloatArray] | None:
         """Images (2, m, 2) that are given of the goal, px, and their deviations (2, m).
 
-        They are of the markers of the calibration, NaN where unseen; zero for unknown deviations. None without
-        such images.
+        They are of the markers of the calibration, NaN where unseen; deviations are zero where unknown. None
+        without such images.
         """
         if self._given is None or self.calibration is None:
             return None

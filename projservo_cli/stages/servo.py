@@ -148,7 +148,7 @@ class _Outcome:
             goal_pose=goal_pose,
             center=center if simulated else np.full_like(center, np.nan),
             unplanned=self.unplanned,
-            estimated_position_error_mm=_estimated_mm(self, views),
+            **_stated_mm(self, views),
             untested="" if driven is None else scenario.untested,
             overruns=None if driven is None else driven.steered.overruns,
             latency=None if driven is None else _whole(driven.delays, rows),
@@ -190,36 +190,36 @@ _HARDLY = 0.01
 _SAME_START, _SAME_GOAL_PX = 1e-6, 10.0
 
 
-def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
-    """Estimate how far the face ended from the goal, rms mm: by images, and by what no test tells from none.
+def _stated_mm(run: _Outcome, views: FloatArray) -> dict[str, Any]:
+    """State how far the face ended from the goal, rms mm: by images, and by what no test tells from none.
 
-    None if no length on the face is known, or images disagree with the calibration.
+    Nothing if no length on the face is known, or images disagree with the calibration.
     """
     scenario, calibration, m = run.scenario, run.scenario.calibration, run.scenario.m
     noise = [_LEAST_NOISE_PX, scenario.noise_px, 0.0 if calibration is None else calibration.sigma_px]
     left = _rms(run.log.fit[run.steps, 1:2], 2.0 * views[-1:] - COORDINATES)[0]
     untested = run.driven is not None and scenario.untested
     if run.verdict in ("fault detected", "failed") or untested or left > _AGREES * max(noise):
-        return None
+        return {}
     numbers, q, known = scenario.numbers_of(run.law), run.log.read[run.steps], calibration or scenario.truth
     assert known is not None
     M = known.of(numbers) if isinstance(known, Truth) else known.M[known.indices_of(numbers)]
     s, s_star = run.log.s[run.steps], scenario.images_for(run.law).s_star
     posture = Posture(scenario.model, q, M[:m], scenario.given.lengths)
     if not posture.known or not np.isfinite(s[:, :m]).all():
-        return None
+        return {}
     used: BoolArray = np.isfinite(s + s_star)[..., 0]
     off = np.where(used[..., None], s - s_star, 0.0).ravel()
     # By all markers that the law measures with, and by the face itself.
     measured = (used, used & (np.arange(len(numbers)) < m))
-    parts = [max(float(np.linalg.norm(posture.carry(M, by) @ off)) for by in measured)]
+    parts, found = [max(float(np.linalg.norm(posture.carry(M, by) @ off)) for by in measured)], {}
     if calibration is not None and run.driven is not None and run.driven.monitor is not None:
         every = np.zeros((2, len(calibration.marker)), dtype=np.bool_)
         every[:, calibration.indices_of(numbers)] = used
-        parts.append(run.driven.monitor.undetected_mm(q, every, posture))
+        found["undetected_position_error_mm"] = run.driven.monitor.undetected_mm(q, every, posture)
     if calibration is not None and calibration.has_covariance and (goal := scenario.goal_pixels) is not None:
         parts.append(rigid_fit(calibration, q, *goal).off_mm(posture, calibration.M))
-    return float(np.linalg.norm(parts))
+    return found | {"estimated_position_error_mm": float(np.linalg.norm([*parts, *found.values()]))}
 
 
 def _replanned(replannings: tuple[str, ...]) -> list[str]:
@@ -274,7 +274,7 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
     rest = f"{' and '.join(left)} {'are' if len(left) > 1 else 'is'} left"
     at_limit = in_unit(float(log.read[steps, joint]), run.scenario.joints.units[joint])
     reasons = {
-        "converged": f"image error {error:.3g} px is within {within:.3g} px",
+        "converged": f"image error {error:.3g} px is within {within:.3g} px{_apart(run)}",
         "no progress": f"the robot stands still at an image error of {error:.3g} px: {run.why}"
         if run.why
         else f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
@@ -297,6 +297,17 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
         obstruction = obstruction_of(run.driven.robot.robot)
     blind = "" if run.verdict == "converged" else _blind_view(log.s[: steps + 1], limits.stall_periods)
     return "; ".join(filter(None, (reasons[run.verdict], blind, obstruction)))
+
+
+def _apart(run: _Outcome) -> str:
+    """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
+    seen, most = float(run.log.error[run.steps]), run.scenario.limits.image_error_px
+    if not seen > most:
+        return ""
+    return (
+        f"; the markers of the face are seen {seen:.3g} px off ({most:.3g} px by noise): they do not sit on "
+        "the tool as when the goal was taught: teach it again, or put back what moved"
+    )
 
 
 def _blind_view(s: FloatArray, window: int) -> str:
