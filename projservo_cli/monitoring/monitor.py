@@ -1,6 +1,7 @@
 """Monitor of a run: tests each observation, holds the arm while they disagree, and names the fault."""
 
 from collections import deque
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +47,8 @@ _LEFT = 0.15
 # Share of the pixels that images are off by which a cause changes them at least: backlash that is
 # more than the calibration found is no turn of a camera by the rest.
 _LEAST_PART = 0.2
+# A tag that is off by less than this share of its side is neither turned by quarters nor exchanged.
+_SIDE = 0.5
 # A corner that is off by less, px, from one side of the tool may be an edge that the finder took for another.
 _LEAST_MOVED_PX = 1.0
 # Share of the markers that a view saw shortly before: one that sees less is covered by something.
@@ -479,14 +482,19 @@ def detected_fault(
 
     def fault_of(pixels: FloatArray) -> str:
         sigma = max(calibration.sigma_px, sigma_px)
-        monitor = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size)
-        monitor.observe(instants, np.stack([q, q]), rest, instants, pixels, new)
+        monitor, both = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size), np.stack([q, q])
+        monitor.observe(instants, both, rest, instants, pixels, new)
+        for k in range(1, _NAMED_AT[0] * bool(monitor.rejected.any() and not monitor.pending)):
+            monitor.observe(instants + k, both, rest, instants, pixels, new)
         return monitor.give_up()
 
+    expected = predict(calibration, q[None])[0]
+    if misplaced := _misplaced(pixels, expected, calibration.marker):
+        return misplaced
     fault = fault_of(pixels)
     if not fault:
         return ""
-    off, tags = pixels - predict(calibration, q[None])[0], calibration.marker // CORNERS
+    off, tags = pixels - expected, calibration.marker // CORNERS
     for _ in range(len(np.unique(tags[np.isfinite(off).any(axis=(0, 2))])) // 2):
         tag = _off_alone(off, calibration.marker)
         if not tag.any():
@@ -495,6 +503,43 @@ def detected_fault(
         if not fault_of(pixels):
             return ""
     return fault
+
+
+def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> str:
+    """Say which tags are turned by quarters, or in each other's places, by pixels (2, m, 2); empty for none.
+
+    If most are, the tool is: its body looks alike from several sides.
+    """
+    tags = {int(tag): np.flatnonzero(numbers // CORNERS == tag) for tag in np.unique(numbers // CORNERS)}
+    tags = {tag: at for tag, at in tags.items() if len(at) == CORNERS and np.isfinite(pixels[:, at]).any()}
+    found: dict[int, tuple[int, int]] = {}
+
+    def rms(tag: int, place: int, turn: int) -> float:
+        off = pixels[:, tags[tag]] - np.roll(expected[:, tags[place]], turn, axis=1)
+        return float(np.sqrt(np.nanmean(np.square(off).sum(axis=-1))))
+
+    for tag, at in tags.items():
+        side = np.linalg.norm(expected[:, at] - np.roll(expected[:, at], 1, axis=1), axis=-1).mean()
+        own, best = rms(tag, tag, 0), min(product(tags, range(CORNERS)), key=lambda to: rms(tag, *to))
+        if own > _SIDE * side and best != (tag, 0) and rms(tag, *best) < _LEFT * own:
+            found[tag] = best
+    words = {2: "upside down"}
+    said = [
+        f"tag {tag} is {words.get(turn, 'turned by a quarter')}"
+        for tag, (place, turn) in found.items()
+        if place == tag
+    ]
+    for tag, (place, _) in found.items():
+        back = found.get(place, (place, 0))[0]
+        if place != tag and (back != tag or tag < place):
+            said.append(
+                f"tags {tag} and {place} are exchanged"
+                if back == tag
+                else f"tag {tag} is in the place of tag {place}"
+            )
+    if not found or 2 * len(found) > len(tags):
+        return ""
+    return f"{' and '.join(said)} on the tool; put them back as they were, or recalibrate"
 
 
 def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:

@@ -48,6 +48,8 @@ _AT_REST_PX, _ENOUGH = 0.2, 100.0
 _DIFFERENCES, _MEDIAN, _MEDIAN_AT_MOST = 9, 1.386, 5.6
 # χ² of a detection that may be off by itself: once in ten thousand by chance.
 _OFF_ALONE = 18.4
+# Minimum information on a direction, in units of its deviations: one that no image shows has some.
+_LEAST_INFORMATION = 1e-12
 # Share of the views after which a fault that grows is seen nearly whole; deviations that are told from none.
 _LATE, TOLD = 2.0 / 3.0, 2.0
 # Share of the markers of a view that may be off one by one before the view itself is.
@@ -681,7 +683,7 @@ class Detector:
             for part in self._errors.parts:
                 if not 2 * n + 2 <= part[0] < end:
                     continue
-                size = np.sqrt(np.maximum(reduced.normal.diagonal(), 1e-300))[part]
+                size = np.sqrt(np.maximum(reduced.normal.diagonal(), _LEAST_INFORMATION))[part]
                 unit, block = np.outer(size, size), np.ix_(part, part)
                 inverse = np.linalg.inv(reduced.normal[block] / unit + RIDGE * np.eye(len(part))) / unit
                 found = carry @ at.F[:, part] @ inverse
