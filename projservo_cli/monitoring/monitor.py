@@ -124,6 +124,7 @@ class ImageMonitor:
         self.calibration = calibration.with_markers(self._shown)
         known = image_size is not None and bool(np.isfinite(image_size).all())
         self._centre = 0.5 * (np.asarray(image_size) - 1.0) if known else None
+        self._image_size, self._sigma_px = image_size if known else None, sigma_px
         self._errors = ErrorModel(self.calibration, sigma_px)
         self._detector = Detector(self._errors, max_observations)
         self._pairing = Pairing()
@@ -193,6 +194,19 @@ class ImageMonitor:
         while not self.fault and (pair := self._pairing.next(at_rest)) is not None:
             self._take(pair)
         return self.fault
+
+    def fault_at_rest(self) -> str:
+        """Return the fault that the mean of the last observations of one posture shows; empty for none."""
+        last = [one.pair for one in self._kept if one.view == self._view]
+        last = [one for one in last if np.abs(one.q - last[-1].q).max() <= _AT_REST]
+        if not last or self.pending:
+            return self.fault
+        images = np.array([one.images for one in last])
+        often = 2 * np.isfinite(images).sum(axis=0) > len(last)
+        mean = np.full(images.shape[1:], np.nan)
+        mean[often] = np.nanmean(images[:, often], axis=0)
+        q, numbers = np.mean([one.q for one in last], axis=(0, 1)), self.calibration.marker
+        return detected_fault(self.calibration, q, numbers, mean, self._image_size, self._sigma_px)
 
     def undetected_mm(self, q: FloatArray, used: BoolArray, posture: Posture) -> float:
         """Return how far off the face may be at joints (n,) by what no test tells from none, mm.
@@ -552,7 +566,7 @@ def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:
     worst, farthest = np.zeros(len(numbers), dtype=np.bool_), 0.0
     for tag in np.unique(tags):
         one = np.isin(tags, tag)
-        if (2 * seen[:, one].sum(axis=1) >= seen.sum(axis=1)).any() or not seen[:, one].any():
+        if (2 * seen[:, one].sum(axis=1) > seen.sum(axis=1)).any() or not seen[:, one].any():
             continue
         against = off[:, one] - np.nanmedian(off[:, ~one], axis=1, keepdims=True)
         rms = float(np.sqrt(np.nanmean(np.square(against).sum(axis=-1))))

@@ -228,16 +228,22 @@ class DrivenRobot:
             self.joints()
             self.observe()
             if self.disturbance or self._agreed(look):
-                return self.disturbance
+                return self.at_rest()
             if self.monitor is None or self.monitor.observations > tested:
                 continue  # the next observation shows another image
             if not self.robot.waits(self.robot.bounds.period):  # time passes in commands alone
                 if look >= WINDOW and self.monitor.agreeing and not self.pending:
-                    return ""
+                    return self.at_rest()
                 if look >= WINDOW:
                     self.steered.hold()
         if self.pending:
             self.give_up()
+        return self.disturbance
+
+    def at_rest(self) -> str:
+        """Return the fault that images show by the test of one posture, that of ``doctor``; else empty."""
+        if self.monitor is not None:
+            self.disturbance = self.disturbance or self.monitor.fault_at_rest()
         return self.disturbance
 
     def _agreed(self, observations: int) -> bool:

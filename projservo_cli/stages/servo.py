@@ -20,7 +20,16 @@ from projservo_cli.loop.metrics import Ended, Summary, angle_between, path_devia
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.settling import StallMonitor
-from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
+from projservo_cli.loop.step import (
+    CONVERGED,
+    FAULT_DETECTED,
+    PLATEAU_FALL,
+    VERDICTS,
+    Log,
+    new_log,
+    plateau_stretch,
+    tolerance,
+)
 from projservo_cli.monitoring.accuracy import Posture, rigid_fit
 from projservo_cli.records import (
     MM,
@@ -480,6 +489,8 @@ class _Asked:
                 for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
                         raise WorkFailed(f"stopped on the path to the start, since {wrong}")
+                if wrong := driven.at_rest():
+                    raise WorkFailed(f"stopped at the start, since {wrong}")
             driven.begin()
             return self._in_python(controller, driven, StallMonitor(driven, scenario.limits))
 
@@ -505,6 +516,8 @@ class _Asked:
         )
         limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
         driven = plant if isinstance(plant, DrivenRobot) else None
+        if driven is not None and code == CONVERGED and driven.at_rest():
+            code = FAULT_DETECTED
         if driven is not None:  # it moves from sample to sample, in any mode
             path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
             log = log._replace(path=path, parts=np.ones_like(log.parts))

@@ -420,6 +420,16 @@ def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(arm, 
     assert changed in said if changed else said == ""
 
 
+@pytest.mark.parametrize(("off", "changed"), [(0.8, ""), (6.0, "at marker 6")])
+def test_one_of_two_tags_may_be_bent_as_one_of_many(arm, off, changed):
+    q = arm.way(2)[0][-1]
+    two = dataclasses.replace(arm.calibration, sigma_px=0.1).with_markers(np.arange(8))
+    s = noisy(arm.images(at_once(q[None])), 2, 0.1)[0, :, :8]
+    s[:, 4:] += off * np.array(BENT_TAG)
+    said = detected_fault(two, q, two.marker, s, arm.image_size)
+    assert changed in said if changed else said == ""
+
+
 @pytest.mark.parametrize(("off_px", "name"), [(0.6, ""), (2.0, "markers 6, 7 moved on the tool")])
 def test_corners_that_are_off_by_less_than_a_pixel_from_one_side_are_edges(arm, off_px, name):
     """Of two corners of a tag under a slant, in several views but from one side of the tool."""
