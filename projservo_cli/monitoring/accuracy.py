@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.calibration.prediction import Parameters, predict
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.statistics import TOLD, ErrorModel, rigid_motions
@@ -80,6 +81,8 @@ class RigidFit(NamedTuple):
     shift: FloatArray  # (2, 2) by which each image seems to be shifted, u and v, px
     covariance: FloatArray  # (2, 2, 2) of it
     excess: float  # the largest χ² of these over its limit by chance
+    moved_px: float  # difference of the images from those at the joints, px rms a marker
+    turn: float | None  # angle between both, rad; None where the axes of the arm leave their metric open
 
     @property
     def agrees(self) -> bool:
@@ -128,7 +131,19 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
         shift[v] = covariance[v] @ F.T @ P @ r
         gain = float(shift[v] @ F.T @ P @ r)
         excess = max(excess, gain / (_UNUSUAL * chdtri(2, _CHANCE) + bias))
-    return RigidFit(rms, rms / np.sqrt(over), at.seen, shift, covariance, excess)
+    off = np.square(images - predict(calibration, q[None])[0]).sum(axis=-1)[at.seen]
+    moved, turn = float(np.sqrt(off.mean())), _angle(calibration, c.M)
+    return RigidFit(rms, rms / np.sqrt(over), at.seen, shift, covariance, excess, moved, turn)
+
+
+def _angle(calibration: Calibration, M: FloatArray) -> float | None:
+    """Angle, rad, by which markers (m, 4) are turned against those of the calibration."""
+    try:
+        G = invariant_upgrade(calibration.H_hat_0, calibration.prismatic)
+    except (InputError, np.linalg.LinAlgError):
+        return None
+    points = [X[:, :3] / X[:, 3:] for X in (calibration.M @ G.T, M @ G.T)]
+    return float(Rotation.align_vectors(*(X - X.mean(axis=0) for X in points))[0].magnitude())
 
 
 def still(q: FloatArray, images: FloatArray, noise: FloatArray) -> FramePair:

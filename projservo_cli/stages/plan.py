@@ -17,7 +17,6 @@ from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.records import (
     NO_SPREAD,
-    VIEWS,
     Calibration,
     FloatArray,
     InputError,
@@ -26,6 +25,7 @@ from projservo_cli.records import (
     Plan,
     WorkFailed,
     in_sense,
+    in_unit,
 )
 from projservo_cli.stages.given import PlanInputs
 from projservo_cli.stages.motions import (
@@ -80,8 +80,6 @@ def _joint_motions(state: State) -> FloatArray:
 # What noise and calibration may leave of images that the joints can reach, px rms per marker and view.
 LEFT_PX = 3.0
 STAGES = 20
-# Median error, px, of a pose from which that of the tool is fitted where joints cannot show goal images.
-_FROM_PX = 20.0
 
 
 def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: FloatArray) -> None:
@@ -129,53 +127,63 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
 
 
 def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
-    """Refuse goal images that the calibration contradicts or no pose of the tool shows, with a WorkFailed.
+    """Refuse goal images that the calibration contradicts or no pose of the arm shows, with a WorkFailed.
 
-    Images without joint readings are tested where the arm shows them best; what fewer joints than six do not
-    show is said with the plan.
+    Images without joint readings are tested where the arm shows them best.
     """
     task = scenario.inputs.task
     images = task.goal.images if task is not None else None
-    if images is None:
+    if images is None or (whole := scenario.goal_pixels) is None:
         return
-    pixels, enough = images.pixels(), len(calibration.joint_types) >= COORDINATES
+    pixels, size = images.pixels(), scenario.demands.image_size
     numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
-    sigma = 0.0
     if images.joints is not None:
-        q, advice = images.joints.values(calibration.joint_types), "teach it again"
-    else:
-        stated = images.sigma_px(scenario.numbers[: scenario.m])
-        sigma = scenario.noise_px if stated is None else stated
-        known = np.isin(numbers, calibration.marker)
-        near_px = max(NEAR_PX, 2.0 * sigma) if enough else _FROM_PX
-        shown = numbers[known].tolist(), seen[:, known]
-        q, median = joints_showing(calibration, *shown, scenario.exact.q_start, near_px)
-        advice = (
-            "take the images again, or give their deviations (sigma_left_px and sigma_right_px of "
-            "task.goal.images)"
+        q = images.joints.values(calibration.joint_types)
+        if fault := detected_fault(calibration, q, numbers, seen, size):
+            raise WorkFailed(_CHANGED.format(fault=fault, advice="teach it again"))
+        _require_rigid(rigid_fit(calibration, q, *whole), "teach it again")
+        return
+    stated = images.sigma_px(scenario.numbers[: scenario.m])
+    sigma = scenario.noise_px if stated is None else stated
+    known, near_px = np.isin(numbers, calibration.marker), max(NEAR_PX, 2.0 * sigma)
+    shown = numbers[known].tolist(), seen[:, known]
+    q, median = joints_showing(calibration, *shown, scenario.exact.q_start, near_px)
+    enough = len(q) >= COORDINATES
+    if enough and median > near_px:
+        raise WorkFailed(
+            f"the goal images fit no pose of the arm: the nearest leaves a median of {median:.3g} px a "
+            f"marker, {near_px:.3g} px are allowed; check which image is of which camera, and the marker "
+            "numbers; then take them again"
         )
-        if enough and median > near_px:
-            raise WorkFailed(
-                f"the goal images fit no pose of the arm: the nearest leaves a median of {median:.3g} px a "
-                "marker; check which image is of which camera, and the marker numbers; then take them again"
-            )
-    size = scenario.demands.image_size
-    tested = images.joints is not None or enough
-    if tested and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
-        raise WorkFailed(f"the goal was taught after a change since the calibration: {fault}; {advice}")
-    if calibration.has_covariance and (whole := scenario.goal_pixels) is not None:
-        _require_rigid(rigid_fit(calibration, q, *whole), advice)
+    advice = (
+        "take the images again, or give their deviations (sigma_left_px and sigma_right_px of "
+        "task.goal.images)"
+    )
+    fit = rigid_fit(calibration, q, *whole)
+    _require_rigid(fit, advice)
+    if fault := detected_fault(calibration, q, numbers, seen, size, sigma):
+        if enough:
+            raise WorkFailed(_CHANGED.format(fault=fault, advice=advice))
+        turn = "" if fit.turn is None else f"{math.degrees(fit.turn):.2g} deg and "
+        readings = zip(q.tolist(), scenario.joints.units, strict=True)
+        raise WorkFailed(
+            f"the goal is a pose that {len(q)} joints do not reach: the nearest is {turn}{fit.moved_px:.3g} "
+            f"px rms a marker off, at joints {', '.join(in_unit(x, unit, 4) for x, unit in readings)}; move "
+            "the arm to the goal by hand and teach it, or set task.goal.joints to these readings"
+        )
+
+
+_CHANGED = "the goal was taught after a change since the calibration: {fault}; {advice}"
 
 
 def _require_rigid(fit: RigidFit, advice: str) -> None:
     """Refuse goal images of which chance does not explain what the nearest pose of the tool leaves."""
     if not fit.agrees:
-        view = int(np.argmax(np.linalg.norm(fit.shift, axis=1)))
-        u, v = fit.shift[view]
+        u, v = fit.shift[0]
         raise WorkFailed(
             f"the goal images fit no pose of the tool: the nearest leaves {fit.rms_px:.3g} px rms a "
-            f"coordinate, their deviations explain {fit.limit_px:.3g} px; most alike is a {VIEWS[view]} "
-            f"image that is shifted by ({u:.2g}, {v:.2g}) px; {advice}"
+            f"coordinate, their deviations explain {fit.limit_px:.3g} px, as if the left image were shifted "
+            f"by ({u:.2g}, {v:.2g}) px against the right one; {advice}"
         )
 
 

@@ -153,9 +153,9 @@ class Scenario:
         """Images (2, m, 2) that are given of the goal, px, and their deviations (2, m).
 
         They are of the markers of the calibration, NaN where unseen; deviations are zero where unknown. None
-        without such images.
+        without such images, or a covariance to test them by.
         """
-        if self._given is None or self.calibration is None:
+        if self._given is None or self.calibration is None or not self.calibration.has_covariance:
             return None
         numbers, pixels = self.calibration.marker.tolist(), self._given.pixels()
         images = np.array([pixels.get(number, _UNSEEN) for number in numbers]).swapaxes(0, 1)

@@ -226,7 +226,7 @@ def _stated_mm(run: _Outcome, views: FloatArray) -> dict[str, Any]:
         every = np.zeros((2, len(calibration.marker)), dtype=np.bool_)
         every[:, calibration.indices_of(numbers)] = used
         found["undetected_position_error_mm"] = run.driven.monitor.undetected_mm(q, every, posture)
-    if calibration is not None and calibration.has_covariance and (goal := scenario.goal_pixels) is not None:
+    if calibration is not None and (goal := scenario.goal_pixels) is not None:
         parts.append(rigid_fit(calibration, q, *goal).off_mm(posture, calibration.M))
     return found | {"estimated_position_error_mm": float(np.linalg.norm([*parts, *found.values()]))}
 
