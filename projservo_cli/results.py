@@ -454,10 +454,16 @@ class RunTrace(Displayable, Trace):
             "steps": f"{self.steps}, {self.steps * self.period:.4g} s",
             "image error": f"{self.image_error[-1]:.4g} px rms as seen",
         }
+        if self.unplanned:
+            found["plan"] = f"none was followed, the law regulated to the goal: {self.unplanned}"
+        if self.untested:
+            found["images"] = f"not tested against the calibration: {self.untested}"
         if self.features == "body":
             found["image error"] += f", {self.convergence_error[-1]:.4g} px by all markers"
         if self.position_error_mm is not None:
             found["position error"] = f"{self.position_error_mm:.4g} mm"
+        elif self.estimated_position_error_mm is not None:
+            found["position error"] = f"about {self.estimated_position_error_mm:.3g} mm"
         if self.rotation_error_deg is not None:
             found["rotation error"] = f"{self.rotation_error_deg:.4g} deg"
         return found

@@ -11,13 +11,24 @@ from scipy.special import chdtri
 from projservo_cli.calibration.prediction import Parameters, predict
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.monitoring.frame_pairs import FramePair
-from projservo_cli.monitoring.statistics import TOLD, ErrorModel, rigid_motions
+from projservo_cli.monitoring.statistics import TOLD, ErrorModel, relative_to_others, rigid_motions
 from projservo_cli.records import MM, PRISMATIC, BoolArray, Calibration, FloatArray, InputError, Model
 
 # Variance of corners from a side that the calibration has not seen, over that of others; chance of a test.
 _UNUSUAL, _CHANCE = 2.0, 1e-4
+# Share of detections that may be off by themselves, and deviation of a pose that is not known, over noise.
+_ALONE, _FREE = 0.25, 1e4
 # Steps of Gauss and Newton towards a pose, and the change of pixels, px, that ends them.
 _STEPS, _SETTLED_PX = 20, 1e-6
+
+
+def metric_points(model: Model, M: FloatArray) -> FloatArray | None:
+    """Points (m, 3) of markers (m, 4) in the metric of the arm, up to scale; None if axes leave it open."""
+    try:
+        X = M @ invariant_upgrade(model.H_hat_0, model.joint_types == PRISMATIC).T
+    except (InputError, np.linalg.LinAlgError):
+        return None
+    return np.asarray(X[:, :3] / X[:, 3:])
 
 
 class Posture:
@@ -30,7 +41,7 @@ class Posture:
 
     def __init__(self, model: Model, q: FloatArray, face: FloatArray, lengths: FloatArray) -> None:
         self._model, self._away = model, (q - model.q_reference)[None]
-        self._twists = rigid_motions(model.H_hat_0, np.linalg.svd(model.a_inf[None])[2][1:], model.a_inf)
+        self.twists = rigid_motions(model.H_hat_0, np.linalg.svd(model.a_inf[None])[2][1:], model.a_inf)
         has: BoolArray = np.isfinite(lengths) & (lengths > 0.0)
         self.known = bool(has.any())
         self._moves = MM / np.sqrt(len(face)) * self._moved(face, has, lengths) if self.known else None
@@ -41,26 +52,22 @@ class Posture:
         Where the axes of the arm leave its metric open they are those across the lines of sight (d, 2 f 2),
         by the pair of corners with the least foreshortening.
         """
-        model, d = self._model, len(self._twists)
-        try:
-            G = invariant_upgrade(model.H_hat_0, model.joint_types == PRISMATIC)
-        except (InputError, np.linalg.LinAlgError):
-            J, s = self._changes(face)
+        d, X = len(self.twists), metric_points(self._model, face)
+        if X is None:
+            J, s = self.changes(face)
             span = np.linalg.norm(s[:, :, None] - s[:, None], axis=3)
             m_per_px = 1.0 / np.max(span[:, has] / lengths[has], axis=1)
             across: FloatArray = J * (np.sqrt(0.5) * m_per_px[:, None, None, None])
             return np.moveaxis(across, -1, 0).reshape(d, -1)
-        X = face @ G.T
-        X = X[:, :3] / X[:, 3:]
         apart = np.linalg.norm(X[:, None] - X[None], axis=2)
-        moved = (face @ self._twists.swapaxes(1, 2) @ G[:3].T) / (face @ G[3])[:, None]
-        return np.asarray(np.median(lengths[has] / apart[has]) * moved.reshape(d, -1))
+        moved = [metric_points(self._model, face + face @ twist.T) for twist in self.twists]
+        return np.asarray(np.median(lengths[has] / apart[has]) * (np.array(moved) - X).reshape(d, -1))
 
-    def _changes(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def changes(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (2, m, 2, d) of pixels of markers (m, 4) by motions of the tool, and the pixels."""
         model, prismatic = self._model, self._model.joint_types == PRISMATIC
         images = Parameters(model.P, model.H_hat_0, prismatic, M, model.lens).everywhere(self._away)
-        return images.by_point[-1] @ np.moveaxis(M @ self._twists.swapaxes(1, 2), 0, -1), images.pixels
+        return images.by_point[-1] @ np.moveaxis(M @ self.twists.swapaxes(1, 2), 0, -1), images.pixels
 
     def carry(self, M: FloatArray, used: BoolArray) -> FloatArray:
         """Matrix (k, 4 m) from changes of pixels, px, to displacements of the face, mm, whose norm is rms.
@@ -68,36 +75,27 @@ class Posture:
         M : (m, 4) markers at the reference; used : (2, m) those by which the tool is measured.
         """
         assert self._moves is not None
-        J = np.where(used[..., None, None], self._changes(M)[0], 0.0).reshape(4 * len(M), -1)
+        J = np.where(used[..., None, None], self.changes(M)[0], 0.0).reshape(4 * len(M), -1)
         return np.asarray(self._moves.T @ np.linalg.pinv(J))
 
 
 class RigidFit(NamedTuple):
     """Images of one instant against the calibrated tool in any pose, whether joints reach it or not."""
 
+    agrees: bool  # whether chance explains what is left, and the shift
     rms_px: float  # residual of a coordinate
     limit_px: float  # of it by chance, with the deviations of the images and of the calibration
-    seen: BoolArray  # (2, m)
-    shift: FloatArray  # (2, 2) by which each image seems to be shifted, u and v, px
-    covariance: FloatArray  # (2, 2, 2) of it
-    excess: float  # the largest χ² of these over its limit by chance
+    seen: BoolArray  # (2, m) but for detections that are off by themselves
+    shift: FloatArray  # (2,) by which the left image seems to be shifted against the right one, px
+    covariance: FloatArray  # (2, 2) of it
     moved_px: float  # difference of the images from those at the joints, px rms a marker
     turn: float | None  # angle between both, rad; None where the axes of the arm leave their metric open
 
-    @property
-    def agrees(self) -> bool:
-        """Whether chance explains what is left, and each shift."""
-        return self.rms_px <= self.limit_px and self.excess <= 1.0
-
     def off_mm(self, posture: Posture, M: FloatArray) -> float:
         """Return how far off the face may be, mm, where one of the images is shifted within chance."""
-        carry = posture.carry(M, self.seen).reshape(-1, 2, len(M), 2).sum(axis=2)
-        squares = [
-            np.square(carry[:, v] @ self.shift[v]).sum()
-            + TOLD**2 * np.trace(carry[:, v] @ self.covariance[v] @ carry[:, v].T)
-            for v in (0, 1)
-        ]
-        return float(np.sqrt(max(squares)))
+        carry = posture.carry(M, self.seen)[:, : 2 * len(M)].reshape(-1, len(M), 2).sum(axis=1)
+        may = TOLD**2 * np.trace(carry @ self.covariance @ carry.T)
+        return float(np.sqrt(np.square(carry @ self.shift).sum() + may))
 
 
 def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma: FloatArray) -> RigidFit:
@@ -105,45 +103,50 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
 
     images : (2, m, 2) px of the markers of the calibration, NaN where unseen; sigma : (2, m) deviations.
     """
-    c, a_inf = calibration, calibration.a_inf
-    twists, seen = rigid_motions(c.H_hat_0, np.linalg.svd(a_inf[None])[2][1:], a_inf), np.isfinite(images)
+    model, M, seen = calibration.model(), calibration.M, np.isfinite(images)
+    posture = Posture(model, q, M[:1], np.full((1, 1), np.nan))
     for _ in range(_STEPS):
-        there = Parameters(c.P, c.H_hat_0, c.prismatic, c.M, c.lens).everywhere((q - c.q_reference)[None])
-        J = there.by_point[-1] @ np.moveaxis(c.M @ twists.swapaxes(1, 2), 0, -1)
-        step = np.linalg.lstsq(J[seen], (images - there.pixels)[seen], rcond=None)[0]
-        c = replace(c, M=c.M @ expm(np.tensordot(step, twists, 1)).T)
+        J, pixels = posture.changes(M)
+        step = np.linalg.lstsq(J[seen], (images - pixels)[seen], rcond=None)[0]
+        M = M @ expm(np.tensordot(step, posture.twists, 1)).T
         if np.abs(J[seen] @ step).max() < _SETTLED_PX:
             break
-    errors = ErrorModel(c, c.sigma_px)
-    at = errors.residual(still(q, images, np.maximum(sigma, c.sigma_px)))
-    shown = np.repeat(at.seen.ravel(), 2)
-    inverse = np.linalg.inv((at.R + at.B @ at.B.T)[np.ix_(shown, shown)])
-    J, r = J.reshape(len(shown), -1)[shown], at.r[shown]
-    P = inverse - inverse @ J @ np.linalg.pinv(J.T @ inverse @ J) @ J.T @ inverse
-    freedom, bias = len(r) - J.shape[1], 2.0 * (np.square(errors.bias_px / at.noise) * at.seen).sum()
-    rms = float(np.sqrt(np.mean(r**2)))
-    over = float(r @ P @ r) / (_UNUSUAL * chdtri(freedom, _CHANCE) + bias)
-    shift, covariance, excess = np.zeros((2, 2)), np.zeros((2, 2, 2)), 0.0
-    for v in (0, 1):
-        one = (np.arange(2)[:, None, None] == v) & np.ones(at.seen.shape, dtype=np.bool_)[..., None]
-        F = (one[..., None] * np.eye(2)).reshape(len(shown), 2)[shown]
-        covariance[v] = np.linalg.inv(F.T @ P @ F)
-        shift[v] = covariance[v] @ F.T @ P @ r
-        gain = float(shift[v] @ F.T @ P @ r)
-        excess = max(excess, gain / (_UNUSUAL * chdtri(2, _CHANCE) + bias))
-    off = np.square(images - predict(calibration, q[None])[0]).sum(axis=-1)[at.seen]
-    moved, turn = float(np.sqrt(off.mean())), _angle(calibration, c.M)
-    return RigidFit(rms, rms / np.sqrt(over), at.seen, shift, covariance, excess, moved, turn)
-
-
-def _angle(calibration: Calibration, M: FloatArray) -> float | None:
-    """Angle, rad, by which markers (m, 4) are turned against those of the calibration."""
-    try:
-        G = invariant_upgrade(calibration.H_hat_0, calibration.prismatic)
-    except (InputError, np.linalg.LinAlgError):
-        return None
-    points = [X[:, :3] / X[:, 3:] for X in (calibration.M @ G.T, M @ G.T)]
-    return float(Rotation.align_vectors(*(X - X.mean(axis=0) for X in points))[0].magnitude())
+    errors = ErrorModel(replace(calibration, M=M), calibration.sigma_px)
+    at = errors.residual(still(q, images, np.maximum(sigma, calibration.sigma_px)))
+    J, left = J.reshape(len(at.r), -1), at.seen.ravel().copy()
+    J = J / np.linalg.norm(J[np.repeat(left, 2)], axis=0)
+    S = at.R + at.B @ at.B.T
+    free = S + _FREE * S.diagonal().max() * J @ J.T
+    for _ in range(int(_ALONE * left.sum())):
+        rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
+        square = relative_to_others(free[np.ix_(rows, rows)], at.r[rows])
+        if square.max() <= _UNUSUAL * chdtri(2, _CHANCE / left.sum()):
+            break
+        left[np.flatnonzero(left)[np.argmax(square)]] = False
+    rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
+    P, r = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows]
+    bias = 2.0 * float(np.square(errors.bias_px / at.noise).ravel()[left].sum())
+    F = np.eye(2)[rows % 2] * (rows < len(at.r) // 2)[:, None]
+    covariance = np.linalg.inv(F.T @ P @ F)
+    shift = covariance @ F.T @ P @ r
+    over = [float(r @ P @ r) / (_UNUSUAL * chdtri(len(rows) - J.shape[1], _CHANCE) + bias)]
+    over.append(float(shift @ F.T @ P @ r) / (_UNUSUAL * chdtri(2, _CHANCE) + bias))
+    used, rms = left.reshape(at.seen.shape), float(np.sqrt(np.mean(r**2)))
+    before, after, turn = metric_points(model, calibration.M), metric_points(model, M), None
+    if before is not None and after is not None:
+        centred = before - before.mean(axis=0), after - after.mean(axis=0)
+        turn = float(Rotation.align_vectors(*centred)[0].magnitude())
+    off = np.square(images - predict(calibration, q[None])[0]).sum(axis=-1)[used]
+    return RigidFit(
+        agrees=max(over) <= 1.0,
+        rms_px=rms,
+        limit_px=rms / np.sqrt(over[0]),
+        seen=used,
+        shift=shift,
+        covariance=covariance,
+        moved_px=float(np.sqrt(off.mean())),
+        turn=turn,
+    )
 
 
 def still(q: FloatArray, images: FloatArray, noise: FloatArray) -> FramePair:

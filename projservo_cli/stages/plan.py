@@ -12,7 +12,7 @@ from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.loop.batch import begin
-from projservo_cli.monitoring.accuracy import RigidFit, rigid_fit
+from projservo_cli.monitoring.accuracy import RigidFit, metric_points, rigid_fit
 from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.records import (
@@ -79,6 +79,8 @@ def _joint_motions(state: State) -> FloatArray:
 
 # What noise and calibration may leave of images that the joints can reach, px rms per marker and view.
 LEFT_PX = 3.0
+# Distance of a marker of the face from its plane, over its size, that noise of the calibration may show.
+_UNEVEN = 0.05
 STAGES = 20
 
 
@@ -122,8 +124,22 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
         _require_taught_since(scenario, calibration)
     search = search_of(scenario) if trajectory.needs_covariance else None
     plan = plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
-    order = calibration.order_advice
-    return replace(plan, reason=f"{plan.reason}; {order}") if order else plan
+    face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
+    notes = [plan.reason, calibration.order_advice, "" if face is None else _uneven(face)]
+    return replace(plan, reason="; ".join(filter(None, notes)))
+
+
+def _uneven(face: FloatArray) -> str:
+    """Say that markers (m, 3) of a face are off the plane that motions take it for; else empty."""
+    size, normal = np.linalg.svd(face - face.mean(axis=0))[1:]
+    share = float(np.abs((face - face.mean(axis=0)) @ normal[2]).max() / size[0])
+    if share <= _UNEVEN:
+        return ""
+    return (
+        f"the face is not plane: a marker is {100.0 * share:.2g} % of its size off ({100.0 * _UNEVEN:g} % "
+        "are allowed), and visibility is that of a plane between them: name markers of one plane in "
+        "markers.face"
+    )
 
 
 def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
@@ -179,7 +195,7 @@ _CHANGED = "the goal was taught after a change since the calibration: {fault}; {
 def _require_rigid(fit: RigidFit, advice: str) -> None:
     """Refuse goal images of which chance does not explain what the nearest pose of the tool leaves."""
     if not fit.agrees:
-        u, v = fit.shift[0]
+        u, v = fit.shift
         raise WorkFailed(
             f"the goal images fit no pose of the tool: the nearest leaves {fit.rms_px:.3g} px rms a "
             f"coordinate, their deviations explain {fit.limit_px:.3g} px, as if the left image were shifted "

@@ -192,6 +192,9 @@ def _reported_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArr
 
 # Maximum residual of a body that agrees with its calibration, over the noise, px.
 _AGREES, _LEAST_NOISE_PX = 4.0, 0.01
+# Image error of a face of three markers as it is seen, over that which counts as converged: by noise once in
+# ten thousand.
+_BY_NOISE = 2.0
 # Joints that moved by less in the steps in which an error must fall hardly did, rad or m.
 _HARDLY = 0.01
 # A plan is of a task where its start, rad or m, and its goal images, px, are the same but for rounding and
@@ -310,7 +313,7 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
 
 def _apart(run: _Outcome) -> str:
     """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
-    seen, most = float(run.log.error[run.steps]), run.scenario.limits.image_error_px
+    seen, most = float(run.log.error[run.steps]), _BY_NOISE * run.scenario.limits.image_error_px
     if not seen > most:
         return ""
     return (

@@ -176,3 +176,9 @@ def test_goal_images_that_joints_do_not_reach_are_told_from_those_that_no_tool_s
         return
     with pytest.raises(WorkFailed, match=words):
         planning.run(config, calibration)
+
+
+@pytest.mark.parametrize(("face", "uneven"), [([0, 1, 2, 3], False), ([0, 1, 2, 7], True)])
+def test_a_face_that_is_not_plane_is_said(face, uneven):
+    config = configured("hobby", f"markers.face={face}", "noise.calibration_px=0.1")
+    assert ("the face is not plane" in planning.run(config, calibrate.run(config)[1]).reason) == uneven
