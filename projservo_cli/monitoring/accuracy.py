@@ -8,10 +8,10 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from projservo_cli.calibration.prediction import Parameters, predict
+from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.monitoring.frame_pairs import FramePair
-from projservo_cli.monitoring.statistics import TOLD, ErrorModel, relative_to_others, rigid_motions
+from projservo_cli.monitoring.statistics import TOLD, ErrorModel, Residual, relative_to_others, rigid_motions
 from projservo_cli.records import MM, PRISMATIC, BoolArray, Calibration, FloatArray, InputError, Model
 
 # Variance of corners from a side that the calibration has not seen, over that of others; chance of a test.
@@ -83,6 +83,7 @@ class RigidFit(NamedTuple):
     """Images of one instant against the calibrated tool in any pose, whether joints reach it or not."""
 
     agrees: bool  # whether chance explains what is left, and the shift
+    reached: bool  # whether it explains what is left where the joints show it best, too
     rms_px: float  # residual of a coordinate
     limit_px: float  # of it by chance, with the deviations of the images and of the calibration
     seen: BoolArray  # (2, m) but for detections that are off by themselves
@@ -111,12 +112,11 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
         M = M @ expm(np.tensordot(step, posture.twists, 1)).T
         if np.abs(J[seen] @ step).max() < _SETTLED_PX:
             break
-    errors = ErrorModel(replace(calibration, M=M), calibration.sigma_px)
-    at = errors.residual(still(q, images, np.maximum(sigma, calibration.sigma_px)))
-    J, left = J.reshape(len(at.r), -1), at.seen.ravel().copy()
-    J = J / np.linalg.norm(J[np.repeat(left, 2)], axis=0)
-    S = at.R + at.B @ at.B.T
-    free = S + _FREE * S.diagonal().max() * J @ J.T
+    pair, n = still(q, images, np.maximum(sigma, calibration.sigma_px)), len(q)
+    errors = [ErrorModel(one, calibration.sigma_px) for one in (replace(calibration, M=M), calibration)]
+    at, by_joints = (one.residual(pair) for one in errors)
+    free, by_joints_free = _free(at, J.reshape(len(at.r), -1)), _free(by_joints, by_joints.F[:, :n])
+    left = at.seen.ravel().copy()
     for _ in range(int(_ALONE * left.sum())):
         rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
         square = relative_to_others(free[np.ix_(rows, rows)], at.r[rows])
@@ -124,29 +124,42 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
             break
         left[np.flatnonzero(left)[np.argmax(square)]] = False
     rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
-    P, r = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows]
-    bias = 2.0 * float(np.square(errors.bias_px / at.noise).ravel()[left].sum())
+    bias = 2.0 * float(np.square(errors[0].bias_px / at.noise).ravel()[left].sum())
+
+    def limit(freedom: int) -> float:
+        return float(_UNUSUAL * chdtri(max(freedom, 1), _CHANCE) + bias)
+
+    P, r, r_joints = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows], by_joints.r[rows]
     F = np.eye(2)[rows % 2] * (rows < len(at.r) // 2)[:, None]
     covariance = np.linalg.inv(F.T @ P @ F)
     shift = covariance @ F.T @ P @ r
-    over = [float(r @ P @ r) / (_UNUSUAL * chdtri(len(rows) - J.shape[1], _CHANCE) + bias)]
-    over.append(float(shift @ F.T @ P @ r) / (_UNUSUAL * chdtri(2, _CHANCE) + bias))
+    over = float(r @ P @ r) / limit(len(rows) - J.shape[-1])
+    shifted = float(shift @ F.T @ P @ r) / limit(2)
+    joints = float(r_joints @ np.linalg.solve(by_joints_free[np.ix_(rows, rows)], r_joints))
     used, rms = left.reshape(at.seen.shape), float(np.sqrt(np.mean(r**2)))
     before, after, turn = metric_points(model, calibration.M), metric_points(model, M), None
     if before is not None and after is not None:
         centred = before - before.mean(axis=0), after - after.mean(axis=0)
         turn = float(Rotation.align_vectors(*centred)[0].magnitude())
-    off = np.square(images - predict(calibration, q[None])[0]).sum(axis=-1)[used]
     return RigidFit(
-        agrees=max(over) <= 1.0,
+        agrees=max(over, shifted) <= 1.0,
+        reached=joints <= limit(len(rows) - n),
         rms_px=rms,
-        limit_px=rms / np.sqrt(over[0]),
+        limit_px=rms / np.sqrt(over),
         seen=used,
         shift=shift,
         covariance=covariance,
-        moved_px=float(np.sqrt(off.mean())),
+        moved_px=float(np.sqrt(2.0 * np.mean(r_joints**2))),
         turn=turn,
     )
+
+
+def _free(at: Residual, J: FloatArray) -> FloatArray:
+    """Covariance (4 m, 4 m) of residuals whose changes along J (4 m, k) are not known."""
+    S = at.R + at.B @ at.B.T
+    J = J * np.repeat(at.seen.ravel(), 2)[:, None]
+    J = J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    return np.asarray(S + _FREE * S.diagonal().max() * J @ J.T)
 
 
 def still(q: FloatArray, images: FloatArray, noise: FloatArray) -> FramePair:

@@ -537,20 +537,12 @@ def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> s
         own, best = rms(tag, tag, 0), min(product(tags, range(CORNERS)), key=lambda to: rms(tag, *to))
         if own > _SIDE * side and best != (tag, 0) and rms(tag, *best) < _LEFT * own:
             found[tag] = best
-    words = {2: "upside down"}
-    said = [
-        f"tag {tag} is {words.get(turn, 'turned by a quarter')}"
-        for tag, (place, turn) in found.items()
-        if place == tag
-    ]
-    for tag, (place, _) in found.items():
-        back = found.get(place, (place, 0))[0]
-        if place != tag and (back != tag or tag < place):
-            said.append(
-                f"tags {tag} and {place} are exchanged"
-                if back == tag
-                else f"tag {tag} is in the place of tag {place}"
-            )
+    said = []
+    for tag, (place, turn) in found.items():
+        if place == tag:
+            said.append(f"tag {tag} is {'upside down' if turn == 2 else 'turned by a quarter'}")
+        elif place not in found or tag < place:
+            said.append(f"tags {tag} and {place} are exchanged")
     if not found or 2 * len(found) > len(tags):
         return ""
     return f"{' and '.join(said)} on the tool; put them back as they were, or recalibrate"

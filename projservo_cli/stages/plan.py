@@ -79,6 +79,7 @@ def _joint_motions(state: State) -> FloatArray:
 
 # What noise and calibration may leave of images that the joints can reach, px rms per marker and view.
 LEFT_PX = 3.0
+STAGES = 20
 # Distance of a marker of the face from its plane, over its size, that noise of the calibration may show.
 _UNEVEN = 0.05
 STAGES = 20
@@ -177,9 +178,9 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     )
     fit = rigid_fit(calibration, q, *whole)
     _require_rigid(fit, advice)
-    if fault := detected_fault(calibration, q, numbers, seen, size, sigma):
-        if enough:
-            raise WorkFailed(_CHANGED.format(fault=fault, advice=advice))
+    if enough and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
+        raise WorkFailed(_CHANGED.format(fault=fault, advice=advice))
+    if not enough and not fit.reached:
         turn = "" if fit.turn is None else f"{math.degrees(fit.turn):.2g} deg and "
         readings = zip(q.tolist(), scenario.joints.units, strict=True)
         raise WorkFailed(

@@ -152,16 +152,17 @@ class Scenario:
     def goal_pixels(self) -> tuple[FloatArray, FloatArray] | None:
         """Images (2, m, 2) that are given of the goal, px, and their deviations (2, m).
 
-        They are of the markers of the calibration, NaN where unseen; deviations are zero where unknown. None
-        without such images, or a covariance to test them by.
+        They are of the markers of the calibration, NaN where unseen; deviations that are not given are those
+        of the loop. None without such images, or a covariance to test them by.
         """
         if self._given is None or self.calibration is None or not self.calibration.has_covariance:
             return None
         numbers, pixels = self.calibration.marker.tolist(), self._given.pixels()
         images = np.array([pixels.get(number, _UNSEEN) for number in numbers]).swapaxes(0, 1)
         known = [number in pixels for number in numbers]
-        sigma = np.zeros((2, len(numbers)))
-        sigma[:, known] = np.nan_to_num(self._given.deviations([k for k in numbers if k in pixels]))
+        sigma = np.full((2, len(numbers)), self.noise_px)
+        stated = np.array(self._given.deviations([k for k in numbers if k in pixels]))
+        sigma[:, known] = np.where(np.isnan(stated), self.noise_px, stated)
         return images, sigma
 
     def images_at(self, seed: int) -> TaskImages:

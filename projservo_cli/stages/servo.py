@@ -20,16 +20,7 @@ from projservo_cli.loop.metrics import Ended, Summary, angle_between, path_devia
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.settling import StallMonitor
-from projservo_cli.loop.step import (
-    CONVERGED,
-    FAULT_DETECTED,
-    PLATEAU_FALL,
-    VERDICTS,
-    Log,
-    new_log,
-    plateau_stretch,
-    tolerance,
-)
+from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.monitoring.accuracy import Posture, rigid_fit
 from projservo_cli.records import (
     MM,
@@ -519,8 +510,8 @@ class _Asked:
         )
         limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
         driven = plant if isinstance(plant, DrivenRobot) else None
-        if driven is not None and code == CONVERGED and driven.at_rest():
-            code = FAULT_DETECTED
+        if driven is not None and VERDICTS[code] == "converged" and driven.at_rest():
+            code = VERDICTS.index("fault detected")
         if driven is not None:  # it moves from sample to sample, in any mode
             path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
             log = log._replace(path=path, parts=np.ones_like(log.parts))
