@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from projservo_cli.calibration.prediction import Parameters
@@ -18,8 +17,8 @@ from projservo_cli.records import MM, PRISMATIC, BoolArray, Calibration, FloatAr
 _UNUSUAL, _CHANCE = 2.0, 1e-4
 # Share of detections that may be off by themselves, and deviation of a pose that is not known, over noise.
 _ALONE, _FREE = 0.25, 1e4
-# Steps of Gauss and Newton towards a pose, and the change of pixels, px, that ends them.
-_STEPS, _SETTLED_PX = 20, 1e-6
+# Steps of Gauss and Newton towards a pose that is some degrees away.
+_STEPS = 4
 
 
 def metric_points(model: Model, M: FloatArray) -> FloatArray | None:
@@ -41,7 +40,7 @@ class Posture:
 
     def __init__(self, model: Model, q: FloatArray, face: FloatArray, lengths: FloatArray) -> None:
         self._model, self._away = model, (q - model.q_reference)[None]
-        self.twists = rigid_motions(model.H_hat_0, np.linalg.svd(model.a_inf[None])[2][1:], model.a_inf)
+        self._twists = rigid_motions(model.H_hat_0, np.linalg.svd(model.a_inf[None])[2][1:], model.a_inf)
         has: BoolArray = np.isfinite(lengths) & (lengths > 0.0)
         self.known = bool(has.any())
         self._moves = MM / np.sqrt(len(face)) * self._moved(face, has, lengths) if self.known else None
@@ -52,22 +51,22 @@ class Posture:
         Where the axes of the arm leave its metric open they are those across the lines of sight (d, 2 f 2),
         by the pair of corners with the least foreshortening.
         """
-        d, X = len(self.twists), metric_points(self._model, face)
+        d, X = len(self._twists), metric_points(self._model, face)
         if X is None:
-            J, s = self.changes(face)
+            J, s = self._changes(face)
             span = np.linalg.norm(s[:, :, None] - s[:, None], axis=3)
             m_per_px = 1.0 / np.max(span[:, has] / lengths[has], axis=1)
             across: FloatArray = J * (np.sqrt(0.5) * m_per_px[:, None, None, None])
             return np.moveaxis(across, -1, 0).reshape(d, -1)
         apart = np.linalg.norm(X[:, None] - X[None], axis=2)
-        moved = [metric_points(self._model, face + face @ twist.T) for twist in self.twists]
+        moved = [metric_points(self._model, face + face @ twist.T) for twist in self._twists]
         return np.asarray(np.median(lengths[has] / apart[has]) * (np.array(moved) - X).reshape(d, -1))
 
-    def changes(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _changes(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (2, m, 2, d) of pixels of markers (m, 4) by motions of the tool, and the pixels."""
         model, prismatic = self._model, self._model.joint_types == PRISMATIC
         images = Parameters(model.P, model.H_hat_0, prismatic, M, model.lens).everywhere(self._away)
-        return images.by_point[-1] @ np.moveaxis(M @ self.twists.swapaxes(1, 2), 0, -1), images.pixels
+        return images.by_point[-1] @ np.moveaxis(M @ self._twists.swapaxes(1, 2), 0, -1), images.pixels
 
     def carry(self, M: FloatArray, used: BoolArray) -> FloatArray:
         """Matrix (k, 4 m) from changes of pixels, px, to displacements of the face, mm, whose norm is rms.
@@ -75,7 +74,7 @@ class Posture:
         M : (m, 4) markers at the reference; used : (2, m) those by which the tool is measured.
         """
         assert self._moves is not None
-        J = np.where(used[..., None, None], self.changes(M)[0], 0.0).reshape(4 * len(M), -1)
+        J = np.where(used[..., None, None], self._changes(M)[0], 0.0).reshape(4 * len(M), -1)
         return np.asarray(self._moves.T @ np.linalg.pinv(J))
 
 
@@ -90,7 +89,7 @@ class RigidFit(NamedTuple):
     shift: FloatArray  # (2,) by which the left image seems to be shifted against the right one, px
     covariance: FloatArray  # (2, 2) of it
     moved_px: float  # difference of the images from those at the joints, px rms a marker
-    turn: float | None  # angle between both, rad; None where the axes of the arm leave their metric open
+    turn: float  # angle between both, rad
 
     def off_mm(self, posture: Posture, M: FloatArray) -> float:
         """Return how far off the face may be, mm, where one of the images is shifted within chance."""
@@ -104,19 +103,15 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
 
     images : (2, m, 2) px of the markers of the calibration, NaN where unseen; sigma : (2, m) deviations.
     """
-    model, M, seen = calibration.model(), calibration.M, np.isfinite(images)
-    posture = Posture(model, q, M[:1], np.full((1, 1), np.nan))
-    for _ in range(_STEPS):
-        J, pixels = posture.changes(M)
-        step = np.linalg.lstsq(J[seen], (images - pixels)[seen], rcond=None)[0]
-        M = M @ expm(np.tensordot(step, posture.twists, 1)).T
-        if np.abs(J[seen] @ step).max() < _SETTLED_PX:
-            break
     pair, n = still(q, images, np.maximum(sigma, calibration.sigma_px)), len(q)
-    errors = [ErrorModel(one, calibration.sigma_px) for one in (replace(calibration, M=M), calibration)]
-    at, by_joints = (one.residual(pair) for one in errors)
-    free, by_joints_free = _free(at, J.reshape(len(at.r), -1)), _free(by_joints, by_joints.F[:, :n])
-    left = at.seen.ravel().copy()
+    errors, moved = ErrorModel(calibration, calibration.sigma_px), np.eye(4)
+    at = by_joints = errors.residual(pair)
+    for _ in range(_STEPS):
+        step = np.linalg.lstsq(at.F[:, errors.tool], at.r, rcond=None)[0]
+        moved = moved @ expm(np.tensordot(step, errors.twists, 1))
+        errors = ErrorModel(replace(calibration, M=calibration.M @ moved.T), calibration.sigma_px)
+        at = errors.residual(pair)
+    free, left = _free(at, at.F[:, errors.tool]), at.seen.ravel().copy()
     for _ in range(int(_ALONE * left.sum())):
         rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
         square = relative_to_others(free[np.ix_(rows, rows)], at.r[rows])
@@ -124,33 +119,25 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
             break
         left[np.flatnonzero(left)[np.argmax(square)]] = False
     rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
-    bias = 2.0 * float(np.square(errors[0].bias_px / at.noise).ravel()[left].sum())
-
-    def limit(freedom: int) -> float:
-        return float(_UNUSUAL * chdtri(max(freedom, 1), _CHANCE) + bias)
-
+    bias = 2.0 * float(np.square(errors.bias_px / at.noise).ravel()[left].sum())
+    freedom = np.maximum([2, len(rows) - len(errors.twists), len(rows) - n], 1)
+    limits = _UNUSUAL * chdtri(freedom, _CHANCE) + bias
     P, r, r_joints = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows], by_joints.r[rows]
     F = np.eye(2)[rows % 2] * (rows < len(at.r) // 2)[:, None]
     covariance = np.linalg.inv(F.T @ P @ F)
     shift = covariance @ F.T @ P @ r
-    over = float(r @ P @ r) / limit(len(rows) - J.shape[-1])
-    shifted = float(shift @ F.T @ P @ r) / limit(2)
-    joints = float(r_joints @ np.linalg.solve(by_joints_free[np.ix_(rows, rows)], r_joints))
-    used, rms = left.reshape(at.seen.shape), float(np.sqrt(np.mean(r**2)))
-    before, after, turn = metric_points(model, calibration.M), metric_points(model, M), None
-    if before is not None and after is not None:
-        centred = before - before.mean(axis=0), after - after.mean(axis=0)
-        turn = float(Rotation.align_vectors(*centred)[0].magnitude())
+    joints = np.linalg.solve(_free(by_joints, by_joints.F[:, :n])[np.ix_(rows, rows)], r_joints)
+    over, rms = np.array([shift @ F.T @ P @ r, r @ P @ r, r_joints @ joints]) / limits, np.sqrt(np.mean(r**2))
     return RigidFit(
-        agrees=max(over, shifted) <= 1.0,
-        reached=joints <= limit(len(rows) - n),
-        rms_px=rms,
-        limit_px=rms / np.sqrt(over),
-        seen=used,
+        agrees=bool(max(over[:2]) <= 1.0),
+        reached=bool(over[2] <= 1.0),
+        rms_px=float(rms),
+        limit_px=float(rms / np.sqrt(over[1])),
+        seen=left.reshape(at.seen.shape),
         shift=shift,
         covariance=covariance,
         moved_px=float(np.sqrt(2.0 * np.mean(r_joints**2))),
-        turn=turn,
+        turn=float(np.arccos(np.clip(0.5 * np.trace(moved) - 1.0, -1.0, 1.0))),
     )
 
 

@@ -141,6 +141,7 @@ class ErrorModel:
         self.twists = rigid_motions(calibration.H_hat_0, self.directions, calibration.a_inf)
         self.cameras = [np.linalg.svd(P.reshape(1, CAMERA))[2][1:].T for P in calibration.P]
         self.parts, self.touches, self.f = _directions_of(n, m, len(self.twists))
+        self.tool = slice(self.f - 2 * len(self.twists), self.f - len(self.twists))  # columns of its motions
         # Squares (K, 2, m) by which corners erred while it was recorded, and where they were seen from.
         self._squares = calibration.corner_squares
         if self._squares is not None and calibration.corner_q is not None:

@@ -132,14 +132,12 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
 
 def _uneven(face: FloatArray) -> str:
     """Say that markers (m, 3) of a face are off the plane that motions take it for; else empty."""
-    size, normal = np.linalg.svd(face - face.mean(axis=0))[1:]
-    share = float(np.abs((face - face.mean(axis=0)) @ normal[2]).max() / size[0])
-    if share <= _UNEVEN:
+    size = np.linalg.svd(face - face.mean(axis=0))[1]
+    if (share := size[2] / size[0]) <= _UNEVEN:
         return ""
     return (
-        f"the face is not plane: a marker is {100.0 * share:.2g} % of its size off ({100.0 * _UNEVEN:g} % "
-        "are allowed), and visibility is that of a plane between them: name markers of one plane in "
-        "markers.face"
+        f"the face is not plane: its markers are {100.0 * share:.2g} % of its size off ({100.0 * _UNEVEN:g} "
+        "% are allowed), and visibility is that of a plane between them: name others in markers.face"
     )
 
 
@@ -181,12 +179,12 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     if enough and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
         raise WorkFailed(_CHANGED.format(fault=fault, advice=advice))
     if not enough and not fit.reached:
-        turn = "" if fit.turn is None else f"{math.degrees(fit.turn):.2g} deg and "
-        readings = zip(q.tolist(), scenario.joints.units, strict=True)
+        units = scenario.joints.units
+        there = ", ".join(in_unit(x, unit, 4) for x, unit in zip(q.tolist(), units, strict=True))
         raise WorkFailed(
-            f"the goal is a pose that {len(q)} joints do not reach: the nearest is {turn}{fit.moved_px:.3g} "
-            f"px rms a marker off, at joints {', '.join(in_unit(x, unit, 4) for x, unit in readings)}; move "
-            "the arm to the goal by hand and teach it, or set task.goal.joints to these readings"
+            f"the goal is a pose that {len(q)} joints do not reach: the nearest, at joints {there}, is "
+            f"{math.degrees(fit.turn):.2g} deg and {fit.moved_px:.3g} px rms a marker off; move the arm to "
+            "the goal by hand and teach it, or set task.goal.joints to these readings"
         )
 
 

@@ -305,12 +305,8 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
 def _apart(run: _Outcome) -> str:
     """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
     seen, most = float(run.log.error[run.steps]), _BY_NOISE * run.scenario.limits.image_error_px
-    if not seen > most:
-        return ""
-    return (
-        f"; the markers of the face are seen {seen:.3g} px off ({most:.3g} px by noise): they do not sit on "
-        "the tool as when the goal was taught: teach it again, or put back what moved"
-    )
+    text = f"; the face itself is seen {seen:.3g} px off ({most:.3g} px by noise): it moved on the tool"
+    return f"{text} since the goal was taught: teach it again" if seen > most else ""
 
 
 def _blind_view(s: FloatArray, window: int) -> str:

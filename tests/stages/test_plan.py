@@ -152,7 +152,7 @@ def test_the_sense_is_that_of_the_whole_plan(name, overrides):
         (
             0.02,
             0.0,
-            r"a pose that 5 joints do not reach: the nearest is [\d.]+ deg and [\d.]+ px rms .* joints",
+            r"that 5 joints do not reach: the nearest, at joints .* deg, is [\d.]+ deg and [\d.]+ px rms",
         ),
         (0.0, 6.0, "fit no pose of the tool: .* as if the left image were shifted by"),
     ],
