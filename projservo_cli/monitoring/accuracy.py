@@ -86,6 +86,7 @@ class RigidFit(NamedTuple):
     rms_px: float  # residual of a coordinate
     limit_px: float  # of it by chance, with the deviations of the images and of the calibration
     seen: BoolArray  # (2, m) but for detections that are off by themselves
+    off_px: FloatArray  # (2, m) residual of each detection, px; 0 where unseen
     shift: FloatArray  # (2,) by which the left image seems to be shifted against the right one, px
     covariance: FloatArray  # (2, 2) of it
     moved_px: float  # difference of the images from those at the joints, px rms a marker
@@ -134,6 +135,7 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
         rms_px=float(rms),
         limit_px=float(rms / np.sqrt(over[1])),
         seen=left.reshape(at.seen.shape),
+        off_px=np.linalg.norm(at.r.reshape(2, -1, 2), axis=2),
         shift=shift,
         covariance=covariance,
         moved_px=float(np.sqrt(2.0 * np.mean(r_joints**2))),

@@ -17,6 +17,7 @@ from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.records import (
     NO_SPREAD,
+    VIEWS,
     Calibration,
     FloatArray,
     InputError,
@@ -163,19 +164,25 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     known, near_px = np.isin(numbers, calibration.marker), max(NEAR_PX, 2.0 * sigma)
     shown = numbers[known].tolist(), seen[:, known]
     q, median = joints_showing(calibration, *shown, scenario.exact.q_start, near_px)
-    enough = len(q) >= COORDINATES
+    enough, fit = len(q) >= COORDINATES, rigid_fit(calibration, q, *whole)
+    check = "check which image is of which camera, and the marker numbers; then take them again"
     if enough and median > near_px:
         raise WorkFailed(
-            f"the goal images fit no pose of the arm: the nearest leaves a median of {median:.3g} px a "
-            f"marker, {near_px:.3g} px are allowed; check which image is of which camera, and the marker "
-            "numbers; then take them again"
+            f"the goal images fit no pose of the arm: the nearest leaves {fit.moved_px:.3g} px rms a marker; "
+            f"{check}"
         )
     advice = (
         "take the images again, or give their deviations (sigma_left_px and sigma_right_px of "
         "task.goal.images)"
     )
-    fit = rigid_fit(calibration, q, *whole)
     _require_rigid(fit, advice)
+    alone = fit.off_px * (np.isfinite(whole[0][..., 0]) & ~fit.seen)
+    view, k = np.unravel_index(int(np.argmax(alone)), alone.shape)
+    if alone[view, k] > near_px:
+        raise WorkFailed(
+            f"the goal images fit no pose of the arm: marker {calibration.marker[k]} is {alone[view, k]:.3g} "
+            f"px off in the {VIEWS[view]} one, {near_px:.3g} px are allowed; {check}"
+        )
     if enough and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
         raise WorkFailed(_CHANGED.format(fault=fault, advice=advice))
     if not enough and not fit.reached:
