@@ -48,11 +48,8 @@ def write_whole(path: Path, content: str | bytes) -> Path:
     return path
 
 
-def text_of(path: Path | str, expected: str, max_bytes: int) -> str:
-    """Text of a file of up to ``max_bytes`` in UTF-8, with or without byte-order mark.
-
-    Raises InputError, naming the ``expected`` content, if the file is no such text.
-    """
+def bytes_of(path: Path | str, expected: str, max_bytes: int) -> bytes:
+    """Content of a file of up to ``max_bytes``. Raises InputError, naming the ``expected`` content."""
     try:
         with Path(path).open("rb") as file:
             content = file.read(max_bytes + 1)
@@ -60,6 +57,15 @@ def text_of(path: Path | str, expected: str, max_bytes: int) -> str:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected {expected}") from error
     if len(content) > max_bytes:
         raise InputError(f"{path}: larger than {max_bytes // 1_000_000} MB; expected {expected}")
+    return content
+
+
+def text_of(path: Path | str, expected: str, max_bytes: int) -> str:
+    """Text of a file of up to ``max_bytes`` in UTF-8, with or without byte-order mark.
+
+    Raises InputError, naming the ``expected`` content, if the file is no such text.
+    """
+    content = bytes_of(path, expected, max_bytes)
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from projservo_cli.calibration import predict, prediction_variance, residual_statistics
 from projservo_cli.calibration.prediction import error_factor, error_factor_with_model, joint_derivative
 from projservo_cli.display import Displayable, Printed, numbers_in, require_radians, xarray
-from projservo_cli.files import text_of
+from projservo_cli.files import bytes_of
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.metric.frame import Metric, Scale, links
 from projservo_cli.metric.kinematic_errors import KinematicErrors, in_model_frames, kinematic_errors
@@ -363,7 +363,7 @@ class MetricModel(Printed, Metric):
 
 
 def _urdf_chain(urdf: str | Path, tip: str | None) -> UrdfChain:
-    return urdf_chain(str(urdf), tip, text_of(Path(urdf), "a URDF", _MAX_BYTES))
+    return urdf_chain(str(urdf), tip, bytes_of(urdf, "a URDF", _MAX_BYTES))
 
 
 class Scene(NamedTuple):

@@ -22,7 +22,7 @@ from pydantic_core import ErrorDetails
 from projservo_cli.config.models import RENDERED, RenderedOptions, Settings
 from projservo_cli.config.robot import CONTRADICTIONS, Finding, Root
 from projservo_cli.config.sweep import SweepConfig
-from projservo_cli.files import text_of
+from projservo_cli.files import bytes_of, text_of
 from projservo_cli.records import InputError
 from projservo_cli.simulation.mjcf import read_mjcf
 from projservo_cli.simulation.urdf import read_urdf
@@ -464,8 +464,7 @@ def _fill_in_arm(document: _Document) -> None:
             if kind == "mjcf":
                 robot["screws"] = read_mjcf(file, tip)
             else:
-                text = text_of(file, "a URDF", _MAX_BYTES)
-                screws = read_urdf(file, tip, text)
+                screws = read_urdf(file, tip, bytes_of(file, "a URDF", _MAX_BYTES))
                 rest = {key: value for key, value in robot.items() if key not in ("urdf", "tip")}
                 document.values["robot"] = {**rest, "screws": screws}
         except InputError as error:

@@ -1,0 +1,124 @@
+"""Files and sources as people have them, each read or refused by its cause: a kind of fault a test."""
+
+import pytest
+
+from projservo_cli import cli
+from projservo_cli.config import load_config
+from projservo_cli.nominal import read_nominal
+from projservo_cli.records import InputError
+from tests.conftest import SHARED
+
+
+@pytest.fixture
+def case(tmp_path, monkeypatch):
+    """Function that enters a copy of a case by name, or skips where it is absent."""
+
+    def enter(name):
+        folder = SHARED.parent / "cases" / name
+        if not folder.is_dir():
+            pytest.skip(f"case not found at {folder}")
+        for file in folder.iterdir():
+            (tmp_path / file.name).write_bytes(file.read_bytes())
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.syspath_prepend(str(tmp_path))
+
+    return enter
+
+
+@pytest.fixture
+def told(capsys):
+    """Exit code of a call, and all that it printed, in one line."""
+
+    def call(*arguments):
+        capsys.readouterr()
+        code = cli.run([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return code, " ".join(captured.out.split()), " ".join(captured.err.split())
+
+    return call
+
+
+LINKS = "".join(f'<link name="{name}"/>' for name in ("base", "upper", "fore", "hand"))
+LIMIT = '<limit lower="-1" upper="2" effort="1" velocity="1"/>'
+
+
+def joint(name, parent, child, limit=LIMIT, kind="revolute", more=""):
+    """A joint about z, half a metre above its parent."""
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="0.1 0 0.5"/><axis xyz="0 0 1"/>{limit}{more}</joint>'
+    )
+
+
+def urdf(*joints, links=LINKS, head="<robot name='arm'>", more=""):
+    """A URDF of joints, in text."""
+    return f"{head}{links}{''.join(joints)}{more}</robot>"
+
+
+CHAIN = (joint("pan", "base", "upper"), joint("lift", "upper", "fore"), joint("roll", "fore", "hand"))
+XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
+
+
+def config_of(folder, content):
+    """The configuration of an arm in a URDF of this content, in bytes."""
+    (folder / "arm.urdf").write_bytes(content)
+    (folder / "arm.yaml").write_text("robot: {urdf: arm.urdf, tip: hand}\ndata: {table: t.csv}\n")
+    return load_config(folder / "arm.yaml")
+
+
+def test_case_03_urdf_two_parents(case, told):
+    case("03_urdf_two_parents")
+    code, _, err = told("calibrate", "-c", "arm.yaml", "-o", "out")
+    assert code == 2
+    assert "link fore has two parent joints, j3 and rod_joint" in err
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (urdf(*CHAIN, joint("rod", "base", "fore")), "two parent joints, lift and rod"),
+        (urdf(*CHAIN, joint("lift", "hand", "tool"), links=LINKS + '<link name="tool"/>'), "2 times"),
+        (urdf(*CHAIN, links=LINKS + '<link name="fore"/>'), "link fore stands there 2 times"),
+        (urdf(*CHAIN[1:], joint("pan", "hand", "upper")), "closes a loop"),
+        (urdf(CHAIN[0], CHAIN[1].replace('"upper"', '"uper"', 1), CHAIN[2]), "lift: there is no link uper"),
+        (urdf(*CHAIN[:2], joint("roll", "fore", "hand", LIMIT, more=LIMIT)), "roll has 2 elements limit"),
+        (urdf(*CHAIN[:2], joint("roll", "fore", "hand", "")), "roll of type revolute has no lower and no"),
+        (urdf(*CHAIN[:2], joint("roll", "fore", "hand", '<limit effort="1"/>', "prismatic")), "joint roll"),
+        (urdf(*CHAIN[:2], joint("roll", "fore", "hand", '<limit lower="-1"/>')), "has no upper limit"),
+        (urdf(*CHAIN[:2], joint("roll", "fore", "hand", '<limit lower="0" upper="0"/>')), "is not below its"),
+        (urdf(*CHAIN, head=f"<robot name='a' {XACRO}>", more='<xacro:property name="l"/>'), "expand it"),
+        (urdf(*CHAIN[:2], joint("roll", "${parent}", "hand")), "expand it first"),
+        (urdf(*CHAIN, head="<robot name='Müller'>"), "encoding that its first line declares"),
+        (urdf(*CHAIN, head="<?xml version='1.0' encoding='klingon'?><robot name='a'>"), "klingon|unknown"),
+    ],
+)  # fmt: skip
+def test_a_urdf_that_is_no_tree_or_leaves_something_open_is_refused_by_its_cause(tmp_path, text, message):
+    with pytest.raises(InputError, match=message) as refused:
+        config_of(tmp_path, text.encode("latin-1"))
+    assert "arm.urdf: " in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_case_07_xacro_comment(case, told):
+    case("07_xacro_comment")
+    code, out, _ = told("calibrate", "-c", "arm.yaml", "-n")
+    assert (code, out) == (0, "calibrate: would be made (none yet)")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1", "cp1252", "utf-16", "gbk"])
+def test_a_urdf_is_read_in_the_encoding_that_it_declares_whatever_its_comments_say(tmp_path, encoding):
+    name = "臂" if encoding == "gbk" else "Müller"
+    declared = "" if encoding == "utf-8-sig" else f"<?xml version='1.0' encoding='{encoding}'?>"
+    gazebo = f"<!-- xacro: ${{x}} {name} --><gazebo><plugin a='${{x}}'>xacro:include</plugin></gazebo>"
+    text = urdf(*CHAIN, head=f"{declared}<robot name='{name}' {XACRO}>", more=gazebo)
+    screws = config_of(tmp_path, text.encode(encoding)).robot.screws
+    assert [one.name for one in screws.joints] == ["pan", "lift", "roll"]
+
+
+def test_a_key_that_stands_twice_overwrites_nothing(tmp_path, told):
+    (tmp_path / "nominal.json").write_text('{"screws": [], "screws": []}')
+    with pytest.raises(InputError, match="the key screws stands in one object twice"):
+        read_nominal(tmp_path / "nominal.json")
+    (tmp_path / "arm.yaml").write_text("plant: so101\nplant: simulated\n")
+    code, _, err = told("release", "-c", tmp_path / "arm.yaml")
+    assert (code, "plant stands there twice" in err) == (2, True)
