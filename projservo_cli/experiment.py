@@ -19,10 +19,19 @@ from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, law_and_mode, mode_in
 from projservo_cli.progress import Bar
-from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Report, WorkFailed
+from projservo_cli.records import (
+    Calibration,
+    CrossValidation,
+    InputError,
+    Observation,
+    Report,
+    WorkFailed,
+    image_sizes,
+)
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
 from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress, silent
+from projservo_cli.stages.given import PlanInputs
 from projservo_cli.steps import STAGES, Step, given_to, result_of, steps_for
 from projservo_cli.store import SERVO, Result, Run, load, run_path, save
 
@@ -201,11 +210,12 @@ class Chain:
         if step.stage == "plan":
             from projservo_cli.stages import plan
 
-            return (plan.run(given, run.calibration),)
+            return (plan.run(_bounded(given, run), run.calibration),)
         if step.stage == "servo":
             from projservo_cli.stages import servo
 
-            return (servo.run(given, run.calibration, run.plan, step.law),)
+            bounded = replace(given, plan=_bounded(given.plan, run))
+            return (servo.run(bounded, run.calibration, run.plan, step.law),)
         from projservo_cli.stages import report
 
         return (report.run(given, self.reported(run), run.path.parent, progress=progress),)
@@ -422,9 +432,17 @@ def scene_of(config: Config, calibration: Calibration) -> Scene:
     return Scene(
         calibration.model(),
         joints.limits,
-        None if size is None else np.array(size, dtype=np.float64),
+        None if size is None else image_sizes(size),
         trajectory_of(config),
     )
+
+
+def _bounded(inputs: PlanInputs, run: Run) -> PlanInputs:
+    """Return the inputs of a plan with the border of images of an unknown size: what the recording shows."""
+    if inputs.image_size is not None:
+        return inputs
+    (left, right) = np.ceil(np.nanmax(run.observation.images, axis=(0, 2)) + 0.5).astype(int).tolist()
+    return replace(inputs, seen_px=(tuple(left), tuple(right)))
 
 
 def _stored(path: "str | Path | None") -> Run:

@@ -68,6 +68,10 @@ def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
     return field(metadata={"units": units, "about": about}, **default)
 
 
+ImageSize = tuple[int, int] | tuple[tuple[int, int], tuple[int, int]]
+"""Width and height of the images, px: of both, or of the left and of the right."""
+
+
 class InputError(ValueError):
     """Usage, configuration or data that cannot be read or make no sense (exit code 2).
 
@@ -77,6 +81,11 @@ class InputError(ValueError):
 
 class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming error
     """The data were read, but the work they ask for cannot be done (exit code 1)."""
+
+
+def image_sizes(size: Any) -> FloatArray:
+    """Width and height (2, 2) of each image, px, by those of both or of one each; infinite for None."""
+    return np.broadcast_to(np.array(math.inf if size is None else size, dtype=np.float64), (2, 2)).copy()
 
 
 REVOLUTE = 0

@@ -371,7 +371,7 @@ class Scene(NamedTuple):
 
     model: Model  # as calibrated
     limits: JointLimits  # infinite where none is set
-    image_size: FloatArray | None  # (2,) px; None where unknown
+    image_size: FloatArray | None  # (2, 2) px, of each; None where unknown
     trajectory: Trajectory  # requested motion
 
 

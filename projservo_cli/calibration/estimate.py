@@ -36,7 +36,16 @@ from projservo_cli.calibration.quality import WEAK_NOISE, assess, check_model, c
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.calibration.undecided import require_poses
 from projservo_cli.geometry.lens import K1
-from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation
+from projservo_cli.records import (
+    VIEWS,
+    BoolArray,
+    Calibration,
+    Errors,
+    ImageSize,
+    InputError,
+    Observation,
+    image_sizes,
+)
 
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
@@ -91,7 +100,7 @@ def calibrate(
     method: str = "bundle_adjustment",
     sigma_px: float | None = None,
     source: str = "simulated",
-    image_size: tuple[int, int] | None = None,
+    image_size: ImageSize | None = None,
     seed: int = 0,
     lens: bool = False,
     init: Nominal | None = None,
@@ -192,19 +201,22 @@ def require_size_and_noise(image_size: Any, sigma_px: Any) -> None:
     if sigma_px is not None and not _is_positive(sigma_px):
         raise InputError(f"pixel noise {sigma_px!r}: give a positive number, or none to estimate it")
     if image_size is not None:
-        lengths = tuple(image_size) if np.iterable(image_size) else ()
-        if len(lengths) != 2 or not all(map(_is_positive, lengths)):
-            raise InputError(f"image size {image_size!r}: give a positive width and height, px")
+        given = tuple(image_size) if np.iterable(image_size) else ()
+        for lengths in given if len(given) == 2 and all(map(np.iterable, given)) else (given,):
+            if len(lengths) != 2 or not all(map(_is_positive, lengths)):
+                raise InputError(
+                    f"image size {image_size!r}: give a positive width and height, px, or one pair a camera"
+                )
 
 
 def _is_positive(value: Any) -> bool:
     return isinstance(value, Real) and 0.0 < float(value) < np.inf
 
 
-def _require_inside(detections: Detections, size: tuple[int, int], strays: float) -> None:
+def _require_inside(detections: Detections, image_size: ImageSize, strays: float) -> None:
     """Refuse an image size, width and height in px, with more than a share of a view's pixels outside."""
-    beyond, pixels = 0.5 + _BEYOND_PX, detections.pixels
-    inside = ((pixels >= -beyond) & (pixels <= np.array(size) - 1.0 + beyond)).all(axis=2)
+    beyond, pixels, sizes = 0.5 + _BEYOND_PX, detections.pixels, image_sizes(image_size)
+    inside = ((pixels >= -beyond) & (pixels <= sizes[:, None] - 1.0 + beyond)).all(axis=2)
     outside = detections.seen & ~inside
     for view, name in enumerate(VIEWS):
         seen = detections.seen[view]
@@ -215,7 +227,8 @@ def _require_inside(detections: Detections, size: tuple[int, int], strays: float
             low, high = np.percentile(pixels[view, seen], [1, 99], axis=0)
             marker, pose = detections.marker[detections.marker_of[i]], detections.pose[detections.pose_of[i]]
             raise InputError(
-                f"image size {size[0]}x{size[1]} px: {100.0 * share:.3g} % of the pixels of the {name} view "
+                f"image size {sizes[view, 0]:.0f}x{sizes[view, 1]:.0f} px: "
+                f"{100.0 * share:.3g} % of the pixels of the {name} view "
                 f"are outside, more than {100.0 * strays:g} %, such as u {u:.1f}, v {v:.1f} of marker "
                 f"{marker} at pose {pose}; that view saw markers at u from {low[0]:.0f} to {high[0]:.0f}, "
                 f"v from {low[1]:.0f} to {high[1]:.0f}: give the size of the images, width before height"

@@ -1,7 +1,7 @@
 """The robot, its rig and its markers, in metric terms: the truth of a simulation."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -12,6 +12,8 @@ from pydantic import (
     Strict,
     StringConstraints,
     ValidationInfo,
+    WithJsonSchema,
+    WrapValidator,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -23,6 +25,24 @@ Positive = Annotated[float, Strict(), Field(gt=0)]
 NotNegative = Annotated[float, Strict(), Field(ge=0)]
 Whole = Annotated[int, Strict(), Field(ge=0, le=2**63 - 1)]
 Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
+
+
+def _one_or_each(value: Any, of_one: Callable[[Any], tuple[int, int]]) -> Any:
+    """Width and height of both images, or, where their sizes differ, those of the left and of the right."""
+    pair = isinstance(value, (list, tuple)) and len(value) == 2
+    if not pair or not all(isinstance(one, (list, tuple)) for one in value):
+        return of_one(value)
+    left, right = map(of_one, value)
+    return left if left == right else (left, right)
+
+
+_TWO = {"type": "array", "minItems": 2, "maxItems": 2}
+_SIZE = {"items": {"type": "integer", "minimum": 1, "maximum": 1_000_000}, **_TWO}
+Sizes = Annotated[
+    tuple[Count, Count],
+    WrapValidator(_one_or_each),
+    WithJsonSchema({"anyOf": [_SIZE, {"items": _SIZE, **_TWO}]}),
+]
 _File = Annotated[str, StringConstraints(min_length=1)]
 Vector2 = tuple[Number, Number]
 # The path from a section to a value in it, and the error of that value.
@@ -310,6 +330,6 @@ class Camera(Section):
 class Rig(Section):
     """Two cameras that look at the robot and do not move."""
 
-    image_size_px: tuple[Count, Count] = Field(description="width and height of both images")
+    image_size_px: Sizes = Field(description="width and height of both images, or those of each")
     left: Camera = Field(description="left camera")
     right: Camera = Field(description="right camera")

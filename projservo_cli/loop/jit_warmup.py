@@ -69,7 +69,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         center=0,
         O=O,
         visible=q,
-        image_size=q,
+        image_size=np.zeros((2, 2)),
         limits=limits,
         opaque=True,
     )

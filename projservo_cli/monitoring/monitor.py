@@ -98,7 +98,7 @@ class ImageMonitor:
     sigma_px : pixel noise per coordinate.
     max_observations : length of the longest sequence, which sets the thresholds.
     shown : indices of the markers that images may show, None all; of many, some stand for all.
-    image_size : (2,) px; None or infinite where it is not known.
+    image_size : (2, 2) px, of each image; None or infinite where it is not known.
     ``fault``: the fault in words; empty without one, or while its cause is not clear.
     ``observations``: number of those that showed a marker and were tested. ``agreeing``: number of those of
     one view in a row that agree. ``rejected``: (2, m) detections of the last observation that are off by
@@ -454,8 +454,8 @@ def detected_fault(
     view of the tool does not tell a tag that moved from one that is bent, or under a slant.
 
     q : (n,) joint readings there, rad or m; images : (2, b, 2) pixels of the markers with the numbers
-    marker (b,), NaN where unseen, those that the calibration does not know among them; image_size : (2,) px;
-    sigma_px : pixel noise per coordinate where that is more than the calibration's.
+    marker (b,), NaN where unseen, those that the calibration does not know among them;
+    image_size : (2, 2) px; sigma_px : pixel noise per coordinate where that is more than the calibration's.
     """
     if not calibration.usable or not calibration.has_covariance:
         return ""

@@ -13,6 +13,7 @@ from projservo_cli.records import (
     Observation,
     Plan,
     Trace,
+    image_sizes,
     position_limits,
 )
 from projservo_cli.report import figures, style
@@ -41,7 +42,7 @@ def of_plan(plan: Plan, scene: Any) -> "Figure":
     scene : has ``model``, ``limits``, ``image_size`` and ``trajectory``.
     """
     spec = _spec(_PLAN)
-    extent = np.nanmax(plan.s, axis=(0, 1, 2)) if scene.image_size is None else scene.image_size
+    extent = image_sizes(np.nanmax(plan.s, axis=(0, 2)) if scene.image_size is None else scene.image_size)
     lowest, highest = plan.q.min(axis=0), plan.q.max(axis=0)
     robot = SimpleNamespace(
         joint_types=scene.model.joint_types,

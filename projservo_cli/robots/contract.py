@@ -14,7 +14,16 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame
-from projservo_cli.records import ByteArray, FloatArray, InputError, JointLimits, WorkFailed, in_unit
+from projservo_cli.records import (
+    ByteArray,
+    FloatArray,
+    ImageSize,
+    InputError,
+    JointLimits,
+    WorkFailed,
+    image_sizes,
+    in_unit,
+)
 from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
@@ -132,7 +141,7 @@ class PluginRobot:
         bounds: Bounds,
         timeout_s: float,
         open_s: float,
-        image_size: tuple[int, int] | None = None,
+        image_size: ImageSize | None = None,
     ) -> None:
         self.robot, self.name, self.bounds, self.image_size = robot, name, bounds, image_size
         self.timeout_s, self.open_s = timeout_s, open_s
@@ -172,10 +181,10 @@ class PluginRobot:
         ):
             raise WorkFailed(f"{self.name}: frames must be an array (2, height, width) of uint8, or None")
         self.frames = None if frames is None else frames.copy()
-        if frames is not None and self.image_size not in (None, frames.shape[:0:-1]):
-            shown, asked = (
-                " x ".join(map(str, size or ())) for size in (frames.shape[:0:-1], self.image_size)
-            )
+        sizes = image_sizes(self.image_size)
+        if frames is not None and np.isfinite(sizes).all() and (sizes != frames.shape[:0:-1]).any():
+            shown = " x ".join(map(str, frames.shape[:0:-1]))
+            asked = " and ".join(dict.fromkeys(f"{width:.0f} x {height:.0f}" for width, height in sizes))
             raise WorkFailed(
                 f"{self.name}: the image size of its frames is {shown} px, not the {asked} of the "
                 "configuration; set resolution and crop of the cameras as they were calibrated with"

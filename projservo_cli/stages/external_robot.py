@@ -13,7 +13,15 @@ from projservo_cli.geometry.algebra import mat
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
-from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import (
+    VIEWS,
+    Calibration,
+    FloatArray,
+    InputError,
+    IntArray,
+    WorkFailed,
+    image_sizes,
+)
 from projservo_cli.robots import plugins
 from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
@@ -352,7 +360,7 @@ def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
         center=task.center,
         O=task.O,
         visible=task.visible,
-        image_size=scenario.demands.image_size,
+        image_size=image_sizes(scenario.inputs.image_size),
         limits=scenario.joints.limits,
         opaque=False,
     )

@@ -26,6 +26,7 @@ from projservo_cli.records import (
     Model,
     Plan,
     WorkFailed,
+    image_sizes,
     in_sense,
 )
 from projservo_cli.stages.given import PlanInputs
@@ -125,8 +126,19 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
         _require_taught_since(scenario, calibration)
     search = search_of(scenario) if trajectory.needs_covariance else None
     plan = plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
-    order = calibration.order_advice
-    return replace(plan, reason=f"{plan.reason}; {order}") if order else plan
+    more = [calibration.order_advice, _borders(inputs)]
+    return replace(plan, reason="; ".join([plan.reason, *filter(None, more)]))
+
+
+def _borders(inputs: PlanInputs) -> str:
+    """Tell which borders images of an unknown size are taken to have; empty where the size is known."""
+    if inputs.image_size is not None:
+        return ""
+    sizes = ["x".join(f"{side:.0f}" for side in one) for one in image_sizes(inputs.seen_px)]
+    return (
+        f"the size of the images is not known: they reach to the last pixels recorded, {sizes[0]} left and "
+        f"{sizes[1]} right; give it: --image-size, or size_px of both cameras"
+    )
 
 
 def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
@@ -153,7 +165,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
             "take the images again, or give their deviations (sigma_left_px and sigma_right_px of "
             "task.goal.images)"
         )
-    if fault := detected_fault(calibration, q, numbers, seen, scenario.demands.image_size, sigma):
+    if fault := detected_fault(calibration, q, numbers, seen, image_sizes(scenario.inputs.image_size), sigma):
         raise WorkFailed(f"the goal was taught after a change since the calibration: {fault}; {advice}")
 
 

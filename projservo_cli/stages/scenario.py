@@ -27,6 +27,7 @@ from projservo_cli.records import (
     IntArray,
     Model,
     WorkFailed,
+    image_sizes,
 )
 from projservo_cli.robots.client import weights
 from projservo_cli.robots.settings import Joints, limit_passed
@@ -111,7 +112,11 @@ class Scenario:
     @cached_property
     def demands(self) -> Demands:
         """Return the constraints of the planned motion."""
-        size = np.array(self.inputs.image_size or (math.inf, math.inf), dtype=np.float64)
+        if (size := self.inputs.image_size or self.inputs.seen_px) is None:
+            raise InputError(
+                "the size of the images, and so their border, is not known: set data.image_size_px, or "
+                "size_px of both cameras"
+            )
         joints, asked = self.joints, self.inputs.trajectory
         margins = asked.joint_margin_m, asked.joint_margin
         keep = np.array([margins[kind != "P"] for kind in joints.types])
@@ -119,7 +124,7 @@ class Scenario:
         face, units = asked.min_face_px, self.joints.units
         return Demands(
             limits=joints.limits,
-            image_size=size,
+            image_size=image_sizes(size),
             border_px=border,
             conditioning=condition,
             keep=keep,
@@ -512,7 +517,7 @@ def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
         center=truth.center,
         O=O,
         visible=np.where(sides > 0.0, 1.0, -1.0),
-        image_size=truth.image_size,
+        image_size=image_sizes(truth.image_size),
         limits=truth.robot.limits,
         opaque=opaque,
     )

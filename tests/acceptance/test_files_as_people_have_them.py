@@ -1,12 +1,17 @@
 """Files and sources as people have them, each read or refused by its cause: a kind of fault a test."""
 
+import json
+
+import numpy as np
 import pytest
 
 from projservo_cli import cli
-from projservo_cli.config import load_config
+from projservo_cli.config import load_config, to_yaml
+from projservo_cli.config.inputs import plan_inputs, truth_of
 from projservo_cli.nominal import read_nominal
 from projservo_cli.records import InputError
-from tests.conftest import SHARED
+from projservo_cli.stages.scenario import scenario_of
+from tests.conftest import ROOT, SHARED
 
 
 @pytest.fixture
@@ -36,6 +41,14 @@ def told(capsys):
         return code, " ".join(captured.out.split()), " ".join(captured.err.split())
 
     return call
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A table of the UR5, as projservo records it."""
+    path = tmp_path_factory.mktemp("recorded") / "t.csv"
+    assert cli.run(["record", "-c", str(ROOT / "configs" / "ur5.yaml"), "--output", str(path), "-q"]) == 0
+    return path
 
 
 LINKS = "".join(f'<link name="{name}"/>' for name in ("base", "upper", "fore", "hand"))
@@ -122,3 +135,37 @@ def test_a_key_that_stands_twice_overwrites_nothing(tmp_path, told):
     (tmp_path / "arm.yaml").write_text("plant: so101\nplant: simulated\n")
     code, _, err = told("release", "-c", tmp_path / "arm.yaml")
     assert (code, "plant stands there twice" in err) == (2, True)
+
+
+def test_case_08_unequal_image_sizes(case, told):
+    case("08_unequal_image_sizes")
+    code, out, _ = told("plan", "-c", "unequal.yaml", "-o", "out", "--json")
+    assert code == 0
+    assert json.loads(out)["profile"] == "joint_space"  # the linear one leaves both images
+    with open("unequal.yaml", encoding="utf-8") as file:
+        text = file.read()
+    with open("unknown.yaml", "w", encoding="utf-8") as file:
+        file.write(text.replace(", size_px: [960, 1023]", ""))
+    code, out, _ = told("plan", "-c", "unknown.yaml", "-o", "out2", "--json")
+    assert (code, json.loads(out)["profile"]) == (0, "joint_space")
+    assert "the size of the images is not known: they reach to the last pixels recorded, 918x862 left" in out
+
+
+@pytest.mark.parametrize("sizes", [[[640, 480], [320, 240]], [[640, 480], [640, 480]]])
+def test_each_camera_has_its_own_border(sizes):
+    rig = f"rig.image_size_px={sizes}"
+    config = load_config(ROOT / "configs" / "paper.yaml", [rig])
+    truth, demands = truth_of(config), scenario_of(plan_inputs(config)).demands
+    np.testing.assert_array_equal(demands.image_size, sizes)
+    assert load_config("again.yaml", text=to_yaml(config)) == config
+    s = np.array([[[400.0, 100.0]], [[400.0, 100.0]]])
+    assert np.isfinite(truth.within(s)[:, 0, 0]).tolist() == [True, sizes[1][0] == 640]
+    assert (config.image_size_px == (640, 480)) == (sizes[0] == sizes[1])
+
+
+def test_a_size_of_each_camera_is_an_option_of_every_stage(told, recorded, tmp_path):
+    calibrate = ["calibrate", "--data", recorded, "-o", tmp_path / "out", "--image-size"]
+    code, _, err = told(*calibrate, "640x480,320x240,1x1")
+    assert (code, "1280x1024,1280x960 where the right images" in err) == (2, True)
+    code, _, err = told(*calibrate, "1280x1024,320x240")
+    assert (code, "image size 320x240 px" in err, "of the right view are outside" in err) == (2, True, True)

@@ -25,7 +25,7 @@ from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.keep_out import keep_out_of
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, within_region
-from projservo_cli.records import WorkFailed
+from projservo_cli.records import WorkFailed, image_sizes
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.scenario import Scenario
@@ -160,7 +160,7 @@ def true_constraints(config, truth: Truth, task: Drawn, q):
     s_start, s_star = (truth.images(x, truth.M_face) for x in (q, task.q_goal))
     aimed = TaskImages(q, s_start, s_star, truth.center).task(truth.model)
     joints = joints_of(config)
-    demands = limits_alone(joints.limits)._replace(image_size=truth.image_size)
+    demands = limits_alone(joints.limits)._replace(image_size=image_sizes(truth.image_size))
     A = truth.M[[*truth.face, *truth.pins]] @ truth.displacement(q).T
     c = constraints_of(truth.model, A, aimed, q, demands)
     return c._replace(
