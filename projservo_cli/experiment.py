@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from projservo_cli.config import Config, load_config, shipped, to_yaml
+from projservo_cli.config import Config, load_config, shipped, stored_yaml
 from projservo_cli.config.inputs import joints_of, trajectory_of
 from projservo_cli.display import Printed
 from projservo_cli.files import working_in
@@ -121,7 +121,7 @@ class Chain:
     @property
     def pending(self) -> bool:
         """Whether a result is to be made, or the configuration to be stored."""
-        return self.run.configuration != to_yaml(self.config) or any(step.why for step in self.steps)
+        return self.run.configuration != stored_yaml(self.config) or any(step.why for step in self.steps)
 
     def lacks(self, stage: str) -> bool:
         """Whether a stage was not completed."""
@@ -182,7 +182,7 @@ class Chain:
                 if trace.verdict == "failed":  # nor is what failed driven by the next law
                     self.failed, self.reason = step.name, trace.reason
                     return
-        text = to_yaml(self.config)
+        text = stored_yaml(self.config)
         if self.run.configuration != text:  # overrides are stored also where nothing had to be made
             self._keep(replace(self.run, configuration=text))
 
@@ -191,7 +191,7 @@ class Chain:
 
     def _make_result(self, step: Step) -> list[str]:
         """Make one result from those before it; which others that made outdated and dropped."""
-        run = replace(self.run, configuration=to_yaml(self.config))
+        run = replace(self.run, configuration=stored_yaml(self.config))
         result = result_of(step, self.config, *self._made(step, run))
         place = STAGES.index(step.stage)
         after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]

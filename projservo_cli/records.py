@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.masking import masked
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -78,9 +80,15 @@ class InputError(ValueError):
     The message is one line a user can act on: place, error and remedy.
     """
 
+    def __init__(self, *args: object) -> None:
+        super().__init__(*masked(args))
+
 
 class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming error
     """The data were read, but the work they ask for cannot be done (exit code 1)."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*masked(args))
 
 
 def image_sizes(size: Any) -> FloatArray:

@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 
+from projservo_cli.masking import masked
 from projservo_cli.progress import Bar
 
 _UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
@@ -33,11 +34,11 @@ def wrapped(text: str, indent: str = "") -> str:
 
 
 def visible(text: str) -> str:
-    """Text whose control characters and changes of direction are written out, line ends apart.
+    """Text without passwords, whose control characters and changes of direction are written out.
 
     Texts come from files of others too; a terminal that is sent them must not obey them.
     """
-    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", masked(text))
 
 
 def _plain(value: Any) -> Any:

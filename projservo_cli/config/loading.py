@@ -23,6 +23,7 @@ from projservo_cli.config.models import RENDERED, RenderedOptions, Settings
 from projservo_cli.config.robot import CONTRADICTIONS, Finding, Root
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.files import bytes_of, text_of
+from projservo_cli.masking import masked
 from projservo_cli.records import InputError
 from projservo_cli.simulation.mjcf import read_mjcf
 from projservo_cli.simulation.urdf import read_urdf
@@ -419,6 +420,11 @@ def _validated(model: type[_Model], document: _Document) -> _Model:
 def to_yaml(config: Config) -> str:
     """The whole configuration, defaults written out, as YAML that loads to an equal one."""
     return plain_yaml(_without_unset(config))
+
+
+def stored_yaml(config: Config) -> str:
+    """The configuration as ``to_yaml``, with the passwords of URLs masked: for files and pages."""
+    return plain_yaml(masked(_without_unset(config)))
 
 
 def plain_yaml(values: Any) -> str:

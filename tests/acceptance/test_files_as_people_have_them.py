@@ -8,9 +8,11 @@ import pytest
 from projservo_cli import cli
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.config.inputs import plan_inputs, truth_of
+from projservo_cli.masking import masked
 from projservo_cli.nominal import read_nominal
-from projservo_cli.records import InputError
+from projservo_cli.records import VIEWS, InputError
 from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.store import load
 from tests.conftest import ROOT, SHARED
 
 
@@ -169,3 +171,46 @@ def test_a_size_of_each_camera_is_an_option_of_every_stage(told, recorded, tmp_p
     assert (code, "1280x1024,1280x960 where the right images" in err) == (2, True)
     code, _, err = told(*calibrate, "1280x1024,320x240")
     assert (code, "image size 320x240 px" in err, "of the right view are outside" in err) == (2, True, True)
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("(rtsp://user:s3cret@10.0.0.2:554/s): lost", "(rtsp://user:***@10.0.0.2:554/s): lost"),
+        ("rtsp://admin:p@ss:w/s3cret@cam/1", "rtsp://admin:***@cam/1"),
+        ("http://s3cret@host/x.mjpg", "http://***@host/x.mjpg"),
+        ("'https://cam/v?user=me&access_token=s3cret&n=1'", "'https://cam/v?user=me&access_token=***&n=1'"),
+        ("http://cam/cgi?loginuse=a&loginpas=s3cret: lost", "http://cam/cgi?loginuse=a&loginpas=***: lost"),
+        ("rtsp://cam/user=admin_password=s3cret_channel=1.sdp", "rtsp://cam/user=admin_password=***"),
+        ("rtspsrc location=rtsp://cam/1 user-pw=s3cret ! x", "rtspsrc location=rtsp://cam/1 user-pw=*** ! x"),
+        ("--set KEY=VALUE, http://host:8080/a me@b.org", "--set KEY=VALUE, http://host:8080/a me@b.org"),
+    ],
+)  # fmt: skip
+def test_passwords_and_tokens_of_urls_are_masked(text, wanted):
+    assert masked(text) == wanted == masked(wanted) == str(InputError(text))
+
+
+def test_case_10_password_in_page(case, told, tmp_path):
+    case("10_password_in_page")
+    for command in (["doctor"], ["doctor", "--json"], ["record", "--output", "t.csv"], ["record", "-v"]):
+        code, out, err = told(*command, "-c", "arm.yaml")
+        assert code == 1
+        assert "rtsp://user:***@127.0.0.1:8554/stream1" in out + err
+        assert "secret123" not in out + err
+    assert all(b"secret123" not in path.read_bytes() for path in tmp_path.rglob("*.html"))
+
+
+def test_no_run_file_holds_the_password_of_a_camera(told, recorded, tmp_path):
+    arm = tmp_path / "arm.yaml"
+    cameras = [f"{side}: {{source: 'rtsp://me:s3cret@cam/{side}', size_px: [1280, 1024]}}" for side in VIEWS]
+    arm.write_text(
+        f"plant: {{use: 'tests.robots.robots:Sound', options: {{config: 'http://h/?token=s3cret'}}}}\n"
+        f"data: {{table: {recorded}}}\nmarkers: {{tags: roof}}\ncameras: {{{', '.join(cameras)}}}\n"
+    )
+    out = tmp_path / "out"
+    assert told("calibrate", "-c", arm, "--set", "seed=1", "-o", out)[0] == 0
+    assert b"s3cret" not in (out / "run.h5").read_bytes()
+    assert "rtsp://me:***@cam/left" in load(out).configuration
+    assert told("calibrate", "-c", arm, "--set", "seed=1", "-o", out)[2].startswith("calibrate: up to date")
+    code, _, err = told("doctor", "-c", arm, "--set", "cameras.left.source=rtsp://me:***@cam/left")
+    assert (code, "is masked" in err) == (2, True)
