@@ -88,7 +88,7 @@ def lines_of(path: Path | str, expected: str, max_bytes: int) -> Iterator[str]:
                 if len(content) > _LONGEST:
                     raise InputError(f"{path}:{number}: a line without an end; expected {expected}")
                 if b"\0" in content:
-                    raise InputError(f"{path}:{number}: not a text file (it has a NUL byte)")
+                    raise InputError(f"{path}:{number}: not a text file in UTF-8 (it has a NUL byte)")
                 text = content.decode("utf-8-sig" if number == 1 else "utf-8")
                 yield from io.StringIO(text, newline="")
                 number += 1

@@ -13,6 +13,7 @@ from projservo_cli.nominal import read_nominal
 from projservo_cli.records import VIEWS, InputError
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.store import load
+from projservo_cli.store.tables import read_table
 from tests.conftest import ROOT, SHARED
 
 
@@ -214,3 +215,82 @@ def test_no_run_file_holds_the_password_of_a_camera(told, recorded, tmp_path):
     assert told("calibrate", "-c", arm, "--set", "seed=1", "-o", out)[2].startswith("calibrate: up to date")
     code, _, err = told("doctor", "-c", arm, "--set", "cameras.left.source=rtsp://me:***@cam/left")
     assert (code, "is masked" in err) == (2, True)
+
+
+def spreadsheet(lines, separator, comma=False, head=""):
+    """Lines of a table as a spreadsheet writes them."""
+    rows = [line.split(",") for line in lines]
+    cells = [[cell.replace(".", ",") if comma else cell for cell in row] for row in rows]
+    return "\n".join([*head.splitlines(), *(separator.join(row) for row in cells)]) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("separator", "comma", "head", "encoding"),
+    [
+        ("\t", False, "", "utf-8"), ("\t", True, "", "utf-8-sig"), (";", True, "", "utf-8"),
+        (";", True, "sep=;", "utf-8-sig"), (",", False, "sep=,", "utf-8"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("unseen", ["", "nan", "NaN", "NA", "#N/A"])
+def test_a_table_of_a_spreadsheet_is_read(recorded, tmp_path, separator, comma, head, encoding, unseen):
+    header, *rows = recorded.read_text().splitlines()
+    wanted, given = [], []
+    for line in rows[:40]:
+        cells = line.split(",")
+        for i in range(len(cells)):
+            if header.split(",")[i].endswith("_left") and cells[1] == "2":
+                cells[i] = ""
+        wanted.append(",".join(cells))
+        given.append(",".join(unseen if name[:2] in ("u_", "v_") and cell == "" else cell
+                              for name, cell in zip(header.split(","), cells, strict=True)))  # fmt: skip
+    (tmp_path / "plain.csv").write_text("\n".join([header, *wanted]) + "\n")
+    sheet = spreadsheet([header, *given], separator, comma, head)
+    (tmp_path / "sheet.csv").write_text(sheet, encoding=encoding)
+    one, other = read_table(tmp_path / "plain.csv"), read_table(tmp_path / "sheet.csv")
+    np.testing.assert_array_equal(one.images, other.images)
+    np.testing.assert_array_equal(one.q, other.q)
+    broken = sheet.replace(rows[39].split(",")[2].replace(".", "," if comma else "."), "x")
+    (tmp_path / "broken.csv").write_text(broken, encoding=encoding)
+    line = broken.splitlines().index(next(row for row in broken.splitlines() if separator + "x" in row)) + 1
+    with pytest.raises(InputError, match=f"broken.csv:{line}: q1 is 'x'"):
+        read_table(tmp_path / "broken.csv")
+
+
+@pytest.mark.parametrize("name", ["q0", "q00"])
+def test_joint_columns_that_begin_with_zero_are_refused(recorded, tmp_path, name):
+    text = recorded.read_text().replace(",q1,", f",{name},q1,", 1).replace("\n", "\n", 1)
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InputError, match=f"has {name}: number the joint columns q1, q2"):
+        read_table(tmp_path / "t.csv")
+
+
+MIXED = [("9999", "9999"), ("-1", "-1"), ("-1000000000", "-1000000000"), ("65535", "65535")]
+
+
+@pytest.mark.parametrize(
+    "placeholders",
+    [[MIXED[1]], [MIXED[2]], [MIXED[3]], MIXED[:2], [("-1", None)], [(None, "9999")]],
+    ids=["-1", "-1e9", "65535", "mixed", "u alone", "v alone"],
+)
+def test_numbers_for_unseen_markers_are_named_and_taken_as_unseen(told, recorded, tmp_path, placeholders):
+    header, *rows = (line.split(",") for line in recorded.read_text().splitlines())
+    draw, at, empty = np.random.default_rng(3), header.index("u_left"), []
+    for row in rows:
+        empty.append(list(row))
+        for view in range(2):
+            if draw.random() < 0.08 and row[at + 2 * view]:
+                given = placeholders[draw.integers(len(placeholders))]
+                for axis in range(2):
+                    row[at + 2 * view + axis] = given[axis] or row[at + 2 * view + axis]
+                    empty[-1][at + 2 * view + axis] = ""
+    found = []
+    for name, lines in (("given", rows), ("empty", empty)):
+        path = tmp_path / f"{name}.csv"
+        path.write_text("\n".join(",".join(line) for line in [header, *lines]) + "\n")
+        code, out, _ = told("calibrate", "--data", path, "-o", tmp_path / name, "--json")
+        assert code == 0
+        found.append(json.loads(out))
+    one, other = found
+    assert one["predicted_rms_px"] == pytest.approx(other["predicted_rms_px"], rel=0.02)
+    assert one["rejected"]["placeholders"] > 0.95 * sum(a != b for a, b in zip(rows, empty, strict=True))
+    assert "taken as unseen" in one["advice"][-1]

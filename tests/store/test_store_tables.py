@@ -58,7 +58,7 @@ BAD = {
     "no joints": (["pose,marker,u_left,v_left,u_right,v_right", "0,0,1,2,3,4"], ":1: .*lacks.*q1"),
     "gap in joints": ([HEADER.replace("q2", "q3"), ROWS[0]], ":1: joint column q2 is missing"),
     "column twice": ([HEADER.replace("q2", "q1"), ROWS[0]], ":1: .*q1 more than once"),
-    "semicolons": ([HEADER.replace(",", ";"), ROWS[0].replace(",", ";")], ":1: .*semicolons"),
+    "joints from zero": ([HEADER.replace("q2", "q0"), ROWS[0]], ":1: the header has q0"),
     "row cut short": ([HEADER, ROWS[0], "0,0,0.5,-1,11,2"], ":3: 6 cells where the header has 8"),
     "text for a number": ([HEADER, ROWS[0].replace("10", "ten")], ":2: u_left is 'ten'"),
     "nan": ([HEADER, ROWS[0].replace("10", "nan")], ":2: u_left is 'nan'; expected a finite"),
