@@ -3,8 +3,8 @@
 Columns, in any order: ``pose, marker, q1 … qN, u_left, v_left, u_right, v_right``, and optionally
 ``sigma_left, sigma_right, moving, t_q, t_left, t_right``; others are ignored. Joint readings are rad or m,
 pixels are raw; empty or ``nan``, they mean *unseen*. Sigmas are standard deviations of the pixels, px. A pose
-with a number in ``moving`` belongs to that motion; times are s, empty if unknown. Files are UTF-8 with or without
-byte-order mark, with any line ends. Columns are separated by commas, or as spreadsheets do by tabs or by
+with a number in ``moving`` belongs to that motion; times are s, empty if unknown. Files are UTF-8 with or
+without byte-order mark, with any line ends. Columns are separated by commas, or as spreadsheets do by tabs or by
 semicolons, where decimal commas are read; a first line ``sep=;`` is skipped.
 """
 
@@ -359,7 +359,9 @@ class _Sheet:
         if first.strip().lower().startswith("sep="):  # of spreadsheets, for their own eyes
             first, self._skipped = next(lines, ""), 1
         self._separator = max(",;\t", key=first.count)
-        self._reader = csv.reader(chain([first], lines), strict=True, delimiter=self._separator)
+        self._reader = csv.reader(
+            chain([first] * (first != ""), lines), strict=True, delimiter=self._separator
+        )
         if (header := self._next()) is None:
             expected = [*needed[:2], "q1…qN", *needed[2:]]
             raise InputError(f"{self.file}: the table is empty; expected a header {','.join(expected)}")

@@ -61,7 +61,7 @@ BAD = {
     "joints from zero": ([HEADER.replace("q2", "q0"), ROWS[0]], ":1: the header has q0"),
     "row cut short": ([HEADER, ROWS[0], "0,0,0.5,-1,11,2"], ":3: 6 cells where the header has 8"),
     "text for a number": ([HEADER, ROWS[0].replace("10", "ten")], ":2: u_left is 'ten'"),
-    "nan": ([HEADER, ROWS[0].replace("10", "nan")], ":2: u_left is 'nan'; expected a finite"),
+    "nan": ([HEADER, ROWS[0].replace("10", "nan")], ":2: one of u_left, v_left is empty"),
     "infinite": ([HEADER, ROWS[0].replace("10", "1e999")], ":2: u_left is '1e999'"),
     "empty joint": ([HEADER, "0,1,,-1,10,20,30,40"], ":2: q1 is ''"),
     "half a pixel": ([HEADER, "0,1,1,-1,10,,30,40"], ":2: one of u_left, v_left is empty"),
