@@ -196,13 +196,18 @@ def _detect(
     """
     import numpy as np
 
-    from projservo_cli.detection import TagFinder, observe_tags, pair_images
+    from projservo_cli.detection import TagFinder, hidden_images, observe_tags, pair_images
     from projservo_cli.store.tables import read_joint_list, write_table
 
     option.require_new(output, force=force)
     finder = TagFinder(dictionary)
     joints = read_joint_list(joints_csv, joint_unit="rad")  # as they are, whatever their unit
     pairs = pair_images(left, right, joints, joints_csv)
+    hidden = [file for side in (left, right) for file in hidden_images(side)]
+    if hidden:
+        console.say(
+            f"detect: {len(hidden)} hidden files such as {hidden[0]} are no images, and were left out"
+        )
     observation, found = observe_tags(pairs, joints.q, finder, points, console.progress)
     write_table(observation, output)
     in_left, in_right = np.moveaxis(np.isfinite(observation.images[..., 0]), 1, 0)
@@ -218,6 +223,7 @@ def _detect(
         "ambiguous": found.ambiguous,
         "unrefined": found.unrefined,
         "empty_images": found.empty,
+        "hidden_files": len(hidden),
     }
     words = (
         f"detect: {{poses}} poses, {len(found.tags)} tags, {{markers}} markers",

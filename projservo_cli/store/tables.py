@@ -4,8 +4,8 @@ Columns, in any order: ``pose, marker, q1 … qN, u_left, v_left, u_right, v_rig
 ``sigma_left, sigma_right, moving, t_q, t_left, t_right``; others are ignored. Joint readings are rad or m,
 pixels are raw; empty or ``nan``, they mean *unseen*. Sigmas are standard deviations of the pixels, px. A pose
 with a number in ``moving`` belongs to that motion; times are s, empty if unknown. Files are UTF-8 with or
-without byte-order mark, with any line ends. Columns are separated by commas, or as spreadsheets do by tabs or by
-semicolons, where decimal commas are read; a first line ``sep=;`` is skipped.
+without byte-order mark, with any line ends. Columns are separated by commas, or as spreadsheets do by tabs or
+by semicolons, where decimal commas are read; a first line ``sep=;`` is skipped.
 """
 
 import csv

@@ -8,6 +8,7 @@ import pytest
 from projservo_cli import cli
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.config.inputs import plan_inputs, truth_of
+from projservo_cli.detection import TagFinder
 from projservo_cli.masking import masked
 from projservo_cli.nominal import read_nominal
 from projservo_cli.records import VIEWS, InputError
@@ -294,3 +295,62 @@ def test_numbers_for_unseen_markers_are_named_and_taken_as_unseen(told, recorded
     assert one["predicted_rms_px"] == pytest.approx(other["predicted_rms_px"], rel=0.02)
     assert one["rejected"]["placeholders"] > 0.95 * sum(a != b for a, b in zip(rows, empty, strict=True))
     assert "taken as unseen" in one["advice"][-1]
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Folders of images of two tags at two poses, and their joints."""
+    cv2, finder = pytest.importorskip("cv2"), TagFinder("4X4_50")
+    for side in VIEWS:
+        (tmp_path / side).mkdir()
+        for k in range(2):
+            image = np.full((240, 320), 200, dtype=np.uint8)
+            for number in range(2):
+                tag = finder.picture(number, 12)
+                image[40 + 9 * k :, 20 + 150 * number :][: len(tag), : len(tag)] = tag
+            cv2.imwrite(str(tmp_path / side / f"img_{k}.png"), cv2.GaussianBlur(image, (5, 5), 0.8))
+    (tmp_path / "q.csv").write_text("pose,q1\n0,0.1\n1,0.2\n")
+    sides = [tmp_path / side for side in VIEWS]
+    return tmp_path, [
+        "detect",
+        *sides,
+        "--joints-csv",
+        tmp_path / "q.csv",
+        "-o",
+        tmp_path / "t.csv",
+        "--json",
+    ]
+
+
+def test_sidecar_files_are_no_images(told, folders):
+    folder, detect = folders
+    for side in VIEWS:
+        (folder / side / "Thumbs.db").write_bytes(b"x")
+        for k in range(2):
+            (folder / side / f"._img_{k}.png").write_bytes(b"\0\5\x16\7")
+    code, out, err = told(*detect)
+    assert (code, json.loads(out)["hidden_files"], json.loads(out)["tags"]) == (0, 4, [0, 1])
+    assert "4 hidden files" in err
+
+
+@pytest.mark.parametrize("kind", ["16 bits", "Bayer"])
+def test_images_that_show_no_grey_values_are_named(told, folders, kind):
+    import cv2
+
+    folder, detect = folders
+    path = folder / "right" / "img_1.png"
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if kind == "Bayer":
+        gain = np.tile([[0.6, 1.0], [1.0, 0.7]], (120, 160))
+        cv2.imwrite(str(path), (image * gain).astype(np.uint8))
+    else:
+        cv2.imwrite(str(path), image.astype(np.uint16) * 16)
+    code, _, err = told(*detect)
+    assert (code, "img_1.png" in err, kind in err) == (2, True, True)
+
+
+def test_an_image_that_two_rows_name_is_refused(told, folders):
+    folder, detect = folders
+    (folder / "q.csv").write_text("q1,left,right\n0.1,img_0.png,img_0.png\n0.2,img_1.png,img_0.png\n")
+    code, _, err = told(*detect)
+    assert (code, "names it in 2 rows" in err) == (2, True)
