@@ -1,6 +1,7 @@
 """The robot, its rig and its markers, in metric terms: the truth of a simulation."""
 
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, Self
 
@@ -19,7 +20,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from projservo_cli.nominal import Matrix34, Matrix44, Number, Vector3, not_a_screw, not_rigid
-from projservo_cli.records import TWO_TURNS
+from projservo_cli.records import FARTHEST_M, TWO_TURNS
 
 Positive = Annotated[float, Strict(), Field(gt=0)]
 NotNegative = Annotated[float, Strict(), Field(ge=0)]
@@ -86,10 +87,30 @@ class Root(Section):
         return ()
 
 
+# Largest value of a key by its name: of the size of a tool and other lengths, m, and of short times, s.
+_LARGEST = (
+    (re.compile(r"(tag_)?size_m|positions_m|by_m|translation_m"), 2.0, "millimetres"),
+    (re.compile(r"\w+_m"), FARTHEST_M, "millimetres"),
+    (re.compile(r"(period|settle|time_offset|camera_latency|max_servo_lag|max_age)_s"), 10.0, "milliseconds"),
+)
+
+
+def _of_another_unit(key: str, value: Any) -> str:
+    """Tell that a length or a time looks like one in another unit; empty if not."""
+    most, unit = next(((most, unit) for name, most, unit in _LARGEST if name.fullmatch(key)), (math.inf, ""))
+    each = list(vars(value).values()) if isinstance(value, Section) else value
+    largest = max((abs(x) for x in np.ravel(each) if isinstance(x, float)), default=0.0) if unit else 0.0
+    return (
+        f"{largest:g} is more than {most:g}: it looks like {unit}; divide by 1000" if largest > most else ""
+    )
+
+
 def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...] = ()) -> Iterator[Finding]:
     """Those of all sections among some values by their keys, and of the sections in these."""
     for key, part in parts:
         here = (*path, key)
+        if what := _of_another_unit(str(key), part):
+            yield here, what
         if isinstance(part, Section):
             yield from ((here + at, what) for at, what in part.contradictions())
             yield from _contradictions(vars(part).items(), here)

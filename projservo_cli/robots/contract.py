@@ -13,12 +13,13 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from projservo_cli.calibration.time_offset import is_repeated_frame
+from projservo_cli.calibration.time_offset import is_repeated_frame, time_unit
 from projservo_cli.records import (
     ByteArray,
     FloatArray,
     ImageSize,
     InputError,
+    IntArray,
     JointLimits,
     WorkFailed,
     image_sizes,
@@ -34,6 +35,7 @@ _ROUND_OFF, _LATE = 1e-9, 0.1
 # A joint that is driven goes from reading to reading at so many times its speed limit, and by so much more
 # (rad or m), at most: one that falls or is pushed goes farther, or one whose reading is wrong.
 _SURGE, _LEAP = 3.0, 0.05
+_WHOLE = 8  # readings in a row whose stamps are whole seconds by chance, at most
 
 
 class Reading(NamedTuple):
@@ -149,6 +151,8 @@ class PluginRobot:
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
         self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
         self._last: Reading | None = None
+        # The clock and the stamps (3,) first read, s, and how many readings in a row have whole ones.
+        self._stamps: tuple[float, FloatArray, IntArray] | None = None
         self._earlier: Reading | None = None  # the one before the last
         self.frames: ByteArray | None = None  # (2, height, width) last seen, where the robot has them
         self._sent: FloatArray | None = None  # the last set-point (n,)
@@ -346,7 +350,11 @@ class PluginRobot:
         before, there = self._shown
         last = max(before + here - there, self._due) if self._shown[1] else math.inf
         if not before <= now <= last + self.timeout_s:
-            raise WorkFailed(f"{self.name}: its clock jumped from {before:.6g} s to {now:.6g} s")
+            unit = time_unit(max(now - before, 1e-9) / max(here - there, 1e-6))
+            raise WorkFailed(
+                f"{self.name}: its clock jumped from {before:.6g} s to {now:.6g} s"
+                + (f" in {here - there:.3g} s: of now(), {unit}" if unit else "")
+            )
         self._shown = now, here
         return now
 
@@ -371,6 +379,7 @@ class PluginRobot:
             if times[i] < last - (i and self.timeout_s):  # exposures that jitter may overtake each other
                 what = f"{name} went back from {last:.6g} s to {times[i]:.6g} s"
                 raise WorkFailed(f"{self.name}: {what}: one clock must stamp all of them")
+        self._require_seconds(before, times)
         if sigma is not None:
             sigma = self._numbers("read() gave sigma_px", sigma, (2, self._markers))
             stated = sigma[np.isfinite(s[..., 0])]
@@ -379,6 +388,26 @@ class PluginRobot:
         return Reading(
             q=q, s=s, t_q=before if np.isnan(times[0]) else float(times[0]), t_view=times[1:], sigma_px=sigma
         )
+
+    def _require_seconds(self, clock: float, times: FloatArray) -> None:
+        """Refuse stamps t_q, t_left, t_right that go on as in another unit than s, or in whole seconds."""
+        if self._stamps is None:
+            self._stamps = clock, times, np.ones(3, dtype=np.int64)
+        begun, first, whole = self._stamps
+        np.multiply(whole + 1, (times == np.rint(times)) & (times != 0.0), out=whole)
+        for name, t, since, count in zip(("t_q", "t_left", "t_right"), times, first, whole, strict=True):
+            # A clock of its own may jump by a second or two, when it is set.
+            unit = time_unit(max(t - since - 2.0, 1e-9) / (clock - begun)) if clock - begun > 2e-3 else ""
+            if unit:
+                raise WorkFailed(
+                    f"{self.name}: {name} went on by {t - since:.6g} while its clock went on by "
+                    f"{clock - begun:.3g} s: {unit}"
+                )
+            if count > _WHOLE and (clock - begun) % 1.0 and self.bounds.period % 1.0:
+                raise WorkFailed(
+                    f"{self.name}: {name} is a whole number in {count} readings, such as {t:.0f}: give s "
+                    "with its fractions, else no latency can be estimated"
+                )
 
     def _wrong(self, target: FloatArray, speed: FloatArray, due: float) -> str:
         """Return the reason why a command must not be sent; empty if it may."""

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.calibration.time_offset import require_seconds
 from projservo_cli.files import lines_of, write_whole
 from projservo_cli.metric.position_error import Positions
 from projservo_cli.records import (
@@ -104,7 +105,7 @@ def read_table(
         np.array([[of_pose.get(name) for name in names] for of_pose in values], dtype=np.float64)
         for names in (sheet.joints, (_MOVING,), _TIMES)
     )
-    return Observation(
+    found = Observation(
         pose=numbers,
         marker=markers,
         q=sheet.in_radians(numbers, q_read, joint_unit),
@@ -114,6 +115,8 @@ def read_table(
         t_view=times[:, 1:] if np.isfinite(times[:, 1:]).any() else None,
         sigma=sigma,
     )
+    require_seconds(sheet.file, found)
+    return found
 
 
 def read_joint_list(

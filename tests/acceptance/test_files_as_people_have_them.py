@@ -354,3 +354,77 @@ def test_an_image_that_two_rows_name_is_refused(told, folders):
     (folder / "q.csv").write_text("q1,left,right\n0.1,img_0.png,img_0.png\n0.2,img_1.png,img_0.png\n")
     code, _, err = told(*detect)
     assert (code, "names it in 2 rows" in err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("change", "unit"),
+    [
+        ("markers.positions_m=[[0, 0, 0], [40, 0, 0], [0, 40, 0], [40, 40, 0]]", "millimetres"),
+        ("rig.left={focal_px: [900, 900], principal_point_px: [640, 512], position_m: [1500, 0, 600], "
+         "target_m: [0, 0, 300]}", "millimetres"),
+        ("control.period_s=40", "milliseconds"),
+        ("plant.time_offset_s=80", "milliseconds"),
+        ("plant.time_offset_s={left: 0.08, right: 80}", "milliseconds"),
+        ("disturbance.camera_latency_s=60", "milliseconds"),
+        ("plant.settle_s=500", "milliseconds"),
+    ],
+)  # fmt: skip
+def test_a_value_of_another_unit_than_its_key_says_is_refused(change, unit):
+    key = change.partition("=")[0]
+    with pytest.raises(InputError, match=rf"{key}[\w.]*: [0-9.]+ is more than [0-9.]+: it looks like {unit}"):
+        load_config(ROOT / "configs" / "paper.yaml", [change])
+
+
+def in_motion(recorded, path, unit=1.0, clocks=("t_q", "t_left", "t_right"), whole=False):
+    """A recorded table with a motion, its stamps by these clocks in another unit, or in whole seconds."""
+    header, *rows = recorded.read_text().splitlines()
+    more = ["0,,,"] * len(rows)
+    for line in rows[:300]:
+        pose, rest = line.split(",", 1)
+        t = round(0.04 * int(pose)) if whole else 5.0 + 0.04 * int(pose)
+        stamps = [t * unit if name in clocks else t for name in ("t_q", "t_left", "t_right")]
+        rows.append(f"{1000 + int(pose)},{rest}")
+        more.append(",".join(["1", *map(repr, stamps)]))
+    text = "\n".join(f"{row},{cells}" for row, cells in zip(rows, more, strict=True))
+    path.write_text(f"{header},moving,t_q,t_left,t_right\n{text}\n")
+    return path
+
+
+@pytest.mark.parametrize("clocks", [("t_q",), ("t_right",), ("t_q", "t_left", "t_right")])
+@pytest.mark.parametrize("unit", [1e3, 1e6, 1e9])
+def test_stamps_of_a_table_in_another_unit_are_refused(recorded, tmp_path, unit, clocks):
+    read_table(in_motion(recorded, tmp_path / "t.csv"))
+    with pytest.raises(
+        InputError, match=rf"t.csv: {clocks[0]} goes on by .* by {unit:g}".replace("+", r"\+")
+    ):
+        read_table(in_motion(recorded, tmp_path / "t.csv", unit, clocks))
+
+
+def test_whole_seconds_in_a_table_are_named_where_the_latency_is_left_out(told, recorded, tmp_path):
+    table = in_motion(recorded, tmp_path / "t.csv", whole=True)
+    code, out, _ = told("calibrate", "--data", table, "-o", tmp_path / "out", "--json")
+    found = json.loads(out)
+    assert (code, found["time_offset_s"]) == (0, None)
+    assert "t_q of poses in motion are whole seconds" in " ".join(found["advice"])
+
+
+@pytest.mark.parametrize("images_only", [False, True])
+@pytest.mark.parametrize(
+    ("unit", "whole", "wanted"),
+    [
+        (1e3, False, "milliseconds"),
+        (1e9, False, "nanoseconds"),
+        (1.0, True, "whole number"),
+        (1.0, False, ""),
+    ],
+)
+def test_record_names_stamps_in_another_unit(told, tmp_path, unit, whole, wanted, images_only):
+    options = f"{{config: {ROOT}/configs/ur5.yaml, unit: {unit}, whole: {whole}, images_only: {images_only}}}"
+    robot = f"plant={{use: 'tests.robots.robots:Stamped', options: {options}}}"
+    few = ["calibration.random_poses=0", "calibration.frames_per_joint=1"]
+    code, _, err = told(
+        "record", "-c", ROOT / "configs" / "ur5.yaml", "-o", tmp_path / "t.csv",
+        *(word for one in (robot, *few) for word in ("--set", one)),
+    )  # fmt: skip
+    assert (code, wanted in err, "t_left" in err) == (int(bool(wanted)), True, images_only and bool(wanted))
+    assert "vibrates" not in err
