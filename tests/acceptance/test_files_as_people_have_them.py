@@ -428,3 +428,18 @@ def test_record_names_stamps_in_another_unit(told, tmp_path, unit, whole, wanted
     )  # fmt: skip
     assert (code, wanted in err, "t_left" in err) == (int(bool(wanted)), True, images_only and bool(wanted))
     assert "vibrates" not in err
+
+
+@pytest.mark.parametrize("mode", ["r", "r+"])
+def test_a_run_file_open_elsewhere_is_read_or_its_holder_named(told, recorded, tmp_path, mode):
+    h5py = pytest.importorskip("h5py")
+    out = tmp_path / "out"
+    assert told("calibrate", "--data", recorded, "-o", out)[0] == 0
+    with h5py.File(out / "run.h5", mode):
+        answers = [told("calibrate", "--data", recorded, "-o", out), told("show", out)]
+    for code, _, err in answers:
+        assert code == (0 if mode == "r" else 2)
+        assert (
+            mode == "r" or "is open for writing in this process, such as by h5py or xarray: close it" in err
+        )
+        assert "delete" not in err
