@@ -42,9 +42,11 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 
 def write_whole(path: Path, content: str | bytes) -> Path:
-    """Write a file as ``replacing`` does, text in UTF-8, and return its path."""
+    """Write a file as ``replacing`` does, text in UTF-8, bytes of paths that are none as in Python."""
     with replacing(path) as temporary:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        temporary.write_bytes(
+            content.encode(errors="backslashreplace") if isinstance(content, str) else content
+        )
     return path
 
 

@@ -41,6 +41,7 @@ _PHRASES = {
     "float_type": "must be a number",
     "int_type": "must be a whole number",
     "string_type": "must be text; put it in quotes",
+    "string_unicode": "must be UTF-8 (rename the file or its folder)",
     "model_type": "must be a mapping of keys to values",
     "dict_type": "must be a mapping of keys to values",
     "tuple_type": "must be a list",

@@ -1,6 +1,7 @@
 """Files and sources as people have them, each read or refused by its cause: a kind of fault a test."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -443,3 +444,18 @@ def test_a_run_file_open_elsewhere_is_read_or_its_holder_named(told, recorded, t
             mode == "r" or "is open for writing in this process, such as by h5py or xarray: close it" in err
         )
         assert "delete" not in err
+
+
+def test_a_path_that_is_not_utf8_works_or_is_refused_in_a_line(told, recorded, tmp_path):
+    folder = tmp_path / os.fsdecode(b"dos\xe9")
+    try:
+        folder.mkdir()
+    except (OSError, UnicodeError):
+        pytest.skip("the file system takes no such name")
+    (folder / "t.csv").write_bytes(recorded.read_bytes())
+    code, _, err = told("calibrate", "--data", folder / "t.csv", "-o", tmp_path / "out")
+    assert (code, "data.table: must be UTF-8 (rename the file or its folder)" in err) == (2, True)
+    code, out, _ = told("calibrate", "--data", recorded, "-o", folder / "out", "--json")
+    assert (code, json.loads(out)["run"]) == (0, str(folder / "out" / "run.h5"))
+    assert told("report", "-o", folder / "out")[0] == 0
+    assert (folder / "out" / "report.html").is_file()
