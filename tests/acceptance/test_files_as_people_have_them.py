@@ -459,3 +459,17 @@ def test_a_path_that_is_not_utf8_works_or_is_refused_in_a_line(told, recorded, t
     assert (code, json.loads(out)["run"]) == (0, str(folder / "out" / "run.h5"))
     assert told("report", "-o", folder / "out")[0] == 0
     assert (folder / "out" / "report.html").is_file()
+
+
+@pytest.mark.parametrize(("shift", "words"), [(1, "before"), (-1, "after")])
+def test_images_of_another_pose_than_their_readings_are_named(told, recorded, tmp_path, shift, words):
+    header, *rows = (line.split(",") for line in recorded.read_text().splitlines())
+    at, last = header.index("u_left"), max(int(row[0]) for row in rows)
+    seen = {(int(row[0]), row[1]): row[at : at + 4] for row in rows}
+    for row in rows:
+        pose = min(max(int(row[0]) - shift, 0), last)
+        row[at : at + 4] = seen[pose, row[1]]
+    (tmp_path / "t.csv").write_text("\n".join(map(",".join, [header, *rows])) + "\n")
+    code, _, err = told("calibrate", "--data", tmp_path / "t.csv", "-o", tmp_path / "out")
+    assert (code, f"each image shows the pose {words} its reading" in err) == (1, True)
+    assert ("plant.settle_s" in err) == (shift == 1)
