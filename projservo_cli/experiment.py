@@ -17,17 +17,10 @@ from projservo_cli.config.inputs import joints_of, trajectory_of
 from projservo_cli.display import Printed
 from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
+from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import CODES, law_and_mode, mode_in
 from projservo_cli.progress import Bar
-from projservo_cli.records import (
-    Calibration,
-    CrossValidation,
-    InputError,
-    Observation,
-    Report,
-    WorkFailed,
-    image_sizes,
-)
+from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Report, WorkFailed
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
 from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress, silent

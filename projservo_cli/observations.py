@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from projservo_cli.calibration.estimate import require_size_and_noise
 from projservo_cli.display import Displayable, checked_array, numbers_in, pandas
-from projservo_cli.records import FloatArray, ImageSize, InputError, Observation
+from projservo_cli.image_size import ImageSize
+from projservo_cli.records import FloatArray, InputError, Observation
 from projservo_cli.store.tables import in_radians, or_empty, read_table, to_csv, write_table
 
 _TABLE = "table"  # name in messages of a table that is not a file

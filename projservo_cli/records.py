@@ -70,10 +70,6 @@ def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
     return field(metadata={"units": units, "about": about}, **default)
 
 
-ImageSize = tuple[int, int] | tuple[tuple[int, int], tuple[int, int]]
-"""Width and height of the images, px: of both, or of the left and of the right."""
-
-
 class InputError(ValueError):
     """Usage, configuration or data that cannot be read or make no sense (exit code 2).
 
@@ -89,11 +85,6 @@ class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming err
 
     def __init__(self, *args: object) -> None:
         super().__init__(*masked(args))
-
-
-def image_sizes(size: Any) -> FloatArray:
-    """Width and height (2, 2) of each image, px, by those of both or of one each; infinite for None."""
-    return np.broadcast_to(np.array(math.inf if size is None else size, dtype=np.float64), (2, 2)).copy()
 
 
 REVOLUTE = 0

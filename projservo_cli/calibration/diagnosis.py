@@ -357,7 +357,7 @@ def straight_joints(solution: Solution) -> list[int]:
 
 
 def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None = None) -> str:
-    """Describe the one change of one joint, or of the order of images, with which the model fits the data; empty if none.
+    """Describe the one change, of a joint or of the order of images, with which the model fits, or "".
 
     A rough fit compares all changes. The best are fitted completely and accepted only if the fit passes as a
     calibration does, with a noise of at most ``max_px``.

@@ -16,7 +16,8 @@ from scipy.special import stdtrit
 
 from projservo_cli.calibration.detections import MAD, MIN_SIGMA, Detections, medians
 from projservo_cli.geometry.rigid import homogeneous
-from projservo_cli.records import BoolArray, FloatArray, ImageSize, IntArray, WorkFailed, image_sizes
+from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Residual, in standard deviations, above which correspondences and detections are outliers.
 OUTLIER = 5.0

@@ -36,16 +36,8 @@ from projservo_cli.calibration.quality import WEAK_NOISE, assess, check_model, c
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.calibration.undecided import require_poses
 from projservo_cli.geometry.lens import K1
-from projservo_cli.records import (
-    VIEWS,
-    BoolArray,
-    Calibration,
-    Errors,
-    ImageSize,
-    InputError,
-    Observation,
-    image_sizes,
-)
+from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation
 
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.

@@ -36,9 +36,10 @@ from projservo_cli.config.robot import (
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
 from projservo_cli.display import Printed
+from projservo_cli.image_size import ImageSize
 from projservo_cli.laws import LAW_SPECS, LAWS, REGULATE, mode_in
 from projservo_cli.nominal import Number, Vector3
-from projservo_cli.records import LIMITS_MISSING, ImageSize, InputError
+from projservo_cli.records import LIMITS_MISSING, InputError
 from projservo_cli.robots import plugins
 
 

@@ -15,13 +15,7 @@ from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.geometry.mechanisms import Seen, reach
 from projservo_cli.loop.metrics import Ended, path_deviation, summarize
 from projservo_cli.loop.step import new_log
-from projservo_cli.planning.margins import (
-    Reaching,
-    carried_into,
-    carrier_of,
-    limits_alone,
-    room_along,
-)
+from projservo_cli.planning.margins import Reaching, carried_into, carrier_of, limits_alone, room_along
 from projservo_cli.records import JointLimits, Model
 from projservo_cli.simulation.ideal import Ends, Plant
 from projservo_cli.task.face import Task

@@ -7,13 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from projservo_cli.calibration.prediction import dense_pixel_changes, error_factor, parameters_from
-from projservo_cli.records import (
-    NO_SPREAD,
-    BoolArray,
-    Calibration,
-    FloatArray,
-    Spread,
-)
+from projservo_cli.records import NO_SPREAD, BoolArray, Calibration, FloatArray, Spread
 
 _BATCH = 1500  # poses drawn at once
 

@@ -12,18 +12,9 @@ from markupsafe import Markup
 
 from projservo_cli.files import replacing, write_whole
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS
-from projservo_cli.records import (
-    BoolArray,
-    ByteArray,
-    FloatArray,
-    ImageSize,
-    InputError,
-    IntArray,
-    Plan,
-    Trace,
-    image_sizes,
-)
+from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
 from projservo_cli.report.figures.frames import frames_of, with_halo
 from projservo_cli.report.figures.images import near_pixels
@@ -310,9 +301,8 @@ def write_animation(
 ) -> None:
     """Write the animation of runs as GIF: the first direct law and the classical ones side by side.
 
-    ``order`` are the markers around the face, ``size`` is that of both images or of each, px; where it is not
-    known, the animation shows what reaches around all that was seen. Where the runs have frames, these are
-    shown.
+    ``order`` are the markers around the face, ``size`` is that of the images in px; where it is not known,
+    the animation shows what reaches around all that was seen. Where the runs have frames, these are shown.
     """
     from PIL import Image
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from projservo_cli.image_size import image_sizes
 from projservo_cli.records import (
     Calibration,
     CrossValidation,
@@ -13,7 +14,6 @@ from projservo_cli.records import (
     Observation,
     Plan,
     Trace,
-    image_sizes,
     position_limits,
 )
 from projservo_cli.report import figures, style

@@ -14,15 +14,14 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame, time_unit
+from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.records import (
     ByteArray,
     FloatArray,
-    ImageSize,
     InputError,
     IntArray,
     JointLimits,
     WorkFailed,
-    image_sizes,
     in_unit,
 )
 from projservo_cli.robots.plugins import what_failed
@@ -149,6 +148,7 @@ class PluginRobot:
         self.timeout_s, self.open_s = timeout_s, open_s
         self._joints, self._markers = len(bounds.limits.speed), markers
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
+        self._began = 0.0, 0.0  # what its clock showed first, and when, as below
         self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
         self._last: Reading | None = None
         # The clock and the stamps (3,) first read, s, and how many readings in a row have whole ones.
@@ -350,11 +350,13 @@ class PluginRobot:
         before, there = self._shown
         last = max(before + here - there, self._due) if self._shown[1] else math.inf
         if not before <= now <= last + self.timeout_s:
-            unit = time_unit(max(now - before, 1e-9) / max(here - there, 1e-6))
+            began, then = self._began  # one that ran well until now was set, whatever its unit
+            unit = time_unit(max(now - began, 1e-9) / max(here - then, 1e-6))
             raise WorkFailed(
                 f"{self.name}: its clock jumped from {before:.6g} s to {now:.6g} s"
-                + (f" in {here - there:.3g} s: of now(), {unit}" if unit else "")
+                + (f" in {here - there:.3g} s: now() must give s, and {unit}" if unit else "")
             )
+        self._began = self._began if self._shown[1] else (now, here)
         self._shown = now, here
         return now
 

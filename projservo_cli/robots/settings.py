@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
-from projservo_cli.records import Calibration, FloatArray, ImageSize, InputError, JointLimits, in_unit
+from projservo_cli.image_size import ImageSize
+from projservo_cli.records import Calibration, FloatArray, InputError, JointLimits, in_unit
 from projservo_cli.robots.contract import Bounds
 
 

@@ -5,17 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import (
-    Mat4,
-    Vec4,
-    apply,
-    as_array,
-    axpy,
-    dot,
-    mat,
-    vec,
-    vec_into,
-)
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, as_array, axpy, dot, mat, vec, vec_into
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward, row
 from projservo_cli.geometry.lens import distort_pixel

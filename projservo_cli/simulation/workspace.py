@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.rigid import rigid
-from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model, image_sizes
+from projservo_cli.image_size import image_sizes
+from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model
 from projservo_cli.simulation.arm import Arm, about_axis, camera_center, roll_axis
 from projservo_cli.simulation.ideal import Ends
 from projservo_cli.simulation.inverse_kinematics import inverse_kinematics

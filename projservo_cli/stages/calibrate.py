@@ -6,28 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.calibration import (
-    Nominal,
-    Solution,
-    calibrate,
-    cross_validate,
-)
+from projservo_cli.calibration import Nominal, Solution, calibrate, cross_validate
 from projservo_cli.calibration.screening import screened
 from projservo_cli.calibration.undecided import undecided_pairs
 from projservo_cli.files import write_whole
+from projservo_cli.image_size import image_sizes
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import Suggestion, suggest
 from projservo_cli.planning.prediction_covariance import Region
-from projservo_cli.records import (
-    Calibration,
-    CrossValidation,
-    FloatArray,
-    IntArray,
-    Observation,
-    WorkFailed,
-    image_sizes,
-)
+from projservo_cli.records import Calibration, CrossValidation, FloatArray, IntArray, Observation, WorkFailed
 from projservo_cli.robots.settings import JointSettings
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.given import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials

@@ -9,7 +9,8 @@ from typing import NamedTuple
 from projservo_cli.canonical import File, encoded
 from projservo_cli.control.law import Gains
 from projservo_cli.display import About
-from projservo_cli.records import FloatArray, ImageSize
+from projservo_cli.image_size import ImageSize
+from projservo_cli.records import FloatArray
 from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings
 from projservo_cli.simulation.arm import Arm
 from projservo_cli.simulation.faults import Events, SimulatedRobot

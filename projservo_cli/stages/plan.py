@@ -12,6 +12,7 @@ from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import undistort
+from projservo_cli.image_size import image_sizes
 from projservo_cli.loop.batch import begin
 from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.planning.margins import Demands, Reaching
@@ -26,7 +27,6 @@ from projservo_cli.records import (
     Model,
     Plan,
     WorkFailed,
-    image_sizes,
     in_sense,
 )
 from projservo_cli.stages.given import PlanInputs

@@ -11,8 +11,9 @@ from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding, Seen, findings_at_rest
 from projservo_cli.hardware.wiggle import Strokes, findings_of, reach_of, strokes
+from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.monitoring.monitor import detected_fault
-from projservo_cli.records import Calibration, FloatArray, ImageSize, InputError, WorkFailed, image_sizes
+from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages import Progress, silent

@@ -11,8 +11,9 @@ import numpy as np
 
 from projservo_cli import provenance
 from projservo_cli.files import replacing, require_inside, write_whole
+from projservo_cli.image_size import ImageSize
 from projservo_cli.metric.frame import Metric, Scale
-from projservo_cli.records import Calibration, ImageSize, InputError, Report, Trace, WorkFailed
+from projservo_cli.records import Calibration, InputError, Report, Trace, WorkFailed
 from projservo_cli.report import style
 from projservo_cli.report.animation import motion_of, write_animation, write_view
 from projservo_cli.report.claims import claims_of

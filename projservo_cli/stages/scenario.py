@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from projservo_cli.calibration import predict
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import BODY_LAWS, LAW_SPECS
 from projservo_cli.loop.step import Limits
 from projservo_cli.planning.margins import Demands
@@ -27,7 +28,6 @@ from projservo_cli.records import (
     IntArray,
     Model,
     WorkFailed,
-    image_sizes,
 )
 from projservo_cli.robots.client import weights
 from projservo_cli.robots.settings import Joints, limit_passed

@@ -12,9 +12,10 @@ from projservo_cli.calibration.detections import MIN_SIGMA
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.geometry.lens import distort, undistort
 from projservo_cli.geometry.rigid import rigid_inverse
+from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.metric.frame import Body, Metric
 from projservo_cli.metric.kinematic_errors import KinematicErrors
-from projservo_cli.records import VIEWS, Calibration, FloatArray, ImageSize, image_sizes
+from projservo_cli.records import VIEWS, Calibration, FloatArray
 
 # Arrays that move along with the cameras.
 _MOVED = ("lens", "poses", "axes", "tool", "markers")

@@ -20,8 +20,9 @@ from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.config.task import Goal, TaskSettings
 from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import law_and_mode, names_of
-from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed, image_sizes
+from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.source import source_hash
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.workspace import Truth

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from projservo_cli.image_size import image_sizes
 from projservo_cli.planning.constraints import Constraints, constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.margins import Demands
-from projservo_cli.records import image_sizes
 from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import TaskImages
 from tests.configured import joints_of, truth_of

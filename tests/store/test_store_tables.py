@@ -9,13 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.records import InputError, Observation
-from projservo_cli.store.tables import (
-    read_joint_list,
-    read_positions,
-    read_table,
-    recording_of,
-    write_table,
-)
+from projservo_cli.store.tables import read_joint_list, read_positions, read_table, recording_of, write_table
 
 HEADER = "pose,marker,q1,q2,u_left,v_left,u_right,v_right"
 ROWS = ["0,1,0.5,-1,10,20,30,40", "0,0,0.5,-1,11,21,31,41", "7,1,0.25,2e-1,12.5,22,,"]

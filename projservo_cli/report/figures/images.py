@@ -9,14 +9,7 @@ from projservo_cli.laws import POINT_LAWS, title_of
 from projservo_cli.loop.step import plateau_stretch
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.report_data import (
-    DIRECT,
-    VIEWS,
-    Data,
-    ReportData,
-    percent,
-    registered,
-)
+from projservo_cli.report.report_data import DIRECT, VIEWS, Data, ReportData, percent, registered
 
 _OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
 _BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
