@@ -72,9 +72,9 @@ class Truth:
         towards = (away * (self.normals @ H[:3, :3].T)).sum(axis=2) / np.linalg.norm(away, axis=2)
         return np.asarray((towards > _EDGE_ON) | ~self.normals.any(axis=-1))
 
-    def within(self, pixels: FloatArray) -> FloatArray:
-        """Pixels (..., 2, m, 2), NaN outside an image: their centres reach from −½ to size − ½."""
-        inside = (pixels >= -0.5) & (pixels <= image_sizes(self.image_size)[:, None] - 0.5)
+    def within(self, pixels: FloatArray, view: int | slice = slice(None)) -> FloatArray:
+        """Pixels (..., 2, m, 2), or (m, 2) of a view, NaN outside an image: centres reach to size − ½."""
+        inside = (pixels >= -0.5) & (pixels <= image_sizes(self.image_size)[view, ..., None, :] - 0.5)
         return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)
 
     def displacement(self, q: FloatArray) -> FloatArray:
