@@ -87,9 +87,9 @@ class Root(Section):
         return ()
 
 
-# Largest value of a key by its name: of the size of a tool and other lengths, m, and of short times, s.
+# Largest value of a key by its name: of what is on the tool and other lengths, m, and of short times, s.
 _LARGEST = (
-    (re.compile(r"(tag_)?size_m|positions_m|by_m|translation_m"), 2.0, "millimetres"),
+    (re.compile(r"(tag_)?size_m|positions_m"), 2.0, "millimetres"),
     (re.compile(r"\w+_m"), FARTHEST_M, "millimetres"),
     (re.compile(r"(period|settle|time_offset|camera_latency|max_servo_lag|max_age)_s"), 10.0, "milliseconds"),
 )

@@ -169,7 +169,7 @@ def _limits(joint: ET.Element, path: str) -> list[float]:
     if missing := [key for key in ("lower", "upper") if given is None or given.get(key) is None]:
         raise InputError(
             f"{path}: joint {name} of type {joint.get('type')} has no {' and no '.join(missing)} limit: give "
-            "lower and upper in its element limit, rad or m, or make a joint without limits continuous"
+            "lower and upper in its element limit, rad or m; a joint that turns without end is continuous"
         )
     lower, upper = (float(_numbers(joint, "limit", key, "0", path)[0]) for key in ("lower", "upper"))
     if not lower < upper:
