@@ -267,7 +267,7 @@ def plan(
     Raises
     ------
     InputError
-        When an array has another shape, or the start is beyond a limit.
+        When an array has another shape, the start is beyond a limit, or the size of the images is not known.
     WorkFailed
         When the task cannot be measured or split: which marker, and why.
     """
