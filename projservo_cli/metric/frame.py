@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.geometry.lens import TERMS, distort, undistort
 from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid_inverse, screws, twists
 from projservo_cli.geometry.stereo import triangulate_points
-from projservo_cli.records import FARTHEST_M, MM, BoolArray, Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, WorkFailed
 
 # Step of the differences that propagate covariances, in standard deviations of the calibration.
 _STEP = 0.05
@@ -365,11 +365,10 @@ class Metric:
         if between != "joint" and length_m is None:
             raise InputError(f"metric: the length between {between} is not given: give it in m")
         length = 1.0 if length_m is None else float(length_m)
-        if not 0.0 < length <= FARTHEST_M or not 0.0 <= length_std_m < np.inf:
+        if not 0.0 < length < np.inf or not 0.0 <= length_std_m < np.inf:
             raise InputError(
                 f"metric: a length of {length_m} m with a standard deviation of {length_std_m} m: give a "
-                f"positive length, in m and not in mm ({FARTHEST_M:g} at most), and a deviation that is not "
-                "negative"
+                "positive length, and a deviation that is not negative"
             )
         marker = c.marker.tolist()
         chosen = range(len(marker)) if face is None else _known_indices(face, marker)

@@ -136,8 +136,8 @@ def _borders(inputs: PlanInputs) -> str:
         return ""
     sizes = ["x".join(f"{side:.0f}" for side in one) for one in image_sizes(inputs.seen_px)]
     return (
-        f"the size of the images is not known: they reach to the last pixels recorded, {sizes[0]} left and "
-        f"{sizes[1]} right; give it: --image-size, or size_px of both cameras"
+        f"the size of the images is not known: they are taken to reach to the last pixels seen, {sizes[0]} "
+        f"left and {sizes[1]} right; give it: --image-size, or size_px of both cameras"
     )
 
 

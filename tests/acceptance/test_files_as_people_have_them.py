@@ -153,7 +153,10 @@ def test_case_08_unequal_image_sizes(case, told):
         file.write(text.replace(", size_px: [960, 1023]", ""))
     code, out, _ = told("plan", "-c", "unknown.yaml", "-o", "out2", "--json")
     assert (code, json.loads(out)["profile"]) == (0, "joint_space")
-    assert "the size of the images is not known: they reach to the last pixels recorded, 918x862 left" in out
+    assert (
+        "the size of the images is not known: they are taken to reach to the last pixels seen, 918x862 left"
+        in out
+    )
 
 
 @pytest.mark.parametrize("sizes", [[[640, 480], [320, 240]], [[640, 480], [640, 480]]])
