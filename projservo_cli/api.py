@@ -156,6 +156,8 @@ def record(
         if table is not None:
             stack.enter_context(working_in(table.parent, name=f".{table.name}.lock"))
         made = recording.new_recording(given, table, motions=further, force=force)
+        if not (made.pending or asked.plant.simulated):
+            listener.say(f"record: {table} is up to date, and the robot is not moved: use force=True")
         driven = None
         if robot is not None:
             assert given.trials.driven is not None
@@ -267,7 +269,7 @@ def plan(
     Raises
     ------
     InputError
-        When an array has another shape, or the start is beyond a limit.
+        When an array has another shape, the start is beyond a limit, or the size of the images is not known.
     WorkFailed
         When the task cannot be measured or split: which marker, and why.
     """
@@ -288,6 +290,7 @@ def servo(
     *,
     mode: str | None = None,
     robot: Any = None,
+    blind: bool = False,
 ) -> RunTrace:
     """Drive a law in closed loop from the start of a task to its verdict.
 
@@ -300,6 +303,7 @@ def servo(
     mode : ``regulate``, ``track`` or ``image_track``; by default that of the name, such as ``exact_track``,
         else ``regulate``.
     robot : an object of the contract to drive, instead of the robot of the configuration.
+    blind : whether a robot may move although cameras show no marker of the calibration.
 
     Returns
     -------
@@ -324,9 +328,9 @@ def servo(
         name, of_name = law_and_mode(law)
         if mode not in (None, of_name) and of_name != REGULATE:
             raise InputError(f"servo: law {law} is {name} in mode {of_name}, not {mode!r}: leave mode out")
-        given, name = driving.Given(None, robot), law_target(name)
+        given, name = driving.Given(None, robot, blind), law_target(name)
     else:
-        given, name, of_name = driving.Given(law, robot), plugins.name_of(law), REGULATE
+        given, name, of_name = driving.Given(law, robot, blind), plugins.name_of(law), REGULATE
     if isinstance(plan, MotionPlan):
         config = _with_task(config, calibration.joint_types, *plan.asked)
     asked = config.replace({"control.mode": [of_name if mode is None else mode]})

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from projservo_cli.masking import masked
 from projservo_cli.records import InputError
 
 
@@ -75,7 +76,7 @@ def _fields(record: Any) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """A value as JSON, in which every mapping has one key, its type."""
     if value is None or isinstance(value, (bool, int, float, str)):
-        return value
+        return masked(value)  # as in a run file, whose configuration has the same key
     if isinstance(value, File):
         return {"file": value.sha256}
     if isinstance(value, np.ndarray):

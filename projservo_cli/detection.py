@@ -65,13 +65,36 @@ def pair_images(left: str, right: str, joints: JointList, where: str) -> list[tu
 
 def _images(source: str) -> list[Path]:
     """Images of a folder or pattern, in the order of their names, 2 before 10."""
-    pattern = Path(source, "*") if Path(source).is_dir() else Path(source)
-    files = [file for file in pattern.parent.glob(pattern.name) if file.suffix.lower() in _SUFFIXES]
-    files = [file for file in files if file.is_file()]
+    files = [file for file in _images_or_not(source) if not file.name.startswith(".")]
     if not files:
         kinds = " ".join(sorted(suffix[1:] for suffix in _SUFFIXES))
         raise InputError(f"{source}: no images there; give a folder or a quoted pattern of files ({kinds})")
     return sorted(files, key=_natural)
+
+
+def hidden_images(source: str) -> list[Path]:
+    """Hidden files of a folder or pattern with names of images, as macOS writes beside each; no images."""
+    return [file for file in _images_or_not(source) if file.name.startswith(".")]
+
+
+def _images_or_not(source: str) -> list[Path]:
+    """Files of a folder or pattern with names of images."""
+    pattern = Path(source, "*") if Path(source).is_dir() else Path(source)
+    named = [file for file in pattern.parent.glob(pattern.name) if file.suffix.lower() in _SUFFIXES]
+    return [file for file in named if file.is_file()]
+
+
+def unfit(image: Any) -> str:
+    """Tell why an image as it was read shows no grey values of a scene, with the remedy; empty if it does."""
+    if image.dtype != np.uint8:
+        return f"has {8 * image.dtype.itemsize} bits a pixel: save it with 8, the brightest part near 255"
+    if image.ndim > 2 or min(image.shape) < 2:
+        return ""
+    even = image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2]
+    cells = even.reshape(len(even) // 2, 2, -1, 2).mean(axis=(0, 2), dtype=np.float64)
+    if np.ptp(cells) > max(1.0, _MOSAIC * cells.mean()):
+        return "is the mosaic of a colour sensor (Bayer): turn it into grey values or colours first"
+    return ""
 
 
 def _natural(file: Path) -> tuple[list[tuple[int, str]], str]:
@@ -85,6 +108,8 @@ def _named(source: str, names: Sequence[str], where: str) -> list[Path]:
     for file in files:
         if not file.is_file():
             raise InputError(f"{file}: there is no such image, though {where} names it")
+        if files.count(file) > 1:
+            raise InputError(f"{file}: {where} names it in {files.count(file)} rows; an image shows one pose")
     return files
 
 
@@ -103,6 +128,8 @@ def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
     return chosen
 
 
+# Share of the mean grey value by which those of the four pixels of a cell of a Bayer mosaic differ at least.
+_MOSAIC = 0.04
 # Minimum width of a cell, px, to fit edges of a tag, whose border is one cell wide.
 MIN_CELL = 2.3
 # Minimum length of a side to fit, px.
@@ -473,10 +500,14 @@ class TagFinder:
             content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-        flags = self.cv.IMREAD_GRAYSCALE | self.cv.IMREAD_IGNORE_ORIENTATION
-        image = self.cv.imdecode(content, flags) if content.size else None
+        image = self.cv.imdecode(content, self.cv.IMREAD_UNCHANGED) if content.size else None
         if image is None:
             raise InputError(f"{path}: not an image that OpenCV can read; save it again, as PNG for example")
+        if wrong := unfit(image):
+            raise InputError(f"{path}: {wrong}")
+        if image.ndim > 2:
+            flags = self.cv.IMREAD_GRAYSCALE | self.cv.IMREAD_IGNORE_ORIENTATION
+            image = self.cv.imdecode(content, flags)
         return np.asarray(image, dtype=np.float64)
 
     def picture(self, number: int, cell_px: int) -> ByteArray:

@@ -12,17 +12,19 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from projservo_cli.config import Config, load_config, shipped, to_yaml
+from projservo_cli.config import Config, load_config, shipped, stored_yaml
 from projservo_cli.config.inputs import joints_of, trajectory_of
 from projservo_cli.display import Printed
 from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
+from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import CODES, law_and_mode, mode_in
 from projservo_cli.progress import Bar
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Report, WorkFailed
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
 from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress, silent
+from projservo_cli.stages.given import PlanInputs
 from projservo_cli.steps import STAGES, Step, given_to, result_of, steps_for
 from projservo_cli.store import SERVO, Result, Run, load, run_path, save
 
@@ -101,6 +103,7 @@ class Chain:
     recording: Any = None  # the recording before the calibration, if any
     confirm: bool = False  # whether to ask before the first motion
     in_memory: bool = False  # whether results stay in memory
+    blind: bool = False  # whether a robot may move although cameras show nothing
     laws: tuple[str, ...] = field(init=False)  # names of the runs of laws that the steps make or need
     failed: str = ""  # name of the step that failed
     reason: str = ""  # why
@@ -112,7 +115,7 @@ class Chain:
     @property
     def pending(self) -> bool:
         """Whether a result is to be made, or the configuration to be stored."""
-        return self.run.configuration != to_yaml(self.config) or any(step.why for step in self.steps)
+        return self.run.configuration != stored_yaml(self.config) or any(step.why for step in self.steps)
 
     def lacks(self, stage: str) -> bool:
         """Whether a stage was not completed."""
@@ -123,6 +126,14 @@ class Chain:
         """The first run that would move a robot of somebody's though the stage servo was not asked for."""
         moving = not self.config.plant.simulated and "servo" not in self.names
         return next((step for step in self.steps if step.law and step.why), None) if moving else None
+
+    def replayed(self) -> list[dict[str, Any]]:
+        """Runs of a robot of somebody's that are shown as they were stored: law, plant, and date."""
+        if self.config.plant.simulated or "servo" in self.names:
+            return []
+        stored = [(step.law, self.run.results[step.name]) for step in self.steps if step.law and not step.why]
+        plant = plugins.short_name(self.config.plant.use or "")
+        return [{"law": law, "plant": plant, "date": one.provenance.get("date")} for law, one in stored]
 
     def code(self) -> list[tuple[str, str]]:
         """Kind and ``module:Class`` of the imports of the steps, of laws and of a robot."""
@@ -138,6 +149,8 @@ class Chain:
         """Make the outdated results, stop at the first failure, keep finished results."""
         if self.failed:
             return
+        for one in self.replayed():
+            self.listener.say("{law}: the stored run of {plant}, recorded {date}".format_map(one))
         self._say_compilation()
         with self._compiling():
             self._make_steps()
@@ -164,6 +177,8 @@ class Chain:
                     dropped = self._make_result(step)
                 except WorkFailed as error:
                     self.failed, self.reason = step.name, " ".join(str(error).split())
+                    if error.refutes:
+                        self._keep(replace(self.run, refuted=self.reason))
                     return
                 if dropped:
                     self.listener.say(f"{', '.join(dropped)}: dropped, their inputs were replaced")
@@ -173,7 +188,7 @@ class Chain:
                 if trace.verdict == "failed":  # nor is what failed driven by the next law
                     self.failed, self.reason = step.name, trace.reason
                     return
-        text = to_yaml(self.config)
+        text = stored_yaml(self.config)
         if self.run.configuration != text:  # overrides are stored also where nothing had to be made
             self._keep(replace(self.run, configuration=text))
 
@@ -182,12 +197,18 @@ class Chain:
 
     def _make_result(self, step: Step) -> list[str]:
         """Make one result from those before it; which others that made outdated and dropped."""
-        run = replace(self.run, configuration=to_yaml(self.config))
+        run = replace(self.run, configuration=stored_yaml(self.config))
         result = result_of(step, self.config, *self._made(step, run))
         place = STAGES.index(step.stage)
         after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
         results = {name: stored for name, stored in run.results.items() if name not in after}
-        self._keep(replace(run, results={**results, step.name: result}))
+        refuted = run.refuted
+        if step.stage == "calibrate":
+            refuted = ""
+        elif step.law and not self.config.plant.simulated:
+            trace = result.records[""]
+            refuted = trace.reason if trace.verdict == "fault detected" else ""
+        self._keep(replace(run, results={**results, step.name: result}, refuted=refuted))
         return after
 
     def _made(self, step: Step, run: Run) -> tuple[Any, ...]:
@@ -201,11 +222,13 @@ class Chain:
         if step.stage == "plan":
             from projservo_cli.stages import plan
 
-            return (plan.run(given, run.calibration),)
+            return (plan.run(_bounded(given, run), run.calibration),)
         if step.stage == "servo":
             from projservo_cli.stages import servo
 
-            return (servo.run(given, run.calibration, run.plan, step.law),)
+            asked = [servo.Given(blind=True)] if self.blind else []
+            bounded = replace(given, plan=_bounded(given.plan, run))
+            return (servo.run(bounded, run.calibration, run.plan, step.law, *asked),)
         from projservo_cli.stages import report
 
         return (report.run(given, self.reported(run), run.path.parent, progress=progress),)
@@ -277,14 +300,19 @@ class Experiment(Printed):
         made._run, made._in_memory, made._progress, made._may_import = run, False, True, False
         return made
 
-    def make(self, *stages: str, laws: Sequence[str] = (), force: bool = False) -> "Experiment":
+    def make(
+        self, *stages: str, laws: Sequence[str] = (), force: bool = False, blind: bool = False
+    ) -> "Experiment":
         """Make stages, and those before them that they need; results that are up to date stay.
+
+        A robot that is not simulated is driven again wherever ``servo`` is named.
 
         Parameters
         ----------
         stages : of ``calibrate``, ``plan``, ``servo`` and ``report``, in their order.
         laws : instead of ``control.laws``: names or ``module:Class``.
         force : whether named stages are made even if they are up to date.
+        blind : whether a robot may move although cameras show no marker of the calibration.
 
         Returns
         -------
@@ -306,16 +334,17 @@ class Experiment(Printed):
             raise InputError("make: a report is written into a folder: give Experiment a path")
         with listening(self._progress) as listener:
             if self._in_memory:
-                return self._make(stages, _targets(laws), force, listener)
+                return self._make(stages, _targets(laws), listener, force=force, blind=blind)
             with working_in(self._run.path.parent, FIGURES):
                 self._run = _stored(self._run.path)  # another process may have written it until now
-                return self._make(stages, _targets(laws), force, listener)
+                return self._make(stages, _targets(laws), listener, force=force, blind=blind)
 
     def _make(
-        self, stages: Sequence[str], laws: Sequence[str], force: bool, listener: Listener
+        self, stages: Sequence[str], laws: Sequence[str], listener: Listener, *, force: bool, blind: bool
     ) -> "Experiment":
         steps = steps_for(self.config, self._run, stages, laws=laws, force=force)
-        chain = Chain(listener, stages, self.config, self._run, steps, in_memory=self._in_memory)
+        memory = self._in_memory
+        chain = Chain(listener, stages, self.config, self._run, steps, in_memory=memory, blind=blind)
         if moving := chain.moves_unasked():
             raise InputError(
                 f"make: {moving.name} moves {self.config.plant.use}: name the stage servo as well"
@@ -422,9 +451,17 @@ def scene_of(config: Config, calibration: Calibration) -> Scene:
     return Scene(
         calibration.model(),
         joints.limits,
-        None if size is None else np.array(size, dtype=np.float64),
+        None if size is None else image_sizes(size),
         trajectory_of(config),
     )
+
+
+def _bounded(inputs: PlanInputs, run: Run) -> PlanInputs:
+    """Return the inputs of a plan with the border of images of an unknown size: what the recording shows."""
+    if inputs.image_size is not None:
+        return inputs
+    (left, right) = np.ceil(np.nanmax(run.observation.images, axis=(0, 2)) + 0.5).astype(int).tolist()
+    return replace(inputs, seen_px=(tuple(left), tuple(right)))
 
 
 def _stored(path: "str | Path | None") -> Run:

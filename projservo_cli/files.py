@@ -42,17 +42,16 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
 
 
 def write_whole(path: Path, content: str | bytes) -> Path:
-    """Write a file as ``replacing`` does, text in UTF-8, and return its path."""
+    """Write a file as ``replacing`` does, text in UTF-8, bytes of paths that are none as in Python."""
     with replacing(path) as temporary:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        temporary.write_bytes(
+            content.encode(errors="backslashreplace") if isinstance(content, str) else content
+        )
     return path
 
 
-def text_of(path: Path | str, expected: str, max_bytes: int) -> str:
-    """Text of a file of up to ``max_bytes`` in UTF-8, with or without byte-order mark.
-
-    Raises InputError, naming the ``expected`` content, if the file is no such text.
-    """
+def bytes_of(path: Path | str, expected: str, max_bytes: int) -> bytes:
+    """Content of a file of up to ``max_bytes``. Raises InputError, naming the ``expected`` content."""
     try:
         with Path(path).open("rb") as file:
             content = file.read(max_bytes + 1)
@@ -60,6 +59,15 @@ def text_of(path: Path | str, expected: str, max_bytes: int) -> str:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected {expected}") from error
     if len(content) > max_bytes:
         raise InputError(f"{path}: larger than {max_bytes // 1_000_000} MB; expected {expected}")
+    return content
+
+
+def text_of(path: Path | str, expected: str, max_bytes: int) -> str:
+    """Text of a file of up to ``max_bytes`` in UTF-8, with or without byte-order mark.
+
+    Raises InputError, naming the ``expected`` content, if the file is no such text.
+    """
+    content = bytes_of(path, expected, max_bytes)
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -82,7 +90,7 @@ def lines_of(path: Path | str, expected: str, max_bytes: int) -> Iterator[str]:
                 if len(content) > _LONGEST:
                     raise InputError(f"{path}:{number}: a line without an end; expected {expected}")
                 if b"\0" in content:
-                    raise InputError(f"{path}:{number}: not a text file (it has a NUL byte)")
+                    raise InputError(f"{path}:{number}: not a text file in UTF-8 (it has a NUL byte)")
                 text = content.decode("utf-8-sig" if number == 1 else "utf-8")
                 yield from io.StringIO(text, newline="")
                 number += 1

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -102,10 +103,22 @@ def read_nominal(path: Path | str) -> dict[str, Any]:
     }
 
 
+def _once(path: Path | str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Keys and values of an object. Raises InputError for a key that stands there twice."""
+    names = [name for name, _ in pairs]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"{path}: the key {twice[0]} stands in one object twice; keep one")
+    return dict(pairs)
+
+
 def _believed(path: Path | str) -> _Believed:
     text = text_of(path, "screws, cameras and markers (JSON)", _MAX_BYTES)
     try:
-        return _Believed.model_validate_json(json.dumps(json.loads(text)))
+        return _Believed.model_validate_json(
+            json.dumps(json.loads(text, object_pairs_hook=partial(_once, path)))
+        )
+    except InputError:
+        raise
     except json.JSONDecodeError as error:
         raise InputError(f"{path}:{error.lineno}:{error.colno}: not JSON: {error.msg}") from error
     except ValidationError as error:

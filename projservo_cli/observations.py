@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from projservo_cli.calibration.estimate import require_size_and_noise
 from projservo_cli.display import Displayable, checked_array, numbers_in, pandas
+from projservo_cli.image_size import ImageSize
 from projservo_cli.records import FloatArray, InputError, Observation
 from projservo_cli.store.tables import in_radians, or_empty, read_table, to_csv, write_table
 
@@ -30,7 +31,7 @@ class Observations(Displayable, Observation):
     images : (K, 2, m, 2) pixels, left and right, NaN where unseen.
     moving, t_q, t_view, sigma : as in [the run file]; None where unknown.
     joint_types : one letter a joint, R or P.
-    image_size : width and height, px; None where unknown.
+    image_size : width and height, px, of both images or of one each; None where unknown.
     noise_px : standard deviation of a coordinate, px; None to estimate it.
     joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad); None to estimate it.
     source : ``simulated`` or ``recorded``.
@@ -40,7 +41,7 @@ class Observations(Displayable, Observation):
     """
 
     joint_types: str = ""
-    image_size: tuple[int, int] | None = None
+    image_size: ImageSize | None = None
     noise_px: float | None = None
     joint_noise: float | None = None
     source: str = "recorded"
@@ -75,7 +76,7 @@ class Observations(Displayable, Observation):
         marker: Sequence[int] | None = None,
         pose: Sequence[int] | None = None,
         sigma: npt.ArrayLike | None = None,
-        image_size: tuple[int, int] | None = None,
+        image_size: ImageSize | None = None,
         noise_px: float | None = None,
     ) -> "Observations":
         """Return observations from arrays.
@@ -90,7 +91,7 @@ class Observations(Displayable, Observation):
             refused as a mistaken unit.
         marker, pose : (m,) and (K,) numbers; by default from 0.
         sigma : (K, 2, m) standard deviations of a coordinate, px.
-        image_size : width and height, px; by default the extent of the pixels.
+        image_size : width and height, px, of both images or of one each; by default the extent of the pixels.
         noise_px : standard deviation of a coordinate, px, if it is common to all; by default estimated.
 
         Raises
@@ -135,7 +136,7 @@ class Observations(Displayable, Observation):
         *,
         joint_types: str | Sequence[str] | None = None,
         joint_unit: str | None = None,
-        image_size: tuple[int, int] | None = None,
+        image_size: ImageSize | None = None,
         noise_px: float | None = None,
     ) -> "Observations":
         """Return observations from an observation table.
@@ -145,7 +146,7 @@ class Observations(Displayable, Observation):
         table : a pandas table or a mapping of columns, as [observation tables] have them, or the path of one.
         joint_types : one letter a joint column, R or P; by default all R.
         joint_unit : ``deg`` or ``rad`` of the revolute columns; by default rad.
-        image_size : width and height, px; by default the extent of the pixels.
+        image_size : width and height, px, of both images or of one each; by default the extent of the pixels.
         noise_px : standard deviation of a coordinate, px; by default that of the table, else estimated.
 
         Raises

@@ -11,6 +11,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from projservo_cli.masking import masked
+
 __version__ = "0.1.0"
 _PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
 
@@ -23,7 +25,7 @@ def collect(*, seed: int) -> dict[str, Any]:
         **{package: version_of(package) for package in _PACKAGES},
         "git_commit": _git("rev-parse", "HEAD"),
         "git_dirty": None if (status := _git("status", "--porcelain", "-uno")) is None else bool(status),
-        "argv": list(sys.argv),
+        "argv": masked(list(sys.argv)),
         "seed": seed,
         "jit": os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0"),
         "host": platform.node(),

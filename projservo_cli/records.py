@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.masking import masked
+
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
@@ -74,9 +76,19 @@ class InputError(ValueError):
     The message is one line a user can act on: place, error and remedy.
     """
 
+    def __init__(self, *args: object) -> None:
+        super().__init__(*masked(args))
+
 
 class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming error
-    """The data were read, but the work they ask for cannot be done (exit code 1)."""
+    """The data were read, but the work they ask for cannot be done (exit code 1).
+
+    refutes : whether images or readings of a robot contradict its calibration, and so the recording of it.
+    """
+
+    def __init__(self, *args: object, refutes: bool = False) -> None:
+        super().__init__(*masked(args))
+        self.refutes = refutes
 
 
 REVOLUTE = 0
@@ -741,8 +753,15 @@ class Trace:
     )
     estimated_position_error_mm: float | None = _scalar(
         "mm",
-        "estimated distance of the face from the goal across the lines of sight, by its size in "
-        "the images; none if no size is known, or images disagree with the calibration",
+        "estimated distance of the face from the goal, rms: by the images, with undetected_position_error_mm "
+        "and what goal images leave open; none if no length on the face is known, or images disagree with "
+        "the calibration",
+        default=None,
+    )
+    undetected_position_error_mm: float | None = _scalar(
+        "mm",
+        "part of it: by what no test tells from none, at two deviations, such as tags that moved less than "
+        "backlash hides; none if images are not tested",
         default=None,
     )
     success: bool | None = _scalar(

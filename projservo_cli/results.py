@@ -12,7 +12,7 @@ import numpy.typing as npt
 from projservo_cli.calibration import predict, prediction_variance, residual_statistics
 from projservo_cli.calibration.prediction import error_factor, error_factor_with_model, joint_derivative
 from projservo_cli.display import Displayable, Printed, numbers_in, require_radians, xarray
-from projservo_cli.files import text_of
+from projservo_cli.files import bytes_of
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.metric.frame import Metric, Scale, links
 from projservo_cli.metric.kinematic_errors import KinematicErrors, in_model_frames, kinematic_errors
@@ -363,7 +363,7 @@ class MetricModel(Printed, Metric):
 
 
 def _urdf_chain(urdf: str | Path, tip: str | None) -> UrdfChain:
-    return urdf_chain(str(urdf), tip, text_of(Path(urdf), "a URDF", _MAX_BYTES))
+    return urdf_chain(str(urdf), tip, bytes_of(urdf, "a URDF", _MAX_BYTES))
 
 
 class Scene(NamedTuple):
@@ -371,7 +371,7 @@ class Scene(NamedTuple):
 
     model: Model  # as calibrated
     limits: JointLimits  # infinite where none is set
-    image_size: FloatArray | None  # (2,) px; None where unknown
+    image_size: FloatArray | None  # (2, 2) px, of each; None where unknown
     trajectory: Trajectory  # requested motion
 
 
@@ -454,10 +454,16 @@ class RunTrace(Displayable, Trace):
             "steps": f"{self.steps}, {self.steps * self.period:.4g} s",
             "image error": f"{self.image_error[-1]:.4g} px rms as seen",
         }
+        if self.unplanned:
+            found["plan"] = f"none was followed, the law regulated to the goal: {self.unplanned}"
+        if self.untested:
+            found["images"] = f"not tested against the calibration: {self.untested}"
         if self.features == "body":
             found["image error"] += f", {self.convergence_error[-1]:.4g} px by all markers"
         if self.position_error_mm is not None:
             found["position error"] = f"{self.position_error_mm:.4g} mm"
+        elif self.estimated_position_error_mm is not None:
+            found["position error"] = f"about {self.estimated_position_error_mm:.3g} mm"
         if self.rotation_error_deg is not None:
             found["rotation error"] = f"{self.rotation_error_deg:.4g} deg"
         return found

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from projservo_cli import provenance
 from projservo_cli.canonical import encoded
-from projservo_cli.config import Config, to_yaml
+from projservo_cli.config import Config, stored_yaml
 from projservo_cli.config.inputs import (
     Files,
     calibration_inputs,
@@ -87,7 +87,10 @@ def steps_for(
         sources = _sources(laws, config, run) if "servo" in stages else {}
         for step in _needed(given, sources, stages):
             remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
-            steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
+            why = _reason(step, run, force and step.stage in named, remade)
+            if step.law and "servo" in named and not config.plant.simulated:
+                why = why or "a real robot moves in every call"
+            steps.append(replace(step, why=why))
         return steps
 
     steps = planned(stages, laws or config.control.laws)
@@ -222,4 +225,4 @@ def result_of(step: Step, config: Config, *made: Any) -> Result:
     """The result that consists of what its stage made."""
     labels = ("observation", "calibration", "cross_validation") if step.stage == "calibrate" else ("",)
     records = {label: record for label, record in zip(labels, made, strict=True) if record is not None}
-    return Result(step.key, to_yaml(config), provenance.collect(seed=config.seed), step.inputs, records)
+    return Result(step.key, stored_yaml(config), provenance.collect(seed=config.seed), step.inputs, records)

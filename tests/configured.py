@@ -47,14 +47,25 @@ def simulate(config, truth, q=None, drawn=None):
     return recording.simulate(truth, q, config.noise.calibration_px, drawn)
 
 
+def plan_inputs(config):
+    """The inputs of a plan; of images of an unknown size the border is far away."""
+    inputs = given.plan_inputs(config)
+    return inputs if inputs.image_size else replace(inputs, seen_px=(4096, 4096))
+
+
+def servo_inputs(config):
+    """The inputs of a run, with those of its plan."""
+    return replace(given.servo_inputs(config), plan=plan_inputs(config))
+
+
 def scenario_of(config, calibration=None):
     """The scenario of the runs of a configuration."""
-    return scenario.run_scenario(given.servo_inputs(config), calibration)
+    return scenario.run_scenario(servo_inputs(config), calibration)
 
 
 def under(scenario, config, **more):
     """A scenario with other parts, under what another configuration gives its runs."""
-    inputs = given.servo_inputs(config)
+    inputs = servo_inputs(config)
     return replace(scenario, inputs=inputs.plan, given=inputs, **more)
 
 
@@ -154,8 +165,8 @@ calibrate = _Stage(
     run=lambda config, **options: calibrating.run(given.calibration_inputs(config), **options),
     suggest_motions=lambda config, *more: calibrating.suggest_motions(given.suggestion_inputs(config), *more),
 )
-plan = _Stage(planning, run=lambda config, calibration: planning.run(given.plan_inputs(config), calibration))
-servo = _Stage(driving, run=lambda config, *more: driving.run(given.servo_inputs(config), *more))
+plan = _Stage(planning, run=lambda config, calibration: planning.run(plan_inputs(config), calibration))
+servo = _Stage(driving, run=lambda config, *more: driving.run(servo_inputs(config), *more))
 record = _Stage(
     recording,
     trial_motions=trial_motions,

@@ -51,6 +51,8 @@ _MAX_RUNS = 4
 _MANY_POSES = 0.4
 # Number of hypotheses about a joint at fault that are fitted completely.
 _FOLLOWED = 2
+# Number of hypotheses about the order of images, the first ones.
+_ORDERS = 2
 # Number of adjustment steps of the screws by which hypotheses are compared before.
 _SCREW_STEPS = 8
 # Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
@@ -355,7 +357,7 @@ def straight_joints(solution: Solution) -> list[int]:
 
 
 def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None = None) -> str:
-    """Describe the one change of one joint with which the model fits the data; empty if none.
+    """Describe the one change, of a joint or of the order of images, with which the model fits, or "".
 
     A rough fit compares all changes. The best are fitted completely and accepted only if the fit passes as a
     calibration does, with a noise of at most ``max_px``.
@@ -366,7 +368,7 @@ def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None
     few = detections.of_markers(starting_markers(detections, search.epipolar.noise_px, search.rng))
     changes = _hypotheses(few, search.problem.q_reference)
     if straight is not None:
-        changes = [changes[i] for i in straight]
+        changes = [changes[_ORDERS + i] for i in straight]
     candidates = []
     try:
         for done, (words, changed, handicap) in enumerate(changes):
@@ -392,8 +394,14 @@ def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None
 
 
 def _hypotheses(detections: Detections, q_reference: FloatArray) -> list[tuple[str, LeastSquares, float]]:
-    """Hypotheses that a joint is of the other type or stands still: description, problem, penalty."""
-    found = []
+    """Hypotheses that a joint is of the other type or stands still, or of late images; with a penalty."""
+    found, q = [], detections.q
+    for order, shifted, remedy in (
+        ("before", np.vstack([q[:1], q[:-1]]), "let each pose settle for longer (plant.settle_s)"),
+        ("after", np.vstack([q[1:], q[-1:]]), "store readings with the image of the same pose"),
+    ):
+        words = f"each image shows the pose {order} its reading: {remedy}, and take the newest frame"
+        found.append((words, LeastSquares.of(dataclasses.replace(detections, q=shifted), q_reference), 0.0))
     for i, slides in enumerate(detections.prismatic):
         flipped = detections.prismatic.copy()
         flipped[i] = not slides

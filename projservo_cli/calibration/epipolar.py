@@ -16,6 +16,7 @@ from scipy.special import stdtrit
 
 from projservo_cli.calibration.detections import MAD, MIN_SIGMA, Detections, medians
 from projservo_cli.geometry.rigid import homogeneous
+from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Residual, in standard deviations, above which correspondences and detections are outliers.
@@ -303,11 +304,11 @@ class ImageFrame:
     known: bool
 
     @classmethod
-    def of(cls, detections: Detections, image_size: tuple[int, int] | None) -> "ImageFrame":
-        """Frame of a width and height, px, else of the extent of the data in each view."""
+    def of(cls, detections: Detections, image_size: ImageSize | None) -> "ImageFrame":
+        """Frame of widths and heights, px, else of the extent of the data in each view."""
         if image_size is not None:
-            center = np.tile(0.5 * np.asarray(image_size, dtype=np.float64), (2, 1))
-            return cls(center, np.full(2, float(max(image_size))), True)
+            sizes = image_sizes(image_size)
+            return cls(0.5 * sizes, sizes.max(axis=1), True)
         # The outermost percent may be outliers.
         low, high = np.stack(
             [np.percentile(detections.pixels[v][detections.seen[v]], [1, 99], axis=0) for v in (0, 1)], axis=1

@@ -28,7 +28,7 @@ from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
-from projservo_cli.calibration.model_error import ModelCheck, describe
+from projservo_cli.calibration.model_error import ModelCheck, describe, stepped
 from projservo_cli.calibration.numbering import epipolar_geometry
 from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.projective import Projective, closed_form_operators
@@ -36,6 +36,7 @@ from projservo_cli.calibration.quality import WEAK_NOISE, assess, check_model, c
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.calibration.undecided import require_poses
 from projservo_cli.geometry.lens import K1
+from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation
 
 _METHODS = ("bundle_adjustment", "closed_form")
@@ -91,7 +92,7 @@ def calibrate(
     method: str = "bundle_adjustment",
     sigma_px: float | None = None,
     source: str = "simulated",
-    image_size: tuple[int, int] | None = None,
+    image_size: ImageSize | None = None,
     seed: int = 0,
     lens: bool = False,
     init: Nominal | None = None,
@@ -192,19 +193,22 @@ def require_size_and_noise(image_size: Any, sigma_px: Any) -> None:
     if sigma_px is not None and not _is_positive(sigma_px):
         raise InputError(f"pixel noise {sigma_px!r}: give a positive number, or none to estimate it")
     if image_size is not None:
-        lengths = tuple(image_size) if np.iterable(image_size) else ()
-        if len(lengths) != 2 or not all(map(_is_positive, lengths)):
-            raise InputError(f"image size {image_size!r}: give a positive width and height, px")
+        given = tuple(image_size) if np.iterable(image_size) else ()
+        for lengths in given if len(given) == 2 and all(map(np.iterable, given)) else (given,):
+            if len(lengths) != 2 or not all(map(_is_positive, lengths)):
+                raise InputError(
+                    f"image size {image_size!r}: give a positive width and height, px, or one pair a camera"
+                )
 
 
 def _is_positive(value: Any) -> bool:
     return isinstance(value, Real) and 0.0 < float(value) < np.inf
 
 
-def _require_inside(detections: Detections, size: tuple[int, int], strays: float) -> None:
+def _require_inside(detections: Detections, image_size: ImageSize, strays: float) -> None:
     """Refuse an image size, width and height in px, with more than a share of a view's pixels outside."""
-    beyond, pixels = 0.5 + _BEYOND_PX, detections.pixels
-    inside = ((pixels >= -beyond) & (pixels <= np.array(size) - 1.0 + beyond)).all(axis=2)
+    beyond, pixels, sizes = 0.5 + _BEYOND_PX, detections.pixels, image_sizes(image_size)
+    inside = ((pixels >= -beyond) & (pixels <= sizes[:, None] - 1.0 + beyond)).all(axis=2)
     outside = detections.seen & ~inside
     for view, name in enumerate(VIEWS):
         seen = detections.seen[view]
@@ -215,7 +219,8 @@ def _require_inside(detections: Detections, size: tuple[int, int], strays: float
             low, high = np.percentile(pixels[view, seen], [1, 99], axis=0)
             marker, pose = detections.marker[detections.marker_of[i]], detections.pose[detections.pose_of[i]]
             raise InputError(
-                f"image size {size[0]}x{size[1]} px: {100.0 * share:.3g} % of the pixels of the {name} view "
+                f"image size {sizes[view, 0]:.0f}x{sizes[view, 1]:.0f} px: "
+                f"{100.0 * share:.3g} % of the pixels of the {name} view "
                 f"are outside, more than {100.0 * strays:g} %, such as u {u:.1f}, v {v:.1f} of marker "
                 f"{marker} at pose {pose}; that view saw markers at u from {low[0]:.0f} to {high[0]:.0f}, "
                 f"v from {low[1]:.0f} to {high[1]:.0f}: give the size of the images, width before height"
@@ -269,7 +274,7 @@ def _refined(
         refusal = expected.refusal(solution)
         if refusal is None:
             rejected = _rejected_views(solution)
-            refusal = _describe_change(rejected) or _describe_order(solution, rejected)
+            refusal = _change(rejected)[1] or _describe_order(solution, rejected)
             refusal = refusal or _describe_unmoved(solution)
         if refusal is not None:
             raise Misfit(refusal)
@@ -295,7 +300,8 @@ def _refined(
             hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         elif not (hint := _deviation(solution, expected)):
             raise
-        raise Misfit(f"{refused}; {hint}") from None
+        what, _, _ = str(refused).partition("; check the joint readings, their units")
+        raise Misfit(f"{what}; {hint}") from None
     lens = _lens_advice(record, share, frame.known)
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
     if kept.all():
@@ -317,8 +323,12 @@ def _deviation(solution: Solution, expected: Expected) -> str:
     """Describe the deviation from the model that explains most of a fit that is refused; else empty."""
     if expected.known or solution.dof <= 0:
         return ""
-    found = check_model(solution, solution.errors(), expected.noise_px(solution)).errors
-    return f"the residuals look as if {describe(found[0], solution.params.prismatic)[1]}" if found else ""
+    errors = check_model(solution, solution.errors(), expected.noise_px(solution)).errors
+    onset, prismatic = _change(_rejected_views(solution))[0], solution.params.prismatic
+    if not onset and errors and errors[0].first is not None:
+        onset = int(np.argmax(solution.problem.detections.pose == errors[0].first))
+    found = (stepped(solution, onset) if onset else None) or next(iter(errors), None)
+    return "" if found is None else f"the residuals look as if {describe(found, prismatic)[1]}"
 
 
 def _describe_unmoved(solution: Solution) -> str | None:
@@ -343,8 +353,8 @@ def _rejected_views(solution: Solution) -> BoolArray:
     return np.asarray(used < _KEPT * seen)
 
 
-def _describe_change(rejected: BoolArray) -> str | None:
-    """Describe poses in a row, at the beginning or the end, that are nearly all rejected, or None.
+def _change(rejected: BoolArray) -> tuple[int, str]:
+    """Row from or up to which poses are nearly all rejected, and a sentence on it; 0 and none without.
 
     rejected : (2, K) views of poses that mostly are.
     """
@@ -357,11 +367,11 @@ def _describe_change(rejected: BoolArray) -> str | None:
             share = np.cumsum(row) / np.arange(1, len(row) + 1)
             count = int(np.flatnonzero(row & (share >= _NEARLY_ALL)).max(initial=-1)) + 1
             if max(_WRONG_RUN, _MUCH * len(row)) <= count < len(row):
-                return (
-                    f"the fit rejects nearly all of the {which} {count} poses{where}: a camera, the tool or "
-                    "the readings of the joints changed there; record again, or remove these poses"
+                return count if which == "first" else len(row) - count, (
+                    f"the fit rejects nearly all of the {which} {count} poses{where}: the base, a camera, "
+                    "the tool or the readings of joints changed there; record again, or remove these poses"
                 )
-    return None
+    return 0, ""
 
 
 def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.special import fdtrc
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.adjustment import LeastSquares, minimize
 from projservo_cli.calibration.detections import Detections, per_rad
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.prediction import LENS, Images, Parameters
@@ -60,6 +60,8 @@ _MAX_TAGS = 4
 _MIN_CORNERS = 2
 # Maximum leverage of the images of a posture, whose residuals say nothing beyond.
 _MAX_LEVERAGE = 0.999
+# Maximum share of the squares of what images are off that a step leaves which is named.
+_UNEXPLAINED = 0.2
 # Effect over the stated error from which a nuisance that the data could not have shown is named.
 _UNSHOWN = 2.0
 # Usual sizes of each kind, beyond which none is expected unless it is seen: of scale and coupling a share, of
@@ -474,6 +476,16 @@ def examine(
     chosen = tests.select()
     found, total, bias = _estimated(tests, effects, chosen)
     slipped, slip_px = _slipped_tags(solution)
+    if len(slipped) > 1:  # several tags do not slip at once, but what carries all of them may move
+        detections = solution.problem.detections
+        kept, seen = (detections.count_at(mask) for mask in (solution.used, detections.seen))
+        lost = 1.0 - kept / np.maximum(seen, 1)
+        change = [abs(lost[k:].mean() - lost[:k].mean()) for k in range(1, len(lost))]
+        moved = stepped(solution, 1 + int(np.argmax(change)))
+        if moved is not None:
+            slipped = [moved._replace(effect_px=slip_px)]
+        elif 2 * len(slipped) > np.unique(detections.marker // CORNERS).size:
+            slipped, slip_px = [], 0.0
     total = float(np.hypot(total, slip_px))
     factor = np.sqrt(_design(tests, tests.r, T, sigma_px))
     at_recorded = sigma_px * np.sqrt(2.0 * np.square(tests.U).sum() / max(len(tests.r), 1))
@@ -490,6 +502,32 @@ def examine(
     named = (*slipped, *(found[k] for k in order))
     bias = np.hstack([np.zeros((len(bias), len(slipped))), bias[:, order]])
     return ModelCheck(named, total, noise_px, float(factor), at_recorded, unshown, bias)
+
+
+def stepped(solution: Solution, onset: int) -> ModelError | None:
+    """Return what moved at a pose, by its row, of a recording that no single fit describes, or None.
+
+    The part in which all joints move more is fitted; a step explains the other's images as far as it can.
+    """
+    plain, detections = solution.problem.with_noise(None), solution.problem.detections
+    span = [(np.ptp(part, axis=0) / np.ptp(plain.q, axis=0)).min() for part in np.split(plain.q, [onset])]
+    fitted = (detections.pose_of < onset) == (span[0] > span[1])
+    params = minimize(plain, solution.params, detections.seen & fitted, robust=True).params
+    rows = np.repeat((detections.seen & ~fitted).ravel(), 2)
+    off = plain.residual(params).ravel()[rows]
+    weight = np.repeat(detections.weight.ravel(), 2)[rows].clip(1e-300)
+    best, left = None, _UNEXPLAINED * float(off @ off)
+    for one in _nuisances(plain, params, _Extent.of(solution)):
+        if one.timed != _STEP:
+            continue
+        Z = one.columns.reshape(len(rows), -1)[rows]
+        b = np.linalg.lstsq(Z, off)[0]
+        if (square := float(np.square(off - Z @ b).sum())) < left:
+            size = float(np.sqrt(np.mean((Z @ b / weight) ** 2)) if one.kind in _OF_IMAGES else -b[0])
+            joints, view = tuple(i + 1 for i in one.joints), "" if one.view is None else VIEWS[one.view]
+            first, left = int(detections.pose[onset]), square
+            best = ModelError(one.kind, joints, view, size, 0.0, abs(size), first)
+    return best
 
 
 def _slipped_tags(solution: Solution) -> tuple[list[ModelError], float]:
@@ -516,8 +554,6 @@ def _slipped_tags(solution: Solution) -> tuple[list[ModelError], float]:
         square += effect**2
         spread = off / float(np.sqrt(np.count_nonzero(rows)))
         found.append(ModelError("tool", (), "", off, spread, effect, int(detections.pose[onset])))
-    if 2 * len(found) > np.unique(number // CORNERS).size:  # not tags but what holds or sees them moved
-        return [], 0.0
     return found, float(np.sqrt(square))
 
 

@@ -15,7 +15,7 @@ from scipy.special import stdtrit
 
 from projservo_cli.calibration.detections import MAD, per_rad
 from projservo_cli.calibration.prediction import joint_derivative, predict
-from projservo_cli.records import Calibration, FloatArray, IntArray, Observation
+from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, Observation
 
 # Minimum time offset searched, s: stamps of another clock may be early.
 _EARLIEST = -0.1
@@ -41,8 +41,41 @@ _MIN_MARKERS = 3
 _STRAIGHT = 0.025
 # Distance of an offset from the median, in deviations, above which its frame does not count.
 _OUTLIER = 4.0
+# Time between readings in a motion, s, give or take a factor of thirty.
+_BETWEEN = 0.06
 # Maximum time before a motion of the reading at rest that it starts from, s.
 _BEFORE = 0.5
+
+
+def time_unit(rate: float) -> str:
+    """Tell in which unit stamps are that go on at such a rate in a second, with the remedy; empty for s."""
+    units = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
+    near = [name for name, unit in units.items() if abs(np.log10(rate / unit)) < 1.5]
+    return f"it looks like {near[0]}: divide by {units[near[0]]:g}" if near else ""
+
+
+def require_seconds(where: str, observation: Observation) -> None:
+    """Refuse stamps of poses in motion that go on as in another unit than s. Raises InputError.
+
+    Readings in a motion come every few hundredths of a second, and images are stamped as fast as readings.
+    """
+    motion = np.zeros(len(observation.pose)) if observation.moving is None else observation.moving
+    spans = dict[str, float]()
+    for name, t in zip(("t_q", "t_left", "t_right"), _stamps(observation), strict=True):
+        motions = [np.sort(t[motion == k]) for k in np.unique(motion[motion > 0])]
+        steps = np.concatenate([np.diff(one[np.isfinite(one)]) for one in motions] or [np.zeros(0)])
+        if not steps.any():
+            continue
+        spans[name], step = float(steps.sum()), float(np.median(steps[steps > 0.0]))
+        if unit := time_unit(step / _BETWEEN) or time_unit(spans[name] / spans.get("t_q", spans[name])):
+            raise InputError(f"{where}: {name} goes on by {step:g} from row to row of a motion: {unit}")
+
+
+def _stamps(observation: Observation) -> FloatArray:
+    """Stamps (3, K) of joints, left and right images, s; NaN where unknown."""
+    nobody = np.full((len(observation.pose), 2), np.nan)
+    t_q = nobody[:, 0] if observation.t_q is None else observation.t_q
+    return np.vstack([t_q, (nobody if observation.t_view is None else observation.t_view).T])
 
 
 def is_repeated_frame(stamp: float, s: FloatArray, last_stamp: float, last_s: FloatArray) -> bool:
@@ -135,6 +168,10 @@ def with_time_offset(calibration: Calibration, observation: Observation) -> Cali
     moving, t_q = observation.moving, observation.t_q
     if moving is None or t_q is None:
         return calibration
+    for name, t in zip(("t_q", "t_left", "t_right"), _stamps(observation)[:, moving > 0], strict=True):
+        if t.size >= _MIN_FRAMES and (t == np.rint(t)).all() and (np.diff(t) == 0.0).any():
+            whole = f"{name} of poses in motion are whole seconds, so no latency of the images was estimated"
+            return replace(calibration, advice=(*calibration.advice, f"{whole}: record their fractions"))
     views = [_Frames.of(calibration, observation, view, moving, t_q) for view in (0, 1)]
     found = [result for result in map(_time_offset, views) if result is not None]
     if len(found) < len(views):

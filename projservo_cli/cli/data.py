@@ -75,7 +75,8 @@ def _teach(
             put = Readings(tuple(float(value) for value in at.split(",")), at_unit)
         except ValueError as error:
             raise InputError(f"--at {at}: expected a number for each joint, with commas") from error
-    calibration = option.calibration_of(run, settings)
+    calibrated = option.calibrated_run(run, settings)
+    calibration = None if calibrated is None else calibrated.calibration
     asks = not settings.plant.simulated and sys.stdin.isatty()
     with option.writing(output):
         try:
@@ -196,13 +197,18 @@ def _detect(
     """
     import numpy as np
 
-    from projservo_cli.detection import TagFinder, observe_tags, pair_images
+    from projservo_cli.detection import TagFinder, hidden_images, observe_tags, pair_images
     from projservo_cli.store.tables import read_joint_list, write_table
 
     option.require_new(output, force=force)
     finder = TagFinder(dictionary)
     joints = read_joint_list(joints_csv, joint_unit="rad")  # as they are, whatever their unit
     pairs = pair_images(left, right, joints, joints_csv)
+    hidden = [file for side in (left, right) for file in hidden_images(side)]
+    if hidden:
+        console.say(
+            f"detect: {len(hidden)} hidden files such as {hidden[0]} are no images, and were left out"
+        )
     observation, found = observe_tags(pairs, joints.q, finder, points, console.progress)
     write_table(observation, output)
     in_left, in_right = np.moveaxis(np.isfinite(observation.images[..., 0]), 1, 0)
@@ -218,6 +224,7 @@ def _detect(
         "ambiguous": found.ambiguous,
         "unrefined": found.unrefined,
         "empty_images": found.empty,
+        "hidden_files": len(hidden),
     }
     words = (
         f"detect: {{poses}} poses, {len(found.tags)} tags, {{markers}} markers",

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -148,23 +149,28 @@ def preflight(
     from projservo_cli.config.inputs import preflight_inputs
     from projservo_cli.files import write_whole
     from projservo_cli.hardware.live_page import page
-    from projservo_cli.stages.preflight import check
+    from projservo_cli.hardware.preflight import FAULT, WARNING
+    from projservo_cli.stages.preflight import CALIBRATION, check
+    from projservo_cli.store import save
 
     settings = option.configured(config, options, teaching=True)
-    calibration = option.calibration_of(run, settings)
+    stored = option.calibrated_run(run, settings)
     move, watch = options["move"], options["watch"]
     if move and not sys.stdin.isatty():
         raise click.UsageError("--move: standard input is no terminal, so nobody can be asked; leave it out")
     with option.writing(output):
         checked = check(
             preflight_inputs(settings),
-            calibration,
+            None if stored is None else stored.calibration,
             confirmed=(lambda way: console.agreed(_QUESTION.format(way=way))) if move else None,
             watch=(lambda robot: _watch(console, settings, robot)) if watch else None,
             progress=console.progress,
         )
         pictures = [] if checked.seen is None else _pictures(settings, checked.seen)
         write_whole(output, page(settings.name, checked.findings, pictures))
+    for told in checked.findings:
+        if stored is not None and told.where == CALIBRATION and told.level != WARNING:
+            save(replace(stored, refuted=told.text if told.level == FAULT else ""))
     value = {
         "page": output.resolve(),
         "works": checked.works,

@@ -45,10 +45,12 @@ def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None
     described = path.with_name(_SCHEMA)
     write_whole(path, starter() if arm is None else starter_for(arm))
     write_whole(described, _as_text(json_schema()))
-    words = (
-        f"init: {path}, with {described} for editors",
-        f"next: projservo {'calibrate plan servo report' if arm is None else 'limits'} -c {path}",
-    )
+    words = [f"init: {path}, with {described} for editors"]
+    if arm is None:
+        words.append(f"next: projservo calibrate plan servo report -c {path}")
+    else:
+        words.append(f"next: set the sources of both cameras in {path}, then print the tags:")
+        words.append("  projservo tags --kind roof --size-mm 30 -o tags.pdf")
     console.report({"configuration": path.resolve(), "schema": described.resolve()}, words)
 
 

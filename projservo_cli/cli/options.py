@@ -15,7 +15,6 @@ from projservo_cli.cli.output import Console
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config, Override
-    from projservo_cli.records import Calibration
     from projservo_cli.store import Run
 
 _Function = Callable[..., Any]
@@ -126,8 +125,8 @@ _OF_STAGES = (
     ),
     click.option(
         "--image-size",
-        metavar="WxH",
-        help="Size of the table's images, px. Default: that of rig, else from where markers were seen.",
+        metavar="WxH[,WxH]",
+        help="Size of the images, px, or of the left and the right ones. Default: that of cameras or rig.",
     ),
     force(help="Make the named stages even where they are up to date."),
     dry_run,
@@ -186,12 +185,12 @@ def configured(
     return found
 
 
-def calibration_of(run: Path | None, config: "Config") -> "Calibration | None":
-    """The calibration of a run, by default of that of the configuration's name; None where none is."""
+def calibrated_run(run: Path | None, config: "Config") -> "Run | None":
+    """The run that is named, by default that of the configuration's name; None without a calibration."""
     found = _stored(run or _RESULTS / config.name)
     if found is None and run is not None:
         raise click.UsageError(f"{run}: there is no run; calibrate first, or leave it out")
-    return found.calibration if found is not None and "calibrate" in found.results else None
+    return found if found is not None and "calibrate" in found.results else None
 
 
 def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Config", "Run"]:
@@ -269,11 +268,16 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
         flag = f"--{name.replace('_', '-')}" + ("" if given is True else f" {given}")
         value = os.path.abspath(given) if name in ("data", "init") else given
         found.append(Override(flag, key, value))
-    if (size := options.get("image_size")) is not None:  # such as 1280x1024
-        flag, sides = f"--image-size {size}", size.lower().split("x")
-        if len(sides) != 2 or not all(side.strip().isdecimal() for side in sides):
-            raise click.UsageError(f"{flag}: expected width x height in px, such as 1280x1024")
-        found.append(Override(flag, "data.image_size_px", [int(side) for side in sides]))
+    if (size := options.get("image_size")) is not None:  # such as 1280x1024,1280x960
+        flag, sizes = f"--image-size {size}", [one.split("x") for one in size.lower().split(",")]
+        sides = [side.strip() for one in sizes for side in one]
+        if len(sizes) > 2 or any(len(one) != 2 for one in sizes) or not all(map(str.isdecimal, sides)):
+            raise click.UsageError(
+                f"{flag}: expected width x height in px, such as 1280x1024, or 1280x1024,1280x960 where the "
+                "right images have another size"
+            )
+        values = [[int(side) for side in one] for one in sizes]
+        found.append(Override(flag, "data.image_size_px", values if len(values) > 1 else values[0]))
     if (goal := options.get("goal")) is not None:
         named = goal if goal.endswith((".yaml", ".yml")) else f"{goal}.yaml"
         found.append(Override(f"--goal {goal}", "task.goal", named))

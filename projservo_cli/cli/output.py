@@ -11,9 +11,10 @@ from typing import Any
 
 import click
 
+from projservo_cli.masking import masked
 from projservo_cli.progress import Bar
 
-_UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+_UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _NOTES = {  # on runs, and their reasons
     "unplanned": "driven without a plan",
     "untested": "images were not tested against the calibration",
@@ -33,11 +34,11 @@ def wrapped(text: str, indent: str = "") -> str:
 
 
 def visible(text: str) -> str:
-    """Text whose control characters and changes of direction are written out, line ends apart.
+    """Text without passwords, whose control characters and changes of direction are written out.
 
     Texts come from files of others too; a terminal that is sent them must not obey them.
     """
-    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", masked(text))
 
 
 def _plain(value: Any) -> Any:
@@ -127,7 +128,7 @@ def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> It
     elif stage == "record":
         yield from _of_recording(value)
     elif stage == "calibrate":
-        yield from _of_calibration(value)
+        yield from _of_calibration(value, detailed)
     elif stage == "plan":
         yield from _of_plan(value, detailed)
     elif stage == "servo":
@@ -148,7 +149,27 @@ def _of_recording(value: dict[str, Any]) -> Iterator[str]:
         yield "  spread of the images of a pose: {spread_px:.3g} px per coordinate".format_map(value)
 
 
-def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
+def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
+    px, bound = (_number(value[f"predicted_{name}_px"]) for name in ("rms", "p99"))
+    sound = value["usable"] and value["reason"].endswith(_SOUND) and all(map(_OF_NOISE, value["advice"]))
+    asked = detailed or value["lens"] or value.get("cross_validation") or len(value["joints"]) == 1
+    if sound and value["predicted_rms_px"] is not None and not asked:
+        yield f"calibrate: usable: predicts images to {px} px rms, 99 % below {bound}; more: -v"
+        if value["time_offset_s"] is not None:
+            yield wrapped(f"time offset {', '.join(_time_offsets(value))}", "  ")
+    else:
+        yield from _in_detail(value)
+    yield from _of_suggestions(value)
+
+
+# Ends of reasons, and advice, that tell of noise alone, which is nothing to mend.
+_SOUND = ("limited by noise", "limited by joint readings")
+_OF_NOISE = re.compile(
+    r"errors of joint readings move|look for joint readings that lag|\d+ observations? (was|were) rejected"
+).match
+
+
+def _in_detail(value: dict[str, Any]) -> Iterator[str]:
     yield wrapped(f"calibrate: {'usable' if value['usable'] else 'NOT usable'}: {value['reason']}")
     for text in value["advice"]:
         yield wrapped(f"advice: {text}", "  ")

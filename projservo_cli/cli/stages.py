@@ -1,5 +1,6 @@
 """Commands of the stages and of their chain: dry run, work, summary."""
 
+import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,7 @@ from projservo_cli.cli.group import FAILED, main
 from projservo_cli.cli.output import Console, visible, words_of, wrapped
 
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
+_AGAIN = ", and the robot is not moved: --force records all poses again"
 _UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")  # by the report of a sweep
 
 
@@ -65,6 +67,8 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     path = options["output"] or _data_table(config)
     poses, given = _motions(config, options), recording_inputs(config)
     recording, reason = new_recording(given, path, motions=poses, force=options["force"]), ""
+    if not (recording.why or config.plant.simulated):
+        console.say(f"record: {path} is up to date{_AGAIN}")
     if not options["dry_run"]:
         with option.writing(path):
             recording = new_recording(given, path, motions=poses, force=options["force"])
@@ -185,6 +189,11 @@ def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
 @option.speed_scale
 @option.confirm
 @click.option(
+    "--blind",
+    is_flag=True,
+    help="Move a robot although cameras show no marker of the calibration, so that nothing is compared.",
+)
+@click.option(
     "--goal",
     metavar="NAME",
     help="Go to this taught goal, NAME.yaml next to the configuration, instead of task.goal.",
@@ -204,8 +213,8 @@ def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
     default direct_three, direct_two, exact and plug-in laws.
 
     With --set plant=module:Class (or plant in the configuration) an external robot takes the place of the
-    simulated one. It is driven to the start of the task and from there by each law, and stopped on every way
-    out.
+    simulated one. It is driven to the start of the task and from there by each law, in every call, and
+    stopped on every way out.
     """
     return _make(console, stages, options)
 
@@ -276,6 +285,8 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
 
 def _recorded(call: _Call) -> _Call:
     """Record the pending poses; return the action for the table."""
+    from projservo_cli.store import save
+
     chain = call.chain
     recording, why = chain.recording, chain.recording.why
     if why:
@@ -283,6 +294,8 @@ def _recorded(call: _Call) -> _Call:
     if reason := _drive(call.console, chain.config, recording, confirm=chain.confirm):
         chain.failed, chain.reason = "record", reason
         return call
+    if chain.run.refuted:  # by what the new recording has taken the place of
+        save(replace(chain.run, refuted=""))
     unasked = {**call.options, "confirm": call.options["confirm"] and not why}
     return _asked(call.console, chain.names, unasked, replace(recording, why=""))
 
@@ -300,8 +313,13 @@ def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
             f"{run.path}: its calibration comes from {stored.inputs['table']} and would be replaced by a "
             "simulated one; choose another folder with -o, or use --force"
         )
-    poses = _motions(config, options)
-    return new_recording(recording_inputs(config), path, motions=poses, force=force, redo=True)
+    poses, given = _motions(config, options), recording_inputs(config)
+    found = new_recording(given, path, motions=poses, force=force, redo=True)
+    digest = stored and stored.inputs.get("table_sha256")
+    if not run.refuted or found.why or digest != hashlib.sha256(path.read_bytes()).hexdigest():
+        return found
+    begun = new_recording(given, path, motions=poses, force=True)
+    return replace(begun, why=f"what is there was contradicted: {run.refuted}")
 
 
 def _asked(
@@ -329,9 +347,8 @@ def _asked(
     steps = steps_for(config, stored, stages, laws=given, force=options["force"], recording=why)
     if records:
         steps.insert(0, Step("record", "", "", {}, why))
-    chain = Chain(
-        console, names, config, stored, steps, recording=recording, confirm=bool(options.get("confirm"))
-    )
+    confirm, blind = (bool(options.get(name)) for name in ("confirm", "blind"))
+    chain = Chain(console, names, config, stored, steps, recording=recording, confirm=confirm, blind=blind)
     if not options["dry_run"]:
         _require_named(chain, options)
     return _Call(console, options, chain)
@@ -414,6 +431,7 @@ def _work(call: _Call) -> int:
         call.beside.setdefault("calibrate", {})["joint_types_assumed"] = assumed
     if (wanted := _extras(call.options)) and not chain.lacks("report"):
         call.beside["report"] = _made_optional(console, chain, wanted)
+    call.beside.setdefault("report", {})["replayed"] = chain.replayed()
     from projservo_cli.report.report_data import failed_object, stage_object
 
     values, joints = {}, chain.config.joint_names
@@ -445,7 +463,9 @@ def _announce(console: Console, chain: Any) -> None:
             continue  # it was said before it was made
         needed = "" if step.stage in chain.names else f", needed by {chain.names[-1]}"
         if step.why or not needed:
-            said = f"making ({step.why}{needed})" if step.why else step.status
+            again = step.stage == "record" and not chain.config.plant.simulated
+            kept = f"{step.status}{_AGAIN}" if again else step.status
+            said = f"making ({step.why}{needed})" if step.why else kept
             reasons.setdefault(said, []).append(step.name)
     for said, found in reasons.items():
         console.say(f"{', '.join(found)}: {said}")

@@ -8,6 +8,7 @@ from projservo_cli.config.loading import (
     overrides_of,
     plain_yaml,
     shipped,
+    stored_yaml,
     sweep_of,
     to_yaml,
 )
@@ -20,6 +21,7 @@ __all__ = [
     "overrides_of",
     "plain_yaml",
     "shipped",
+    "stored_yaml",
     "sweep_of",
     "to_yaml",
 ]

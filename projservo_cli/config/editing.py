@@ -37,6 +37,9 @@ def plant_of(text: str, where: str) -> tuple[str, dict[str, Any]]:
     An arm can be released, and its limits be found, with a file that has other faults.
     where : of the text, for messages. Raises InputError for a text that is no YAML.
     """
+    root = _parsed(yaml.compose, text, where)
+    if [key.value for key, _ in getattr(root, "value", ()) if key.value == "plant"][1:]:
+        raise InputError(f"{where}: plant stands there twice; keep one")
     values = _parsed(yaml.safe_load, text, where)
     plant = values.get("plant") if isinstance(values, dict) else None
     if isinstance(plant, str):

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from projservo_cli.canonical import File
-from projservo_cli.config.loading import Config, to_yaml
+from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.config.markers import Markers
 from projservo_cli.config.models import Disturbance, RenderedOptions
 from projservo_cli.config.robot import Camera, JointVector, Rig, RobotSettings
@@ -285,7 +285,7 @@ def _known_lengths(config: Config) -> KnownLengths:
 def about_of(config: Config, read: Iterable[File] = ()) -> About:
     """Return the part of a configuration for the page; paths of its files may change."""
     files = {file.path: file for file in read}
-    pieces = [to_yaml(config)]
+    pieces = [stored_yaml(config)]
     if files:
         pieces = re.split("(" + "|".join(map(re.escape, files)) + ")", pieces[0])
     return About(

@@ -22,7 +22,8 @@ from pydantic_core import ErrorDetails
 from projservo_cli.config.models import RENDERED, RenderedOptions, Settings
 from projservo_cli.config.robot import CONTRADICTIONS, Finding, Root
 from projservo_cli.config.sweep import SweepConfig
-from projservo_cli.files import text_of
+from projservo_cli.files import bytes_of, text_of
+from projservo_cli.masking import masked
 from projservo_cli.records import InputError
 from projservo_cli.simulation.mjcf import read_mjcf
 from projservo_cli.simulation.urdf import read_urdf
@@ -40,6 +41,7 @@ _PHRASES = {
     "float_type": "must be a number",
     "int_type": "must be a whole number",
     "string_type": "must be text; put it in quotes",
+    "string_unicode": "must be UTF-8 (rename the file or its folder)",
     "model_type": "must be a mapping of keys to values",
     "dict_type": "must be a mapping of keys to values",
     "tuple_type": "must be a list",
@@ -421,6 +423,11 @@ def to_yaml(config: Config) -> str:
     return plain_yaml(_without_unset(config))
 
 
+def stored_yaml(config: Config) -> str:
+    """The configuration as ``to_yaml``, with the passwords of URLs masked: for files and pages."""
+    return plain_yaml(masked(_without_unset(config)))
+
+
 def plain_yaml(values: Any) -> str:
     """Plain values as YAML."""
     return yaml.dump(
@@ -464,8 +471,7 @@ def _fill_in_arm(document: _Document) -> None:
             if kind == "mjcf":
                 robot["screws"] = read_mjcf(file, tip)
             else:
-                text = text_of(file, "a URDF", _MAX_BYTES)
-                screws = read_urdf(file, tip, text)
+                screws = read_urdf(file, tip, bytes_of(file, "a URDF", _MAX_BYTES))
                 rest = {key: value for key, value in robot.items() if key not in ("urdf", "tip")}
                 document.values["robot"] = {**rest, "screws": screws}
         except InputError as error:

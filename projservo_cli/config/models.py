@@ -4,7 +4,7 @@ import inspect
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
 from pydantic import (
@@ -30,11 +30,13 @@ from projservo_cli.config.robot import (
     RobotSettings,
     Root,
     Section,
+    Sizes,
     Whole,
     are_degrees,
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
 from projservo_cli.display import Printed
+from projservo_cli.image_size import ImageSize
 from projservo_cli.laws import LAW_SPECS, LAWS, REGULATE, mode_in
 from projservo_cli.nominal import Number, Vector3
 from projservo_cli.records import LIMITS_MISSING, InputError
@@ -309,8 +311,8 @@ class _Data(Section):
         "an external robot only if poses show it",
     )
     noise_px: Positive | None = Field(None, description="pixel noise per coordinate; null: estimated")
-    image_size_px: tuple[Count, Count] | None = Field(
-        None, description="width and height of the images; null: those of rig, else from the observations"
+    image_size_px: Sizes | None = Field(
+        None, description="width and height of both images, or those of each; null: those of cameras or rig"
     )
 
 
@@ -599,10 +601,14 @@ def _simulated_alone(disturbance: Disturbance, plant: _PlantSettings) -> Iterato
         yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
 
 
-def _rendered(plant: _PlantSettings, noise: _Noise, markers: Markers | None) -> Iterator[Finding]:
+def _rendered(
+    plant: _PlantSettings, noise: _Noise, markers: Markers | None, rig: Rig | None
+) -> Iterator[Finding]:
     """Yield keys without effect for rendered images."""
     if plant.use != RENDERED:
         return
+    if rig is not None and np.ndim(rig.image_size_px) > 1:
+        yield ("rig", "image_size_px"), "rendered cameras have one size; give one width and height"
     for key in ("calibration_px", "servo_px"):
         if getattr(noise, key) != getattr(_Noise(), key):
             yield (
@@ -796,12 +802,11 @@ class Settings(Printed, Root):
         return self.markers.front
 
     @property
-    def image_size_px(self) -> tuple[int, int] | None:
-        """Width and height of the images, if they are known."""
+    def image_size_px(self) -> ImageSize | None:
+        """Width and height of both images, or those of each, if they are known."""
         if self.data is not None and self.data.image_size_px is not None:
-            return self.data.image_size_px
+            return cast(ImageSize, self.data.image_size_px)
         if self.cameras is not None:
-            return (
-                self.cameras.left.size_px if self.cameras.left.size_px == self.cameras.right.size_px else None
-            )
-        return self.rig.image_size_px if self.rig is not None else None
+            left, right = self.cameras.left.size_px, self.cameras.right.size_px
+            return None if left is None or right is None else left if left == right else (left, right)
+        return cast(ImageSize, self.rig.image_size_px) if self.rig is not None else None

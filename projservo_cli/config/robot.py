@@ -1,7 +1,8 @@
 """The robot, its rig and its markers, in metric terms: the truth of a simulation."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -12,17 +13,37 @@ from pydantic import (
     Strict,
     StringConstraints,
     ValidationInfo,
+    WithJsonSchema,
+    WrapValidator,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
 
 from projservo_cli.nominal import Matrix34, Matrix44, Number, Vector3, not_a_screw, not_rigid
-from projservo_cli.records import TWO_TURNS
+from projservo_cli.records import FARTHEST_M, TWO_TURNS
 
 Positive = Annotated[float, Strict(), Field(gt=0)]
 NotNegative = Annotated[float, Strict(), Field(ge=0)]
 Whole = Annotated[int, Strict(), Field(ge=0, le=2**63 - 1)]
 Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
+
+
+def _one_or_each(value: Any, of_one: Callable[[Any], tuple[int, int]]) -> Any:
+    """Width and height of both images, or, where their sizes differ, those of the left and of the right."""
+    pair = isinstance(value, (list, tuple)) and len(value) == 2
+    if not pair or not all(isinstance(one, (list, tuple)) for one in value):
+        return of_one(value)
+    left, right = map(of_one, value)
+    return left if left == right else (left, right)
+
+
+_TWO = {"type": "array", "minItems": 2, "maxItems": 2}
+_SIZE = {"items": {"type": "integer", "minimum": 1, "maximum": 1_000_000}, **_TWO}
+Sizes = Annotated[
+    tuple[Count, Count],
+    WrapValidator(_one_or_each),
+    WithJsonSchema({"anyOf": [_SIZE, {"items": _SIZE, **_TWO}]}),
+]
 _File = Annotated[str, StringConstraints(min_length=1)]
 Vector2 = tuple[Number, Number]
 # The path from a section to a value in it, and the error of that value.
@@ -66,10 +87,30 @@ class Root(Section):
         return ()
 
 
+# Largest value of a key by its name: of what is on the tool and other lengths, m, and of short times, s.
+_LARGEST = (
+    (re.compile(r"(tag_)?size_m|positions_m"), 2.0, "millimetres"),
+    (re.compile(r"\w+_m"), FARTHEST_M, "millimetres"),
+    (re.compile(r"(period|settle|time_offset|camera_latency|max_servo_lag|max_age)_s"), 10.0, "milliseconds"),
+)
+
+
+def _of_another_unit(key: str, value: Any) -> str:
+    """Tell that a length or a time looks like one in another unit; empty if not."""
+    most, unit = next(((most, unit) for name, most, unit in _LARGEST if name.fullmatch(key)), (math.inf, ""))
+    each = list(vars(value).values()) if isinstance(value, Section) else value
+    largest = max((abs(x) for x in np.ravel(each) if isinstance(x, float)), default=0.0) if unit else 0.0
+    return (
+        f"{largest:g} is more than {most:g}: it looks like {unit}; divide by 1000" if largest > most else ""
+    )
+
+
 def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...] = ()) -> Iterator[Finding]:
     """Those of all sections among some values by their keys, and of the sections in these."""
     for key, part in parts:
         here = (*path, key)
+        if what := _of_another_unit(str(key), part):
+            yield here, what
         if isinstance(part, Section):
             yield from ((here + at, what) for at, what in part.contradictions())
             yield from _contradictions(vars(part).items(), here)
@@ -310,6 +351,6 @@ class Camera(Section):
 class Rig(Section):
     """Two cameras that look at the robot and do not move."""
 
-    image_size_px: tuple[Count, Count] = Field(description="width and height of both images")
+    image_size_px: Sizes = Field(description="width and height of both images, or those of each")
     left: Camera = Field(description="left camera")
     right: Camera = Field(description="right camera")

@@ -10,7 +10,7 @@ import numpy as np
 
 from projservo_cli.detection import Corners, TagFinder
 from projservo_cli.hardware.cameras import Camera, Frame
-from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray
+from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray, WorkFailed
 from projservo_cli.robots.settings import StereoSettings
 
 # Mean grey value, of 255, below which an image is dark, and share of clipped pixels that is too much.
@@ -19,6 +19,8 @@ _DARK, _CLIPPED_SHARE = 20.0, 0.2
 _WHITE = 252
 # Blur of the sharpest edges of an image, px, from which it is blurred: corners then lose half their accuracy.
 _BLURRED = 2.5
+# Number of frames of a view without tags of which the mirror image is searched: more are a tool out of sight.
+_MIRRORS = 10
 # Number of edges that show the blur, and half the width within which their contrast is taken, px.
 _EDGES, _REACH = 300, 6
 
@@ -70,7 +72,7 @@ class CameraRobot:
         both = zip(VIEWS, (stereo.left, stereo.right), strict=True)
         self.cameras = [Camera(view, one, stereo.max_age_s, stereo.reconnect_s, now) for view, one in both]
         self.views: list[View | None] = [None, None]
-        self._begun = False
+        self._begun, self._blind = False, [0, 0]
 
     def open(self) -> None:
         """Connect to both cameras, and then to the arm."""
@@ -99,7 +101,21 @@ class CameraRobot:
         if last is None or last.frame.serial != frame.serial:
             last = View(frame, *self.finder.find(frame.grey.astype(np.float64)))
             self.views[view] = last
+            if not last.tags.keys() & {*(self._numbers // CORNERS).tolist()}:
+                self._blind[view] += 1
+                if self._blind[view] <= _MIRRORS:
+                    self._require_not_mirrored(view, frame.grey)
         return last
+
+    def _require_not_mirrored(self, view: int, grey: ByteArray) -> None:
+        """Raise WorkFailed for an image (height, width) without tags whose mirror image shows them."""
+        tags = self.finder.find(grey[:, ::-1].astype(np.float64))[0].keys()
+        if found := tags & {*(self._numbers // CORNERS).tolist()}:
+            listed = ", ".join(map(str, sorted(found)))
+            raise WorkFailed(
+                f"the {VIEWS[view]} camera's image is mirrored: it shows no tag, its mirror image "
+                f"tag{'s' * (len(found) > 1)} {listed}; switch off mirror or flip of the {VIEWS[view]} camera"
+            )
 
     def _corners(self, view: View) -> tuple[FloatArray, FloatArray]:
         """Pixels (m, 2) of all markers and their deviations (m,); NaN where unseen or rejected."""

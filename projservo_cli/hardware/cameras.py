@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.detection import opencv
+from projservo_cli.detection import opencv, unfit
 from projservo_cli.records import ByteArray, InputError, WorkFailed
 from projservo_cli.robots.settings import CameraSettings, device_of
 
@@ -187,9 +187,11 @@ class Camera:
         cv = _cv()
         grey = np.asarray(image if image.ndim == 2 else cv.cvtColor(image, cv.COLOR_BGR2GRAY), dtype=np.uint8)
         before, wanted = self._frame, self.settings.size_px
-        size = grey.shape[::-1]
+        size, wrong = grey.shape[::-1], unfit(image) if self._frame is None else ""
         with self._came:
-            if wanted is not None and size != tuple(wanted):
+            if wrong:
+                self._refused = f"each of its frames {wrong}"
+            elif wanted is not None and size != tuple(wanted):
                 self._refused = (
                     f"gives frames of {size[0]} x {size[1]} px, not the {wanted[0]} x {wanted[1]} of "
                     f"cameras.{self.name}.size_px: set a size that it has"

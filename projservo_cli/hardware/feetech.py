@@ -20,6 +20,7 @@ _MEMORY = 86
 # Fewest bytes that a request reads, and how many lengths there are, one after the other: those of as many
 # failed requests take 0.14 s, and no reply is later.
 _SHORTEST, _LENGTHS = 15, 12
+_HEAD = 4  # bytes of a reply before its status: fewer may be noise of a line that nobody drives
 # Time within which replies come, s, at first and at most: the bytes of six servos and their delays take 3 ms,
 # adapters and busy machines more.
 _REPLY_S, _SLOW_S = 0.012, 0.1
@@ -45,7 +46,12 @@ class ServoSilent(WorkFailed):
 
     def __init__(self, silent: Sequence[int], garbled: Sequence[int] = ()) -> None:
         self.silent, self.garbled = tuple(silent), tuple(garbled)
-        super().__init__(f"servos {', '.join(map(str, silent))} do not answer")
+        super().__init__(
+            f"replies of servos {', '.join(map(str, garbled))} are garbled: two servos answer at once: "
+            "unplug the other arm, or the servo that has the same id"
+            if garbled
+            else f"servos {', '.join(map(str, silent))} do not answer"
+        )
 
 
 class PortLost(WorkFailed):
@@ -107,12 +113,12 @@ class FeetechBus:
             )
 
     def _asked(self, ids: Sequence[int], address: int, size: int) -> tuple[dict[int, Reply], set[int]]:
-        """Replies to one request by servo, and the servo of which something arrived that is no reply."""
+        """Replies to one request by servo, and those of which there is none, but bytes that are no reply."""
         with self._lock:
             longer = _SHORTEST + self._failed % _LENGTHS
             start = min(address, _MEMORY - longer)
             self._checked(self._serial.reset_input_buffer)
-            self._send(_SYNC_READ, bytes([start, longer, *ids]))
+            sent = self._send(_SYNC_READ, bytes([start, longer, *ids]))
             found: dict[int, Reply] = {}
             before = self.now()
             heard, end = b"", before + self._reply_s
@@ -126,12 +132,15 @@ class FeetechBus:
             self._failed += bool(missing)
             slower = 2.0 if missing else 0.5
             self._reply_s = min(max(slower * self._reply_s, _REPLY_S), _SLOW_S)
-            return found, missing if len(ids) == 1 and heard else set()
+            garbled = len(heard.removeprefix(sent)) >= _HEAD and not found  # some adapters echo requests
+            return found, missing if garbled else set()
 
-    def _send(self, instruction: int, given: bytes) -> None:
+    def _send(self, instruction: int, given: bytes) -> bytes:
         body = bytes([_ALL, len(given) + 2, instruction]) + given
+        packet = b"\xff\xff" + body + _checksum(body)
         with self._lock:
-            self._checked(self._serial.write, b"\xff\xff" + body + _checksum(body))
+            self._checked(self._serial.write, packet)
+        return packet
 
     def _received(self) -> bytes:
         if waiting := self._checked(lambda: self._serial.in_waiting):

@@ -76,14 +76,15 @@ def _of_camera(camera: Camera) -> Iterator[Finding]:
     rate, asked = camera.rate_hz, camera.settings.rate_hz or _USUAL_HZ
     stamps = "stamped by its driver" if camera.stamped else "stamped when they arrive"
     size = f"{grey.shape[1]} x {grey.shape[0]} px"
-    if rate < _SLOW * asked:
+    found = f"{rate:.1f}" if math.isfinite(rate) else "fewer than 3"
+    if not rate >= _SLOW * asked:
         remedy = (
             "webcams expose longer in the dark: add light, or set exposure_ms below "
             f"{1e3 / asked:.0f}; on one hub with another camera, set fourcc: MJPG"
         )
-        yield Finding(WARNING, where, f"{size}, {rate:.1f} frames a second instead of {asked:g}", remedy)
+        yield Finding(WARNING, where, f"{size}, {found} frames a second instead of {asked:g}", remedy)
     else:
-        yield Finding(FINE, where, f"{size}, {rate:.1f} frames a second, {stamps}")
+        yield Finding(FINE, where, f"{size}, {found} frames a second, {stamps}")
     for remark in camera.remarks:
         what, _, remedy = remark.partition(": ")
         yield Finding(WARNING, where, what, remedy or "take another camera, or keep it from changing")
@@ -94,9 +95,9 @@ def _of_camera(camera: Camera) -> Iterator[Finding]:
     for wrong in light.faults():
         what, _, remedy = wrong.rpartition(": ")
         yield Finding(FAULT if "black" in wrong else WARNING, where, f"its image {what}", remedy)
-    white, blur = f"{light.clipped:.1%} white", f"edges blurred by {light.blur_px:.1f} px"
-    text = f"mean grey {light.mean:.0f} of 255, {white}, {blur}"
-    yield Finding(FINE, where, text)
+    text = f"mean grey {light.mean:.0f} of 255, {light.clipped:.1%} white"
+    sharp = math.isfinite(light.blur_px)
+    yield Finding(FINE, where, f"{text}, edges blurred by {light.blur_px:.1f} px" if sharp else text)
 
 
 def _of_tags(name: str, view: View, seen: Seen, finder: TagFinder, dictionary: str) -> Iterator[Finding]:
@@ -126,9 +127,9 @@ def _of_tags(name: str, view: View, seen: Seen, finder: TagFinder, dictionary: s
     width = {number: _width(tag) for number, tag in there.items()}
     smallest = min(width, key=lambda number: width[number])
     cell = width[smallest] / finder.cells
-    sigma = float(np.nanmedian([tag.sigma for tag in there.values()]))
+    sigma = np.concatenate([tag.sigma[np.isfinite(tag.sigma)] for tag in there.values()])
     sizes = ", ".join(f"{number} ({width[number]:.0f} px)" for number in sorted(there))
-    text = f"tags {sizes}; corners to {sigma:.2g} px"
+    text = f"tags {sizes}" + (f"; corners to {np.median(sigma):.2g} px" if sigma.size else "")
     if cell < _GOOD_CELL:
         limit = MIN_CELL if cell < MIN_CELL else _GOOD_CELL
         level = FAULT if max(width.values()) / finder.cells < MIN_CELL else WARNING

@@ -110,10 +110,15 @@ class Servos:
             if there and not whole:
                 self.lost |= {*error.silent}
                 return self._first(whole)
-            if error.garbled:
+            if error.garbled and there:
                 raise InputError(
                     f"{where} answers of servo {error.garbled[0]} are garbled, those of {there} are not: "
                     "two servos have this id: unplug one of them, and set its id"
+                ) from error
+            if error.garbled:
+                raise InputError(
+                    f"{where} servos answer, but every reply is garbled: two arms share this bus, such as "
+                    "leader and follower, or all servos have one id: unplug one arm, or set each id alone"
                 ) from error
             if there:
                 raise InputError(
@@ -187,6 +192,9 @@ class Servos:
         """Tell which joints may fall where the bus fails; nothing more is written to them."""
         if not isinstance(error, ServoSilent):
             return f"{error}; servos with power go on to their last set-points, and hold there"
+        if error.garbled:
+            self.lost |= {*error.silent}
+            return str(error)
         if {*error.silent} >= {*self.alive}:
             self.lost |= {*error.silent}
             return "no servo answers any more: all joints may fall: hold the arm, and look at its supply"

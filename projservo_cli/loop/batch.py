@@ -86,7 +86,7 @@ class _Rehearsal:
         depth = model.P[:, 2] @ np.array(center_of(state.A, MIDPOINT))
         seen = model._replace(P=model.P * np.sign(depth)[:, None, None])
         M = np.ascontiguousarray(state.A @ as_array(backward(model, self.q_start)).T)
-        endless = np.full(2, np.inf)
+        endless = np.full((2, 2), np.inf)
         plant = Plant(seen, M, task.order, task.center, task.O, task.visible, endless, self.bounds, False)
         law = Law(_DIRECT_TWO, seen, task._replace(body=NO_BODY), _REHEARSAL)
         step = np.full(len(self.q_start), _REHEARSAL_STEP)

@@ -15,13 +15,7 @@ from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.geometry.mechanisms import Seen, reach
 from projservo_cli.loop.metrics import Ended, path_deviation, summarize
 from projservo_cli.loop.step import new_log
-from projservo_cli.planning.margins import (
-    Reaching,
-    carried_into,
-    carrier_of,
-    limits_alone,
-    room_along,
-)
+from projservo_cli.planning.margins import Reaching, carried_into, carrier_of, limits_alone, room_along
 from projservo_cli.records import JointLimits, Model
 from projservo_cli.simulation.ideal import Ends, Plant
 from projservo_cli.task.face import Task
@@ -69,7 +63,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         center=0,
         O=O,
         visible=q,
-        image_size=q,
+        image_size=np.zeros((2, 2)),
         limits=limits,
         opaque=True,
     )

@@ -159,7 +159,7 @@ def _outside(s: FloatArray, m: int, image_size: FloatArray) -> bool:
     for view in range(2):
         for k in range(m):
             seen = math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])
-            if seen and not inside(s[view, k], image_size):
+            if seen and not inside(s[view, k], image_size[view]):
                 return True
     return False
 

@@ -265,7 +265,7 @@ _NONE = np.zeros((1, 0))
 def causes_of(evidence: Evidence, numbers: IntArray, centre: FloatArray | None) -> Iterator[Cause]:
     """All causes that may be named, the simplest of a kind first.
 
-    numbers : (m,) of the markers; centre : (2,) of the images, px; None where their size is not known.
+    numbers : (m,) of the markers; centre : (2, 2) of the images, px; None where their size is not known.
     """
     yield Cause(
         "exchanged",

@@ -1,12 +1,14 @@
 """Monitor of a run: tests each observation, holds the arm while they disagree, and names the fault."""
 
 from collections import deque
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import predict
+from projservo_cli.monitoring.accuracy import Posture, still
 from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
@@ -45,6 +47,8 @@ _LEFT = 0.15
 # Share of the pixels that images are off by which a cause changes them at least: backlash that is
 # more than the calibration found is no turn of a camera by the rest.
 _LEAST_PART = 0.2
+# A tag that is off by less than this share of its side is neither turned by quarters nor exchanged.
+_SIDE = 0.5
 # A corner that is off by less, px, from one side of the tool may be an edge that the finder took for another.
 _LEAST_MOVED_PX = 1.0
 # Share of the markers that a view saw shortly before: one that sees less is covered by something.
@@ -98,7 +102,7 @@ class ImageMonitor:
     sigma_px : pixel noise per coordinate.
     max_observations : length of the longest sequence, which sets the thresholds.
     shown : indices of the markers that images may show, None all; of many, some stand for all.
-    image_size : (2,) px; None or infinite where it is not known.
+    image_size : (2, 2) px, of each image; None or infinite where it is not known.
     ``fault``: the fault in words; empty without one, or while its cause is not clear.
     ``observations``: number of those that showed a marker and were tested. ``agreeing``: number of those of
     one view in a row that agree. ``rejected``: (2, m) detections of the last observation that are off by
@@ -120,6 +124,7 @@ class ImageMonitor:
         self.calibration = calibration.with_markers(self._shown)
         known = image_size is not None and bool(np.isfinite(image_size).all())
         self._centre = 0.5 * (np.asarray(image_size) - 1.0) if known else None
+        self._image_size, self._sigma_px = image_size if known else None, sigma_px
         self._errors = ErrorModel(self.calibration, sigma_px)
         self._detector = Detector(self._errors, max_observations)
         self._pairing = Pairing()
@@ -189,6 +194,31 @@ class ImageMonitor:
         while not self.fault and (pair := self._pairing.next(at_rest)) is not None:
             self._take(pair)
         return self.fault
+
+    def fault_at_rest(self) -> str:
+        """Return the fault that the mean of the last observations of one posture shows; empty for none."""
+        last = [one.pair for one in self._kept if one.view == self._view]
+        last = [one for one in last if np.abs(one.q - last[-1].q).max() <= _AT_REST]
+        if not last or self.pending:
+            return self.fault
+        images = np.array([one.images for one in last])
+        often = 2 * np.isfinite(images).sum(axis=0) > len(last)
+        mean = np.full(images.shape[1:], np.nan)
+        mean[often] = np.nanmean(images[:, often], axis=0)
+        q, numbers = np.mean([one.q for one in last], axis=(0, 1)), self.calibration.marker
+        return detected_fault(self.calibration, q, numbers, mean, self._image_size, self._sigma_px)
+
+    def undetected_mm(self, q: FloatArray, used: BoolArray, posture: Posture) -> float:
+        """Return how far off the face may be at joints (n,) by what no test tells from none, mm.
+
+        used : (2, m) markers of the calibration by which a law measures it, all of them; posture : at q.
+        """
+        if not self._kept:
+            return 0.0
+        used = used[:, self._shown]
+        pair = still(q, np.where(used[..., None], np.zeros(2), np.nan), np.ones(used.shape))
+        carry = posture.carry(self.calibration.M, used)
+        return self._detector.undetected(carry, self._errors.residual(pair), self._kept[-1].pair.sigma_t)
 
     def give_up(self) -> str:
         """Return the fault that is pending, by the observations so far."""
@@ -454,8 +484,8 @@ def detected_fault(
     view of the tool does not tell a tag that moved from one that is bent, or under a slant.
 
     q : (n,) joint readings there, rad or m; images : (2, b, 2) pixels of the markers with the numbers
-    marker (b,), NaN where unseen, those that the calibration does not know among them; image_size : (2,) px;
-    sigma_px : pixel noise per coordinate where that is more than the calibration's.
+    marker (b,), NaN where unseen, those that the calibration does not know among them;
+    image_size : (2, 2) px; sigma_px : pixel noise per coordinate where that is more than the calibration's.
     """
     if not calibration.usable or not calibration.has_covariance:
         return ""
@@ -466,14 +496,19 @@ def detected_fault(
 
     def fault_of(pixels: FloatArray) -> str:
         sigma = max(calibration.sigma_px, sigma_px)
-        monitor = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size)
-        monitor.observe(instants, np.stack([q, q]), rest, instants, pixels, new)
+        monitor, both = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size), np.stack([q, q])
+        monitor.observe(instants, both, rest, instants, pixels, new)
+        for k in range(1, _NAMED_AT[0] * bool(monitor.rejected.any() and not monitor.pending)):
+            monitor.observe(instants + k, both, rest, instants, pixels, new)
         return monitor.give_up()
 
+    expected = predict(calibration, q[None])[0]
+    if misplaced := _misplaced(pixels, expected, calibration.marker):
+        return misplaced
     fault = fault_of(pixels)
     if not fault:
         return ""
-    off, tags = pixels - predict(calibration, q[None])[0], calibration.marker // CORNERS
+    off, tags = pixels - expected, calibration.marker // CORNERS
     for _ in range(len(np.unique(tags[np.isfinite(off).any(axis=(0, 2))])) // 2):
         tag = _off_alone(off, calibration.marker)
         if not tag.any():
@@ -482,6 +517,35 @@ def detected_fault(
         if not fault_of(pixels):
             return ""
     return fault
+
+
+def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> str:
+    """Say which tags are turned by quarters, or in each other's places, by pixels (2, m, 2); empty for none.
+
+    If most are, the tool is: its body looks alike from several sides.
+    """
+    tags = {int(tag): np.flatnonzero(numbers // CORNERS == tag) for tag in np.unique(numbers // CORNERS)}
+    tags = {tag: at for tag, at in tags.items() if len(at) == CORNERS and np.isfinite(pixels[:, at]).any()}
+    found: dict[int, tuple[int, int]] = {}
+
+    def rms(tag: int, place: int, turn: int) -> float:
+        off = pixels[:, tags[tag]] - np.roll(expected[:, tags[place]], turn, axis=1)
+        return float(np.sqrt(np.nanmean(np.square(off).sum(axis=-1))))
+
+    for tag, at in tags.items():
+        side = np.linalg.norm(expected[:, at] - np.roll(expected[:, at], 1, axis=1), axis=-1).mean()
+        own, best = rms(tag, tag, 0), min(product(tags, range(CORNERS)), key=lambda to: rms(tag, *to))
+        if own > _SIDE * side and best != (tag, 0) and rms(tag, *best) < _LEFT * own:
+            found[tag] = best
+    said = []
+    for tag, (place, turn) in found.items():
+        if place == tag:
+            said.append(f"tag {tag} is {'upside down' if turn == 2 else 'turned by a quarter'}")
+        elif place not in found or tag < place:
+            said.append(f"tags {tag} and {place} are exchanged")
+    if not found or 2 * len(found) > len(tags):
+        return ""
+    return f"{' and '.join(said)} on the tool; put them back as they were, or recalibrate"
 
 
 def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:
@@ -494,7 +558,7 @@ def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:
     worst, farthest = np.zeros(len(numbers), dtype=np.bool_), 0.0
     for tag in np.unique(tags):
         one = np.isin(tags, tag)
-        if (2 * seen[:, one].sum(axis=1) >= seen.sum(axis=1)).any() or not seen[:, one].any():
+        if (2 * seen[:, one].sum(axis=1) > seen.sum(axis=1)).any() or not seen[:, one].any():
             continue
         against = off[:, one] - np.nanmedian(off[:, ~one], axis=1, keepdims=True)
         rms = float(np.sqrt(np.nanmean(np.square(against).sum(axis=-1))))

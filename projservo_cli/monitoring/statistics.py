@@ -48,6 +48,10 @@ _AT_REST_PX, _ENOUGH = 0.2, 100.0
 _DIFFERENCES, _MEDIAN, _MEDIAN_AT_MOST = 9, 1.386, 5.6
 # χ² of a detection that may be off by itself: once in ten thousand by chance.
 _OFF_ALONE = 18.4
+# Minimum information on a direction, in units of its deviations: one that no image shows has some.
+_LEAST_INFORMATION = 1e-12
+# Share of the views after which a fault that grows is seen nearly whole; deviations that are told from none.
+_LATE, TOLD = 2.0 / 3.0, 2.0
 # Share of the markers of a view that may be off one by one before the view itself is.
 _MOST_ASIDE = 0.5
 
@@ -134,9 +138,10 @@ class ErrorModel:
         self.sigma_q = np.maximum(sigma_q * per_rad(calibration.prismatic), LEAST_ERROR)
         # Directions of points at infinity, of rigid motions, and of changes of a camera but for its scale.
         self.directions = np.linalg.svd(calibration.a_inf[None])[2][1:]
-        self.twists = _rigid_motions(calibration.H_hat_0, self.directions, calibration.a_inf)
+        self.twists = rigid_motions(calibration.H_hat_0, self.directions, calibration.a_inf)
         self.cameras = [np.linalg.svd(P.reshape(1, CAMERA))[2][1:].T for P in calibration.P]
         self.parts, self.touches, self.f = _directions_of(n, m, len(self.twists))
+        self.tool = slice(self.f - 2 * len(self.twists), self.f - len(self.twists))  # columns of its motions
         # Squares (K, 2, m) by which corners erred while it was recorded, and where they were seen from.
         self._squares = calibration.corner_squares
         if self._squares is not None and calibration.corner_q is not None:
@@ -634,21 +639,59 @@ class Detector:
         beyond = np.flatnonzero(excess > 0.0)
         if not beyond.size:
             return excess
-        # Corners that are off all along change the calibration as seen before the onset, too.
-        e, memory = self._errors.e, self.memory
-        by_corner = total.by_corner - since.by_corner
-        by_corner[:e] = total.by_corner[:e]
-        off = reduced.of(by_corner)
-        spread, weight = off @ off.T, total.weight - since.weight
+        spread, weight, memory = self._spread(since, total, reduced), total.weight - since.weight, self.memory
         share = np.minimum([_greatest(spread, reduced, parts[i]) / weight for i in beyond], 1.0)
         touched, seen = touches[beyond], (total.seen - since.seen).ravel()
         corners = np.maximum(2.0 * touched @ (seen > 0.0), 4.0)  # coordinates of a view
         worst = (1.0 - memory.fresh) * chdtri(corners, _LASTING_CORNERS) / corners * share * (touched @ seen)
-        one = (total.weight_squares - since.weight_squares) / weight**2  # what one view is of all
+        one = _one_of(since, total)
         nuisance = self._root_gains(reduced, (1.0 - one) * memory.persistent * spread)
         limits = [by_chance[beyond] + np.sqrt(bias[beyond] + part * worst) for part in (1.0, one)]
         excess[beyond] = np.maximum(gained[beyond] - limits[0], nuisance[beyond] - limits[1])
         return excess
+
+    def _spread(self, since: Sums, total: Sums, reduced: _Reduced) -> FloatArray:
+        """Covariance (f, f) of scores by corners that each keep an error of one deviation.
+
+        Those that are off all along change the calibration as seen before the onset, too.
+        """
+        e, by_corner = self._errors.e, total.by_corner - since.by_corner
+        by_corner[:e] = total.by_corner[:e]
+        off = reduced.of(by_corner)
+        return np.asarray(off @ off.T)
+
+    def undetected(self, carry: FloatArray, at: Residual, sigma_t: FloatArray) -> float:
+        """Return how far off a measurement may be by what no test tells from none.
+
+        Of each direction of a fault but those of joints and instants: what observations show of it since the
+        first, of a camera also since two thirds of them, since it may drift, and two deviations of that. The
+        largest is returned: a fault has one cause.
+
+        carry : (k, 4 m) from changes of pixels to what is measured; at : images where it is measured.
+        Source: W. Baarda, "A testing procedure for use in geodetic networks", Delft 1968, on external
+        reliability.
+        """
+        total, onsets, n = self.memory.total, self.memory.onsets(), len(self._errors.sigma_q)
+        if not onsets:
+            return 0.0
+        late, greatest = min(onsets, key=lambda sums: abs(sums.views - _LATE * total.views)), 0.0
+        cameras = 2 * n + 2 + 2 * (CAMERA - 1)
+        for since, end in ((onsets[0], self._errors.f), (late, cameras)):
+            reduced = self._reduced(since, total, sigma_t, [])
+            lasting = max(0.0, 1.0 - _one_of(since, total)) * self.memory.persistent
+            lasting += (total.bias - since.bias).sum() / (total.seen - since.seen).sum()
+            spread = reduced.normal[:-1, :-1] + lasting * self._spread(since, total, reduced)
+            for part in self._errors.parts:
+                if not 2 * n + 2 <= part[0] < end:
+                    continue
+                size = np.sqrt(np.maximum(reduced.normal.diagonal(), _LEAST_INFORMATION))[part]
+                unit, block = np.outer(size, size), np.ix_(part, part)
+                inverse = np.linalg.inv(reduced.normal[block] / unit + RIDGE * np.eye(len(part))) / unit
+                found = carry @ at.F[:, part] @ inverse
+                off = np.square(found @ reduced.normal[part, -1]).sum()
+                may = np.trace(found @ spread[block] @ found.T)
+                greatest = max(greatest, float(off + TOLD**2 * may))
+        return float(np.sqrt(greatest))
 
     def _root_gains(self, reduced: _Reduced, more: FloatArray | float) -> FloatArray:
         """Root (h,) of what each direction gains, its score with more covariance (f, f)."""
@@ -668,6 +711,11 @@ def gains(
     b = right[parts] / size
     x = np.linalg.solve(blocks + RIDGE * np.eye(parts.shape[1]), b[..., None])[..., 0]
     return np.maximum((b * x).sum(axis=1), 0.0), x / size
+
+
+def _one_of(since: Sums, total: Sums) -> float:
+    """Share of all observations since an onset that one view is."""
+    return (total.weight_squares - since.weight_squares) / (total.weight - since.weight) ** 2
 
 
 def _greatest(spread: FloatArray, reduced: _Reduced, part: IntArray) -> float:
@@ -701,7 +749,7 @@ def _rays(scene: Parameters, directions: FloatArray, q: FloatArray) -> FloatArra
     return np.asarray((ray / np.linalg.norm(ray, axis=-1, keepdims=True)).swapaxes(0, 1))
 
 
-def _rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) -> FloatArray:
+def rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) -> FloatArray:
     """Basis (d, 4, 4) of rigid motions: translations, and those that the joints generate together."""
     brackets = [A @ B - B @ A for A in H_hat for B in H_hat]
     known = np.concatenate([H_hat, np.array(brackets), directions[:, :, None] * a_inf])

@@ -59,7 +59,7 @@ class Constraints(NamedTuple):
     O: FloatArray  # (2, 4) optical centres, a·O = 1 of the face at the start
     depth: FloatArray  # (2,) minimum third coordinate of a marker at the start
     limits: JointLimits  # of the joints
-    image_size: FloatArray  # (2,) px; infinite where an image has no border
+    image_size: FloatArray  # (2, 2) px, of each; infinite where an image has no border
     keep: FloatArray  # (n,) distance from a limit that counts as margin one, rad or m
     full: FloatArray  # (10,) margins asked for
     ends: FloatArray  # (k, n) start and goals, near which constraints are relaxed
@@ -160,7 +160,7 @@ def _sight_into(
         sight[2 + view] = width(s[view], c.tags[tag]) if visible else -math.inf
         sight[4 + view] = math.inf if visible else -math.inf
         for k in c.tags[tag]:
-            border = from_border(c.image_size, s[view, k, 0], s[view, k, 1])
+            border = from_border(c.image_size[view], s[view, k, 0], s[view, k, 1])
             sight[4 + view] = min(sight[4 + view], border)
 
 
@@ -226,8 +226,8 @@ def clear_by(c: Constraints, H: Mat4, s: FloatArray) -> float:
             if not both or (keep.occludes[region] == 1 and k < c.face):
                 minimum = min(minimum, first, second)
             else:
-                first = min(first, from_border(c.image_size, left[0], left[1]))
-                second = min(second, from_border(c.image_size, right[0], right[1]))
+                first = min(first, from_border(c.image_size[0], left[0], left[1]))
+                second = min(second, from_border(c.image_size[1], right[0], right[1]))
                 minimum = min(minimum, max(first, second))
         for k in range(c.face if both else 0):
             A = apply(H, vec(c.M[k]))
@@ -256,7 +256,9 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
         for view in range(2):
             s, at, t = pixel(c.model, view, first), pixel(c.model, view, middle), pixel(c.model, view, last)
             radius = math.sqrt(max(squared(at, s), squared(at, t)))
-            clear = min(clearance(c.keep_out, region, view, at), from_border(c.image_size, at[0], at[1]))
+            clear = min(
+                clearance(c.keep_out, region, view, at), from_border(c.image_size[view], at[0], at[1])
+            )
             here, along, half = max(here, clear), max(along, clear - radius), max(half, radius)
         decided = along >= c.full[CLEAR] or here < c.full[CLEAR]
         if half > PIECE and not (decided and half <= 0.5 * abs(here)):

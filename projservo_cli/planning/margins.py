@@ -105,7 +105,7 @@ class Demands(NamedTuple):
     """Constraints of a planned motion."""
 
     limits: JointLimits  # of the joints
-    image_size: FloatArray  # (2,) width and height of both images, px; infinite where an image has no border
+    image_size: FloatArray  # (2, 2) width and height of each image, px; infinite where it has no border
     border_px: float  # minimum distance of a marker from the border of an image, px
     conditioning: float  # minimum reciprocal condition number of the image Jacobian of the face
     keep: FloatArray  # (n,) minimum distance from a joint limit, rad or m, along a path through joint space
@@ -120,7 +120,7 @@ def limits_alone(limits: JointLimits) -> Demands:
     """Demands of joint limits alone."""
     return Demands(
         limits=limits,
-        image_size=np.full(2, math.inf),
+        image_size=np.full((2, 2), math.inf),
         border_px=0.0,
         conditioning=0.0,
         keep=np.zeros(len(limits.lower)),
@@ -395,7 +395,7 @@ def measured(motion: Motion) -> Motion:
     # A camera has a marker before it as long as it has it on the side on which it had it at the start.
     depth = A @ model.P[:, 2].T
     visible = np.swapaxes((M @ model.P[:, 2].T) * depth > 1e-9 * depth**2, 1, 2)
-    border = np.minimum(s + 0.5, demands.image_size - 0.5 - s).min(axis=3)
+    border = np.minimum(s + 0.5, demands.image_size[:, None] - 0.5 - s).min(axis=3)
     border = np.where(visible & np.isfinite(border), border, BEHIND)
     found.distance[:] = border[:, :, :m].min(axis=2)
     if len(demands.tags):

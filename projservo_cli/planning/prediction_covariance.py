@@ -7,13 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from projservo_cli.calibration.prediction import dense_pixel_changes, error_factor, parameters_from
-from projservo_cli.records import (
-    NO_SPREAD,
-    BoolArray,
-    Calibration,
-    FloatArray,
-    Spread,
-)
+from projservo_cli.records import NO_SPREAD, BoolArray, Calibration, FloatArray, Spread
 
 _BATCH = 1500  # poses drawn at once
 
@@ -39,7 +33,7 @@ def drawn_poses(
 
 
 # Lower and upper limits of n joints, rad or m, and width and height of both images, px.
-_Bounds = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+_Bounds = tuple[tuple[float, ...], tuple[float, ...], tuple[tuple[float, ...], ...]]
 # Number of principal directions; of joints at which they are computed, and batches of them.
 _DIRECTIONS, _LOOKED_AT, _MOST_BATCHES = 8, 150, 40
 
@@ -84,8 +78,8 @@ def _showing(calibration: Calibration, face: int, bounds: _Bounds, seed: int) ->
     lower, upper, image_size = bounds
     low = np.where(np.isfinite(lower), lower, calibration.q_reference - np.pi)
     high = np.where(np.isfinite(upper), upper, calibration.q_reference + np.pi)
-    corners = np.array([[-0.5, -0.5], np.array(image_size) - 0.5])
-    region, found = Region(low, high, np.stack([corners, corners])), np.zeros((0, len(low)))
+    corners = np.stack([np.full((2, 2), -0.5), np.array(image_size) - 0.5], axis=1)
+    region, found = Region(low, high, corners), np.zeros((0, len(low)))
     for q, seen in drawn_poses(calibration, region, _MOST_BATCHES, np.random.default_rng(seed)):
         found = np.concatenate([found, q[seen[:, :, :face].all(axis=(1, 2))]])
         if len(found) >= _LOOKED_AT:

@@ -3,7 +3,7 @@
 The view is drawn by plotly and has a time slider; the animation has a column a law.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from projservo_cli.files import replacing, write_whole
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
@@ -295,7 +296,7 @@ def write_animation(
     path: Path,
     traces: Mapping[str, Trace],
     order: IntArray,
-    size: Sequence[float] | None,
+    size: ImageSize | None,
     progress: Callable[[str, int, int], None],
 ) -> None:
     """Write the animation of runs as GIF: the first direct law and the classical ones side by side.
@@ -308,10 +309,11 @@ def write_animation(
     direct = [name for name in traces if name in BODY_LAWS]
     pair = [*direct[:1], *(name for name in traces if name in POINT_LAWS)]
     columns = {name: traces[name] for name in (pair if len(pair) > 1 else [*traces])[:_MOST_COLUMNS]}
+    shown = image_sizes(size).max(axis=0)
     if size is None:
-        size = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
+        shown = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
     images = []
-    for pixels in _frames(columns, order, np.array(size, dtype=np.float64)):
+    for pixels in _frames(columns, order, shown):
         images.append(Image.fromarray(pixels))
         progress("animation", len(images), FRAMES)
     # The last frame has all colours; one palette for all keeps what does not move the same.

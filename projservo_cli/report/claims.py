@@ -371,7 +371,7 @@ def _direct(report_data: ReportData) -> Iterator[_Claim]:
         )
     if len(traces) == len(DIRECT):
         gap = _path_gap(*(trace.s.reshape(len(trace.s), -1, 2) for trace in traces.values()))
-        diagonal = float(np.linalg.norm(report_data.plant.image_size))
+        diagonal = float(np.linalg.norm(report_data.plant.image_size, axis=1).min())
         yield _Claim(
             "The image paths of directTHREE and directTWO differ very little",
             "section 6, Fig. 7",

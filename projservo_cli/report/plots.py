@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from projservo_cli.image_size import image_sizes
 from projservo_cli.records import (
     Calibration,
     CrossValidation,
@@ -41,7 +42,7 @@ def of_plan(plan: Plan, scene: Any) -> "Figure":
     scene : has ``model``, ``limits``, ``image_size`` and ``trajectory``.
     """
     spec = _spec(_PLAN)
-    extent = np.nanmax(plan.s, axis=(0, 1, 2)) if scene.image_size is None else scene.image_size
+    extent = image_sizes(np.nanmax(plan.s, axis=(0, 2)) if scene.image_size is None else scene.image_size)
     lowest, highest = plan.q.min(axis=0), plan.q.max(axis=0)
     robot = SimpleNamespace(
         joint_types=scene.model.joint_types,

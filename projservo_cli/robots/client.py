@@ -137,6 +137,7 @@ class DrivenRobot:
         self.disturbance = ""
         self.weight: FloatArray | None = None
         self._stale = 0  # looks in a row without a new frame while the arm is held
+        self._dark = np.zeros(2, dtype=np.int64)  # looks in a row that show no marker of the calibration
         self.begin()
 
     def begin(self) -> None:
@@ -167,6 +168,7 @@ class DrivenRobot:
         if self.monitor is not None:
             _require_apart(self.robot.name, reading.s)
         images = np.where((order < 0)[:, None], np.nan, reading.s[:, order])
+        self._dark = np.where(np.isfinite(images[..., 0]).any(axis=1), 0, self._dark + 1)
         visible, stated = self.known.visible, None
         if reading.sigma_px is not None:
             stated = reading.sigma_px[:, order]
@@ -228,16 +230,30 @@ class DrivenRobot:
             self.joints()
             self.observe()
             if self.disturbance or self._agreed(look):
-                return self.disturbance
+                return self.at_rest()
             if self.monitor is None or self.monitor.observations > tested:
                 continue  # the next observation shows another image
             if not self.robot.waits(self.robot.bounds.period):  # time passes in commands alone
                 if look >= WINDOW and self.monitor.agreeing and not self.pending:
-                    return ""
+                    return self.at_rest()
                 if look >= WINDOW:
                     self.steered.hold()
         if self.pending:
             self.give_up()
+        return self.disturbance
+
+    def unseen(self, least: int) -> str:
+        """Return which cameras show no marker of the calibration, if so many or more do not; else empty."""
+        dark = [view for view, looks in zip(VIEWS, self._dark, strict=True) if looks >= WINDOW]
+        if len(dark) < least:
+            return ""
+        which = f"the {dark[0]} camera shows no" if len(dark) == 1 else "neither camera shows a"
+        return f"{which} marker of the calibration"
+
+    def at_rest(self) -> str:
+        """Return the fault that images show by the test of one posture, that of ``doctor``; else empty."""
+        if self.monitor is not None:
+            self.disturbance = self.disturbance or self.monitor.fault_at_rest()
         return self.disturbance
 
     def _agreed(self, observations: int) -> bool:

@@ -13,8 +13,17 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from projservo_cli.calibration.time_offset import is_repeated_frame
-from projservo_cli.records import ByteArray, FloatArray, InputError, JointLimits, WorkFailed, in_unit
+from projservo_cli.calibration.time_offset import is_repeated_frame, time_unit
+from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.records import (
+    ByteArray,
+    FloatArray,
+    InputError,
+    IntArray,
+    JointLimits,
+    WorkFailed,
+    in_unit,
+)
 from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
@@ -25,6 +34,7 @@ _ROUND_OFF, _LATE = 1e-9, 0.1
 # A joint that is driven goes from reading to reading at so many times its speed limit, and by so much more
 # (rad or m), at most: one that falls or is pushed goes farther, or one whose reading is wrong.
 _SURGE, _LEAP = 3.0, 0.05
+_WHOLE = 8  # readings in a row whose stamps are whole seconds by chance, at most
 
 
 class Reading(NamedTuple):
@@ -132,14 +142,17 @@ class PluginRobot:
         bounds: Bounds,
         timeout_s: float,
         open_s: float,
-        image_size: tuple[int, int] | None = None,
+        image_size: ImageSize | None = None,
     ) -> None:
         self.robot, self.name, self.bounds, self.image_size = robot, name, bounds, image_size
         self.timeout_s, self.open_s = timeout_s, open_s
         self._joints, self._markers = len(bounds.limits.speed), markers
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
+        self._began = 0.0, 0.0  # what its clock showed first, and when, as below
         self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
         self._last: Reading | None = None
+        # The clock and the stamps (3,) first read, s, and how many readings in a row have whole ones.
+        self._stamps: tuple[float, FloatArray, IntArray] | None = None
         self._earlier: Reading | None = None  # the one before the last
         self.frames: ByteArray | None = None  # (2, height, width) last seen, where the robot has them
         self._sent: FloatArray | None = None  # the last set-point (n,)
@@ -172,10 +185,10 @@ class PluginRobot:
         ):
             raise WorkFailed(f"{self.name}: frames must be an array (2, height, width) of uint8, or None")
         self.frames = None if frames is None else frames.copy()
-        if frames is not None and self.image_size not in (None, frames.shape[:0:-1]):
-            shown, asked = (
-                " x ".join(map(str, size or ())) for size in (frames.shape[:0:-1], self.image_size)
-            )
+        sizes = image_sizes(self.image_size)
+        if frames is not None and np.isfinite(sizes).all() and (sizes != frames.shape[:0:-1]).any():
+            shown = " x ".join(map(str, frames.shape[:0:-1]))
+            asked = " and ".join(dict.fromkeys(f"{width:.0f} x {height:.0f}" for width, height in sizes))
             raise WorkFailed(
                 f"{self.name}: the image size of its frames is {shown} px, not the {asked} of the "
                 "configuration; set resolution and crop of the cameras as they were calibrated with"
@@ -216,7 +229,8 @@ class PluginRobot:
             raise WorkFailed(
                 f"{self.name}: nothing was moved: its readings mean something else than in the recording: "
                 f"{_difference(recorded, now)}: was it homed or calibrated since? Record again: projservo "
-                "record calibrate --force"
+                "record calibrate --force",
+                refutes=True,
             )
 
     @property
@@ -337,7 +351,13 @@ class PluginRobot:
         before, there = self._shown
         last = max(before + here - there, self._due) if self._shown[1] else math.inf
         if not before <= now <= last + self.timeout_s:
-            raise WorkFailed(f"{self.name}: its clock jumped from {before:.6g} s to {now:.6g} s")
+            began, then = self._began  # one that ran well until now was set, whatever its unit
+            unit = time_unit(max(now - began, 1e-9) / max(here - then, 1e-6))
+            raise WorkFailed(
+                f"{self.name}: its clock jumped from {before:.6g} s to {now:.6g} s"
+                + (f" in {here - there:.3g} s: now() must give s, and {unit}" if unit else "")
+            )
+        self._began = self._began if self._shown[1] else (now, here)
         self._shown = now, here
         return now
 
@@ -362,6 +382,7 @@ class PluginRobot:
             if times[i] < last - (i and self.timeout_s):  # exposures that jitter may overtake each other
                 what = f"{name} went back from {last:.6g} s to {times[i]:.6g} s"
                 raise WorkFailed(f"{self.name}: {what}: one clock must stamp all of them")
+        self._require_seconds(before, times)
         if sigma is not None:
             sigma = self._numbers("read() gave sigma_px", sigma, (2, self._markers))
             stated = sigma[np.isfinite(s[..., 0])]
@@ -370,6 +391,26 @@ class PluginRobot:
         return Reading(
             q=q, s=s, t_q=before if np.isnan(times[0]) else float(times[0]), t_view=times[1:], sigma_px=sigma
         )
+
+    def _require_seconds(self, clock: float, times: FloatArray) -> None:
+        """Refuse stamps t_q, t_left, t_right that go on as in another unit than s, or in whole seconds."""
+        if self._stamps is None:
+            self._stamps = clock, times, np.ones(3, dtype=np.int64)
+        begun, first, whole = self._stamps
+        np.multiply(whole + 1, (times == np.rint(times)) & (times != 0.0), out=whole)
+        for name, t, since, count in zip(("t_q", "t_left", "t_right"), times, first, whole, strict=True):
+            # A clock of its own may jump by a second or two, when it is set.
+            unit = time_unit(max(t - since - 2.0, 1e-9) / (clock - begun)) if clock - begun > 2e-3 else ""
+            if unit:
+                raise WorkFailed(
+                    f"{self.name}: {name} went on by {t - since:.6g} while its clock went on by "
+                    f"{clock - begun:.3g} s: {unit}"
+                )
+            if count > _WHOLE and (clock - begun) % 1.0 and self.bounds.period % 1.0:
+                raise WorkFailed(
+                    f"{self.name}: {name} is a whole number in {count} readings, such as {t:.0f}: give s "
+                    "with its fractions, else no latency can be estimated"
+                )
 
     def _wrong(self, target: FloatArray, speed: FloatArray, due: float) -> str:
         """Return the reason why a command must not be sent; empty if it may."""

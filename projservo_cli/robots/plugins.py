@@ -166,7 +166,7 @@ def _require_methods(where: str, found: Any, kind: str) -> None:
     methods = _METHODS[kind]
     if kind == "plant" and not callable(getattr(found, "read", None)) and brings_no_pixels(found):
         methods = tuple("joints" if name == "read" else name for name in methods)
-    lacking = [name for name in methods if not callable(getattr(found, name, None))]
+    lacking = [name for name in methods if not (callable(getattr(found, name, None)) or _sets(found, name))]
     if lacking:
         require_spelt(where, found, lacking)
         raise InputError(
@@ -181,7 +181,16 @@ def _require_methods(where: str, found: Any, kind: str) -> None:
 
 def brings_no_pixels(found: object) -> bool:
     """Whether a robot class, or an object of it, reads joints alone and leaves images to projservo."""
-    return callable(getattr(found, "joints", None))
+    return callable(getattr(found, "joints", None)) or _sets(found, "joints")
+
+
+def _sets(found: object, name: str) -> bool:
+    """Whether a class may give its objects an attribute as they are made; these are checked then."""
+    kinds = found.__mro__ if isinstance(found, type) else ()
+    codes = [getattr(vars(kind).get("__init__"), "__code__", None) for kind in kinds]
+    codes += [inner for code in codes if code is not None for inner in code.co_consts]  # comprehensions
+    used = {word for code in codes for word in getattr(code, "co_names", ())}
+    return bool(used & {name, "setattr"}) or any("__getattr__" in vars(kind) for kind in kinds)
 
 
 def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
+from projservo_cli.image_size import ImageSize
 from projservo_cli.records import Calibration, FloatArray, InputError, JointLimits, in_unit
 from projservo_cli.robots.contract import Bounds
 
@@ -160,5 +161,5 @@ class OwnRobot(NamedTuple):
     dictionary: str | None  # of tags, which a class that takes it is given
     timeout_s: float  # most time an answer may take
     open_s: float  # most time that opening may take
-    image_size: tuple[int, int] | None  # width and height of its images, px, if they are known
+    image_size: ImageSize | None  # width and height of its images, px, if known
     cameras: StereoSettings | None = None  # of an arm that reads joints alone

@@ -517,7 +517,7 @@ class _Camera:
         if (lost := events.lost_markers) is not None and _lasts(lost, step):
             pixels[[truth.number.index(number) for number in lost.markers or truth.number]] = math.nan
         if world.eyes.borders:
-            pixels = truth.within(pixels)
+            pixels = truth.within(pixels, self._view)
         return _Frame(middle, middle + self._clock, pixels, sigma)
 
 

@@ -5,17 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import (
-    Mat4,
-    Vec4,
-    apply,
-    as_array,
-    axpy,
-    dot,
-    mat,
-    vec,
-    vec_into,
-)
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, as_array, axpy, dot, mat, vec, vec_into
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward, row
 from projservo_cli.geometry.lens import distort_pixel
@@ -42,7 +32,7 @@ class Plant(NamedTuple):
     center: int  # index of the centre marker, or ``MIDPOINT``
     O: FloatArray  # (2, 4) optical centres
     visible: FloatArray  # (2,) sign of a·O on the visible side of the face
-    image_size: FloatArray  # (2,) width and height, px; infinite where an image has no border
+    image_size: FloatArray  # (2, 2) width and height of each image, px; infinite where it has no border
     limits: JointLimits  # of the joints
     opaque: bool  # whether the face hides its markers from a camera behind it
     # (p, 4) further markers of the body at the reference, m; a camera sees those within its image
@@ -76,7 +66,7 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
         for k in range(plant.pins.shape[0]):
             pixel = s[view, m + k]
             A = apply(H, vec(plant.pins[k]))
-            if _put_pixel(camera, lens, A, pixel) and not inside(pixel, plant.image_size):
+            if _put_pixel(camera, lens, A, pixel) and not inside(pixel, plant.image_size[view]):
                 pixel[:] = math.nan
     return in_front
 
@@ -112,7 +102,7 @@ def shows_face(plant: Plant, H: Mat4, pixel: FloatArray) -> bool:
         for view in range(2):
             if not _put_pixel(plant.model.P[view], plant.model.lens[view], A, pixel):
                 return False
-            if not inside(pixel, plant.image_size):
+            if not inside(pixel, plant.image_size[view]):
                 return False
     return True
 

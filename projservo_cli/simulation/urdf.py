@@ -4,6 +4,7 @@ An arm is what ``robot.screws`` takes: the joint screws at a reference and the p
 """
 
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,33 +16,19 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.records import FloatArray, InputError
 
 _MOVING = {"revolute": "R", "continuous": "R", "prismatic": "P"}
+_MACRO = ("${", "$(")  # marks of what xacro replaces in attributes
 
 
-def read_urdf(path: str, tip: str, text: str) -> dict[str, Any]:
+def read_urdf(path: str, tip: str, content: bytes, *, bounded: bool = True) -> dict[str, Any]:
     """Screws of the joints of a URDF from its root to a link, as ``robot.screws`` takes them.
 
-    text : of the file. Raises InputError if it is no URDF, there is no such link, or a joint on the chain to
-    it is none of those that turn or slide by themselves.
+    content : of the file, as bytes in the encoding that it declares.
+    bounded : whether joints that the URDF gives limits must state both.
+    Raises InputError if it is no URDF or no tree, there is no such link, or a joint on the chain to it is
+    none of those that turn or slide by themselves.
     """
-    try:
-        root = ET.fromstring(text)
-    except ET.ParseError as error:
-        raise InputError(f"{path}: not XML: {error}") from error
-    if "xacro" in text and ("${" in text or "xacro:" in text):
-        raise InputError(f"{path}: is a xacro file: expand it first, xacro {Path(path).name} > robot.urdf")
-    if root.tag != "robot":
-        raise InputError(f"{path}: not a URDF: its outermost element is {root.tag}, not robot")
-    links = [link.get("name", "") for link in root.findall("link")]
-    above = {_of(joint, "child", "link", "", path): joint for joint in root.findall("joint")}
-    if tip not in links and tip not in above:
-        raise InputError(f"{path}: there is no link {tip}; links: {listed(links)}")
-    chain: list[ET.Element] = []
-    link = tip
-    while link in above:
-        chain.insert(0, above.pop(link))
-        link = _of(chain[0], "parent", "link", "", path)
     T, joints = np.eye(4), []
-    for joint in chain:
+    for joint in _chain(path, tip, content):
         T = T @ _origin(joint, path)
         name, kind = joint.get("name", ""), joint.get("type", "")
         if joint.find("mimic") is not None:
@@ -55,9 +42,7 @@ def read_urdf(path: str, tip: str, text: str) -> dict[str, Any]:
         axis = _numbers(joint, "axis", "xyz", "1 0 0", path)
         if not np.linalg.norm(axis) > 0.0:
             raise InputError(f"{path}: joint {name}: its axis is zero")
-        limits = None
-        if kind != "continuous" and joint.find("limit") is not None:
-            limits = [float(_numbers(joint, "limit", key, "0", path)[0]) for key in ("lower", "upper")]
+        limits = _limits(joint, path) if bounded and kind != "continuous" else None
         joints.append(
             joint_screw(_MOVING[kind], name, T[:3, :3] @ axis / np.linalg.norm(axis), T[:3, 3], limits)
         )
@@ -74,29 +59,81 @@ class UrdfChain(NamedTuple):
     tip: FloatArray  # (4, 4) pose of the link, m
 
 
-def urdf_chain(path: str, tip: str | None, text: str) -> UrdfChain:
-    """Joints of a URDF from its root to a link, by default the last one.
+def urdf_chain(path: str, tip: str | None, content: bytes) -> UrdfChain:
+    """Joints of a URDF from its root to a link, by default the last one; limits do not count.
 
     Raises InputError as ``read_urdf``, or if several links are last.
     """
-    try:
-        root = ET.fromstring(text)
-    except ET.ParseError as error:
-        raise InputError(f"{path}: not XML: {error}") from error
-    joints, links = root.findall("joint"), [link.get("name", "") for link in root.findall("link")]
-    above = {
-        _of(joint, "child", "link", "", path): _of(joint, "parent", "link", "", path) for joint in joints
-    }
     if tip is None:
-        ends = [name for name in links if name not in above.values()]
+        root = _parsed(path, content)
+        above = {_of(joint, "parent", "link", "", path) for joint in root.findall("joint")}
+        ends = [name for name in (link.get("name", "") for link in root.findall("link")) if name not in above]
         if len(ends) != 1:
             raise InputError(f"{path}: has {len(ends)} last links ({listed(ends)}): name one as the tip")
         tip = ends[0]
-    arm, first = read_urdf(path, tip, text), tip
-    while first in above:
-        first = above.pop(first)
+    arm = read_urdf(path, tip, content, bounded=False)
+    first = _of(_chain(path, tip, content)[0], "parent", "link", "", path)
     axes = np.array([[*joint["w"], *joint["v"]] for joint in arm["joints"]])
     return UrdfChain(first, axes, np.array(arm["base_tool"]))
+
+
+def _parsed(path: str, content: bytes) -> ET.Element:
+    """The outermost element of a URDF, in whatever encoding the file declares."""
+    try:
+        try:
+            root = ET.fromstring(content)
+        except ValueError:  # of several bytes a character, which the parser leaves to its caller
+            found = re.search(rb"""encoding\s*=\s*["']([\w.:-]+)""", content[:200])
+            root = ET.fromstring(content.decode(found[1].decode() if found else "utf-8"))
+    except (ET.ParseError, LookupError, ValueError) as error:
+        raise InputError(
+            f"{path}: not XML: {error}; its text must be in the encoding that its first line declares, by "
+            "default UTF-8"
+        ) from error
+    if root.tag != "robot":
+        raise InputError(f"{path}: not a URDF: its outermost element is {root.tag}, not robot")
+    spaces = {str(name).partition("}")[0] for e in root.iter() for name in (e.tag, *e.keys()) if "}" in name}
+    used = [part for name in ("joint", "link") for one in root.findall(name) for part in one.iter()]
+    values = [value for e in (root, *used) for value in e.attrib.values()]
+    if any(space.endswith("xacro") for space in spaces) or any(mark in v for v in values for mark in _MACRO):
+        raise InputError(f"{path}: is a xacro file: expand it first, xacro {Path(path).name} > robot.urdf")
+    return root
+
+
+def _chain(path: str, tip: str, content: bytes) -> list[ET.Element]:
+    """Joints from the root of a URDF to a link. Raises InputError if links and joints are no tree."""
+    root = _parsed(path, content)
+    links, names = ([one.get("name", "") for one in root.findall(kind)] for kind in ("link", "joint"))
+    for kind, given in (("link", links), ("joint", names)):
+        if twice := [name for name in dict.fromkeys(given) if given.count(name) > 1]:
+            raise InputError(
+                f"{path}: {kind} {twice[0]} stands there {given.count(twice[0])} times: keep one"
+            )
+    above: dict[str, ET.Element] = {}
+    for joint in root.findall("joint"):
+        link = _of(joint, "child", "link", "", path)
+        if link in above:
+            raise InputError(
+                f"{path}: link {link} has two parent joints, {above[link].get('name')} and "
+                f"{joint.get('name')}: a URDF is a tree; remove the one that closes the loop"
+            )
+        above[link] = joint
+    for joint in above.values():
+        if links and (link := _of(joint, "parent", "link", "", path)) not in (*links, *above):
+            raise InputError(
+                f"{path}: joint {joint.get('name')}: there is no link {link}, its parent; links: "
+                f"{listed(links)}"
+            )
+    if tip not in links and tip not in above:
+        raise InputError(f"{path}: there is no link {tip}; links: {listed(links)}")
+    chain: list[ET.Element] = []
+    link = tip
+    while link in above:
+        chain.insert(0, above.pop(link))
+        link = _of(chain[0], "parent", "link", "", path)
+        if link == tip:
+            raise InputError(f"{path}: joint {chain[0].get('name')} closes a loop of links: a URDF is a tree")
+    return chain
 
 
 def joint_screw(
@@ -126,10 +163,28 @@ def _origin(joint: ET.Element, path: str) -> FloatArray:
     return T
 
 
+def _limits(joint: ET.Element, path: str) -> list[float]:
+    """Lower and upper limit of a joint, rad or m."""
+    name, given = joint.get("name", ""), joint.find("limit")
+    if missing := [key for key in ("lower", "upper") if given is None or given.get(key) is None]:
+        raise InputError(
+            f"{path}: joint {name} of type {joint.get('type')} has no {' and no '.join(missing)} limit: give "
+            "lower and upper in its element limit, rad or m; a joint that turns without end is continuous"
+        )
+    lower, upper = (float(_numbers(joint, "limit", key, "0", path)[0]) for key in ("lower", "upper"))
+    if not lower < upper:
+        raise InputError(
+            f"{path}: joint {name}: its lower limit, {lower:g}, is not below its upper, {upper:g}"
+        )
+    return [lower, upper]
+
+
 def _of(joint: ET.Element, tag: str, key: str, default: str, path: str) -> str:
     """An attribute of an element of a joint."""
-    found = joint.find(tag)
-    value = default if found is None else found.get(key, default)
+    found = joint.findall(tag)
+    if len(found) > 1:
+        raise InputError(f"{path}: joint {joint.get('name', '')} has {len(found)} elements {tag}: keep one")
+    value = found[0].get(key, default) if found else default
     if not value:
         raise InputError(f"{path}: joint {joint.get('name', '')}: its {tag} has no {key}")
     return value

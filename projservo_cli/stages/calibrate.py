@@ -6,15 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.calibration import (
-    Nominal,
-    Solution,
-    calibrate,
-    cross_validate,
-)
+from projservo_cli.calibration import Nominal, Solution, calibrate, cross_validate
 from projservo_cli.calibration.screening import screened
 from projservo_cli.calibration.undecided import undecided_pairs
 from projservo_cli.files import write_whole
+from projservo_cli.image_size import image_sizes
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import Suggestion, suggest
@@ -60,11 +56,12 @@ def simulated(
     """Simulate the trial motions, or poses (K, n), rad or m; the observations."""
     observation, noise_px = observed(trials, q, seed, progress=progress)
     assert trials.truth is not None
-    ideal, (width, height) = trials.driven is None, trials.truth.image_size.astype(int).tolist()
+    ideal, size = trials.driven is None, trials.truth.image_size.astype(int).tolist()
+    sizes = tuple(map(tuple, size)) if trials.truth.image_size.ndim > 1 else tuple(size)
     return Observations.of(
         observation,
         joint_types=trials.joints.types,
-        image_size=(width, height),
+        image_size=sizes,
         noise_px=noise_px,
         # Where joints or images have faults, χ² of pixel noise alone decides no more than in a recording.
         joint_noise=0.0 if ideal else None,
@@ -139,7 +136,7 @@ def suggest_motions(
     pixels, size = observation.images, inputs.image_size
     image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
     if size is not None:
-        image = np.array([[[-0.5, -0.5], np.array(size) - 0.5]] * 2)
+        image = np.array([[[-0.5, -0.5], one - 0.5] for one in image_sizes(size)])
     targets = _region(inputs.joints, observation.q, WIDER, image)
     candidates = targets if inputs.recorded else _region(inputs.joints, observation.q, FARTHER, image)
     rng = generator(inputs.seed, SUGGESTIONS)

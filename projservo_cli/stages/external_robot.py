@@ -11,6 +11,8 @@ from projservo_cli.calibration import predict
 from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
+from projservo_cli.image_size import image_sizes
+from projservo_cli.masking import MASK
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
@@ -71,6 +73,11 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds) -> Robot:
     A class that takes an argument ``limits`` is given those of its joints.
     """
     options = dict(own.options)
+    if MASK in repr((options, own.cameras)):
+        raise InputError(
+            f"plant {own.target}: a password of its options or cameras is masked, as run files keep none: "
+            "name the configuration, -c FILE"
+        )
     if takes_limits(own):
         options["limits"] = bounds.limits
     if own.cameras is not None:
@@ -352,7 +359,7 @@ def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
         center=task.center,
         O=task.O,
         visible=task.visible,
-        image_size=scenario.demands.image_size,
+        image_size=image_sizes(scenario.inputs.image_size),
         limits=scenario.joints.limits,
         opaque=False,
     )

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from projservo_cli.canonical import File, encoded
 from projservo_cli.control.law import Gains
 from projservo_cli.display import About
+from projservo_cli.image_size import ImageSize
 from projservo_cli.records import FloatArray
 from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings
 from projservo_cli.simulation.arm import Arm
@@ -91,7 +92,7 @@ class Table(NamedTuple):
     file: File
     joint_types: str | None  # one letter a joint, R or P; None for R
     joint_unit: str | None  # of revolute joints, deg or rad; None for rad unless readings look like degrees
-    image_size: tuple[int, int] | None  # width and height, px, if they are known
+    image_size: ImageSize | None  # width and height, px, of both images or of one each, if known
     noise_px: float | None  # standard deviation of a coordinate; None to estimate it
     seed: int  # of random starts
     order_stated: bool  # whether somebody stated the order of the joints
@@ -121,7 +122,7 @@ class SuggestionInputs(NamedTuple):
     """Inputs of a suggestion of further poses, except observations and calibration."""
 
     joints: JointSettings
-    image_size: tuple[int, int] | None  # width and height, px, if they are known
+    image_size: ImageSize | None  # width and height, px, of both images or of one each, if known
     recorded: bool  # whether the robot may not go farther than it was
     unit: str  # of revolute joints in the list
     seed: int
@@ -210,12 +211,14 @@ class PlanInputs:
     known: tuple[int, ...] | None  # numbers of all markers; None for those of the calibration
     tags: tuple[tuple[int, ...], ...]  # numbers of the corners of each tag among them
     joints: JointSettings
-    image_size: tuple[int, int] | None  # width and height, px, if they are known
+    image_size: ImageSize | None  # width and height, px, of both images or of one each, if known
     noise_px: float  # standard deviation of simulated pixels
     averaged_frames: int  # that are averaged of start and goal
     features: str | None  # points, body, or None for body where the calibration is usable
     tests_images: bool  # whether images are tested against the calibration
     trajectory: Trajectory
+    # Width and height to which recorded images reach at least, px, where their size is not known.
+    seen_px: ImageSize | None = None
 
 
 class StopSettings(NamedTuple):

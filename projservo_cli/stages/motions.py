@@ -95,7 +95,7 @@ def search_of(scenario: Scenario) -> JointSearch:
             calibration,
             tuple(calibration.indices_of(numbers)),
             scenario.m,
-            (tuple(demands.limits.lower), tuple(demands.limits.upper), tuple(demands.image_size)),
+            (tuple(demands.limits.lower), tuple(demands.limits.upper), tuple(map(tuple, demands.image_size))),
             scenario.inputs.trajectory.search_seed,
         )
     limits, closed = scenario.joints.limits, ""

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from projservo_cli.calibration.prediction import predict
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import undistort
+from projservo_cli.image_size import image_sizes
 from projservo_cli.loop.batch import begin
+from projservo_cli.monitoring.accuracy import RigidFit, metric_points, rigid_fit
 from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.records import (
@@ -21,12 +22,12 @@ from projservo_cli.records import (
     Calibration,
     FloatArray,
     InputError,
-    IntArray,
     JointLimits,
     Model,
     Plan,
     WorkFailed,
     in_sense,
+    in_unit,
 )
 from projservo_cli.stages.given import PlanInputs
 from projservo_cli.stages.motions import (
@@ -81,8 +82,9 @@ def _joint_motions(state: State) -> FloatArray:
 # What noise and calibration may leave of images that the joints can reach, px rms per marker and view.
 LEFT_PX = 3.0
 STAGES = 20
-# A marker may be off by so many times what half of them are allowed.
-_ALONE = 4.0
+# Distance of a marker of the face from its plane, over its size, that noise of the calibration may show.
+_UNEVEN = 0.05
+STAGES = 20
 
 
 def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: FloatArray) -> None:
@@ -125,60 +127,98 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
         _require_taught_since(scenario, calibration)
     search = search_of(scenario) if trajectory.needs_covariance else None
     plan = plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
-    order = calibration.order_advice
-    return replace(plan, reason=f"{plan.reason}; {order}") if order else plan
+    face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
+    notes = [plan.reason, calibration.order_advice, _borders(inputs), "" if face is None else _uneven(face)]
+    return replace(plan, reason="; ".join(filter(None, notes)))
+
+
+def _borders(inputs: PlanInputs) -> str:
+    """Tell which borders images of an unknown size are taken to have; empty where the size is known."""
+    if inputs.image_size is not None:
+        return ""
+    sizes = ["x".join(f"{side:.0f}" for side in one) for one in image_sizes(inputs.seen_px)]
+    return (
+        f"the size of the images is not known: they are taken to reach to the last pixels seen, {sizes[0]} "
+        f"left and {sizes[1]} right; give it: --image-size, or size_px of both cameras"
+    )
+
+
+def _uneven(face: FloatArray) -> str:
+    """Say that markers (m, 3) of a face are off the plane that motions take it for; else empty."""
+    size = np.linalg.svd(face - face.mean(axis=0))[1]
+    if (share := size[2] / size[0]) <= _UNEVEN:
+        return ""
+    return (
+        f"the face is not plane: its markers are {100.0 * share:.2g} % of its size off ({100.0 * _UNEVEN:g} "
+        "% are allowed), and visibility is that of a plane between them: name others in markers.face"
+    )
 
 
 def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
-    """Refuse goal images that the calibration contradicts, with a WorkFailed.
+    """Refuse goal images that the calibration contradicts or no pose of the arm shows, with a WorkFailed.
 
     Images without joint readings are tested where the arm shows them best.
     """
     task = scenario.inputs.task
     images = task.goal.images if task is not None else None
-    # What fewer joints cannot show is refused with the plan.
-    if images is None or (images.joints is None and len(calibration.joint_types) < COORDINATES):
+    if images is None or (whole := scenario.goal_pixels) is None:
         return
-    pixels = images.pixels()
+    pixels, size = images.pixels(), image_sizes(scenario.inputs.image_size)
     numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
-    sigma = 0.0
     if images.joints is not None:
-        q, advice = images.joints.values(calibration.joint_types), "teach it again"
-    else:
-        stated = images.sigma_px(scenario.numbers[: scenario.m])
-        sigma = scenario.noise_px if stated is None else stated
-        known = np.isin(numbers, calibration.marker)
-        q = _joints_at(scenario, calibration, numbers[known], seen[:, known], max(NEAR_PX, 2.0 * sigma))
-        advice = (
-            "take the images again, or give their deviations (sigma_left_px and sigma_right_px of "
-            "task.goal.images)"
-        )
-    if fault := detected_fault(calibration, q, numbers, seen, scenario.demands.image_size, sigma):
-        raise WorkFailed(f"the goal was taught after a change since the calibration: {fault}; {advice}")
-
-
-def _joints_at(
-    scenario: Scenario, calibration: Calibration, numbers: IntArray, seen: FloatArray, near_px: float
-) -> FloatArray:
-    """Joints (n,) at which the arm shows goal images (2, b, 2), rad or m.
-
-    Raises WorkFailed where it shows them nowhere, or one marker far from its place.
-    """
-    q, median = joints_showing(calibration, numbers.tolist(), seen, scenario.exact.q_start, near_px)
-    each = np.linalg.norm(predict(calibration, q[None])[0][:, calibration.indices_of(numbers)] - seen, axis=2)
-    again = "check which image is of which camera, and the marker numbers; then take them again"
-    if median > near_px:
-        rms = np.sqrt(np.nanmean(each**2))
+        q = images.joints.values(calibration.joint_types)
+        if fault := detected_fault(calibration, q, numbers, seen, size):
+            raise WorkFailed(_CHANGED.format(fault=fault, advice="teach it again"))
+        _require_rigid(rigid_fit(calibration, q, *whole), "teach it again")
+        return
+    stated = images.sigma_px(scenario.numbers[: scenario.m])
+    sigma = scenario.noise_px if stated is None else stated
+    known, near_px = np.isin(numbers, calibration.marker), max(NEAR_PX, 2.0 * sigma)
+    shown = numbers[known].tolist(), seen[:, known]
+    q, median = joints_showing(calibration, *shown, scenario.exact.q_start, near_px)
+    enough, fit = len(q) >= COORDINATES, rigid_fit(calibration, q, *whole)
+    check = "check which image is of which camera, and the marker numbers; then take them again"
+    if enough and median > near_px:
         raise WorkFailed(
-            f"the goal images fit no pose of the arm: the nearest leaves {rms:.3g} px rms a marker; {again}"
+            f"the goal images fit no pose of the arm: the nearest leaves {fit.moved_px:.3g} px rms a marker; "
+            f"{check}"
         )
-    view, k = np.unravel_index(int(np.nanargmax(each)), each.shape)
-    if each[view, k] > _ALONE * near_px:
+    advice = (
+        "take the images again, or give their deviations (sigma_left_px and sigma_right_px of "
+        "task.goal.images)"
+    )
+    _require_rigid(fit, advice)
+    alone = fit.off_px * (np.isfinite(whole[0][..., 0]) & ~fit.seen)
+    view, k = np.unravel_index(int(np.argmax(alone)), alone.shape)
+    if alone[view, k] > near_px:
         raise WorkFailed(
-            f"the goal images fit no pose of the arm: marker {numbers[k]} is {each[view, k]:.3g} px off in "
-            f"the {VIEWS[view]} one, {_ALONE * near_px:.3g} px are allowed; {again}"
+            f"the goal images fit no pose of the arm: marker {calibration.marker[k]} is {alone[view, k]:.3g} "
+            f"px off in the {VIEWS[view]} one, {near_px:.3g} px are allowed; {check}"
         )
-    return q
+    if enough and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
+        raise WorkFailed(_CHANGED.format(fault=fault, advice=advice))
+    if not enough and not fit.reached:
+        units = scenario.joints.units
+        there = ", ".join(in_unit(x, unit, 4) for x, unit in zip(q.tolist(), units, strict=True))
+        raise WorkFailed(
+            f"the goal is a pose that {len(q)} joints do not reach: the nearest, at joints {there}, is "
+            f"{math.degrees(fit.turn):.2g} deg and {fit.moved_px:.3g} px rms a marker off; move the arm to "
+            "the goal by hand and teach it, or set task.goal.joints to these readings"
+        )
+
+
+_CHANGED = "the goal was taught after a change since the calibration: {fault}; {advice}"
+
+
+def _require_rigid(fit: RigidFit, advice: str) -> None:
+    """Refuse goal images of which chance does not explain what the nearest pose of the tool leaves."""
+    if not fit.agrees:
+        u, v = fit.shift
+        raise WorkFailed(
+            f"the goal images fit no pose of the tool: the nearest leaves {fit.rms_px:.3g} px rms a "
+            f"coordinate, their deviations explain {fit.limit_px:.3g} px, as if the left image were shifted "
+            f"by ({u:.2g}, {v:.2g}) px against the right one; {advice}"
+        )
 
 
 def plan_task(

@@ -11,6 +11,7 @@ from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding, Seen, findings_at_rest
 from projservo_cli.hardware.wiggle import Strokes, findings_of, reach_of, strokes
+from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
@@ -21,6 +22,7 @@ from projservo_cli.stages.given import PreflightInputs
 
 # Time of observation of a robot at rest, s, and minimum number of readings.
 _LOOK_S, _MIN_LOOKS = 1.5, 8
+CALIBRATION = "calibration"  # subject of the finding of a comparison with one
 
 
 class Checked(NamedTuple):
@@ -124,14 +126,14 @@ def _mean(readings: Sequence[Reading], view: int) -> tuple[FloatArray, FloatArra
     return mean, scatter
 
 
-def _against(calibration: Calibration, seen: Seen, image_size: tuple[int, int] | None) -> Finding:
+def _against(calibration: Calibration, seen: Seen, image_size: ImageSize | None) -> Finding:
     """Whether images at rest still agree with a calibration, and what changed if they do not."""
     if not calibration.usable or not calibration.has_covariance:
-        return Finding(WARNING, "calibration", "is not usable", "record and calibrate again")
-    size = None if image_size is None else np.array(image_size, dtype=np.float64)
-    if size is None and len(seen.views):
-        size = np.array(seen.views[0].frame.grey.shape[::-1], dtype=np.float64)
+        return Finding(WARNING, CALIBRATION, "is not usable", "record and calibrate again")
+    size = image_sizes(image_size or [view.frame.grey.shape[::-1] for view in seen.views] or None)
     marker = np.array(seen.marker, dtype=np.int64)
+    if not np.isfinite(seen.s[:, np.isin(marker, calibration.marker)]).any():
+        return Finding(WARNING, CALIBRATION, "was not compared: no marker of it is seen", "show the tags")
     if fault := detected_fault(calibration, seen.q, marker, seen.s, size):
-        return Finding(FAULT, "calibration", fault, "put that back, or record and calibrate again")
-    return Finding(FINE, "calibration", "agrees with the images")
+        return Finding(FAULT, CALIBRATION, fault, "put that back, or record and calibrate again")
+    return Finding(FINE, CALIBRATION, "agrees with the images")

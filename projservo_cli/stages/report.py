@@ -11,6 +11,7 @@ import numpy as np
 
 from projservo_cli import provenance
 from projservo_cli.files import replacing, require_inside, write_whole
+from projservo_cli.image_size import ImageSize
 from projservo_cli.metric.frame import Metric, Scale
 from projservo_cli.records import Calibration, InputError, Report, Trace, WorkFailed
 from projservo_cli.report import style
@@ -205,10 +206,10 @@ def view(scenery: Scenery, run: "Run", progress: Progress = silent) -> Path:
     return path
 
 
-def animation(size: tuple[int, int] | None, run: "Run", progress: Progress = silent) -> Path:
+def animation(size: ImageSize | None, run: "Run", progress: Progress = silent) -> Path:
     """Write the film of both camera images into the folder of a run, as GIF; fails as ``view`` does.
 
-    size : width and height of the images, px, if they are known.
+    size : width and height, px, of both images or of one each, if known.
     """
     path, traces = run.path.parent / ANIMATION_FILE, _moved(run)
     write_animation(path, traces, cyclic_order(run.plan.A), size, progress)

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from projservo_cli.calibration import predict
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import BODY_LAWS, LAW_SPECS
 from projservo_cli.loop.step import Limits
 from projservo_cli.planning.margins import Demands
@@ -111,7 +112,11 @@ class Scenario:
     @cached_property
     def demands(self) -> Demands:
         """Return the constraints of the planned motion."""
-        size = np.array(self.inputs.image_size or (math.inf, math.inf), dtype=np.float64)
+        if (size := self.inputs.image_size or self.inputs.seen_px) is None:
+            raise InputError(
+                "the size of the images, and so their border, is not known: set data.image_size_px, or "
+                "size_px of both cameras"
+            )
         joints, asked = self.joints, self.inputs.trajectory
         margins = asked.joint_margin_m, asked.joint_margin
         keep = np.array([margins[kind != "P"] for kind in joints.types])
@@ -119,7 +124,7 @@ class Scenario:
         face, units = asked.min_face_px, self.joints.units
         return Demands(
             limits=joints.limits,
-            image_size=size,
+            image_size=image_sizes(size),
             border_px=border,
             conditioning=condition,
             keep=keep,
@@ -147,6 +152,23 @@ class Scenario:
     def _given(self) -> GoalImages | None:
         """Images of the goal that are given."""
         return None if self.inputs.task is None else self.inputs.task.goal.images
+
+    @property
+    def goal_pixels(self) -> tuple[FloatArray, FloatArray] | None:
+        """Images (2, m, 2) that are given of the goal, px, and their deviations (2, m).
+
+        They are of the markers of the calibration, NaN where unseen; deviations that are not given are those
+        of the loop. None without such images, or a covariance to test them by.
+        """
+        if self._given is None or self.calibration is None or not self.calibration.has_covariance:
+            return None
+        numbers, pixels = self.calibration.marker.tolist(), self._given.pixels()
+        images = np.array([pixels.get(number, _UNSEEN) for number in numbers]).swapaxes(0, 1)
+        known = [number in pixels for number in numbers]
+        sigma = np.full((2, len(numbers)), self.noise_px)
+        stated = np.array(self._given.deviations([k for k in numbers if k in pixels]))
+        sigma[:, known] = np.where(np.isnan(stated), self.noise_px, stated)
+        return images, sigma
 
     def images_at(self, seed: int) -> TaskImages:
         """Start and goal as the images of a seed show them, which are averages."""
@@ -512,7 +534,7 @@ def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
         center=truth.center,
         O=O,
         visible=np.where(sides > 0.0, 1.0, -1.0),
-        image_size=truth.image_size,
+        image_size=image_sizes(truth.image_size),
         limits=truth.robot.limits,
         opaque=opaque,
     )

@@ -14,6 +14,7 @@ from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, T
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span
+from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.laws import CODES, REGULATE, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import Ended, Summary, angle_between, path_deviation, summarize
@@ -21,9 +22,12 @@ from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
+from projservo_cli.monitoring.accuracy import Posture, rigid_fit
+from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import (
     MM,
     VIEWS,
+    BoolArray,
     Calibration,
     FloatArray,
     InputError,
@@ -41,6 +45,7 @@ from projservo_cli.robots.contract import at_rest_after
 from projservo_cli.robots.plugins import what_failed
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.ideal import AnalyticPlant, Plant
+from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import external_robot
 from projservo_cli.stages.given import ServoInputs
 from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
@@ -66,6 +71,7 @@ class _Outcome:
     unplanned: str = ""  # why it went without the plan that it was to follow
     replannings: tuple[str, ...] = ()  # time and reason of each replanning
     driven: DrivenRobot | None = None  # client of a robot of the contract
+    unseen: str = ""  # which cameras showed nothing before the run, though they were to be compared
 
     @cached_property
     def summary(self) -> Summary:
@@ -98,6 +104,8 @@ class _Outcome:
         simulated = scenario.truth is not None
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
         driven = self.driven
+        lost = _blind_view(log.s[:rows], WINDOW) if driven and self.verdict == "converged" else ""
+        untested = "" if driven is None else scenario.untested
         if driven is not None:  # the log has the predicted rest of the robot instead of readings
             read = _whole(driven.readings, rows)
         values = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
@@ -145,8 +153,8 @@ class _Outcome:
             goal_pose=goal_pose,
             center=center if simulated else np.full_like(center, np.nan),
             unplanned=self.unplanned,
-            estimated_position_error_mm=_estimated_mm(self, views),
-            untested="" if driven is None else scenario.untested,
+            **_stated_mm(self, views),
+            untested="; ".join(filter(None, (untested, self.unseen or lost))),
             overruns=None if driven is None else driven.steered.overruns,
             latency=None if driven is None else _whole(driven.delays, rows),
             **({} if driven is None else driven.film.fields()),
@@ -180,6 +188,9 @@ def _reported_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArr
 
 # Maximum residual of a body that agrees with its calibration, over the noise, px.
 _AGREES, _LEAST_NOISE_PX = 4.0, 0.01
+# Image error of a face of three markers as it is seen, over that which counts as converged: by noise once in
+# ten thousand.
+_BY_NOISE = 2.0
 # Joints that moved by less in the steps in which an error must fall hardly did, rad or m.
 _HARDLY = 0.01
 # A plan is of a task where its start, rad or m, and its goal images, px, are the same but for rounding and
@@ -187,29 +198,36 @@ _HARDLY = 0.01
 _SAME_START, _SAME_GOAL_PX = 1e-6, 10.0
 
 
-def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
-    """Estimate how far the face ended from the goal across the lines of sight, mm, by its size in the images.
+def _stated_mm(run: _Outcome, views: FloatArray) -> dict[str, Any]:
+    """State how far the face ended from the goal, rms mm: by images, and by what no test tells from none.
 
-    None if the size is unknown, or images disagree with the calibration.
+    Nothing if no length on the face is known, or images disagree with the calibration.
     """
-    scenario, lengths = run.scenario, run.scenario.given.lengths
-    s_star = scenario.ends.by_points().s_star
-    m = s_star.shape[1]
-    s, noise = run.log.s[run.steps, :, :m], [_LEAST_NOISE_PX, scenario.noise_px]
-    if scenario.calibration is not None:
-        noise.append(scenario.calibration.sigma_px)
+    scenario, calibration, m = run.scenario, run.scenario.calibration, run.scenario.m
+    noise = [_LEAST_NOISE_PX, scenario.noise_px, 0.0 if calibration is None else calibration.sigma_px]
     left = _rms(run.log.fit[run.steps, 1:2], 2.0 * views[-1:] - COORDINATES)[0]
     untested = run.driven is not None and scenario.untested
     if run.verdict in ("fault detected", "failed") or untested or left > _AGREES * max(noise):
-        return None
-    # The pair of corners with the least foreshortening gives the size of a pixel on the face.
-    span = np.linalg.norm(s[:, :, None] - s[:, None], axis=3)
-    known = np.isfinite(lengths) & (lengths > 0.0)
-    if not known.any() or not np.isfinite(s).all():
-        return None
-    m_per_px = 1.0 / np.max(span[:, known] / lengths[known], axis=1)
-    off = np.sqrt(np.mean(np.sum((s - s_star) ** 2, axis=2), axis=1))
-    return float(MM * math.sqrt(np.mean((m_per_px * off) ** 2)))
+        return {}
+    numbers, q, known = scenario.numbers_of(run.law), run.log.read[run.steps], calibration or scenario.truth
+    assert known is not None
+    M = known.of(numbers) if isinstance(known, Truth) else known.M[known.indices_of(numbers)]
+    s, s_star = run.log.s[run.steps], scenario.images_for(run.law).s_star
+    posture = Posture(scenario.model, q, M[:m], scenario.given.lengths)
+    if not posture.known or not np.isfinite(s[:, :m]).all():
+        return {}
+    used: BoolArray = np.isfinite(s + s_star)[..., 0]
+    off = np.where(used[..., None], s - s_star, 0.0).ravel()
+    # By all markers that the law measures with, and by the face itself.
+    measured = (used, used & (np.arange(len(numbers)) < m))
+    parts, found = [max(float(np.linalg.norm(posture.carry(M, by) @ off)) for by in measured)], {}
+    if calibration is not None and run.driven is not None and run.driven.monitor is not None:
+        every = np.zeros((2, len(calibration.marker)), dtype=np.bool_)
+        every[:, calibration.indices_of(numbers)] = used
+        found["undetected_position_error_mm"] = run.driven.monitor.undetected_mm(q, every, posture)
+    if calibration is not None and (goal := scenario.goal_pixels) is not None:
+        parts.append(rigid_fit(calibration, q, *goal).off_mm(posture, calibration.M))
+    return found | {"estimated_position_error_mm": float(np.linalg.norm([*parts, *found.values()]))}
 
 
 def _replanned(replannings: tuple[str, ...]) -> list[str]:
@@ -264,7 +282,7 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
     rest = f"{' and '.join(left)} {'are' if len(left) > 1 else 'is'} left"
     at_limit = in_unit(float(log.read[steps, joint]), run.scenario.joints.units[joint])
     reasons = {
-        "converged": f"image error {error:.3g} px is within {within:.3g} px",
+        "converged": f"image error {error:.3g} px is within {within:.3g} px{_apart(run)}",
         "no progress": f"the robot stands still at an image error of {error:.3g} px: {run.why}"
         if run.why
         else f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
@@ -289,6 +307,13 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
     return "; ".join(filter(None, (reasons[run.verdict], blind, obstruction)))
 
 
+def _apart(run: _Outcome) -> str:
+    """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
+    seen, most = float(run.log.error[run.steps]), _BY_NOISE * run.scenario.limits.image_error_px
+    text = f"; the face itself is seen {seen:.3g} px off ({most:.3g} px by noise): it moved on the tool"
+    return f"{text} since the goal was taught: teach it again" if seen > most else ""
+
+
 def _blind_view(s: FloatArray, window: int) -> str:
     """Say which camera showed no marker in the last images (k, 2, m, 2), and since when; else empty."""
     for view, name in enumerate(VIEWS):
@@ -304,6 +329,7 @@ class Given(NamedTuple):
 
     law: Callable[[Any], Any] | None = None  # makes a law of its setup; None for that of the name
     robot: Any = None  # an object of the contract; None for that of the configuration
+    blind: bool = False  # whether a robot may move although cameras show no marker of the calibration
 
 
 def run(
@@ -449,18 +475,35 @@ class _Asked:
         )
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), at_rest_after(driven.robot):
+            unseen = ""
             if own:
                 driven.robot.require_identity(contract.identity)
                 wrong = driven.fits()
                 if wrong:
-                    raise WorkFailed(f"the robot did not move, since at the start {wrong}")
+                    raise WorkFailed(f"the robot did not move, since at the start {wrong}", refutes=True)
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
+                unseen = self._require_images(driven, "the robot did not move, since where it stands", 2)
                 for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
-                        raise WorkFailed(f"stopped on the path to the start, since {wrong}")
+                        raise WorkFailed(f"stopped on the path to the start, since {wrong}", refutes=True)
+                if wrong := driven.at_rest():
+                    raise WorkFailed(f"stopped at the start, since {wrong}", refutes=True)
+                unseen = self._require_images(driven, "stopped at the start of the task, since", 1) or unseen
             driven.begin()
-            return self._in_python(controller, driven, StallMonitor(driven, scenario.limits))
+            run = self._in_python(controller, driven, StallMonitor(driven, scenario.limits))
+            return replace(run, unseen=unseen)
+
+    def _require_images(self, driven: DrivenRobot, what: str, least: int) -> str:
+        """Refuse to move a robot of which so many cameras or more show nothing, unless that was asked for."""
+        unseen, own = driven.unseen(least), driven.robot.robot
+        if unseen and not self.given.blind:
+            seen = "; ".join([unseen, *(own.remarks() if isinstance(own, CameraRobot) else ())])
+            raise WorkFailed(
+                f"{what} {seen}: uncover both cameras and look at their light, or move the arm by hand to "
+                "where they see the tags; --blind (blind=True) drives it without images"
+            )
+        return unseen
 
     def _in_python(
         self, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, stall: StallMonitor | None = None
@@ -484,6 +527,8 @@ class _Asked:
         )
         limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
         driven = plant if isinstance(plant, DrivenRobot) else None
+        if driven is not None and VERDICTS[code] == "converged" and driven.at_rest():
+            code = VERDICTS.index("fault detected")
         if driven is not None:  # it moves from sample to sample, in any mode
             path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
             log = log._replace(path=path, parts=np.ones_like(log.parts))

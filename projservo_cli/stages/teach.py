@@ -210,8 +210,11 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     limits = np.concatenate([joints.limits.lower, joints.limits.upper, joints.limits.speed])
     # No path is searched for joints whose limits are not known: the arm stands at the goal as it is.
     profile = "joint_space" if np.isfinite(limits).all() else "linear"
+    border = inputs.trajectory.border_px + 1.0  # beyond what the goal shows, where the size is not known
+    left, right = np.ceil(np.nanmax(taught.s, axis=1) + border).astype(int).tolist()
     asked = replace(
         inputs,
+        seen_px=(tuple(left), tuple(right)),
         task=ReachingTask(start, None, Goal(images=taught.images)),
         trajectory=inputs.trajectory._replace(profile=profile, keep_out=()),
     )

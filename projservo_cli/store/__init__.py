@@ -45,6 +45,7 @@ if typing.TYPE_CHECKING:
 
 SCHEMA_VERSION = 3  # version of the layout of a file
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"  # first bytes of an HDF5 file
+_FLAGS = 3  # bytes from it to the flags of a file that is open (HDF5 File Format 3.0, superblock version 3)
 _SEAL = b"\nprojservo sha256 %s\n"  # last line of a file, with its checksum
 _SEAL_SIZE = len(_SEAL % bytes(64))  # bytes of that line
 _AT_ONCE = 2**23  # bytes that are written or hashed together
@@ -90,6 +91,7 @@ class Run:
     path: Path
     configuration: str = ""
     results: Mapping[str, Result] = dataclasses.field(default_factory=dict)
+    refuted: str = ""  # what contradicted the recording of its calibration since, in words
     # Bytes of the last write, and the results in them.
     written: tuple[bytes, Mapping[str, Result]] = dataclasses.field(
         default=(b"", {}), repr=False, compare=False
@@ -149,6 +151,8 @@ def save(run: Run) -> Run:
     stream = io.BytesIO(image)
     with new_file(run.path, image=stream) as new, labelled(new) as file:
         attributes = {"configuration": run.configuration, "order": json.dumps(list(run.results))}
+        if run.refuted or "refuted" in file.attrs:
+            attributes["refuted"] = run.refuted
         file.attrs.update({"schema": _SCHEMA, "schema_version": SCHEMA_VERSION, **attributes})
         for name, result in run.results.items():
             if name in written:
@@ -187,7 +191,8 @@ def load(target: Path | str) -> Run:
         _require_names(file, {name.split("/")[0] for name in names})
         sizes = dict(SIZES)
         results = {name: _load_result(_member(file, name), sizes) for name in names}
-        return Run(path, attribute(file, "configuration", str), results)
+        refuted = attribute(file, "refuted", str) if "refuted" in file.attrs else ""
+        return Run(path, attribute(file, "configuration", str), results, refuted)
 
 
 def _load_result(group: h5py.Group, sizes: dict[str, int]) -> Result:
@@ -251,13 +256,24 @@ def _require_unchanged(path: Path, remedy: str) -> None:
     """Refuse a file whose last line is not the checksum of its other bytes, before HDF5 reads it."""
     size = path.stat().st_size
     with path.open("rb") as stream:
-        head = stream.read(len(_SIGNATURE))
+        head, _, flags = stream.read(len(_SIGNATURE)), stream.read(_FLAGS), ord(stream.read(1) or b"\0")
         stream.seek(max(0, size - _SEAL_SIZE))
         last = stream.read()
     if size and head != _SIGNATURE[:size]:
         raise InputError(f"{path}: no HDF5 file, so not a run file or sweep of projservo; name another")
     if last != _SEAL % _digest(path, size - _SEAL_SIZE).encode():
-        raise InputError(f"{path}: cut short or changed since it was written; {remedy}")
+        if head == _SIGNATURE and flags & 1:
+            raise InputError(f"{path}: is open for writing {_holder(path)}: close it there, and try again")
+        raise InputError(
+            f"{path}: cut short or changed since it was written, as by opening it for writing; {remedy}"
+        )
+
+
+def _holder(path: Path) -> str:
+    """Tell who holds an HDF5 file open, as far as this process knows."""
+    opened = [h5py.h5f.get_name(one) for one in h5py.h5f.get_obj_ids(types=h5py.h5f.OBJ_FILE)]
+    here = any(Path(os.fsdecode(name)).resolve() == path.resolve() for name in opened)
+    return "in this process, such as by h5py or xarray" if here else "by another program, such as a viewer"
 
 
 @contextmanager
@@ -266,7 +282,13 @@ def opened(path: Path, remedy: str, *, unchanged: bool = False) -> Iterator[h5py
     try:
         if unchanged:
             _require_unchanged(path, remedy)
-        with h5py.File(path, "r", locking=False) as file:
+        try:
+            file = h5py.File(path, "r", locking=False)
+        except OSError:
+            if not _holder(path).startswith("in this"):
+                raise
+            file = h5py.File(io.BytesIO(path.read_bytes()), "r")  # past whoever holds it otherwise
+        with file:
             yield file
     except InputError:
         raise

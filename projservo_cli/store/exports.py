@@ -12,6 +12,7 @@ from projservo_cli.calibration.detections import MIN_SIGMA
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.geometry.lens import distort, undistort
 from projservo_cli.geometry.rigid import rigid_inverse
+from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.metric.frame import Body, Metric
 from projservo_cli.metric.kinematic_errors import KinematicErrors
 from projservo_cli.records import VIEWS, Calibration, FloatArray
@@ -138,7 +139,7 @@ def _shifted(T: FloatArray, change: FloatArray) -> FloatArray:
     return moved
 
 
-def opencv_yaml(found: OpenCV, size: tuple[int, int] | None) -> str:
+def opencv_yaml(found: OpenCV, size: ImageSize | None) -> str:
     """Both cameras and the stereo rig for ``cv2.FileStorage``, in the words of OpenCV's calibration samples.
 
     R and T of a camera map the base frame to it; those of the rig map the left camera to the right one.
@@ -146,7 +147,10 @@ def opencv_yaml(found: OpenCV, size: tuple[int, int] | None) -> str:
     K, poses = found.body.intrinsics(), found.body.camera_poses()
     lines = ["%YAML:1.0", "---", f"delta_chi2: {found.delta_chi2!r}"]
     if size is not None:
-        lines += [f"image_width: {size[0]}", f"image_height: {size[1]}"]
+        (left, right) = image_sizes(size).astype(int).tolist()
+        each = {"": left} if left == right else {"left_": left, "right_": right}
+        for name, (width, height) in each.items():
+            lines += [f"{name}image_width: {width}", f"{name}image_height: {height}"]
     K[:, 0, 1] = 0.0  # what rounding leaves
     world = rigid_inverse(poses)
     for v, view in enumerate(VIEWS):

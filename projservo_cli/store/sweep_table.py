@@ -27,7 +27,7 @@ if typing.TYPE_CHECKING:
     import h5netcdf
 
 _SCHEMA = "projservo sweep"
-_AGAIN = "delete it and run the sweep again"
+_AGAIN = "move it elsewhere and run the sweep again"
 TABLE = SWEEP
 _ROWS = 16_384  # of a chunk of the file
 _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}

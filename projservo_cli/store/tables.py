@@ -2,9 +2,10 @@
 
 Columns, in any order: ``pose, marker, q1 … qN, u_left, v_left, u_right, v_right``, and optionally
 ``sigma_left, sigma_right, moving, t_q, t_left, t_right``; others are ignored. Joint readings are rad or m,
-pixels are raw, empty pixel cells mean *unseen*. Sigmas are standard deviations of the pixels, px. A pose with
-a number in ``moving`` belongs to that motion; times are s, empty if unknown. Files are UTF-8 with or without
-byte-order mark, with any line ends.
+pixels are raw; empty or ``nan``, they mean *unseen*. Sigmas are standard deviations of the pixels, px. A pose
+with a number in ``moving`` belongs to that motion; times are s, empty if unknown. Files are UTF-8 with or
+without byte-order mark, with any line ends. Columns are separated by commas, or as spreadsheets do by tabs or
+by semicolons, where decimal commas are read; a first line ``sep=;`` is skipped.
 """
 
 import csv
@@ -13,13 +14,14 @@ import math
 import re
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.calibration.time_offset import require_seconds
 from projservo_cli.files import lines_of, write_whole
 from projservo_cli.metric.position_error import Positions
 from projservo_cli.records import (
@@ -45,6 +47,9 @@ _XYZ = ("x", "y", "z")  # columns of a position, m
 _RECORDING = "recording"  # column of the recording that a row belongs to
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
 _INTEGER = re.compile(r"([+-]?[0-9]{1,18})(\.0*)?")
+_UNKNOWN = frozenset(
+    {"nan", "na", "n/a", "#n/a", "null", "none", "-"}
+)  # cells as good as empty, where one may be
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
@@ -100,7 +105,7 @@ def read_table(
         np.array([[of_pose.get(name) for name in names] for of_pose in values], dtype=np.float64)
         for names in (sheet.joints, (_MOVING,), _TIMES)
     )
-    return Observation(
+    found = Observation(
         pose=numbers,
         marker=markers,
         q=sheet.in_radians(numbers, q_read, joint_unit),
@@ -110,6 +115,8 @@ def read_table(
         t_view=times[:, 1:] if np.isfinite(times[:, 1:]).any() else None,
         sigma=sigma,
     )
+    require_seconds(sheet.file, found)
+    return found
 
 
 def read_joint_list(
@@ -350,7 +357,14 @@ class _Sheet:
         optional: Sequence[str] = (),
     ) -> None:
         self.file = str(path)
-        self._reader = csv.reader(lines_of(path, "a table as UTF-8 CSV", _MAX_BYTES), strict=True)
+        lines = lines_of(path, "a table as UTF-8 CSV", _MAX_BYTES)
+        first, self._skipped = next(lines, ""), 0
+        if first.strip().lower().startswith("sep="):  # of spreadsheets, for their own eyes
+            first, self._skipped = next(lines, ""), 1
+        self._separator = max(",;\t", key=first.count)
+        self._reader = csv.reader(
+            chain([first] * (first != ""), lines), strict=True, delimiter=self._separator
+        )
         if (header := self._next()) is None:
             expected = [*needed[:2], "q1…qN", *needed[2:]]
             raise InputError(f"{self.file}: the table is empty; expected a header {','.join(expected)}")
@@ -358,8 +372,8 @@ class _Sheet:
         self.joints = sorted(filter(_JOINT.fullmatch, set(names)), key=lambda name: int(name[1:]))
         wanted = [*needed, *self.joints, *(name for name in optional if name in names)]
         if wrong := self._wrong(names, needed, wanted, joint_types):
-            raise InputError(f"{self.file}:1: {wrong}")
-        self._width = len(names)
+            raise InputError(f"{self.file}:{1 + self._skipped}: {wrong}")
+        self._width, self._numeric = len(names), {*wanted} - {"left", "right", _RECORDING}
         self.columns = {name: names.index(name) for name in wanted}
         self._joint_types = joint_types or "R" * len(self.joints)
 
@@ -370,8 +384,8 @@ class _Sheet:
         n = len(self.joints)
         if len(names) > _MAX_COLUMNS:
             return f"{len(names)} columns; a table has at most {_MAX_COLUMNS}"
-        if len(names) == 1 and ";" in names[0]:
-            return "columns are separated by semicolons; use commas and decimal points"
+        if wrong := [name for name in names if re.fullmatch(r"q0[0-9]*", name)]:
+            return f"the header has {wrong[0]}: number the joint columns q1, q2, … from base to tool"
         if missing := [name for name in needed if name not in names] + ([] if n else ["q1"]):
             return f"the header lacks the column(s) {', '.join(missing)}"
         if twice := sorted({name for name in wanted if names.count(name) > 1}):
@@ -397,13 +411,18 @@ class _Sheet:
         while (cells := self._next()) is not None:
             if not any(cell.strip() for cell in cells):
                 continue
-            line = self._reader.line_num
+            line = self._reader.line_num + self._skipped
             if len(cells) != self._width:
                 raise InputError(
                     f"{self.file}:{line}: {len(cells)} cells where the header has {self._width}; the row is "
                     "cut short or malformed"
                 )
             row = _Row({name: cells[i].strip() for name, i in self.columns.items()})
+            for name in (*_PIXELS, *_SIGMAS, *_TIMES):
+                if row.get(name, "").lower() in _UNKNOWN:
+                    row[name] = ""
+            if self._separator != ",":
+                row.update({name: row[name].replace(",", ".") for name in self._numeric})
             row.file, row.line = self.file, line
             yield row
 
@@ -412,7 +431,8 @@ class _Sheet:
             return next(self._reader, None)
         except csv.Error as error:
             raise InputError(
-                f"{self.file}:{self._reader.line_num}: {error}; expected comma-separated values"
+                f"{self.file}:{self._reader.line_num + self._skipped}: {error}; expected values between "
+                f"{self._separator!r}"
             ) from error
 
     def in_radians(self, pose: IntArray, q: FloatArray, unit: str | None) -> FloatArray:

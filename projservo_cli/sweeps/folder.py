@@ -18,7 +18,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from projservo_cli import provenance
-from projservo_cli.config import Config, to_yaml
+from projservo_cli.config import Config, stored_yaml
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.files import write_whole
 from projservo_cli.geometry.jit import CACHE_FOLDER
@@ -200,7 +200,7 @@ class Folder:
             write_whole(path.with_suffix(REFUSED), made.reason + "\n")
             return
         (step,) = steps_for(made.config, Run(path), ["calibrate"])
-        save(Run(path, to_yaml(made.config), {"calibrate": result_of(step, made.config, *made.records)}))
+        save(Run(path, stored_yaml(made.config), {"calibrate": result_of(step, made.config, *made.records)}))
 
     def calibrations(self, design: Design) -> dict[str, Calibration | None]:
         """Calibrations by their key, None where one was refused; with covariance where a plan needs it."""

@@ -20,8 +20,8 @@ GARBAGE = (
     + ", ".join(f"{{type: R, d_m: {0.1 * i}, a_m: {1.7 - 0.3 * i}, alpha_deg: {17 * i}}}" for i in range(6))
     + "]}}",
     "rig.left={focal_px: [7, 900], principal_point_px: [9, 9], position_m: [-5, 2, 9], target_m: [0, 0, 1]}",
-    "rig.right={focal_px: [99, 99], principal_point_px: [0, 0], position_m: [0, 30, 0], target_m: [1, 1, 1]}",
-    "markers.positions_m=[" + ", ".join(f"[{i}, {i * i % 7}, {-i}]" for i in range(10)) + "]",
+    "rig.right={focal_px: [99, 99], principal_point_px: [0, 0], position_m: [0, 15, 0], target_m: [1, 1, 1]}",
+    "markers.positions_m=[" + ", ".join(f"[{0.2 * i}, {i * i % 7 / 5}, {-0.2 * i}]" for i in range(10)) + "]",
     "task={start: {joints: [1, 2, 3, 4, 5, 6], unit: rad}, goal: {roll_deg: 90}}",
 )
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate, predict
 from projservo_cli.calibration.model_error import describe
-from projservo_cli.records import ModelError, WorkFailed
-from tests.calibration.simulated_robot import around, random_robot
+from projservo_cli.records import ModelError, Observation, WorkFailed
+from tests.calibration.simulated_robot import around, random_robot, trials
 
 SIGMA, K, HELD_OUT, ANGLE = 0.3, 50, 40, 0.7
 TYPES = "RRRRR"
@@ -157,3 +158,24 @@ def test_deviations_that_images_hardly_tell_apart_are_all_named():
             assert str(seed % len(TYPES) + 1) in named
             others += len(first.others)
     assert others
+
+
+@pytest.mark.parametrize(("moved", "at"), [((0, 1), 22), ((1,), 30)])
+def test_a_table_that_is_bumped_amid_the_recording_is_named_and_no_readings_are(moved, at):
+    """Both cameras see the base move alike; one camera that moves is told from that."""
+    rng = np.random.default_rng(at)
+    robot = random_robot("RRRRR", rng, markers=20)
+    q = np.vstack([trials(robot, 6, np.radians(20)), around(robot, 12, rng, np.radians(20))])
+    w, bump = np.radians(1.5) * rng.standard_normal(3), np.zeros((4, 4))
+    bump[:3, :3], bump[:3, 3] = np.cross(np.eye(3), w), 0.006 * rng.standard_normal(3)
+    cameras = robot.cameras.copy()
+    cameras[[*moved]] = cameras[[*moved]] @ expm(bump)
+    images = robot.images(q)
+    images[at:] = dataclasses.replace(robot, cameras=cameras).images(q[at:])
+    images += 0.1 * rng.standard_normal(images.shape)
+    seen = Observation(np.arange(len(q)), np.arange(20), q, images)
+    with pytest.raises(WorkFailed) as refused:
+        calibrate(seen, "RRRRR", source="recorded", joint_noise=None)
+    what = "the right camera" if moved == (1,) else "the base of the arm or both cameras"
+    assert f"{what} moved at pose {at}" in str(refused.value)
+    assert "check the joint readings" not in str(refused.value)

@@ -106,7 +106,7 @@ def test_yourdfpy_reads_the_arm_and_predicts_the_same_pixels(ur5, metric, tmp_pa
 
 def test_the_own_reader_finds_the_same_axes(ur5, metric, tmp_path):
     file = export(ur5, tmp_path, "urdf")
-    axes = urdf_chain(str(file), "tool", file.read_text()).axes
+    axes = urdf_chain(str(file), "tool", file.read_bytes()).axes
     np.testing.assert_allclose(axes, metric.axes, atol=1e-12)
 
 

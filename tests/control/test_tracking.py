@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.cli.output import words_of
 from projservo_cli.records import WorkFailed
+from projservo_cli.results import RunTrace
 from tests.configured import calibrate, plan, scenario_of, servo, truth_of, under
 from tests.known import configured, driven
 
@@ -103,7 +104,10 @@ def test_without_a_plan_to_follow_the_law_goes_alone_and_says_so(lost):
     trace, alone = (servo.run(config, calibration, planned, name) for name in ("exact_track", "exact"))
     assert (trace.verdict, trace.mode, trace.planned_s) == ("converged", "track", None)
     assert trace.unplanned == "no joints can follow the plan: too near to something"
-    assert alone.unplanned == ""
+    assert (
+        "none was followed, the law regulated to the goal: no joints" in RunTrace.of(trace).summary()["plan"]
+    )
+    assert (alone.unplanned, "plan" in RunTrace.of(alone).summary()) == ("", False)
     np.testing.assert_array_equal(trace.q, alone.q)
     words = " ".join(" ".join(words_of("servo", {"laws": [vars(trace)]})).split())
     assert "driven without a plan: no joints can follow the plan: too near to something" in words

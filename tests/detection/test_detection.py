@@ -241,7 +241,7 @@ REFUSED = {
     "no such pose": (["q1,pose", "1,1", "2,5"], 2, "no image has a name that ends in 5"),
     "no such name": (["q1,left,right", "1,a1.png,c.png"], 2, "there is no such image"),
     "not an image": (["q1,left,right", "1,a1.png,b.txt"], 2, "not an image that OpenCV can read"),
-    "another size": (["q1,left,right", "1,a1.png,b1.png", "2,a1.png,big.png"], 2, "81×60 pixels"),
+    "another size": (["q1,left,right", "1,a1.png,b1.png", "2,a2.png,big.png"], 2, "81×60 pixels"),
     "no tag": (["q1,left,right", "1,none.png,none.png"], 1, "no tag in any of 2 images"),
     "in one view only": (["q1,left,right", "1,a1.png,none.png"], 1, "by both cameras"),
 }

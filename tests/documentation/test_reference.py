@@ -38,6 +38,9 @@ def test_every_key_has_a_row(schema):
     assert all(len(row) == 5 and row[4] for row in rows)
 
 
+PAIR = "list of 2 × (whole number, ≥ 1, ≤ 1,000,000)"
+
+
 def test_a_key_is_told_as_it_is():
     rows = [tuple(row[:4]) for row in told(keys.all_keys(json_schema()))]
     assert {
@@ -45,7 +48,7 @@ def test_a_key_is_told_as_it_is():
         ("`joint_speed_limit_deg_s`", "number, > 0 or null", "`125.0`", "°/s"),
         ("`gain_t`", "number, > 0", "`2.5`", "1/s"),
         ("`self_occlusion`", "`transparent`, `opaque`", "`transparent`", ""),
-        ("`image_size_px`", "list of 2 × (whole number, ≥ 1, ≤ 1,000,000)", "required", "px"),
+        ("`image_size_px`", PAIR + f" or list of 2 × ({PAIR})", "required", "px"),
         ("`table`", "text", "required", ""),
         ("`lens`", "true or false", "`false`", ""),
     } <= set(rows)

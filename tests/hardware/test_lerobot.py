@@ -1,12 +1,13 @@
 """The class for LeRobot in the documentation, around a stand-in of its shape."""
 
-import importlib
 import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from projservo_cli.records import WorkFailed
+from projservo_cli.robots import plugins
 from tests.documentation.blocks import PAGES, blocks_of
 
 NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
@@ -52,7 +53,7 @@ def made(tmp_path, monkeypatch):
     def make(**config):
         robot = StandIn(**config)
         monkeypatch.setitem(sys.modules, "my_arm", SimpleNamespace(make_robot=lambda: robot))
-        return robot, importlib.import_module("lerobot_arm").LeRobotArm("my_arm:make_robot")
+        return robot, plugins.make("plant", "lerobot_arm:LeRobotArm", (), {"make": "my_arm:make_robot"})
 
     make.lines = [line for line in text[text.index("class") :].splitlines() if line.strip()]
     return make
@@ -80,5 +81,5 @@ def test_a_robot_of_lerobot_is_driven_in_radians(made):
 
 @pytest.mark.parametrize("config", [{"use_degrees": False}, {"disable_torque_on_disconnect": True}])
 def test_percentages_and_an_arm_that_falls_are_refused(made, config):
-    with pytest.raises(ValueError, match="set use_degrees=True and disable_torque_on_disconnect=False"):
+    with pytest.raises(WorkFailed, match="set use_degrees=True and disable_torque_on_disconnect=False"):
         made(**config)

@@ -3,6 +3,7 @@
 import html
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -57,6 +58,7 @@ def doctor(projservo, tmp_path, monkeypatch):
         (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
         answer = projservo("doctor", "-c", "arm.yaml", "--json", *sets)
         told = json.loads(answer.out)["findings"]
+        assert not re.search(r"\bnan\b", answer.out)
         return answer, {
             level: [
                 f"{one['where']}: {one['text']}: {one['remedy']}" for one in told if one["level"] == level
@@ -116,6 +118,12 @@ _OTHER = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
                 "left image: tag 0 is there twice: a number must be unique: print another one",
                 "right image: 2 tags are of 5X5_50, none of 4X4_50: set markers.dictionary: 5X5_50",
             ),
+        ),
+        (
+            LEFT[:, ::-1],
+            LEFT,
+            "fault",
+            ("the left camera's image is mirrored: it shows no tag, its mirror image tags 0, 1, 2; switch",),
         ),
         (
             picture(at=(60.0, 80.0), numbers=(7, 8)),
@@ -280,12 +288,15 @@ def calibrated():
         (lambda s: s, "agrees with the images"),
         (lambda s: s[::-1], "exchanged"),
         (lambda s: s + np.array([[[12.0, 0.0]], [[0.0, 0.0]]]), "the left camera"),
+        (lambda s: _tag(s, 1, np.roll(s[:, 4:8], 2, axis=1)), "tag 1 is upside down on the tool; put"),
+        (lambda s: _tag(_tag(s, 1, s[:, 12:16]), 3, s[:, 4:8]), "tags 1 and 3 are exchanged on the tool"),
+        (lambda s: _tag(s, 2, s[:, 8:12] + 15.0), "tag 2 (markers 8, 9, 10, 11) moved on the tool"),
         (
             lambda s: _scaled(s, 0.94),
             "all tags are 6 % smaller than those of the calibration; print them in their size",
         ),
     ],
-    ids=["sound", "exchanged", "moved", "fit to page"],
+    ids=["sound", "exchanged", "moved", "upside down", "two tags", "loose", "fit to page"],
 )
 def test_a_calibrated_run_tells_what_changed_since(calibrated, change, words):
     q = calibrated.q_reference
@@ -294,6 +305,13 @@ def test_a_calibrated_run_tells_what_changed_since(calibrated, change, words):
     finding = preflight._against(calibrated, seen, (640, 480))
     assert words in f"{finding.text}: {finding.remedy}"
     assert (finding.level == "fine") == (words == "agrees with the images")
+
+
+def _tag(s, tag, pixels):
+    """Images with other pixels (2, 4, 2) of a tag."""
+    changed = s.copy()
+    changed[:, 4 * tag : 4 * tag + 4] = pixels
+    return changed
 
 
 def _scaled(s, factor):

@@ -49,7 +49,7 @@ def recording(tmp_path, monkeypatch):
         "frames_per_joint": 2,
         "random_poses": 1,
     }
-    config["cameras"]["max_age_s"] = config["cameras"]["reconnect_s"] = 1e6  # its clock is none of the wall
+    config["cameras"]["max_age_s"] = config["cameras"]["reconnect_s"] = 10.0  # its clock is none of the wall
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     yield tmp_path
     for stream in streams:

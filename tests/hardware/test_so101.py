@@ -280,6 +280,8 @@ MISTAKES = {
         Faults(missing=(4, 5, 6)),
         r"servos \[4, 5, 6\] do not answer, \[1, 2, 3\] do: look at the cable",
     ),
+    "two arms": (Faults(twice=(1, 2, 3, 4, 5, 6)), "every reply is garbled: two arms share this bus"),
+    "two pairs": (Faults(twice=(2, 5)), r"answers of servo 2 are garbled, those of \[1, 3, 4, 6\]"),
     "twice": (Faults(twice=(3,)), "answers of servo 3 are garbled.*two servos have this id"),
 }
 
@@ -289,6 +291,21 @@ def test_servos_that_are_not_as_they_should_be_are_named(rig, mistake):
     faults, told = MISTAKES[mistake]
     with pytest.raises(InputError, match=told):
         SO101(rig(faults).port).open()
+
+
+@pytest.mark.parametrize("heard", ["the request", "noise"])
+def test_an_echo_or_noise_alone_is_silence(rig, heard):
+    bus = rig()
+    bus._answer = lambda packet: bus._write_out(packet if heard == "the request" else b"\x00\x80")
+    with pytest.raises(InputError, match="no servo answers: switch the supply on"):
+        SO101(bus.port).open()
+
+
+def test_a_second_arm_that_shows_in_some_registers_alone_is_told_from_silence(rig, opened):
+    bus, arm = opened()
+    bus.faults.twice = (1, 2, 3, 4, 5, 6)  # replies that are the same bits are whole
+    with pytest.raises(WorkFailed, match="garbled: two servos answer at once"):
+        arm.joints()
 
 
 def test_another_kind_of_servo_is_named(rig):

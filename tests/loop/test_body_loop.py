@@ -79,7 +79,7 @@ def test_markers_lost_one_after_the_other(rng):
 
 def test_a_marker_beyond_the_image_is_unseen_if_it_is_a_pin():
     sc = with_pins(scene())
-    low = sc.plant._replace(image_size=np.array([1280.0, 500.0]))
+    low = sc.plant._replace(image_size=np.full((2, 2), [1280.0, 500.0]))
     run = body_run(sc._replace(plant=low), "direct_three", bounds=limits(stop_at_border=False))
     free = body_run(sc, "direct_three")
     v = free.log.s[: run.steps + 1, :, :, 1]

@@ -266,7 +266,7 @@ def test_success_is_told_of_the_truth(rng):
     for axis in range(2):
         size, border = sc.plant.image_size.copy(), seen[..., axis].max() + 0.5
         for beside, wanted in ((1e-6, 1.0), (-1e-6, 0.0)):
-            size[axis] = border + beside
+            size[:, axis] = border + beside
             assert success(image_size=size, log=noisy) == wanted
     q = run.log.q[:, 3]
     for limit, least, sign in (("lower", q.min(), 1.0), ("upper", -q.max(), -1.0)):

@@ -67,7 +67,7 @@ def test_both_loops_follow_a_plan_alike(law, rng):
 def test_both_loops_measure_with_the_body_alike(rng):
     """Pins outside the narrow image are unseen, another is lost by noise that is no number."""
     sc = with_pins(scene())
-    sc = sc._replace(plant=sc.plant._replace(image_size=np.array([760.0, 560.0])))
+    sc = sc._replace(plant=sc.plant._replace(image_size=np.full((2, 2), [760.0, 560.0])))
     noise = 0.3 * rng.normal(size=(41, 2, 9, 2))
     noise[5:9, 0, 1] = np.nan
     bounds = limits(max_steps=40)
@@ -105,7 +105,7 @@ def test_both_loops_end_alike(bounds):
     upper[2] = sc.q_start[2] + 0.5 * STEP[2]
     sc = sc._replace(
         plant=sc.plant._replace(
-            limits=sc.plant.limits._replace(upper=upper), image_size=np.array([1280.0, 700.0])
+            limits=sc.plant.limits._replace(upper=upper), image_size=np.full((2, 2), [1280.0, 700.0])
         )
     )
     bounds = limits(**{"max_steps": 60, **bounds})

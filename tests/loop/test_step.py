@@ -163,7 +163,7 @@ def noted(s, s_star, size=(math.inf, math.inf), **given):
     log, plant = new_log(6, s.shape[1], 2, 5), scene().plant
     log.s[1] = s
     log.read[1] = given.pop("read", np.zeros(6))
-    return log, note(log, 1, s_star, plant._replace(image_size=np.array(size)), limits(**given))
+    return log, note(log, 1, s_star, plant._replace(image_size=np.full((2, 2), size)), limits(**given))
 
 
 def test_image_error_is_the_rms_over_markers_and_views():

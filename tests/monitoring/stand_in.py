@@ -7,6 +7,8 @@ Faults begin at a time, s, and all but those of joints hold for frames exposed f
     {kind: shift, views: [0], by: [8, 0]}             image shifted by px
     {kind: turn, views: [0], axis: 0, by: 0.01}       camera turned about its axis, rad
     {kind: move, views: [1], axis: 2, by: 0.01}       camera moved along its axis, m
+    {kind: drift, views: [0], axis: 0, by: 0.001}     camera that goes on turning about its axis, rad/s
+    {kind: slip, by: [0, 0.001, 0]}                   tags moved on the tool, m
     {kind: refocus, views: [0], by: 1.01}             zoomed about the centre of the image
     {kind: exchange}                                  left image for right
     {kind: size, by: 0.5, crop: [0, 0]}               images scaled, less so many px at the left and above
@@ -148,9 +150,9 @@ def seen(T, view, faults=()):
             axis = fault["by"] * np.eye(3)[fault["axis"]]
             turn = Rotation.from_rotvec(axis).as_matrix() if fault["kind"] == "turn" else np.eye(3)
             R, t = turn @ R, turn @ t + (axis if fault["kind"] == "move" else 0.0)
-    in_tool = roof().place[:, None] + corners
-    there = (in_tool @ T[:3, :3].T + T[:3, 3]) @ R.T + t
-    middle = (roof().place @ T[:3, :3].T + T[:3, 3]) @ R.T + t
+    place = roof().place + sum((np.array(f["by"]) for f in faults if f["kind"] == "slip"), np.zeros(3))
+    there = ((place[:, None] + corners) @ T[:3, :3].T + T[:3, 3]) @ R.T + t
+    middle = (place @ T[:3, :3].T + T[:3, 3]) @ R.T + t
     turned = R @ T[:3, :3] @ roof().turn
     pixels = FOCAL * there[..., :2] / there[..., 2:] + centre
     away = middle / np.linalg.norm(middle, axis=1, keepdims=True)
@@ -285,6 +287,8 @@ class StandIn:
     def _frame(self, view, k, t):
         """Pixels (m, 2), NaN where unseen, and stated deviations (m,) of a frame."""
         faults = (self.fault,) if self.fault and self._lasts(t) else ()
+        if faults and faults[0]["kind"] == "drift":
+            faults = ({**faults[0], "kind": "turn", "by": faults[0]["by"] * (t - faults[0].get("at", 0.0))},)
         found = seen(tool_pose(self.arm, self._at(t)), view, faults)
         pixels, shown, sigma = found.pixels.copy(), found.shown, np.full(found.pixels.shape[:2], 0.01)
         here = [fault for fault in faults if view in fault.get("views", ())]

@@ -19,6 +19,7 @@ from projservo_cli.calibration.prediction import (
     parameters_from,
 )
 from projservo_cli.monitoring import statistics
+from projservo_cli.monitoring.accuracy import Posture
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.monitor import ImageMonitor, detected_fault
 from projservo_cli.monitoring.statistics import WINDOW, Detector, ErrorModel, Memory
@@ -417,6 +418,55 @@ def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(arm, 
     s = noisy(arm.images(at_once(q[None])), seed, 0.1)[0]
     s[:, 4:8] += off * np.array(BENT_TAG)
     said = detected_fault(sharp, q, sharp.marker, s, arm.image_size)
+    assert changed in said if changed else said == ""
+
+
+def shoved(arm, by_m):
+    """Markers (m, 4) of a tool that was moved on its holder, m."""
+    moved = arm.scene.M.copy()
+    moved[:, :3] += by_m
+    return moved
+
+
+def posture_of(arm, q):
+    M = arm.scene.M[:4, :3]
+    return Posture(arm.calibration.model(), q, arm.calibration.M[:4], np.linalg.norm(M[:, None] - M, axis=2))
+
+
+@pytest.mark.parametrize("by_mm", [(1.0, 0.0, 0.0), (0.0, -2.0, 0.0), (0.0, 0.0, 1.5)])
+def test_pixels_become_millimetres_in_any_direction(arm, by_mm):
+    """Along the lines of sight, too."""
+    q, m = arm.way(1)[0][-1:], len(arm.scene.M)
+    off = arm.images(at_once(q), shoved(arm, 1e-3 * np.array(by_mm))[None]) - arm.images(at_once(q))
+    for used in (np.ones((2, m), dtype=bool), np.arange(m) < 4 + np.zeros((2, 1))):
+        carried = posture_of(arm, q[0]).carry(arm.calibration.M, used) @ off.ravel()
+        assert np.linalg.norm(carried) == pytest.approx(np.linalg.norm(by_mm), rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("sigma_deg", "by_mm"), [(0.0, 0.0), (0.0, 0.3), (0.3, 1.0), (0.3, 3.0)])
+def test_a_tool_that_moved_by_less_than_a_test_tells_from_none_is_stated(arm, seed, sigma_deg, by_mm):
+    doubtful, q = arm.with_joint_noise(np.radians(sigma_deg)), arm.way(seed)[0]
+    by = np.random.default_rng(seed).standard_normal(3)
+    moved = shoved(arm, 1e-3 * by_mm * by / np.linalg.norm(by))
+    s = noisy(arm.images(at_once(q), np.repeat(moved[None], len(q), 0)), seed)
+    test, rest, said = ImageMonitor(doubtful.calibration, SIGMA, LOOKS), np.zeros(2), ""
+    for k, row in enumerate(at_once(q)):
+        said = said or test.observe(
+            np.full(2, PERIOD * k), row, 0.0 * row, rest, s[k], np.ones(2, dtype=bool)
+        )
+    used = np.ones((2, len(moved)), dtype=bool)
+    assert said or by_mm <= 1.5 * test.undetected_mm(q[-1], used, posture_of(arm, q[-1]))
+    assert not (said and by_mm == 0.0)
+
+
+@pytest.mark.parametrize(("off", "changed"), [(0.8, ""), (6.0, "at marker 6")])
+def test_one_of_two_tags_may_be_bent_as_one_of_many(arm, off, changed):
+    q = arm.way(2)[0][-1]
+    two = dataclasses.replace(arm.calibration, sigma_px=0.1).with_markers(np.arange(8))
+    s = noisy(arm.images(at_once(q[None])), 2, 0.1)[0, :, :8]
+    s[:, 4:] += off * np.array(BENT_TAG)
+    said = detected_fault(two, q, two.marker, s, arm.image_size)
     assert changed in said if changed else said == ""
 
 

@@ -51,7 +51,7 @@ def outside(s, corners):
 def test_the_margin_is_that_of_every_point_of_every_segment(k):
     """Held against thousands of points, of thin regions too, which markers alone would not meet."""
     found, rng = case("paper", k), np.random.default_rng(k)
-    truth, size = found.truth, np.asarray(found.c.image_size)
+    truth, size = found.truth, np.asarray(found.c.image_size)[:, None]
     for _ in range(8):
         q = found.q_start + rng.uniform(-0.05, 0.05, 6)
         face = truth.M_face @ truth.displacement(q).T

@@ -63,7 +63,7 @@ def test_middle_camera_of_two_equal_cameras_is_the_camera():
 
 
 def test_rendered_plan_begins_and_ends_at_the_true_faces(material):
-    camera = planned.middle_camera(material.plant.model.P, material.plant.image_size)
+    camera = planned.middle_camera(material.plant.model.P, material.plant.image_size[0])
     trace, face = material.traces["direct_three"], material.plant.M[material.plant.order]
     for data in (data_of("planned", material), data_of("planned_steep", material)):
         for j, pose in ((0, trace.pose[0]), (-1, trace.goal_pose)):
@@ -88,7 +88,7 @@ def test_skeleton_passes_the_axes_of_revolute_joints():
 
 
 def test_corners_of_a_viewing_pyramid_are_seen_at_the_corners_of_the_image(material):
-    model, size = material.plant.model, material.plant.image_size
+    model, size = material.plant.model, material.plant.image_size[0]
     pyramids = data_of("scene", material)["pyramids"]
     for P, (center, *corners) in zip(model.P, pyramids, strict=True):
         np.testing.assert_allclose(center, camera_center(P), atol=1e-12)
@@ -163,7 +163,7 @@ def test_the_map_of_sight_is_the_margin_of_the_displaced_face(material):
     # No share μ_p does better for both images than the one shown, of 41.
     H = trajectory_displacement(plan.H_hat, amplitudes, np.array([20 / 80, 60 / 80, 0.4]))
     s = project(material.calibrated.P, plan.A @ H.T)
-    border = np.minimum(s + 0.5, material.plant.image_size - 0.5 - s).min(axis=(1, 2))
+    border = np.minimum(s + 0.5, material.plant.image_size[:, None] - 0.5 - s).min(axis=(1, 2))
     assert data["border_px"][:, 20, 60].min() >= border.min() - 1e-9
 
 

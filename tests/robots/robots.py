@@ -104,6 +104,19 @@ class Faulty(Sound):
             raise RuntimeError("protective stop")
 
 
+class Stamped(Sound):
+    """Stamps joints and images in a unit of its own: so many a second, in whole numbers if it says so."""
+
+    def __init__(self, config, unit=1.0, images_only=False, whole=False):
+        super().__init__(config)
+        self.unit, self.images_only, self.whole = unit, images_only, whole
+
+    def read(self):
+        stamp = self.unit * (1000.25 + self.time)
+        stamp = float(round(stamp)) if self.whole else stamp
+        return *super().read(), None if self.images_only else stamp, stamp, stamp
+
+
 class NoStop:
     def open(self): ...
     def read(self): ...

@@ -76,6 +76,27 @@ def test_a_function_may_make_the_robot():
     assert made.read()[0].shape == (6,)
 
 
+MADE = {
+    "in __init__": "def __init__(self):\n        self.open = self.close = self.stop = print",
+    "by a loop": "def __init__(self):\n        [setattr(self, n, print) for n in ('open', 'close', 'stop')]",
+    "by delegation": "def __getattr__(self, name):\n        return getattr(Bare, name)",
+    "too few": "def __init__(self):\n        self.open = self.close = print\n        self.stop = None",
+}
+
+
+@pytest.mark.parametrize("way", MADE)
+def test_methods_that_objects_are_given_as_they_are_made_count(way):
+    text = "class Bare:\n    open = close = stop = print\n\n\nclass Arm:\n    def joints(self): ...\n"
+    text += "    def command(self, target, speed, due): ...\n    "
+    written(f"mine_arm_{len(way)}", text + MADE[way] + "\n")
+    found = plugins.find("plant", f"mine_arm_{len(way)}:Arm")
+    if way == "too few":
+        with pytest.raises(InputError, match=r"lacks stop\(\); needed: open, joints"):
+            plugins.called("plant", "mine:Arm", found, (), {})
+    else:
+        assert plugins.brings_no_pixels(plugins.called("plant", "mine:Arm", found, (), {}))
+
+
 def test_the_working_directory_comes_last():
     written("colorsys", "raise AssertionError('a file here must not stand in for an installed module')\n")
     sys.modules.pop("colorsys", None)

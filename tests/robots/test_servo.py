@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.config import load_config
+import projservo_cli as ps
+from projservo_cli.config import Override, load_config
 from projservo_cli.records import Calibration
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.store import load
@@ -196,6 +197,34 @@ def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
     assert commands()
 
 
+@pytest.mark.parametrize(
+    ("fault", "dark"),
+    [("lost", "neither camera shows a marker"), ("blind", "the left camera shows no marker")],
+)
+@pytest.mark.parametrize("tested", [True, False])
+def test_without_an_image_nothing_moves_unless_that_is_asked_for(servo, fault, dark, tested):
+    sets = [*NEAR, "--set", "stop.max_steps=40"]
+    sets += [] if tested else ["--set", "stop.innovation_threshold=0"]
+    answer = servo(*faulty(fault), *sets, "--json", law="exact")
+    assert answer.code == 1
+    assert dark in answer.json["reason"]
+    assert "--blind" in answer.json["reason"]
+    begun = robots.Sound(UR5).q
+    if fault == "lost":  # one camera alone still tells whether the way to the start may be driven
+        CALLS.clear()
+        servo(*faulty(fault), *sets, "-q", law="exact")
+        assert all((sent.target == begun).all() for sent in commands())
+    told = servo(*faulty(fault), *sets, "--json", "--blind", law="exact").json["laws"][0]
+    assert dark in told["untested"]
+
+
+def test_a_camera_that_is_lost_under_way_is_said_of_a_run_that_converges(servo):
+    answer = servo(*faulty("blind", 75), *NEAR, law="exact")
+    assert answer.code == 0, answer.err
+    assert "converged" in answer.out
+    assert "the left camera has shown no marker" in " ".join(answer.out.split())
+
+
 def test_a_calibration_without_covariance_tests_nothing_and_says_so():
     inputs = SimpleNamespace(tests_images=True)
     bare = fake(Calibration, sqrt_cov_shared=np.full((3, 3), np.nan))
@@ -377,6 +406,31 @@ def test_a_report_never_moves_a_robot(servo, projservo):
     assert CALLS == []
 
 
+def test_a_real_robot_moves_whenever_it_is_asked_to_and_a_report_shows_what_is_stored(servo, projservo):
+    asked = servo(*faulty("bumped camera", 70), "--json")
+    assert (asked.code, asked.json["laws"][0]["verdict"]) == (1, "fault detected")
+    for call in range(2):  # what is wrong is mended, and nothing else is said about it
+        CALLS.clear()
+        again = servo(*SOUND, "--json")
+        assert (again.code, again.json["laws"][0]["verdict"]) == (0, "converged"), call
+        assert len(commands()) > 10
+    dry = servo(*SOUND, "-n", "--json").json["steps"]
+    assert [step["stage"] for step in dry if step["why"]] == ["servo"]
+    sent = len(CALLS)
+    shown = projservo(
+        "report", "-c", UR5, "-o", "run", *SOUND, "--set", "control.laws=[direct_three]", "--json"
+    )
+    assert shown.code == 0, shown.err
+    (stored,) = shown.json["replayed"]
+    date = load("run").results["servo/direct_three"].provenance["date"]
+    assert stored == {"law": "direct_three", "plant": "tests.robots.robots:Sound", "date": date}
+    assert f"the stored run of tests.robots.robots:Sound, recorded {date}" in shown.err.replace("\n", " ")
+    assert len(CALLS) == sent
+    config = load_config(UR5, [Override.parse(SOUND[1])])
+    ps.Experiment(config, "run", progress=False).make("servo", laws=["direct_three"])
+    assert CALLS.count("open") == 1  # of a new object
+
+
 def test_a_robot_is_calibrated_from_what_it_showed(projservo, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     CALLS.clear()
@@ -393,6 +447,18 @@ def test_a_robot_is_calibrated_from_what_it_showed(projservo, monkeypatch, tmp_p
     assert (refused.code, CALLS) == (2, [])
     assert "is named by the stored run alone, which starts no code" in refused.err
     assert projservo("calibrate", "-o", "run", "--json").json["usable"] == answer.json["calibrate"]["usable"]
+    again = projservo(*chain, "-c", UR5, *SOUND)
+    assert (again.code, CALLS) == (0, [])
+    assert "record: up to date, and the robot is not moved: --force records all poses again" in again.err
+    # A fault that advises to recalibrate leads somewhere: what it contradicts is recorded again, once.
+    few = ["--set", "calibration.frames_per_joint=4", "--law", "exact"]
+    moved = projservo("servo", "-c", UR5, "-o", "run", *few, *faulty("bumped camera"), "--json")
+    assert moved.code == 1
+    assert "the left camera was moved" in moved.json["reason"]
+    for recorded, why in ((37, "what is there was contradicted"), (0, "up to date")):
+        answer = projservo(*chain, "-c", UR5, *SOUND, "--json")
+        assert answer.json["record"]["recorded"] == recorded, answer.err
+        assert f"record: {'making (' * bool(recorded)}{why}" in answer.err
 
 
 def test_record_drives_the_same_robot(projservo, monkeypatch, tmp_path):

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from projservo_cli.planning.margins import limits_alone
+from projservo_cli.records import WorkFailed
 from projservo_cli.stages.plan import plan_task, rotation_sense
 from projservo_cli.task.trajectory import PROFILES
-from tests.configured import calibrate, scenario_of
+from tests.configured import calibrate, scenario_of, truth_of
 from tests.configured import plan as planning
 from tests.known import asked, configured
 from tests.samples import frame, in_frame, pixels
@@ -142,3 +143,42 @@ def test_the_sense_is_that_of_the_whole_plan(name, overrides):
     _, calibration, _ = calibrate.run(config)
     found = rotation_sense(scenario_of(config, calibration))
     assert np.array_equal(found, planning.run(config, calibration).rotation_sense())
+
+
+@pytest.mark.parametrize(
+    ("aside_m", "shift_px", "words"),
+    [
+        (0.0, 0.0, ""),
+        (
+            0.02,
+            0.0,
+            r"that 5 joints do not reach: the nearest, at joints .* deg, is [\d.]+ deg and [\d.]+ px rms",
+        ),
+        (0.0, 6.0, "fit no pose of the tool: .* as if the left image were shifted by"),
+    ],
+    ids=["reached", "aside", "one view"],
+)
+def test_goal_images_that_joints_do_not_reach_are_told_from_those_that_no_tool_shows(
+    aside_m, shift_px, words
+):
+    config = configured(
+        "hobby", "noise.servo_px=0.1", "noise.calibration_px=0.1", "calibration.random_poses=8"
+    )
+    truth, q = truth_of(config), np.radians([20, -5, 5, -10, 80])
+    s = pixels(truth.P, truth.M @ truth.displacement(q).T + [0.0, aside_m, 0.0, 0.0])
+    s[0] += [shift_px, 0.0]
+    images = {"markers": list(truth.number), "left": s[0].tolist(), "right": s[1].tolist()}
+    goal = config.task.goal.model_validate({"images": images})
+    config = config.model_copy(update={"task": config.task.model_copy(update={"goal": goal})})
+    calibration = calibrate.run(config)[1]
+    if not words:
+        assert planning.run(config, calibration).feasible
+        return
+    with pytest.raises(WorkFailed, match=words):
+        planning.run(config, calibration)
+
+
+@pytest.mark.parametrize(("face", "uneven"), [([0, 1, 2, 3], False), ([0, 1, 2, 7], True)])
+def test_a_face_that_is_not_plane_is_said(face, uneven):
+    config = configured("hobby", f"markers.face={face}", "noise.calibration_px=0.1")
+    assert ("the face is not plane" in planning.run(config, calibrate.run(config)[1]).reason) == uneven

@@ -112,6 +112,9 @@ def test_what_is_added_to_and_what_is_written_as_a_whole_hold_the_same(tmp_path,
     for name in made:
         run = store.save(dataclasses.replace(run, results={**run.results, name: made[name]}))
     assert len(stored) == len(set(stored)) == 7  # each record once
+    for refuted in ("a camera moved", ""):  # said, and taken back
+        run = store.save(dataclasses.replace(run, refuted=refuted))
+        assert store.load(run.path).refuted == refuted
     replaced = {**made, "plan": result(**{"": fake(Plan, 8)})}
     for results in (made, replaced):
         run = store.save(dataclasses.replace(run, results=results))

@@ -57,7 +57,7 @@ def test_failures_of_all_parts_are_counted_and_the_reason_is_that_of_the_first_r
 def test_a_part_that_changed_costs_no_table(table, parts):
     before = table.read_bytes()
     parts[1].write_bytes(parts[1].read_bytes()[:-1])
-    with pytest.raises(InputError, match="delete it and run the sweep again"):
+    with pytest.raises(InputError, match="move it elsewhere and run the sweep again"):
         assemble(table, parts, HEADINGS, {})
     assert table.read_bytes() == before
     table.write_bytes(before[:-1])

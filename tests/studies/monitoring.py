@@ -28,7 +28,7 @@ from projservo_cli.config import load_config
 from projservo_cli.monitoring.statistics import ErrorModel
 from projservo_cli.records import WorkFailed
 from tests.configured import calibrate, plan, record, servo
-from tests.monitoring.stand_in import ARMS, KINDS, LAST, StandIn, seen, tool_pose
+from tests.monitoring.stand_in import ARMS, KINDS, LAST, TAG_M, StandIn, seen, tool_pose
 from tests.studies.planning_tables import in_two_processes, quantiles, rate
 
 # Causes as they are worded; a group of an expression is the joint.
@@ -131,7 +131,7 @@ def config_of(rig, task, table, options):
             "settle_s": 0.3,
         },
         "data": {"table": str(table), "joints": "R" * len(arm.axes)} | size,
-        "markers": {"numbers": list(range(20)), "face": [0, 1, 2, 3]},
+        "markers": {"numbers": list(range(20)), "face": [0, 1, 2, 3], "tag_size_m": TAG_M},
         "robot": {"limits": {"joints": [list(pair) for pair in arm.limits], "unit": "deg"}},
         "calibration": {
             "amplitude_deg": 25,
@@ -272,6 +272,7 @@ def run_of(rig, task, fault=None, made=None, frames=False, seed=1):
         row["stage"] = "servo"
         trace = servo.run(config, calibration, made, "exact_track")
         row |= {"verdict": trace.verdict, "steps": trace.steps, "reason": trace.reason}
+        row["stated_mm"] = trace.estimated_position_error_mm
         must = trace.verdict != "converged" and trace.law in (config.control.must_converge or (trace.law,))
         row["exit"] = int(trace.verdict == "fault detected" or must)
     except WorkFailed as error:
@@ -370,7 +371,7 @@ def jobs_of(cells, runs, kinds, each=10, most=40):
 COLUMNS = (
     *("cell", "number", *Rig._fields, "goal", "fault", "level", "expected", "judged", "named", "verdict"),
     *("exit", "stage", "steps", "sent_deg", "error_mm", "quiet_mm", "quiet", "quiet_steps", "at", "until_s"),
-    *("seconds", "task", "by", "reason"),
+    *("seconds", "task", "by", "stated_mm", "reason"),
 )
 
 

@@ -6,6 +6,7 @@ import re
 import time
 import types
 from contextlib import contextmanager
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -33,6 +34,17 @@ def commands():
     """The commands of the page, as lists of words."""
     lines = "\n".join(block.text for block in blocks_of(PAGES["so101"])).splitlines()
     return [line.split()[1:] for line in lines if line.startswith("projservo ")]
+
+
+def shown():
+    """What the page shows that a command prints, by the command."""
+    blocks = list(blocks_of(PAGES["so101"]))
+    return {before.text.split()[1]: block.text for before, block in pairwise(blocks) if block.excuse}
+
+
+def without_numbers(text):
+    """The first line, which says what became of the command."""
+    return re.sub(r"[\d.]+", "#", text.splitlines()[0])
 
 
 def by_hand(arm, *ways):
@@ -129,6 +141,10 @@ def test_ten_commands_lead_from_an_empty_folder_to_the_taught_goal(bench, capsys
             bench.reached = arm.link.copy()
     assert "torque is on: the arm holds" in printed["servo"].err
     assert "torque is off" in printed["release"].err
+    for command, text in shown().items():
+        if command != "doctor":  # the emulated cameras are slow
+            assert without_numbers(text) == without_numbers(printed[command].out)
+    assert "\ncalibrate: usable: predicts images to " in printed["record"].out
     off = np.degrees(np.abs(bench.reached - bench.taught))
     assert off.max() < 1.5, off  # of 1° of hysteresis and 2° of sag; joints make up for each other
     _homed_since(bench, capsys)

@@ -9,14 +9,7 @@ from projservo_cli.laws import POINT_LAWS, title_of
 from projservo_cli.loop.step import plateau_stretch
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.report_data import (
-    DIRECT,
-    VIEWS,
-    Data,
-    ReportData,
-    percent,
-    registered,
-)
+from projservo_cli.report.report_data import DIRECT, VIEWS, Data, ReportData, percent, registered
 
 _OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
 _BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
@@ -78,10 +71,9 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
     """One row a law, one column a camera."""
     laws, size = [law for law in POINT_LAWS if f"s_{law}" in data], data["image_size"]
     panels = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
-    heights = [_PANEL_WIDTH * style.aspect(near_pixels(s, size)) for s in panels]
+    heights = [_PANEL_WIDTH * style.aspect(both_near(s, size)) for s in panels]
     figure.set_figheight(sum(heights) + 0.62 * len(laws) + 0.45)
     axes = figure.subplots(len(laws), 2, squeeze=False, height_ratios=heights)
-    border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
     for row, law in enumerate(laws):
         first, last = data[f"plateau_{law}"]
         for view, name in enumerate(VIEWS):
@@ -94,8 +86,8 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
             style.face(panel, s[0], style.START, fill=True)
             style.face(panel, goal, style.GOAL)
             title = f"{name} camera" if view else f"{title_of(law)}: {data[f'verdict_{law}']}"
-            style.image_axes(panel, title, near_pixels(np.concatenate([s, goal[None]]), size))
-            panel.plot(*style.closed(border).T, **_BORDER)
+            style.image_axes(panel, title, near_pixels(np.concatenate([s, goal[None]]), size[view]))
+            panel.plot(*style.closed(image_border(size[view])).T, **_BORDER)
     line_styles: dict[str, style.LineStyle] = {
         "start": style.START,
         "goal": style.GOAL,
@@ -103,10 +95,20 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
     }
     line_styles |= {"face hidden from this camera": _HIDDEN, "plateau of the image error": _PLATEAU}
     line_styles["end of the run"] = {"color": style.BLACK, "marker": "x", "linestyle": "none"}
-    every = np.concatenate([near_pixels(s, size) for s in panels]) / size
+    every = np.concatenate([near_pixels(s[:, v], size[v]) / size[v] for s in panels for v in (0, 1)])
     if (np.abs(every - 0.5) > 0.5 - _BORDER_SHOWN).any():
         line_styles["border of the image"] = _BORDER
     style.legend_below(figure, line_styles, 4)
+
+
+def image_border(size: FloatArray) -> FloatArray:
+    """Corners (4, 2) of an image of a width and height (2,), px."""
+    return np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
+
+
+def both_near(pixels: FloatArray, size: FloatArray) -> FloatArray:
+    """Pixels (k, 2) of both images (…, 2, m, 2) of sizes (2, 2), as ``near_pixels``."""
+    return np.concatenate([near_pixels(pixels[..., view, :, :], size[view]) for view in range(2)])
 
 
 def near_pixels(pixels: FloatArray, size: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.planning.margins import BEHIND, CLEAR, CONSTRAINTS, IMAGE, WIDTH
 from projservo_cli.records import PRISMATIC, FloatArray, IntArray, Plan
 from projservo_cli.report import style
-from projservo_cli.report.figures.images import near_pixels
+from projservo_cli.report.figures.images import image_border, near_pixels
 from projservo_cli.report.report_data import VIEWS, Data, ReportData, registered
 
 PIECES = 4  # of each edge of a tree, which is no straight line in an image
@@ -163,7 +163,7 @@ def _visible(data: Data, view: int) -> FloatArray:
     names = ["s", "s_star", "center", *(f"tree_{name}" for name in _TREES if f"tree_{name}" in data)]
     drawn = [data[name][..., view, :, :] if name[0] == "s" else data[name][:, view] for name in names]
     drawn += [data[name] for name in data if name.startswith(f"kept_out_{VIEWS[view]}")]
-    return near_pixels(np.concatenate([pixels.reshape(-1, 2) for pixels in drawn]), data["image_size"])
+    return near_pixels(np.concatenate([pixels.reshape(-1, 2) for pixels in drawn]), data["image_size"][view])
 
 
 def _image(axes: "style.Axes", data: Data, view: int, visible: FloatArray) -> None:
@@ -181,8 +181,7 @@ def _image(axes: "style.Axes", data: Data, view: int, visible: FloatArray) -> No
     style.face(axes, s[0], style.START, fill=True)
     style.face(axes, data["s_star"][view], style.GOAL)
     style.image_axes(axes, f"{VIEWS[view]} camera, {data['name']}", visible)
-    border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * data["image_size"] - 0.5
-    axes.plot(*style.closed(border).T, **_EDGE)
+    axes.plot(*style.closed(image_border(data["image_size"][view])).T, **_EDGE)
 
 
 def _time(data: Data) -> tuple[FloatArray, str]:
@@ -263,7 +262,7 @@ def _legend(data: Data) -> dict[str, style.LineStyle]:
         "right camera": grey | {"linestyle": _SIDES[1]},
     }
     line_styles["asked for"] = grey | _ASKED
-    visible = np.concatenate([_visible(data, view) for view in range(2)]) / data["image_size"]
+    visible = np.concatenate([_visible(data, view) / data["image_size"][view] for view in range(2)])
     return line_styles | (
         {"border of the image": _EDGE} if (np.abs(visible - 0.5) > _NEAR_EDGE).any() else {}
     )

@@ -74,7 +74,7 @@ def _rendered(
         "sigma": plan.path_parameter,
         "mu": mu,
         "margin": margin,
-        "faces": project(middle_camera(P, report_data.plant.image_size)[None], points)[0],
+        "faces": project(middle_camera(P, report_data.plant.image_size.mean(axis=0))[None], points)[0],
         "profile": np.array(profile.replace("_", " ")),
     }
 
@@ -193,7 +193,7 @@ def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
     M = np.einsum("rij,pmj->mrpi", onto, plan.A @ np.swapaxes(within, 1, 2)).copy()
     moved = M @ plan.H_hat[0].T
     depth = np.sign(np.einsum("vc,mc->vm", P[:, 2], plan.A))[:, :, None, None]
-    wide, high = report_data.plant.image_size - 0.5
+    wide, high = (report_data.plant.image_size - 0.5).T[:, :, None, None, None]
     result = np.empty((2, len(mu), len(mu)))
     for i, share in enumerate(mu):
         there = (M + share * plan.tau * moved).reshape(-1, 4)

@@ -1,0 +1,157 @@
+"""Accuracy of an arrival: pixels by which images are off, or may be, carried to the face in millimetres."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.special import chdtri
+
+from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.metric.frame import invariant_upgrade
+from projservo_cli.monitoring.frame_pairs import FramePair
+from projservo_cli.monitoring.statistics import TOLD, ErrorModel, Residual, relative_to_others, rigid_motions
+from projservo_cli.records import MM, PRISMATIC, BoolArray, Calibration, FloatArray, InputError, Model
+
+# Variance of corners from a side that the calibration has not seen, over that of others; chance of a test.
+_UNUSUAL, _CHANCE = 2.0, 1e-4
+# Share of detections that may be off by themselves, and deviation of a pose that is not known, over noise.
+_ALONE, _FREE = 0.25, 1e4
+# Steps of Gauss and Newton towards a pose that is some degrees away.
+_STEPS = 4
+
+
+def metric_points(model: Model, M: FloatArray) -> FloatArray | None:
+    """Points (m, 3) of markers (m, 4) in the metric of the arm, up to scale; None if axes leave it open."""
+    try:
+        X = M @ invariant_upgrade(model.H_hat_0, model.joint_types == PRISMATIC).T
+    except (InputError, np.linalg.LinAlgError):
+        return None
+    return np.asarray(X[:, :3] / X[:, 3:])
+
+
+class Posture:
+    """A rigid tool at joints: how its motions change its images, and by how much they move its face.
+
+    model : of robot and rig; q : (n,) joint readings, rad or m.
+    face : (f, 4) its markers at the reference; lengths : (f, f) between them, m, NaN if unknown.
+    ``known``: whether one of these is.
+    """
+
+    def __init__(self, model: Model, q: FloatArray, face: FloatArray, lengths: FloatArray) -> None:
+        self._model, self._away = model, (q - model.q_reference)[None]
+        self._twists = rigid_motions(model.H_hat_0, np.linalg.svd(model.a_inf[None])[2][1:], model.a_inf)
+        has: BoolArray = np.isfinite(lengths) & (lengths > 0.0)
+        self.known = bool(has.any())
+        self._moves = MM / np.sqrt(len(face)) * self._moved(face, has, lengths) if self.known else None
+
+    def _moved(self, face: FloatArray, has: BoolArray, lengths: FloatArray) -> FloatArray:
+        """Displacements (d, f 3), m, of the face by motions of the tool.
+
+        Where the axes of the arm leave its metric open they are those across the lines of sight (d, 2 f 2),
+        by the pair of corners with the least foreshortening.
+        """
+        d, X = len(self._twists), metric_points(self._model, face)
+        if X is None:
+            J, s = self._changes(face)
+            span = np.linalg.norm(s[:, :, None] - s[:, None], axis=3)
+            m_per_px = 1.0 / np.max(span[:, has] / lengths[has], axis=1)
+            across: FloatArray = J * (np.sqrt(0.5) * m_per_px[:, None, None, None])
+            return np.moveaxis(across, -1, 0).reshape(d, -1)
+        apart = np.linalg.norm(X[:, None] - X[None], axis=2)
+        moved = [metric_points(self._model, face + face @ twist.T) for twist in self._twists]
+        return np.asarray(np.median(lengths[has] / apart[has]) * (np.array(moved) - X).reshape(d, -1))
+
+    def _changes(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Derivatives (2, m, 2, d) of pixels of markers (m, 4) by motions of the tool, and the pixels."""
+        model, prismatic = self._model, self._model.joint_types == PRISMATIC
+        images = Parameters(model.P, model.H_hat_0, prismatic, M, model.lens).everywhere(self._away)
+        return images.by_point[-1] @ np.moveaxis(M @ self._twists.swapaxes(1, 2), 0, -1), images.pixels
+
+    def carry(self, M: FloatArray, used: BoolArray) -> FloatArray:
+        """Matrix (k, 4 m) from changes of pixels, px, to displacements of the face, mm, whose norm is rms.
+
+        M : (m, 4) markers at the reference; used : (2, m) those by which the tool is measured.
+        """
+        assert self._moves is not None
+        J = np.where(used[..., None, None], self._changes(M)[0], 0.0).reshape(4 * len(M), -1)
+        return np.asarray(self._moves.T @ np.linalg.pinv(J))
+
+
+class RigidFit(NamedTuple):
+    """Images of one instant against the calibrated tool in any pose, whether joints reach it or not."""
+
+    agrees: bool  # whether chance explains what is left, and the shift
+    reached: bool  # whether it explains what is left where the joints show it best, too
+    rms_px: float  # residual of a coordinate
+    limit_px: float  # of it by chance, with the deviations of the images and of the calibration
+    seen: BoolArray  # (2, m) but for detections that are off by themselves
+    off_px: FloatArray  # (2, m) residual of each detection, px; 0 where unseen
+    shift: FloatArray  # (2,) by which the left image seems to be shifted against the right one, px
+    covariance: FloatArray  # (2, 2) of it
+    moved_px: float  # difference of the images from those at the joints, px rms a marker
+    turn: float  # angle between both, rad
+
+    def off_mm(self, posture: Posture, M: FloatArray) -> float:
+        """Return how far off the face may be, mm, where one of the images is shifted within chance."""
+        carry = posture.carry(M, self.seen)[:, : 2 * len(M)].reshape(-1, len(M), 2).sum(axis=1)
+        may = TOLD**2 * np.trace(carry @ self.covariance @ carry.T)
+        return float(np.sqrt(np.square(carry @ self.shift).sum() + may))
+
+
+def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma: FloatArray) -> RigidFit:
+    """Fit the pose of the tool to images, from joints (n,), rad or m.
+
+    images : (2, m, 2) px of the markers of the calibration, NaN where unseen; sigma : (2, m) deviations.
+    """
+    pair, n = still(q, images, np.maximum(sigma, calibration.sigma_px)), len(q)
+    errors, moved = ErrorModel(calibration, calibration.sigma_px), np.eye(4)
+    at = by_joints = errors.residual(pair)
+    for _ in range(_STEPS):
+        step = np.linalg.lstsq(at.F[:, errors.tool], at.r, rcond=None)[0]
+        moved = moved @ expm(np.tensordot(step, errors.twists, 1))
+        errors = ErrorModel(replace(calibration, M=calibration.M @ moved.T), calibration.sigma_px)
+        at = errors.residual(pair)
+    free, left = _free(at, at.F[:, errors.tool]), at.seen.ravel().copy()
+    for _ in range(int(_ALONE * left.sum())):
+        rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
+        square = relative_to_others(free[np.ix_(rows, rows)], at.r[rows])
+        if square.max() <= _UNUSUAL * chdtri(2, _CHANCE / left.sum()):
+            break
+        left[np.flatnonzero(left)[np.argmax(square)]] = False
+    rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
+    bias = 2.0 * float(np.square(errors.bias_px / at.noise).ravel()[left].sum())
+    freedom = np.maximum([2, len(rows) - len(errors.twists), len(rows) - n], 1)
+    limits = _UNUSUAL * chdtri(freedom, _CHANCE) + bias
+    P, r, r_joints = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows], by_joints.r[rows]
+    F = np.eye(2)[rows % 2] * (rows < len(at.r) // 2)[:, None]
+    covariance = np.linalg.inv(F.T @ P @ F)
+    shift = covariance @ F.T @ P @ r
+    joints = np.linalg.solve(_free(by_joints, by_joints.F[:, :n])[np.ix_(rows, rows)], r_joints)
+    over, rms = np.array([shift @ F.T @ P @ r, r @ P @ r, r_joints @ joints]) / limits, np.sqrt(np.mean(r**2))
+    return RigidFit(
+        agrees=bool(max(over[:2]) <= 1.0),
+        reached=bool(over[2] <= 1.0),
+        rms_px=float(rms),
+        limit_px=float(rms / np.sqrt(over[1])),
+        seen=left.reshape(at.seen.shape),
+        off_px=np.linalg.norm(at.r.reshape(2, -1, 2), axis=2),
+        shift=shift,
+        covariance=covariance,
+        moved_px=float(np.sqrt(2.0 * np.mean(r_joints**2))),
+        turn=float(np.arccos(np.clip(0.5 * np.trace(moved) - 1.0, -1.0, 1.0))),
+    )
+
+
+def _free(at: Residual, J: FloatArray) -> FloatArray:
+    """Covariance (4 m, 4 m) of residuals whose changes along J (4 m, k) are not known."""
+    S = at.R + at.B @ at.B.T
+    J = J * np.repeat(at.seen.ravel(), 2)[:, None]
+    J = J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    return np.asarray(S + _FREE * S.diagonal().max() * J @ J.T)
+
+
+def still(q: FloatArray, images: FloatArray, noise: FloatArray) -> FramePair:
+    """Observation of an arm that stands still at joints (n,), of pixels (2, m, 2) with deviations (2, m)."""
+    none = np.zeros(2)
+    return FramePair(none, np.stack([q, q]), np.zeros((2, len(q))), none, images, noise, np.zeros(len(q)))
