@@ -637,7 +637,7 @@ def _described(
 ) -> ModelError:
     """Record of a nuisance of amplitudes b (d,), in units of its usual size, with their covariance."""
     one, length = tests.nuisances[number], max(float(np.linalg.norm(b)), 1e-300)
-    sign = float(np.sign(b[0])) if len(b) == 1 else 1.0
+    sign = -1.0 if (len(b) == 1 or one.kind == "scale") and (b < 0.0).all() else 1.0
     deviation = float(np.sqrt(max(float(b @ covariance @ b), 0.0))) / length
     joints, view = tuple(i + 1 for i in one.joints), "" if one.view is None else VIEWS[one.view]
     size = _SIZES[one.kind]
@@ -706,7 +706,7 @@ def describe(error: ModelError, prismatic: BoolArray) -> tuple[str, str]:
         )
     size = f"{factor * abs(error.estimate):.2g}{unit}" + (f" ± {factor * spread:.1g}{unit}" if spread else "")
     several, names = len(error.joints) > 1, _names(error)
-    more = "more or less" if several else "less" if error.estimate < 0.0 else "more"
+    more = "less" if error.estimate < 0.0 else "more or less" if several else "more"
     turn = ("move" if slides else "turn") + "s" * (not several)
     words = {"joints": names, "view": error.view, "size": size, "share": size, "more": more, "turn": turn}
     words |= {"read": "they read" if several else "it reads"}
