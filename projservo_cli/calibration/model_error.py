@@ -14,7 +14,7 @@ Biometrika 73, 1986).
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -143,7 +143,8 @@ def _nuisances(problem: LeastSquares, params: Parameters, extent: _Extent) -> li
         columns = (images.by_point[last] @ motion) * detections.weight[..., None, None]
         found += [_Nuisance(kind, (), None, columns, timed) for timed in (_DRIFT, _STEP)]
     tag_of = detections.marker[detections.marker_of] // CORNERS
-    tags = np.unique(tag_of)
+    tags, corners = np.unique(detections.marker // CORNERS, return_counts=True)
+    tags = tags[corners == CORNERS]
     if 1 < tags.size <= _MAX_TAGS:
         for tag in tags.tolist():
             of_tag = columns * (tag_of == tag)[:, None, None]
@@ -328,29 +329,32 @@ class _Tests:
 
         for number, a, b in zip(plain, edges[:-1], edges[1:], strict=True):
             gram = stack[:, a:b].T @ stack[:, a:b] - W[:, a:b].T @ W[:, a:b]
-            judge(self._gain(gram, s[a:b]), _Choice(number, 0), 1)
-        for number, one in enumerate(self.nuisances):
-            if one.timed == _STEP and K > 2:
-                gains = self._step_gains(number)
-                onset = int(np.argmax(gains)) + 1
-                judge(gains[onset - 1], _Choice(number, onset), K)
+            judge(float(self._gain(gram, s[a:b])), _Choice(number, 0), 1)
+        for number, gains in self._step_gains() if K > 2 else ():
+            onset = int(np.argmax(gains)) + 1
+            judge(float(gains[onset - 1]), _Choice(number, onset), K)
         return sorted(found)
 
-    def _gain(self, gram: FloatArray, score: FloatArray) -> float:
-        """Squared residuals that cleared columns take away, by their Gram matrix (d, d) and scores (d,)."""
+    def _gain(self, gram: FloatArray, score: FloatArray) -> FloatArray:
+        """Squared residuals (…) that cleared columns take away, by Gram matrices and scores (…, d)."""
         values, basis = np.linalg.eigh(gram)
-        return float(((basis.T @ score) ** 2 / np.maximum(values, (self.sigma / _OPEN) ** 2 + 1e-18)).sum())
+        along = (basis.swapaxes(-1, -2) @ score[..., None])[..., 0]
+        return np.asarray((along**2 / np.maximum(values, (self.sigma / _OPEN) ** 2 + 1e-18)).sum(axis=-1))
 
-    def _step_gains(self, number: int) -> list[float]:
-        """Gains of steps at each pose from the second on."""
-        Z, first = self.Z[:, slice(*self.parts[number : number + 2])], self.edges[:-1]
-        s = np.add.reduceat(Z * self.r[:, None], first, axis=0)
-        A = np.add.reduceat(Z[:, :, None] * Z[:, None], first, axis=0)
-        basis = np.hstack([self.U, self.Q])
+    def _step_gains(self) -> Iterator[tuple[int, FloatArray]]:
+        """Number and gains (K - 1,) of each step, at each pose from the second on."""
+        steps = [number for number, one in enumerate(self.nuisances) if one.timed == _STEP]
+        Z = np.hstack([self.columns(_Choice(number, 0)) for number in steps])
+        first, basis = self.edges[:-1], np.hstack([self.U, self.Q])
         spans = list(zip(first, self.edges[1:], strict=True))
-        W = np.array([basis[a:b].T @ Z[a:b] for a, b in spans])
+        s = np.add.reduceat(Z * self.r[:, None], first, axis=0)
+        A, W = (np.array([part[a:b].T @ Z[a:b] for a, b in spans]) for part in (Z, basis))
         s, A, W = (np.cumsum(part[::-1], axis=0)[::-1][1:] for part in (s, A, W))
-        return [self._gain(*parts) for parts in zip(A - W.swapaxes(1, 2) @ W, s, strict=True)]
+        end = 0
+        for number in steps:
+            own = slice(end, end := end + len(self.units[number]))
+            gram = A[:, own, own] - W[:, :, own].swapaxes(1, 2) @ W[:, :, own]
+            yield number, self._gain(gram, s[:, own])
 
     def chance(self, choice: _Choice) -> float:
         """Probability of chance: the larger of the F test and of the Wald test by postures."""
