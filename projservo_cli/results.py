@@ -463,7 +463,7 @@ class RunTrace(Displayable, Trace):
         if self.position_error_mm is not None:
             found["position error"] = f"{self.position_error_mm:.4g} mm"
         elif self.estimated_position_error_mm is not None:
-            found["position error"] = f"about {self.estimated_position_error_mm:.3g} mm"
+            found["position error"] = f"within {self.estimated_position_error_mm:.3g} mm"
         if self.rotation_error_deg is not None:
             found["rotation error"] = f"{self.rotation_error_deg:.4g} deg"
         return found

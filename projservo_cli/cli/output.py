@@ -335,7 +335,7 @@ def _of_laws(value: dict[str, Any]) -> Iterator[str]:
     words, units = ("position", "rotation", "path deviation"), ("mm", "deg", "mm")
     if not known:
         keys = "image_error_px", "estimated_position_error_mm", ""
-        words, units = ("image", "about", ""), ("px", "mm", "")
+        words, units = ("image", "within", ""), ("px", "mm", "")
     errors = "true errors" if known else "image errors"
     yield f"servo: {errors} at the end, self-occluded steps left/right"
     first, second, last = words
