@@ -307,7 +307,7 @@ def test_without_a_truth_the_table_tells_errors_in_the_images(projservo, stages,
     head, words, columns, row = answer.out.splitlines()[:4]
     assert head == "servo: image errors at the end, self-occluded steps left/right"
     assert columns.split() == ["law", "verdict", "steps", "px", "mm", "occluded"]
-    assert words.split() == ["image", "about"]
+    assert words.split() == ["image", "within"]
     assert row.split() == ["exact", "converged", "3", "0.25", "0.5", "3/3"]
     told |= {"position_error_mm": 2.0, "estimated_position_error_mm": None}
     answer = projservo("servo", "-o", "out", "--law", "exact", "--force")
