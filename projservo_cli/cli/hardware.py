@@ -169,8 +169,10 @@ def preflight(
         pictures = [] if checked.seen is None else _pictures(settings, checked.seen)
         write_whole(output, page(settings.name, checked.findings, pictures))
     for told in checked.findings:
-        if stored is not None and told.where == CALIBRATION and told.level != WARNING:
-            save(replace(stored, refuted=told.text if told.level == FAULT else ""))
+        refuted = told.text if told.level == FAULT else ""
+        compared = told.where == CALIBRATION and told.level != WARNING
+        if stored is not None and compared and refuted != stored.refuted:
+            save(replace(stored, refuted=refuted))
     value = {
         "page": output.resolve(),
         "works": checked.works,
