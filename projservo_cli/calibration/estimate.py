@@ -25,7 +25,15 @@ from projservo_cli.calibration.diagnosis import (
     straight_joints,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
-from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, fit_joint_noise, solve
+from projservo_cli.calibration.fit import (
+    CHECK_READINGS,
+    REFUSE_RATIO,
+    Expected,
+    Misfit,
+    Solution,
+    fit_joint_noise,
+    solve,
+)
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
 from projservo_cli.calibration.model_error import ModelCheck, describe, stepped
@@ -300,8 +308,7 @@ def _refined(
             hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         elif not (hint := _deviation(solution, expected)):
             raise
-        what, _, _ = str(refused).partition("; check the joint readings, their units")
-        raise Misfit(f"{what}; {hint}") from None
+        raise Misfit(f"{str(refused).removesuffix(CHECK_READINGS)}; {hint}") from None
     lens = _lens_advice(record, share, frame.known)
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
     if kept.all():

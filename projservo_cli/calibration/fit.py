@@ -54,6 +54,8 @@ _POSE_TAIL = 1e-7
 _MIN_SHARE = 0.25
 # Noise over that of the rig after the robust search above which a start is wrong.
 _HOPELESS = 10.0
+# Remedy of a fit that is refused, where no deviation from the model explains it.
+CHECK_READINGS = "; check the joint readings, their units and types, and the marker numbers"
 # Minimum relative gain over ``_PATIENCE`` steps of a robust search whose result would be refused so far.
 _CRAWL = 0.01
 # Number of steps over which this gain is measured.
@@ -343,8 +345,7 @@ class Expected:
         if ratio > REFUSE_RATIO:
             return (
                 f"the fit does not describe the data: residuals of {solution.sigma_px:.3g} px a coordinate "
-                f"are {ratio:.3g} times the {self.sigma_px:.3g} px {self.origin}; check the "
-                "joint readings, their units and types, and the marker numbers"
+                f"are {ratio:.3g} times the {self.sigma_px:.3g} px {self.origin}" + CHECK_READINGS
             )
         return None
 
