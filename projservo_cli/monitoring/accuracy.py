@@ -151,6 +151,13 @@ def _free(at: Residual, J: FloatArray) -> FloatArray:
     return np.asarray(S + _FREE * S.diagonal().max() * J @ J.T)
 
 
+def mean_image(images: FloatArray) -> FloatArray:
+    """Mean (…, 2) of images (K, …, 2) of an arm that stands still; NaN where most show no marker."""
+    often, mean = 2 * np.isfinite(images).sum(axis=0) > len(images), np.full(images.shape[1:], np.nan)
+    mean[often] = np.nanmean(images[:, often], axis=0)
+    return mean
+
+
 def still(q: FloatArray, images: FloatArray, noise: FloatArray) -> FramePair:
     """Observation of an arm that stands still at joints (n,), of pixels (2, m, 2) with deviations (2, m)."""
     none = np.zeros(2)

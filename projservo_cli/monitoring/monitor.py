@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import predict
-from projservo_cli.monitoring.accuracy import Posture, still
+from projservo_cli.monitoring.accuracy import Posture, mean_image, still
 from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
@@ -201,10 +201,7 @@ class ImageMonitor:
         last = [one for one in last if np.abs(one.q - last[-1].q).max() <= _AT_REST]
         if not last or self.pending:
             return self.fault
-        images = np.array([one.images for one in last])
-        often = 2 * np.isfinite(images).sum(axis=0) > len(last)
-        mean = np.full(images.shape[1:], np.nan)
-        mean[often] = np.nanmean(images[:, often], axis=0)
+        mean = mean_image(np.array([one.images for one in last]))
         q, numbers = np.mean([one.q for one in last], axis=(0, 1)), self.calibration.marker
         return detected_fault(self.calibration, q, numbers, mean, self._image_size, self._sigma_px)
 

@@ -12,6 +12,7 @@ from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding, Seen, findings_at_rest
 from projservo_cli.hardware.wiggle import Strokes, findings_of, reach_of, strokes
 from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.monitoring.accuracy import mean_image
 from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
@@ -118,9 +119,8 @@ def _mean(readings: Sequence[Reading], view: int) -> tuple[FloatArray, FloatArra
     """Mean (m, 2) of the new frames of a view, NaN where most show no marker, and scatter (m,), px."""
     new = [readings[0], *(b for a, b in pairwise(readings) if b.new_views(a)[view])]
     s = np.array([look.s[view] for look in new])
-    often = 2 * np.isfinite(s[..., 0]).sum(axis=0) > len(s)
-    mean, scatter = np.full(s.shape[1:], np.nan), np.full(s.shape[1], np.nan)
-    mean[often] = np.nanmean(s[:, often], axis=0)
+    mean, scatter = mean_image(s), np.full(s.shape[1], np.nan)
+    often = np.isfinite(mean[:, 0])
     if len(s) > 2:
         scatter[often] = np.sqrt(np.nanvar(s[:, often], axis=0).mean(axis=1))
     return mean, scatter
