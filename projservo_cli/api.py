@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli import plugins
 from projservo_cli.canonical import File
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
 from projservo_cli.config.inputs import (
@@ -36,14 +37,13 @@ from projservo_cli.laws import CODES, REGULATE, law_and_mode, name_of, names_of
 from projservo_cli.observations import Observations, require_observations, rows_of
 from projservo_cli.records import Calibration, InputError, JointList, Plan
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
-from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress
 from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages.external_robot import plugin_robot
-from projservo_cli.stages.given import Estimation, Trials
+from projservo_cli.stages.inputs import Estimation, Trials
 from projservo_cli.store import load as stored_run
 from projservo_cli.store import run_path
 from projservo_cli.store.sweep_table import TABLE, SweepTable
@@ -328,9 +328,9 @@ def servo(
         name, of_name = law_and_mode(law)
         if mode not in (None, of_name) and of_name != REGULATE:
             raise InputError(f"servo: law {law} is {name} in mode {of_name}, not {mode!r}: leave mode out")
-        given, name = driving.Given(None, robot, blind), law_target(name)
+        factory, name = None, law_target(name)
     else:
-        given, name, of_name = driving.Given(law, robot, blind), plugins.name_of(law), REGULATE
+        factory, name, of_name = law, plugins.name_of(law), REGULATE
     if isinstance(plan, MotionPlan):
         config = _with_task(config, calibration.joint_types, *plan.asked)
     asked = config.replace({"control.mode": [of_name if mode is None else mode]})
@@ -338,7 +338,8 @@ def servo(
     if robot is not None:
         asked = _with_robot(asked, robot)
     _say_compilation()
-    trace = driving.run(servo_inputs(asked), calibration, plan, name, given)
+    brought = {"factory": factory, "robot": robot, "blind": blind}
+    trace = driving.run(servo_inputs(asked), calibration, plan, name, **brought)
     return RunTrace.of(trace, asked.face_numbers)
 
 

@@ -67,10 +67,11 @@ def files_in(record: Any) -> list[File]:
 
 
 def _fields(record: Any) -> dict[str, Any]:
-    """Values of a dataclass or a named tuple by their names; none of other values."""
+    """Values of a dataclass, a named tuple or a section by their names; none of other values."""
     if dataclasses.is_dataclass(record):
         return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
-    return {name: getattr(record, name) for name in getattr(record, "_fields", ())}
+    names = getattr(record, "_fields", ()) or getattr(type(record), "model_fields", ())
+    return {name: getattr(record, name) for name in names}
 
 
 def _plain(value: Any) -> Any:

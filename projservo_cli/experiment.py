@@ -12,8 +12,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from projservo_cli import plugins
 from projservo_cli.config import Config, load_config, shipped, stored_yaml
-from projservo_cli.config.inputs import joints_of, trajectory_of
+from projservo_cli.config.inputs import joints_of
 from projservo_cli.display import Printed
 from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
@@ -22,9 +23,8 @@ from projservo_cli.laws import CODES, law_and_mode, mode_in
 from projservo_cli.progress import Bar
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Report, WorkFailed
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
-from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.given import PlanInputs
+from projservo_cli.stages.inputs import PlanInputs
 from projservo_cli.steps import STAGES, Step, given_to, result_of, steps_for
 from projservo_cli.store import SERVO, Result, Run, load, run_path, save
 
@@ -226,9 +226,8 @@ class Chain:
         if step.stage == "servo":
             from projservo_cli.stages import servo
 
-            asked = [servo.Given(blind=True)] if self.blind else []
             bounded = replace(given, plan=_bounded(given.plan, run))
-            return (servo.run(bounded, run.calibration, run.plan, step.law, *asked),)
+            return (servo.run(bounded, run.calibration, run.plan, step.law, blind=self.blind),)
         from projservo_cli.stages import report
 
         return (report.run(given, self.reported(run), run.path.parent, progress=progress),)
@@ -452,7 +451,7 @@ def scene_of(config: Config, calibration: Calibration) -> Scene:
         calibration.model(),
         joints.limits,
         None if size is None else image_sizes(size),
-        trajectory_of(config),
+        config.trajectory,
     )
 
 

@@ -1,47 +1,19 @@
 """File of a nominal robot, rig and markers, as an initial guess of a calibration."""
 
 import json
-import math
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from projservo_cli.files import text_of
 from projservo_cli.records import FloatArray, InputError
+from projservo_cli.settings.sections import Matrix34, Matrix44, Vector3, not_a_screw, not_rigid
 
-Number = Annotated[float, Strict()]
-Vector3 = tuple[Number, Number, Number]
-Vector4 = tuple[Number, Number, Number, Number]
-Matrix34 = tuple[Vector4, Vector4, Vector4]
-Matrix44 = tuple[Vector4, Vector4, Vector4, Vector4]
 _MAX_BYTES = 10_000_000  # of the file
-_TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
-
-
-def not_rigid(T: Matrix44) -> str:
-    """Return the reason why a matrix is no pose; empty if it is one."""
-    R = np.array(T)[:3, :3]
-    if T[3] != (0, 0, 0, 1):
-        return "the last row must be [0, 0, 0, 1]"
-    if abs(R).max() > 2 or abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
-        return "the upper left 3×3 block must be a rotation, written with seven digits or more"
-    return ""
-
-
-def not_a_screw(kind: str, w: Vector3, v: Vector3) -> Iterator[tuple[str, str]]:
-    """Yield the reasons why w and v are no screw of a joint, R or P: which of both, and why."""
-    axis = "w" if kind == "R" else "v"
-    length = math.hypot(*(w if kind == "R" else v))
-    if abs(length - 1) > _TOLERANCE:
-        yield axis, f"must be of unit length for a joint of type {kind}, it is {length:g}"
-    if kind == "P" and math.hypot(*w) > _TOLERANCE:
-        yield "w", "must be zero for a joint of type P"
-    if kind == "R" and abs(np.dot(w, v)) > _TOLERANCE:
-        yield "v", "must be orthogonal to w: a revolute joint has no pitch"
 
 
 class _Screw(BaseModel):

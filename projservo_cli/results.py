@@ -31,8 +31,8 @@ from projservo_cli.records import (
     Plan,
     Trace,
 )
+from projservo_cli.settings.task import Trajectory
 from projservo_cli.simulation.urdf import UrdfChain, urdf_chain
-from projservo_cli.task.trajectory import Trajectory
 
 _AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
 _MAX_BYTES = 10_000_000  # maximum size of a URDF

@@ -8,8 +8,8 @@ from typing import Any
 from projservo_cli.config import inputs as given
 from projservo_cli.config import load_config
 from projservo_cli.report import page
-from projservo_cli.robots.settings import Readings
-from projservo_cli.simulation import faults
+from projservo_cli.settings.sections import JointVector
+from projservo_cli.simulation import faults, streams, workspace
 from projservo_cli.simulation.cameras import Frames
 from projservo_cli.simulation.scene import rendered_model
 from projservo_cli.stages import calibrate as calibrating
@@ -20,7 +20,7 @@ from projservo_cli.stages import report as reporting
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages import teach as teaching
 
-arm_of, truth_of = given.arm_of, given.truth_of
+truth_of = given.truth_of
 
 
 class _Stage:
@@ -43,7 +43,7 @@ def trial_motions(config):
 
 def simulate(config, truth, q=None, drawn=None):
     q = trial_motions(config) if q is None else q
-    drawn = drawn or (trials_of(config).motions.seed, scenario.CALIBRATION_NOISE)
+    drawn = drawn or (trials_of(config).motions.seed, streams.CALIBRATION_NOISE)
     return recording.simulate(truth, q, config.noise.calibration_px, drawn)
 
 
@@ -73,7 +73,7 @@ def trajectory_of(**asked):
     """A motion that is asked for, else as by default."""
     values = [f"trajectory.{key}={json.dumps(x)}" for key, x in asked.items()]
     values += ["control.mode=track"] if asked.get("keep_out") else []
-    return given.trajectory_of(load_config(None, values, text="data: {table: none}"))
+    return load_config(None, values, text="data: {table: none}").trajectory
 
 
 def joints_of(config, types="", calibration=None):
@@ -110,7 +110,7 @@ def eyes_of(config):
 
 
 def plant_of(config, truth, q):
-    return scenario.plant_of(truth, q, opaque=config.plant.self_occlusion == "opaque")
+    return workspace.plant_of(truth, q, opaque=config.plant.self_occlusion == "opaque")
 
 
 def checked(config, calibration, taught):
@@ -118,7 +118,7 @@ def checked(config, calibration, taught):
 
 
 def teach(config, frames, at=None, *more):
-    readings = None if at is None else Readings(tuple(at), "rad")
+    readings = None if at is None else JointVector.model_construct(joints=tuple(at), unit="rad")
     return teaching.teach(given.teach_inputs(config), frames, readings, *more)
 
 

@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
@@ -63,7 +63,7 @@ def _teach(
     from projservo_cli.config.inputs import plan_inputs, teach_inputs
     from projservo_cli.files import write_whole
     from projservo_cli.records import InputError, WorkFailed
-    from projservo_cli.robots.settings import Readings
+    from projservo_cli.settings.sections import JointVector
     from projservo_cli.stages import teach as stage
 
     output = output or Path("start.yaml" if start else "goal.yaml")
@@ -72,9 +72,12 @@ def _teach(
     put = None
     if at is not None:
         try:
-            put = Readings(tuple(float(value) for value in at.split(",")), at_unit)
+            joints = tuple(float(value) for value in at.split(","))
+
         except ValueError as error:
             raise InputError(f"--at {at}: expected a number for each joint, with commas") from error
+        unit: Literal["deg", "rad"] = "deg" if at_unit == "deg" else "rad"
+        put = JointVector.model_construct(joints=joints, unit=unit)  # checked against the robot
     calibrated = option.calibrated_run(run, settings)
     calibration = None if calibrated is None else calibrated.calibration
     asks = not settings.plant.simulated and sys.stdin.isatty()

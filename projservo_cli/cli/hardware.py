@@ -74,10 +74,10 @@ def _tags(
     """
     import numpy as np
 
-    from projservo_cli.config.markers import GROUND, Markers
     from projservo_cli.detection import TagFinder
     from projservo_cli.files import write_whole
     from projservo_cli.hardware import tags as sheets
+    from projservo_cli.settings.markers import GROUND, Markers
 
     if numbers is not None and kind != "single":
         raise click.UsageError(

@@ -111,10 +111,10 @@ def _servos(console: Console, config: str, text: str, *, whole: bool = True) -> 
 
     whole : whether all servos must answer.
     """
+    from projservo_cli import plugins
     from projservo_cli.config.editing import plant_of
     from projservo_cli.hardware.so101 import SO101, connected, torque_reported
     from projservo_cli.records import InputError
-    from projservo_cli.robots import plugins
 
     use, options = plant_of(text, config)
     if (name := plugins.short_name(use)) != "so101":

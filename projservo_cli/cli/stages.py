@@ -396,8 +396,8 @@ def _require_named(chain: Any, options: Mapping[str, Any]) -> None:
     A run file may come from anybody: its contents are shown and compared, never imported. Classes
     that are named are imported, so that what cannot be found is known before any work.
     """
+    from projservo_cli import plugins
     from projservo_cli.config import Override
-    from projservo_cli.robots import plugins
 
     if moving := chain.moves_unasked():
         raise click.UsageError(

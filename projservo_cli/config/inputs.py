@@ -8,71 +8,49 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from projservo_cli.canonical import File
 from projservo_cli.config.loading import Config, stored_yaml
-from projservo_cli.config.markers import Markers
-from projservo_cli.config.models import Disturbance, RenderedOptions
-from projservo_cli.config.robot import Camera, JointVector, Rig, RobotSettings
-from projservo_cli.config.task import Goal as GoalSettings
-from projservo_cli.control.law import UNLIMITED, Gains
-from projservo_cli.detection import DICTIONARY
+from projservo_cli.control.law import Gains
 from projservo_cli.display import About
-from projservo_cli.records import (
-    CORNERS,
-    NO_LENS,
-    PRISMATIC,
-    REVOLUTE,
-    FloatArray,
-    InputError,
-    position_limits,
+from projservo_cli.records import CORNERS, InputError
+from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
+from projservo_cli.settings.disturbance import Disturbance, Events, Faults
+from projservo_cli.simulation.described import (
+    arm_of,
+    cameras_of,
+    center_in_face,
+    described_scene,
+    described_truth,
 )
-from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings, SpeedLimits
-from projservo_cli.simulation import dh
-from projservo_cli.simulation.arm import Arm, twist
-from projservo_cli.simulation.faults import (
-    CameraMoved,
-    Events,
-    Faults,
-    JointMoved,
-    LostMarkers,
-    MarkerMoved,
-    SimulatedRobot,
-    StuckEncoder,
-)
+from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.mjcf import files_named
-from projservo_cli.simulation.scene import Scene, Tag, lens_of
-from projservo_cli.simulation.workspace import Truth, Turn, look_at, metric_camera
-from projservo_cli.stages.given import (
+from projservo_cli.simulation.scene import Scene
+from projservo_cli.simulation.workspace import Truth
+from projservo_cli.stages.inputs import (
     CalibrationInputs,
     Contract,
     Driven,
     Estimation,
-    Goal,
-    GoalImages,
     KnownLengths,
     Motions,
+    OwnRobot,
     PlanInputs,
     PreflightInputs,
-    ReachingTask,
     RecordingInputs,
     ReportInputs,
     Scenery,
     ServoInputs,
-    StopSettings,
     SuggestionInputs,
     Table,
     TeachInputs,
     Trials,
 )
 from projservo_cli.store.tables import identity_in
-from projservo_cli.task.face import MIDPOINT
-from projservo_cli.task.trajectory import KeptOut, Trajectory
 
 _RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
 _TICKS = 4096  # in a turn of an encoder that is as coarse as any
@@ -83,7 +61,6 @@ _EXPECTED = {
     "init": "JSON with screws, cameras and markers",
     "mjcf": "a model of MuJoCo",
 }
-_Record = TypeVar("_Record", bound=tuple[Any, ...])
 Files = Mapping[str, File]  # by their roles; read from disk if not given
 
 
@@ -194,14 +171,14 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
     simulated = config.plant.simulated and not predicted
     known = markers.known if markers.tags is not None else ()
     return PlanInputs(
-        task=task_of(config),
+        task=config.task,
         seed=config.seed,
         truth=truth_of(config) if simulated else None,
-        arm=arm_of(config),
+        arm=None if config.arm is None else arm_of(config.arm),
         P=None if config.rig is None else cameras_of(config.rig),
         scene=scene_of(config, files) if simulated else None,
         face=face,
-        center=_center(markers),
+        center=center_in_face(markers),
         known=markers.known,
         tags=tuple(known[i : i + CORNERS] for i in range(0, len(known or ()), CORNERS)) if known else (),
         joints=joints_of(config),
@@ -210,28 +187,33 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         averaged_frames=config.noise.averaged_frames,
         features=config.control.features,
         tests_images=config.stop.innovation_threshold > 0.0,
-        trajectory=trajectory_of(config),
+        trajectory=config.trajectory,
     )
 
 
 def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
     """Return the inputs of the run of a law."""
-    plan, control, stop, plant = plan_inputs(config, files), config.control, config.stop, config.plant
+    plan, control, plant = plan_inputs(config, files), config.control, config.plant
     assert config.markers is not None
     # A robot that is not simulated is never driven beyond a limit.
     at_limit = not plant.simulated or plant.joint_limits == "stop"
     return ServoInputs(
         plan=plan,
-        gains=_taken(
-            Gains,
-            control,
+        gains=Gains(
+            gain_t=control.gain_t,
+            gain_r=control.gain_r,
+            gain_p=control.gain_p,
+            gain_s=control.gain_s,
+            ratio_rp=control.ratio_rp,
+            gain=control.gain,
             period=control.period_s,
             visibility_fraction=plan.trajectory.visibility_fraction,
-            limits=UNLIMITED,
             substeps=control.substeps == "auto",
             scale=plant.speed_scale,
         ),
-        stop=_taken(StopSettings, stop, at_joint_limit=at_limit, at_border=plant.image_border == "stop"),
+        stop=config.stop,
+        at_joint_limit=at_limit,
+        at_border=plant.image_border == "stop",
         opaque=plant.self_occlusion == "opaque",
         speed_scale=plant.speed_scale,
         max_replan_attempts=control.max_replan_attempts,
@@ -254,13 +236,13 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
     settle_s = plant.settle_s if plan.truth is None else None
     table = config.data.table if config.data is not None and plan.truth is None else ""
     identity = identity_in(table) if table and Path(table).is_file() else ""
-    return Contract(driven, events_of(config), plant.timeout_s, delay, settle_s, identity)
+    return Contract(driven, config.disturbance.part(Events), plant.timeout_s, delay, settle_s, identity)
 
 
 def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
     """Return the inputs of a report: the whole configuration, which its page prints, and the extra runs."""
     files = files_of(config) if files is None else files
-    about, trajectory = about_of(config, files.values()), trajectory_of(config)
+    about, trajectory = about_of(config, files.values()), config.trajectory
     formats, lengths = config.report.formats, _known_lengths(config)
     if not config.has_task:
         return ReportInputs(about, formats, None, trajectory, lengths)
@@ -361,75 +343,7 @@ def _truth(config: Config, *, face: bool) -> Truth:
     rendered = config.plant.rendered
     k1 = 0.0 if rendered is None else rendered.k1
     markers = config.markers if face else config.markers.model_copy(update={"center": "midpoint"})
-    return _made_truth(config.arm, config.rig, markers, k1, face)
-
-
-@lru_cache(maxsize=32)
-def _made_truth(described: RobotSettings, rig: Rig, markers: Markers, k1: float, face: bool) -> Truth:
-    robot, P, numbers = _arm(described), cameras_of(rig), markers.known
-    assert numbers is not None
-    points = np.c_[markers.points, np.ones(len(numbers))]
-    return Truth(
-        robot=robot,
-        P=P,
-        M=points @ robot.base_tool.T,
-        number=numbers,
-        face=tuple(numbers.index(number) for number in markers.front or ()) if face else (),
-        center=_center(markers),
-        image_size=np.array(rig.image_size_px, dtype=np.float64),
-        lens=lens_of(P, k1) if k1 else NO_LENS,
-        normals=np.zeros(3) if markers.normals is None else markers.normals @ robot.base_tool[:3, :3].T,
-    )
-
-
-def arm_of(config: Config) -> Arm | None:
-    """The arm of a configuration; None where its kinematics are not given."""
-    return None if config.arm is None else _arm(config.arm)
-
-
-@lru_cache(maxsize=32)
-def _arm(described: RobotSettings) -> Arm:
-    """Arm of screws, or of a Denavit–Hartenberg table, whose reference is all joints zero."""
-    kinds = described.joint_types
-    types = np.array([PRISMATIC if kind == "P" else REVOLUTE for kind in kinds], dtype=np.int64)
-    limits = position_limits(*np.array(described.ranges, dtype=np.float64).T.copy())
-    if described.screws is not None:
-        screws = described.screws
-        twists = np.array([twist(joint.w, joint.v) for joint in screws.joints])
-        q_reference = np.array(screws.reference.values(kinds))
-        return Arm(twists, types, q_reference, np.array(screws.base_tool), limits)
-    assert described.dh is not None
-    table = described.dh
-    links = [
-        dh.Link(row.type, math.radians(row.theta_deg), row.d_m, row.a_m, math.radians(row.alpha_deg))
-        for row in table.joints
-    ]
-    twists, base_tool = dh.screws_of(links, np.array(table.tool), modified=table.convention == "modified")
-    return Arm(twists, types, np.zeros(len(kinds)), base_tool, limits)
-
-
-@lru_cache(maxsize=32)
-def cameras_of(rig: Rig) -> FloatArray:
-    """Cameras (2, 3, 4) of a rig, to px."""
-    return np.array([_camera(rig.left), _camera(rig.right)])
-
-
-def _camera(camera: Camera) -> FloatArray:
-    if camera.matrix is not None:
-        return metric_camera(np.array(camera.matrix))
-    assert camera.focal_px is not None
-    assert camera.principal_point_px is not None
-    assert camera.position_m is not None
-    assert camera.target_m is not None
-    (f_u, f_v), (u, v) = camera.focal_px, camera.principal_point_px
-    K = np.array([[f_u, 0.0, u], [0.0, f_v, v], [0.0, 0.0, 1.0]])
-    return look_at(K, camera.position_m, camera.target_m, camera.up)
-
-
-def _center(markers: Markers) -> int:
-    """Position of the centre marker within the face, or ``MIDPOINT``."""
-    midpoint = markers.center == "midpoint" or not markers.front
-    return MIDPOINT if midpoint else (markers.front or ()).index(int(markers.center))
+    return described_truth(config.arm, config.rig, markers, k1, face)
 
 
 def scene_of(config: Config, files: Files | None = None) -> Scene | None:
@@ -440,29 +354,7 @@ def scene_of(config: Config, files: Files | None = None) -> Scene | None:
     assert config.arm is not None
     assert config.rig is not None
     assert config.markers is not None
-    return _scene(config.arm, config.rig, config.markers, options, _file(config, "mjcf", files))
-
-
-@lru_cache(maxsize=8)
-def _scene(
-    robot: RobotSettings, rig: Rig, markers: Markers, options: RenderedOptions, mjcf: File | None
-) -> Scene:
-    assert markers.known is not None
-    return Scene(
-        arm=_arm(robot),
-        P=cameras_of(rig),
-        size=rig.image_size_px,
-        tags=tuple(Tag(tag.number, tag.size_m, tag.pose) for tag in markers.all_tags),
-        numbers=markers.known,
-        dictionary=markers.dictionary or DICTIONARY,
-        mjcf=mjcf,
-        tip=robot.tip or "",
-        servo=options.servo,
-        grey_noise=options.grey_noise,
-        blur_px=options.blur_px,
-        k1=options.k1,
-        light=options.light,
-    )
+    return described_scene(config.arm, config.rig, config.markers, options, _file(config, "mjcf", files))
 
 
 # What drives.
@@ -491,10 +383,6 @@ def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
     )
 
 
-def _readings(vector: JointVector | None) -> Readings | None:
-    return None if vector is None else Readings(vector.joints, vector.unit)
-
-
 def _following(config: Config, speed_scale: float) -> Following:
     """Return the settings of commands to a robot of the contract."""
     plant = config.plant
@@ -516,49 +404,17 @@ def _own(config: Config) -> OwnRobot:
     plant, markers = config.plant, config.markers
     dictionary = markers.dictionary if markers is not None else None
     size, options = config.image_size_px, dict(plant.options)
-    cameras = None if config.cameras is None else config.cameras.settings
-    return OwnRobot(plant.use or "", options, dictionary, plant.timeout_s, plant.open_s, size, cameras)
+    return OwnRobot(plant.use or "", options, dictionary, plant.timeout_s, plant.open_s, size, config.cameras)
 
 
 def _simulated(config: Config, truth: Truth, files: Files | None) -> SimulatedRobot:
     """Return the simulated robot with time and faults."""
-    return SimulatedRobot(truth, faults_of(config), scene_of(config, files), config.control.period_s)
-
-
-def faults_of(config: Config) -> Faults:
-    """Return the permanent faults of the simulated robot."""
-    given = config.disturbance
-    return _taken(
-        Faults,
-        given,
-        camera_latency_s=(given.camera_latency_s.left, given.camera_latency_s.right),
-        gravity_sag=math.radians(given.gravity_sag_deg),
-        link_deflection=math.radians(given.link_deflection_deg),
-        backlash=math.radians(given.backlash_deg),
+    return SimulatedRobot(
+        truth, config.disturbance.part(Faults), scene_of(config, files), config.control.period_s
     )
 
 
-def events_of(config: Config) -> Events:
-    """Return the events of the simulated robot in a run."""
-    given, found = config.disturbance, dict[str, Any]()
-    if given.lost_markers is not None:
-        found["lost_markers"] = _taken(LostMarkers, given.lost_markers)
-    if (moved := given.joint_moved) is not None:
-        by = moved.by_m or 0.0 if moved.by_deg is None else math.radians(moved.by_deg)
-        found["joint_moved"] = JointMoved(moved.at_step, moved.joint - 1, by, moved.encoder_slip)
-    if given.stuck_encoder is not None:
-        found["stuck_encoder"] = _taken(
-            StuckEncoder, given.stuck_encoder, joint=given.stuck_encoder.joint - 1
-        )
-    if given.camera_moved is not None:
-        left, right = given.camera_moved.by_view()
-        found["camera_moved"] = CameraMoved(given.camera_moved.at_step, (left, right))
-    if given.marker_moved is not None:
-        found["marker_moved"] = _taken(MarkerMoved, given.marker_moved, by=given.marker_moved.by_m)
-    return Events(**found)
-
-
-# Trials, task and trajectory.
+# Trials.
 
 
 def _seed(config: Config) -> int:
@@ -575,11 +431,10 @@ def _trials(
     speed_scale: float,
 ) -> Trials:
     """Trial motions and the robot that is driven through them: somebody's, else the simulated one."""
-    settings, vector = config.calibration, config.reference
-    robot: SimulatedRobot | OwnRobot | None = own
-    if vector is None:
+    settings, reference = config.calibration, config.reference
+    if reference is None:
         raise InputError("trial motions need a reference: set calibration.reference or task.start")
-    faults, scene = faults_of(config), scene_of(config, files) if own is None else None
+    faults, scene = config.disturbance.part(Faults), scene_of(config, files) if own is None else None
     driven = own is not None or scene is not None or faults != Faults()
     # The closed form assumes that joints without a command stand still.
     faultless = not driven or settings.method == "closed_form"
@@ -587,76 +442,23 @@ def _trials(
     if poses is None:
         poses = 0 if faultless else _RANDOM_POSES
     motions = Motions(
-        Readings(vector.joints, vector.unit),
+        reference,
         (float(np.radians(settings.amplitude_deg)), settings.amplitude_m),
         settings.frames_per_joint,
         poses,
         0.0 if faultless else 2.0 * math.pi / (config.disturbance.encoder_counts_per_turn or _TICKS),
         _seed(config),
     )
-    noise, joints = config.noise.calibration_px, joints_of(config, paced=driven)
-    if not driven:
-        return Trials(
-            motions=motions,
-            joints=joints,
-            truth=truth,
-            driven=None,
-            noise_px=noise,
-            averaged_frames=1,
-            settle_s=0.0,
-        )
-    if robot is None:
+    robot: SimulatedRobot | OwnRobot | None = own
+    if driven and robot is None:
         assert truth is not None
         robot = SimulatedRobot(truth, faults, scene, config.control.period_s)
-    how = Driven(robot, _following(config, speed_scale), _endless(config))
-    plant = config.plant
     return Trials(
         motions=motions,
-        joints=joints,
+        joints=joints_of(config, paced=driven),
         truth=truth,
-        driven=how,
-        noise_px=noise,
-        averaged_frames=plant.averaged_frames,
-        settle_s=plant.settle_s,
+        driven=None if robot is None else Driven(robot, _following(config, speed_scale), _endless(config)),
+        noise_px=config.noise.calibration_px,
+        averaged_frames=config.plant.averaged_frames if driven else 1,
+        settle_s=config.plant.settle_s if driven else 0.0,
     )
-
-
-def task_of(config: Config) -> ReachingTask | None:
-    """The task; None where there is none."""
-    task = config.task
-    if task is None:
-        return None
-    start = Readings(task.start.joints, task.start.unit)
-    return ReachingTask(start, _readings(task.start_offset), _goal(task.goal, config))
-
-
-def _goal(goal: GoalSettings, config: Config) -> Goal:
-    turn = images = None
-    if goal.roll_deg is not None:
-        near = goal.perturbation
-        displacement = None if near is None else (near.translation_m, near.rotation_rad)
-        turn = Turn(math.radians(goal.roll_deg), displacement)
-    if (seen := goal.images) is not None:
-        numbers = seen.markers or config.face_numbers
-        sigma = seen.sigma_left_px, seen.sigma_right_px
-        images = GoalImages(numbers, seen.left, seen.right, *sigma, _readings(seen.joints))
-    return Goal(_readings(goal.joints), turn, images)
-
-
-def trajectory_of(config: Config) -> Trajectory:
-    """Return the requested motion."""
-    given = config.trajectory
-    return _taken(
-        Trajectory,
-        given,
-        joint_margin=math.radians(given.joint_margin_deg),
-        max_search_samples=given.search.max_samples,
-        search_seed=given.search.seed,
-        keep_out=tuple(KeptOut(region.left, region.right, region.occludes) for region in given.keep_out),
-    )
-
-
-def _taken(record: type[_Record], section: Any, **others: Any) -> _Record:
-    """A record of the values of a section that have its names, and of others."""
-    names: tuple[str, ...] = record._fields  # type: ignore[attr-defined]
-    return record(**{name: getattr(section, name) for name in names if name not in others} | others)

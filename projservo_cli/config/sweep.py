@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from projservo_cli.config.models import FolderName, Plain, one_or_more
-from projservo_cli.config.robot import Count, Finding, Positive, Root, Section, Whole
-from projservo_cli.nominal import Number
+from projservo_cli.config.models import FolderName
+from projservo_cli.settings.control import Plain, one_or_more
+from projservo_cli.settings.sections import Count, Finding, Number, Positive, Root, Section, Whole
 
 BASE, LAW = "base", "law"  # names of axes with a special meaning
 

@@ -11,7 +11,7 @@ import numpy as np
 from projservo_cli.detection import Corners, TagFinder
 from projservo_cli.hardware.cameras import Camera, Frame
 from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray, WorkFailed
-from projservo_cli.robots.settings import StereoSettings
+from projservo_cli.settings.cameras import Cameras
 
 # Mean grey value, of 255, below which an image is dark, and share of clipped pixels that is too much.
 _DARK, _CLIPPED_SHARE = 20.0, 0.2
@@ -63,7 +63,7 @@ class CameraRobot:
     ``views`` are those of the last reading, None before.
     """
 
-    def __init__(self, arm: Arm, stereo: StereoSettings, finder: TagFinder, numbers: Sequence[int]) -> None:
+    def __init__(self, arm: Arm, stereo: Cameras, finder: TagFinder, numbers: Sequence[int]) -> None:
         self.arm, self.finder, self._numbers = arm, finder, np.array(numbers, dtype=np.int64)
         for name in ("now", "truth", "release", "hold", "health", "identity"):
             if callable(found := getattr(arm, name, None)):

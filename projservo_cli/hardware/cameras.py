@@ -20,7 +20,7 @@ import numpy as np
 
 from projservo_cli.detection import opencv, unfit
 from projservo_cli.records import ByteArray, InputError, WorkFailed
-from projservo_cli.robots.settings import CameraSettings, device_of
+from projservo_cli.settings.cameras import Source, device_of
 
 
 class Frame(NamedTuple):
@@ -63,7 +63,7 @@ class Camera:
     def __init__(
         self,
         name: str,
-        settings: CameraSettings,
+        settings: Source,
         max_age_s: float,
         reconnect_s: float,
         now: Callable[[], float] = time.monotonic,
@@ -249,7 +249,7 @@ def _cv() -> Any:
     return cv
 
 
-def _set_up(capture: Any, settings: CameraSettings) -> Iterator[str]:
+def _set_up(capture: Any, settings: Source) -> Iterator[str]:
     """Set format, size, rate, exposure and focus of a device; return what it did not take, in words."""
     cv = _cv()
     capture.set(cv.CAP_PROP_FOURCC, cv.VideoWriter.fourcc(*settings.fourcc))

@@ -13,147 +13,25 @@ from projservo_cli.control.law import (
     Law,
     State,
     make_split,
-    measure,
     new_state,
     reset,
 )
-from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.jit import composed, merged, njit
-from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.lens import undistort_into
-from projservo_cli.geometry.mechanisms import OWN, Span, make_span
-from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import Ended, Summary, summarize
-from projservo_cli.loop.step import CONVERGED, RUNNING, Limits, Log, new_log
-from projservo_cli.records import FloatArray, JointLimits, Model
-from projservo_cli.simulation.ideal import Ends, Plant
-from projservo_cli.task.body import NO_BODY, Body
+from projservo_cli.loop.rehearsal import Rehearsal, first_parts, is_half_turn
+from projservo_cli.loop.step import RUNNING, Log, new_log
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.simulation.ideal import Ends
+from projservo_cli.task.body import Body
 from projservo_cli.task.face import (
     FOUND,
-    MIDPOINT,
-    NOT_MEASURED,
-    NOT_UNIQUE,
     Task,
-    center_of,
     new_task,
-    require_found,
     task_into,
 )
-from projservo_cli.task.partition import NO_PARTS, Parts, partition
 from projservo_cli.task.target import body_task_into
-
-# Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
-_HALF_TURN_BAND = math.radians(2.0)
-_REHEARSAL_STEPS = 300
-_REHEARSAL_PX = 1.0
-_REHEARSAL_STEP = math.radians(5.0)
-_REHEARSAL = Gains(
-    gain_t=0.1,
-    gain_r=0.1,
-    gain_p=0.1,
-    gain_s=0.1,
-    ratio_rp=1.0,
-    gain=0.1,
-    period=1.0,
-    visibility_fraction=0.9,
-)
-_DIRECT_TWO = CODES["direct_two"]
-
-
-class _Rehearsal:
-    """Both senses of a half turn, tried on a robot that is as the model says, without noise.
-
-    Either sense reaches the goal, but they take the joints elsewhere. Both are rehearsed at a tenth of the
-    error and at most 5° a step; the sense that arrives without passing a joint limit is taken, between equals
-    the one that arrives in fewer steps.
-
-    model : calibrated; q_start : (n,) first joints, rad or m; m : markers of the face; bounds : of
-        the joints; span : of an arm of n ≠ 6 joints.
-    """
-
-    def __init__(
-        self, model: Model, q_start: FloatArray, m: int, bounds: JointLimits, span: Span = OWN
-    ) -> None:
-        self.model, self.q_start, self.bounds, n = model, q_start, bounds, len(q_start)
-        self.noise, self.state = np.zeros((_REHEARSAL_STEPS + 1, 2, m, 2)), new_state(n, m, span=span)
-        self.log = new_log(n, m, _REHEARSAL_STEPS, len(ERRORS))
-
-    def better(self, task: Task, state: State) -> tuple[int, Parts, bool]:
-        """A partitioned task in the better sense: its verdict, its parts, and whether it arrives."""
-        model = self.model
-        # Cameras have no sign of their own; the plant distinguishes front and back by positive depths.
-        depth = model.P[:, 2] @ np.array(center_of(state.A, MIDPOINT))
-        seen = model._replace(P=model.P * np.sign(depth)[:, None, None])
-        M = np.ascontiguousarray(state.A @ as_array(backward(model, self.q_start)).T)
-        endless = np.full((2, 2), np.inf)
-        plant = Plant(seen, M, task.order, task.center, task.O, task.visible, endless, self.bounds, False)
-        law = Law(_DIRECT_TWO, seen, task._replace(body=NO_BODY), _REHEARSAL)
-        step = np.full(len(self.q_start), _REHEARSAL_STEP)
-        q_hat_p = state.q_hat[2].copy()
-
-        def simulated(sense: float, max_steps: int) -> tuple[bool, bool, int]:
-            """Whether a sense fails to arrive, whether it passes a joint limit, and in how many steps."""
-            reset(self.state)
-            self.state.driven[1] = sense * q_hat_p
-            limits = Limits(
-                speed=step,
-                image_error_px=_REHEARSAL_PX,
-                diverged_factor=math.inf,
-                stall_periods=20,
-                max_steps=max_steps,
-                stop_at_joint_limit=False,
-                stop_at_border=False,
-            )
-            course = Course(plant, limits, self.q_start)
-            verdict, steps = run_compiled(law, course, self.noise, self.state, self.log)
-            return verdict != CONVERGED, bool(self.log.events[1] >= 0.0), steps
-
-        first = simulated(1.0, _REHEARSAL_STEPS)
-        # Where the first sense does well, the other one is better only if it arrives before.
-        other = simulated(-1.0, _REHEARSAL_STEPS if any(first[:2]) else max(0, first[2] - 1))
-        state.driven[1] = (-1.0 if other < first else 1.0) * q_hat_p
-        parts = partition(task, make_split(state))
-        return FOUND if parts.found else NOT_UNIQUE, parts, not (first[0] and other[0])
-
-
-def begin(
-    model: Model, task: Task, s: FloatArray, q_start: FloatArray, bounds: JointLimits | None
-) -> tuple[State, Parts, bool]:
-    """Measure and partition the task at its start.
-
-    model : calibrated; task : in its frame.
-    s : (2, b, 2) straight pixels at the start; q_start : (n,) joints there, rad or m.
-    bounds : limits of the joints, where a half turn is to be made in the sense
-        that is better when rehearsed.
-    Returns the state with the face and the joint motions; the parts; False where neither sense of a half turn
-    arrived. Raises WorkFailed if the face is not seen, or a motion not unique.
-    """
-    m, span, arrives = len(task.A_star), make_span(model, task.A_star), True
-    state = new_state(len(q_start), m, span=span)
-    status, parts = _first_parts(model, task, s, q_start, state)
-    if status == FOUND and bounds is not None and _is_half_turn(parts.theta_p):
-        status, parts, arrives = _Rehearsal(model, q_start, m, bounds, span).better(task, state)
-    require_found(status, 0)
-    return state, parts, arrives
-
-
-@composed
-def _first_parts(
-    model: Model, task: Task, s: FloatArray, q_start: FloatArray, state: State
-) -> tuple[int, Parts]:
-    """Measure and partition the task in the sense of the angles; return the verdict and the parts."""
-    if not measure(model, task, s, q_start, state):
-        return NOT_MEASURED, NO_PARTS
-    parts = partition(task, make_split(state))
-    return FOUND if parts.found else NOT_UNIQUE, parts
-
-
-@composed
-def _is_half_turn(theta_p: float) -> bool:
-    """Whether the rotation within the plane is so near to half a turn that its sense must be chosen."""
-    return math.pi - abs(theta_p) < _HALF_TURN_BAND
-
 
 # A run that could not be begun; other verdicts as of ``step``.
 NOT_STARTED = -2
@@ -211,7 +89,7 @@ class Trials:
                 n, observed, limits.max_steps, len(ERRORS), MAX_PARTS if setting.gains.substeps else 0
             ),
         )
-        self.rehearsal = _Rehearsal(setting.model, q_start, m, plant.limits)
+        self.rehearsal = Rehearsal(setting.model, q_start, m, plant.limits)
 
     def numbers(self, images: FloatArray, noise: FloatArray) -> FloatArray:
         """Measure the task, partition it, drive the law to its verdict and sum up: (r, ``NUMBERS``).
@@ -244,7 +122,7 @@ def _until_rehearsal(
         status = opened
         if made > 0 or opened == _NOT_OPENED:
             status, theta_p = _open(setting, images[made], desk)
-            if status == FOUND and setting.rehearse and _is_half_turn(theta_p):
+            if status == FOUND and setting.rehearse and is_half_turn(theta_p):
                 return made
         _drive(setting, status, noise[made], desk, numbers[made])
     return len(images)
@@ -262,7 +140,7 @@ def _open(setting: Setting, images: FloatArray, desk: _Desk) -> tuple[int, float
     if status != FOUND:
         return status, 0.0
     reset(desk.state)
-    status, parts = _first_parts(setting.model, desk.task, desk.images[0], setting.course.q_start, desk.state)
+    status, parts = first_parts(setting.model, desk.task, desk.images[0], setting.course.q_start, desk.state)
     return status, parts.theta_p
 
 

@@ -13,8 +13,8 @@ from projservo_cli.geometry.jit import COMPILED, allocating
 from projservo_cli.geometry.mechanisms import make_span
 from projservo_cli.loop.monitors import Monitor, Monitored, Monitors
 from projservo_cli.loop.step import FAILED, RUNNING, WAITING, Command, Instant, Limits, Log, new_log, note
+from projservo_cli.plugins import require_spelt
 from projservo_cli.records import FloatArray, Model, WorkFailed
-from projservo_cli.robots.plugins import require_spelt
 from projservo_cli.task.face import Task
 
 # Handing some forty arrays over to compiled code takes longer than a control step. They are handed over

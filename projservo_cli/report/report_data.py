@@ -29,10 +29,10 @@ from projservo_cli.records import (
     Plan,
     Trace,
 )
+from projservo_cli.settings.task import Trajectory
 from projservo_cli.simulation.arm import Arm
 from projservo_cli.simulation.ideal import Plant
 from projservo_cli.store import Run
-from projservo_cli.task.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

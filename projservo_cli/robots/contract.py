@@ -15,6 +15,7 @@ import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame, time_unit
 from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
     ByteArray,
     FloatArray,
@@ -24,7 +25,6 @@ from projservo_cli.records import (
     WorkFailed,
     in_unit,
 )
-from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
 STOP_S = 10.0

@@ -1,31 +1,14 @@
-"""Settings of a robot: its joints and their limits, its servos, its class and its cameras."""
+"""Settings of a robot: its joints and their limits, and its servos."""
 
 import math
-import re
-import sys
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
-from projservo_cli.image_size import ImageSize
 from projservo_cli.records import Calibration, FloatArray, InputError, JointLimits, in_unit
 from projservo_cli.robots.contract import Bounds
-
-
-class Readings(NamedTuple):
-    """Joint readings as somebody gave them."""
-
-    joints: tuple[float, ...]
-    unit: str  # of the revolute joints, deg or rad; prismatic ones are in m
-
-    def values(self, types: str) -> FloatArray:
-        """Readings (n,) in rad (R) and m (P); a ValueError when the numbers of joints differ."""
-        pairs = zip(self.joints, types, strict=True)
-        turn = math.radians if self.unit == "deg" else float
-        return np.array([turn(value) if letter == "R" else float(value) for value, letter in pairs])
 
 
 class SpeedLimits(NamedTuple):
@@ -121,45 +104,3 @@ class Following(NamedTuple):
             lead = joints.length_of(self.max_relative_target_deg)
         limits = joints.limits._replace(speed=speed)
         return Bounds(limits, lead, self.period, self.max_servo_lag_s, sag, joints.units)
-
-
-class CameraSettings(NamedTuple):
-    """One camera, as it is configured."""
-
-    source: int | str  # index, device, file or URL
-    size_px: tuple[int, int] | None = None  # width and height; None for the native size
-    rate_hz: float | None = None  # frames a second; None for its own
-    fourcc: str = "MJPG"  # format in which a device sends frames
-    exposure_ms: float | None = None  # None leaves it to the camera
-    focus: float | None = None  # in units of the driver; None for where it stands
-
-
-def device_of(source: int | str) -> Path | None:
-    """Device node of V4L2 that a source is, such as ``/dev/video0``; None for others."""
-    if not sys.platform.startswith("linux"):
-        return None
-    path = Path(f"/dev/video{source}") if isinstance(source, int) else Path(source)
-    if not str(path).startswith("/dev/"):
-        return None
-    return path.resolve() if re.fullmatch(r"video\d+", path.resolve().name) else path
-
-
-class StereoSettings(NamedTuple):
-    """Both cameras, and how long projservo waits for their frames."""
-
-    left: CameraSettings
-    right: CameraSettings
-    max_age_s: float = 0.3  # of a frame that still counts as new
-    reconnect_s: float = 1.5  # within which a lost camera must give frames again
-
-
-class OwnRobot(NamedTuple):
-    """A robot of somebody's."""
-
-    target: str  # its class, module:Class
-    options: dict[str, Any]  # arguments that the class is made with
-    dictionary: str | None  # of tags, which a class that takes it is given
-    timeout_s: float  # most time an answer may take
-    open_s: float  # most time that opening may take
-    image_size: ImageSize | None  # width and height of its images, px, if known
-    cameras: StereoSettings | None = None  # of an arm that reads joints alone

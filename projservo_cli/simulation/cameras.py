@@ -37,7 +37,7 @@ class Frames:
             self._renderer = mj.Renderer(rendered.model, FINER * height, FINER * width)
         except Exception as error:  # of another kind for each library of GL
             raise InputError(no_gl(error)) from error
-        self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._scene.light == "side"
+        self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._scene.options.light == "side"
         self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SKYBOX] = 0  # of a file: it takes longer than the rest
         self._model = copy.copy(rendered.model)
         self._data = rendered.begin(self._model, rendered.model.qpos0[rendered.positions])
@@ -63,9 +63,10 @@ class Frames:
         shots = [self._drawn(view, joints) for joints in (q[len(q) // 2 :][:1] if still else q)]
         image = np.mean(shots, axis=0, dtype=np.float32)
         cv = self._finder.cv
-        if self._scene.blur_px > 0.0:
-            image = cv.GaussianBlur(image, (0, 0), self._scene.blur_px)
-        image += np.float32(self._scene.grey_noise) * rng.standard_normal(image.shape, dtype=np.float32)
+        if self._scene.options.blur_px > 0.0:
+            image = cv.GaussianBlur(image, (0, 0), self._scene.options.blur_px)
+        noise = rng.standard_normal(image.shape, dtype=np.float32)
+        image += np.float32(self._scene.options.grey_noise) * noise
         self.last[view] = np.clip(np.rint(image), 0, 255).astype(np.uint8)
         return self._found(view)
 
@@ -105,7 +106,7 @@ class Frames:
         offset = 0.5 * (FINER - 1)  # centres of pixels have whole coordinates
         u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
         pixels = (np.stack([u, v], axis=-1).reshape(-1, 2) - offset) / FINER
-        lens = lens_of(P, self._scene.k1)
+        lens = lens_of(P, self._scene.options.k1)
         drawn = drawn_at(P, lens, np.stack([pixels, pixels]))
         if np.array_equal(drawn[0], pixels) and np.array_equal(drawn[1], pixels):
             return None

@@ -17,10 +17,12 @@ import numpy as np
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import PRISMATIC, ByteArray, FloatArray
+from projservo_cli.settings.disturbance import Events, Faults, JointMoved, LostMarkers, StuckEncoder
 from projservo_cli.simulation.arm import Arm
 from projservo_cli.simulation.cameras import Frames
 from projservo_cli.simulation.physics import Physics
 from projservo_cli.simulation.scene import Scene, rendered_model
+from projservo_cli.simulation.streams import generator
 from projservo_cli.simulation.workspace import Truth
 
 # Joints are worked out this often at least, s, and taken as straight lines between.
@@ -29,76 +31,6 @@ _EXPOSED = 5  # instants of an exposure that are averaged
 _POSTURES = 500  # that are drawn to see how far an arm reaches
 _BEFORE = 2**20  # frames before the opening are numbered too
 _CLOCKS_S = 100.0  # how far clocks of cameras are off at most
-
-
-class Faults(NamedTuple):
-    """Permanent faults of a simulated robot, which a calibration has to model too."""
-
-    camera_latency_s: tuple[float, float] = (
-        0.0,
-        0.0,
-    )  # from the middle of an exposure to the readings that arrive with its image
-    exposure_s: float = 0.0  # over which an image is averaged
-    jitter_s: float = 0.0  # standard deviation of when single images are taken
-    frame_rate_hz: float | None = None  # of cameras that run freely; None for an image per reading
-    frame_offset_s: float = 0.0  # by which the right camera's images come after the left one's
-    stamps: bool = False  # whether images carry the middle of their exposure
-    encoder_counts_per_turn: int | None = None  # steps of joint readings in a turn
-    quantize_setpoints: bool = False  # whether set-points are whole ticks too
-    servo_time_constant_s: float = 0.0  # time constant with which joints follow their set-points
-    gravity_sag: float = 0.0  # by which gravity turns a joint off its set-point at full reach, rad
-    link_deflection: float = 0.0  # the same of a link beyond its encoder, rad
-    backlash: float = 0.0  # between each encoder and its link, from end to end, rad
-
-
-class LostMarkers(NamedTuple):
-    """Markers that neither camera sees for a while; all of them where none is named."""
-
-    from_step: int
-    steps: int | None  # None for ever
-    markers: tuple[int, ...] | None
-
-
-class JointMoved(NamedTuple):
-    """A joint that is pushed aside, or slips on its encoder."""
-
-    at_step: int
-    joint: int  # counted from 0
-    by: float  # rad or m
-    encoder_slip: bool  # whether its reading stays
-
-
-class StuckEncoder(NamedTuple):
-    """A joint whose reading stands still while it moves."""
-
-    from_step: int
-    steps: int | None  # None for ever
-    joint: int  # counted from 0
-
-
-class CameraMoved(NamedTuple):
-    """A camera that is knocked, so that all it sees is shifted."""
-
-    at_step: int
-    by_px: tuple[tuple[float, float], tuple[float, float]]  # along u and v, left and right
-
-
-class MarkerMoved(NamedTuple):
-    """A marker that is knocked aside on the tool."""
-
-    at_step: int
-    marker: int  # its number
-    by: tuple[float, float, float]  # in the frame of the tool, m
-
-
-class Events(NamedTuple):
-    """Events of a simulated robot and its images in a run."""
-
-    lost_markers: LostMarkers | None = None
-    joint_moved: JointMoved | None = None
-    stuck_encoder: StuckEncoder | None = None
-    camera_moved: CameraMoved | None = None
-    marker_moved: MarkerMoved | None = None
 
 
 class SimulatedRobot(NamedTuple):
@@ -193,12 +125,7 @@ class World(NamedTuple):
 
     def random(self, view: int, k: int) -> np.random.Generator:
         """Random numbers of a frame of a view."""
-        return _random(self.seed, self.stream, view, k)
-
-
-def _random(*key: int) -> np.random.Generator:
-    """Random numbers of a seed, a stream of it, a view and a frame."""
-    return np.random.default_rng(np.random.SeedSequence(key[0], spawn_key=key[1:]))
+        return generator(self.seed, self.stream, view, k)
 
 
 def robot_by_itself(
@@ -223,7 +150,7 @@ def robot_of(
     if scene is None:
         return FaultyRobot(World(truth, q_start, points, period, *drawn), faults, events)
     rendered = rendered_model(scene)
-    servos = Physics(rendered, q_start, faults.servo_time_constant_s, faults.gravity_sag)
+    servos = Physics(rendered, q_start, faults.servo_time_constant_s, math.radians(faults.gravity_sag_deg))
     return FaultyRobot(World(truth, q_start, Frames(rendered), period, *drawn, servos), faults, events)
 
 
@@ -249,7 +176,7 @@ def _looked(
     eyes.open()
     try:
         for k, view in np.ndindex(frames, 2):
-            pixels, sigma = eyes.capture(view, q, None, _random(*drawn, view, k))
+            pixels, sigma = eyes.capture(view, q, None, generator(*drawn, view, k))
             found[k, view] = np.column_stack([pixels, sigma])
     finally:
         eyes.close()
@@ -318,8 +245,8 @@ class FaultyRobot:
         """Joint readings (n,) as encoders count them."""
         q, frozen = _whole(self._joints.servos.motor, self._joints.tick), self._events.stuck_encoder
         if frozen is not None and _lasts(frozen, _step(self.now(), self.world.period)):
-            self._frozen = q[frozen.joint] if self._frozen is None else self._frozen
-            q[frozen.joint] = self._frozen
+            self._frozen = q[frozen.joint - 1] if self._frozen is None else self._frozen
+            q[frozen.joint - 1] = self._frozen
         return q
 
 
@@ -397,9 +324,9 @@ class _Joints:
         self.tick = scale * (
             2.0 * math.pi / faults.encoder_counts_per_turn if faults.encoder_counts_per_turn else 0.0
         )
-        self._play = 0.5 * faults.backlash * scale
+        self._play = 0.5 * math.radians(faults.backlash_deg) * scale
         # What gravity costs a joint that holds the tool at full reach, rad.
-        sag, self._flex = faults.gravity_sag, faults.link_deflection
+        sag, self._flex = math.radians(faults.gravity_sag_deg), math.radians(faults.link_deflection_deg)
         self._loaded = sag > 0.0 or self._flex > 0.0
         self._reach = full_reach(self.arm) if self._loaded else 1.0
         self.servos = world.servos or _FirstOrder(
@@ -440,7 +367,7 @@ class _Joints:
         """A joint is knocked aside, or slips."""
         assert self._moved is not None
         by = np.zeros(len(self._link))
-        by[self._moved.joint] = self._moved.by
+        by[self._moved.joint - 1] = self._moved.by
         self._moved_at = math.inf
         if not self._moved.encoder_slip:
             self.servos.strike(by)
@@ -471,7 +398,7 @@ class _Camera:
         self._joints, self._world, self._faults, self._events = joints, world, faults, events
         self._view, self._looks = view, 0
         # No frame is read before it was exposed whole.
-        self._delay = max(faults.camera_latency_s[view], 0.5 * faults.exposure_s)
+        self._delay = max(faults.latencies_s[view], 0.5 * faults.exposure_s)
         self._interval = 0.0 if faults.frame_rate_hz is None else 1.0 / faults.frame_rate_hz
         self._clock = float(world.random(view, 0).uniform(-_CLOCKS_S, _CLOCKS_S))
         self._first = float(world.random(0, 0).uniform(0.0, 1.0)) * self._interval
@@ -505,7 +432,7 @@ class _Camera:
         world, events, step = self._world, self._events, _step(middle, self._world.period)
         truth, befell, moved = world.truth, events.marker_moved, None
         if befell is not None and step >= befell.at_step:
-            moved = befell.marker, np.array(befell.by)
+            moved = befell.marker, np.array(befell.by_m)
         many = _EXPOSED if self._faults.exposure_s else 1
         times = middle + self._faults.exposure_s * ((np.arange(many) + 0.5) / many - 0.5)
         rng = world.random(self._view, _BEFORE + k)
@@ -513,7 +440,7 @@ class _Camera:
         q = np.array([self._joints.at(t) for t in times])
         pixels, sigma = world.eyes.capture(self._view, q, moved, rng)
         if (knocked := events.camera_moved) is not None and step >= knocked.at_step:
-            pixels += knocked.by_px[self._view]
+            pixels += knocked.by_view()[self._view]
         if (lost := events.lost_markers) is not None and _lasts(lost, step):
             pixels[[truth.number.index(number) for number in lost.markers or truth.number]] = math.nan
         if world.eyes.borders:

@@ -53,7 +53,7 @@ class Physics:
     """
 
     def __init__(self, rendered: RenderedModel, q: FloatArray, lag_s: float, sag: float) -> None:
-        arm, servo = rendered.scene.arm, rendered.scene.servo
+        arm, servo = rendered.scene.arm, rendered.scene.options.servo
         self._model, self._places, self._rates = (
             copy.copy(rendered.model),
             rendered.positions,

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.linalg import rq
@@ -14,6 +14,8 @@ from projservo_cli.canonical import File
 from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray
+from projservo_cli.settings.control import RenderedOptions
+from projservo_cli.settings.markers import Tag
 from projservo_cli.simulation.arm import Arm, roll_axis
 from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, spec_of, tip_of
 
@@ -41,14 +43,6 @@ CAMERAS = ("left camera", "right camera")
 """Names of both in the model."""
 
 
-class Tag(NamedTuple):
-    """A tag on the tool."""
-
-    number: int  # in its dictionary; its corners are markers 4 t to 4 t + 3
-    size_m: float  # side of its black square
-    pose: tuple[tuple[float, ...], ...]  # (4, 4) in the frame of the tool, m: it looks along z, y is up on it
-
-
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Scene and settings of rendered cameras."""
@@ -61,11 +55,7 @@ class Scene:
     dictionary: str  # of the tags
     mjcf: File | None  # the model of the arm, with the files that it names; None for one of capsules
     tip: str  # body or site of the model that is the tool
-    servo: str  # own, position or velocity
-    grey_noise: float  # standard deviation of a pixel, grey levels of 255
-    blur_px: float
-    k1: float  # radial distortion, in units of the focal length
-    light: str  # soft or side
+    options: RenderedOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,10 +127,10 @@ def rendered_model(scene: Scene) -> RenderedModel:
     joints = np.array(chain_of(bare, holder, where))
     tip = next(body for body in spec.bodies if body.id == holder)
     _add_tags(spec, tip, tool, scene.tags, finder)
-    _put_light(spec, scene.light, P)
+    _put_light(spec, scene.options.light, P)
     K, R, t = (np.array(parts) for parts in zip(*map(_decomposed, P), strict=True))
     width, height = scene.size
-    margin = _margin(P, scene.k1, width, height)
+    margin = _margin(P, scene.options.k1, width, height)
     K_wide = K + margin * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
     _add_cameras(spec, K_wide, R, t, (width + 2 * margin, height + 2 * margin))
     model = compiled(spec, where)

@@ -3,20 +3,21 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.rigid import rigid
+from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import image_sizes
-from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model
-from projservo_cli.simulation.arm import Arm, about_axis, camera_center, roll_axis
-from projservo_cli.simulation.ideal import Ends
+from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model, WorkFailed
+from projservo_cli.settings.task import Goal
+from projservo_cli.simulation.arm import METRIC_A_INF, Arm, about_axis, camera_center, roll_axis
+from projservo_cli.simulation.ideal import Ends, Plant
 from projservo_cli.simulation.inverse_kinematics import inverse_kinematics
-from projservo_cli.task.face import center_of
+from projservo_cli.task.face import center_of, cyclic_order, face_plane
 
 _EDGE_ON = math.cos(math.radians(70.0))  # of the angle to a camera from which tags are not found
 
@@ -86,38 +87,53 @@ class Truth:
         return np.asarray(np.linalg.inv(self.robot.base_tool), dtype=np.float64)
 
 
-class Turn(NamedTuple):
-    """A goal that is a turn of the tool about the roll axis of the rig, perhaps displaced a little."""
+def turned(goal: Goal, arm: Arm, P: FloatArray, q_start: FloatArray) -> FloatArray:
+    """Joints (n,) of a goal that is a turn of the tool about the roll axis of the rig from joints (n,).
 
-    angle: float  # rad
-    # translation along the axes of the tool, m, and rotation vector in them, rad; None for neither
-    displacement: tuple[tuple[float, float, float], tuple[float, float, float]] | None
-
-    def joints(self, arm: Arm, P: FloatArray, q_start: FloatArray) -> FloatArray:
-        """Joints (n,) of an arm before cameras (2, 3, 4) after the turn from joints (n,), rad or m."""
-        point, direction = roll_axis(P)
-        pose = about_axis(point, direction, self.angle) @ arm.pose(q_start)
-        if self.displacement is not None:
-            t, v = (np.array(part) for part in self.displacement)
-            angle = float(np.linalg.norm(v))
-            turn = about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
-            pose = pose @ rigid(Rotation.identity(), t) @ turn
-        return inverse_kinematics(arm, pose, q_start)
+    arm, P : the arm before cameras (2, 3, 4), m. The pose is perhaps displaced a little along the axes of the
+    tool. Raises WorkFailed where no joints reach it.
+    """
+    assert goal.roll_deg is not None
+    point, direction = roll_axis(P)
+    pose = about_axis(point, direction, math.radians(goal.roll_deg)) @ arm.pose(q_start)
+    if goal.perturbation is not None:
+        t, v = np.array(goal.perturbation.translation_m), np.array(goal.perturbation.rotation_rad)
+        angle = float(np.linalg.norm(v))
+        turn = about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
+        pose = pose @ rigid(Rotation.identity(), t) @ turn
+    return inverse_kinematics(arm, pose, q_start)
 
 
-def metric_camera(P: FloatArray) -> FloatArray:
-    """Camera (3, 4) in the scale that makes depths positive metres, which a given one is only up to."""
-    scale = float(np.sign(np.linalg.det(P[:, :3])) * np.linalg.norm(P[2, :3]))
-    return P / scale if abs(scale - 1.0) > 1e-12 else P
+def plant_of(truth: Truth, q_start: FloatArray, *, opaque: bool) -> Plant:
+    """The truth as the loop sees it from the joints q_start (n,), undisturbed.
+
+    opaque : whether the face hides its markers from a camera behind it.
+    Raises WorkFailed if a camera sees the face edge-on there.
+    """
+    return _plant_at(truth, q_start.tobytes(), opaque)
 
 
-def look_at(
-    K: FloatArray, position: Sequence[float], target: Sequence[float], up: Sequence[float]
-) -> FloatArray:
-    """Camera (3, 4) to px with intrinsics K (3, 3) at a position that looks at a target, m."""
-    z = np.subtract(target, position)
-    x = np.cross(z, up)
-    z = z / np.linalg.norm(z)
-    x = x / np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
-    return np.asarray(K @ np.c_[R, -R @ np.asarray(position)])
+@lru_cache(maxsize=2048)
+def _plant_at(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
+    q_start = np.frombuffer(start_bytes)
+    M = truth.M_face
+    start = M @ truth.displacement(q_start).T
+    order = cyclic_order(start)
+    O = optical_centers(truth.P, METRIC_A_INF)
+    sides = O @ np.array(face_plane(start, order, center_of(start, truth.center)))
+    if np.abs(sides).min() < 1e-9 or sides[0] * sides[1] < 0.0:
+        raise WorkFailed(
+            "task.start: the cameras see different sides of the face, or one sees it edge-on: "
+            "turn the face towards both"
+        )
+    return Plant(
+        model=truth.model,
+        M=M,
+        order=order,
+        center=truth.center,
+        O=O,
+        visible=np.where(sides > 0.0, 1.0, -1.0),
+        image_size=image_sizes(truth.image_size),
+        limits=truth.robot.limits,
+        opaque=opaque,
+    )

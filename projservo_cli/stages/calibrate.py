@@ -17,10 +17,10 @@ from projservo_cli.planning.pose_selection import Suggestion, suggest
 from projservo_cli.planning.prediction_covariance import Region
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, IntArray, Observation, WorkFailed
 from projservo_cli.robots.settings import JointSettings
+from projservo_cli.simulation.streams import SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.given import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
+from projservo_cli.stages.inputs import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
 from projservo_cli.stages.record import observed
-from projservo_cli.stages.scenario import SUGGESTIONS, generator
 from projservo_cli.store.tables import read_table, to_csv
 
 

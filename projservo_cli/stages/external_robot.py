@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from projservo_cli import plugins
 from projservo_cli.calibration import predict
 from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.geometry.algebra import mat
@@ -16,14 +17,13 @@ from projservo_cli.masking import MASK
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
-from projservo_cli.robots import plugins
 from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
 from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.robots.settings import Joints, OwnRobot
+from projservo_cli.robots.settings import Joints
+from projservo_cli.settings.disturbance import Events
 from projservo_cli.simulation.faults import (
-    Events,
     FaultyRobot,
     Points,
     SimulatedRobot,
@@ -31,8 +31,9 @@ from projservo_cli.simulation.faults import (
     robot_of,
 )
 from projservo_cli.simulation.ideal import Plant, observe
-from projservo_cli.stages.given import Contract, Driven
-from projservo_cli.stages.scenario import SERVO_NOISE, RunScenario
+from projservo_cli.simulation.streams import SERVO_NOISE
+from projservo_cli.stages.inputs import Contract, Driven, OwnRobot
+from projservo_cli.stages.scenario import RunScenario
 
 # Drift of a joint, rad or m, and of an image, px rms, within which both count as still.
 _STILL, _STILL_PX = 2e-5, 0.02

@@ -34,12 +34,13 @@ from projservo_cli.records import (
     Spread,
     WorkFailed,
 )
+from projservo_cli.settings.task import Trajectory
 from projservo_cli.stages.plan_summary import sight_words, verdict_of
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
 from projservo_cli.task.target import TaskImages
-from projservo_cli.task.trajectory import Trajectory, profile_shares
+from projservo_cli.task.trajectory import profile_shares
 
 
 class Found(NamedTuple):
@@ -96,7 +97,7 @@ def search_of(scenario: Scenario) -> JointSearch:
             tuple(calibration.indices_of(numbers)),
             scenario.m,
             (tuple(demands.limits.lower), tuple(demands.limits.upper), tuple(map(tuple, demands.image_size))),
-            scenario.inputs.trajectory.search_seed,
+            scenario.inputs.trajectory.search.seed,
         )
     limits, closed = scenario.joints.limits, ""
     if scenario.truth is None and not (np.isfinite(limits.lower) & np.isfinite(limits.upper)).all():
@@ -168,7 +169,7 @@ _INTERPOLATED_PX = 0.05
 
 def _joint_constraints(reaching: Reaching, task: Task, trajectory: Trajectory, spread: Spread) -> Constraints:
     """Return the constraints of the joints."""
-    drawn = keep_out_of(trajectory.keep_out)
+    drawn = keep_out_of([(one.left, one.right, one.occludes) for one in trajectory.keep_out])
     c = constraints_of(reaching.model, reaching.body, task, reaching.q_start, reaching.demands, drawn)
     return c._replace(spread=spread)
 
@@ -197,11 +198,11 @@ def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: J
     c = _joint_constraints(reaching, task, trajectory, search.spread)
     target = GoalFeatures(task.A_star, undistort(reaching.model.lens, task.s_star), search.sigma)
     how = SearchLimits(
-        trajectory.max_search_samples, trajectory.search_seed, trajectory.max_goal_configurations
+        trajectory.search.max_samples, trajectory.search.seed, trajectory.max_goal_configurations
     )
     path = find_path(c, target, reaching.q_start, search.goal_joints, how)
     if path.timing is None:
-        linear = given("linear", reaching, trajectory._replace(duration_s=None), 1.0)
+        linear = given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.n_samples, np.nan)
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)
@@ -264,7 +265,7 @@ class PathReplanner:
         full[CLEAR] += np.abs(off).max()
         c = self._c._replace(full=full)
         how = SearchLimits(
-            asked.max_search_samples, asked.search_seed + self._made, asked.max_goal_configurations, excluded
+            asked.search.max_samples, asked.search.seed + self._made, asked.max_goal_configurations, excluded
         )
         start = np.clip(q, c.limits.lower, c.limits.upper)
         path = find_path(c, self._goal, start, self._search.goal_joints, how)

@@ -12,10 +12,11 @@ from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.image_size import image_sizes
-from projservo_cli.loop.batch import begin
+from projservo_cli.loop.rehearsal import begin
 from projservo_cli.monitoring.accuracy import RigidFit, metric_points, rigid_fit
 from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.planning.margins import Demands, Reaching
+from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
     NO_SPREAD,
     VIEWS,
@@ -29,7 +30,8 @@ from projservo_cli.records import (
     in_sense,
     in_unit,
 )
-from projservo_cli.stages.given import PlanInputs
+from projservo_cli.settings.task import Trajectory
+from projservo_cli.stages.inputs import PlanInputs
 from projservo_cli.stages.motions import (
     Found,
     JointSearch,
@@ -42,11 +44,10 @@ from projservo_cli.stages.motions import (
     why_closed,
 )
 from projservo_cli.stages.plan_summary import minimum_of, reason_of, search_summary, verdict_of
-from projservo_cli.stages.scenario import NEAR_PX, Scenario, joints_showing, scenario_of
+from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import TaskImages
-from projservo_cli.task.trajectory import Trajectory
 from projservo_cli.task.visibility import (
     arc_minimum,
     margin_coefficients,
@@ -163,7 +164,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     images = task.goal.images if task is not None else None
     if images is None or (whole := scenario.goal_pixels) is None:
         return
-    pixels, size = images.pixels(), image_sizes(scenario.inputs.image_size)
+    pixels, size = images.pixels(scenario.inputs.face), image_sizes(scenario.inputs.image_size)
     numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
     if images.joints is not None:
         q = images.joints.values(calibration.joint_types)
@@ -171,7 +172,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
             raise WorkFailed(_CHANGED.format(fault=fault, advice="teach it again"))
         _require_rigid(rigid_fit(calibration, q, *whole), "teach it again")
         return
-    stated = images.sigma_px(scenario.numbers[: scenario.m])
+    stated = images.sigma_px(scenario.numbers[: scenario.m], scenario.inputs.face)
     sigma = scenario.noise_px if stated is None else stated
     known, near_px = np.isin(numbers, calibration.marker), max(NEAR_PX, 2.0 * sigma)
     shown = numbers[known].tolist(), seen[:, known]
@@ -241,7 +242,7 @@ def plan_task(
     before: list[str] = []
     shut = why_closed(model, demands, search)
     for profile in ("linear", "constrained", "joint_space"):
-        asked = trajectory._replace(profile=profile)
+        asked = trajectory.model_copy(update={"profile": profile})
         last = profile == "joint_space" or (profile == "constrained" and bool(shut))
         try:
             plan, fails = _planned(model, images, asked, demands, search)
@@ -353,7 +354,7 @@ def _planned(
         theta_0=theta_0,
         sense=sense,
         sense_margin=sense_margin,
-        **({} if path is None else search_summary(path, along.q, time, trajectory.search_seed)),
+        **({} if path is None else search_summary(path, along.q, time, trajectory.search.seed)),
     )
     return plan, found.entered or ("" if holds or (path is not None and found.feasible) else words)
 

@@ -31,9 +31,9 @@ from projservo_cli.report.report_data import (
     Studies,
 )
 from projservo_cli.results import ImageModel
+from projservo_cli.simulation.workspace import plant_of
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.given import KnownLengths, ReportInputs, Scenery
-from projservo_cli.stages.scenario import plant_of
+from projservo_cli.stages.inputs import KnownLengths, ReportInputs, Scenery
 from projservo_cli.stages.studies import (
     LAMBDAS,
     STEP_LIMIT_DEG,

@@ -6,19 +6,18 @@ A ``Scenario`` is made once from the inputs of a stage and a calibration; a plan
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from projservo_cli.calibration import predict
 from projservo_cli.control.law import Gains
-from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import BODY_LAWS, LAW_SPECS
 from projservo_cli.loop.step import Limits
 from projservo_cli.planning.margins import Demands
+from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
     CORNERS,
     VIEWS,
@@ -31,27 +30,25 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.client import weights
 from projservo_cli.robots.settings import Joints, limit_passed
-from projservo_cli.simulation.arm import METRIC_A_INF
+from projservo_cli.settings.task import GoalImages, TaskSettings
 from projservo_cli.simulation.faults import observed_in_frames
 from projservo_cli.simulation.ideal import NO_PINS, Ends, Plant
-from projservo_cli.simulation.workspace import Truth
-from projservo_cli.stages.given import GoalImages, PlanInputs, ReachingTask, ServoInputs
+from projservo_cli.simulation.streams import (
+    GOAL_FRAMES,
+    PIN_NOISE,
+    PIN_TARGET_NOISE,
+    SERVO_NOISE,
+    START_FRAMES,
+    TARGET_NOISE,
+    generator,
+)
+from projservo_cli.simulation.workspace import Truth, plant_of, turned
+from projservo_cli.stages.inputs import PlanInputs, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body
-from projservo_cli.task.face import center_of, cyclic_order, face_plane
 from projservo_cli.task.target import TaskImages
 
 _UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera sees
-# Weight of a marker in a fit that is predicted from others. Starts from which joints that show a
-# goal are sought; how near they must come, and how far off it is to be behind a camera, px.
-_GUESSED, _TRIALS, NEAR_PX, _FAR_PX = 1e-3, 60, 1.0, 1e3
-# Independent streams of random numbers, each a child of a seed.
-CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
-TRIAL_POSES, TAUGHT_NOISE, START_FRAMES, GOAL_FRAMES, POSE_NOISE = range(6, 11)
-
-
-def generator(seed: int, stream: int) -> np.random.Generator:
-    """Random numbers of one stream of a seed."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+_GUESSED = 1e-3  # weight of a marker in a fit that is predicted from others
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +142,7 @@ class Scenario:
     def goal_sigma_px(self) -> float:
         """Standard deviation of a coordinate of the face in the images of the goal, px."""
         images = self._given
-        stated = None if images is None else images.sigma_px(self.numbers[: self.m])
+        stated = None if images is None else images.sigma_px(self.numbers[: self.m], self.inputs.face)
         return self.noise_px / math.sqrt(self.inputs.averaged_frames) if stated is None else stated
 
     @property
@@ -162,11 +159,11 @@ class Scenario:
         """
         if self._given is None or self.calibration is None or not self.calibration.has_covariance:
             return None
-        numbers, pixels = self.calibration.marker.tolist(), self._given.pixels()
+        numbers, pixels = self.calibration.marker.tolist(), self._given.pixels(self.inputs.face)
         images = np.array([pixels.get(number, _UNSEEN) for number in numbers]).swapaxes(0, 1)
         known = [number in pixels for number in numbers]
         sigma = np.full((2, len(numbers)), self.noise_px)
-        stated = np.array(self._given.deviations([k for k in numbers if k in pixels]))
+        stated = np.array(self._given.deviations([k for k in numbers if k in pixels], self.inputs.face))
         sigma[:, known] = np.where(np.isnan(stated), self.noise_px, stated)
         return images, sigma
 
@@ -198,7 +195,7 @@ class Scenario:
         if given is None:
             goal, there = self._frames(self.goal_joints[0], (seed, GOAL_FRAMES))
         else:
-            goal, there = seen_images.s_star, np.array(given.deviations(numbers))
+            goal, there = seen_images.s_star, np.array(given.deviations(numbers, self.inputs.face))
         sigma = np.fmax(sigma, there)
         start = self._with_face("task.start", start, seen_images.q_start)
         seen_images = seen_images._replace(s_start=start, s_star=self._with_face("task.goal", goal, None))
@@ -283,36 +280,6 @@ class RunScenario(Scenario):
         return noise
 
 
-def joints_showing(
-    calibration: Calibration,
-    numbers: Sequence[int],
-    s: FloatArray,
-    q_start: FloatArray,
-    near_px: float = NEAR_PX,
-) -> tuple[FloatArray, float]:
-    """Joints (n,) at which markers are predicted where images (2, b, 2) show them, and the median error, px.
-
-    Least squares from joints (n,) and from others about them, until a start leads near enough; else the
-    nearest. s : NaN where unseen.
-    """
-    places, seen, rng = calibration.indices_of(numbers), np.isfinite(s), np.random.default_rng(0)
-
-    def off(q: FloatArray) -> FloatArray:
-        """Return the prediction errors, px; large behind a camera."""
-        return np.asarray(np.nan_to_num(predict(calibration, q[None])[0][:, places] - s, nan=_FAR_PX)[seen])
-
-    best, least = q_start, math.inf
-    for trial in range(_TRIALS):
-        q = q_start + (trial > 0) * rng.uniform(-np.pi, np.pi, len(q_start))
-        found = least_squares(off, q, loss="soft_l1", f_scale=near_px).x
-        median = float(np.median(np.abs(off(found))))
-        if median < least:
-            best, least = found, median
-        if median <= near_px:
-            break
-    return best, least
-
-
 def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> Scenario:
     """Make the scenario of a simulated robot, or of one that a calibration predicts.
 
@@ -363,15 +330,15 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
 def run_scenario(inputs: ServoInputs, calibration: Calibration | None = None) -> RunScenario:
     """Make the scenario of runs; raises as ``scenario_of``."""
     found = scenario_of(inputs.plan, calibration)
-    parts = {field.name: getattr(found, field.name) for field in fields(found)}
-    gains = _gains(inputs, found.joints)
-    return RunScenario(**parts, given=inputs, gains=gains, limits=_limits(inputs, found))
+    return RunScenario(
+        **vars(found), given=inputs, gains=_gains(inputs, found.joints), limits=_limits(inputs, found)
+    )
 
 
 def _gains(inputs: ServoInputs, joints: Joints) -> Gains:
     """Gains of the laws with the limits of the joints, which end no path where a run may pass them."""
     limits, endless = joints.limits, np.full(len(joints.types), math.inf)
-    if not inputs.stop.at_joint_limit:
+    if not inputs.at_joint_limit:
         limits = limits._replace(lower=-endless, upper=endless)
     return inputs.gains._replace(limits=limits)
 
@@ -386,8 +353,8 @@ def _limits(inputs: ServoInputs, found: Scenario) -> Limits:
         diverged_factor=stop.diverged_factor,
         stall_periods=stop.stall_periods,
         max_steps=stop.max_steps,
-        stop_at_joint_limit=stop.at_joint_limit,
-        stop_at_border=stop.at_border,
+        stop_at_joint_limit=inputs.at_joint_limit,
+        stop_at_border=inputs.at_border,
         max_lost_periods=stop.max_lost_periods,
         noise_px=noise_px,
     )
@@ -419,7 +386,7 @@ def _observed(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
 
 @lru_cache(maxsize=2048)
 def _simulated_ends(
-    task: ReachingTask, types: str, units: tuple[str, ...], truth: Truth, pins: tuple[int, ...], center: int
+    task: TaskSettings, types: str, units: tuple[str, ...], truth: Truth, pins: tuple[int, ...], center: int
 ) -> tuple[TaskImages, Ends, FloatArray | None]:
     """Return the images of the ends of a task, for any seed and noise, and the joints (n,) at the goal."""
     M_pins, robot = truth.of(pins), truth.robot
@@ -431,8 +398,7 @@ def _simulated_ends(
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
     def turn(q: FloatArray) -> FloatArray:
-        assert task.goal.turn is not None
-        return task.goal.turn.joints(robot, truth.P, q)
+        return turned(task.goal, robot, truth.P, q)
 
     numbers = tuple(truth.number[i] for i in truth.face), pins
     seen_images, q_goal = _task_images(task, types, numbers, center, images, turn)
@@ -440,7 +406,7 @@ def _simulated_ends(
 
 
 def _task_images(
-    task: ReachingTask,
+    task: TaskSettings,
     types: str,
     numbers: tuple[Sequence[int], Sequence[int]],
     center: int,
@@ -459,7 +425,7 @@ def _task_images(
         q_start = q_from + task.start_offset.values(types)
     s_start = images(q_start, "task.start" if task.start_offset is None else "task.start_offset")
     if task.goal.images is not None:
-        pixels = task.goal.images.pixels()
+        pixels = task.goal.images.pixels(numbers[0])
         s_star = np.array([pixels.get(number, _UNSEEN) for number in (*numbers[0], *numbers[1])])
         s_star = np.ascontiguousarray(np.swapaxes(s_star, 0, 1))
         return TaskImages(q_start, s_start, s_star, center, pins), None
@@ -473,7 +439,7 @@ def _unknown(base_tool: FloatArray) -> Ends:
 
 
 def _predicted_ends(
-    inputs: PlanInputs, task: ReachingTask, calibration: Calibration, joints: Joints, numbers: Sequence[int]
+    inputs: PlanInputs, task: TaskSettings, calibration: Calibration, joints: Joints, numbers: Sequence[int]
 ) -> tuple[TaskImages, Ends, FloatArray | None]:
     """Start and goal of a robot that is not simulated, as the calibration predicts them, as above."""
     m, columns = len(inputs.face), calibration.indices_of(numbers)
@@ -492,49 +458,13 @@ def _predicted_ends(
         return np.ascontiguousarray(s)
 
     def turn(q: FloatArray) -> FloatArray:
-        assert task.goal.turn is not None
         if inputs.arm is None or inputs.P is None:
             raise InputError(
                 "task.goal.roll_deg needs the model of the robot and its rig: give joints or images instead"
             )
-        return task.goal.turn.joints(inputs.arm, inputs.P, q)
+        return turned(task.goal, inputs.arm, inputs.P, q)
 
     seen_images, q_goal = _task_images(
         task, joints.types, (numbers[:m], numbers[m:]), inputs.center, images, turn
     )
     return seen_images, _unknown(np.full((4, 4), np.nan)), q_goal
-
-
-def plant_of(truth: Truth, q_start: FloatArray, *, opaque: bool) -> Plant:
-    """The truth as the loop sees it from the joints q_start (n,), undisturbed.
-
-    opaque : whether the face hides its markers from a camera behind it.
-    Raises WorkFailed if a camera sees the face edge-on there.
-    """
-    return _plant(truth, q_start.tobytes(), opaque)
-
-
-@lru_cache(maxsize=2048)
-def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
-    q_start = np.frombuffer(start_bytes)
-    M = truth.M_face
-    start = M @ truth.displacement(q_start).T
-    order = cyclic_order(start)
-    O = optical_centers(truth.P, METRIC_A_INF)
-    sides = O @ np.array(face_plane(start, order, center_of(start, truth.center)))
-    if np.abs(sides).min() < 1e-9 or sides[0] * sides[1] < 0.0:
-        raise WorkFailed(
-            "task.start: the cameras see different sides of the face, or one sees it edge-on: "
-            "turn the face towards both"
-        )
-    return Plant(
-        model=truth.model,
-        M=M,
-        order=order,
-        center=truth.center,
-        O=O,
-        visible=np.where(sides > 0.0, 1.0, -1.0),
-        image_size=image_sizes(truth.image_size),
-        limits=truth.robot.limits,
-        opaque=opaque,
-    )

@@ -3,13 +3,14 @@
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from projservo_cli import plugins
 from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, THETA_S, Gains
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
@@ -24,6 +25,7 @@ from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.monitoring.accuracy import Posture, rigid_fit
 from projservo_cli.monitoring.statistics import WINDOW
+from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
     MM,
     VIEWS,
@@ -39,39 +41,212 @@ from projservo_cli.records import (
     in_unit,
 )
 from projservo_cli.results import ImageModel
-from projservo_cli.robots import plugins
 from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.contract import at_rest_after
-from projservo_cli.robots.plugins import what_failed
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.ideal import AnalyticPlant, Plant
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import external_robot
-from projservo_cli.stages.given import ServoInputs
+from projservo_cli.stages.inputs import ServoInputs
 from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.target import followed
 
+_NOT_DRIVEN: Any = None  # in place of what a run leaves
 
-@dataclass(frozen=True, eq=False)
-class _Outcome:
-    """A run as it ended."""
+
+@dataclass(eq=False)
+class Run:
+    """A run of a law: made, driven to its verdict, and summed up."""
 
     scenario: RunScenario
-    verdict: str
-    why: str  # verdict, why: how it ended, and what held, disturbed or failed it, where something did
-    steps: int  # commands sent
-    log: Log  # the recorded run
-    limited: float  # how often visibility limited the translation
-    plant: Plant  # that was driven; of an external robot the calibrated model
-    law: str = ""
+    plan: Plan | FloatArray  # of the task, or the joint motions (2, n) of its rotations where that is enough
+    law: str
     mode: str = REGULATE  # law, mode: of the run
-    planned_s: float | None = None  # when the plan that it followed arrives, s
-    unplanned: str = ""  # why it went without the plan that it was to follow
+    planned_s: float | None = None  # when the plan that it follows arrives, s
+    unplanned: str = ""  # why it goes without the plan that it was to follow
+    believed: Model | None = None  # robot and rig as the law has them; None for the default of its kind
+    factory: Callable[[Any], Any] | None = None  # makes the law of its setup; None for that of its name
+    robot: Any = None  # an object of the contract; None for that of the configuration
+    blind: bool = False  # whether a robot may move although cameras show no marker of the calibration
+    # As it ended.
+    verdict: str = ""
+    why: str = ""  # what held, disturbed or failed it, where something did
+    steps: int = 0  # commands sent
+    log: Log = _NOT_DRIVEN  # the recorded run, once it was driven
+    limited: float = 0.0  # how often visibility limited the translation
+    plant: Plant = _NOT_DRIVEN  # that was driven; of an external robot the calibrated model
     replannings: tuple[str, ...] = ()  # time and reason of each replanning
     driven: DrivenRobot | None = None  # client of a robot of the contract
     unseen: str = ""  # which cameras showed nothing before the run, though they were to be compared
+
+    @property
+    def replans(self) -> bool:
+        """Whether the law goes its own way instead of following the plan."""
+        return self.mode == REGULATE or bool(self.unplanned)
+
+    @property
+    def is_guided(self) -> bool:
+        """Whether the run follows a plan which gives way to another one where it fails."""
+        scenario = self.scenario
+        searched = scenario.inputs.trajectory.profile in ("joint_space", "auto")
+        if self.replans or self.law not in CODES or not searched:
+            return False
+        return not why_closed(scenario.model, scenario.demands, search_of(scenario))
+
+    def drive(self) -> "Run":
+        """Drive the law to its verdict: in the compiled loop where it can be, else in that of Python.
+
+        Raises InputError, WorkFailed as of ``run``.
+        """
+        if self.scenario.given.contract is not None:
+            self._drive_by_contract()
+        elif isinstance(self.plan, Plan) and (
+            not _in_compiled_loop(self.scenario.given, self.law) or self.is_guided
+        ):
+            self._drive_in_python(self._controller(), AnalyticPlant(*self._simulated()))
+        else:
+            self._drive_compiled()
+        return self
+
+    def _simulated(self) -> tuple[Plant, FloatArray, FloatArray]:
+        """The simulated robot as the law sees it, its first joints (n,), and the noise of its images."""
+        scenario = self.scenario
+        noise = scenario.noise_of(self.law, scenario.inputs.seed, scenario.limits.max_steps + 1)
+        return scenario.plant_of(self.law), scenario.ends.q_start, noise
+
+    def _drive_compiled(self) -> None:
+        """Drive a built-in law on the simulated robot in the compiled loop."""
+        scenario, controller = self.scenario, self._built_in()
+        limits, observed = scenario.limits, len(scenario.numbers_of(self.law))
+        self.plant, q_start, noise = self._simulated()
+        parts = MAX_PARTS if scenario.gains.substeps else 0
+        self.log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts)
+        course = Course(self.plant, limits, q_start.copy())
+        code, self.steps = run_compiled(controller.law, course, noise, controller.state, self.log)
+        self.verdict, self.limited = VERDICTS[code], float(controller.state.limited[0])
+
+    def _drive_by_contract(self) -> None:
+        """Drive a robot of the contract from the start of the task, where a simulated one stands.
+
+        That of ``plant.use`` is driven there. Before its first motion, its images must agree with the
+        calibration where it stands. The robot is stopped and closed on every way out.
+        """
+        scenario, contract = self.scenario, self.scenario.given.contract
+        assert contract is not None
+        own = scenario.truth is None
+        if own and (scenario.calibration is None or not scenario.calibration.usable):
+            raise WorkFailed("the calibration is not usable, and no robot is driven with it: calibrate again")
+        if own and scenario.calibration is not None and (order := scenario.calibration.order_advice):
+            raise InputError(
+                f"{order}, or set data.joint_order=stated if it is known; no robot is driven before"
+            )
+        controller, driven = (
+            self._controller(),
+            external_robot.connected(scenario, self.law, self.robot),
+        )
+        # The matrices of a frame are small: a second thread costs more than it gives.
+        with threadpool_limits(limits=1), at_rest_after(driven.robot):
+            if own:
+                driven.robot.require_identity(contract.identity)
+                wrong = driven.fits()
+                if wrong:
+                    raise WorkFailed(f"the robot did not move, since at the start {wrong}", refutes=True)
+                assert contract.settle_s is not None
+                start, settle_s = scenario.ends.q_start, contract.settle_s
+                unseen = self._require_images(driven, "the robot did not move, since where it stands", 2)
+                for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
+                    if wrong := driven.agrees():
+                        raise WorkFailed(f"stopped on the path to the start, since {wrong}", refutes=True)
+                if wrong := driven.at_rest():
+                    raise WorkFailed(f"stopped at the start, since {wrong}", refutes=True)
+                at_start = self._require_images(driven, "stopped at the start of the task, since", 1)
+                self.unseen = at_start or unseen
+            driven.begin()
+            self._drive_in_python(controller, driven, StallMonitor(driven, scenario.limits))
+
+    def _require_images(self, driven: DrivenRobot, what: str, least: int) -> str:
+        """Refuse to move a robot of which so many cameras or more show nothing, unless that was asked for."""
+        unseen, own = driven.unseen(least), driven.robot.robot
+        if unseen and not self.blind:
+            seen = "; ".join([unseen, *(own.remarks() if isinstance(own, CameraRobot) else ())])
+            raise WorkFailed(
+                f"{what} {seen}: uncover both cameras and look at their light, or move the arm by hand to "
+                "where they see the tags; --blind (blind=True) drives it without images"
+            )
+        return unseen
+
+    def _drive_in_python(
+        self, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, stall: StallMonitor | None = None
+    ) -> None:
+        """Drive a law on a plant, every command scaled; a run that is guided is watched."""
+        scenario, execution = self.scenario, None
+        if self.is_guided and isinstance(law, BuiltInLaw):
+            assert isinstance(self.plan, Plan)
+            follow, searches = partial(self._task, law.law.model), scenario.given.max_replan_attempts
+            replanner = PathReplanner(scenario, self.plan)
+            execution = ExecutionMonitor(law, follow, replanner, searches, scenario.limits, stall)
+        code, self.steps, self.log = run_in_python(
+            law,
+            plant,
+            scenario.ends.by_points().s_star,
+            scenario.gains.period,
+            scenario.limits,
+            scenario.given.speed_scale,
+            stall=stall,
+            execution=execution,
+        )
+        if isinstance(plant, DrivenRobot):
+            self.driven = plant
+            if VERDICTS[code] == "converged" and plant.at_rest():
+                code = VERDICTS.index("fault detected")
+            # It moves from sample to sample, in any mode.
+            path = np.stack([self.log.q, np.roll(self.log.q, -1, axis=0)], axis=1)
+            self.log = self.log._replace(path=path, parts=np.ones_like(self.log.parts))
+        self.verdict, self.plant = VERDICTS[code], plant.plant
+        self.limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
+        self.why = plant.disturbance or ("" if stall is None else stall.reason)
+        self.replannings = () if execution is None else tuple(execution.attempts)
+
+    def _task(self, model: Model, plan: Plan) -> Task:
+        """The task as a built-in law with a model is given it, with the plan that it follows."""
+        scenario = self.scenario
+        task, scale = scenario.images_for(self.law).task(model), scenario.given.speed_scale
+        return followed(model, task, plan, scenario.gains.period, scale)
+
+    def _built_in(self) -> BuiltInLaw:
+        """The built-in law with the model that it is given, and the sense of its rotations."""
+        scenario, plan = self.scenario, self.plan
+        model = self.believed or scenario.believed_by(self.law)
+        if self.replans:
+            task = scenario.images_for(self.law).task(model)
+        else:
+            assert isinstance(plan, Plan)
+            task = self._task(model, plan)
+        found = BuiltInLaw(CODES[self.law], model, task, scenario.gains)
+        sense = plan.rotation_sense() if isinstance(plan, Plan) else plan
+        found.state.driven[:] = in_span(found.state.work.span, model, scenario.ends.q_start, sense)
+        return found
+
+    def _controller(self) -> LoopLaw:
+        """The law, ready for the Python loop.
+
+        Raises InputError if there is no such law, it needs a model of the robot that the configuration lacks,
+        or the plan to follow has no time; WorkFailed if it cannot be made, or the joints cannot follow the
+        plan.
+        """
+        if self.law in CODES:
+            return self._built_in()
+        scenario, gains, ends = self.scenario, self.scenario.gains, self.scenario.ends.by_points()
+        assert scenario.calibration is not None
+        assert isinstance(self.plan, Plan)
+        face = np.array(scenario.calibration.indices_of(scenario.numbers[: scenario.m]))
+        model, shown = ImageModel.of(scenario.calibration), (ends.s_start, ends.s_star)
+        # A copy: no law may write to the arrays of another.
+        setup = copy.deepcopy(LawSetup(model, face, *shown, self.plan, gains, gains.period))
+        factory = self.factory or plugins.find("law", self.law)
+        return PluginLaw(plugins.called("law", self.law, factory, (setup,), {}), f"law {self.law}")
 
     @cached_property
     def summary(self) -> Summary:
@@ -198,7 +373,7 @@ _HARDLY = 0.01
 _SAME_START, _SAME_GOAL_PX = 1e-6, 10.0
 
 
-def _stated_mm(run: _Outcome, views: FloatArray) -> dict[str, Any]:
+def _stated_mm(run: Run, views: FloatArray) -> dict[str, Any]:
     """State how far the face ended from the goal, rms mm: by images, and by what no test tells from none.
 
     Nothing if no length on the face is known, or images disagree with the calibration.
@@ -249,7 +424,7 @@ def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(mean))
 
 
-def _stalled_by(run: _Outcome) -> str:
+def _stalled_by(run: Run) -> str:
     """Return why the image error stopped falling: commands too slow to lower it, or a local minimum.
 
     Joints that move on at their limits, as a law asks of them near a singularity, are not slow.
@@ -268,7 +443,7 @@ def _stalled_by(run: _Outcome) -> str:
     )
 
 
-def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | None]) -> str:
+def _reason(run: Run, joint: int, remaining: tuple[float | None, float | None]) -> str:
     """Return the reason of the verdict, one sentence."""
     log, steps, limits = run.log, run.steps, run.scenario.limits
     error, first = float(log.judged[steps]), float(log.judged[0])
@@ -307,7 +482,7 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
     return "; ".join(filter(None, (reasons[run.verdict], blind, obstruction)))
 
 
-def _apart(run: _Outcome) -> str:
+def _apart(run: Run) -> str:
     """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
     seen, most = float(run.log.error[run.steps]), _BY_NOISE * run.scenario.limits.image_error_px
     text = f"; the face itself is seen {seen:.3g} px off ({most:.3g} px by noise): it moved on the tool"
@@ -324,28 +499,18 @@ def _blind_view(s: FloatArray, window: int) -> str:
     return ""
 
 
-class Given(NamedTuple):
-    """Objects that a caller in Python passes in place of names."""
-
-    law: Callable[[Any], Any] | None = None  # makes a law of its setup; None for that of the name
-    robot: Any = None  # an object of the contract; None for that of the configuration
-    blind: bool = False  # whether a robot may move although cameras show no marker of the calibration
-
-
-def run(
-    inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, given: Given | None = None
-) -> Trace:
+def run(inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, **brought: Any) -> Trace:
     """Drive one law in one mode from the start of the task to its verdict.
 
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
-    given : objects that a caller passes.
+    brought : by a caller in Python: ``factory``, ``robot`` and ``blind`` of ``Run``.
     Raises InputError if a part of the simulation is missing, the plan is of another task, or the plan to
     follow has no time; WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
     ``refuses`` is set.
     """
     scenario = run_scenario(inputs, calibration)
     _require_its_task(scenario, plan)
-    return drive(scenario, plan, name, given=given).trace()
+    return drive(scenario, plan, name, **brought).trace()
 
 
 def _require_its_task(scenario: RunScenario, plan: Plan) -> None:
@@ -363,13 +528,8 @@ def _require_its_task(scenario: RunScenario, plan: Plan) -> None:
 
 
 def drive(
-    scenario: RunScenario,
-    plan: Plan | FloatArray,
-    name: str,
-    believed: Model | None = None,
-    *,
-    given: Given | None = None,
-) -> _Outcome:
+    scenario: RunScenario, plan: Plan | FloatArray, name: str, believed: Model | None = None, **brought: Any
+) -> Run:
     """Drive the run of a name to its verdict.
 
     plan : of the task; a built-in law that does not follow it needs but the joint motions (2, n) of its
@@ -386,14 +546,7 @@ def drive(
             unplanned = f"no joints can follow the plan: {plan.reason}"
         elif plan.duration is not None:
             planned_s = plan.duration / scenario.given.speed_scale
-    asked = _Asked(scenario, plan, law, mode == REGULATE or bool(unplanned), believed, given or Given())
-    if scenario.given.contract is not None:
-        run = asked.by_contract()
-    elif isinstance(plan, Plan) and (not _in_compiled_loop(scenario.given, law) or asked.is_guided):
-        run = asked.simulated()
-    else:
-        run = asked.compiled()
-    return replace(run, law=law, mode=mode, planned_s=planned_s, unplanned=unplanned)
+    return Run(scenario, plan, law, mode, planned_s, unplanned, believed, **brought).drive()
 
 
 def _in_compiled_loop(inputs: ServoInputs, law: str) -> bool:
@@ -405,183 +558,6 @@ def sense_is_enough(inputs: ServoInputs, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
     return mode == REGULATE and _in_compiled_loop(inputs, law)
-
-
-@dataclass(frozen=True, eq=False)
-class _Asked:
-    """A run that is to be driven."""
-
-    scenario: RunScenario
-    plan: Plan | FloatArray  # of the task, or the joint motions (2, n) of its rotations where that is enough
-    law: str
-    replans: bool  # whether the law goes its own way instead of following the plan
-    believed: Model | None  # robot and rig as the law has them; None for the default of its kind
-    given: Given  # objects that a caller passes
-
-    @property
-    def is_guided(self) -> bool:
-        """Whether the run follows a plan which gives way to another one where it fails."""
-        scenario = self.scenario
-        searched = scenario.inputs.trajectory.profile in ("joint_space", "auto")
-        if self.replans or self.law not in CODES or not searched:
-            return False
-        return not why_closed(scenario.model, scenario.demands, search_of(scenario))
-
-    def compiled(self) -> _Outcome:
-        """Drive a built-in law on the simulated robot in the compiled loop."""
-        scenario, controller = self.scenario, self._built_in()
-        q_start, limits, observed = scenario.ends.q_start, scenario.limits, len(scenario.numbers_of(self.law))
-        parts = MAX_PARTS if scenario.gains.substeps else 0
-        log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts)
-        plant, state = scenario.plant_of(self.law), controller.state
-        noise = scenario.noise_of(self.law, scenario.inputs.seed, limits.max_steps + 1)
-        course = Course(plant, limits, q_start.copy())
-        code, steps = run_compiled(controller.law, course, noise, state, log)
-        return _Outcome(
-            scenario=scenario,
-            verdict=VERDICTS[code],
-            why="",
-            steps=steps,
-            log=log,
-            limited=float(state.limited[0]),
-            plant=plant,
-        )
-
-    def simulated(self) -> _Outcome:
-        """Drive a law on the simulated robot without a fault in the Python loop."""
-        scenario = self.scenario
-        noise = scenario.noise_of(self.law, scenario.inputs.seed, scenario.limits.max_steps + 1)
-        plant = AnalyticPlant(scenario.plant_of(self.law), scenario.ends.q_start, noise)
-        return self._in_python(self._controller(), plant)
-
-    def by_contract(self) -> _Outcome:
-        """Drive a robot of the contract from the start of the task, where a simulated one stands.
-
-        That of ``plant.use`` is driven there. Before its first motion, its images must agree with the
-        calibration where it stands. The robot is stopped and closed on every way out.
-        """
-        scenario, contract = self.scenario, self.scenario.given.contract
-        assert contract is not None
-        own = scenario.truth is None
-        if own and (scenario.calibration is None or not scenario.calibration.usable):
-            raise WorkFailed("the calibration is not usable, and no robot is driven with it: calibrate again")
-        if own and scenario.calibration is not None and (order := scenario.calibration.order_advice):
-            raise InputError(
-                f"{order}, or set data.joint_order=stated if it is known; no robot is driven before"
-            )
-        controller, driven = (
-            self._controller(),
-            external_robot.connected(scenario, self.law, self.given.robot),
-        )
-        # The matrices of a frame are small: a second thread costs more than it gives.
-        with threadpool_limits(limits=1), at_rest_after(driven.robot):
-            unseen = ""
-            if own:
-                driven.robot.require_identity(contract.identity)
-                wrong = driven.fits()
-                if wrong:
-                    raise WorkFailed(f"the robot did not move, since at the start {wrong}", refutes=True)
-                assert contract.settle_s is not None
-                start, settle_s = scenario.ends.q_start, contract.settle_s
-                unseen = self._require_images(driven, "the robot did not move, since where it stands", 2)
-                for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
-                    if wrong := driven.agrees():
-                        raise WorkFailed(f"stopped on the path to the start, since {wrong}", refutes=True)
-                if wrong := driven.at_rest():
-                    raise WorkFailed(f"stopped at the start, since {wrong}", refutes=True)
-                unseen = self._require_images(driven, "stopped at the start of the task, since", 1) or unseen
-            driven.begin()
-            run = self._in_python(controller, driven, StallMonitor(driven, scenario.limits))
-            return replace(run, unseen=unseen)
-
-    def _require_images(self, driven: DrivenRobot, what: str, least: int) -> str:
-        """Refuse to move a robot of which so many cameras or more show nothing, unless that was asked for."""
-        unseen, own = driven.unseen(least), driven.robot.robot
-        if unseen and not self.given.blind:
-            seen = "; ".join([unseen, *(own.remarks() if isinstance(own, CameraRobot) else ())])
-            raise WorkFailed(
-                f"{what} {seen}: uncover both cameras and look at their light, or move the arm by hand to "
-                "where they see the tags; --blind (blind=True) drives it without images"
-            )
-        return unseen
-
-    def _in_python(
-        self, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, stall: StallMonitor | None = None
-    ) -> _Outcome:
-        """Drive a law on a plant, every command scaled; a run that is guided is watched."""
-        scenario, execution = self.scenario, None
-        if self.is_guided and isinstance(law, BuiltInLaw):
-            assert isinstance(self.plan, Plan)
-            follow, searches = partial(self._task, law.law.model), scenario.given.max_replan_attempts
-            replanner = PathReplanner(scenario, self.plan)
-            execution = ExecutionMonitor(law, follow, replanner, searches, scenario.limits, stall)
-        code, steps, log = run_in_python(
-            law,
-            plant,
-            scenario.ends.by_points().s_star,
-            scenario.gains.period,
-            scenario.limits,
-            scenario.given.speed_scale,
-            stall=stall,
-            execution=execution,
-        )
-        limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
-        driven = plant if isinstance(plant, DrivenRobot) else None
-        if driven is not None and VERDICTS[code] == "converged" and driven.at_rest():
-            code = VERDICTS.index("fault detected")
-        if driven is not None:  # it moves from sample to sample, in any mode
-            path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
-            log = log._replace(path=path, parts=np.ones_like(log.parts))
-        return _Outcome(
-            scenario=scenario,
-            verdict=VERDICTS[code],
-            why=plant.disturbance or ("" if stall is None else stall.reason),
-            steps=steps,
-            log=log,
-            limited=limited,
-            plant=plant.plant,
-            replannings=() if execution is None else tuple(execution.attempts),
-            driven=driven,
-        )
-
-    def _task(self, model: Model, plan: Plan) -> Task:
-        """The task as a built-in law with a model is given it, with the plan that it follows."""
-        scenario = self.scenario
-        task, scale = scenario.images_for(self.law).task(model), scenario.given.speed_scale
-        return followed(model, task, plan, scenario.gains.period, scale)
-
-    def _built_in(self) -> BuiltInLaw:
-        """The built-in law with the model that it is given, and the sense of its rotations."""
-        scenario, plan = self.scenario, self.plan
-        model = self.believed or scenario.believed_by(self.law)
-        if self.replans:
-            task = scenario.images_for(self.law).task(model)
-        else:
-            assert isinstance(plan, Plan)
-            task = self._task(model, plan)
-        found = BuiltInLaw(CODES[self.law], model, task, scenario.gains)
-        sense = plan.rotation_sense() if isinstance(plan, Plan) else plan
-        found.state.driven[:] = in_span(found.state.work.span, model, scenario.ends.q_start, sense)
-        return found
-
-    def _controller(self) -> LoopLaw:
-        """The law, ready for the Python loop.
-
-        Raises InputError if there is no such law, it needs a model of the robot that the configuration lacks,
-        or the plan to follow has no time; WorkFailed if it cannot be made, or the joints cannot follow the
-        plan.
-        """
-        if self.law in CODES:
-            return self._built_in()
-        scenario, gains, ends = self.scenario, self.scenario.gains, self.scenario.ends.by_points()
-        assert scenario.calibration is not None
-        assert isinstance(self.plan, Plan)
-        face = np.array(scenario.calibration.indices_of(scenario.numbers[: scenario.m]))
-        model, shown = ImageModel.of(scenario.calibration), (ends.s_start, ends.s_star)
-        # A copy: no law may write to the arrays of another.
-        setup = copy.deepcopy(LawSetup(model, face, *shown, self.plan, gains, gains.period))
-        factory = self.given.law or plugins.find("law", self.law)
-        return PluginLaw(plugins.called("law", self.law, factory, (setup,), {}), f"law {self.law}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Pla
 from projservo_cli.report.report_data import DIRECT, Studies
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.given import ServoInputs
+from projservo_cli.stages.inputs import ServoInputs
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive
@@ -134,7 +134,7 @@ def run_studies(
 def metric_plan(bench: Comparison) -> Plan:
     """The task partitioned with the true metric model, so that its operators are in metres."""
     asked, robot = bench.scenario.inputs.trajectory, bench.truth.robot
-    trajectory = asked._replace(profile="linear", n_samples=2, duration_s=None)
+    trajectory = asked.model_copy(update={"profile": "linear", "n_samples": 2, "duration_s": None})
     shown, limits = bench.scenario.ends, limits_alone(robot.limits)
     return plan_task(bench.models["true"], shown, trajectory, limits)
 

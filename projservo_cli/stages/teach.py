@@ -13,12 +13,14 @@ from projservo_cli.display import require_radians
 from projservo_cli.hardware.preflight import MIN_SHARED
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
-from projservo_cli.robots.settings import Joints, OwnRobot, Readings
+from projservo_cli.robots.settings import Joints
+from projservo_cli.settings.sections import JointVector
+from projservo_cli.settings.task import Goal, GoalImages, TaskSettings
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
+from projservo_cli.simulation.streams import TAUGHT_NOISE, generator
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.external_robot import at_rest, averaged, plugin_robot, simulated_robot, takes_limits
-from projservo_cli.stages.given import Goal, GoalImages, PlanInputs, ReachingTask, TeachInputs
-from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
+from projservo_cli.stages.inputs import OwnRobot, PlanInputs, TeachInputs
 
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
@@ -64,19 +66,18 @@ class _Taught:
             else None
             for side in self.sigma
         ]
-        readings = Readings(tuple(self.q.tolist()), "rad")
-        return GoalImages(tuple(self.marker.tolist()), left, right, sigma[0], sigma[1], readings)
+        return GoalImages(
+            markers=tuple(self.marker.tolist()),
+            left=left,
+            right=right,
+            sigma_left_px=sigma[0],
+            sigma_right_px=sigma[1],
+            joints=JointVector(joints=self.q.tolist(), unit="rad"),
+        )
 
     def as_goal(self) -> dict[str, Any]:
         """Return the section ``task.goal`` of a configuration."""
-        seen = self.images
-        images: dict[str, Any] = {"markers": [*seen.markers]}
-        for name, pixels in zip(VIEWS, (seen.left, seen.right), strict=True):
-            images[name] = [None if pixel is None else [*pixel] for pixel in pixels]
-        for name, sigma in (("sigma_left_px", seen.sigma_left), ("sigma_right_px", seen.sigma_right)):
-            if sigma is not None:
-                images[name] = [*sigma]
-        return {"images": images | {"joints": {"joints": self.q.tolist(), "unit": "rad"}}}
+        return {"images": self.images.model_dump(mode="json", exclude_none=True)}
 
 
 class _Checked(NamedTuple):
@@ -91,7 +92,7 @@ class _Checked(NamedTuple):
 def teach(
     inputs: TeachInputs,
     frames: int,
-    at: Readings | None = None,
+    at: JointVector | None = None,
     wait: Callable[[str], None] | None = None,
 ) -> _Taught:
     """Look where the robot stands, and average so many frames of each camera.
@@ -163,7 +164,7 @@ def _require_limits(joints: Joints) -> None:
         )
 
 
-def _within_limits(at: Readings, joints: Joints) -> FloatArray:
+def _within_limits(at: JointVector, joints: Joints) -> FloatArray:
     """The joints (n,) of ``--at``, rad or m. Raises InputError where the robot cannot be put there."""
     if len(at.joints) != len(joints.types):
         raise InputError(f"--at: {len(at.joints)} numbers for {len(joints.types)} joints: give one for each")
@@ -206,7 +207,8 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     inputs : of a plan from anywhere; taught : with the whole face.
     """
     joints = inputs.joints.joints(calibration.joint_types, calibration)
-    start = Readings(tuple(np.clip(taught.q, joints.limits.lower, joints.limits.upper).tolist()), "rad")
+    within = np.clip(taught.q, joints.limits.lower, joints.limits.upper)
+    start = JointVector(joints=within.tolist(), unit="rad")
     limits = np.concatenate([joints.limits.lower, joints.limits.upper, joints.limits.speed])
     # No path is searched for joints whose limits are not known: the arm stands at the goal as it is.
     profile = "joint_space" if np.isfinite(limits).all() else "linear"
@@ -215,8 +217,8 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     asked = replace(
         inputs,
         seen_px=(tuple(left), tuple(right)),
-        task=ReachingTask(start, None, Goal(images=taught.images)),
-        trajectory=inputs.trajectory._replace(profile=profile, keep_out=()),
+        task=TaskSettings(start=start, goal=Goal(images=taught.images)),
+        trajectory=inputs.trajectory.model_copy(update={"profile": profile, "keep_out": ()}),
     )
     try:
         plan = planning.run(asked, calibration)

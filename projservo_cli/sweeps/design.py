@@ -15,15 +15,15 @@ import numpy as np
 
 from projservo_cli.calibration.prediction import displacements, image_points, moved_points
 from projservo_cli.config import Config, Override, load_config, to_yaml
-from projservo_cli.config.inputs import calibration_inputs, trajectory_of, truth_of
-from projservo_cli.config.robot import JointVector
+from projservo_cli.config.inputs import calibration_inputs, truth_of
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
-from projservo_cli.config.task import Goal, TaskSettings
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import law_and_mode, names_of
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.source import source_hash
+from projservo_cli.settings.sections import JointVector
+from projservo_cli.settings.task import Goal, TaskSettings
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.steps import key_of
@@ -305,7 +305,7 @@ class Design:
 
     def with_covariance(self) -> set[str]:
         """Keys of the calibrations of which a run needs the covariance, each 0.1 MB."""
-        cells = [c for c in range(self.cells) if trajectory_of(self.cell(c)).needs_covariance]
+        cells = [c for c in range(self.cells) if self.cell(c).trajectory.needs_covariance]
         return {self.calibration_key(*place) for place in product(cells, range(self._calibrations))}
 
     @property

@@ -15,43 +15,6 @@ _PLATEAU = 0.5
 PROFILES = ("linear", "exponential", "rotation_first", "translation_first", "planar_first")
 
 
-class KeptOut(NamedTuple):
-    """Region of an obstacle in the images: polygons of corners u and v, px; None for none in an image."""
-
-    left: tuple[tuple[float, float], ...] | None
-    right: tuple[tuple[float, float], ...] | None
-    occludes: bool  # whether the obstacle may hide markers: those of the face stay outside in both images
-
-
-class Trajectory(NamedTuple):
-    """The requested motion and its constraints."""
-
-    profile: str  # one of ``PROFILES``, ``constrained``, ``joint_space`` or ``auto``
-    visibility_fraction: float  # share of the translation at which visibility changes that is kept to
-    n_samples: int  # points of the path that are stored
-    duration_s: float | None  # time the motion is given; None for as little as it takes
-    acceleration_time_s: float  # time in which a motion comes up to its pace, and to rest again
-    border_px: float  # minimum distance of a marker from an image border
-    min_reciprocal_condition: float  # minimum reciprocal condition number of the face's image Jacobian
-    min_face_px: float  # minimum width of the face in an image
-    joint_margin: float  # minimum distance from a limit, revolute joints, rad
-    joint_margin_m: float  # and prismatic ones
-    max_goal_configurations: int  # joints that show the goal which a search tries
-    max_search_samples: int  # joint vectors that two trees grow towards, at most
-    search_seed: int
-    keep_out: tuple[KeptOut, ...]
-
-    @property
-    def rehearses(self) -> bool:
-        """Whether half turns are rehearsed; a search of the fractions compares both senses."""
-        return self.profile not in ("constrained", "auto")
-
-    @property
-    def needs_covariance(self) -> bool:
-        """Whether a plan takes the covariance of the calibration: searches through joint space, regions."""
-        return self.profile in ("joint_space", "auto") or bool(self.keep_out)
-
-
 def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.0) -> FloatArray:
     """Shares μ_t, μ_r, μ_p of the parts along the path, [RH00] eq. (18) and section 4.3.
 

@@ -12,7 +12,7 @@ from projservo_cli import calibration, cli, files, steps
 from projservo_cli.laws import law_and_mode
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
 from projservo_cli.stages import calibrate, plan, report, servo
-from projservo_cli.stages.given import CalibrationInputs, PlanInputs, ServoInputs, Table
+from projservo_cli.stages.inputs import CalibrationInputs, PlanInputs, ServoInputs, Table
 from projservo_cli.store.tables import read_table
 from tests.fake_records import fake
 
@@ -116,7 +116,7 @@ def pretend(patch, folder):
     pretended = Stages()
     patch.setattr(calibrate, "run", lambda *given, **named: pretended.calibrate(*given, **named))
     patch.setattr(plan, "run", lambda *given: pretended.plan(*given))
-    patch.setattr(servo, "run", lambda *given: pretended.servo(*given))
+    patch.setattr(servo, "run", lambda *given, **brought: pretended.servo(*given))
     patch.setattr(report, "run", lambda *given, **named: pretended.report(*given, **named))
     patch.setattr(steps, "missing", lambda run: pretended.gone)
     patch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time

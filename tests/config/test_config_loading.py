@@ -51,7 +51,7 @@ def test_a_configuration_loads_with_defaults_and_units(good):
     config = load_config(good)
     assert config.name == "good"
     assert config.joint_types == "RP"
-    assert config.task.start.values("RP") == (math.radians(10), 0.5)
+    assert tuple(config.task.start.values("RP")) == (math.radians(10), 0.5)
     assert config.robot.ranges == ((-2 * math.pi, 2 * math.pi), (0.2, 0.9))
     assert config.noise.calibration_px == 0.1
     assert config.control.joint_speed_limit_deg_s is None
@@ -255,7 +255,7 @@ def test_overrides_reach_lists_and_make_sections(good):
     gains = ["control.gain=1", "control.gain=2"]
     config = load_config(good, ["robot.dh.joints.1.limits_m=[0.1, 0.6]", *reference, *gains])
     assert config.robot.ranges[1] == (0.1, 0.6)
-    assert config.calibration.reference.values("RP") == (math.radians(1), 0.2)
+    assert tuple(config.calibration.reference.values("RP")) == (math.radians(1), 0.2)
     assert config.control.gain == 2
 
 

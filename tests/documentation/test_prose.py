@@ -61,7 +61,7 @@ TERMS = {
     "cluster|Dask": "sweeps/engine",
     "covariance": "calibration/prediction",
     "cross-validation": "calibration/quality",
-    "entry point|plug-?in": "robots/plugins",
+    "entry point|plug-?in": "plugins",
     "epipolar": "calibration/epipolar",
     "errors in variables": "calibration/joint_noise",
     "exit code": "cli/group",

@@ -16,7 +16,8 @@ from projservo_cli.hardware import cameras
 from projservo_cli.hardware.camera_robot import CameraRobot, exposure_of
 from projservo_cli.hardware.cameras import Camera
 from projservo_cli.records import WorkFailed
-from projservo_cli.robots.settings import CameraSettings, StereoSettings
+from projservo_cli.settings.cameras import Cameras as Stereo
+from projservo_cli.settings.cameras import Source
 from tests.hardware.streams import Stream, picture
 
 SEEN = picture()
@@ -40,7 +41,7 @@ def camera():
     opened = []
 
     def make(source, max_age_s=0.3, reconnect_s=1.0, **settings):
-        opened.append(Camera("left", CameraSettings(source, **settings), max_age_s, reconnect_s))
+        opened.append(Camera("left", Source(source=source, **settings), max_age_s, reconnect_s))
         opened[-1].open()
         return opened[-1]
 
@@ -114,13 +115,13 @@ def test_frames_of_another_size_are_refused(stream, camera):
 
 def test_what_cannot_be_opened_is_named():
     with pytest.raises(WorkFailed, match=r"the right camera .*no-such-film.*: cannot be opened"):
-        Camera("right", CameraSettings("no-such-film.mp4"), 0.3, 1.0).open()
+        Camera("right", Source(source="no-such-film.mp4"), 0.3, 1.0).open()
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="device nodes of Linux")
 def test_a_missing_or_forbidden_or_metadata_device_is_named_with_the_right_one(monkeypatch, tmp_path):
     with pytest.raises(WorkFailed, match=r"there is no /dev/video77; devices: "):
-        Camera("left", CameraSettings(77), 0.3, 1.0).open()
+        Camera("left", Source(source=77), 0.3, 1.0).open()
     nodes = [tmp_path / "video0", tmp_path / "video1"]
     for node in nodes:
         node.touch()
@@ -174,7 +175,7 @@ class _Driver:
 
 def test_autofocus_and_exposure_that_a_driver_does_not_fix_are_said():
     cv = cameras._cv()
-    settings = CameraSettings(0, (640, 480), 30.0, exposure_ms=8.0, focus=20.0)
+    settings = Source(source=0, size_px=(640, 480), rate_hz=30.0, exposure_ms=8.0, focus=20.0)
     sound = _Driver(set())
     assert list(cameras._set_up(sound, settings)) == []
     assert sound.told[cv.CAP_PROP_EXPOSURE] == 80.0  # V4L2 counts 100 µs
@@ -185,7 +186,7 @@ def test_autofocus_and_exposure_that_a_driver_does_not_fix_are_said():
     assert "autofocus is on" in autofocus
     assert "does not set the focus to 20" in focus
     assert "does not fix the exposure at 8 ms" in exposure
-    (automatic,) = cameras._set_up(sound, CameraSettings(0))
+    (automatic,) = cameras._set_up(sound, Source(source=0))
     assert "its exposure is automatic" in automatic
 
 
@@ -202,7 +203,7 @@ class _Ignoring(_Driver):
 
 def test_settings_that_a_driver_takes_and_ignores_are_said():
     yuyv = float(cameras._cv().VideoWriter.fourcc(*"YUYV"))
-    settings = CameraSettings(0, exposure_ms=8.0, focus=30.0)
+    settings = Source(source=0, exposure_ms=8.0, focus=30.0)
     ignoring = _Ignoring(FOURCC=yuyv, AUTOFOCUS=1.0, FOCUS=100.0, EXPOSURE=156.0)
     assert list(cameras._set_up(ignoring, settings)) == [
         "sends YUYV, not the MJPG of fourcc: set fourcc: YUYV, or take another camera",
@@ -252,7 +253,7 @@ class Arm:
 def test_an_arm_without_pixels_becomes_a_robot_that_sees_tags(stream):
     left, right = stream(lambda: SEEN), stream(lambda: picture(at=(120.0, 90.0), numbers=(0, 1)))
     arm = Arm()
-    stereo = StereoSettings(CameraSettings(left.url), CameraSettings(right.url))
+    stereo = Stereo(left=Source(source=left.url), right=Source(source=right.url))
     robot = CameraRobot(arm, stereo, TagFinder("4X4_50"), range(8))
     robot.open()
     q, pixels, t_q, t_left, t_right, sigma = robot.read()

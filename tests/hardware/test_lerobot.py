@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from projservo_cli import plugins
 from projservo_cli.records import WorkFailed
-from projservo_cli.robots import plugins
 from tests.documentation.blocks import PAGES, blocks_of
 
 NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")

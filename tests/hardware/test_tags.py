@@ -6,9 +6,9 @@ import re
 import numpy as np
 import pytest
 
-from projservo_cli.config.markers import GROUND, Markers
 from projservo_cli.detection import TagFinder
 from projservo_cli.hardware import tags
+from projservo_cli.settings.markers import GROUND, Markers
 
 pdfium = pytest.importorskip("pypdfium2")
 pytest.importorskip("cv2")

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.config.markers import Markers
+from projservo_cli.settings.markers import Markers
 from tests.monitoring.corners import CornerMap
 
 IMAGE, FOCAL, TAG_M = (800, 600), 760.0, 0.035

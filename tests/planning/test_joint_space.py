@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import predict
-from projservo_cli.config.robot import JointVector
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.settings.sections import JointVector
 from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import followed
 from projservo_cli.task.trajectory import planned

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from projservo_cli import plugins
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.robots import plugins
 from projservo_cli.robots.source import source_hash
 
 UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"

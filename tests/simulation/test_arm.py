@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.config.inputs import task_of
 from projservo_cli.records import InputError
 from projservo_cli.simulation.arm import camera_center, roll_axis
+from projservo_cli.simulation.workspace import turned
 from tests.configured import truth_of
 from tests.known import configured
 from tests.samples import displacement, pixels
@@ -118,7 +118,7 @@ def test_the_joints_of_a_goal_hold_the_tool_there(roll_deg):
     config = configured("paper_perturbed", f"task.goal.roll_deg={roll_deg}")
     truth, goal = truth_of(config), config.task.goal
     q_start = np.array(config.task.start.values(config.joint_types))
-    q = task_of(config).goal.turn.joints(truth.robot, truth.P, q_start)
+    q = turned(goal, truth.robot, truth.P, q_start)
     around, direction = roll_axis(truth.P)
     turn = displacement(math.radians(roll_deg) * direction, np.zeros(3))
     turn[:3, 3] = around - turn[:3, :3] @ around

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config, plain_yaml
-from projservo_cli.config.inputs import events_of, faults_of
 from projservo_cli.records import REVOLUTE, position_limits
 from projservo_cli.simulation.arm import Arm
 from projservo_cli.simulation.faults import FaultyRobot, Points, World, full_reach
@@ -44,7 +43,7 @@ def robot(sigma_px=0.0, seed=1, q_start=(0.0, 0.0), **disturbance):
     truth = Truth(arm(), CAMERAS, M, (0, 1, 2), (), 0, np.full(2, math.inf))
     world = World(truth, np.array(q_start), Points(truth, truth.images, True, sigma_px), PERIOD, seed, 0)
     config = load_config(None, text=plain_yaml({"data": {"table": "none"}, "disturbance": disturbance}))
-    return FaultyRobot(world, faults_of(config), events_of(config))
+    return FaultyRobot(world, config.disturbance, config.disturbance)
 
 
 def driven(plant, targets):

@@ -8,7 +8,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
 from projservo_cli.simulation import mjcf
-from tests.configured import arm_of
+from projservo_cli.simulation.described import arm_of
 from tests.samples import displacement
 
 try:
@@ -87,7 +87,7 @@ def poses(model, tip, names, readings):
 
 def test_a_urdf_moves_as_mujoco_has_it(tmp_path, rng):
     config = configured(tmp_path, "urdf", URDF, "tool")
-    arm, readings = arm_of(config), rng.uniform(-1.0, 1.0, (20, 3))
+    arm, readings = arm_of(config.arm), rng.uniform(-1.0, 1.0, (20, 3))
     extra = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco></robot>'
     model = mujoco.MjModel.from_xml_string(URDF.replace("</robot>", extra))
     expected = poses(model, "tool", ["turn", "lift", "spin"], readings)
@@ -99,11 +99,11 @@ def test_a_urdf_moves_as_mujoco_has_it(tmp_path, rng):
 
 def test_an_mjcf_moves_as_mujoco_has_it(tmp_path, rng):
     config = configured(tmp_path, "mjcf", MJCF, "hand")
-    arm, readings = arm_of(config), rng.uniform(-1.0, 1.0, (20, 3))
+    arm, readings = arm_of(config.arm), rng.uniform(-1.0, 1.0, (20, 3))
     model = mujoco.MjModel.from_xml_string(MJCF)
     expected = poses(model, "hand", ["b", "a", model.nu + 4], readings)
     assert np.array([arm.pose(q) for q in readings]) == pytest.approx(expected, abs=1e-12)
-    at_site = arm_of(configured(tmp_path, "mjcf", MJCF, "flange"))
+    at_site = arm_of(configured(tmp_path, "mjcf", MJCF, "flange").arm)
     assert at_site.base_tool == pytest.approx(arm.base_tool @ displacement([0, 0, 0], [0, 0.1, 0]), abs=1e-12)
     assert config.joint_types == "RRP"
     assert arm.q_reference.tolist() == [0.2, 0.0, 0.0]

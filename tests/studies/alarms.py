@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.config.robot import JointVector
 from projservo_cli.records import WorkFailed
+from projservo_cli.settings.sections import JointVector
 from projservo_cli.sweeps.design import random_tasks
 from tests.configured import calibrate, plan, servo, truth_of
 from tests.known import configured

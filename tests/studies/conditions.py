@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from projservo_cli.config.robot import JointVector
+from projservo_cli.settings.sections import JointVector
 from projservo_cli.simulation.faults import FaultyRobot
 from projservo_cli.sweeps.design import STRATA, random_tasks
 from tests.configured import truth_of

@@ -17,8 +17,6 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
-from projservo_cli.config.robot import JointVector
-from projservo_cli.config.task import KeptOut
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import image_sizes
 from projservo_cli.planning.constraints import constraints_of
@@ -27,6 +25,8 @@ from projservo_cli.planning.keep_out import keep_out_of
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, within_region
 from projservo_cli.records import WorkFailed
+from projservo_cli.settings.sections import JointVector
+from projservo_cli.settings.task import KeptOut
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.scenario import Scenario

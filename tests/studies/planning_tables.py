@@ -12,12 +12,12 @@ import numpy as np
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from projservo_cli.config.robot import JointVector
 from projservo_cli.image_size import image_sizes
 from projservo_cli.planning.constraints import constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path
+from projservo_cli.settings.sections import JointVector
 from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import TaskImages
 from tests.configured import joints_of, truth_of

@@ -16,7 +16,7 @@ from projservo_cli.hardware.camera_robot import View
 from projservo_cli.hardware.cameras import Frame
 from projservo_cli.hardware.preflight import Seen, findings_at_rest
 from projservo_cli.records import JointLimits
-from projservo_cli.robots.settings import CameraSettings
+from projservo_cli.settings.cameras import Source
 from tests.hardware.streams import picture
 from tests.hardware.test_preflight import seen_from
 from tests.hardware.wiggled import Faults, findings
@@ -85,7 +85,7 @@ def at_rest(rng, change):
                 name=name,
                 newest=lambda frame=frame: frame,
                 rate_hz=change.get("rate", rng.uniform(27.0, 31.0)),
-                settings=CameraSettings("http://camera", rate_hz=30.0),
+                settings=Source(source="http://camera", rate_hz=30.0),
                 stamped=False,
                 remarks=[],
             )

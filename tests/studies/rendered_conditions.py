@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.config.robot import JointVector
 from projservo_cli.records import FloatArray
+from projservo_cli.settings.sections import JointVector
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.sweeps.design import STRATA, random_tasks
 from tests.configured import observed_in_frames, robot_by_itself, truth_of

@@ -1,15 +1,17 @@
 """Cameras that projservo itself reads, for an arm whose class reads joints alone."""
 
+import re
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field, Strict, StrictInt, StrictStr, StringConstraints
 
-from projservo_cli.config.robot import Count, Finding, NotNegative, Positive, Section
-from projservo_cli.robots.settings import CameraSettings, StereoSettings, device_of
+from projservo_cli.settings.sections import Count, Finding, NotNegative, Positive, Section
 
 
-class _Source(Section):
+class Source(Section):
     """A camera: a device, a film, or a stream."""
 
     source: Annotated[StrictInt, Field(ge=0)] | Annotated[StrictStr, Field(min_length=1)] = Field(
@@ -33,11 +35,21 @@ class _Source(Section):
             yield ("source",), f"is text: an index has no quotes: source: {int(self.source)}"
 
 
+def device_of(source: int | str) -> Path | None:
+    """Device node of V4L2 that a source is, such as ``/dev/video0``; None for others."""
+    if not sys.platform.startswith("linux"):
+        return None
+    path = Path(f"/dev/video{source}") if isinstance(source, int) else Path(source)
+    if not str(path).startswith("/dev/"):
+        return None
+    return path.resolve() if re.fullmatch(r"video\d+", path.resolve().name) else path
+
+
 class Cameras(Section):
     """Both cameras, of an arm whose class has joints() in place of read(); projservo finds the tags."""
 
-    left: _Source = Field(description="the left camera")
-    right: _Source = Field(description="the right camera")
+    left: Source = Field(description="the left camera")
+    right: Source = Field(description="the right camera")
     max_age_s: Positive = Field(0.3, description="how old a frame may be, from its stamp")
     reconnect_s: Positive = Field(
         1.5, description="within which a lost camera must give frames again; the arm holds meanwhile"
@@ -50,9 +62,3 @@ class Cameras(Section):
             yield ("right", "source"), f"is {left}, that of the left camera as well: name the other one"
         if self.reconnect_s < self.max_age_s:
             yield ("reconnect_s",), f"must not be below max_age_s, {self.max_age_s:g}"
-
-    @property
-    def settings(self) -> StereoSettings:
-        """Both cameras as records."""
-        left, right = (CameraSettings(**vars(one)) for one in (self.left, self.right))
-        return StereoSettings(left, right, self.max_age_s, self.reconnect_s)

@@ -7,17 +7,18 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool, StrictInt
 
-from projservo_cli.config.robot import (
+from projservo_cli.settings.sections import (
     Count,
     Finding,
     JointVector,
     NotNegative,
+    Number,
     Positive,
     Section,
     Vector2,
+    Vector3,
     Whole,
 )
-from projservo_cli.nominal import Number, Vector3
 
 
 class _Perturbation(Section):
@@ -31,7 +32,7 @@ _Pixels = tuple[Vector2 | None, ...]
 _Deviations = tuple[NotNegative | None, ...]
 
 
-class _GoalImages(Section):
+class GoalImages(Section):
     """Pixels of the face, and of further markers, at the goal, with their standard deviations."""
 
     markers: Annotated[tuple[Whole, ...], Field(min_length=1)] | None = Field(
@@ -62,9 +63,9 @@ class _GoalImages(Section):
         known = [dict(zip(own, side, strict=True)) for side in sides]
         return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in known]
 
-    def sigma_px(self, face: Sequence[int]) -> float | None:
-        """Standard deviation of a coordinate of the markers of the face, rms; None if unknown."""
-        known = [sigma**2 for side in self.deviations(face, face) for sigma in side]
+    def sigma_px(self, numbers: Sequence[int], face: Sequence[int]) -> float | None:
+        """Standard deviation of a coordinate of markers of some numbers, rms; None if unknown."""
+        known = [sigma**2 for side in self.deviations(numbers, face) for sigma in side]
         return None if any(map(math.isnan, known)) else math.sqrt(sum(known) / len(known))
 
 
@@ -78,7 +79,7 @@ class Goal(Section):
     perturbation: _Perturbation | None = Field(
         None, description="small displacement of a goal that roll_deg gives, in the tool frame"
     )
-    images: _GoalImages | None = Field(None, description="pixels of the face at the goal")
+    images: GoalImages | None = Field(None, description="pixels of the face at the goal")
 
     def contradictions(self) -> Iterator[Finding]:
         """No goal, or several."""
@@ -220,3 +221,18 @@ class Trajectory(Section):
         description="outlines of obstacles, each {left: [[u, v], ...], right: [[u, v], ...], "
         "occludes: true}, that no marker and no line between markers of the face enters",
     )
+
+    @property
+    def joint_margin(self) -> float:
+        """Minimum distance from a limit, revolute joints, rad."""
+        return math.radians(self.joint_margin_deg)
+
+    @property
+    def rehearses(self) -> bool:
+        """Whether half turns are rehearsed; a search of the fractions compares both senses."""
+        return self.profile not in ("constrained", "auto")
+
+    @property
+    def needs_covariance(self) -> bool:
+        """Whether a plan takes the covariance of the calibration: searches through joint space, regions."""
+        return self.profile in ("joint_space", "auto") or bool(self.keep_out)

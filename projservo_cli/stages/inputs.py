@@ -1,24 +1,36 @@
 """Inputs of each stage: records of the values that it reads, of which its key is a hash."""
 
 import hashlib
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from projservo_cli.canonical import File, encoded
 from projservo_cli.control.law import Gains
 from projservo_cli.display import About
 from projservo_cli.image_size import ImageSize
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings
+from projservo_cli.robots.settings import Following, JointSettings
+from projservo_cli.settings.cameras import Cameras
+from projservo_cli.settings.control import Stop
+from projservo_cli.settings.disturbance import Events
+from projservo_cli.settings.sections import JointVector
+from projservo_cli.settings.task import TaskSettings, Trajectory
 from projservo_cli.simulation.arm import Arm
-from projservo_cli.simulation.faults import Events, SimulatedRobot
+from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.scene import Scene
-from projservo_cli.simulation.workspace import Truth, Turn
-from projservo_cli.task.trajectory import Trajectory
+from projservo_cli.simulation.workspace import Truth
 
-_Pixel = tuple[float, float]
+
+class OwnRobot(NamedTuple):
+    """A robot of somebody's."""
+
+    target: str  # its class, module:Class
+    options: dict[str, Any]  # arguments that the class is made with
+    dictionary: str | None  # of tags, which a class that takes it is given
+    timeout_s: float  # most time an answer may take
+    open_s: float  # most time that opening may take
+    image_size: ImageSize | None  # width and height of its images, px, if known
+    cameras: Cameras | None = None  # of an arm that reads joints alone
 
 
 class Driven(NamedTuple):
@@ -32,7 +44,7 @@ class Driven(NamedTuple):
 class Motions(NamedTuple):
     """Trial motions: every joint alone about a reference, then all joints at once."""
 
-    reference: Readings
+    reference: JointVector
     amplitude: tuple[float, float]  # farthest trial to each side, revolute joints, rad, and prismatic ones, m
     frames_per_joint: int
     random_poses: int  # of all joints at once
@@ -152,55 +164,11 @@ class PreflightInputs:
     dictionary: str | None  # of the tags; None if not configured
 
 
-class GoalImages(NamedTuple):
-    """Pixels of markers at the goal, with how sure they are."""
-
-    markers: tuple[int, ...]  # numbers of the markers that pixels are of
-    left: tuple[_Pixel | None, ...]
-    right: tuple[_Pixel | None, ...]  # left, right: u and v of each marker, px; None where unseen
-    sigma_left: tuple[float | None, ...] | None
-    sigma_right: tuple[float | None, ...] | None  # their standard deviations, px; None if unknown
-    joints: Readings | None  # there
-
-    def pixels(self) -> dict[int, tuple[_Pixel, _Pixel]]:
-        """Left and right pixel of each marker, NaN where unseen."""
-        unseen = math.nan, math.nan
-        each = zip(self.markers, self.left, self.right, strict=True)
-        return {number: (left or unseen, right or unseen) for number, left, right in each}
-
-    def deviations(self, numbers: Sequence[int]) -> list[list[float]]:
-        """Standard deviation of markers in the left and in the right image, px; NaN if unknown."""
-        sides = [side or (None,) * len(self.markers) for side in (self.sigma_left, self.sigma_right)]
-        known = [dict(zip(self.markers, side, strict=True)) for side in sides]
-        return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in known]
-
-    def sigma_px(self, face: Sequence[int]) -> float | None:
-        """Standard deviation of a coordinate of the markers of the face, rms; None if unknown."""
-        known = [sigma**2 for side in self.deviations(face) for sigma in side]
-        return None if any(map(math.isnan, known)) else math.sqrt(sum(known) / len(known))
-
-
-class Goal(NamedTuple):
-    """The goal: joint readings, a turn, or images; the others are None."""
-
-    joints: Readings | None = None
-    turn: Turn | None = None
-    images: GoalImages | None = None
-
-
-class ReachingTask(NamedTuple):
-    """A task from start to goal; a goal that is a turn stays that of the start without the offset."""
-
-    start: Readings
-    start_offset: Readings | None
-    goal: Goal
-
-
 @dataclass(frozen=True, eq=False)
 class PlanInputs:
     """Inputs of a plan, except the calibration."""
 
-    task: ReachingTask | None
+    task: TaskSettings | None
     seed: int  # of the noise of start and goal
     truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
     arm: Arm | None  # kinematics as they are described, if they are
@@ -221,20 +189,6 @@ class PlanInputs:
     seen_px: ImageSize | None = None
 
 
-class StopSettings(NamedTuple):
-    """When a closed loop ends."""
-
-    image_error_px: float
-    noise_factor: float  # ``image_error_px`` grows by this factor × the noise
-    max_steps: int
-    diverged_factor: float
-    stall_periods: int
-    max_lost_periods: int
-    innovation_threshold: float  # of the noise, beyond which images disturb a run; 0 tests nothing
-    at_joint_limit: bool
-    at_border: bool  # at_joint_limit, at_border: whether they end a run
-
-
 class Contract(NamedTuple):
     """Further inputs of a run by the contract."""
 
@@ -252,7 +206,9 @@ class ServoInputs:
 
     plan: PlanInputs  # inputs of the plan
     gains: Gains  # of the laws; limits are those of the joints
-    stop: StopSettings
+    stop: Stop
+    at_joint_limit: bool
+    at_border: bool  # at_joint_limit, at_border: whether they end a run
     opaque: bool  # whether the face hides its markers from a camera behind it
     speed_scale: float  # factor of every command
     max_replan_attempts: int  # maximum number of replanning attempts

@@ -8,9 +8,8 @@ import numpy as np
 from pydantic import Field, PlainValidator, StringConstraints, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.config.robot import Finding, Positive, Section, Whole
-from projservo_cli.nominal import Matrix44, Vector3, not_rigid
 from projservo_cli.records import CORNERS, FloatArray
+from projservo_cli.settings.sections import Finding, Matrix44, Positive, Section, Vector3, Whole, not_rigid
 
 GROUND = 4.0 / 3.0
 """Width of a tag of six cells with a bright margin of one cell, over that without."""

@@ -1,0 +1,114 @@
+"""Trial motions, the table that stands in for them, and the method that evaluates them."""
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, StrictBool, StrictInt, StringConstraints
+
+from projservo_cli.settings.sections import (
+    Count,
+    Finding,
+    JointVector,
+    NotNegative,
+    Number,
+    Positive,
+    Section,
+    Sizes,
+    Whole,
+)
+
+
+class Noise(Section):
+    """Standard deviation of simulated pixel noise, per coordinate."""
+
+    calibration_px: NotNegative = Field(0.5, description="pixel noise of the trial motions")
+    servo_px: NotNegative = Field(
+        0.0, description="pixel noise of the closed loop, and of the images of start and goal"
+    )
+    averaged_frames: Count = Field(
+        1, description="number of images averaged at the start and at the goal, where the robot rests"
+    )
+
+
+class CalibrationSettings(Section):
+    """Trial motions of one joint each around a reference, and the method that evaluates them."""
+
+    method: Literal["bundle_adjustment", "closed_form"] = Field(
+        "bundle_adjustment",
+        description="bundle_adjustment is maximum likelihood; closed_form has the closed forms of the paper",
+    )
+    frames_per_joint: StrictInt = Field(
+        8, ge=0, le=10_000, description="trial poses of each joint, in addition to the reference"
+    )
+    amplitude_deg: Number = Field(
+        30.0, ge=0, lt=180, description="maximum trial motion to each side, revolute joints"
+    )
+    amplitude_m: NotNegative = Field(0.15, description="maximum trial motion to each side, prismatic joints")
+    reference: JointVector | None = Field(
+        None, description="joint readings of the reference pose; null: task.start"
+    )
+    cross_validate: StrictInt | None = Field(
+        None,
+        ge=2,
+        le=10_000,
+        description="number of folds of the poses, each predicted from the others; null: no cross-validation",
+    )
+    max_predicted_px: Positive | None = Field(
+        None,
+        description="error of predictions by deviations of arm and rig from the model above which the "
+        "calibration is not usable, px; null: 1 % of the image size",
+    )
+    init: Annotated[str, StringConstraints(min_length=1)] | None = Field(
+        None, description="JSON file of a known robot and rig, the first initial guess of the fit"
+    )
+    random_poses: StrictInt | None = Field(
+        None,
+        ge=0,
+        le=10_000,
+        description="trial poses of all joints at once, within the amplitudes, after those of single "
+        "joints; null: 12 if readings or images may have faults, 0 for the ideal plant",
+    )
+    joint_noise_deg: NotNegative | None = Field(
+        None,
+        description="standard deviation of joint readings (prismatic joints: × 0.3 m/rad); null: "
+        "estimated, 0 for the ideal plant",
+    )
+    seed: Whole | None = Field(
+        None, description="seed of the noise of the trial motions; null: seed of the run"
+    )
+    lens: StrictBool = Field(
+        False,
+        description="whether to estimate radial distortion: two coefficients a camera, and its centre",
+    )
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Yield keys of another method."""
+        for key in ("cross_validate", "init"):
+            if getattr(self, key) is not None and self.method != "bundle_adjustment":
+                yield (key,), f"belongs to the method bundle_adjustment, not to {self.method}"
+
+
+class Data(Section):
+    """A recorded run: the observation table that stands in for simulated trial motions."""
+
+    table: Annotated[str, StringConstraints(min_length=1)] = Field(
+        description="path of the table, relative to the configuration"
+    )
+    joints: Annotated[str, StringConstraints(pattern=r"^[RrPp]+$"), AfterValidator(str.upper)] | None = Field(
+        None,
+        description="joint types, one letter R or P for each column q1 ... qN; null: those of robot, "
+        "else all R",
+    )
+    joint_unit: Literal["deg", "rad"] | None = Field(
+        None,
+        description="unit of revolute joints; null: rad, and readings that look like degrees are refused",
+    )
+    joint_order: Literal["stated"] | None = Field(
+        None,
+        description="stated: q1 ... qN are known to follow each other from base to tool; null: servo drives "
+        "an external robot only if poses show it",
+    )
+    noise_px: Positive | None = Field(None, description="pixel noise per coordinate; null: estimated")
+    image_size_px: Sizes | None = Field(
+        None, description="width and height of both images, or those of each; null: those of cameras or rig"
+    )

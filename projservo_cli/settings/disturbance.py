@@ -1,0 +1,163 @@
+"""Faults of the simulated robot and its cameras, permanent ones and events in a run."""
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, StrictBool
+
+from projservo_cli.records import VIEWS
+from projservo_cli.settings.sections import (
+    Count,
+    Finding,
+    NotNegative,
+    Number,
+    Positive,
+    Section,
+    Vector3,
+    Whole,
+)
+
+
+class LostMarkers(Section):
+    """Markers that both cameras lose for some steps."""
+
+    from_step: Whole = Field(description="first step at which the markers are unseen")
+    steps: Count | None = Field(None, description="number of steps; null: until the end of the run")
+    markers: Annotated[tuple[Whole, ...], Field(min_length=1)] | None = Field(
+        None, description="numbers of the markers; null: all markers"
+    )
+
+
+class JointMoved(Section):
+    """A joint that is displaced, or slips on its encoder."""
+
+    at_step: Count = Field(description="step at which the joint moves")
+    joint: Count = Field(description="number of the joint, from 1")
+    by_deg: Number | None = Field(None, description="angle of a revolute joint")
+    by_m: Number | None = Field(None, description="distance of a prismatic joint")
+    encoder_slip: StrictBool = Field(
+        False, description="whether the link slips on its encoder, so that the reading stays the same"
+    )
+
+    def contradictions(self) -> Iterator[Finding]:
+        """An angle and a distance, or neither."""
+        if (self.by_deg is None) == (self.by_m is None):
+            yield (), "give exactly one of by_deg and by_m"
+
+    @property
+    def by(self) -> float:
+        """By how much it is moved, rad or m."""
+        return self.by_m or 0.0 if self.by_deg is None else math.radians(self.by_deg)
+
+
+class StuckEncoder(Section):
+    """An encoder whose reading stays constant while its joint moves."""
+
+    joint: Count = Field(description="number of the joint, from 1")
+    from_step: Whole = Field(description="first step of the constant reading")
+    steps: Count | None = Field(None, description="number of steps; null: until the end of the run")
+
+
+class CameraMoved(Section):
+    """A camera that moves, which shifts its image."""
+
+    at_step: Whole = Field(description="first step at which the image is shifted")
+    view: Literal["left", "right"] = Field(description="the camera that moves")
+    by_px: Number | tuple[Number, Number] = Field(description="shift of its image along u, or along u and v")
+
+    def by_view(self) -> tuple[tuple[float, float], ...]:
+        """Return the shift along u and v, left and right."""
+        shift = self.by_px if isinstance(self.by_px, tuple) else (self.by_px, 0.0)
+        return tuple(shift if self.view == view else (0.0, 0.0) for view in VIEWS)
+
+
+class MarkerMoved(Section):
+    """A marker that moves on the tool."""
+
+    at_step: Whole = Field(description="first step at the new position")
+    marker: Whole = Field(description="number of the marker")
+    by_m: Vector3 = Field(description="displacement in the frame of the tool")
+
+
+class Delays(Section):
+    """Latency of both cameras, s."""
+
+    left: NotNegative = Field(0.0, description="latency of the left camera")
+    right: NotNegative = Field(0.0, description="latency of the right camera")
+
+
+def of_both(value: Any) -> Any:
+    """One number stands for both cameras."""
+    return {"left": value, "right": value} if isinstance(value, int | float) else value
+
+
+class Faults(Section):
+    """Permanent faults of the simulated robot and its cameras, which a calibration has to model too."""
+
+    camera_latency_s: Annotated[
+        Delays, BeforeValidator(of_both, json_schema_input_type=NotNegative | Delays)
+    ] = Field(
+        Delays(),
+        description="time from the middle of an exposure to the joint readings that arrive with its "
+        "image, at least half the exposure; a number for both cameras, or {left, right}",
+    )
+    exposure_s: NotNegative = Field(0.0, description="exposure time, over which an image is averaged")
+    jitter_s: NotNegative = Field(
+        0.0, description="standard deviation of the exposure times of single images"
+    )
+    frame_rate_hz: Positive | None = Field(
+        None, description="frame rate of free-running cameras; null: each reading triggers an image"
+    )
+    frame_offset_s: Number = Field(
+        0.0, description="delay of the right camera behind the left one, with frame_rate_hz"
+    )
+    stamps: StrictBool = Field(
+        False, description="whether images carry the time of mid-exposure, each camera by its own clock"
+    )
+    encoder_counts_per_turn: Count | None = Field(
+        None,
+        description="resolution of the joint readings, counts per turn, or per 1.885 m of a prismatic "
+        "joint; null: continuous",
+    )
+    quantize_setpoints: StrictBool = Field(
+        False, description="whether set-points are rounded to encoder counts as well"
+    )
+    servo_time_constant_s: NotNegative = Field(
+        0.0, description="time constant of the first-order lag of the servos"
+    )
+    gravity_sag_deg: NotNegative = Field(
+        0.0, description="steady-state error under gravity at full reach; the encoders read it"
+    )
+    link_deflection_deg: NotNegative = Field(
+        0.0, description="deflection of a link under gravity at full reach; no encoder reads it"
+    )
+    backlash_deg: NotNegative = Field(
+        0.0, description="backlash between each encoder and its link, from end to end"
+    )
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Yield keys without effect because another is missing."""
+        if self.frame_offset_s and self.frame_rate_hz is None:
+            yield ("frame_offset_s",), "is that of cameras that run freely: set frame_rate_hz as well"
+        if self.quantize_setpoints and self.encoder_counts_per_turn is None:
+            yield ("quantize_setpoints",), "takes the ticks of encoders: set encoder_counts_per_turn as well"
+
+    @property
+    def latencies_s(self) -> tuple[float, float]:
+        """Latency of the left and of the right camera."""
+        return self.camera_latency_s.left, self.camera_latency_s.right
+
+
+class Events(Section):
+    """Events of the simulated robot and its cameras in a run."""
+
+    lost_markers: LostMarkers | None = None
+    joint_moved: JointMoved | None = None
+    stuck_encoder: StuckEncoder | None = None
+    camera_moved: CameraMoved | None = None
+    marker_moved: MarkerMoved | None = None
+
+
+class Disturbance(Events, Faults):
+    """Faults of the simulated robot and its cameras, permanent ones and events in a run."""

@@ -1,0 +1,166 @@
+"""Sections of a configuration: frozen values, each with its unit in its name, and what contradicts them."""
+
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Annotated, Any, Literal, Self, TypeVar, cast
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationInfo,
+    WithJsonSchema,
+    WrapValidator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from projservo_cli.records import FARTHEST_M, FloatArray
+
+Number = Annotated[float, Strict()]
+Vector2 = tuple[Number, Number]
+Vector3 = tuple[Number, Number, Number]
+Vector4 = tuple[Number, Number, Number, Number]
+Matrix34 = tuple[Vector4, Vector4, Vector4]
+Matrix44 = tuple[Vector4, Vector4, Vector4, Vector4]
+Positive = Annotated[float, Strict(), Field(gt=0)]
+NotNegative = Annotated[float, Strict(), Field(ge=0)]
+Whole = Annotated[int, Strict(), Field(ge=0, le=2**63 - 1)]
+Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
+
+
+def _one_or_each(value: Any, of_one: Callable[[Any], tuple[int, int]]) -> Any:
+    """Width and height of both images, or, where their sizes differ, those of the left and of the right."""
+    pair = isinstance(value, (list, tuple)) and len(value) == 2
+    if not pair or not all(isinstance(one, (list, tuple)) for one in value):
+        return of_one(value)
+    left, right = map(of_one, value)
+    return left if left == right else (left, right)
+
+
+_TWO = {"type": "array", "minItems": 2, "maxItems": 2}
+_SIZE = {"items": {"type": "integer", "minimum": 1, "maximum": 1_000_000}, **_TWO}
+Sizes = Annotated[
+    tuple[Count, Count],
+    WrapValidator(_one_or_each),
+    WithJsonSchema({"anyOf": [_SIZE, {"items": _SIZE, **_TWO}]}),
+]
+# The path from a section to a value in it, and the error of that value.
+Finding = tuple[tuple[str | int, ...], str]
+_TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
+CONTRADICTIONS = "contradictions"  # type of the error that holds them
+
+_Part = TypeVar("_Part", bound="Section")
+
+
+class Section(BaseModel):
+    """A mapping of the configuration: immutable, no unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    def contradictions(self) -> Iterable[Finding]:
+        """Yield the contradictions of this section, each value of which is valid by itself."""
+        return ()
+
+    def part(self, kind: type[_Part]) -> _Part:
+        """Return the values that a section declares from which this one inherits."""
+        return cast(_Part, kind.model_construct(**{name: getattr(self, name) for name in kind.model_fields}))
+
+
+class Root(Section):
+    """A configuration as a whole, of which all contradictions are found at once.
+
+    The context of a validation names keys whose values are wrong by themselves, and which are left out.
+    """
+
+    @model_validator(mode="after")
+    def _consistent(self, info: ValidationInfo) -> Self:
+        sound = {key: value for key, value in vars(self).items() if key not in (info.context or ())}
+        if found := [*_contradictions(sound.items()), *self.between(sound)]:
+            told = "; ".join(f"{'.'.join(map(str, path))}: {what}" for path, what in found)
+            raise PydanticCustomError(CONTRADICTIONS, "{told}", {"told": told, "found": found})
+        return self
+
+    def between(self, sound: Mapping[str, Any]) -> Iterable[Finding]:
+        """Yield contradictions between values by key."""
+        return ()
+
+
+# Largest value of a key by its name: of what is on the tool and other lengths, m, and of short times, s.
+_LARGEST = (
+    (re.compile(r"(tag_)?size_m|positions_m"), 2.0, "millimetres"),
+    (re.compile(r"\w+_m"), FARTHEST_M, "millimetres"),
+    (re.compile(r"(period|settle|time_offset|camera_latency|max_servo_lag|max_age)_s"), 10.0, "milliseconds"),
+)
+
+
+def _of_another_unit(key: str, value: Any) -> str:
+    """Tell that a length or a time looks like one in another unit; empty if not."""
+    most, unit = next(((most, unit) for name, most, unit in _LARGEST if name.fullmatch(key)), (math.inf, ""))
+    each = list(vars(value).values()) if isinstance(value, Section) else value
+    largest = max((abs(x) for x in np.ravel(each) if isinstance(x, float)), default=0.0) if unit else 0.0
+    return (
+        f"{largest:g} is more than {most:g}: it looks like {unit}; divide by 1000" if largest > most else ""
+    )
+
+
+def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...] = ()) -> Iterator[Finding]:
+    """Those of all sections among some values by their keys, and of the sections in these."""
+    for key, part in parts:
+        here = (*path, key)
+        if what := _of_another_unit(str(key), part):
+            yield here, what
+        if isinstance(part, Section):
+            yield from ((here + at, what) for at, what in part.contradictions())
+            yield from _contradictions(vars(part).items(), here)
+        elif isinstance(part, dict):
+            yield from _contradictions(part.items(), here)
+        elif isinstance(part, tuple) and part and isinstance(part[0], Section):
+            yield from _contradictions(enumerate(part), here)
+
+
+class JointVector(Section):
+    """Joint readings; ``unit`` is that of the revolute joints, prismatic ones are in metres."""
+
+    joints: tuple[Number, ...] = Field(min_length=1, description="one reading per joint, base to tool")
+    unit: Literal["deg", "rad"] = Field(description="unit of the revolute joints; prismatic joints are in m")
+
+    def values(self, joint_types: str) -> FloatArray:
+        """Readings (n,) in rad (R) and m (P), one for each letter of ``joint_types``.
+
+        Raises ValueError when the numbers of joints differ.
+        """
+        pairs = zip(self.joints, joint_types, strict=True)
+        turn = math.radians if self.unit == "deg" else float
+        return np.array([turn(value) if letter == "R" else float(value) for value, letter in pairs])
+
+    def miscounted(self, joint_types: str, *path: str) -> Iterator[Finding]:
+        """Readings too many or too few for the joints of a robot, this vector being at a path."""
+        if len(self.joints) != len(joint_types):
+            what = f"{len(self.joints)} values for {len(joint_types)} joints ({joint_types})"
+            yield (*path, "joints"), what
+
+
+def not_rigid(T: Matrix44) -> str:
+    """Return the reason why a matrix is no pose; empty if it is one."""
+    R = np.array(T)[:3, :3]
+    if T[3] != (0, 0, 0, 1):
+        return "the last row must be [0, 0, 0, 1]"
+    if abs(R).max() > 2 or abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
+        return "the upper left 3×3 block must be a rotation, written with seven digits or more"
+    return ""
+
+
+def not_a_screw(kind: str, w: Vector3, v: Vector3) -> Iterator[tuple[str, str]]:
+    """Yield the reasons why w and v are no screw of a joint, R or P: which of both, and why."""
+    axis = "w" if kind == "R" else "v"
+    length = math.hypot(*(w if kind == "R" else v))
+    if abs(length - 1) > _TOLERANCE:
+        yield axis, f"must be of unit length for a joint of type {kind}, it is {length:g}"
+    if kind == "P" and math.hypot(*w) > _TOLERANCE:
+        yield "w", "must be zero for a joint of type P"
+    if kind == "R" and abs(np.dot(w, v)) > _TOLERANCE:
+        yield "v", "must be orthogonal to w: a revolute joint has no pitch"

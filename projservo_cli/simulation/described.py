@@ -1,0 +1,127 @@
+"""Robot, rig, markers and scene of a simulation, as a configuration describes them.
+
+The same sections give the same object, so that derived results are kept.
+"""
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from projservo_cli.canonical import File
+from projservo_cli.detection import DICTIONARY
+from projservo_cli.records import NO_LENS, PRISMATIC, REVOLUTE, FloatArray, position_limits
+from projservo_cli.settings.control import RenderedOptions
+from projservo_cli.settings.markers import Markers
+from projservo_cli.settings.robot import Camera, Rig, RobotSettings
+from projservo_cli.simulation import dh
+from projservo_cli.simulation.arm import Arm, twist
+from projservo_cli.simulation.scene import Scene, lens_of
+from projservo_cli.simulation.workspace import Truth
+from projservo_cli.task.face import MIDPOINT
+
+
+@lru_cache(maxsize=32)
+def arm_of(robot: RobotSettings) -> Arm:
+    """Arm of screws, or of a Denavit–Hartenberg table, whose reference is all joints zero."""
+    kinds = robot.joint_types
+    types = np.array([PRISMATIC if kind == "P" else REVOLUTE for kind in kinds], dtype=np.int64)
+    limits = position_limits(*np.array(robot.ranges, dtype=np.float64).T.copy())
+    if robot.screws is not None:
+        screws = robot.screws
+        twists = np.array([twist(joint.w, joint.v) for joint in screws.joints])
+        q_reference = screws.reference.values(kinds)
+        return Arm(twists, types, q_reference, np.array(screws.base_tool), limits)
+    assert robot.dh is not None
+    table = robot.dh
+    links = [
+        dh.Link(row.type, math.radians(row.theta_deg), row.d_m, row.a_m, math.radians(row.alpha_deg))
+        for row in table.joints
+    ]
+    twists, base_tool = dh.screws_of(links, np.array(table.tool), modified=table.convention == "modified")
+    return Arm(twists, types, np.zeros(len(kinds)), base_tool, limits)
+
+
+@lru_cache(maxsize=32)
+def cameras_of(rig: Rig) -> FloatArray:
+    """Cameras (2, 3, 4) of a rig, to px."""
+    return np.array([_camera(rig.left), _camera(rig.right)])
+
+
+def _camera(camera: Camera) -> FloatArray:
+    if camera.matrix is not None:
+        return _metric_camera(np.array(camera.matrix))
+    assert camera.focal_px is not None
+    assert camera.principal_point_px is not None
+    assert camera.position_m is not None
+    assert camera.target_m is not None
+    (f_u, f_v), (u, v) = camera.focal_px, camera.principal_point_px
+    K = np.array([[f_u, 0.0, u], [0.0, f_v, v], [0.0, 0.0, 1.0]])
+    return _look_at(K, camera.position_m, camera.target_m, camera.up)
+
+
+def _metric_camera(P: FloatArray) -> FloatArray:
+    """Camera (3, 4) in the scale that makes depths positive metres, which a given one is only up to."""
+    scale = float(np.sign(np.linalg.det(P[:, :3])) * np.linalg.norm(P[2, :3]))
+    return P / scale if abs(scale - 1.0) > 1e-12 else P
+
+
+def _look_at(
+    K: FloatArray, position: Sequence[float], target: Sequence[float], up: Sequence[float]
+) -> FloatArray:
+    """Camera (3, 4) to px with intrinsics K (3, 3) at a position that looks at a target, m."""
+    z = np.subtract(target, position)
+    x = np.cross(z, up)
+    z = z / np.linalg.norm(z)
+    x = x / np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    return np.asarray(K @ np.c_[R, -R @ np.asarray(position)])
+
+
+def center_in_face(markers: Markers) -> int:
+    """Position of the centre marker within the face, or ``MIDPOINT``."""
+    midpoint = markers.center == "midpoint" or not markers.front
+    return MIDPOINT if midpoint else (markers.front or ()).index(int(markers.center))
+
+
+@lru_cache(maxsize=32)
+def described_truth(robot: RobotSettings, rig: Rig, markers: Markers, k1: float, face: bool) -> Truth:
+    """Robot, rig and markers as they are.
+
+    k1 : radial distortion of both lenses, in units of the focal length.
+    face : whether the truth has the face, of which a calibration knows nothing.
+    """
+    arm, P, numbers = arm_of(robot), cameras_of(rig), markers.known
+    assert numbers is not None
+    points = np.c_[markers.points, np.ones(len(numbers))]
+    return Truth(
+        robot=arm,
+        P=P,
+        M=points @ arm.base_tool.T,
+        number=numbers,
+        face=tuple(numbers.index(number) for number in markers.front or ()) if face else (),
+        center=center_in_face(markers),
+        image_size=np.array(rig.image_size_px, dtype=np.float64),
+        lens=lens_of(P, k1) if k1 else NO_LENS,
+        normals=np.zeros(3) if markers.normals is None else markers.normals @ arm.base_tool[:3, :3].T,
+    )
+
+
+@lru_cache(maxsize=8)
+def described_scene(
+    robot: RobotSettings, rig: Rig, markers: Markers, options: RenderedOptions, mjcf: File | None
+) -> Scene:
+    """Return the scene before rendered cameras; ``mjcf`` is the model of the arm, None for capsules."""
+    assert markers.known is not None
+    return Scene(
+        arm=arm_of(robot),
+        P=cameras_of(rig),
+        size=rig.image_size_px,
+        tags=markers.all_tags,
+        numbers=markers.known,
+        dictionary=markers.dictionary or DICTIONARY,
+        mjcf=mjcf,
+        tip=robot.tip or "",
+        options=options,
+    )
