@@ -25,7 +25,7 @@ from projservo_cli.records import Calibration, CrossValidation, InputError, Obse
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.inputs import PlanInputs
-from projservo_cli.steps import STAGES, Step, given_to, result_of, steps_for
+from projservo_cli.steps import STAGES, Step, inputs_of, result_of, steps_for
 from projservo_cli.store import SERVO, Result, Run, load, run_path, save
 
 # Options of the command line in messages, and what takes their place in Python.
@@ -213,7 +213,7 @@ class Chain:
 
     def _made(self, step: Step, run: Run) -> tuple[Any, ...]:
         """Return the result of a stage from its inputs; import its module on demand."""
-        given, progress = step.given or given_to(step.stage, self.config), self.listener.progress
+        given, progress = step.record or inputs_of(step.stage, self.config), self.listener.progress
         if step.stage == "calibrate":
             from projservo_cli.stages import calibrate
 

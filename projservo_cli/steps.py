@@ -29,13 +29,13 @@ from projservo_cli.robots.source import source_hash
 from projservo_cli.store import SERVO, Result, Run
 
 # The stages in their order, and what makes the record that each is given.
-_GIVEN: dict[str, Callable[[Config, Files | None], Any]] = {
+_INPUTS: dict[str, Callable[[Config, Files | None], Any]] = {
     "calibrate": calibration_inputs,
     "plan": plan_inputs,
     "servo": servo_inputs,
     "report": report_inputs,
 }
-STAGES = tuple(_GIVEN)
+STAGES = tuple(_INPUTS)
 _HASH = "_sha256"  # behind the name of a file, of its hash
 
 
@@ -50,7 +50,7 @@ class Step:
     why: str = ""  # why it has to be made; empty where the stored one is up to date
     note: str = ""  # what changed that does not outdate it, in words
     unkeyed: bool = False  # whether its law has no source, so that it is never up to date
-    given: Any = None  # the record that the stage is given; None where it cannot be made
+    record: Any = None  # inputs of the stage; None where they cannot be made
 
     @property
     def name(self) -> str:
@@ -80,12 +80,12 @@ def steps_for(
     recording : why the table has to be recorded first; keys of what rests on it are not known until then.
     """
     stages = STAGES[: max(map(STAGES.index, named)) + 1]
-    given = _Given() if recording else _given(config, run, stages)
+    inputs = _Inputs() if recording else _inputs(config, run, stages)
 
     def planned(stages: Sequence[str], laws: Sequence[str]) -> list[Step]:
         steps: list[Step] = []
         sources = _sources(laws, config, run) if "servo" in stages else {}
-        for step in _needed(given, sources, stages):
+        for step in _needed(inputs, sources, stages):
             remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
             why = _reason(step, run, force and step.stage in named, remade)
             if step.law and "servo" in named and not config.plant.simulated:
@@ -109,9 +109,9 @@ def steps_for(
     return steps
 
 
-def key_of(given: Any, **more: Any) -> str:
+def key_of(inputs: Any, **more: Any) -> str:
     """Return the hash of the inputs of a stage, and of further values: its predecessors and its law."""
-    return hashlib.sha256(encoded([given, more])).hexdigest()
+    return hashlib.sha256(encoded([inputs, more])).hexdigest()
 
 
 class _Read(NamedTuple):
@@ -150,14 +150,14 @@ def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
     return found
 
 
-class _Given(NamedTuple):
+class _Inputs(NamedTuple):
     """Inputs of stages."""
 
     records: Mapping[str, Any] = {}  # by stage; none where the configuration lacks a part of it
     files: Mapping[str, str] = {}  # hashes of the input files, by name
 
 
-def _given(config: Config, run: Run, stages: Sequence[str]) -> _Given:
+def _inputs(config: Config, run: Run, stages: Sequence[str]) -> _Inputs:
     """Return the inputs of each stage that the configuration determines; making others reports missing keys.
 
     An InputError where a file cannot be read. Where a file is gone since, its stored hash stands.
@@ -173,26 +173,26 @@ def _given(config: Config, run: Run, stages: Sequence[str]) -> _Given:
     records: dict[str, Any] = {}
     for stage in stages:
         with suppress(InputError):
-            records[stage] = _GIVEN[stage](config, read)
-    return _Given(records, files)
+            records[stage] = _INPUTS[stage](config, read)
+    return _Inputs(records, files)
 
 
-def given_to(stage: str, config: Config) -> Any:
+def inputs_of(stage: str, config: Config) -> Any:
     """The record that a stage is given; an InputError where a part of the configuration is missing."""
-    return _GIVEN[stage](config, None)
+    return _INPUTS[stage](config, None)
 
 
-def _needed(given: _Given, laws: Mapping[str, _Read], stages: Sequence[str]) -> Iterator[Step]:
+def _needed(inputs: _Inputs, laws: Mapping[str, _Read], stages: Sequence[str]) -> Iterator[Step]:
     """Every result of the stages with its key, each made from those before."""
     before: list[str] = []
     for stage in stages:
-        keys, record = [], given.records.get(stage)
+        keys, record = [], inputs.records.get(stage)
         own = "" if record is None else key_of(record)
-        of_files = {"": _Read(given.files if stage == "calibrate" else {})}
+        of_files = {"": _Read(inputs.files if stage == "calibrate" else {})}
         for law, read in (laws if stage == "servo" else of_files).items():
             more = {"before": before, "law": law, "source": dict(read.hashed)}
             keys.append(own and key_of(own, **more))
-            yield Step(stage, law, keys[-1], read.inputs, note=read.note, unkeyed=read.unkeyed, given=record)
+            yield Step(stage, law, keys[-1], read.inputs, note=read.note, unkeyed=read.unkeyed, record=record)
         before = keys
 
 

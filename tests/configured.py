@@ -66,7 +66,7 @@ def scenario_of(config, calibration=None):
 def under(scenario, config, **more):
     """A scenario with other parts, under what another configuration gives its runs."""
     inputs = servo_inputs(config)
-    return replace(scenario, inputs=inputs.plan, given=inputs, **more)
+    return replace(scenario, inputs=inputs.plan, servo=inputs, **more)
 
 
 def trajectory_of(**asked):

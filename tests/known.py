@@ -37,5 +37,5 @@ def planned(scenario, model, profile="linear", samples=11, **more):
 
 def driven(scenario, plan, name, model, **limits):
     """Trace of the run of a name with a model; ``limits`` replace those of the scenario."""
-    scenario = replace(scenario, limits=scenario.limits._replace(**limits))
+    scenario = replace(scenario, termination=scenario.termination._replace(**limits))
     return drive(scenario, plan, name, model).trace()

@@ -47,7 +47,7 @@ class Case:
         scenario = run_scenario(replace(inputs, plan=replace(inputs.plan, features="body")))
         shown, gains = scenario.exact, scenario.gains
         self.m, self.q_start, self.model, self.gains = scenario.m, shown.q_start, scenario.model, gains
-        self.limits = scenario.limits._replace(
+        self.limits = scenario.termination._replace(
             image_error_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
         )
         seen = 2, len(scenario.numbers), 2

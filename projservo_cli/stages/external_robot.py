@@ -331,7 +331,7 @@ def connected(scenario: RunScenario, law: str, given: Robot | None = None) -> Dr
 
     given : an object of the contract instead of one of a class.
     """
-    contract, joints, calibration = scenario.given.contract, scenario.joints, scenario.calibration
+    contract, joints, calibration = scenario.servo.contract, scenario.joints, scenario.calibration
     assert calibration is not None
     assert contract is not None
     driven = contract.driven
@@ -343,9 +343,9 @@ def connected(scenario: RunScenario, law: str, given: Robot | None = None) -> Dr
         robot = simulated_robot(driven, joints, _in_the_loop(scenario, driven.robot, contract.events))
     monitor = None
     if not scenario.untested:
-        noise = scenario.given.stop.innovation_threshold * scenario.noise_px
+        noise = scenario.servo.stop.innovation_threshold * scenario.noise_px
         visible = np.flatnonzero(np.isin(calibration.marker, scenario.observed))
-        readings = scenario.limits.max_steps + 1 + WINDOW
+        readings = scenario.termination.max_steps + 1 + WINDOW
         monitor = ImageMonitor(calibration, noise, readings, visible, plant.image_size)
     return DrivenRobot(robot, plant, _known_of(scenario, contract, calibration, law), monitor)
 

@@ -67,7 +67,7 @@ def coupled(reaching: Reaching, trajectory: Trajectory) -> Found:
     return Found(judged, motion, _timed(sigma * duration(judged), sigma, trajectory), feasible, reason)
 
 
-def given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_translation: float) -> Found:
+def by_profile(profile: str, reaching: Reaching, trajectory: Trajectory, pure_translation: float) -> Found:
     """Shares of a profile of the paper; ``pure_translation`` of the translation at most before a rotation."""
     sigma = np.linspace(0.0, 1.0, trajectory.n_samples)
     motion = along_shares(reaching, profile_shares(profile, sigma, pure_translation))
@@ -202,7 +202,7 @@ def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: J
     )
     path = find_path(c, target, reaching.q_start, search.goal_joints, how)
     if path.timing is None:
-        linear = given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
+        linear = by_profile("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.n_samples, np.nan)
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)

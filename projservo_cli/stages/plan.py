@@ -36,8 +36,8 @@ from projservo_cli.stages.motions import (
     Found,
     JointSearch,
     body_at_start,
+    by_profile,
     coupled,
-    given,
     joint_path,
     kept_out,
     search_of,
@@ -276,7 +276,7 @@ def _found(
         found = coupled(reaching, trajectory)
     else:
         tau = float(reaching.amplitudes[0])
-        found = given(profile, reaching, trajectory, tau_limit / tau if tau > 0.0 else 1.0)
+        found = by_profile(profile, reaching, trajectory, tau_limit / tau if tau > 0.0 else 1.0)
     if trajectory.keep_out and found.feasible:
         found = kept_out(found, task, trajectory, NO_SPREAD if search is None else search.spread)
     return found

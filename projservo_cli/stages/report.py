@@ -149,7 +149,7 @@ def _report_data(
         traces=run.traces,
         studies=studies,
         no_studies="" if studies else left_out[-1]["reason"],
-        stall_periods=bench.scenario.limits.stall_periods,
+        stall_periods=bench.scenario.termination.stall_periods,
         held_out=run.cross_validation,
         trajectory=inputs.trajectory,
     )

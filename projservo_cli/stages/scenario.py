@@ -141,12 +141,12 @@ class Scenario:
     @property
     def goal_sigma_px(self) -> float:
         """Standard deviation of a coordinate of the face in the images of the goal, px."""
-        images = self._given
+        images = self.goal_images
         stated = None if images is None else images.sigma_px(self.numbers[: self.m], self.inputs.face)
         return self.noise_px / math.sqrt(self.inputs.averaged_frames) if stated is None else stated
 
     @property
-    def _given(self) -> GoalImages | None:
+    def goal_images(self) -> GoalImages | None:
         """Images of the goal that are given."""
         return None if self.inputs.task is None else self.inputs.task.goal.images
 
@@ -157,13 +157,13 @@ class Scenario:
         They are of the markers of the calibration, NaN where unseen; deviations that are not given are those
         of the loop. None without such images, or a covariance to test them by.
         """
-        if self._given is None or self.calibration is None or not self.calibration.has_covariance:
+        if self.goal_images is None or self.calibration is None or not self.calibration.has_covariance:
             return None
-        numbers, pixels = self.calibration.marker.tolist(), self._given.pixels(self.inputs.face)
+        numbers, pixels = self.calibration.marker.tolist(), self.goal_images.pixels(self.inputs.face)
         images = np.array([pixels.get(number, _UNSEEN) for number in numbers]).swapaxes(0, 1)
         known = [number in pixels for number in numbers]
         sigma = np.full((2, len(numbers)), self.noise_px)
-        stated = np.array(self._given.deviations([k for k in numbers if k in pixels], self.inputs.face))
+        stated = np.array(self.goal_images.deviations([k for k in numbers if k in pixels], self.inputs.face))
         sigma[:, known] = np.where(np.isnan(stated), self.noise_px, stated)
         return images, sigma
 
@@ -177,7 +177,7 @@ class Scenario:
         m, others = self.m, self.truth.pins
         which = [others.index(self.truth.number.index(number)) for number in self.numbers[m:]]
         images = np.array([self.exact.s_start, self.exact.s_star])
-        drawn = 2 if self._given is None else 1  # images that are given stay as they are
+        drawn = 2 if self.goal_images is None else 1  # images that are given stay as they are
         images[:drawn, :, :m] += sigma * generator(seed, TARGET_NOISE).standard_normal((drawn, 2, m, 2))
         if which:
             noise = generator(seed, PIN_TARGET_NOISE).standard_normal((drawn, 2, len(others), 2))
@@ -190,7 +190,7 @@ class Scenario:
         The body is fitted to both by the deviations of their pixels, whichever is the larger. Markers of the
         face that frames do not show are predicted from those that they show.
         """
-        numbers, seen_images, given = self.numbers, self.exact, self._given
+        numbers, seen_images, given = self.numbers, self.exact, self.goal_images
         start, sigma = self._frames(seen_images.q_start, (seed, START_FRAMES))
         if given is None:
             goal, there = self._frames(self.goal_joints[0], (seed, GOAL_FRAMES))
@@ -240,9 +240,9 @@ class Scenario:
 class RunScenario(Scenario):
     """A scenario with the further inputs of runs."""
 
-    given: ServoInputs
+    servo: ServoInputs  # further inputs of runs
     gains: Gains
-    limits: Limits  # gains, limits: of the laws, and when a run ends
+    termination: Limits  # gains, termination: of the laws, and when a run ends
 
     def believed_by(self, law: str) -> Model:
         """The model that a law is given: the calibrated one, or for a metric law the true one."""
@@ -260,7 +260,7 @@ class RunScenario(Scenario):
     def plant_of(self, law: str) -> Plant:
         """The simulated robot as a law sees it."""
         assert self.truth is not None
-        plant = plant_of(self.truth, self.exact.q_start, opaque=self.given.opaque)
+        plant = plant_of(self.truth, self.exact.q_start, opaque=self.servo.opaque)
         M = self.truth.of(self.numbers[self.m :]) if law in BODY_LAWS else NO_PINS
         return plant._replace(pins=M)
 
@@ -330,9 +330,9 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
 def run_scenario(inputs: ServoInputs, calibration: Calibration | None = None) -> RunScenario:
     """Make the scenario of runs; raises as ``scenario_of``."""
     found = scenario_of(inputs.plan, calibration)
-    return RunScenario(
-        **vars(found), given=inputs, gains=_gains(inputs, found.joints), limits=_limits(inputs, found)
-    )
+    gains, termination = _gains(inputs, found.joints), _termination(inputs, found)
+    # What was just made holds its fields alone: nothing is derived from them yet.
+    return RunScenario(**vars(found), servo=inputs, gains=gains, termination=termination)
 
 
 def _gains(inputs: ServoInputs, joints: Joints) -> Gains:
@@ -343,7 +343,7 @@ def _gains(inputs: ServoInputs, joints: Joints) -> Gains:
     return inputs.gains._replace(limits=limits)
 
 
-def _limits(inputs: ServoInputs, found: Scenario) -> Limits:
+def _termination(inputs: ServoInputs, found: Scenario) -> Limits:
     """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
     stop = inputs.stop
     noise_px = stop.noise_factor * found.noise_px

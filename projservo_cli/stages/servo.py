@@ -100,10 +100,10 @@ class Run:
 
         Raises InputError, WorkFailed as of ``run``.
         """
-        if self.scenario.given.contract is not None:
+        if self.scenario.servo.contract is not None:
             self._drive_by_contract()
         elif isinstance(self.plan, Plan) and (
-            not _in_compiled_loop(self.scenario.given, self.law) or self.is_guided
+            not _in_compiled_loop(self.scenario.servo, self.law) or self.is_guided
         ):
             self._drive_in_python(self._controller(), AnalyticPlant(*self._simulated()))
         else:
@@ -113,13 +113,13 @@ class Run:
     def _simulated(self) -> tuple[Plant, FloatArray, FloatArray]:
         """The simulated robot as the law sees it, its first joints (n,), and the noise of its images."""
         scenario = self.scenario
-        noise = scenario.noise_of(self.law, scenario.inputs.seed, scenario.limits.max_steps + 1)
+        noise = scenario.noise_of(self.law, scenario.inputs.seed, scenario.termination.max_steps + 1)
         return scenario.plant_of(self.law), scenario.ends.q_start, noise
 
     def _drive_compiled(self) -> None:
         """Drive a built-in law on the simulated robot in the compiled loop."""
         scenario, controller = self.scenario, self._built_in()
-        limits, observed = scenario.limits, len(scenario.numbers_of(self.law))
+        limits, observed = scenario.termination, len(scenario.numbers_of(self.law))
         self.plant, q_start, noise = self._simulated()
         parts = MAX_PARTS if scenario.gains.substeps else 0
         self.log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts)
@@ -133,7 +133,7 @@ class Run:
         That of ``plant.use`` is driven there. Before its first motion, its images must agree with the
         calibration where it stands. The robot is stopped and closed on every way out.
         """
-        scenario, contract = self.scenario, self.scenario.given.contract
+        scenario, contract = self.scenario, self.scenario.servo.contract
         assert contract is not None
         own = scenario.truth is None
         if own and (scenario.calibration is None or not scenario.calibration.usable):
@@ -164,7 +164,7 @@ class Run:
                 at_start = self._require_images(driven, "stopped at the start of the task, since", 1)
                 self.unseen = at_start or unseen
             driven.begin()
-            self._drive_in_python(controller, driven, StallMonitor(driven, scenario.limits))
+            self._drive_in_python(controller, driven, StallMonitor(driven, scenario.termination))
 
     def _require_images(self, driven: DrivenRobot, what: str, least: int) -> str:
         """Refuse to move a robot of which so many cameras or more show nothing, unless that was asked for."""
@@ -184,16 +184,16 @@ class Run:
         scenario, execution = self.scenario, None
         if self.is_guided and isinstance(law, BuiltInLaw):
             assert isinstance(self.plan, Plan)
-            follow, searches = partial(self._task, law.law.model), scenario.given.max_replan_attempts
+            follow, searches = partial(self._task, law.law.model), scenario.servo.max_replan_attempts
             replanner = PathReplanner(scenario, self.plan)
-            execution = ExecutionMonitor(law, follow, replanner, searches, scenario.limits, stall)
+            execution = ExecutionMonitor(law, follow, replanner, searches, scenario.termination, stall)
         code, self.steps, self.log = run_in_python(
             law,
             plant,
             scenario.ends.by_points().s_star,
             scenario.gains.period,
-            scenario.limits,
-            scenario.given.speed_scale,
+            scenario.termination,
+            scenario.servo.speed_scale,
             stall=stall,
             execution=execution,
         )
@@ -212,7 +212,7 @@ class Run:
     def _task(self, model: Model, plan: Plan) -> Task:
         """The task as a built-in law with a model is given it, with the plan that it follows."""
         scenario = self.scenario
-        task, scale = scenario.images_for(self.law).task(model), scenario.given.speed_scale
+        task, scale = scenario.images_for(self.law).task(model), scenario.servo.speed_scale
         return followed(model, task, plan, scenario.gains.period, scale)
 
     def _built_in(self) -> BuiltInLaw:
@@ -274,7 +274,7 @@ class Run:
         # A law that follows a plan measures the distance to the plan, not to the goal.
         remaining = _left(log, steps) if self.mode == REGULATE else (None, None)
         joint = int(log.events[2])
-        stretch = plateau_stretch(log.judged[:rows], scenario.limits.stall_periods)
+        stretch = plateau_stretch(log.judged[:rows], scenario.termination.stall_periods)
         s_star = scenario.ends.by_points().s_star
         simulated = scenario.truth is not None
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
@@ -388,7 +388,7 @@ def _stated_mm(run: Run, views: FloatArray) -> dict[str, Any]:
     assert known is not None
     M = known.of(numbers) if isinstance(known, Truth) else known.M[known.indices_of(numbers)]
     s, s_star = run.log.s[run.steps], scenario.images_for(run.law).s_star
-    posture = Posture(scenario.model, q, M[:m], scenario.given.lengths)
+    posture = Posture(scenario.model, q, M[:m], scenario.servo.lengths)
     if not posture.known or not np.isfinite(s[:, :m]).all():
         return {}
     used: BoolArray = np.isfinite(s + s_star)[..., 0]
@@ -429,7 +429,7 @@ def _stalled_by(run: Run) -> str:
 
     Joints that move on at their limits, as a law asks of them near a singularity, are not slow.
     """
-    gains, window = run.scenario.gains, run.scenario.limits.stall_periods
+    gains, window = run.scenario.gains, run.scenario.termination.stall_periods
     if run.steps < window:
         return "a local minimum"
     limited = float(np.median(run.log.factor[run.steps - window : run.steps]))
@@ -445,7 +445,7 @@ def _stalled_by(run: Run) -> str:
 
 def _reason(run: Run, joint: int, remaining: tuple[float | None, float | None]) -> str:
     """Return the reason of the verdict, one sentence."""
-    log, steps, limits = run.log, run.steps, run.scenario.limits
+    log, steps, limits = run.log, run.steps, run.scenario.termination
     error, first = float(log.judged[steps]), float(log.judged[0])
     within = tolerance(limits, float(log.fit[steps, 2]))
     share, turn = remaining
@@ -484,7 +484,7 @@ def _reason(run: Run, joint: int, remaining: tuple[float | None, float | None]) 
 
 def _apart(run: Run) -> str:
     """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
-    seen, most = float(run.log.error[run.steps]), _BY_NOISE * run.scenario.limits.image_error_px
+    seen, most = float(run.log.error[run.steps]), _BY_NOISE * run.scenario.termination.image_error_px
     text = f"; the face itself is seen {seen:.3g} px off ({most:.3g} px by noise): it moved on the tool"
     return f"{text} since the goal was taught: teach it again" if seen > most else ""
 
@@ -542,10 +542,10 @@ def drive(
     if scenario.inputs.trajectory.keep_out and not (isinstance(plan, Plan) and plan.feasible):
         raise WorkFailed("the plan is not feasible, and with trajectory.keep_out no law runs without one")
     if mode != REGULATE and isinstance(plan, Plan):
-        if not np.isfinite(plan.q).all() and not scenario.given.refuses:
+        if not np.isfinite(plan.q).all() and not scenario.servo.refuses:
             unplanned = f"no joints can follow the plan: {plan.reason}"
         elif plan.duration is not None:
-            planned_s = plan.duration / scenario.given.speed_scale
+            planned_s = plan.duration / scenario.servo.speed_scale
     return Run(scenario, plan, law, mode, planned_s, unplanned, believed, **brought).drive()
 
 

@@ -53,12 +53,12 @@ class Comparison:
 
     def run(self, law: str, operators: str, gains: Gains, *, limited: bool) -> Trace:
         """Drive a direct law without limit, or with 5° a step and that of prismatic joints as configured."""
-        limits = self.scenario.limits
+        limits = self.scenario.termination
         speed = np.full(len(self.scenario.ends.q_start), math.inf)
         if limited:
             prismatic = self.truth.robot.joint_types == PRISMATIC
             speed = np.where(prismatic, limits.speed, math.radians(STEP_LIMIT_DEG) / gains.period)
-        scenario = replace(self.scenario, gains=gains, limits=limits._replace(speed=speed))
+        scenario = replace(self.scenario, gains=gains, termination=limits._replace(speed=speed))
         return drive(scenario, self.sense, law, self.models[operators]).trace()
 
 
@@ -81,8 +81,8 @@ def comparison_of(inputs: ServoInputs, calibration: Calibration, plan: Plan) -> 
     inputs : of laws by themselves on the ideal plant: nothing keeps them out of regions.
     """
     scenario = run_scenario(inputs, calibration)
-    limits = scenario.limits._replace(stop_at_joint_limit=False, stop_at_border=False)
-    scenario = replace(scenario, limits=limits)
+    limits = scenario.termination._replace(stop_at_joint_limit=False, stop_at_border=False)
+    scenario = replace(scenario, termination=limits)
     assert scenario.truth is not None
     metric = scenario.truth.model
     models = {"true": metric, "twin": projective_twin(metric), "calibrated": calibration.model()}

@@ -24,7 +24,7 @@ from projservo_cli.files import write_whole
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages import Progress, calibrate
-from projservo_cli.steps import given_to, result_of, steps_for
+from projservo_cli.steps import inputs_of, result_of, steps_for
 from projservo_cli.store import Result, Run, load, save
 from projservo_cli.store.sweep_table import TABLE, SweepTable, assemble, write_part
 from projservo_cli.sweeps.design import Design, name_of_run
@@ -316,7 +316,7 @@ def _calibrate(wanted: tuple[str, Config]) -> _Calibrated:
     """Make the calibration of a key, on one thread like all that must be the same to the bit."""
     with threadpool_limits(1):
         try:
-            return _Calibrated(*wanted, calibrate.run(given_to("calibrate", wanted[1])))
+            return _Calibrated(*wanted, calibrate.run(inputs_of("calibrate", wanted[1])))
         except WorkFailed as error:
             return _Calibrated(*wanted, None, str(error))
 

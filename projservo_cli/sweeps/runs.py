@@ -243,7 +243,7 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
         shares_task=law in BODY_LAWS,
         rehearse=scenario.inputs.trajectory.rehearses,
         gains=scenario.gains,
-        course=Course(scenario.plant_of(law), scenario.limits, scenario.exact.q_start),
+        course=Course(scenario.plant_of(law), scenario.termination, scenario.exact.q_start),
         ends=scenario.true_ends,
     )
     trials = Trials(setting, len(scenario.numbers))
@@ -251,7 +251,7 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
     for first in range(0, len(seeds), TOGETHER):
         running, instants = list(range(first, min(first + TOGETHER, len(seeds)))), INSTANTS
         while running:  # those that outlast their noise are repeated with more
-            drawn = min(instants, scenario.limits.max_steps + 1)
+            drawn = min(instants, scenario.termination.max_steps + 1)
             displayed = [scenario.images_at(seeds[i]) for i in running]
             images = np.array([(ends.s_start, ends.s_star) for ends in displayed])
             noise = np.array([scenario.noise_of(law, seeds[i], drawn) for i in running])

@@ -47,7 +47,7 @@ def case(name="paper", steps=SHORT, whole=False):
         followed = name_of(law, LAW_SPECS[law].modes[1])
         traces[followed] = driven(scenario, plan, followed, model)
     clean = replace(
-        known_scenario(config.idealized), limits=scenario.limits._replace(stop_at_joint_limit=False)
+        known_scenario(config.idealized), termination=scenario.termination._replace(stop_at_joint_limit=False)
     )
     models = {"true": true.model, "twin": model, "calibrated": model}
     bench = studies.Comparison(clean, models, sense)

@@ -252,7 +252,7 @@ def test_joint_limits_end_a_run_whatever_is_configured(calibrated):
     config = load_config(UR5, [use, "noise.servo_px=0.1"])
     calibration = load(calibrated).calibration
     scenario = scenario_of(config, calibration)
-    gains, limits = scenario.gains, scenario.limits
+    gains, limits = scenario.gains, scenario.termination
     assert limits.stop_at_joint_limit
     assert limits.image_error_px == 0.01 + 2.0 * calibration.sigma_fitted_px
     np.testing.assert_array_equal(gains.limits.speed, np.full(6, np.radians(125.0)))

@@ -16,7 +16,7 @@ class Case:
         self.scenario = known_scenario(self.config)
         self.truth, self.ends = self.scenario.truth, self.scenario.ends
         self.plant = self.scenario.plant_of("direct_three")
-        self.gains, self.limits = self.scenario.gains, self.scenario.limits
+        self.gains, self.limits = self.scenario.gains, self.scenario.termination
         self.plan = self.planned(self.truth.model)
         self.traces = {}
 

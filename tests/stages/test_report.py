@@ -208,9 +208,10 @@ def test_limited_runs_keep_the_limit_and_free_ones_do_not():
 
 def test_periods_at_which_no_loop_survives_are_left_out():
     _, bench, _ = case()
+    short = bench.scenario.termination._replace(max_steps=1)
     few = dataclasses.replace(
         bench,
-        scenario=dataclasses.replace(bench.scenario, limits=bench.scenario.limits._replace(max_steps=1)),
+        scenario=dataclasses.replace(bench.scenario, termination=short),
     )
     extra = studies.run_studies(few, (0.1,), (0.4, 0.04))  # gain 2.5 1/s
     assert extra.periods == (0.04,)

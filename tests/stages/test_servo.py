@@ -108,7 +108,9 @@ def _corners(trace, pose):
 
 def test_no_size_and_no_images_that_agree_are_no_measure():
     example = case("ur5")
-    run = drive(replace(example.scenario, limits=example.limits._replace(max_steps=5)), example.plan, "exact")
+    run = drive(
+        replace(example.scenario, termination=example.limits._replace(max_steps=5)), example.plan, "exact"
+    )
     assert run.trace().estimated_position_error_mm > 0.0
     assert replace(run, verdict="fault detected").trace().estimated_position_error_mm is None
     for left_px, agrees in ((0.03, True), (0.05, False)):  # of 8 markers, with 10 coordinates to spare
@@ -119,6 +121,6 @@ def test_no_size_and_no_images_that_agree_are_no_measure():
         assert (told.estimated_position_error_mm is not None) == agrees
     unsized = example.config.markers.model_copy(update={"positions_m": None})
     for markers, size in ((unsized, None), (unsized.model_copy(update={"tag_size_m": 0.1}), 0.1)):
-        given = replace(run.scenario.given, lengths=markers.lengths(example.config.face_numbers))
-        told = replace(run, scenario=replace(run.scenario, given=given)).trace()
+        given = replace(run.scenario.servo, lengths=markers.lengths(example.config.face_numbers))
+        told = replace(run, scenario=replace(run.scenario, servo=given)).trace()
         assert (told.estimated_position_error_mm is None) == (size is None)
