@@ -28,16 +28,6 @@ from projservo_cli.stages.inputs import PlanInputs
 from projservo_cli.steps import STAGES, Step, inputs_of, result_of, steps_for
 from projservo_cli.store import SERVO, Result, Run, load, run_path, save
 
-# Options of the command line in messages, and what takes their place in Python.
-_IN_PYTHON = {
-    " with -o": "",
-    "with --force": "with force=True",
-    "use --force": "use force=True",
-    "with --data": "with data.table",
-    "without --lens": "without lens",
-    "omit --init": "omit init",
-    "check --joints": "check joint_types",
-}
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
 
 
@@ -81,12 +71,6 @@ def listening(progress: Progress | bool) -> Iterator[_Caller]:
     bar = Bar()
     try:
         yield _Caller(progress if callable(progress) else silent if progress is False else bar, bar)
-    except (InputError, WorkFailed) as error:
-        text = str(error)
-        for option, argument in _IN_PYTHON.items():
-            text = text.replace(option, argument)
-        error.args = (text,)
-        raise
     finally:
         bar.close()
 
@@ -252,7 +236,7 @@ def require_simulated(config: Config) -> None:
     if not config.recorded and not config.plant.simulated:
         raise InputError(
             f"plant {config.plant.use} is calibrated from a table: record it, projservo record calibrate, or "
-            "name one with --data"
+            "name one: data.table, --data"
         )
 
 

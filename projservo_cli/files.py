@@ -125,7 +125,7 @@ def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
                 number = path.read_text(encoding="ascii", errors="replace").strip()
             owner = f"process {number}" if number.isdecimal() else "another process"
             raise InputError(
-                f"{folder}: {owner} is at work there; wait for its end, or choose another folder with -o"
+                f"{folder}: {owner} is at work there; wait for its end, or choose another folder"
             ) from error
     try:
         with suppress(OSError):  # only messages need the number of the process
@@ -161,7 +161,7 @@ def require_inside(path: Path, folder: Path) -> None:
     """Raise InputError for a path that symbolic links lead out of a folder."""
     if not lies_inside(path, folder):
         raise InputError(
-            f"{path}: a symbolic link leads out of {folder}; remove it, or choose another folder with -o"
+            f"{path}: a symbolic link leads out of {folder}; remove it, or choose another folder"
         )
 
 

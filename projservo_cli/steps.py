@@ -104,7 +104,7 @@ def steps_for(
     if steps[0].why and not force and stored == "recorded" and not config.recorded:
         raise InputError(
             f"{run.path}: its calibration comes from recorded data and would be replaced by a simulated one; "
-            "choose another folder with -o, give the table with --data, or use --force"
+            "choose another folder, name the table (data.table, --data), or use --force (force=True)"
         )
     return steps
 

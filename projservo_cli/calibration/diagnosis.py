@@ -407,7 +407,8 @@ def _hypotheses(detections: Detections, q_reference: FloatArray) -> list[tuple[s
         flipped[i] = not slides
         given, fits = ("prismatic", "revolute") if slides else ("revolute", "prismatic")
         letters = "".join("P" if one else "R" for one in flipped)
-        words = f"by the images joint {i + 1} is {fits}, not {given}: check --joints ({letters} would fit)"
+        remedy = f"check the types of joints ({letters} would fit)"
+        words = f"by the images joint {i + 1} is {fits}, not {given}: {remedy}"
         other = dataclasses.replace(detections, prismatic=flipped)
         found.append((words, LeastSquares.of(other, q_reference), _SIMPLER))
     for i in range(len(q_reference) if len(q_reference) > 1 else 0):

@@ -448,13 +448,13 @@ class Nominal:
         if own != letters:
             raise InputError(
                 f"{self.where}: its joints are {own}, those of the data {letters}; "
-                "give one screw a joint, or omit --init"
+                "give one screw a joint, or leave calibration.init out"
             )
         missing = np.setdiff1d(detections.marker, self.marker)
         if missing.size:
             raise InputError(
                 f"{self.where}: marker {missing[0]} of the data is not in it; add the marker (marker_numbers "
-                "says which is which), or omit --init"
+                "says which is which), or leave calibration.init out"
             )
         types = np.where(detections.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
         model = Model(self.P, self.H_hat, types, self.q_reference, np.array([0.0, 0.0, 0.0, 1.0]))

@@ -95,7 +95,7 @@ def fit_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
         return found, Epipolar.of(detections, search.rng)
     raise WorkFailed(
         "the images do not determine the distortion of the lenses: record poses with markers all over "
-        "both images, or calibrate without --lens"
+        "both images, or calibrate without lens (calibration.lens)"
     )
 
 

@@ -193,6 +193,8 @@ def _in_metres(
 
     from projservo_cli.config import load_config
     from projservo_cli.config.inputs import joints_of
+    from projservo_cli.metric.messages import contradictions, kinematic_words
+    from projservo_cli.metric.opencv import opencv_cameras
     from projservo_cli.records import WorkFailed
     from projservo_cli.results import ImageModel
     from projservo_cli.store import exports
@@ -206,19 +208,19 @@ def _in_metres(
         words.append(
             f"known length {length_m:g} m ± ? (--metric-std): deviations of lengths leave its own out"
         )
-    wrong = "; ".join(exports.contradictions(metric, None, measured=std is not None))
+    wrong = "; ".join(contradictions(metric, None, measured=std is not None))
     if model is not None and not wrong:
         errors = metric.errors_of(*model[:2])
         value["nominal"] = [error._asdict() for error in errors.joints]
         value |= {"length_error": errors.length, "length_error_std": errors.length_std}
-        words += exports.kinematic_words(errors, metric.joint_types)
-        wrong = "; ".join(exports.contradictions(metric, errors, measured=std is not None))
+        words += kinematic_words(errors, metric.joint_types)
+        wrong = "; ".join(contradictions(metric, errors, measured=std is not None))
     if wrong:
         raise WorkFailed(f"export: {wrong}; check the known length, in m, and its ends, or the model")
     if model is not None and model[2]:
         metric = metric.in_frames_of(*model[:2])
     if to == "opencv":
-        found = exports.opencv_cameras(metric, calibration)
+        found = opencv_cameras(metric, calibration)
         value |= {"delta_chi2": found.delta_chi2, "lens_rms_px": found.lens_rms_px}
         words.insert(0, f"cameras without skew cost Δχ² {found.skew_chi2:.3g} (2 on average)")
         if calibration.lens is not None:

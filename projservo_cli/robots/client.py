@@ -5,10 +5,9 @@ joints at which the arm would come to rest without further commands: lag has the
 and sag is integrated away.
 """
 
-import io
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +16,9 @@ from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
-from projservo_cli.records import VIEWS, BoolArray, ByteArray, FloatArray, IntArray, WorkFailed
+from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray, WorkFailed
 from projservo_cli.robots.contract import PluginRobot
+from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.robots.latency import DelayPrior, Delays, squares_by_joints
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.simulation.ideal import Plant, observe
@@ -31,61 +31,6 @@ _REJECTED = 1e-3
 _STALE_S = 0.5
 # Looks before the first motion, until enough agree or a fault is named.
 _MOST_LOOKS = 120
-
-
-MOST_FRAMES = 60  # pairs of a run that are kept
-_QUALITY = 85  # of JPEG
-
-
-class _Shot(NamedTuple):
-    """A pair of frames that is kept."""
-
-    instant: int
-    s: FloatArray  # (2, m, 2) px, its detections
-    jpeg: tuple[bytes, bytes]
-
-
-class FrameRecorder:
-    """Frames of a run, evenly thinned while it runs, the first and the last among them."""
-
-    def __init__(self) -> None:
-        self._kept: list[_Shot] = []
-        self._every = 1  # instants from one to the next
-        self._last: tuple[int, FloatArray, ByteArray] | None = None
-
-    def show(self, instant: int, s: FloatArray, frames: ByteArray) -> None:
-        """Take the frames (2, height, width) of an instant, and the pixels (2, m, 2) that were found."""
-        self._last = instant, s, frames
-        if instant % self._every == 0 and len(self._kept) == MOST_FRAMES - 1:
-            self._kept, self._every = self._kept[::2], 2 * self._every
-        if instant % self._every == 0:
-            self._kept.append(_Shot(instant, s, _as_jpeg(frames)))
-
-    def fields(self) -> dict[str, Any]:
-        """The part that a ``Trace`` holds."""
-        if self._last is None:
-            return {}
-        instant, s, frames = self._last
-        shots = [*self._kept]
-        if not shots or shots[-1].instant != instant:
-            shots.append(_Shot(instant, s, _as_jpeg(frames)))
-        whole = b"".join(one for shot in shots for one in shot.jpeg)
-        return {
-            "frame_index": np.array([shot.instant for shot in shots], dtype=np.int64),
-            "frame_s": np.array([shot.s for shot in shots]),
-            "frame_size": np.array([[len(one) for one in shot.jpeg] for shot in shots], dtype=np.int64),
-            "frame_jpeg": np.frombuffer(whole, dtype=np.uint8),
-        }
-
-
-def _as_jpeg(frames: ByteArray) -> tuple[bytes, bytes]:
-    """Both frames (2, height, width) as files."""
-    from PIL import Image
-
-    files = io.BytesIO(), io.BytesIO()
-    for file, frame in zip(files, frames, strict=True):
-        Image.fromarray(frame).save(file, "JPEG", quality=_QUALITY)
-    return files[0].getvalue(), files[1].getvalue()
 
 
 class Known(NamedTuple):

@@ -243,7 +243,7 @@ def new_recording(
 def _resumed(empty: _Recording, maximum: FloatArray) -> _Recording:
     """The poses of an interrupted recording taken over, at most so far (n,) from where they were to be."""
     recording = replace(empty, done={}, motion_readings={})
-    path, remedy = recording.path, "choose another table, or replace it with --force"
+    path, remedy = recording.path, "choose another table, or replace it with --force (force=True)"
     recording.identity = identity_in(path)
     if recording_of(path) != recording.key:
         raise _OutdatedError(f"{path}: was not recorded with this configuration; {remedy}")
@@ -411,7 +411,7 @@ class _Sight:
         s = np.array([self.recording.done[k].s for k in group])
         if wrong := self._wrong(s, f"in the {len(s)} poses of joint {i}") or self._faceless():
             remedy = "choose another calibration.reference or a smaller calibration.amplitude_deg"
-            raise WorkFailed(f"record: {wrong}, or {remedy}; then start again with --force")
+            raise WorkFailed(f"record: {wrong}, or {remedy}; then start again with --force (force=True)")
 
     def _faceless(self) -> str:
         """Tell which marker of the face no pose shows to both cameras so far; empty where there is none."""

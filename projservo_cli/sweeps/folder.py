@@ -94,7 +94,8 @@ class Folder:
         total = design.total
         if not force and self.table.exists() and not self.manifest.exists():
             raise InputError(
-                f"{self.table}: its {self.manifest.name} is missing; choose another folder or use --force"
+                f"{self.table}: its {self.manifest.name} is missing; choose another folder, or use "
+                "--force (force=True)"
             )
         if force or not self.manifest.exists():
             return _Status(0, total, 0)
@@ -109,22 +110,22 @@ class Folder:
         manifest, now = self._read(), versions()
         if manifest["key"] != design.key:
             raise InputError(
-                f"{self.manifest}: of another configuration; choose another folder with -o, or start again "
-                "with --force"
+                f"{self.manifest}: of another configuration; choose another folder, or start again "
+                "with --force (force=True)"
             )
         made_by = manifest.get("sources", {})
         changed = [law for law, source in design.sources.items() if source and source != made_by.get(law)]
         if changed:
             raise InputError(
                 f"{self.manifest}: the source of {', '.join(changed)} changed since; choose another folder "
-                "with -o, or start again with --force"
+                "or start again with --force (force=True)"
             )
         made_with = manifest["provenance"]
         other = [f"{name} {made_with[name]}, now {now[name]}" for name in now if made_with[name] != now[name]]
         if other:
             raise InputError(
                 f"{self.manifest}: made with {'; '.join(other)}: a sweep is not continued with other "
-                "versions; start again with --force"
+                "versions; start again with --force (force=True)"
             )
         return int(manifest["chunk"])
 
@@ -135,7 +136,7 @@ class Folder:
         try:
             found: dict[str, Any] = json.loads(self.manifest.read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise InputError(f"{self.manifest}: damaged; start again with --force") from error
+            raise InputError(f"{self.manifest}: damaged; start again with --force (force=True)") from error
         return found
 
     def design(self) -> Design:

@@ -15,6 +15,7 @@ from projservo_cli.config.sweep import LAW
 from projservo_cli.files import write_whole
 from projservo_cli.records import BoolArray
 from projservo_cli.report import style
+from projservo_cli.report.figures.sweep import draw_basin, draw_final_errors, draw_success
 from projservo_cli.report.report_data import Data
 from projservo_cli.stages import Progress
 from projservo_cli.store.sweep_table import SweepTable
@@ -175,7 +176,7 @@ def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict
     pictures = list(_pictures(rows))
     for done, (name, data, draw) in enumerate(pictures):
         progress("figures", done, len(pictures))
-        height, width = (4.0, style.WIDTH) if draw is _draw_basin else (2.9, 0.65 * style.WIDTH)
+        height, width = (4.0, style.WIDTH) if draw is draw_basin else (2.9, 0.65 * style.WIDTH)
         made = style.contents(style.drawn(draw, data, height, width), formats)
         files += [write_whole(folder / f"{name}.{kind}", content) for kind, content in made.items()]
         files.append(write_whole(folder / f"{name}.csv", to_csv(data)))
@@ -187,19 +188,19 @@ def _pictures(rows: Rows) -> Iterator[tuple[str, Data, Any]]:
     """Every figure that the columns of a sweep allow: the name of its files, its numbers, how it is drawn."""
     axes = [name for name, values in rows.axes if len(values) > 1 and {*map(type, values)} <= {int, float}]
     for name in axes:
-        yield f"success_over_{name}", _success(rows, name, name, None), _draw_success
+        yield f"success_over_{name}", _success(rows, name, name, None), draw_success
     drawn = [name for name in rows.table.names if name in rows.table.attributes["random"]]
     for name in (name for name in drawn if rows[name].dtype.kind == "f"):
         edges = np.linspace(rows[name].min(), np.nextafter(rows[name].max(), math.inf), BINS + 1)
-        yield f"success_over_{name}", _success(rows, name, name, edges.tolist()), _draw_success
+        yield f"success_over_{name}", _success(rows, name, name, edges.tolist()), draw_success
     if np.nanmax(rows["rotation_deg"], initial=0.0) - np.nanmin(rows["rotation_deg"], initial=180.0) > 1.0:
         data = _success(rows, "rotation_deg", "rotation from start to goal (deg)", [*ANGLES[:-1], 180.1])
-        yield "success_over_rotation", data, _draw_success
+        yield "success_over_rotation", data, draw_success
     offsets = [name for name in axes if name.startswith(OFFSET)]
     if len(offsets) >= 2:
-        yield "basin", _basin(rows, offsets[0], offsets[1]), _draw_basin
+        yield "basin", _basin(rows, offsets[0], offsets[1]), draw_basin
     if errors := _final_errors(rows):
-        yield "final_error", errors, _draw_final_errors
+        yield "final_error", errors, draw_final_errors
 
 
 def _success(rows: Rows, name: str, label: str, edges: Sequence[float] | None) -> Data:
@@ -248,68 +249,3 @@ def _final_errors(rows: Rows) -> Data:
             data[f"{law}.error"] = np.maximum(finite[displayed], 1e-6)
             data[f"{law}.share"] = (displayed + 1) / len(errors)
     return data
-
-
-def _draw_success(data: Data, figure: "style.Figure") -> None:
-    """Success of each law, ``<law>.rate``, from ``.low`` to ``.high``, over ``.x``, which is a ``label``."""
-    axes = figure.add_subplot()
-    laws = _laws(data, ".rate")
-    line_styles = {law: style.curve(i, marker=True) for i, law in enumerate(laws)}
-    span = max(float(np.ptp(data[f"{law}.x"])) for law in laws) or 1.0
-    for i, law in enumerate(laws):
-        x, rate = data[f"{law}.x"], data[f"{law}.rate"]
-        offset = 0.006 * span * (i - 0.5 * (len(laws) - 1))  # so that bars of laws do not hide each other
-        reach = np.maximum(0.0, [rate - data[f"{law}.low"], data[f"{law}.high"] - rate])
-        axes.errorbar(x + offset, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **line_styles[law])
-    axes.set(xlabel=str(data["label"]), ylabel="success (%), bars: 95 %", ylim=(-3, 103))
-    style.legend_below(figure, line_styles, min(3, len(laws)))
-
-
-def _draw_basin(data: Data, figure: "style.Figure") -> None:
-    """Success of each law over two start offsets, as a map with a panel for each; pale where none begins.
-
-    ``data`` has ``x`` (k,), ``y`` (j,), ``label_x``, ``label_y`` and for each law ``<law>.share`` (j, k).
-    """
-    figure.set_layout_engine("constrained")  # leaves the scale of colours its room
-    laws = _laws(data, ".share")
-    columns = min(3, len(laws))
-    panels = figure.subplots(
-        math.ceil(len(laws) / columns), columns, sharex=True, sharey=True, squeeze=False
-    ).ravel()
-    x, y = _edges(data["x"]), _edges(data["y"])
-    mesh: Any = None
-    for axes, law in zip(panels, laws, strict=False):
-        mesh = axes.pcolormesh(x, y, 100.0 * data[f"{law}.share"], vmin=0, vmax=100)
-        axes.grid(visible=False)
-        axes.set(title=law, facecolor=style.PALE)  # pale where no run can begin
-        axes.set_xticks(data["x"][:: max(1, len(data["x"]) // 5)])
-        axes.set_yticks(data["y"][:: max(1, len(data["y"]) // 5)])
-    for axes in panels[len(laws) :]:
-        axes.set_visible(False)
-    figure.supxlabel(str(data["label_x"]), fontsize=8)
-    figure.supylabel(str(data["label_y"]), fontsize=8)
-    figure.colorbar(mesh, ax=panels.tolist(), label="success (%)")
-
-
-def _draw_final_errors(data: Data, figure: "style.Figure") -> None:
-    """Share of the runs of each law that end within a distance of the goal.
-
-    ``data`` has for each law ``<law>.error`` (k,), mm, sorted, and ``<law>.share`` (k,) of all its runs.
-    """
-    axes = figure.add_subplot()
-    line_styles = {law: style.curve(i) for i, law in enumerate(_laws(data, ".error"))}
-    for law, line_style in line_styles.items():
-        axes.plot(data[f"{law}.error"], 100.0 * data[f"{law}.share"], drawstyle="steps-post", **line_style)
-    label = "distance of the centre from the goal at the end (mm)"
-    axes.set(xlabel=label, ylabel="runs within it (%)", xscale="log", ylim=(-3, 103))
-    style.legend_below(figure, line_styles, min(3, len(line_styles)))
-
-
-def _laws(data: Data, ending: str) -> list[str]:
-    return [name.removesuffix(ending) for name in data if name.endswith(ending)]
-
-
-def _edges(x: Any) -> Any:
-    """Edges of the cells around sorted places."""
-    middle = 0.5 * (x[1:] + x[:-1])
-    return np.concatenate([[1.5 * x[0] - 0.5 * x[1]], middle, [1.5 * x[-1] - 0.5 * x[-2]]])

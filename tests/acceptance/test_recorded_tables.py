@@ -193,7 +193,7 @@ def test_types_that_are_not_given_are_told_and_tried(answer, shared_data, noise)
     code, _, err = answer("calibrate", "--data", table, "-o", "out", "--json")
     told = " ".join(err.split())
     assert code == 1
-    assert "joint 3 is prismatic, not revolute: check --joints (RRPRRR would fit)" in told
+    assert "joint 3 is prismatic, not revolute: check the types of joints (RRPRRR would fit)" in told
     table = shared_data / "ur5" / f"trials_{noise}px.csv"
     for types, assumed in ((), True), (("--joints", "RRRRRR"), False):
         code, value, err = answer("calibrate", "--data", table, *types, "-o", "other", "--json", "--force")

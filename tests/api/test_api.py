@@ -296,7 +296,9 @@ def test_a_sweep_in_a_folder_is_continued_but_never_that_of_a_class_without_sour
         np.testing.assert_array_equal(first.table["steps"], ps.load(path).table["steps"])
     ps.sweep(config, laws=["exact"], runs=3, path=tmp_path / "sweep")
     assert (tmp_path / "sweep" / "sweep.h5").stat().st_mtime_ns == done
-    with pytest.raises(ps.InputError, match="; choose another folder, or start again with force=True"):
+    with pytest.raises(
+        ps.InputError, match=r"; choose another folder, or start again with --force \(force=True\)"
+    ):
         ps.sweep(config, laws=["exact"], runs=4, path=tmp_path / "sweep")
 
 

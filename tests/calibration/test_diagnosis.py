@@ -41,7 +41,9 @@ def test_a_joint_of_the_wrong_type(types, joint, motions):
     robot = robot_of(types)
     message = refusal(seen(robot, poses(robot, motions)), flipped(types, joint))
     right, wrong = ("revolute", "prismatic") if types[joint] == "R" else ("prismatic", "revolute")
-    assert message.startswith(f"by the images joint {joint + 1} is {right}, not {wrong}: check --joints")
+    assert message.startswith(
+        f"by the images joint {joint + 1} is {right}, not {wrong}: check the types of joints"
+    )
 
 
 def test_a_joint_of_the_wrong_type_whose_fit_passes():
@@ -49,7 +51,7 @@ def test_a_joint_of_the_wrong_type_whose_fit_passes():
     robot = robot_of("RPRP")
     message = refusal(seen(robot, poses(robot, "all at once")), "RPRR")
     assert message.startswith(
-        "by the images joint 4 is prismatic, not revolute: check --joints (RPRP would fit)"
+        "by the images joint 4 is prismatic, not revolute: check the types of joints (RPRP would fit)"
     )
 
 

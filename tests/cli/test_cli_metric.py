@@ -16,10 +16,10 @@ from projservo_cli import store
 from projservo_cli.calibration import calibrate
 from projservo_cli.cli import run
 from projservo_cli.metric.kinematic_errors import kinematic_errors
+from projservo_cli.metric.opencv import opencv_cameras
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.results import ImageModel
 from projservo_cli.simulation.urdf import urdf_chain
-from projservo_cli.store import exports
 from projservo_cli.store.tables import read_table
 
 KNOWN = ["--metric", "0.2492990172463582", "--between", "2,8"]
@@ -54,7 +54,7 @@ def export(ur5, tmp_path, kind, *more):
 def test_opencv_reads_the_cameras_and_projects_as_the_model_that_was_fitted(ur5, metric, tmp_path):
     cv2 = pytest.importorskip("cv2")
     file = cv2.FileStorage(str(export(ur5, tmp_path, "opencv")), cv2.FILE_STORAGE_READ)
-    found = exports.opencv_cameras(metric, store.load(ur5).calibration)
+    found = opencv_cameras(metric, store.load(ur5).calibration)
     body = found.body
     # The true cameras have no skew, so that this costs what chance does: 14 in one of 1,000 draws.
     assert 0.0 < found.skew_chi2 < 13.9

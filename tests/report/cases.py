@@ -11,7 +11,7 @@ from projservo_cli.laws import LAW_SPECS, LAWS, name_of
 from projservo_cli.records import PRISMATIC, Calibration
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import ReportData
-from projservo_cli.robots.client import FrameRecorder
+from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.stages import studies
 from projservo_cli.stages.report import in_metres
 from tests.configured import record

@@ -12,7 +12,7 @@ from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Fit
-from projservo_cli.robots.client import FrameRecorder
+from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.steps import steps_for
 from projservo_cli.store import Result, Run
 from tests.configured import calibrate, report_on
