@@ -29,8 +29,8 @@ from projservo_cli.experiment import (
     compilation,
     law_target,
     listening,
+    plan_scene_of,
     require_simulated,
-    scene_of,
 )
 from projservo_cli.files import working_in
 from projservo_cli.laws import CODES, REGULATE, law_and_mode, name_of, names_of
@@ -279,7 +279,7 @@ def plan(
     described = asked.arm is not None and asked.rig is not None
     described = described and asked.markers is not None and asked.markers.points is not None
     given = plan_inputs(asked, predicted=asked.plant.simulated and not described)
-    return MotionPlan.of(planning.run(given, calibration), scene_of(asked, calibration), (q_start, goal))
+    return MotionPlan.of(planning.run(given, calibration), plan_scene_of(asked, calibration), (q_start, goal))
 
 
 def servo(
@@ -330,7 +330,7 @@ def servo(
             raise InputError(f"servo: law {law} is {name} in mode {of_name}, not {mode!r}: leave mode out")
         factory, name = None, law_target(name)
     else:
-        factory, name, of_name = law, plugins.name_of(law), REGULATE
+        factory, name, of_name = law, plugins.class_name(law), REGULATE
     if isinstance(plan, MotionPlan):
         config = _with_task(config, calibration.joint_types, *plan.asked)
     asked = config.replace({"control.mode": [of_name if mode is None else mode]})
@@ -482,7 +482,7 @@ def _say_compilation() -> None:
 
 def _with_robot(config: Config, robot: Any) -> Config:
     """The configuration with an object of the contract in place of its robot."""
-    name = plugins.name_of(robot)
+    name = plugins.class_name(robot)
     plugins.require_object("plant", name, robot)
     plant = config.plant.model_copy(update={"use": name, "options": {}})
     return config.model_copy(update={"plant": plant})
@@ -529,7 +529,7 @@ def _law_of_sweep(law: str | type, workers: int) -> str:
     target = plugins.bring("law", law)
     if workers > 1 and not plugins.importable(law):
         raise InputError(
-            f"sweep: other processes cannot import {plugins.name_of(law)}: put it into a module, or use "
+            f"sweep: other processes cannot import {plugins.class_name(law)}: put it into a module, or use "
             "workers=1"
         )
     return target

@@ -22,7 +22,7 @@ from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import CODES, law_and_mode, mode_in
 from projservo_cli.progress import Bar
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Report, WorkFailed
-from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
+from projservo_cli.results import ImageModel, MotionPlan, PlanScene, RunTrace
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.inputs import PlanInputs
 from projservo_cli.steps import STAGES, Step, inputs_of, result_of, steps_for
@@ -392,7 +392,7 @@ class Experiment(Printed):
         """The plan."""
         self._require("plan")
         plan, config = self._run.plan, self._readable()
-        return MotionPlan.of(plan, None if config is None else scene_of(config, self._run.calibration))
+        return MotionPlan.of(plan, None if config is None else plan_scene_of(config, self._run.calibration))
 
     @property
     def traces(self) -> dict[str, RunTrace]:
@@ -427,11 +427,11 @@ class Experiment(Printed):
         return {"path": place, "results": ", ".join(self._run.results) or "nothing made yet"}
 
 
-def scene_of(config: Config, calibration: Calibration) -> Scene:
+def plan_scene_of(config: Config, calibration: Calibration) -> PlanScene:
     """Return the scene of plans of a configuration."""
     joints = joints_of(config).joints(calibration.joint_types, calibration)
     size = config.image_size_px
-    return Scene(
+    return PlanScene(
         calibration.model(),
         joints.limits,
         None if size is None else image_sizes(size),
@@ -460,7 +460,7 @@ def _targets(laws: Sequence[str]) -> tuple[str, ...]:
     given = [laws] if isinstance(laws, str) or not np.iterable(laws) else laws
     for law in given:
         if not isinstance(law, str):
-            named = f", such as {plugins.name_of(law)!r}" if callable(law) else ""
+            named = f", such as {plugins.class_name(law)!r}" if callable(law) else ""
             raise InputError(f"make: law {law!r:.60}: give the name of a law, or module:Class{named}")
     return tuple(dict.fromkeys(map(law_target, given)))
 
@@ -471,6 +471,6 @@ def law_target(name: str) -> str:
     if target is None:
         if remedy := mode_in(name):
             raise InputError(f"law {name}: {remedy}")
-        valid = ", ".join((*CODES, *plugins.registered("law")))
+        valid = ", ".join((*CODES, *plugins.registered_names("law")))
         raise InputError(f"law {name}: no such law; laws: {valid}, or module:Class")
     return target

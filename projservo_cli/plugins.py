@@ -29,7 +29,7 @@ _ALIKE = 0.8
 TARGET = rf"^{DOTTED}:{DOTTED}$"
 
 
-def registered(kind: str) -> dict[str, str]:
+def registered_names(kind: str) -> dict[str, str]:
     """Names of a ``plant`` or ``law``, projservo's own and those of installed packages, with the classes."""
     found = {point.name: point.value for point in metadata.entry_points(group=GROUPS[kind])}
     return found | (_OWN_PLANTS if kind == "plant" else {})
@@ -42,7 +42,7 @@ def short_name(target: str) -> str:
 
 def target_of(kind: str, name: str) -> str | None:
     """The class ``module:Class`` that a name stands for; None where it stands for none."""
-    return name if re.match(TARGET, name) else registered(kind).get(name)
+    return name if re.match(TARGET, name) else registered_names(kind).get(name)
 
 
 def find(kind: str, target: str) -> Any:
@@ -138,7 +138,7 @@ def require_object(kind: str, target: str, given: Any) -> None:
     _require_methods(f"{kind} {target}", given, kind)
 
 
-def name_of(given: Any) -> str:
+def class_name(given: Any) -> str:
     """Return ``module:Class`` of a class, of a function or of an object's class."""
     kind = given if hasattr(given, "__qualname__") else type(given)
     steps = [step for step in kind.__qualname__.split(".") if step.isidentifier()]
@@ -147,7 +147,7 @@ def name_of(given: Any) -> str:
 
 def bring(kind: str, given: Any) -> str:
     """Make a class that this process has be found by its name, which is returned."""
-    target = name_of(given)
+    target = class_name(given)
     _require_methods(f"{kind} {target}", given, kind)
     _BROUGHT[target] = given
     return target

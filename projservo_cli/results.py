@@ -366,7 +366,7 @@ def _urdf_chain(urdf: str | Path, tip: str | None) -> UrdfChain:
     return urdf_chain(str(urdf), tip, bytes_of(urdf, "a URDF", _MAX_BYTES))
 
 
-class Scene(NamedTuple):
+class PlanScene(NamedTuple):
     """Scene of the figure of a plan."""
 
     model: Model  # as calibrated
@@ -379,11 +379,11 @@ class Scene(NamedTuple):
 class MotionPlan(Displayable, Plan):
     """A plan that shows itself."""
 
-    scene: Scene | None = None  # of its figure, if at hand
+    scene: PlanScene | None = None  # of its figure, if at hand
     asked: tuple[Any, Any] = (None, None)  # start and goal that it was asked for, None of the configuration
 
     @classmethod
-    def of(cls, plan: Plan, scene: Scene | None = None, asked: tuple[Any, Any] = (None, None)) -> Self:
+    def of(cls, plan: Plan, scene: PlanScene | None = None, asked: tuple[Any, Any] = (None, None)) -> Self:
         """Return a record with its functions."""
         return plan if isinstance(plan, cls) else cls(**_fields_of(plan, Plan), scene=scene, asked=asked)
 

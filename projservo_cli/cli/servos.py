@@ -112,11 +112,11 @@ def _servos(console: Console, config: str, text: str, *, whole: bool = True) -> 
     whole : whether all servos must answer.
     """
     from projservo_cli import plugins
-    from projservo_cli.config.editing import plant_of
+    from projservo_cli.config.editing import named_plant
     from projservo_cli.hardware.so101 import SO101, connected, torque_reported
     from projservo_cli.records import InputError
 
-    use, options = plant_of(text, config)
+    use, options = named_plant(text, config)
     if (name := plugins.short_name(use)) != "so101":
         raise InputError(f"plant {name}: is no arm of bus servos: set plant: so101")
     arm = plugins.called("plant", name, SO101, (), options)

@@ -31,7 +31,7 @@ def with_limits(text: str, limits_deg: Sequence[tuple[float, float]], where: str
     return f"{text[:at]}limits: {value}{divider if robot.value else ''}{text[at:]}"
 
 
-def plant_of(text: str, where: str) -> tuple[str, dict[str, Any]]:
+def named_plant(text: str, where: str) -> tuple[str, dict[str, Any]]:
     """Return the plant of a configuration and its options, whatever else the text holds.
 
     An arm can be released, and its limits be found, with a file that has other faults.

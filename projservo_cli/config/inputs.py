@@ -34,7 +34,7 @@ from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.inputs import (
     CalibrationInputs,
     Contract,
-    Driven,
+    Drive,
     Estimation,
     KnownLengths,
     Motions,
@@ -116,7 +116,7 @@ def teach_inputs(config: Config) -> TeachInputs:
         robot = _simulated(config, truth_of(config), None)
     else:
         robot = _own(config)
-    driven = Driven(robot, _following(config, config.plant.speed_scale), _endless(config))
+    driven = Drive(robot, _following(config, config.plant.speed_scale), _endless(config))
     noise, settle_s = config.noise.servo_px, config.plant.settle_s
     return TeachInputs(driven, joints_of(config), numbers, noise, settle_s, config.seed)
 
@@ -231,7 +231,7 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
     robot: SimulatedRobot | OwnRobot = _own(config)
     if plan.truth is not None:
         robot = _simulated(config, plan.truth, files)
-    driven = Driven(robot, _following(config, plant.speed_scale), _endless(config))
+    driven = Drive(robot, _following(config, plant.speed_scale), _endless(config))
     delay = None if plant.time_offset_s is None else (plant.time_offset_s.left, plant.time_offset_s.right)
     settle_s = plant.settle_s if plan.truth is None else None
     table = config.data.table if config.data is not None and plan.truth is None else ""
@@ -457,7 +457,7 @@ def _trials(
         motions=motions,
         joints=joints_of(config, paced=driven),
         truth=truth,
-        driven=None if robot is None else Driven(robot, _following(config, speed_scale), _endless(config)),
+        driven=None if robot is None else Drive(robot, _following(config, speed_scale), _endless(config)),
         noise_px=config.noise.calibration_px,
         averaged_frames=config.plant.averaged_frames if driven else 1,
         settle_s=config.plant.settle_s if driven else 0.0,

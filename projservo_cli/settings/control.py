@@ -20,7 +20,7 @@ def _law(name: str) -> str:
     if target is None:
         if remedy := mode_in(name):
             raise ValueError(remedy)
-        valid = ", ".join(map(repr, (*LAWS, *plugins.registered("law"))))
+        valid = ", ".join(map(repr, (*LAWS, *plugins.registered_names("law"))))
         raise PydanticCustomError("literal_error", "is not one of them", {"expected": valid})
     return target
 
@@ -32,7 +32,7 @@ RENDERED = "mujoco"
 def _plant(name: str) -> str:
     target = name if name == RENDERED else plugins.target_of("plant", name)
     if target is None:
-        names = ", ".join((RENDERED, *plugins.registered("plant")))
+        names = ", ".join((RENDERED, *plugins.registered_names("plant")))
         raise ValueError(f"must be module:Class, such as my_robot:Robot, or one of {names}")
     return target
 
@@ -135,7 +135,7 @@ class Control(Section):
                 )
 
 
-class EachView(Section):
+class _EachView(Section):
     """A number for each camera."""
 
     left: Number = Field(description="time offset of the left camera")
@@ -188,7 +188,7 @@ class PlantSettings(Section):
         "per degree",
     )
     time_offset_s: Annotated[
-        EachView | None, BeforeValidator(of_both, json_schema_input_type=Number | EachView | None)
+        _EachView | None, BeforeValidator(of_both, json_schema_input_type=Number | _EachView | None)
     ] = Field(
         None,
         description="time from the middle of an exposure to the joint readings that arrive with its "

@@ -80,7 +80,7 @@ class MarkerMoved(Section):
     by_m: Vector3 = Field(description="displacement in the frame of the tool")
 
 
-class Delays(Section):
+class _Delays(Section):
     """Latency of both cameras, s."""
 
     left: NotNegative = Field(0.0, description="latency of the left camera")
@@ -96,9 +96,9 @@ class Faults(Section):
     """Permanent faults of the simulated robot and its cameras, which a calibration has to model too."""
 
     camera_latency_s: Annotated[
-        Delays, BeforeValidator(of_both, json_schema_input_type=NotNegative | Delays)
+        _Delays, BeforeValidator(of_both, json_schema_input_type=NotNegative | _Delays)
     ] = Field(
-        Delays(),
+        _Delays(),
         description="time from the middle of an exposure to the joint readings that arrive with its "
         "image, at least half the exposure; a number for both cameras, or {left, right}",
     )

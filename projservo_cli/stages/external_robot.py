@@ -32,7 +32,7 @@ from projservo_cli.simulation.faults import (
 )
 from projservo_cli.simulation.ideal import Plant, observe
 from projservo_cli.simulation.streams import SERVO_NOISE
-from projservo_cli.stages.inputs import Contract, Driven, OwnRobot
+from projservo_cli.stages.inputs import Contract, Drive, OwnRobot
 from projservo_cli.stages.scenario import RunScenario
 
 # Drift of a joint, rad or m, and of an image, px rms, within which both count as still.
@@ -298,7 +298,7 @@ def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.var(means, axis=0, ddof=1), noise / third
 
 
-def simulated_robot(driven: Driven, joints: Joints, robot: FaultyRobot) -> PluginRobot:
+def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> PluginRobot:
     """A simulated robot of the contract, which is never late, and goes beyond its limits where it may."""
     bounds = driven.following.bounds(joints)
     if driven.endless:
@@ -326,7 +326,7 @@ def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -
     return robot_of(robot, scenario.exact.q_start, points, drawn, events)
 
 
-def connected(scenario: RunScenario, law: str, given: Robot | None = None) -> DrivenRobot:
+def connected_robot(scenario: RunScenario, law: str, given: Robot | None = None) -> DrivenRobot:
     """Return the robot as the loop of a law sees it: with its truth, or with the calibrated model.
 
     given : an object of the contract instead of one of a class.

@@ -33,7 +33,7 @@ class OwnRobot(NamedTuple):
     cameras: Cameras | None = None  # of an arm that reads joints alone
 
 
-class Driven(NamedTuple):
+class Drive(NamedTuple):
     """A robot of the contract and how it is driven."""
 
     robot: SimulatedRobot | OwnRobot
@@ -60,7 +60,7 @@ class Trials:
     motions: Motions
     joints: JointSettings
     truth: Truth | None  # robot, rig and markers as they are; None for a robot of somebody's
-    driven: Driven | None  # by the contract; None for one that stands wherever it is sent
+    driven: Drive | None  # by the contract; None for one that stands wherever it is sent
     noise_px: float  # standard deviation of simulated pixels
     averaged_frames: int  # images of each pose that are averaged
     settle_s: float  # for how long joints and images have stood still before
@@ -144,7 +144,7 @@ class SuggestionInputs(NamedTuple):
 class TeachInputs:
     """Inputs of teaching a pose."""
 
-    driven: Driven
+    driven: Drive
     joints: JointSettings
     numbers: tuple[int, ...]  # of the markers
     noise_px: float  # standard deviation of simulated pixels
@@ -192,7 +192,7 @@ class PlanInputs:
 class Contract(NamedTuple):
     """Further inputs of a run by the contract."""
 
-    driven: Driven
+    driven: Drive
     events: Events  # of a simulated robot
     timeout_s: float  # most time that an answer may take
     time_offset_s: tuple[float, float] | None  # of the images of both cameras; None to estimate them

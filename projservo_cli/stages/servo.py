@@ -57,7 +57,7 @@ _NOT_DRIVEN: Any = None  # in place of what a run leaves
 
 
 @dataclass(eq=False)
-class Run:
+class LawRun:
     """A run of a law: made, driven to its verdict, and summed up."""
 
     scenario: RunScenario
@@ -95,7 +95,7 @@ class Run:
             return False
         return not why_closed(scenario.model, scenario.demands, search_of(scenario))
 
-    def drive(self) -> "Run":
+    def drive(self) -> "LawRun":
         """Drive the law to its verdict: in the compiled loop where it can be, else in that of Python.
 
         Raises InputError, WorkFailed as of ``run``.
@@ -144,7 +144,7 @@ class Run:
             )
         controller, driven = (
             self._controller(),
-            external_robot.connected(scenario, self.law, self.robot),
+            external_robot.connected_robot(scenario, self.law, self.robot),
         )
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), at_rest_after(driven.robot):
@@ -373,7 +373,7 @@ _HARDLY = 0.01
 _SAME_START, _SAME_GOAL_PX = 1e-6, 10.0
 
 
-def _stated_mm(run: Run, views: FloatArray) -> dict[str, Any]:
+def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
     """State how far the face ended from the goal, rms mm: by images, and by what no test tells from none.
 
     Nothing if no length on the face is known, or images disagree with the calibration.
@@ -424,7 +424,7 @@ def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(mean))
 
 
-def _stalled_by(run: Run) -> str:
+def _stalled_by(run: LawRun) -> str:
     """Return why the image error stopped falling: commands too slow to lower it, or a local minimum.
 
     Joints that move on at their limits, as a law asks of them near a singularity, are not slow.
@@ -443,7 +443,7 @@ def _stalled_by(run: Run) -> str:
     )
 
 
-def _reason(run: Run, joint: int, remaining: tuple[float | None, float | None]) -> str:
+def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None]) -> str:
     """Return the reason of the verdict, one sentence."""
     log, steps, limits = run.log, run.steps, run.scenario.termination
     error, first = float(log.judged[steps]), float(log.judged[0])
@@ -482,7 +482,7 @@ def _reason(run: Run, joint: int, remaining: tuple[float | None, float | None]) 
     return "; ".join(filter(None, (reasons[run.verdict], blind, obstruction)))
 
 
-def _apart(run: Run) -> str:
+def _apart(run: LawRun) -> str:
     """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
     seen, most = float(run.log.error[run.steps]), _BY_NOISE * run.scenario.termination.image_error_px
     text = f"; the face itself is seen {seen:.3g} px off ({most:.3g} px by noise): it moved on the tool"
@@ -503,7 +503,7 @@ def run(inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, **
     """Drive one law in one mode from the start of the task to its verdict.
 
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
-    brought : by a caller in Python: ``factory``, ``robot`` and ``blind`` of ``Run``.
+    brought : by a caller in Python: ``factory``, ``robot`` and ``blind`` of ``LawRun``.
     Raises InputError if a part of the simulation is missing, the plan is of another task, or the plan to
     follow has no time; WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
     ``refuses`` is set.
@@ -529,7 +529,7 @@ def _require_its_task(scenario: RunScenario, plan: Plan) -> None:
 
 def drive(
     scenario: RunScenario, plan: Plan | FloatArray, name: str, believed: Model | None = None, **brought: Any
-) -> Run:
+) -> LawRun:
     """Drive the run of a name to its verdict.
 
     plan : of the task; a built-in law that does not follow it needs but the joint motions (2, n) of its
@@ -546,7 +546,7 @@ def drive(
             unplanned = f"no joints can follow the plan: {plan.reason}"
         elif plan.duration is not None:
             planned_s = plan.duration / scenario.servo.speed_scale
-    return Run(scenario, plan, law, mode, planned_s, unplanned, believed, **brought).drive()
+    return LawRun(scenario, plan, law, mode, planned_s, unplanned, believed, **brought).drive()
 
 
 def _in_compiled_loop(inputs: ServoInputs, law: str) -> bool:

@@ -336,7 +336,7 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
             arrays[field] = np.asarray(value)
             _require_sizes(field.name, field.metadata["dims"], arrays[field].shape, sizes)
         elif value is not None:
-            group.attrs[field.name] = encoded(value)
+            group.attrs[field.name] = as_attribute(value)
     group.dimensions.update({dim: sizes[dim] for field in arrays for dim in field.metadata["dims"]})
     for field, value in arrays.items():
         boolean = value.dtype == np.bool_
@@ -378,7 +378,7 @@ def _require_sizes(name: str, dims: tuple[str, ...], shape: tuple[int, ...], siz
             raise ValueError(f"{name} has {size} entries along {dim}, not {sizes[dim]}")
 
 
-def encoded(value: Any) -> Any:
+def as_attribute(value: Any) -> Any:
     """Encode an attribute of HDF5 and netCDF: number or text; other values as JSON."""
     if isinstance(value, (bool, np.bool_)):
         return np.int8(value)

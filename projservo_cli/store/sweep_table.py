@@ -14,8 +14,8 @@ from projservo_cli.records import SIZES, InputError, Trace
 from projservo_cli.store import (
     SCHEMA_VERSION,
     SWEEP,
+    as_attribute,
     attribute,
-    encoded,
     labelled,
     load_record,
     new_file,
@@ -87,7 +87,7 @@ def assemble(
     size += sum(part.stat().st_size for part in parts)  # their traces
     with new_file(path, size) as new, labelled(new) as file:
         file.attrs.update({"schema": _SCHEMA, "schema_version": SCHEMA_VERSION})
-        file.attrs.update({name: encoded(value) for name, value in attributes.items()})
+        file.attrs.update({name: as_attribute(value) for name, value in attributes.items()})
         failures: dict[str, Failure] = {}
         for part in parts:
             merge_failures(failures, _failures(part))
