@@ -1,8 +1,7 @@
 """Commands of the stages and of their chain: dry run, work, summary."""
 
-import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -61,10 +60,11 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     if len(stages) > 1:
         return _make(console, stages, options)
     from projservo_cli.config.inputs import recording_inputs
+    from projservo_cli.experiment import data_table, recorded
     from projservo_cli.stages.record import new_recording
 
     config = option.configured(options["config"], options)
-    path = options["output"] or _data_table(config)
+    path = options["output"] or data_table(config)
     poses, given = _motions(config, options), recording_inputs(config)
     recording, reason = new_recording(given, path, motions=poses, force=options["force"]), ""
     if not (recording.why or config.plant.simulated):
@@ -72,23 +72,12 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     if not options["dry_run"]:
         with option.writing(path):
             recording = new_recording(given, path, motions=poses, force=options["force"])
-            reason = _drive(console, config, recording, confirm=options["confirm"])
+            reason = recorded(console, config, recording, confirm=options["confirm"])
     value = _recording_object(recording, reason)
     console.report(value, [*words_of("record", value), *([f"table: {path}"] if path.exists() else [])])
     if reason:
         click.echo(visible(f"projservo: record: {reason}"), err=True)
     return FAILED if reason else 0
-
-
-def _data_table(config: Any) -> Path:
-    """Return the table of a configuration as one to be recorded."""
-    from projservo_cli.records import InputError
-
-    if config.data is None:
-        raise click.UsageError("record needs a table to write: -o TABLE, or data.table in the configuration")
-    if config.data.joint_unit == "deg":
-        raise InputError("data.joint_unit: record writes rad; leave it out")
-    return Path(config.data.table)
 
 
 def _recording_object(recording: Any, reason: str) -> dict[str, Any]:
@@ -105,31 +94,6 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
         return None
     types = config.robot.joint_types if config.robot is not None else None
     return read_joint_list(options["motions"], types, options["joint_unit"])
-
-
-def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> str:
-    """Record the pending poses, and report the progress on an interrupt; return the reason of a failure."""
-    from projservo_cli.config.inputs import joints_of, recording_inputs
-    from projservo_cli.records import WorkFailed
-    from projservo_cli.stages.record import record
-
-    if recording.pending and confirm:
-        console.confirm("record", config.plant)
-    total, units = len(recording.targets), joints_of(config).joints().units
-
-    def progress(what: str, done: int, whole: int) -> None:
-        console.progress(what, done, whole, recording.note(units))
-
-    if recording.found and recording.pending:
-        console.say(f"{recording.path}: continued after {recording.found} of {total} poses")
-    try:
-        record(recording_inputs(config), recording, progress=progress)
-    except WorkFailed as error:
-        return " ".join(str(error).split()).removeprefix("record: ")
-    except KeyboardInterrupt:
-        console.say(f"{recording.path}: {len(recording.done)} of {total} poses; run again to continue")
-        raise
-    return ""
 
 
 @main.stage(
@@ -280,46 +244,11 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
         if chain.recording is None:  # again, since another process may have written the run until now
             return _work(_asked(console, names, options))
         with option.writing(chain.recording.path):
-            return _work(_recorded(_asked(console, names, options)))
-
-
-def _recorded(call: _Call) -> _Call:
-    """Record the pending poses; return the action for the table."""
-    from projservo_cli.store import save
-
-    chain = call.chain
-    recording, why = chain.recording, chain.recording.why
-    if why:
-        call.console.say(f"record: making ({why})")
-    if reason := _drive(call.console, chain.config, recording, confirm=chain.confirm):
-        chain.failed, chain.reason = "record", reason
-        return call
-    if chain.run.refuted:  # by what the new recording has taken the place of
-        save(replace(chain.run, refuted=""))
-    unasked = {**call.options, "confirm": call.options["confirm"] and not why}
-    return _asked(call.console, chain.names, unasked, replace(recording, why=""))
-
-
-def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
-    """Return the pending recording of the table of a calibration."""
-    from projservo_cli.config.inputs import recording_inputs
-    from projservo_cli.records import InputError
-    from projservo_cli.stages.record import new_recording
-
-    path, force, stored = _data_table(config), options["force"], run.results.get("calibrate")
-    table = str(path)
-    if stored and stored.inputs.get("table", table) != table and config.plant.simulated and not force:
-        raise InputError(
-            f"{run.path}: its calibration comes from {stored.inputs['table']} and would be replaced by a "
-            "simulated one; choose another folder with -o, or use --force"
-        )
-    poses, given = _motions(config, options), recording_inputs(config)
-    found = new_recording(given, path, motions=poses, force=force, redo=True)
-    digest = stored and stored.inputs.get("table_sha256")
-    if not run.refuted or found.why or digest != hashlib.sha256(path.read_bytes()).hexdigest():
-        return found
-    begun = new_recording(given, path, motions=poses, force=True)
-    return replace(begun, why=f"what is there was contradicted: {run.refuted}")
+            call = _asked(console, names, options)
+            if not call.chain.record():
+                return _work(call)
+            unasked = {**options, "confirm": options["confirm"] and not call.chain.recording.why}
+            return _work(_asked(console, names, unasked, replace(call.chain.recording, why="")))
 
 
 def _asked(
@@ -329,10 +258,10 @@ def _asked(
 
     recording : where it was made just now.
     """
-    from projservo_cli.experiment import Chain
-    from projservo_cli.steps import Step, steps_for
+    from projservo_cli.config import Override
+    from projservo_cli.experiment import Chain, pending_recording
 
-    given, records = _law_names(options.get("laws", ())), "record" in names
+    laws, records = _law_names(options.get("laws", ())), "record" in names
     config, stored = option.resolve(options, recording=records)
     if options.get("suggest") is not None and config.calibration.method != "bundle_adjustment":
         raise click.UsageError(
@@ -342,15 +271,15 @@ def _asked(
     if wanted := _extras(options):
         require_optional(config, wanted)
     if records and recording is None:
-        recording = _recording(config, stored, options)
-    stages, why = [name for name in names if name != "record"], recording.why if records else ""
-    steps = steps_for(config, stored, stages, laws=given, force=options["force"], recording=why)
-    if records:
-        steps.insert(0, Step("record", "", "", {}, why))
-    confirm, blind = (bool(options.get(name)) for name in ("confirm", "blind"))
-    chain = Chain(console, names, config, stored, steps, recording=recording, confirm=confirm, blind=blind)
+        recording = pending_recording(config, stored, _motions(config, options), force=options["force"])
+    how = {name: bool(options.get(name)) for name in ("confirm", "blind")}
+    chain = Chain.asked(
+        console, names, config, stored, laws=laws, force=options["force"], recording=recording, **how
+    )
     if not options["dry_run"]:
-        _require_named(chain, options)
+        keys = {Override.parse(text).key for text in options["sets"]}
+        named = {kind for kind, those in _NAMING.items() if options["config"] or keys & those}
+        chain.require_permitted(named | ({"law"} if laws else set()))
     return _Call(console, options, chain)
 
 
@@ -390,47 +319,18 @@ def _law_names(names: Sequence[str]) -> tuple[str, ...]:
         raise click.UsageError(f"--{error}") from error
 
 
-def _require_named(chain: Any, options: Mapping[str, Any]) -> None:
-    """Refuse to move a robot that no stage asks for, or to start code that only a stored run names.
-
-    A run file may come from anybody: its contents are shown and compared, never imported. Classes
-    that are named are imported, so that what cannot be found is known before any work.
-    """
-    from projservo_cli import plugins
-    from projservo_cli.config import Override
-
-    if moving := chain.moves_unasked():
-        raise click.UsageError(
-            f"{chain.names[-1]} needs a run of {moving.law} ({moving.why}), which moves "
-            f"{chain.config.plant.use}: run projservo servo first"
-        )
-    given = {Override.parse(text).key for text in options["sets"]}
-    named = {kind: bool(keys & given) for kind, keys in _NAMING.items()}
-    named["law"] |= bool(options.get("laws"))
-    flags = {"law": "--law {}", "plant": "--set plant={}"}
-    code = chain.code()
-    for kind, target in code:
-        if not (options["config"] or named[kind]):
-            raise click.UsageError(
-                f"{kind} {target} is named by the stored run alone, which starts no code: give the "
-                f"configuration again with -c, or {flags[kind].format(target)}"
-            )
-    for kind, target in code:
-        plugins.find(kind, target)
-
-
 def _work(call: _Call) -> int:
     """Make the outdated stages and print their results; return the exit code."""
     console, chain = call.console, call.chain
     _announce(console, chain)
     chain.make()
     if (count := call.options.get("suggest")) is not None and not chain.lacks("calibrate"):
-        call.beside["calibrate"] = _suggestions(chain, count)
+        call.beside["calibrate"] = chain.suggestions(count)
     if "calibrate" in chain.names:
         assumed = chain.config.joint_types is None
         call.beside.setdefault("calibrate", {})["joint_types_assumed"] = assumed
     if (wanted := _extras(call.options)) and not chain.lacks("report"):
-        call.beside["report"] = _made_optional(console, chain, wanted)
+        call.beside["report"] = chain.extras(wanted)
     call.beside.setdefault("report", {})["replayed"] = chain.replayed()
     from projservo_cli.report.report_data import failed_object, stage_object
 
@@ -448,11 +348,11 @@ def _work(call: _Call) -> int:
     words += [f"table: {chain.recording.path}"] if chain.recording is not None else []
     words += [f"run: {chain.run.path}"] if chain.run.results else []
     console.report(values if len(values) > 1 else values[chain.names[0]], words)
-    findings = list(_findings(call))
-    for text, fatal in findings:
-        if fatal or not console.quiet:
-            click.echo(visible(f"projservo: {text}"), err=True)
-    return FAILED if any(fatal for _, fatal in findings) else 0
+    findings = list(chain.findings(call.beside.get("calibrate", {})))
+    for finding in findings:
+        if finding.fatal or not console.quiet:
+            click.echo(visible(f"projservo: {finding.text}"), err=True)
+    return FAILED if any(finding.fatal for finding in findings) else 0
 
 
 def _announce(console: Console, chain: Any) -> None:
@@ -469,93 +369,6 @@ def _announce(console: Console, chain: Any) -> None:
             reasons.setdefault(said, []).append(step.name)
     for said, found in reasons.items():
         console.say(f"{', '.join(found)}: {said}")
-
-
-def _suggestions(chain: Any, count: int) -> dict[str, Any]:
-    """Further poses for the calibration, as JSON values; their list is written next to the run."""
-    import numpy as np
-
-    from projservo_cli.config.inputs import suggestion_inputs
-    from projservo_cli.records import WorkFailed
-    from projservo_cli.stages.calibrate import suggest_motions
-
-    calibration, given = chain.run.calibration, suggestion_inputs(chain.config)
-    path = chain.run.path.parent / "suggestions.csv"
-    try:
-        found = suggest_motions(given, chain.run.observation, calibration, count, path)
-    except WorkFailed as error:
-        return {"suggestions": [], "suggestions_reason": str(error)}
-    keys = ("q", "from_pose", "delta", "variance_before", "variance_after")
-    limits = given.joints.joints(calibration.joint_types).limits
-    return {
-        "suggestions": [{key: getattr(one, key) for key in keys} for one in found],
-        "suggestions_file": path.resolve(),
-        "suggestions_unit": given.unit,
-        "suggestions_limited": bool(np.isfinite(limits.lower).any()),
-    }
-
-
-def _made_optional(console: Console, chain: Any, wanted: Sequence[str]) -> dict[str, Path]:
-    """Write the requested files, and the page with links to them; return the paths by name."""
-    from projservo_cli.config.inputs import about_of, scenery_of
-    from projservo_cli.report.page import write_page
-    from projservo_cli.stages import report as reporting
-
-    explained, config, made = chain.reported(), chain.config, {}
-    for name in wanted:
-        console.detail(f"report: making the {name}")
-        if name == "view":
-            path = reporting.view(scenery_of(config), explained, console.progress)
-        else:
-            path = reporting.animation(config.image_size_px, explained, console.progress)
-        made[name] = path.resolve()
-    explained = replace(explained, results={**explained.results, "report": chain.run.results["report"]})
-    write_page(explained, about_of(config))
-    return made
-
-
-def _findings(call: _Call) -> Iterator[tuple[str, bool]]:
-    """Return the failures of the call, and whether they end it with exit code 1."""
-    chain = call.chain
-    if chain.failed:
-        yield from _of_runs(chain)
-        yield f"{chain.failed}: {chain.reason}", True
-        return
-    results = chain.run.results
-    if "calibrate" in results and not chain.run.calibration.usable:
-        reason = " ".join(chain.run.calibration.reason.split())
-        yield f"calibrate: the calibration is not usable: {reason}", "calibrate" in chain.names
-    if (beside := call.beside.get("calibrate", {})).get("joint_types_assumed"):
-        yield "calibrate: joint types are not given: all are taken as revolute (--joints)", False
-    if beside.get("suggestions") == []:
-        yield f"calibrate: {beside['suggestions_reason']}", True
-    yield from _of_runs(chain)
-    # Other profiles are those of the paper, of which the margins are only measured.
-    searched = "plan" in results and chain.run.plan.profile in ("constrained", "joint_space")
-    if searched and not chain.run.plan.feasible:
-        yield f"plan: {chain.run.plan.reason}", "plan" in chain.names
-
-
-def _of_runs(chain: Any) -> Iterator[tuple[str, bool]]:
-    """A line on each run that did not converge or missed periods, and whether the call fails by it."""
-    from projservo_cli.laws import POINT_LAWS, must_converge, name_of
-
-    required = chain.config.control.must_converge
-    for trace in (chain.run.traces[law] for law in chain.laws_done):
-        must, converged = must_converge(trace.law, required), trace.verdict == "converged"
-        if trace.verdict == "failed" or (converged and not trace.overruns):
-            continue  # failures are printed last
-        but = " must converge, but" if must and not converged else ""
-        reason = " ".join(trace.reason.split())
-        said = f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"
-        if trace.overruns:
-            said += (
-                f"; it missed {trace.overruns} periods of {trace.period:g} s: raise control.period_s, or "
-                "find fewer markers"
-            )
-        # Classical laws lead where nothing can be expected of them, images included.
-        disturbed = trace.verdict == "fault detected" and trace.law not in POINT_LAWS
-        yield said, not converged and (must or disturbed)
 
 
 def _print_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> int:
