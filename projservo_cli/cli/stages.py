@@ -59,8 +59,8 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
         raise click.UsageError("--joint-unit is that of --motions, which is not given")
     if len(stages) > 1:
         return _make(console, stages, options)
+    from projservo_cli.chain import data_table, recorded
     from projservo_cli.config.inputs import recording_inputs
-    from projservo_cli.experiment import data_table, recorded
     from projservo_cli.stages.record import new_recording
 
     config = option.configured(options["config"], options)
@@ -226,7 +226,7 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     """Make the named stages and their missing inputs; return the exit code."""
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
-    from projservo_cli.experiment import FIGURES
+    from projservo_cli.chain import FIGURES
     from projservo_cli.files import tidy, working_in
 
     call = _asked(console, names, options)
@@ -258,8 +258,8 @@ def _asked(
 
     recording : where it was made just now.
     """
+    from projservo_cli.chain import Chain, pending_recording
     from projservo_cli.config import Override
-    from projservo_cli.experiment import Chain, pending_recording
 
     laws, records = _law_names(options.get("laws", ())), "record" in names
     config, stored = option.resolve(options, recording=records)

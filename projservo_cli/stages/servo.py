@@ -95,39 +95,24 @@ class LawRun:
             return False
         return not why_closed(scenario.model, scenario.demands, search_of(scenario))
 
-    def drive(self) -> "LawRun":
-        """Drive the law to its verdict: in the compiled loop where it can be, else in that of Python.
-
-        Raises InputError, WorkFailed as of ``run``.
-        """
-        if self.scenario.servo.contract is not None:
-            self._drive_by_contract()
-        elif isinstance(self.plan, Plan) and (
-            not _in_compiled_loop(self.scenario.servo, self.law) or self.is_guided
-        ):
-            self._drive_in_python(self._controller(), AnalyticPlant(*self._simulated()))
-        else:
-            self._drive_compiled()
-        return self
-
-    def _simulated(self) -> tuple[Plant, FloatArray, FloatArray]:
+    def simulated(self) -> tuple[Plant, FloatArray, FloatArray]:
         """The simulated robot as the law sees it, its first joints (n,), and the noise of its images."""
         scenario = self.scenario
         noise = scenario.noise_of(self.law, scenario.inputs.seed, scenario.termination.max_steps + 1)
         return scenario.plant_of(self.law), scenario.ends.q_start, noise
 
-    def _drive_compiled(self) -> None:
+    def compiled(self) -> None:
         """Drive a built-in law on the simulated robot in the compiled loop."""
         scenario, controller = self.scenario, self._built_in()
         limits, observed = scenario.termination, len(scenario.numbers_of(self.law))
-        self.plant, q_start, noise = self._simulated()
+        self.plant, q_start, noise = self.simulated()
         parts = MAX_PARTS if scenario.gains.substeps else 0
         self.log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts)
         course = Course(self.plant, limits, q_start.copy())
         code, self.steps = run_compiled(controller.law, course, noise, controller.state, self.log)
         self.verdict, self.limited = VERDICTS[code], float(controller.state.limited[0])
 
-    def _drive_by_contract(self) -> None:
+    def by_contract(self) -> None:
         """Drive a robot of the contract from the start of the task, where a simulated one stands.
 
         That of ``plant.use`` is driven there. Before its first motion, its images must agree with the
@@ -143,7 +128,7 @@ class LawRun:
                 f"{order}, or set data.joint_order=stated if it is known; no robot is driven before"
             )
         controller, driven = (
-            self._controller(),
+            self.controller(),
             external_robot.connected_robot(scenario, self.law, self.robot),
         )
         # The matrices of a frame are small: a second thread costs more than it gives.
@@ -164,7 +149,7 @@ class LawRun:
                 at_start = self._require_images(driven, "stopped at the start of the task, since", 1)
                 self.unseen = at_start or unseen
             driven.begin()
-            self._drive_in_python(controller, driven, StallMonitor(driven, scenario.termination))
+            self.in_python(controller, driven, StallMonitor(driven, scenario.termination))
 
     def _require_images(self, driven: DrivenRobot, what: str, least: int) -> str:
         """Refuse to move a robot of which so many cameras or more show nothing, unless that was asked for."""
@@ -177,7 +162,7 @@ class LawRun:
             )
         return unseen
 
-    def _drive_in_python(
+    def in_python(
         self, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, stall: StallMonitor | None = None
     ) -> None:
         """Drive a law on a plant, every command scaled; a run that is guided is watched."""
@@ -229,7 +214,7 @@ class LawRun:
         found.state.driven[:] = in_span(found.state.work.span, model, scenario.ends.q_start, sense)
         return found
 
-    def _controller(self) -> LoopLaw:
+    def controller(self) -> LoopLaw:
         """The law, ready for the Python loop.
 
         Raises InputError if there is no such law, it needs a model of the robot that the configuration lacks,
@@ -546,7 +531,14 @@ def drive(
             unplanned = f"no joints can follow the plan: {plan.reason}"
         elif plan.duration is not None:
             planned_s = plan.duration / scenario.servo.speed_scale
-    return LawRun(scenario, plan, law, mode, planned_s, unplanned, believed, **brought).drive()
+    run = LawRun(scenario, plan, law, mode, planned_s, unplanned, believed, **brought)
+    if scenario.servo.contract is not None:
+        run.by_contract()
+    elif isinstance(plan, Plan) and (not _in_compiled_loop(scenario.servo, law) or run.is_guided):
+        run.in_python(run.controller(), AnalyticPlant(*run.simulated()))
+    else:
+        run.compiled()
+    return run
 
 
 def _in_compiled_loop(inputs: ServoInputs, law: str) -> bool:

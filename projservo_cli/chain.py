@@ -1,0 +1,450 @@
+"""A chain of stages: which are to be made, in which order, what may move, and what became of them."""
+
+import hashlib
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from projservo_cli import plugins
+from projservo_cli.config import Config, stored_yaml
+from projservo_cli.config.inputs import about_of, joints_of, recording_inputs, scenery_of, suggestion_inputs
+from projservo_cli.geometry.jit import CACHE_FOLDER
+from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, name_of
+from projservo_cli.progress import Bar
+from projservo_cli.records import (
+    InputError,
+    JointList,
+    WorkFailed,
+)
+from projservo_cli.stages import Progress, silent
+from projservo_cli.stages.inputs import PlanInputs
+from projservo_cli.steps import STAGES, Step, inputs_of, result_of, steps_for
+from projservo_cli.store import SERVO, Run, save
+
+FIGURES = "figures"  # folder of a run in which a killed report may have left something
+
+
+class Listener(Protocol):
+    """Who follows a chain, and may be asked before something moves."""
+
+    def say(self, text: str) -> None:
+        """Take note of a message."""
+
+    def detail(self, text: str) -> None:
+        """Take note of a message that few want to read."""
+
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
+        """Show how far the work is, with a note."""
+
+    def confirm(self, command: str, plant: Any) -> None:
+        """Ask before the first motion of a plant; raises KeyboardInterrupt where the answer is not yes."""
+
+
+@dataclass(frozen=True)
+class _Caller:
+    """A caller in Python, who is shown progress and messages, and confirms every call."""
+
+    shown: Progress
+    bar: Bar
+
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
+        """Show how far the work is; the function of a caller takes no note."""
+        del note
+        self.shown(what, done, total)
+
+    def say(self, text: str) -> None:
+        """Print a message on standard error."""
+        self.bar.say(text)
+
+    def detail(self, text: str) -> None:
+        """Leave a message unread that few want to read."""
+
+    def confirm(self, command: str, plant: Any) -> None:
+        """Agree."""
+
+
+@contextmanager
+def listening(progress: Progress | bool) -> Iterator[_Caller]:
+    """Who follows work that is called from Python: a function, or for True a bar in a terminal."""
+    bar = Bar()
+    try:
+        yield _Caller(progress if callable(progress) else silent if progress is False else bar, bar)
+    finally:
+        bar.close()
+
+
+class Finding(NamedTuple):
+    """A failure in words, and whether a call fails by it."""
+
+    text: str
+    fatal: bool
+
+
+@dataclass
+class Chain:
+    """Stages that were asked for, the steps that they take, and what became of them."""
+
+    listener: Listener
+    names: Sequence[str]  # of the stages
+    config: Config
+    run: Run  # the stored run, with results made since
+    steps: Sequence[Step]
+    recording: Any = None  # the recording before the calibration, if any
+    confirm: bool = False  # whether to ask before the first motion
+    in_memory: bool = False  # whether results stay in memory
+    blind: bool = False  # whether a robot may move although cameras show nothing
+    laws: tuple[str, ...] = field(init=False)  # names of the runs of laws that the steps make or need
+    failed: str = ""  # name of the step that failed
+    reason: str = ""  # why
+    laws_done: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.laws = tuple(step.law for step in self.steps if step.law)
+
+    @classmethod
+    def asked(
+        cls,
+        listener: Listener,
+        names: Sequence[str],
+        config: Config,
+        run: Run,
+        *,
+        laws: Sequence[str] = (),
+        force: bool = False,
+        recording: Any = None,
+        confirm: bool = False,
+        in_memory: bool = False,
+        blind: bool = False,
+    ) -> "Chain":
+        """Return the chain of named stages, whose recording, if any, comes first."""
+        stages, why = [name for name in names if name != "record"], "" if recording is None else recording.why
+        steps = steps_for(config, run, stages, laws=laws, force=force, recording=why)
+        if recording is not None:
+            steps.insert(0, Step("record", "", "", {}, why))
+        return cls(listener, names, config, run, steps, recording, confirm, in_memory, blind)
+
+    @property
+    def pending(self) -> bool:
+        """Whether a result is to be made, or the configuration to be stored."""
+        return self.run.configuration != stored_yaml(self.config) or any(step.why for step in self.steps)
+
+    def lacks(self, stage: str) -> bool:
+        """Whether a stage was not completed."""
+        order = [step.stage for step in self.steps]
+        return bool(self.failed) and order.index(stage) >= order.index(self.failed.split("/")[0])
+
+    def require_permitted(self, named: Collection[str]) -> None:
+        """Refuse to move a robot that no stage asks for, or to start code that only a stored run names.
+
+        A run file may come from anybody: its contents are shown and compared, never imported. Classes that
+        are named are imported, so that what cannot be found is known before any work.
+
+        named : kinds of code, ``law`` and ``plant``, that the caller names.
+        Raises InputError.
+        """
+        moving = None
+        if not self.config.plant.simulated and "servo" not in self.names:
+            moving = next((step for step in self.steps if step.law and step.why), None)
+        if moving is not None:
+            raise InputError(
+                f"{self.names[-1]} needs a run of {moving.law} ({moving.why}), which moves "
+                f"{self.config.plant.use}: run projservo servo first, or name the stage servo as well"
+            )
+        code = self.code()
+        for kind, target in code:
+            if kind not in named:
+                flag = {"law": f"--law {target}", "plant": f"--set plant={target}"}[kind]
+                raise InputError(
+                    f"{kind} {target} is named by the stored run alone, which starts no code: give the "
+                    f"configuration again (-c), or {flag}; in Python, make an Experiment of it"
+                )
+        for kind, target in code:
+            plugins.find(kind, target)
+
+    def replayed(self) -> list[dict[str, Any]]:
+        """Runs of a robot of somebody's that are shown as they were stored: law, plant, and date."""
+        if self.config.plant.simulated or "servo" in self.names:
+            return []
+        stored = [(step.law, self.run.results[step.name]) for step in self.steps if step.law and not step.why]
+        plant = plugins.short_name(self.config.plant.use or "")
+        return [{"law": law, "plant": plant, "date": one.provenance.get("date")} for law, one in stored]
+
+    def code(self) -> list[tuple[str, str]]:
+        """Kind and ``module:Class`` of the imports of the steps, of laws and of a robot."""
+        servo = [law_and_mode(step.law)[0] for step in self.steps if step.law and step.why]
+        found = dict.fromkeys(("law", law) for law in servo if law not in CODES)
+        records = any(step.stage == "record" and step.why for step in self.steps)
+        if (servo or records) and not self.config.plant.simulated:
+            assert self.config.plant.use is not None
+            found["plant", self.config.plant.use] = None
+        return list(found)
+
+    def make(self) -> None:
+        """Make the outdated results, stop at the first failure, keep finished results."""
+        if self.failed:
+            return
+        for one in self.replayed():
+            self.listener.say("{law}: the stored run of {plant}, recorded {date}".format_map(one))
+        if any(step.why for step in self.steps) and (told := compilation()):
+            self.listener.say(told)  # the first run on a machine is slower by that
+        motion = next((step for step in self.steps if step.law and step.why), None)
+        steps = [step for step in self.steps if step.stage != "record"]
+        with self._compiling():
+            for done, step in enumerate(steps):
+                self.listener.progress("results", done, len(steps))
+                if step is motion and self.confirm:
+                    self.listener.confirm("servo", self.config.plant)
+                if step.why:
+                    self._make_result(step)
+                if step.law and not self.failed:
+                    self.laws_done += (step.law,)
+                    trace = self.run.traces[step.law]
+                    if trace.verdict == "failed":  # nor is what failed driven by the next law
+                        self.failed, self.reason = step.name, trace.reason
+                if self.failed:
+                    return
+        text = stored_yaml(self.config)
+        if self.run.configuration != text:  # overrides are stored also where nothing had to be made
+            self._keep(replace(self.run, configuration=text))
+
+    def reported(self, run: Run | None = None) -> Run:
+        """Return the results that a report of the named runs of laws needs.
+
+        run : one that is not stored yet.
+        """
+        run = run or self.run
+        made = ["plan", *(SERVO + law for law in self.laws)] if self.laws else []
+        return replace(run, results={name: run.results[name] for name in ["calibrate", *made]})
+
+    def record(self) -> bool:
+        """Record the pending poses first; return whether they are all there."""
+        if self.recording.why:
+            self.listener.say(f"record: making ({self.recording.why})")
+        if reason := recorded(self.listener, self.config, self.recording, confirm=self.confirm):
+            self.failed, self.reason = "record", reason
+            return False
+        if self.run.refuted:  # by what the new recording has taken the place of
+            save(replace(self.run, refuted=""))
+        return True
+
+    def suggestions(self, count: int) -> dict[str, Any]:
+        """Further poses for the calibration, as JSON values; their list is written next to the run."""
+        from projservo_cli.stages.calibrate import suggest_motions
+
+        calibration, inputs = self.run.calibration, suggestion_inputs(self.config)
+        path = self.run.path.parent / "suggestions.csv"
+        try:
+            found = suggest_motions(inputs, self.run.observation, calibration, count, path)
+        except WorkFailed as error:
+            return {"suggestions": [], "suggestions_reason": str(error)}
+        keys = ("q", "from_pose", "delta", "variance_before", "variance_after")
+        limits = inputs.joints.joints(calibration.joint_types).limits
+        return {
+            "suggestions": [{key: getattr(one, key) for key in keys} for one in found],
+            "suggestions_file": path.resolve(),
+            "suggestions_unit": inputs.unit,
+            "suggestions_limited": bool(np.isfinite(limits.lower).any()),
+        }
+
+    def extras(self, wanted: Sequence[str]) -> dict[str, Path]:
+        """Write the ``view`` or ``animation``, and the page with links to them; return the paths by name."""
+        from projservo_cli.report.page import write_page
+        from projservo_cli.stages import report
+
+        explained, config, made = self.reported(), self.config, {}
+        for name in wanted:
+            self.listener.detail(f"report: making the {name}")
+            if name == "view":
+                path = report.view(scenery_of(config), explained, self.listener.progress)
+            else:
+                path = report.animation(config.image_size_px, explained, self.listener.progress)
+            made[name] = path.resolve()
+        explained = replace(explained, results={**explained.results, "report": self.run.results["report"]})
+        write_page(explained, about_of(config))
+        return made
+
+    def findings(self, of_calibration: Mapping[str, Any]) -> Iterator["Finding"]:
+        """Yield the failures of the chain, and whether they end the call with exit code 1.
+
+        of_calibration : whether joint types were assumed, and what came of suggestions.
+        """
+        if self.failed:
+            yield from self._of_runs()
+            yield Finding(f"{self.failed}: {self.reason}", fatal=True)
+            return
+        results = self.run.results
+        if "calibrate" in results and not self.run.calibration.usable:
+            reason = " ".join(self.run.calibration.reason.split())
+            text = f"calibrate: the calibration is not usable: {reason}"
+            yield Finding(text, fatal="calibrate" in self.names)
+        if of_calibration.get("joint_types_assumed"):
+            text = "calibrate: joint types are not given: all are taken as revolute (--joints)"
+            yield Finding(text, fatal=False)
+        if of_calibration.get("suggestions") == []:
+            yield Finding(f"calibrate: {of_calibration['suggestions_reason']}", fatal=True)
+        yield from self._of_runs()
+        # Other profiles are those of the paper, of which the margins are only measured.
+        searched = "plan" in results and self.run.plan.profile in ("constrained", "joint_space")
+        if searched and not self.run.plan.feasible:
+            yield Finding(f"plan: {self.run.plan.reason}", fatal="plan" in self.names)
+
+    def _of_runs(self) -> Iterator["Finding"]:
+        """A line on each run that did not converge or missed periods, and whether the call fails by it."""
+        required = self.config.control.must_converge
+        for trace in (self.run.traces[law] for law in self.laws_done):
+            must, converged = must_converge(trace.law, required), trace.verdict == "converged"
+            if trace.verdict == "failed" or (converged and not trace.overruns):
+                continue  # failures are printed last
+            but = " must converge, but" if must and not converged else ""
+            reason = " ".join(trace.reason.split())
+            said = f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"
+            if trace.overruns:
+                said += (
+                    f"; it missed {trace.overruns} periods of {trace.period:g} s: raise control.period_s, or "
+                    "find fewer markers"
+                )
+            # Classical laws lead where nothing can be expected of them, images included.
+            disturbed = trace.verdict == "fault detected" and trace.law not in POINT_LAWS
+            yield Finding(said, fatal=not converged and (must or disturbed))
+
+    def _keep(self, run: Run) -> None:
+        self.run = run if self.in_memory else save(run)
+
+    def _make_result(self, step: Step) -> None:
+        """Make one result from those before it, and drop those that it made outdated; or note its failure."""
+        self.listener.detail(f"{step.name}: making it")
+        run = replace(self.run, configuration=stored_yaml(self.config))
+        try:
+            result = result_of(step, self.config, *self._made(step, run))
+        except WorkFailed as error:
+            self.failed, self.reason = step.name, " ".join(str(error).split())
+            if error.refutes:
+                self._keep(replace(self.run, refuted=self.reason))
+            return
+        place = STAGES.index(step.stage)
+        after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
+        results = {name: stored for name, stored in run.results.items() if name not in after}
+        refuted = run.refuted
+        if step.stage == "calibrate":
+            refuted = ""
+        elif step.law and not self.config.plant.simulated:
+            trace = result.records[""]
+            refuted = trace.reason if trace.verdict == "fault detected" else ""
+        self._keep(replace(run, results={**results, step.name: result}, refuted=refuted))
+        if after:
+            self.listener.say(f"{', '.join(after)}: dropped, their inputs were replaced")
+
+    def _made(self, step: Step, run: Run) -> tuple[Any, ...]:
+        """Return the result of a stage from its inputs; import its module on demand."""
+        inputs, progress = step.record or inputs_of(step.stage, self.config), self.listener.progress
+        if step.stage == "calibrate":
+            from projservo_cli.stages import calibrate
+
+            require_simulated(self.config)
+            return calibrate.run(inputs, progress=progress)
+        if step.stage == "plan":
+            from projservo_cli.stages import plan
+
+            return (plan.run(_bounded(inputs, run), run.calibration),)
+        if step.stage == "servo":
+            from projservo_cli.stages import servo
+
+            bounded = replace(inputs, plan=_bounded(inputs.plan, run))
+            return (servo.run(bounded, run.calibration, run.plan, step.law, blind=self.blind),)
+        from projservo_cli.stages import report
+
+        return (report.run(inputs, self.reported(run), run.path.parent, progress=progress),)
+
+    def _compiling(self) -> AbstractContextManager[None]:
+        """Return the background compilation for runs that follow a calibration."""
+        made = [step.stage for step in self.steps if step.why]
+        if "calibrate" not in made or "servo" not in made:
+            return nullcontext()
+        from projservo_cli.loop.jit_warmup import compiling_in_background
+
+        return compiling_in_background()
+
+
+def data_table(config: Config) -> Path:
+    """Return the table of a configuration as one to be recorded; an InputError without."""
+    if config.data is None:
+        raise InputError("record needs a table to write: -o TABLE, or data.table in the configuration")
+    if config.data.joint_unit == "deg":
+        raise InputError("data.joint_unit: record writes rad; leave it out")
+    return Path(config.data.table)
+
+
+def pending_recording(config: Config, run: Run, motions: JointList | None, *, force: bool) -> Any:
+    """Return the pending recording of the table of a calibration.
+
+    motions : further poses after the trial motions.
+    """
+    from projservo_cli.stages.record import new_recording
+
+    path, stored, inputs = data_table(config), run.results.get("calibrate"), recording_inputs(config)
+    before = {} if stored is None else stored.inputs
+    if before.get("table", str(path)) != str(path) and config.plant.simulated and not force:
+        raise InputError(
+            f"{run.path}: its calibration comes from {before['table']} and would be replaced by a simulated "
+            "one; choose another folder, or use --force (force=True)"
+        )
+    found = new_recording(inputs, path, motions=motions, force=force, redo=True)
+    contradicted = run.refuted and not found.why
+    if not contradicted or before.get("table_sha256") != hashlib.sha256(path.read_bytes()).hexdigest():
+        return found
+    begun = new_recording(inputs, path, motions=motions, force=True)
+    return replace(begun, why=f"what is there was contradicted: {run.refuted}")
+
+
+def recorded(listener: Listener, config: Config, recording: Any, *, confirm: bool) -> str:
+    """Record the pending poses, and tell how far it is on an interrupt; return the reason of a failure."""
+    from projservo_cli.stages.record import record
+
+    if recording.pending and confirm:
+        listener.confirm("record", config.plant)
+    total, units = len(recording.targets), joints_of(config).joints().units
+
+    def progress(what: str, done: int, whole: int) -> None:
+        listener.progress(what, done, whole, recording.note(units))
+
+    if recording.found and recording.pending:
+        listener.say(f"{recording.path}: continued after {recording.found} of {total} poses")
+    try:
+        record(recording_inputs(config), recording, progress=progress)
+    except WorkFailed as error:
+        return " ".join(str(error).split()).removeprefix("record: ")
+    except KeyboardInterrupt:
+        listener.say(f"{recording.path}: {len(recording.done)} of {total} poses; run again to continue")
+        raise
+    return ""
+
+
+def require_simulated(config: Config) -> None:
+    """Refuse to simulate the trials of a robot that is not a simulated one, with an InputError."""
+    if not config.recorded and not config.plant.simulated:
+        raise InputError(
+            f"plant {config.plant.use} is calibrated from a table: record it, projservo record calibrate, or "
+            "name one: data.table, --data"
+        )
+
+
+def compilation() -> str:
+    """Whether kernels will have to be compiled, in words; empty where they are there or are not used."""
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+        return ""
+    if CACHE_FOLDER is None:
+        return "compiling kernels (in every run: no cache folder can be written)"
+    return "" if any(CACHE_FOLDER.rglob("*.nbi")) else "compiling kernels, once"
+
+
+def _bounded(inputs: PlanInputs, run: Run) -> PlanInputs:
+    """Return the inputs of a plan with the border of images of an unknown size: what the recording shows."""
+    if inputs.image_size is not None:
+        return inputs
+    (left, right) = np.ceil(np.nanmax(run.observation.images, axis=(0, 2)) + 0.5).astype(int).tolist()
+    return replace(inputs, seen_px=(tuple(left), tuple(right)))
