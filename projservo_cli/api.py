@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli import plugins
-from projservo_cli.canonical import File
 from projservo_cli.chain import compilation, listening, require_simulated
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
 from projservo_cli.config.inputs import (
@@ -27,6 +26,7 @@ from projservo_cli.config.inputs import (
 from projservo_cli.display import checked_array, numbers_in, require_radians
 from projservo_cli.experiment import Experiment, law_target, plan_scene_of
 from projservo_cli.files import working_in
+from projservo_cli.keys import File
 from projservo_cli.laws import CODES, REGULATE, law_and_mode, name_of, names_of
 from projservo_cli.observations import Observations, require_observations, rows_of
 from projservo_cli.records import Calibration, InputError, JointList, Plan

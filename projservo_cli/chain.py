@@ -1,6 +1,5 @@
 """A chain of stages: which are to be made, in which order, what may move, and what became of them."""
 
-import hashlib
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -14,6 +13,7 @@ from projservo_cli import plugins
 from projservo_cli.config import Config, stored_yaml
 from projservo_cli.config.inputs import about_of, joints_of, recording_inputs, scenery_of, suggestion_inputs
 from projservo_cli.geometry.jit import CACHE_FOLDER
+from projservo_cli.keys import digest
 from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, name_of
 from projservo_cli.progress import Bar
 from projservo_cli.records import (
@@ -395,7 +395,7 @@ def pending_recording(config: Config, run: Run, motions: JointList | None, *, fo
         )
     found = new_recording(inputs, path, motions=motions, force=force, redo=True)
     contradicted = run.refuted and not found.why
-    if not contradicted or before.get("table_sha256") != hashlib.sha256(path.read_bytes()).hexdigest():
+    if not contradicted or before.get("table_sha256") != digest(path.read_bytes()):
         return found
     begun = new_recording(inputs, path, motions=motions, force=True)
     return replace(begun, why=f"what is there was contradicted: {run.refuted}")

@@ -2,13 +2,15 @@
 
 import dataclasses
 import html
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.canonical import File
+from projservo_cli.keys import File
 from projservo_cli.records import FARTHEST_M, TWO_TURNS, VIEWS, FloatArray, InputError
 
 _WIDTH = 100  # maximum length of a line, characters
@@ -67,6 +69,22 @@ class Displayable(Printed):
         if "joint" in sizes:
             found["joint"] = [f"q{i + 1}" for i in range(sizes["joint"])]
         return found
+
+
+def plain(value: Any, *, finite: bool = False) -> Any:
+    """A value as YAML and JSON know it: no arrays and numbers of NumPy, no tuples, no paths.
+
+    finite : strict JSON, with None in place of NaN and infinity.
+    """
+    if hasattr(value, "tolist"):  # of NumPy
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [plain(inner, finite=finite) for inner in value]
+    if isinstance(value, Mapping):
+        return {str(key): plain(inner, finite=finite) for key, inner in value.items()}
+    if finite and isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
 
 
 def pandas() -> Any:

@@ -5,14 +5,12 @@ from. Keys follow from the configuration and the files that it names, so the wor
 anything is done.
 """
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from projservo_cli import provenance
-from projservo_cli.canonical import encoded
 from projservo_cli.config import Config, stored_yaml
 from projservo_cli.config.inputs import (
     Files,
@@ -22,6 +20,7 @@ from projservo_cli.config.inputs import (
     report_inputs,
     servo_inputs,
 )
+from projservo_cli.keys import key_of
 from projservo_cli.laws import law_and_mode, names_of
 from projservo_cli.records import InputError
 from projservo_cli.report.report_data import CLAIMS_FILE, PAGE_FILE
@@ -107,11 +106,6 @@ def steps_for(
             "choose another folder, name the table (data.table, --data), or use --force (force=True)"
         )
     return steps
-
-
-def key_of(inputs: Any, **more: Any) -> str:
-    """Return the hash of the inputs of a stage, and of further values: its predecessors and its law."""
-    return hashlib.sha256(encoded([inputs, more])).hexdigest()
 
 
 class _Read(NamedTuple):

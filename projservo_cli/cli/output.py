@@ -6,7 +6,6 @@ import re
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import click
@@ -41,21 +40,6 @@ def visible(text: str) -> str:
     return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", masked(text))
 
 
-def _plain(value: Any) -> Any:
-    """A value as strict JSON knows it: no NaN or infinity, no NumPy types, no tuples."""
-    if isinstance(value, dict):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "tolist"):  # of NumPy
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
 class Console:
     """Messages at the level of the user, and a progress bar in a terminal."""
 
@@ -75,7 +59,11 @@ class Console:
     def report(self, value: dict[str, Any], lines: Iterable[str]) -> None:
         """Data on standard output: one object of strict JSON in UTF-8, whatever the locale, or in words."""
         if self.as_json:
-            text = visible(json.dumps(_plain(value), ensure_ascii=False, allow_nan=False, indent=2))
+            from projservo_cli.display import plain
+
+            text = visible(
+                json.dumps(plain(value, finite=True), ensure_ascii=False, allow_nan=False, indent=2)
+            )
             self._data.buffer.write(f"{text}\n".encode())
         elif not self.quiet:
             for line in lines:

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.canonical import File
 from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.control.law import Gains
 from projservo_cli.display import About
+from projservo_cli.keys import File
 from projservo_cli.records import CORNERS, InputError
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults

@@ -21,6 +21,7 @@ from pydantic_core import ErrorDetails
 
 from projservo_cli.config.models import Settings
 from projservo_cli.config.sweep import SweepConfig
+from projservo_cli.display import plain
 from projservo_cli.files import bytes_of, text_of
 from projservo_cli.masking import masked
 from projservo_cli.records import InputError
@@ -358,20 +359,9 @@ def overrides_of(what: str, values: Mapping[str, Any]) -> list["Override"]:
         if isinstance(value, Mapping):
             found += overrides_of(what, {f"{key}.{inner}": one for inner, one in value.items()})
             continue
-        plain = _plain(value)
-        found.append(Override(_shortened(f"{what}: {key}={plain!r}"), str(key), plain))
+        usual = plain(value)
+        found.append(Override(_shortened(f"{what}: {key}={usual!r}"), str(key), usual))
     return found
-
-
-def _plain(value: Any) -> Any:
-    """A value as YAML would give it: no arrays and numbers of NumPy, no tuples, no paths."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, (list, tuple)):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, Mapping):
-        return {str(key): _plain(inner) for key, inner in value.items()}
-    return str(value) if isinstance(value, pathlib.Path) else value
 
 
 def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
@@ -393,7 +383,7 @@ def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> Sweep
 def sweep_of(values: Mapping[str, Any]) -> SweepConfig:
     """Check the configuration of a sweep that is at hand; an InputError as for one in a file."""
     document = _Document("", "sweep")
-    document.values = _plain(values)
+    document.values = plain(values)
     return _validated(SweepConfig, document)
 
 

@@ -42,7 +42,7 @@ def sweep_schema() -> dict[str, Any]:
 
 
 def _schema(model: type[BaseModel]) -> dict[str, Any]:
-    schema: dict[str, Any] = _plain(model.model_json_schema(schema_generator=_Generator))
+    schema: dict[str, Any] = _without_titles(model.model_json_schema(schema_generator=_Generator))
     schema["required"].remove("name")  # by default that of the file
     return {"$schema": _DRAFT, **schema}
 
@@ -54,14 +54,16 @@ class _Generator(GenerateJsonSchema):
         return super().normalize_name(name).lstrip("_")
 
 
-def _plain(value: Any) -> Any:
+def _without_titles(value: Any) -> Any:
     """Without titles that repeat the key, and with vectors in the form that every draft understands."""
     if isinstance(value, list):
-        return [_plain(inner) for inner in value]
+        return [_without_titles(inner) for inner in value]
     if not isinstance(value, dict):
         return value
     kept = {
-        key: _plain(inner) for key, inner in value.items() if not (key == "title" and isinstance(inner, str))
+        key: _without_titles(inner)
+        for key, inner in value.items()
+        if not (key == "title" and isinstance(inner, str))
     }
     entries = kept.get("prefixItems")
     if isinstance(entries, list) and all(entry == entries[0] for entry in entries):

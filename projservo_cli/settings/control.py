@@ -45,7 +45,7 @@ Law = Annotated[str, AfterValidator(_law), WithJsonSchema({"anyOf": [{"enum": li
 PlantClass = Annotated[str, AfterValidator(_plant), WithJsonSchema({"type": "string"})]
 
 
-def _plain(value: Any) -> Any:
+def _as_given(value: Any) -> Any:
     try:
         json.dumps(value, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -53,7 +53,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-Plain = Annotated[Any, AfterValidator(_plain)]
+Plain = Annotated[Any, AfterValidator(_as_given)]
 
 
 def one_or_more(value: Any) -> Any:

@@ -9,8 +9,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from projservo_cli.canonical import File
 from projservo_cli.detection import DICTIONARY
+from projservo_cli.keys import File
 from projservo_cli.records import NO_LENS, PRISMATIC, REVOLUTE, FloatArray, position_limits
 from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Markers

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.canonical import File
 from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import undistort
+from projservo_cli.keys import File
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray
 from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Tag

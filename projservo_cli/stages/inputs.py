@@ -1,13 +1,12 @@
 """Inputs of each stage: records of the values that it reads, of which its key is a hash."""
 
-import hashlib
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from projservo_cli.canonical import File, encoded
 from projservo_cli.control.law import Gains
 from projservo_cli.display import About
 from projservo_cli.image_size import ImageSize
+from projservo_cli.keys import File, digest, encoded
 from projservo_cli.records import FloatArray
 from projservo_cli.robots.settings import Following, JointSettings
 from projservo_cli.settings.cameras import Cameras
@@ -88,7 +87,7 @@ class RecordingInputs:
             own._replace(timeout_s=0.0, open_s=0.0, cameras=None) if own else (trials.truth, trials.driven)
         )
         how = trials.motions.seed, trials.noise_px, trials.averaged_frames, trials.settle_s
-        key = hashlib.sha256(encoded((robot, how, self.numbers, self.dictionary))).hexdigest()
+        key = digest(encoded((robot, how, self.numbers, self.dictionary)))
         return f"{own.target if own else 'simulated'} {key[:16]}"
 
     @property

@@ -1,6 +1,5 @@
 """Run number i of a sweep as an ordinary configuration."""
 
-import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -19,6 +18,7 @@ from projservo_cli.config.inputs import calibration_inputs, truth_of
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import image_sizes
+from projservo_cli.keys import digest, key_of
 from projservo_cli.laws import law_and_mode, names_of
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.source import source_hash
@@ -26,7 +26,6 @@ from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, TaskSettings
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.workspace import Truth
-from projservo_cli.steps import key_of
 
 RANGE = 0.9
 LEAST_COSINE = math.cos(math.radians(75.0))
@@ -227,7 +226,7 @@ class Design:
         left_out = {"name", "base", "chunk"}
         values = {name: value for name, value in self.recipe["sweep"].items() if name not in left_out}
         text = json.dumps([values, self.recipe["bases"]], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
+        return digest(text.encode())
 
     @cached_property
     def sources(self) -> dict[str, str]:

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.keys import key_of
 from projservo_cli.laws import BODY_LAWS, CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled import Course
@@ -21,7 +22,6 @@ from projservo_cli.stages.inputs import PlanInputs, ServoInputs
 from projservo_cli.stages.plan import rotation_sense
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive, sense_is_enough
-from projservo_cli.steps import key_of
 from projservo_cli.store.sweep_table import Failure, merge_failures
 from projservo_cli.sweeps.design import RUNS, Design, name_of_run
 

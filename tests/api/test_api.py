@@ -15,8 +15,8 @@ import projservo_cli as ps
 from projservo_cli import cli
 from projservo_cli.calibration import prediction_variance
 from projservo_cli.config.inputs import calibration_inputs
+from projservo_cli.keys import key_of
 from projservo_cli.records import Calibration, Observation, Trace
-from projservo_cli.steps import key_of
 from projservo_cli.store.tables import read_table, write_table
 from tests.configured import calibrate
 from tests.conftest import ROOT

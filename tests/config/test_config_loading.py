@@ -5,9 +5,9 @@ import math
 import pytest
 import yaml
 
-from projservo_cli.canonical import encoded
 from projservo_cli.config import Config, Override, load_config, shipped, to_yaml
 from projservo_cli.config.inputs import servo_inputs
+from projservo_cli.keys import encoded
 from projservo_cli.laws import LAWS
 from projservo_cli.records import InputError
 from tests.conftest import ROOT, SHIPPED

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import yaml
 
-from projservo_cli.canonical import decoded, encoded, files_in
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.config.inputs import calibration_inputs, files_of, plan_inputs, report_inputs, servo_inputs
+from projservo_cli.keys import decoded, encoded, files_in, key_of
 from projservo_cli.records import InputError
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.steps import key_of
 from tests.configured import record
 from tests.conftest import ROOT
 

@@ -1,6 +1,6 @@
-"""Canonical bytes of the records that stages read: equal bytes for equal values, and the values again.
+"""Keys of results: hashes of the canonical bytes of the records that stages read, and the records again.
 
-A key is a hash of these bytes, so that the inputs of a stage alone decide whether its result is outdated.
+Equal values have equal bytes, so that the inputs of a stage alone decide whether its result is outdated.
 Files stand in them by their content.
 """
 
@@ -36,16 +36,26 @@ class File(NamedTuple):
         contents = []
         for name in (path, *further):
             try:
-                contents.append(hashlib.sha256(Path(name).read_bytes()).hexdigest())
+                contents.append(digest(Path(name).read_bytes()))
             except OSError as error:
                 reason = f"cannot be read: {error.strerror or error}; expected {expected}"
                 raise InputError(f"{name}: {reason}") from error
-        return cls(path, hashlib.sha256("".join(contents).encode()).hexdigest() if further else contents[0])
+        return cls(path, digest("".join(contents).encode()) if further else contents[0])
+
+
+def digest(content: bytes) -> str:
+    """Return the SHA-256 of bytes, in hexadecimal."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def key_of(inputs: Any, **more: Any) -> str:
+    """Return the hash of the inputs of a stage, and of further values: its predecessors and its law."""
+    return digest(encoded([inputs, more]))
 
 
 def encoded(record: Any) -> bytes:
     """Return the canonical bytes of a record of plain values, arrays, files and further records."""
-    return json.dumps(_plain(record), separators=(",", ":"), ensure_ascii=False).encode()
+    return json.dumps(_canonical(record), separators=(",", ":"), ensure_ascii=False).encode()
 
 
 def decoded(content: bytes, files: Mapping[str, str]) -> Any:
@@ -74,7 +84,7 @@ def _fields(record: Any) -> dict[str, Any]:
     return {name: getattr(record, name) for name in names}
 
 
-def _plain(value: Any) -> Any:
+def _canonical(value: Any) -> Any:
     """A value as JSON, in which every mapping has one key, its type."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return masked(value)  # as in a run file, whose configuration has the same key
@@ -84,11 +94,11 @@ def _plain(value: Any) -> Any:
         return {"array": [value.dtype.str, value.shape, value.tobytes().hex()]}
     if fields := _fields(value):
         kind = f"{type(value).__module__}:{type(value).__qualname__}"
-        return {kind: {name: _plain(inner) for name, inner in fields.items()}}
+        return {kind: {name: _canonical(inner) for name, inner in fields.items()}}
     if isinstance(value, dict):
-        return {"mapping": {key: _plain(value[key]) for key in sorted(value)}}
+        return {"mapping": {key: _canonical(value[key]) for key in sorted(value)}}
     if isinstance(value, (tuple, list)):
-        return {type(value).__name__: [_plain(inner) for inner in value]}
+        return {type(value).__name__: [_canonical(inner) for inner in value]}
     raise TypeError(f"{type(value).__name__} has no canonical bytes")
 
 
