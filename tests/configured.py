@@ -81,7 +81,7 @@ def joints_of(config, types="", calibration=None):
 
 
 def bounds_of(config, joints):
-    return given._following(config, config.plant.speed_scale).bounds(joints)
+    return given._drive(config, None).following.bounds(joints)
 
 
 def plugin_robot(config, joints, markers):
@@ -90,7 +90,7 @@ def plugin_robot(config, joints, markers):
 
 
 def robot_by_itself(config, truth, q, sigma_px, seed, stream):
-    robot = given._simulated(config, truth, None)
+    robot = given._drive(config, truth).robot
     return faults.robot_by_itself(robot, q, sigma_px, (seed, stream))
 
 

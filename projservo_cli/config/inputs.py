@@ -75,7 +75,7 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         source = Table(table, config.joint_types, data.joint_unit, size, data.noise_px, _seed(config), stated)
     else:
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
-        source = _trials(config, _truth(config, face=False), None, files, speed_scale=1.0)
+        source = _trials(config, _truth(config, face=False), files, speed_scale=1.0)
     noise = None if settings.joint_noise_deg is None else float(np.radians(settings.joint_noise_deg))
     how = Estimation(
         settings.method,
@@ -93,8 +93,7 @@ def recording_inputs(config: Config) -> RecordingInputs:
     truth = _truth(config, face=False) if plant.simulated else None
     numbers = _numbers(config, "record")
     assert markers is not None
-    own = None if plant.simulated else _own(config)
-    trials = _trials(config, truth, own, None, speed_scale=plant.speed_scale)
+    trials = _trials(config, truth)
     # A robot that a caller brings along takes the place of the ideal plant too.
     trials = replace(trials, averaged_frames=plant.averaged_frames, settle_s=plant.settle_s)
     return RecordingInputs(
@@ -111,12 +110,7 @@ def recording_inputs(config: Config) -> RecordingInputs:
 def teach_inputs(config: Config) -> TeachInputs:
     """Return the inputs of teaching a pose."""
     numbers = _numbers(config, "teach")
-    robot: SimulatedRobot | OwnRobot
-    if config.plant.simulated:
-        robot = _simulated(config, truth_of(config), None)
-    else:
-        robot = _own(config)
-    driven = Drive(robot, _following(config, config.plant.speed_scale), _endless(config))
+    driven = _drive(config, truth_of(config) if config.plant.simulated else None)
     noise, settle_s = config.noise.servo_px, config.plant.settle_s
     return TeachInputs(driven, joints_of(config), numbers, noise, settle_s, config.seed)
 
@@ -130,8 +124,7 @@ def preflight_inputs(config: Config) -> PreflightInputs:
     numbers = _numbers(config, "doctor")
     assert config.markers is not None
     return PreflightInputs(
-        robot=_own(config),
-        following=_following(config, config.plant.speed_scale),
+        driven=_drive(config, None),
         joints=joints_of(config),
         numbers=numbers,
         face=config.markers.front or (),
@@ -228,10 +221,7 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
     plant = config.plant
     if plant.use is None and config.disturbance == Disturbance():
         return None
-    robot: SimulatedRobot | OwnRobot = _own(config)
-    if plan.truth is not None:
-        robot = _simulated(config, plan.truth, files)
-    driven = Drive(robot, _following(config, plant.speed_scale), _endless(config))
+    driven = _drive(config, plan.truth, files)
     delay = None if plant.time_offset_s is None else (plant.time_offset_s.left, plant.time_offset_s.right)
     settle_s = plant.settle_s if plan.truth is None else None
     table = config.data.table if config.data is not None and plan.truth is None else ""
@@ -383,20 +373,25 @@ def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
     )
 
 
-def _following(config: Config, speed_scale: float) -> Following:
-    """Return the settings of commands to a robot of the contract."""
-    plant = config.plant
-    return Following(
-        config.control.period_s,
-        speed_scale,
+def _drive(
+    config: Config, truth: Truth | None, files: Files | None = None, speed_scale: float | None = None
+) -> Drive:
+    """Return how a robot of the contract is driven: the simulated one of a truth, else somebody's.
+
+    speed_scale : factor of every command; None for that of the configuration.
+    """
+    plant, period, robot = config.plant, config.control.period_s, None
+    if truth is not None:
+        faults, scene = config.disturbance.part(Faults), scene_of(config, files)
+        robot = SimulatedRobot(truth, faults, scene, period)
+    following = Following(
+        period,
+        plant.speed_scale if speed_scale is None else speed_scale,
         plant.max_servo_lag_s,
         plant.max_steady_state_error_deg,
         plant.max_relative_target_deg,
     )
-
-
-def _endless(config: Config) -> bool:
-    return config.plant.simulated and config.plant.joint_limits == "report"
+    return Drive(robot or _own(config), following, plant.simulated and plant.joint_limits == "report")
 
 
 def _own(config: Config) -> OwnRobot:
@@ -405,13 +400,6 @@ def _own(config: Config) -> OwnRobot:
     dictionary = markers.dictionary if markers is not None else None
     size, options = config.image_size_px, dict(plant.options)
     return OwnRobot(plant.use or "", options, dictionary, plant.timeout_s, plant.open_s, size, config.cameras)
-
-
-def _simulated(config: Config, truth: Truth, files: Files | None) -> SimulatedRobot:
-    """Return the simulated robot with time and faults."""
-    return SimulatedRobot(
-        truth, config.disturbance.part(Faults), scene_of(config, files), config.control.period_s
-    )
 
 
 # Trials.
@@ -423,19 +411,17 @@ def _seed(config: Config) -> int:
 
 
 def _trials(
-    config: Config,
-    truth: Truth | None,
-    own: OwnRobot | None,
-    files: Files | None,
-    *,
-    speed_scale: float,
+    config: Config, truth: Truth | None, files: Files | None = None, speed_scale: float | None = None
 ) -> Trials:
-    """Trial motions and the robot that is driven through them: somebody's, else the simulated one."""
-    settings, reference = config.calibration, config.reference
+    """Trial motions and the robot that is driven through them: the simulated one, without a truth somebody's.
+
+    speed_scale : factor of every command; None for that of the configuration.
+    """
+    settings, plant, reference = config.calibration, config.plant, config.reference
     if reference is None:
         raise InputError("trial motions need a reference: set calibration.reference or task.start")
-    faults, scene = config.disturbance.part(Faults), scene_of(config, files) if own is None else None
-    driven = own is not None or scene is not None or faults != Faults()
+    # The ideal plant stands wherever it is sent.
+    driven = truth is None or plant.rendered is not None or config.disturbance.part(Faults) != Faults()
     # The closed form assumes that joints without a command stand still.
     faultless = not driven or settings.method == "closed_form"
     poses = settings.random_poses
@@ -443,22 +429,18 @@ def _trials(
         poses = 0 if faultless else _RANDOM_POSES
     motions = Motions(
         reference,
-        (float(np.radians(settings.amplitude_deg)), settings.amplitude_m),
+        (math.radians(settings.amplitude_deg), settings.amplitude_m),
         settings.frames_per_joint,
         poses,
         0.0 if faultless else 2.0 * math.pi / (config.disturbance.encoder_counts_per_turn or _TICKS),
         _seed(config),
     )
-    robot: SimulatedRobot | OwnRobot | None = own
-    if driven and robot is None:
-        assert truth is not None
-        robot = SimulatedRobot(truth, faults, scene, config.control.period_s)
     return Trials(
         motions=motions,
         joints=joints_of(config, paced=driven),
         truth=truth,
-        driven=None if robot is None else Drive(robot, _following(config, speed_scale), _endless(config)),
+        driven=_drive(config, truth, files, speed_scale) if driven else None,
         noise_px=config.noise.calibration_px,
-        averaged_frames=config.plant.averaged_frames if driven else 1,
-        settle_s=config.plant.settle_s if driven else 0.0,
+        averaged_frames=plant.averaged_frames if driven else 1,
+        settle_s=plant.settle_s if driven else 0.0,
     )

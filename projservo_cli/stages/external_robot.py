@@ -1,7 +1,6 @@
-"""Robots of the contract: made, checked against the calibration, driven to given joints, waited for."""
+"""Robots of the contract: made, checked against the calibration, driven to given joints."""
 
 import math
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
@@ -16,12 +15,13 @@ from projservo_cli.image_size import image_sizes
 from projservo_cli.masking import MASK
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
-from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
 from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints
+from projservo_cli.robots.standstill import STILL, Standstill, at_rest
 from projservo_cli.settings.disturbance import Events
 from projservo_cli.simulation.faults import (
     FaultyRobot,
@@ -35,14 +35,9 @@ from projservo_cli.simulation.streams import SERVO_NOISE
 from projservo_cli.stages.inputs import Contract, Drive, OwnRobot
 from projservo_cli.stages.scenario import RunScenario
 
-# Drift of a joint, rad or m, and of an image, px rms, within which both count as still.
-_STILL, _STILL_PX = 2e-5, 0.02
 _NEVER_LATE_S = 3600.0  # for a simulated robot, whose code may be compiled first
-_LEAST = 6  # readings that separate noise from motion
 # Minimum deviation of a delay and of single frames, s; width of a 95 % interval in deviations.
 _LEAST_JITTER_S, _INTERVAL = 0.002, 3.92
-_PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
-_WAITED = 5  # looks for each image that is wanted, where the same one comes again
 
 
 def plugin_robot(
@@ -135,7 +130,7 @@ def path_to(
     images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest, or if
     one reads a whole turn beyond its limits.
     """
-    bounds, still = robot.robot.bounds, _Standstill(settle_s)
+    bounds, still = robot.robot.bounds, Standstill(settle_s)
     begun = robot.observe().q
     _require_no_turn_off(bounds, begun)
     if fit is not None:
@@ -152,8 +147,8 @@ def path_to(
     else:
         yield from at_rest(robot.reading, robot.hold, settle_s, what)
     gap = np.abs(q - robot.reading.q)
-    i, sag = int(np.argmax(gap / np.maximum(bounds.sag, _STILL))), bounds.sag
-    if gap[i] > max(sag[i], _STILL) or (q != robot.target).any():
+    i, sag = int(np.argmax(gap / np.maximum(bounds.sag, STILL))), bounds.sag
+    if gap[i] > max(sag[i], STILL) or (q != robot.target).any():
         remedy = "free the robot, or check its sag and backlash (plant.max_steady_state_error_deg)"
         if gap[i] > abs(q[i] - begun[i]) + sag[i]:
             remedy = (
@@ -167,135 +162,6 @@ def path_to(
             f"{bounds.text(i, robot.reading.q[i])}, {bounds.text(i, gap[i], 3)} short: {remedy}; then run "
             "the command again" + (" to continue" if what == "record" else "")
         )
-
-
-def at_rest(
-    reading: Reading, observe: Callable[[], Reading], settle_s: float, what: str
-) -> Iterator[Reading]:
-    """Read once per period until joints and images stand still, and yield each reading."""
-    still, first = _Standstill(settle_s), reading.t_q
-    while not still.all(reading):
-        if reading.t_q > first + settle_s + _PATIENCE_S:
-            raise WorkFailed(
-                f"{what}: {still.moving or 'the robot'} does not come to rest within {_PATIENCE_S:g} s: look "
-                "for what vibrates, creeps or flickers"
-            )
-        reading = observe()
-        yield reading
-
-
-def averaged(
-    reading: Reading, observe: Callable[[], Reading], wanted: int
-) -> tuple[Reading, FloatArray, FloatArray]:
-    """Return the mean of readings of a robot at rest, with a number of frames of each view, each once.
-
-    Frames are weighted by their deviations, if they have any. Markers that most of the frames of a view do
-    not show are NaN. Returns the mean; sums (2, m) of the squares by which pixels are off it, px²; how many
-    frames (2, m) show a marker, 0 where it is NaN.
-    """
-    readings, frames = [reading], [[_frame(reading, view)] for view in (0, 1)]
-    for _ in range(_WAITED * wanted):
-        if min(map(len, frames)) >= wanted:
-            break
-        readings.append(observe())
-        for view, new in enumerate(readings[-1].new_views(readings[-2])):
-            if new and len(frames[view]) < wanted:
-                frames[view].append(_frame(readings[-1], view))
-    s, sigma, squares, count = (np.stack(both) for both in zip(*map(_mean, frames), strict=True))
-    q = readings[0].q + np.mean([seen.q - readings[0].q for seen in readings], axis=0)
-    stated = reading.sigma_px if reading.sigma_px is None or len(readings) == 1 else sigma
-    return readings[-1]._replace(q=q, s=s, sigma_px=stated), squares, count
-
-
-def _frame(reading: Reading, view: int) -> FloatArray:
-    """Return u, v and their deviation (m, 3), px, of a view; a deviation of one if it has none."""
-    sigma = np.ones(len(reading.s[view])) if reading.sigma_px is None else reading.sigma_px[view]
-    return np.column_stack([reading.s[view], sigma])
-
-
-def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Mean (m, 2) of frames (m, 3) of one view, its deviation (m,), squares (m,) off it, their count (m,).
-
-    An error without scatter from frame to frame does not average away: the share of the stated variance that
-    scatters, of all markers together, becomes less.
-    """
-    seen, sigma = np.split(np.array(frames), [2], axis=2)
-    count = np.isfinite(seen[..., 0]).sum(axis=0)
-    count[2 * count <= len(seen)] = 0
-    weight = np.where(np.isfinite(seen), sigma**-2.0, 0.0)
-    total = np.maximum(weight.sum(axis=0), 1e-300)
-    mean: FloatArray = np.nansum(seen * weight, axis=0) / total
-    mean[count == 0] = np.nan
-    off = (seen - mean) ** 2
-    freedom = 2 * np.maximum(count - 1, 0).sum()
-    scatter = min(1.0, float(np.nansum(off / sigma**2)) / freedom) if freedom else 1.0
-    typical = count / total[:, 0]  # variance of a frame
-    variance = np.where(count > 0, typical * (1.0 - scatter) + scatter / total[:, 0], np.nan)
-    return mean, np.sqrt(variance), np.nansum(off, axis=(0, 2)), count
-
-
-class _Standstill:
-    """Tells whether a robot has stood still for a time, s, by consecutive readings.
-
-    Over that time, and no fewer than six looks, the means of its thirds differ by no more than noise
-    explains, from the differences of consecutive readings: motion adds up, noise does not.
-
-    Source: J. von Neumann, "Distribution of the ratio of the mean square successive difference to the
-    variance", Annals of Mathematical Statistics 12, 1941.
-    """
-
-    def __init__(self, seconds: float) -> None:
-        self.seconds = seconds
-        self._since = math.inf
-        self._q: _Rows = deque()
-        self._s: tuple[_Rows, _Rows] = deque(), deque()
-        self._last: Reading | None = None
-        self.moving = ""  # message on the part that moves
-
-    def joints(self, reading: Reading) -> bool:
-        """Whether the joints have stood still up to the next reading."""
-        self._since = min(self._since, reading.t_q)
-        square, variance = _drift(self._kept(self._q, reading.t_q, reading.q))
-        moving = np.flatnonzero(square > np.maximum(_STILL**2, 9.0 * variance))
-        self.moving = f"joint {moving[0] + 1}" if len(moving) else ""
-        whole = reading.t_q - self._since >= self.seconds * (1.0 - 1e-9)
-        return whole and len(self._q) >= _LEAST and not self.moving
-
-    def all(self, reading: Reading) -> bool:
-        """Whether joints and images have stood still up to the next reading."""
-        still = self.joints(reading)
-        new = reading.new_views(self._last)
-        self._last = reading
-        for view, rows in enumerate(self._s):
-            frames = self._kept(rows, reading.t_q, reading.s[view].ravel() if new[view] else None)
-            if rows[-1][0] < reading.t_q - self.seconds:
-                continue  # the same image all the time
-            square, variance = _drift(frames[:, np.isfinite(frames).all(axis=0)])
-            if square.size and square.mean() > max(_STILL_PX**2, 2.0 * variance.mean()):
-                self.moving = self.moving or f"the {VIEWS[view]} image"
-            still = still and len(rows) >= _LEAST
-        return still and not self.moving
-
-    def _kept(self, rows: "_Rows", now: float, row: FloatArray | None) -> FloatArray:
-        """The rows of the time that counts, with one more unless it is None."""
-        if row is not None:
-            rows.append((now, row))
-        while len(rows) > _LEAST and rows[0][0] < now - self.seconds * (1.0 + 1e-9):
-            rows.popleft()
-        return np.array([values for _, values in rows])
-
-
-_Rows = deque[tuple[float, FloatArray]]
-
-
-def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Variance of the means of the thirds of rows (k, c), and what noise makes of it, (c,)."""
-    third = len(rows) // 3
-    if third == 0:
-        return np.zeros(rows.shape[1]), np.zeros(rows.shape[1])
-    means = [part.mean(axis=0) for part in (rows[:third], rows[third:-third], rows[-third:])]
-    noise = 0.5 * (np.diff(rows, axis=0) ** 2).mean(axis=0)
-    return np.var(means, axis=0, ddof=1), noise / third
 
 
 def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> PluginRobot:

@@ -155,8 +155,7 @@ class TeachInputs:
 class PreflightInputs:
     """Inputs of a preflight, which needs neither reference nor task."""
 
-    robot: OwnRobot
-    following: Following
+    driven: Drive
     joints: JointSettings
     numbers: tuple[int, ...]  # of the markers
     face: tuple[int, ...]  # numbers of the markers that must stay visible; may be empty

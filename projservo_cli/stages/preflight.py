@@ -19,7 +19,7 @@ from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import plugin_robot
-from projservo_cli.stages.inputs import PreflightInputs
+from projservo_cli.stages.inputs import OwnRobot, PreflightInputs
 
 # Time of observation of a robot at rest, s, and minimum number of readings.
 _LOOK_S, _MIN_LOOKS = 1.5, 8
@@ -53,7 +53,9 @@ def check(
     watch : is called with the open robot, for as long as somebody wants to see its images.
     """
     joints, dictionary = inputs.joints.joints("", calibration), inputs.dictionary or DICTIONARY
-    robot = plugin_robot(inputs.robot, inputs.following.bounds(joints), joints.types, inputs.numbers)
+    assert isinstance(inputs.driven.robot, OwnRobot)
+    bounds = inputs.driven.following.bounds(joints)
+    robot = plugin_robot(inputs.driven.robot, bounds, joints.types, inputs.numbers)
     found: list[Finding] = []
     seen, moved = None, list[Strokes]()
     try:

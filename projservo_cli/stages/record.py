@@ -31,11 +31,12 @@ from projservo_cli.records import (
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints
+from projservo_cli.robots.standstill import averaged
 from projservo_cli.simulation.faults import robot_by_itself
 from projservo_cli.simulation.streams import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.external_robot import averaged, path_to, plugin_robot, simulated_robot
+from projservo_cli.stages.external_robot import path_to, plugin_robot, simulated_robot
 from projservo_cli.stages.inputs import OwnRobot, RecordingInputs, Trials
 from projservo_cli.store.tables import identity_in, read_table, recording_of, write_table
 

@@ -14,12 +14,13 @@ from projservo_cli.hardware.preflight import MIN_SHARED
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
 from projservo_cli.robots.settings import Joints
+from projservo_cli.robots.standstill import at_rest, averaged
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.simulation.streams import TAUGHT_NOISE, generator
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.external_robot import at_rest, averaged, plugin_robot, simulated_robot, takes_limits
+from projservo_cli.stages.external_robot import plugin_robot, simulated_robot, takes_limits
 from projservo_cli.stages.inputs import OwnRobot, PlanInputs, TeachInputs
 
 _FAR = 4.0  # standard deviations that a marker may be off
