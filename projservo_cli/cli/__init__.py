@@ -5,7 +5,17 @@ when they run.
 """
 
 from projservo_cli.cli import stages  # isort: skip  # first in the help
-from projservo_cli.cli import data, hardware, look, machine, servos, sweep_command
-from projservo_cli.cli.group import main, run
+from projservo_cli.cli import data, hardware, inspection, installation, servos, sweep_command
+from projservo_cli.cli.program import main, run
 
-__all__ = ["data", "hardware", "look", "machine", "main", "run", "servos", "stages", "sweep_command"]
+__all__ = [
+    "data",
+    "hardware",
+    "inspection",
+    "installation",
+    "main",
+    "run",
+    "servos",
+    "stages",
+    "sweep_command",
+]

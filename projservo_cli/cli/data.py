@@ -7,8 +7,8 @@ from typing import Any, Literal
 import click
 
 from projservo_cli.cli import options as option
-from projservo_cli.cli.group import main
 from projservo_cli.cli.output import Console, wrapped
+from projservo_cli.cli.program import main
 
 # Squared error over its covariance that reveals another robot, or other units.
 _FAR = 20.0

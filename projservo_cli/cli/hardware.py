@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from projservo_cli.cli import options as option
-from projservo_cli.cli.group import FAILED, main
 from projservo_cli.cli.output import Console, wrapped
+from projservo_cli.cli.program import FAILED, main
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 from projservo_cli.cli import options as option
-from projservo_cli.cli.group import main
 from projservo_cli.cli.output import Console
+from projservo_cli.cli.program import main
 
 if TYPE_CHECKING:
     from projservo_cli.hardware.so101 import Servos

@@ -9,8 +9,8 @@ from typing import Any
 import click
 
 from projservo_cli.cli import options as option
-from projservo_cli.cli.group import FAILED, main
 from projservo_cli.cli.output import Console, visible, words_of, wrapped
+from projservo_cli.cli.program import FAILED, main
 
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
 _AGAIN = ", and the robot is not moved: --force records all poses again"

@@ -6,8 +6,8 @@ from pathlib import Path
 import click
 
 from projservo_cli.cli import options as option
-from projservo_cli.cli.group import main
 from projservo_cli.cli.output import Console
+from projservo_cli.cli.program import main
 
 
 @main.command("sweep", epilog="Example: projservo sweep -c configs/sweep_noise.yaml -j 2")

@@ -19,8 +19,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from projservo_cli.config.models import Settings
 from projservo_cli.config.sweep import SweepConfig
+from projservo_cli.config.whole import Settings
 from projservo_cli.display import plain
 from projservo_cli.files import bytes_of, text_of
 from projservo_cli.masking import masked

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from projservo_cli.config.models import FolderName
+from projservo_cli.config.whole import FolderName
 from projservo_cli.settings.control import Plain, one_or_more
 from projservo_cli.settings.sections import Count, Finding, Number, Positive, Root, Section, Whole
 

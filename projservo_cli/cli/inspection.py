@@ -10,8 +10,8 @@ from typing import Any
 import click
 
 from projservo_cli.cli import options as option
-from projservo_cli.cli.group import main
 from projservo_cli.cli.output import Console, words_of, wrapped
+from projservo_cli.cli.program import main
 
 
 @main.command("show", epilog="Example: projservo show results/ur5 --json")

@@ -1,4 +1,4 @@
-"""A machine and how to begin on it: ``init``, ``schema``, ``doctor`` and ``bench``."""
+"""The installation and how to begin with it: ``init``, ``schema``, ``doctor`` and ``bench``."""
 
 import json
 import os
@@ -10,8 +10,8 @@ from typing import Any
 import click
 
 from projservo_cli.cli import options as option
-from projservo_cli.cli.group import FAILED, main
 from projservo_cli.cli.output import Console, wrapped
+from projservo_cli.cli.program import FAILED, main
 from projservo_cli.provenance import __version__, version_of
 
 _STARTER, _SCHEMA = "projservo.yaml", "projservo.schema.json"  # as the first line of the starter names it
