@@ -158,7 +158,7 @@ def record(
             assert given.own is not None
             bounds = given.trials.driven.following.bounds(joints)
             driven = plugin_robot(given.own, bounds, joints.types, made.marker.tolist(), robot)
-        recording.record(given, made, driven, kept=table is not None, progress=listener.progress)
+        recording.record_poses(given, made, driven, kept=table is not None, progress=listener.progress)
     return Observations.of(
         made.observation(),
         joint_types=asked.joint_types,

@@ -403,7 +403,7 @@ def pending_recording(config: Config, run: Run, motions: JointList | None, *, fo
 
 def recorded(listener: Listener, config: Config, recording: Any, *, confirm: bool) -> str:
     """Record the pending poses, and tell how far it is on an interrupt; return the reason of a failure."""
-    from projservo_cli.stages.record import record
+    from projservo_cli.stages.record import record_poses
 
     if recording.pending and confirm:
         listener.confirm("record", config.plant)
@@ -415,7 +415,7 @@ def recorded(listener: Listener, config: Config, recording: Any, *, confirm: boo
     if recording.found and recording.pending:
         listener.say(f"{recording.path}: continued after {recording.found} of {total} poses")
     try:
-        record(recording_inputs(config), recording, progress=progress)
+        record_poses(recording_inputs(config), recording, progress=progress)
     except WorkFailed as error:
         return " ".join(str(error).split()).removeprefix("record: ")
     except KeyboardInterrupt:

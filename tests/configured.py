@@ -44,7 +44,7 @@ def trial_motions(config):
 def simulate(config, truth, q=None, drawn=None):
     q = trial_motions(config) if q is None else q
     drawn = drawn or (trials_of(config).motions.seed, streams.CALIBRATION_NOISE)
-    return recording.simulate(truth, q, config.noise.calibration_px, drawn)
+    return recording.noisy_observation(truth, q, config.noise.calibration_px, drawn)
 
 
 def plan_inputs(config):
@@ -175,5 +175,7 @@ record = _Stage(
     new_recording=lambda config, *more, **named: recording.new_recording(
         given.recording_inputs(config), *more, **named
     ),
-    record=lambda config, *more, **named: recording.record(given.recording_inputs(config), *more, **named),
+    record=lambda config, *more, **named: recording.record_poses(
+        given.recording_inputs(config), *more, **named
+    ),
 )

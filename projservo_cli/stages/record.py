@@ -191,7 +191,7 @@ def _random_pose(
     return reference
 
 
-def simulate(truth: Truth, q: FloatArray, noise_px: float, drawn: tuple[int, int]) -> Observation:
+def noisy_observation(truth: Truth, q: FloatArray, noise_px: float, drawn: tuple[int, int]) -> Observation:
     """Noisy images of all markers at poses (k, n); unseen outside an image.
 
     drawn : seed and stream of the noise.
@@ -272,7 +272,7 @@ def _resumed(empty: _Recording, maximum: FloatArray) -> _Recording:
     return recording
 
 
-def record(
+def record_poses(
     inputs: RecordingInputs,
     recording: _Recording,
     robot: PluginRobot | None = None,
@@ -360,7 +360,7 @@ def observed(
     recording = _Recording(Path(), "", targets, np.array(truth.number))
     robot = _robot_of(trials, recording, drawn)
     if robot is None or trials.driven is None:
-        return simulate(truth, targets, sigma_px, drawn), sigma_px or None
+        return noisy_observation(truth, targets, sigma_px, drawn), sigma_px or None
     with at_rest_after(robot):
         for _ in _recorded(robot, trials, recording):
             progress("trial motions", len(recording.done), len(recording.targets))
@@ -373,7 +373,7 @@ def observed(
 def _simulated(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> Iterator[int]:
     """One pending pose after the other as calibrate simulates it; the number of each."""
     assert trials.truth is not None
-    seen = simulate(trials.truth, recording.targets, trials.noise_px, drawn)
+    seen = noisy_observation(trials.truth, recording.targets, trials.noise_px, drawn)
     for pose in recording.pending:
         recording.done[pose] = Reading(seen.q[pose], seen.images[pose], np.nan, np.full(2, np.nan), None)
         yield pose

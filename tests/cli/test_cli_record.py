@@ -99,7 +99,7 @@ def test_a_recording_that_fails_is_an_object_and_nothing_else_is_made(projservo,
     def fail(config, recording, progress):
         raise WorkFailed("record: joint 1 stands still")
 
-    monkeypatch.setattr(record, "record", fail)
+    monkeypatch.setattr(record, "record_poses", fail)
     answer = projservo(*CHAIN, "--json")
     assert (answer.code, stages.made) == (1, [])
     assert answer.err.splitlines()[-1] == "projservo: record: joint 1 stands still"

@@ -19,7 +19,7 @@ from projservo_cli.config.inputs import recording_inputs
 from projservo_cli.hardware.so101 import COUNT, MIDDLE, SO101
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages.external_robot import plugin_robot
-from projservo_cli.stages.record import new_recording, record
+from projservo_cli.stages.record import new_recording, record_poses
 from tests.configured import truth_of
 from tests.emulated.arm import Arm, Clock
 from tests.emulated.servos import Bus, Faults
@@ -78,7 +78,7 @@ def recorded(seed, faults=BAD):
         robot = Projected(bus, bounds.limits)
         foreign = plugin_robot(inputs.own, bounds, joints.types, inputs.numbers, robot)
         try:
-            record(inputs, recording, foreign)
+            record_poses(inputs, recording, foreign)
         except WorkFailed as failure:
             error = str(failure)
         goals = {(i, goal) for i in range(1, 6) for _, goal in bus.servos[i].moments}
