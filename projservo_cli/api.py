@@ -37,7 +37,7 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages.external_robot import plugin_robot
-from projservo_cli.stages.inputs import Estimation, Trials
+from projservo_cli.stages.stage_inputs import Estimation, Trials
 from projservo_cli.store import load as stored_run
 from projservo_cli.store import run_path
 from projservo_cli.store.sweep_table import TABLE, SweepTable

@@ -22,7 +22,7 @@ from projservo_cli.records import (
     WorkFailed,
 )
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.inputs import PlanInputs
+from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.steps import STAGES, Step, inputs_of, result_of, steps_for
 from projservo_cli.store import SERVO, Run, save
 
@@ -78,7 +78,7 @@ def listening(progress: Progress | bool) -> Iterator[_Caller]:
         bar.close()
 
 
-class Finding(NamedTuple):
+class Shortfall(NamedTuple):
     """A failure in words, and whether a call fails by it."""
 
     text: str
@@ -225,7 +225,7 @@ class Chain:
         """Record the pending poses first; return whether they are all there."""
         if self.recording.why:
             self.listener.say(f"record: making ({self.recording.why})")
-        if reason := recorded(self.listener, self.config, self.recording, confirm=self.confirm):
+        if reason := recording_made(self.listener, self.config, self.recording, confirm=self.confirm):
             self.failed, self.reason = "record", reason
             return False
         if self.run.refuted:  # by what the new recording has taken the place of
@@ -268,32 +268,32 @@ class Chain:
         write_page(explained, about_of(config))
         return made
 
-    def findings(self, of_calibration: Mapping[str, Any]) -> Iterator["Finding"]:
+    def findings(self, of_calibration: Mapping[str, Any]) -> Iterator["Shortfall"]:
         """Yield the failures of the chain, and whether they end the call with exit code 1.
 
         of_calibration : whether joint types were assumed, and what came of suggestions.
         """
         if self.failed:
             yield from self._of_runs()
-            yield Finding(f"{self.failed}: {self.reason}", fatal=True)
+            yield Shortfall(f"{self.failed}: {self.reason}", fatal=True)
             return
         results = self.run.results
         if "calibrate" in results and not self.run.calibration.usable:
             reason = " ".join(self.run.calibration.reason.split())
             text = f"calibrate: the calibration is not usable: {reason}"
-            yield Finding(text, fatal="calibrate" in self.names)
+            yield Shortfall(text, fatal="calibrate" in self.names)
         if of_calibration.get("joint_types_assumed"):
             text = "calibrate: joint types are not given: all are taken as revolute (--joints)"
-            yield Finding(text, fatal=False)
+            yield Shortfall(text, fatal=False)
         if of_calibration.get("suggestions") == []:
-            yield Finding(f"calibrate: {of_calibration['suggestions_reason']}", fatal=True)
+            yield Shortfall(f"calibrate: {of_calibration['suggestions_reason']}", fatal=True)
         yield from self._of_runs()
         # Other profiles are those of the paper, of which the margins are only measured.
         searched = "plan" in results and self.run.plan.profile in ("constrained", "joint_space")
         if searched and not self.run.plan.feasible:
-            yield Finding(f"plan: {self.run.plan.reason}", fatal="plan" in self.names)
+            yield Shortfall(f"plan: {self.run.plan.reason}", fatal="plan" in self.names)
 
-    def _of_runs(self) -> Iterator["Finding"]:
+    def _of_runs(self) -> Iterator["Shortfall"]:
         """A line on each run that did not converge or missed periods, and whether the call fails by it."""
         required = self.config.control.must_converge
         for trace in (self.run.traces[law] for law in self.laws_done):
@@ -310,7 +310,7 @@ class Chain:
                 )
             # Classical laws lead where nothing can be expected of them, images included.
             disturbed = trace.verdict == "fault detected" and trace.law not in POINT_LAWS
-            yield Finding(said, fatal=not converged and (must or disturbed))
+            yield Shortfall(said, fatal=not converged and (must or disturbed))
 
     def _keep(self, run: Run) -> None:
         self.run = run if self.in_memory else save(run)
@@ -401,7 +401,7 @@ def pending_recording(config: Config, run: Run, motions: JointList | None, *, fo
     return replace(begun, why=f"what is there was contradicted: {run.refuted}")
 
 
-def recorded(listener: Listener, config: Config, recording: Any, *, confirm: bool) -> str:
+def recording_made(listener: Listener, config: Config, recording: Any, *, confirm: bool) -> str:
     """Record the pending poses, and tell how far it is on an interrupt; return the reason of a failure."""
     from projservo_cli.stages.record import record_poses
 

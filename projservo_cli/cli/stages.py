@@ -59,7 +59,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
         raise click.UsageError("--joint-unit is that of --motions, which is not given")
     if len(stages) > 1:
         return _make(console, stages, options)
-    from projservo_cli.chain import data_table, recorded
+    from projservo_cli.chain import data_table, recording_made
     from projservo_cli.config.inputs import recording_inputs
     from projservo_cli.stages.record import new_recording
 
@@ -72,7 +72,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     if not options["dry_run"]:
         with option.writing(path):
             recording = new_recording(given, path, motions=poses, force=options["force"])
-            reason = recorded(console, config, recording, confirm=options["confirm"])
+            reason = recording_made(console, config, recording, confirm=options["confirm"])
     value = _recording_object(recording, reason)
     console.report(value, [*words_of("record", value), *([f"table: {path}"] if path.exists() else [])])
     if reason:

@@ -31,7 +31,7 @@ from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.simulation.scene import Scene
 from projservo_cli.simulation.workspace import Truth
-from projservo_cli.stages.inputs import (
+from projservo_cli.stages.stage_inputs import (
     CalibrationInputs,
     Contract,
     Drive,

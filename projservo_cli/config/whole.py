@@ -12,7 +12,6 @@ from projservo_cli.display import Printed
 from projservo_cli.image_size import ImageSize
 from projservo_cli.laws import REGULATE
 from projservo_cli.records import LIMITS_MISSING, InputError
-from projservo_cli.settings.calibration import CalibrationSettings, Data, Noise
 from projservo_cli.settings.cameras import Cameras
 from projservo_cli.settings.control import RENDERED, Control, PlantSettings, ReportSettings, Stop
 from projservo_cli.settings.disturbance import Disturbance
@@ -20,6 +19,7 @@ from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.robot import Rig, RobotSettings, are_degrees
 from projservo_cli.settings.sections import Finding, JointVector, Root, Whole
 from projservo_cli.settings.task import TaskSettings, Trajectory
+from projservo_cli.settings.trials import CalibrationSettings, Data, Noise
 
 
 def _folder_name(name: str) -> str:

@@ -21,8 +21,8 @@ from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.loop.step import Log, new_log
 from projservo_cli.records import FloatArray
 from projservo_cli.simulation.ideal import Plant
-from projservo_cli.stages.inputs import ServoInputs
 from projservo_cli.stages.scenario import run_scenario
+from projservo_cli.stages.stage_inputs import ServoInputs
 from projservo_cli.task.face import Task
 
 STATES, STEPS, PIECE, ROUNDS = 256, 150, 64, 200

@@ -19,8 +19,8 @@ from projservo_cli.records import Calibration, CrossValidation, FloatArray, IntA
 from projservo_cli.robots.settings import JointSettings
 from projservo_cli.simulation.streams import SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.inputs import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
 from projservo_cli.stages.record import observed
+from projservo_cli.stages.stage_inputs import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
 from projservo_cli.store.tables import read_table, to_csv
 
 

@@ -32,8 +32,8 @@ from projservo_cli.simulation.faults import (
 )
 from projservo_cli.simulation.ideal import Plant, observe
 from projservo_cli.simulation.streams import SERVO_NOISE
-from projservo_cli.stages.inputs import Contract, Drive, OwnRobot
 from projservo_cli.stages.scenario import RunScenario
+from projservo_cli.stages.stage_inputs import Contract, Drive, OwnRobot
 
 _NEVER_LATE_S = 3600.0  # for a simulated robot, whose code may be compiled first
 # Minimum deviation of a delay and of single frames, s; width of a 95 % interval in deviations.

@@ -31,7 +31,6 @@ from projservo_cli.records import (
     in_unit,
 )
 from projservo_cli.settings.task import Trajectory
-from projservo_cli.stages.inputs import PlanInputs
 from projservo_cli.stages.motions import (
     Found,
     JointSearch,
@@ -45,6 +44,7 @@ from projservo_cli.stages.motions import (
 )
 from projservo_cli.stages.plan_summary import minimum_of, reason_of, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import TaskImages

@@ -19,7 +19,7 @@ from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import plugin_robot
-from projservo_cli.stages.inputs import OwnRobot, PreflightInputs
+from projservo_cli.stages.stage_inputs import OwnRobot, PreflightInputs
 
 # Time of observation of a robot at rest, s, and minimum number of readings.
 _LOOK_S, _MIN_LOOKS = 1.5, 8

@@ -33,7 +33,7 @@ from projservo_cli.report.report_data import (
 from projservo_cli.results import ImageModel
 from projservo_cli.simulation.workspace import plant_of
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.inputs import KnownLengths, ReportInputs, Scenery
+from projservo_cli.stages.stage_inputs import KnownLengths, ReportInputs, Scenery
 from projservo_cli.stages.studies import (
     LAMBDAS,
     STEP_LIMIT_DEG,

@@ -43,7 +43,7 @@ from projservo_cli.simulation.streams import (
     generator,
 )
 from projservo_cli.simulation.workspace import Truth, plant_of, turned
-from projservo_cli.stages.inputs import PlanInputs, ServoInputs
+from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.target import TaskImages
 

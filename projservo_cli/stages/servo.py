@@ -47,9 +47,9 @@ from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.ideal import AnalyticPlant, Plant
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import external_robot
-from projservo_cli.stages.inputs import ServoInputs
 from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
 from projservo_cli.stages.scenario import RunScenario, run_scenario
+from projservo_cli.stages.stage_inputs import ServoInputs
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.target import followed
 

@@ -22,10 +22,10 @@ from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Pla
 from projservo_cli.report.report_data import DIRECT, Studies
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.inputs import ServoInputs
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive
+from projservo_cli.stages.stage_inputs import ServoInputs
 
 GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
 PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)

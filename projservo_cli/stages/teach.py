@@ -21,7 +21,7 @@ from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_b
 from projservo_cli.simulation.streams import TAUGHT_NOISE, generator
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.external_robot import plugin_robot, simulated_robot, takes_limits
-from projservo_cli.stages.inputs import OwnRobot, PlanInputs, TeachInputs
+from projservo_cli.stages.stage_inputs import OwnRobot, PlanInputs, TeachInputs
 
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written

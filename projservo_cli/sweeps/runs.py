@@ -18,10 +18,10 @@ from projservo_cli.loop.compiled import Course
 from projservo_cli.loop.step import FAILED, RUNNING, VERDICTS
 from projservo_cli.records import Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.inputs import PlanInputs, ServoInputs
 from projservo_cli.stages.plan import rotation_sense
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive, sense_is_enough
+from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.store.sweep_table import Failure, merge_failures
 from projservo_cli.sweeps.design import RUNS, Design, name_of_run
 

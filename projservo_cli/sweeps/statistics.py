@@ -15,7 +15,7 @@ from projservo_cli.config.sweep import LAW
 from projservo_cli.files import write_whole
 from projservo_cli.records import BoolArray
 from projservo_cli.report import style
-from projservo_cli.report.figures.sweep import draw_basin, draw_final_errors, draw_success
+from projservo_cli.report.figures.sweep_success import draw_basin, draw_final_errors, draw_success
 from projservo_cli.report.report_data import Data
 from projservo_cli.stages import Progress
 from projservo_cli.store.sweep_table import SweepTable
