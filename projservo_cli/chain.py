@@ -1,4 +1,4 @@
-"""A chain of stages: which are to be made, in which order, what may move, and what became of them."""
+"""A chain of stages: their order and permission, results made and saved, and findings of a call."""
 
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -87,7 +87,7 @@ class Shortfall(NamedTuple):
 
 @dataclass
 class Chain:
-    """Stages that were asked for, the steps that they take, and what became of them."""
+    """Stages that were asked for, the steps that they take, and their outcome."""
 
     listener: Listener
     names: Sequence[str]  # of the stages
@@ -190,8 +190,8 @@ class Chain:
             return
         for one in self.replayed():
             self.listener.say("{law}: the stored run of {plant}, recorded {date}".format_map(one))
-        if any(step.why for step in self.steps) and (told := compilation()):
-            self.listener.say(told)  # the first run on a machine is slower by that
+        if any(step.why for step in self.steps) and (notice := compilation()):
+            self.listener.say(notice)  # the first run on a machine is slower by that
         motion = next((step for step in self.steps if step.law and step.why), None)
         steps = [step for step in self.steps if step.stage != "record"]
         with self._compiling():
@@ -251,7 +251,7 @@ class Chain:
             "suggestions_limited": bool(np.isfinite(limits.lower).any()),
         }
 
-    def extras(self, wanted: Sequence[str]) -> dict[str, Path]:
+    def optional_files(self, wanted: Sequence[str]) -> dict[str, Path]:
         """Write the ``view`` or ``animation``, and the page with links to them; return the paths by name."""
         from projservo_cli.report.page import write_page
         from projservo_cli.stages import report
@@ -302,15 +302,15 @@ class Chain:
                 continue  # failures are printed last
             but = " must converge, but" if must and not converged else ""
             reason = " ".join(trace.reason.split())
-            said = f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"
+            text = f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"
             if trace.overruns:
-                said += (
+                text += (
                     f"; it missed {trace.overruns} periods of {trace.period:g} s: raise control.period_s, or "
                     "find fewer markers"
                 )
             # Classical laws lead where nothing can be expected of them, images included.
             disturbed = trace.verdict == "fault detected" and trace.law not in POINT_LAWS
-            yield Shortfall(said, fatal=not converged and (must or disturbed))
+            yield Shortfall(text, fatal=not converged and (must or disturbed))
 
     def _keep(self, run: Run) -> None:
         self.run = run if self.in_memory else save(run)

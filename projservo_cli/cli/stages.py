@@ -237,7 +237,7 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
         console.report({"run": chain.run.path.resolve(), "dry_run": True, "steps": steps}, words)
         return 0
     folder = chain.run.path.parent
-    if not chain.pending and not _extras(options):
+    if not chain.pending and not _optional_files(options):
         tidy(folder, FIGURES)
         return _work(call)
     with working_in(folder, FIGURES):
@@ -268,7 +268,7 @@ def _asked(
             f"--suggest: the method {config.calibration.method} has no covariance to judge poses by; "
             "use --set calibration.method=bundle_adjustment"
         )
-    if wanted := _extras(options):
+    if wanted := _optional_files(options):
         require_optional(config, wanted)
     if records and recording is None:
         recording = pending_recording(config, stored, _motions(config, options), force=options["force"])
@@ -303,7 +303,7 @@ def require_optional(config: Any, wanted: Sequence[str]) -> None:
             ) from error
 
 
-def _extras(options: Mapping[str, Any]) -> list[str]:
+def _optional_files(options: Mapping[str, Any]) -> list[str]:
     """Return the files that a report has in addition to its page."""
     return [name for name in ("view", "animation") if options.get(name)]
 
@@ -329,8 +329,8 @@ def _work(call: _Call) -> int:
     if "calibrate" in chain.names:
         assumed = chain.config.joint_types is None
         call.beside.setdefault("calibrate", {})["joint_types_assumed"] = assumed
-    if (wanted := _extras(call.options)) and not chain.lacks("report"):
-        call.beside["report"] = chain.extras(wanted)
+    if (wanted := _optional_files(call.options)) and not chain.lacks("report"):
+        call.beside["report"] = chain.optional_files(wanted)
     call.beside.setdefault("report", {})["replayed"] = chain.replayed()
     from projservo_cli.report.report_data import failed_object, stage_object
 

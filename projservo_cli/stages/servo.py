@@ -127,10 +127,8 @@ class LawRun:
             raise InputError(
                 f"{order}, or set data.joint_order=stated if it is known; no robot is driven before"
             )
-        controller, driven = (
-            self.controller(),
-            external_robot.connected_robot(scenario, self.law, self.robot),
-        )
+        controller = self.controller()
+        driven = external_robot.connected_robot(scenario, self.law, self.robot)
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), at_rest_after(driven.robot):
             if own:
