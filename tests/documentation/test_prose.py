@@ -64,7 +64,7 @@ TERMS = {
     "entry point|plug-?in": "plugins",
     "epipolar": "calibration/epipolar",
     "errors in variables": "calibration/joint_noise",
-    "exit code": "cli/group",
+    "exit code": "cli/program",
     "fault detection": "monitoring/__init__",
     "forward kinematics": "geometry/kinematics",
     "goal configuration": "planning/goal_configurations",
