@@ -6,7 +6,7 @@ import pytest
 from projservo_cli.config import load_config, plain_yaml
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.robots.contract import Reading
-from projservo_cli.stages.external_robot import averaged
+from projservo_cli.robots.standstill import averaged
 from tests.configured import calibrate, checked, plan, require_face, servo, teach, truth_of
 from tests.conftest import ROOT
 
