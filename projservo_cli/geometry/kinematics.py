@@ -1,5 +1,7 @@
 """Forward kinematics and image Jacobian in projective space: [RH00] equations (6), (7) and (19)."""
 
+import math
+
 import numpy as np
 
 from projservo_cli.geometry.algebra import (
@@ -17,6 +19,7 @@ from projservo_cli.geometry.algebra import (
 )
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import distort_visible
+from projservo_cli.image_size import BEHIND
 from projservo_cli.records import NO_LENS, PRISMATIC, FloatArray, Model
 
 
@@ -112,6 +115,17 @@ def image_motion(P: FloatArray, A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
     u, v, u_dot, v_dot = image_velocity(P[0], A, D)
     x, y, x_dot, y_dot = image_velocity(P[1], A, D)
     return (u, v, x, y), (u_dot, v_dot, x_dot, y_dot)
+
+
+@merged
+def from_border(image_size: FloatArray, u: float, v: float) -> float:
+    """Distance of a pixel from the border of an image, px; negative outside, ``BEHIND`` of none.
+
+    The compiled twin of ``image_size.border_distance``, for one image of a width and height (2,).
+    """
+    if not math.isfinite(u + v):
+        return BEHIND
+    return min(u + 0.5, v + 0.5, float(image_size[0]) - 0.5 - u, float(image_size[1]) - 0.5 - v)
 
 
 @inline

@@ -26,9 +26,9 @@ import numpy as np
 
 from projservo_cli.control.law import LOST, SINGULAR, limit_speed
 from projservo_cli.geometry.jit import merged
-from projservo_cli.geometry.kinematics import beyond_limits
+from projservo_cli.geometry.kinematics import beyond_limits, from_border
 from projservo_cli.records import FloatArray, IntArray
-from projservo_cli.simulation.ideal import Plant, inside
+from projservo_cli.simulation.ideal import Plant
 
 RUNNING = -1
 WAITING = -3  # for lost markers; no verdict of a run
@@ -158,8 +158,8 @@ def _outside(s: FloatArray, m: int, image_size: FloatArray) -> bool:
     """Whether one of the first m markers was seen outside an image."""
     for view in range(2):
         for k in range(m):
-            seen = math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])
-            if seen and not inside(s[view, k], image_size[view]):
+            u, v = s[view, k, 0], s[view, k, 1]
+            if math.isfinite(u + v) and from_border(image_size[view], u, v) < 0.0:
                 return True
     return False
 

@@ -15,7 +15,7 @@ import numpy as np
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import row_into
-from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
+from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, from_border, row
 from projservo_cli.planning.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance, squared
 from projservo_cli.planning.margins import (
     CLEAR,
@@ -25,7 +25,6 @@ from projservo_cli.planning.margins import (
     MARGINS,
     VISIBILITY,
     Demands,
-    from_border,
     pixel,
     straight_pixel,
     tag_planes,

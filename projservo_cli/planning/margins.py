@@ -47,6 +47,7 @@ from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
 from projservo_cli.geometry.kinematics import backward, forward, image_motion, operators_at, project, row
 from projservo_cli.geometry.lens import distort_pixel, distorts
 from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, make_span, reach, workspace
+from projservo_cli.image_size import BEHIND, border_distance
 from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients
@@ -94,8 +95,6 @@ def constraint_at(column: int) -> tuple[Words, int]:
 
 # A margin this bad is as bad as it gets: joints out of reach.
 WORST = -10.0
-# Distance, px, from the border of an image of what no camera shows.
-BEHIND = -1e9
 # A joint that moves more than this between neighbours on a path, rad or m, asks for twice the parts between.
 MOST_PART = 0.2
 MOST_PARTS = 256
@@ -210,14 +209,6 @@ def pixel(model: Model, view: int, A: Vec4) -> tuple[float, float]:
     """Pixel of a point, as the camera reports it."""
     u, v = straight_pixel(model.P[view], A)
     return distort_pixel(model.lens[view], u, v) if distorts(model.lens) else (u, v)
-
-
-@merged
-def from_border(image_size: FloatArray, u: float, v: float) -> float:
-    """Distance of a pixel from the border of the image, px; negative outside, ``BEHIND`` of none."""
-    if not math.isfinite(u + v):
-        return BEHIND
-    return min(u + 0.5, v + 0.5, float(image_size[0]) - 0.5 - u, float(image_size[1]) - 0.5 - v)
 
 
 def image_margin(demands: Demands, distance: FloatArray) -> FloatArray:
@@ -395,7 +386,7 @@ def measured(motion: Motion) -> Motion:
     # A camera has a marker before it as long as it has it on the side on which it had it at the start.
     depth = A @ model.P[:, 2].T
     visible = np.swapaxes((M @ model.P[:, 2].T) * depth > 1e-9 * depth**2, 1, 2)
-    border = np.minimum(s + 0.5, demands.image_size[:, None] - 0.5 - s).min(axis=3)
+    border = border_distance(s, demands.image_size[:, None])
     border = np.where(visible & np.isfinite(border), border, BEHIND)
     found.distance[:] = border[:, :, :m].min(axis=2)
     if len(demands.tags):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.rigid import rigid
-from projservo_cli.image_size import image_sizes
+from projservo_cli.image_size import image_sizes, within_images
 from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model
 from projservo_cli.simulation.arm import Arm, about_axis, camera_center, roll_axis
 from projservo_cli.simulation.ideal import Ends
@@ -74,8 +74,8 @@ class Truth:
 
     def within(self, pixels: FloatArray, view: int | slice = slice(None)) -> FloatArray:
         """Pixels (..., 2, m, 2), or (m, 2) of a view, NaN outside an image: centres reach to size − ½."""
-        inside = (pixels >= -0.5) & (pixels <= image_sizes(self.image_size)[view, ..., None, :] - 0.5)
-        return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)
+        inside = within_images(pixels, image_sizes(self.image_size)[view, ..., None, :])
+        return np.where(inside[..., None], pixels, np.nan)
 
     def displacement(self, q: FloatArray) -> FloatArray:
         """True displacement (4, 4) of the face from the reference at the joints q (n,)."""

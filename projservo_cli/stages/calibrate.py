@@ -10,7 +10,7 @@ from projservo_cli.calibration import Nominal, Solution, calibrate, cross_valida
 from projservo_cli.calibration.screening import screened
 from projservo_cli.calibration.undecided import undecided_pairs
 from projservo_cli.files import write_whole
-from projservo_cli.image_size import image_sizes
+from projservo_cli.image_size import image_corners, image_sizes
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import Suggestion, suggest
@@ -136,7 +136,7 @@ def suggest_motions(
     pixels, size = observation.images, inputs.image_size
     image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
     if size is not None:
-        image = np.array([[[-0.5, -0.5], one - 0.5] for one in image_sizes(size)])
+        image = image_corners(image_sizes(size))
     targets = _region(inputs.joints, observation.q, WIDER, image)
     candidates = targets if inputs.recorded else _region(inputs.joints, observation.q, FARTHER, image)
     rng = generator(inputs.seed, SUGGESTIONS)

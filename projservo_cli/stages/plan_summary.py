@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from projservo_cli.image_size import BEHIND
 from projservo_cli.planning.constraints import Constraints, demands_into, margins_along_into, new_trial
 from projservo_cli.planning.margins import (
-    BEHIND,
     CONDITIONING,
     CONSTRAINTS,
     IMAGE,

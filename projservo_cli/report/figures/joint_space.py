@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics, project
-from projservo_cli.planning.margins import BEHIND, CLEAR, CONSTRAINTS, IMAGE, WIDTH
+from projservo_cli.image_size import BEHIND
+from projservo_cli.planning.margins import CLEAR, CONSTRAINTS, IMAGE, WIDTH
 from projservo_cli.records import PRISMATIC, FloatArray, IntArray, Plan
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import image_border, near_pixels

@@ -6,6 +6,7 @@ import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.geometry.rigid import homogeneous
+from projservo_cli.image_size import image_corners
 from projservo_cli.records import PRISMATIC, FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, ReportData, registered
@@ -60,7 +61,7 @@ def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArra
 
 def plant_pyramids(plant: Plant, face: FloatArray) -> FloatArray:
     """Pyramids (2, 5, 3) of the whole images of a plant, by ``pyramids``."""
-    return pyramids(plant.model.P, rectangle(np.full(2, -0.5), plant.image_size - 0.5), face)
+    return pyramids(plant.model.P, rectangle(*np.moveaxis(image_corners(plant.image_size), -2, 0)), face)
 
 
 def pyramids(P: FloatArray, corners: FloatArray, face: FloatArray) -> FloatArray:
