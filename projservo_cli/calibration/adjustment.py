@@ -23,10 +23,11 @@ import numpy as np
 from scipy.linalg import expm, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
-from projservo_cli.calibration.detections import RAYLEIGH, Detections, per_block
+from projservo_cli.calibration.detections import Detections, per_block
 from projservo_cli.calibration.prediction import CAMERA, Parameters, image_points
+from projservo_cli.calibration.robust import RAYLEIGH, cauchy_weights
+from projservo_cli.geometry.displacements import cross_matrix
 from projservo_cli.geometry.lens import TERMS, distort
-from projservo_cli.geometry.rigid import cross_matrix
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray
 
 
@@ -652,7 +653,7 @@ def _weights(residual: FloatArray, rows: BoolArray, robust: bool) -> FloatArray:
         return rows.astype(np.float64)
     distance = np.linalg.norm(residual, axis=2)
     width = _CAUCHY * max(float(np.median(distance[rows])) / RAYLEIGH, 1e-9)
-    return np.where(rows, 1.0 / (1.0 + (distance / width) ** 2), 0.0)
+    return np.where(rows, cauchy_weights((distance / width) ** 2), 0.0)
 
 
 def _cost(weight: FloatArray, residual: FloatArray, strain: FloatArray) -> float:

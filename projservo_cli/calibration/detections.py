@@ -9,16 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
+from projservo_cli.calibration.robust import MAD
 from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Observation, WorkFailed
 
 # Difference, rad or m, below which two joint readings are equal: far below any encoder's resolution.
 SAME_READING = 1e-7
 # Minimum pixel noise, px per coordinate: exact images have round-off.
 MIN_SIGMA = 1e-4
-# Median of |x| over the standard deviation of a normal variable.
-MAD = 0.6744897501960817
-# Median of the length of a two-dimensional normal vector of unit deviation.
-RAYLEIGH = 1.1774100225154747
 # Distance from the reference at which predictions are assessed, revolute joints, rad.
 REACH_RAD = 0.5
 # Distance from the reference at which predictions are assessed, prismatic joints, m.

@@ -14,8 +14,8 @@ import numpy as np
 from projservo_cli.calibration.detections import Detections, per_rad
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.screening import without_placeholders
+from projservo_cli.geometry.displacements import displacements, sine_and_versine
 from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible, undistort
-from projservo_cli.geometry.rigid import sine_and_versine
 from projservo_cli.records import (
     BoolArray,
     Calibration,
@@ -36,16 +36,6 @@ LENS = 2
 CONTRADICTED = 3.0
 # Minimum number of correspondences whose epipolar geometry determines their noise within a seventh.
 _NOISE_PAIRS = 32
-
-
-def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
-    """Displacements exp(q Ĥ) (n, K, 4, 4) of operators (n, 4, 4) at joints (K, n), [RH00] eqs. (4), (5).
-
-    Joint values are from the reference, rad or m.
-    """
-    squared = H_hat @ H_hat
-    sine, versine = (part.T[..., None, None] for part in sine_and_versine(prismatic, q))
-    return np.eye(4) + sine * H_hat[:, None] + versine * squared[:, None]
 
 
 def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from projservo_cli.calibration.detections import MAX_JUDGED, ON_A_LINE, Detectio
 from projservo_cli.calibration.epipolar import reconstruct
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
 from projservo_cli.calibration.prediction import Parameters
-from projservo_cli.geometry.algebra import normalize_displacement
+from projservo_cli.geometry.displacements import normalize_displacement
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
 
 # Minimum distance of the markers from their best line, in units of its noise.

@@ -20,7 +20,8 @@ from projservo_cli.control.law import (
     speed_share,
     translation_rate,
 )
-from projservo_cli.geometry.algebra import Mat4, mul, rotation, translation
+from projservo_cli.geometry.algebra import Mat4, mul
+from projservo_cli.geometry.displacements import rotation, translation
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.mechanisms import SETTLED, Seen, reach

@@ -16,8 +16,6 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     apply,
     axpy,
-    composed_angle,
-    composed_operator,
     dot,
     inner,
     mat,
@@ -27,6 +25,7 @@ from projservo_cli.geometry.algebra import (
     vec,
     vec_into,
 )
+from projservo_cli.geometry.displacements import composed_angle, composed_operator
 from projservo_cli.geometry.jit import composed, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, least_squares
 from projservo_cli.geometry.kinematics import image_velocity, operators_at, row

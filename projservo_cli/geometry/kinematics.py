@@ -4,19 +4,8 @@ import math
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import (
-    IDENTITY,
-    Mat4,
-    Vec4,
-    as_array,
-    mat,
-    mat_into,
-    mul,
-    rotation,
-    rotation_and_inverse,
-    translation,
-    vec,
-)
+from projservo_cli.geometry.algebra import IDENTITY, Mat4, Vec4, as_array, mat, mat_into, mul, vec
+from projservo_cli.geometry.displacements import rotation, rotation_and_inverse, translation
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.image_size import BEHIND

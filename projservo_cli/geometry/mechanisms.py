@@ -17,7 +17,6 @@ from projservo_cli.geometry.algebra import (
     combine,
     dual_pencil,
     inner,
-    invariant_rotations,
     mat,
     mul,
     multiple,
@@ -25,6 +24,7 @@ from projservo_cli.geometry.algebra import (
     vec,
     vec_into,
 )
+from projservo_cli.geometry.displacements import invariant_rotations
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kernels import (
     COORDINATES,

@@ -19,8 +19,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.geometry.displacements import (
+    carried_screws,
+    homogeneous,
+    invariant_forms,
+    rigid_inverse,
+    screw_displacements,
+    screws,
+    twists,
+)
 from projservo_cli.geometry.lens import TERMS, distort, undistort
-from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid_inverse, screws, twists
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, WorkFailed
 
@@ -79,7 +87,7 @@ class Body(NamedTuple):
 
     def tool_poses(self, prismatic: BoolArray, q: FloatArray) -> FloatArray:
         """Poses (…, K, 4, 4) of the tool at readings (K, n), [RH00] eq. (6), m."""
-        moved = exponentials(self.axes[..., None, :, :], prismatic, q)
+        moved = screw_displacements(self.axes[..., None, :, :], prismatic, q)
         factors = [moved[..., i, :, :] for i in range(len(prismatic))]
         return np.asarray(reduce(np.matmul, factors) @ self.tool[..., None, :, :])
 
@@ -108,16 +116,11 @@ def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
     U = np.linalg.svd(np.concatenate(np.moveaxis(H_hat, -3, 0), axis=-1))[0]
     D, a_inf = U[..., :3].swapaxes(-1, -2), U[..., 3]
     L = (D[..., None, :, :] @ H_hat @ D.swapaxes(-1, -2)[..., None, :, :])[..., turning, :, :]
-    i, j = np.triu_indices(3)
-    basis = np.zeros((6, 3, 3))
-    basis[range(6), i, j] = basis[range(6), j, i] = np.where(i == j, 1.0, np.sqrt(0.5))
-    moved = np.einsum("...nab,sbc->...nacs", L, basis)
-    changes = (moved + np.einsum("...nacs->...ncas", moved)).reshape(*L.shape[:-3], -1, 6)
-    _, sizes, rows = np.linalg.svd(changes)
+    sizes, forms = invariant_forms(L)
     if (sizes[..., 4] < _SECOND_FORM * sizes[..., 0]).any():
         raise InputError(_ALL_PARALLEL)
-    S = np.einsum("...s,sab->...ab", rows[..., 5, :], basis)
-    S *= np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None]
+    S = forms[..., 5, :, :]
+    S = S * np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None]
     try:
         A = np.linalg.cholesky(S)
     except np.linalg.LinAlgError:
@@ -247,12 +250,7 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
     at_reference[:, c.prismatic, :3] = 0.0
     w, v = at_reference[:, turning, :3], at_reference[:, turning, 3:]
     at_reference[:, turning, 3:] = v - w * (w * v).sum(axis=-1, keepdims=True) / (w * w).sum(-1)[..., None]
-    to_zero = exponentials(at_reference, c.prismatic, -c.q_reference)
-    chain = [np.broadcast_to(np.eye(4), G.shape)]
-    for i in range(len(c.prismatic)):
-        chain.append(chain[-1] @ to_zero[:, i])
-    moved = np.stack(chain[:-1], axis=1)
-    axes = screws(moved @ twists(at_reference) @ rigid_inverse(moved))
+    axes, to_zero = carried_screws(at_reference, c.prismatic, -c.q_reference)
     axes[:, c.prismatic, :3] = 0.0
     base = base_frame(axes, c.prismatic, base_joints(axes[0], c.prismatic))
     tool = _tool_frame(M, face, _off_line(M[0], face))
@@ -260,7 +258,7 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
     P = models.P @ back[:, None] @ base[:, None]
     P /= np.linalg.norm(P[..., 2, :3], axis=-1)[..., None, None]
     markers = (homogeneous(M) @ rigid_inverse(tool).swapaxes(-1, -2))[..., :3]
-    return Body(P, models.lens, in_frame(axes, c.prismatic, base), inverse @ chain[-1] @ tool, markers)
+    return Body(P, models.lens, in_frame(axes, c.prismatic, base), inverse @ to_zero @ tool, markers)
 
 
 def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -594,8 +592,8 @@ class Metric:
         Those at the reference stay, which trial motions of single joints show.
         """
         q, prismatic = self.q_reference, self.prismatic
-        there = _carried(axes, prismatic, q)[..., order, :]
-        return _carried(there, prismatic[order], -q[order])
+        there = carried_screws(axes, prismatic, q)[0][..., order, :]
+        return carried_screws(there, prismatic[order], -q[order])[0]
 
     def changes(
         self,
@@ -627,15 +625,6 @@ class Metric:
         flat = np.ascontiguousarray(views.reshape(2, -1, 2))
         seen: BoolArray = np.isfinite(flat[0, :, 0]) & np.isfinite(flat[1, :, 0])
         return flat[:, seen], seen, views.shape[1:-1]
-
-
-def _carried(axes: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
-    """Screws (…, n, 6) after motions by readings (n,) of the joints before each."""
-    T, moved = np.broadcast_to(np.eye(4), (*axes.shape[:-2], 4, 4)), axes.copy()
-    for i, step in enumerate(np.moveaxis(exponentials(axes, prismatic, q), -3, 0)):
-        moved[..., i, :] = screws(T @ twists(axes[..., i, :]) @ rigid_inverse(T))
-        T = T @ step
-    return moved
 
 
 def _covariances(changes: FloatArray) -> FloatArray:

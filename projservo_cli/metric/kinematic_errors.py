@@ -11,7 +11,13 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid, rigid_inverse, screws, twists
+from projservo_cli.geometry.displacements import (
+    carried_screws,
+    homogeneous,
+    rigid,
+    rigid_inverse,
+    screw_displacements,
+)
 from projservo_cli.metric.frame import Body, Metric, base_frame, base_joints, directions, in_frame
 from projservo_cli.records import MM, BoolArray, FloatArray, InputError, IntArray, WorkFailed
 
@@ -109,11 +115,11 @@ class _ModelFit:
             for width in (np.pi, 2.0 * np.pi / _ANGLES):
                 at = np.tile(zeros, (_ANGLES + 1, 1))
                 at[:, i] += width * np.linspace(-1.0, 1.0, _ANGLES + 1)
-                moved = _moved(self._base, at, self.given, self.prismatic)
+                moved, _ = carried_screws(self.given, self.prismatic, at, self._base)
                 off = _differences(self.axes, moved, self.prismatic, self._near)[:, i + 1]
                 misfit = (off[:, :3] ** 2).sum(axis=1) + (off[:, 3:] ** 2).sum(axis=1) / size**2
                 zeros[i] = at[np.argmin(misfit.round(9) + 1e-6 * np.abs(at[:, i])), i]
-        self._base = self._base @ exponentials(self.given, self.prismatic, zeros)[0]
+        self._base = self._base @ screw_displacements(self.given, self.prismatic, zeros)[0]
         self.x[6:] = zeros[1:-1]
         return self
 
@@ -164,7 +170,7 @@ class _ModelFit:
         base, given = self._base.copy(), self.given.copy()
         base[:3, 3] *= factor
         given[~self.prismatic, 3:] *= factor
-        model = _moved(_placed(base, x), _zeros_of(x, len(given)), given, self.prismatic)
+        model, _ = carried_screws(given, self.prismatic, _zeros_of(x, len(given)), _placed(base, x))
         return _differences(found, model, self.prismatic, self._near).reshape(*found.shape[:-2], -1)
 
     def bases_and_zeros(self, axes: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -282,15 +288,6 @@ def _zeros_of(x: FloatArray, n: int) -> FloatArray:
     zeros = np.zeros((*x.shape[:-1], n))
     zeros[..., 1 : n - 1] = x[..., 6:]
     return zeros
-
-
-def _moved(base: FloatArray, zeros: FloatArray, given: FloatArray, prismatic: BoolArray) -> FloatArray:
-    """Screws (…, n, 6) of a model at a base (4, 4), whose joints move by zeros (…, n)."""
-    T, moved, steps = base, [], exponentials(given, prismatic, zeros)
-    for i, twist in enumerate(twists(given)):
-        moved.append(screws(T @ twist @ rigid_inverse(T)))
-        T = T @ steps[..., i, :, :]
-    return np.stack(np.broadcast_arrays(*moved), axis=-2)
 
 
 def _differences(found: FloatArray, model: FloatArray, prismatic: BoolArray, near: FloatArray) -> FloatArray:

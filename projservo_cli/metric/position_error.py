@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.geometry.displacements import aligned
 from projservo_cli.metric.frame import Metric
 from projservo_cli.records import MM, FloatArray, InputError, IntArray, WorkFailed
 
@@ -70,10 +71,9 @@ def _least_squares(T: FloatArray, xyz: FloatArray) -> Any:
     """Fit of a link to positions (K, 3) at poses (K, 4, 4) of the tool, m."""
     t = T[:, :3, 3]
     centered, target = t - t.mean(axis=0), xyz - xyz.mean(axis=0)
-    U, s, Vt = np.linalg.svd(target.T @ centered)  # Umeyama 1991, with the point at the tool's origin
-    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    scale = float(np.trace(np.diag(s) @ turn) / (centered**2).sum())
-    rotation = U @ turn @ Vt
+    # With the point at the tool's origin, and the scale that S. Umeyama gives with the rotation.
+    rotation = aligned(centered[None], target[None], np.ones((1, len(t))))[0][0]
+    scale = float((target * (centered @ rotation.T)).sum() / (centered**2).sum())
     shift = xyz.mean(axis=0) - scale * rotation @ t.mean(axis=0)
     start = np.r_[np.log(scale), Rotation.from_matrix(rotation).as_rotvec(), shift, np.zeros(3)]
 

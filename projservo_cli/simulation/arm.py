@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.geometry.displacements import rigid
 from projservo_cli.geometry.kinematics import forward_kinematics
-from projservo_cli.geometry.rigid import rigid
 from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 
 METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.rigid import rigid
+from projservo_cli.geometry.displacements import rigid
 from projservo_cli.records import FloatArray
 from projservo_cli.simulation.arm import twist
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.geometry.displacements import rigid
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.geometry.rigid import rigid
 from projservo_cli.image_size import image_sizes, within_images
 from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model
 from projservo_cli.simulation.arm import Arm, about_axis, camera_center, roll_axis

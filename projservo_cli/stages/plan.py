@@ -7,7 +7,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from projservo_cli.control.law import State
-from projservo_cli.geometry.algebra import as_array, composed_angle, vec
+from projservo_cli.geometry.algebra import as_array, vec
+from projservo_cli.geometry.displacements import composed_angle
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import undistort

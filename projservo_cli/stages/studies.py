@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.control.law import Gains
-from projservo_cli.geometry.algebra import (
-    as_array,
+from projservo_cli.geometry.algebra import as_array, mat
+from projservo_cli.geometry.displacements import (
     composed_angle,
     composed_operator,
     exp_rotation,
-    mat,
     twist_exponential,
 )
 from projservo_cli.planning.margins import limits_alone

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.detections import MIN_SIGMA
 from projservo_cli.calibration.prediction import predict
+from projservo_cli.geometry.displacements import rigid_inverse
 from projservo_cli.geometry.lens import distort, undistort
-from projservo_cli.geometry.rigid import rigid_inverse
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.metric.frame import Body, Metric
 from projservo_cli.metric.kinematic_errors import KinematicErrors

@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import displacements, image_points, moved_points
+from projservo_cli.calibration.prediction import image_points, moved_points
 from projservo_cli.config import Config, Override, load_config, to_yaml
 from projservo_cli.config.inputs import calibration_inputs, trajectory_of, truth_of
 from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.config.task import Goal, TaskSettings
+from projservo_cli.geometry.displacements import displacements
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import image_sizes, within_images
 from projservo_cli.laws import law_and_mode, names_of

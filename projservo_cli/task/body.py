@@ -17,14 +17,13 @@ from projservo_cli.geometry.algebra import (
     apply_transposed,
     combine,
     dot,
-    invariant_rotations,
     mat,
     mul,
     scale,
-    twist_exponential,
     vec,
     vec_into,
 )
+from projservo_cli.geometry.displacements import invariant_rotations, twist_exponential
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, solve_normal
 from projservo_cli.records import BoolArray, FloatArray, Model

@@ -16,13 +16,13 @@ from projservo_cli.geometry.algebra import (
     meet,
     mul,
     multiple,
-    rotation,
     scale,
     sub,
     unit,
     vec,
     vec_into,
 )
+from projservo_cli.geometry.displacements import rotation
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.mechanisms import (
     NO_OPERATOR,

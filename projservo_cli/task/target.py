@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import mul, translation
+from projservo_cli.geometry.algebra import mul
+from projservo_cli.geometry.displacements import translation
 from projservo_cli.geometry.jit import composed
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, operators_at, project

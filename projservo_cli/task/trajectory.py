@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, rotation, translation, vec, vec_into
+from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, vec, vec_into
+from projservo_cli.geometry.displacements import rotation, translation
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import backward, forward_between
 from projservo_cli.records import FloatArray, Model

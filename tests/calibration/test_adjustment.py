@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from projservo_cli.calibration import adjustment
 from projservo_cli.calibration.adjustment import LeastSquares, minimize
 from projservo_cli.calibration.detections import Detections
-from projservo_cli.calibration.prediction import Parameters, displacements
+from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.geometry.displacements import displacements
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
 from projservo_cli.records import Model
 from tests.calibration.simulated_robot import Robot, around, random_robot

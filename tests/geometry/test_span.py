@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.algebra import invariant_rotations, mat
+from projservo_cli.geometry.algebra import mat
+from projservo_cli.geometry.displacements import invariant_rotations
 from projservo_cli.geometry.kinematics import backward, forward_kinematics, joint_operators
 from projservo_cli.geometry.mechanisms import Seen, in_span, joint_motion, make_span, reach, workspace
 from projservo_cli.records import WorkFailed

@@ -13,11 +13,11 @@ from projservo_cli.calibration import predict
 from projservo_cli.calibration.prediction import (
     Parameters,
     dense_pixel_changes,
-    displacements,
     image_points,
     moved_points,
     parameters_from,
 )
+from projservo_cli.geometry.displacements import displacements
 from projservo_cli.monitoring import statistics
 from projservo_cli.monitoring.accuracy import Posture
 from projservo_cli.monitoring.frame_pairs import FramePair

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.algebra import exp_rotation
+from projservo_cli.geometry.displacements import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import PRISMATIC, REVOLUTE
 from projservo_cli.report import style

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from projservo_cli.geometry.displacements import twists
 from projservo_cli.geometry.kinematics import joint_operators
-from projservo_cli.geometry.rigid import twists
 from projservo_cli.metric.frame import Metric, links
 from projservo_cli.records import MM, VIEWS, FloatArray
 from projservo_cli.report import style

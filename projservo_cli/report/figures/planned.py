@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import exp_rotation
+from projservo_cli.geometry.displacements import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.geometry.stereo import triangulate_points

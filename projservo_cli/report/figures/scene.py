@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.geometry.rigid import homogeneous
 from projservo_cli.image_size import image_corners
 from projservo_cli.records import PRISMATIC, FloatArray
 from projservo_cli.report import style
