@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
 
 from projservo_cli.files import text_of
+from projservo_cli.geometry.displacements import twists
 from projservo_cli.records import FloatArray, InputError
 
 Number = Annotated[float, Strict()]
@@ -137,11 +138,7 @@ def _twist(where: str, screw: _Screw) -> FloatArray:
     w, v = np.array(screw.w), np.array(screw.v)
     for key, what in not_a_screw("R" if w.any() else "P", screw.w, screw.v):
         raise InputError(f"{where}: {key} {what}")
-    twist = np.zeros((4, 4))
     if not w.any():
-        twist[:3, 3] = v / np.linalg.norm(v)
-        return twist
+        return twists(np.r_[w, v / np.linalg.norm(v)])
     w = w / np.linalg.norm(w)
-    twist[:3, :3] = np.cross(np.eye(3), w)
-    twist[:3, 3] = v - w * (w @ v)
-    return twist
+    return twists(np.r_[w, v - w * (w @ v)])

@@ -176,7 +176,7 @@ REGISTER = (
     _entry(
         "22",
         "Translation and rotation at once",
-        "control.direct.direct_two control.exact.exact",
+        "control.direct.direct_two control.direct.exact",
         "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit "
         "control/test_exact.py::test_the_centre_keeps_to_its_line",
         "exp(τĤ_t) exp(θĤ_s) = exp(τĤ_t + θĤ_s) holds only to first order, or where the translation is "

@@ -23,6 +23,7 @@ from projservo_cli.config.task import Goal as GoalSettings
 from projservo_cli.control.law import UNLIMITED, Gains
 from projservo_cli.detection import DICTIONARY
 from projservo_cli.display import About
+from projservo_cli.geometry.displacements import twists
 from projservo_cli.records import (
     CORNERS,
     NO_LENS,
@@ -33,8 +34,7 @@ from projservo_cli.records import (
     position_limits,
 )
 from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings, SpeedLimits
-from projservo_cli.simulation import dh
-from projservo_cli.simulation.arm import Arm, twist
+from projservo_cli.simulation.arm import Arm, Link, dh_twists
 from projservo_cli.simulation.faults import (
     CameraMoved,
     Events,
@@ -46,7 +46,7 @@ from projservo_cli.simulation.faults import (
     StuckEncoder,
 )
 from projservo_cli.simulation.mjcf import files_named
-from projservo_cli.simulation.scene import Scene, Tag, lens_of
+from projservo_cli.simulation.rendering import Scene, Tag, lens_of
 from projservo_cli.simulation.workspace import Truth, Turn, look_at, metric_camera
 from projservo_cli.stages.given import (
     CalibrationInputs,
@@ -395,17 +395,17 @@ def _arm(described: RobotSettings) -> Arm:
     limits = position_limits(*np.array(described.ranges, dtype=np.float64).T.copy())
     if described.screws is not None:
         screws = described.screws
-        twists = np.array([twist(joint.w, joint.v) for joint in screws.joints])
+        H_hat = twists(np.array([[*joint.w, *joint.v] for joint in screws.joints], dtype=np.float64))
         q_reference = np.array(screws.reference.values(kinds))
-        return Arm(twists, types, q_reference, np.array(screws.base_tool), limits)
+        return Arm(H_hat, types, q_reference, np.array(screws.base_tool), limits)
     assert described.dh is not None
     table = described.dh
     links = [
-        dh.Link(row.type, math.radians(row.theta_deg), row.d_m, row.a_m, math.radians(row.alpha_deg))
+        Link(row.type, math.radians(row.theta_deg), row.d_m, row.a_m, math.radians(row.alpha_deg))
         for row in table.joints
     ]
-    twists, base_tool = dh.screws_of(links, np.array(table.tool), modified=table.convention == "modified")
-    return Arm(twists, types, np.zeros(len(kinds)), base_tool, limits)
+    H_hat, base_tool = dh_twists(links, np.array(table.tool), modified=table.convention == "modified")
+    return Arm(H_hat, types, np.zeros(len(kinds)), base_tool, limits)
 
 
 @lru_cache(maxsize=32)

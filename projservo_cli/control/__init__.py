@@ -3,9 +3,8 @@
 Run files and tables know a law by its name, compiled code by its code in ``laws``.
 """
 
-from projservo_cli.control import exact
 from projservo_cli.control.classical import blockwise, euclidean_points, stacked
-from projservo_cli.control.direct import direct_three, direct_two
+from projservo_cli.control.direct import direct_three, direct_two, exact
 from projservo_cli.control.law import LOST, OK, Gains, Law, State, limit_speed
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.lens import distorts, undistort_into
@@ -49,7 +48,7 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
     elif code == _EUCLIDEAN_POINTS:
         status = euclidean_points(model, task, gains, seen, q, state)
     else:
-        status = exact.exact(model, task, gains, seen, q, state)
+        status = exact(model, task, gains, seen, q, state)
     if following(task.reference):
         limited = code == _EXACT
         if status != LOST and on_joint_path(task.reference, float(state.clock[0])):

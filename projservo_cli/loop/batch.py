@@ -24,10 +24,10 @@ from projservo_cli.geometry.lens import undistort_into
 from projservo_cli.geometry.mechanisms import OWN, Span, make_span
 from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.metrics import Ended, Summary, summarize
-from projservo_cli.loop.step import CONVERGED, RUNNING, Limits, Log, new_log
+from projservo_cli.loop.run_metrics import Ended, Summary, summarize
+from projservo_cli.loop.verdicts import CONVERGED, RUNNING, Limits, Log, new_log
 from projservo_cli.records import FloatArray, JointLimits, Model
-from projservo_cli.simulation.ideal import Ends, Plant
+from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.task.body import NO_BODY, Body
 from projservo_cli.task.face import (
     FOUND,

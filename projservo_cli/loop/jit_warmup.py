@@ -13,11 +13,11 @@ from projservo_cli.control.law import ERRORS, new_state, pseudo_inverse, single_
 from projservo_cli.geometry.algebra import IDENTITY
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.geometry.mechanisms import Seen, reach
-from projservo_cli.loop.metrics import Ended, path_deviation, summarize
-from projservo_cli.loop.step import new_log
+from projservo_cli.loop.run_metrics import Ended, path_deviation, summarize
+from projservo_cli.loop.verdicts import new_log
 from projservo_cli.planning.margins import Reaching, carried_into, carrier_of, limits_alone, room_along
 from projservo_cli.records import JointLimits, Model
-from projservo_cli.simulation.ideal import Ends, Plant
+from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import NO_PARTS
 

@@ -1,4 +1,18 @@
-"""The closed loop in Python: any law on any plant, the same limits, counting and verdicts."""
+"""The closed loop in Python: any law on any plant, the same limits, counting and verdicts.
+
+Monitors end a run in this order. Each is given the verdict of those before it and returns its own:
+
+1. the fault monitor holds the robot where images contradict the calibration, and ends the run once it is
+   known why, before the law is asked;
+2. ``verdict_at``, which alone rules over the compiled loop too;
+3. the stall monitor, of a robot that may lag behind its set-points: it has ``converged`` once it stands,
+   and makes no progress where it stands still away from the goal;
+4. the execution monitor, of a plan that gives way to another one: it replans instead of ending the run;
+5. the fault monitor again: nothing ends while it is not known what images mean;
+6. ``bounded``, over the command of a run that goes on, and the execution monitor over its joint limit.
+
+``failed`` ends a run wherever a robot or a law of somebody else raises once it has begun.
+"""
 
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -11,10 +25,23 @@ from projservo_cli.control import command
 from projservo_cli.control.law import ERRORS, OK, Gains, Law, State, new_state
 from projservo_cli.geometry.jit import COMPILED, allocating
 from projservo_cli.geometry.mechanisms import make_span
-from projservo_cli.loop.monitors import Monitor, Monitored, Monitors
-from projservo_cli.loop.step import FAILED, RUNNING, WAITING, Command, Instant, Limits, Log, new_log, note
+from projservo_cli.loop.verdicts import (
+    FAILED,
+    FAULT_DETECTED,
+    RUNNING,
+    WAITING,
+    Command,
+    Instant,
+    Limits,
+    Log,
+    bounded,
+    new_log,
+    note,
+    verdict_at,
+)
 from projservo_cli.records import FloatArray, Model, WorkFailed
 from projservo_cli.robots.plugins import require_spelt
+from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.task.face import Task
 
 # Handing some forty arrays over to compiled code takes longer than a control step. They are handed over
@@ -64,6 +91,69 @@ OPTIONAL: dict[str, tuple[float, ...]] = {
 }
 
 
+class Monitored(Protocol):
+    """Interface of a plant for the fault monitor."""
+
+    plant: Plant  # the truth, or its calibrated model: image size, joint limits
+    # why the run cannot go on, the images no longer agree with the calibration or something failed; empty
+    # where it can
+    disturbance: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether images disagree with the calibration so that nothing should move."""
+
+    @property
+    def pending(self) -> bool:
+        """Tell whether images disagreed and have not agreed since."""
+
+    def give_up(self) -> None:
+        """Return the maximum-likelihood fault without further frames."""
+
+
+class Monitor(Protocol):
+    """Interface of a monitor, which may change the verdict and the joint velocity (n,)."""
+
+    def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
+        """Return the new verdict."""
+
+
+class Monitors(NamedTuple):
+    """Monitors of a run, asked in the order that the module states."""
+
+    plant: Monitored
+    limits: Limits
+    stall: Monitor | None = None
+    execution: Monitor | None = None
+
+    def of_faults(self, k: int) -> int:
+        """Verdict before the law is asked: ``RUNNING`` where it may be."""
+        if self.plant.disturbance:
+            return FAULT_DETECTED
+        if not self.plant.holds:
+            return RUNNING
+        if k < self.limits.max_steps:
+            return WAITING
+        self.plant.give_up()
+        return FAULT_DETECTED
+
+    def of_instant(self, log: Log, k: int, now: Instant) -> int:
+        """Verdict of an instant at which the law was asked."""
+        verdict = verdict_at(log, k, now, self.limits)
+        for monitor in (self.stall, self.execution):
+            if monitor is not None:
+                verdict = monitor.ruled(log, k, verdict, now.q_dot)
+        waits = self.plant.pending and k < self.limits.max_steps
+        return WAITING if waits and verdict != RUNNING else verdict
+
+    def of_command(self, log: Log, k: int, asked: Command) -> int:
+        """Verdict of a command, which is bounded."""
+        verdict = bounded(log, k, asked, self.plant.plant, self.limits)
+        if verdict != RUNNING and self.execution is not None:
+            verdict = self.execution.ruled(log, k, verdict, asked.q_dot)
+        return verdict
+
+
 class LoopLaw(Protocol):
     """Interface of a law for the Python loop; it may also have the attributes of ``OPTIONAL``."""
 
@@ -82,7 +172,7 @@ class _LoopPlant(Monitored, Protocol):
     q: FloatArray  # (n,) joints as they are, or as they were read
     H: FloatArray  # (4, 4) displacement of the face from the reference
     hidden: FloatArray
-    in_front: bool  # hidden, in_front: as of ``simulation.ideal.observe``, when last observed
+    in_front: bool  # hidden, in_front: as of ``simulation.analytic_plant.observe``, when last observed
     markers: int  # how many are observed, those of the face first
     takes_parts: bool  # whether a long step is sent in the parts that the law split it into
     weight: FloatArray | None  # (2, markers) of the pixels last observed in a fit; None for one

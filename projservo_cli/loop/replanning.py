@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 
 from projservo_cli.loop.python import BuiltInLaw
-from projservo_cli.loop.settling import StallMonitor
-from projservo_cli.loop.step import (
+from projservo_cli.loop.stall_monitor import StallMonitor
+from projservo_cli.loop.verdicts import (
     CONVERGED,
     DIVERGED,
     JOINT_LIMIT,

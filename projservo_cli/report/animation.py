@@ -22,8 +22,8 @@ from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
 from projservo_cli.report.figures.scene import plant_pyramids, skeleton
 from projservo_cli.report.page import template
 from projservo_cli.report.report_data import PAGE_FILE, VIEWS, title
+from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import Arm
-from projservo_cli.simulation.ideal import Plant
 from projservo_cli.task.face import center_of
 
 MOST_INSTANTS = 60

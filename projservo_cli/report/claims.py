@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.laws import title_of
-from projservo_cli.loop.step import plateau_stretch
+from projservo_cli.loop.verdicts import plateau_stretch
 from projservo_cli.records import PRISMATIC, BoolArray, FloatArray, Trace
 from projservo_cli.report.figures.path_deviation import study_numbers
 from projservo_cli.report.report_data import (

@@ -29,8 +29,8 @@ from projservo_cli.records import (
     Plan,
     Trace,
 )
+from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import Arm
-from projservo_cli.simulation.ideal import Plant
 from projservo_cli.store import Run
 from projservo_cli.task.trajectory import Trajectory
 

@@ -18,9 +18,8 @@ from projservo_cli.calibration.detections import per_rad
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import PRISMATIC, ByteArray, FloatArray
 from projservo_cli.simulation.arm import Arm
-from projservo_cli.simulation.cameras import Frames
 from projservo_cli.simulation.physics import Physics
-from projservo_cli.simulation.scene import Scene, rendered_model
+from projservo_cli.simulation.rendering import Frames, Scene, rendered_model
 from projservo_cli.simulation.workspace import Truth
 
 # Joints are worked out this often at least, s, and taken as straight lines between.

@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, WorkFailed
 from projservo_cli.simulation.mjcf import mujoco
-from projservo_cli.simulation.scene import RenderedModel
+from projservo_cli.simulation.rendering import RenderedModel
 
 _STEP_S = 0.002  # longest step of the integration
 _RATE = 100.0  # 1/s, at which a servo that need not sag takes back an error

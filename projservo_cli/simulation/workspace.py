@@ -13,9 +13,8 @@ from projservo_cli.geometry.displacements import rigid
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.image_size import image_sizes, within_images
 from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model
-from projservo_cli.simulation.arm import Arm, about_axis, camera_center, roll_axis
-from projservo_cli.simulation.ideal import Ends
-from projservo_cli.simulation.inverse_kinematics import inverse_kinematics
+from projservo_cli.simulation.analytic_plant import Ends
+from projservo_cli.simulation.arm import Arm, about_axis, camera_center, inverse_kinematics, roll_axis
 from projservo_cli.task.face import center_of
 
 _EDGE_ON = math.cos(math.radians(70.0))  # of the angle to a camera from which tags are not found

@@ -22,6 +22,7 @@ from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
 from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints, OwnRobot
+from projservo_cli.simulation.analytic_plant import Plant, observe
 from projservo_cli.simulation.faults import (
     Events,
     FaultyRobot,
@@ -30,7 +31,6 @@ from projservo_cli.simulation.faults import (
     obstruction_of,
     robot_of,
 )
-from projservo_cli.simulation.ideal import Plant, observe
 from projservo_cli.stages.given import Contract, Driven
 from projservo_cli.stages.scenario import SERVO_NOISE, RunScenario
 

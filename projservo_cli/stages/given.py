@@ -14,7 +14,7 @@ from projservo_cli.records import FloatArray
 from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings
 from projservo_cli.simulation.arm import Arm
 from projservo_cli.simulation.faults import Events, SimulatedRobot
-from projservo_cli.simulation.scene import Scene
+from projservo_cli.simulation.rendering import Scene
 from projservo_cli.simulation.workspace import Truth, Turn
 from projservo_cli.task.trajectory import Trajectory
 

@@ -17,7 +17,7 @@ from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import BODY_LAWS, LAW_SPECS
-from projservo_cli.loop.step import Limits
+from projservo_cli.loop.verdicts import Limits
 from projservo_cli.planning.margins import Demands
 from projservo_cli.records import (
     CORNERS,
@@ -31,9 +31,9 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.client import weights
 from projservo_cli.robots.settings import Joints, limit_passed
+from projservo_cli.simulation.analytic_plant import NO_PINS, Ends, Plant
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.faults import observed_in_frames
-from projservo_cli.simulation.ideal import NO_PINS, Ends, Plant
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.given import GoalImages, PlanInputs, ReachingTask, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body

@@ -14,7 +14,7 @@ from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.laws import BODY_LAWS, CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Setting, Trials
 from projservo_cli.loop.compiled import Course
-from projservo_cli.loop.step import FAILED, RUNNING, VERDICTS
+from projservo_cli.loop.verdicts import FAILED, RUNNING, VERDICTS
 from projservo_cli.records import Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.given import PlanInputs, ServoInputs

@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.control.law import LOST, OK, SINGULAR
 from projservo_cli.geometry.kinematics import beyond_limits
-from projservo_cli.loop.step import (
+from projservo_cli.loop.verdicts import (
     BEHIND_CAMERA,
     CONVERGED,
     DIVERGED,

@@ -10,8 +10,8 @@ from projservo_cli.image_size import image_corners
 from projservo_cli.records import PRISMATIC, FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, ReportData, registered
+from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import camera_center
-from projservo_cli.simulation.ideal import Plant
 from projservo_cli.task.face import center_of
 
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face

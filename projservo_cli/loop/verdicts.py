@@ -1,6 +1,6 @@
 """One period of the loop without the law: limits, counting, verdict.
 
-Precedence of the verdicts of ``verdict_at`` at one instant, first match wins; ``loop.monitors`` states what
+Precedence of the verdicts of ``verdict_at`` at one instant, first match wins; ``loop.python`` states what
 rules before and after it:
 
 1. ``behind camera``: a marker is not in front of a camera.
@@ -28,7 +28,7 @@ from projservo_cli.control.law import LOST, SINGULAR, limit_speed
 from projservo_cli.geometry.jit import merged
 from projservo_cli.geometry.kinematics import beyond_limits, from_border
 from projservo_cli.records import FloatArray, IntArray
-from projservo_cli.simulation.ideal import Plant
+from projservo_cli.simulation.analytic_plant import Plant
 
 RUNNING = -1
 WAITING = -3  # for lost markers; no verdict of a run

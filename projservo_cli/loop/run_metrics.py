@@ -6,9 +6,9 @@ from typing import NamedTuple
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, sub, vec, vec_into
 from projservo_cli.geometry.jit import composed, merged, njit
 from projservo_cli.geometry.kinematics import forward
-from projservo_cli.loop.step import CONVERGED, Log
+from projservo_cli.loop.verdicts import CONVERGED, Log
 from projservo_cli.records import MM, FloatArray
-from projservo_cli.simulation.ideal import Ends, Plant, shows_face
+from projservo_cli.simulation.analytic_plant import Ends, Plant, shows_face
 from projservo_cli.task.face import center_of
 
 _ROUND_OFF = 1e-9  # rad or m, by which a joint at its limit may seem to be beyond
