@@ -23,9 +23,8 @@ import numpy as np
 from scipy.linalg import expm, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
-from projservo_cli.calibration.detections import Detections, per_block
+from projservo_cli.calibration.detections import RAYLEIGH, Detections, cauchy_weights, per_block
 from projservo_cli.calibration.prediction import CAMERA, Parameters, image_points
-from projservo_cli.calibration.robust import RAYLEIGH, cauchy_weights
 from projservo_cli.geometry.displacements import cross_matrix
 from projservo_cli.geometry.lens import TERMS, distort
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray

@@ -1,6 +1,8 @@
 """Detections of a calibration as flat lists, and refusals of data without motion or without two dimensions.
 
-The checks need joint readings, marker numbers and pixels, and no geometry yet.
+The checks need joint readings, marker numbers and pixels, and no geometry yet. At the end stand deviations
+and weights of residuals. Fits by reweighting solve other equations in each round, in closed form and many at
+once, so that each keeps its own loop: two-view geometry, rigid motions, axis points and the adjustment.
 """
 
 import dataclasses
@@ -9,13 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.calibration.robust import MAD
 from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Observation, WorkFailed
 
 # Difference, rad or m, below which two joint readings are equal: far below any encoder's resolution.
 SAME_READING = 1e-7
 # Minimum pixel noise, px per coordinate: exact images have round-off.
 MIN_SIGMA = 1e-4
+# Median of |x| over the standard deviation of a normal variable.
+MAD = 0.6744897501960817
+# Median of the length of a two-dimensional normal vector of unit deviation.
+RAYLEIGH = 1.1774100225154747
 # Distance from the reference at which predictions are assessed, revolute joints, rad.
 REACH_RAD = 0.5
 # Distance from the reference at which predictions are assessed, prismatic joints, m.
@@ -425,3 +430,13 @@ def _require_no_line(detections: Detections, sigma: float) -> None:
                 off.append(across**2 > sigma**2 * chdtri(len(pixels) - 2, _OFF_LINE_TAIL))
     if off and np.mean(off) < 0.5:
         raise WorkFailed(ON_A_LINE)
+
+
+def deviation(residual: FloatArray, floor: float) -> float:
+    """Robust standard deviation of residuals about zero, at least ``floor``."""
+    return max(float(np.median(np.abs(residual))) / MAD, floor)
+
+
+def cauchy_weights(square: FloatArray) -> FloatArray:
+    """Weights (…) of the Cauchy loss log(1 + x²), by the squares x² of residuals over its width."""
+    return np.asarray(1.0 / (1.0 + square))

@@ -12,14 +12,13 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
 from projservo_cli.calibration.adjustment import LeastSquares, fit_offsets, minimize
-from projservo_cli.calibration.detections import Detections
+from projservo_cli.calibration.detections import RAYLEIGH, Detections
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution, fit_from, median_px
 from projservo_cli.calibration.initialization import Search, starting_markers, starts, stationary
 from projservo_cli.calibration.lens_estimation import undistorted
 from projservo_cli.calibration.model_error import image_motions
 from projservo_cli.calibration.prediction import CAMERA, Parameters
-from projservo_cli.calibration.robust import RAYLEIGH
 from projservo_cli.geometry.displacements import cross_matrix
 from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray, WorkFailed
 

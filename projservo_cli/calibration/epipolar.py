@@ -14,8 +14,7 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-from projservo_cli.calibration.detections import MIN_SIGMA, Detections, medians
-from projservo_cli.calibration.robust import deviation
+from projservo_cli.calibration.detections import MIN_SIGMA, Detections, deviation, medians
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed

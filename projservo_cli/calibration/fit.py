@@ -10,12 +10,11 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.calibration.adjustment import JointErrors, LeastSquares, fit_offsets, minimize
-from projservo_cli.calibration.detections import MAX_JUDGED, even_choice, medians, per_rad
+from projservo_cli.calibration.detections import MAX_JUDGED, RAYLEIGH, even_choice, medians, per_rad
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.initialization import Nominal, Search, starting_markers, starts
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
 from projservo_cli.calibration.prediction import Parameters
-from projservo_cli.calibration.robust import RAYLEIGH
 from projservo_cli.calibration.triangulation import Tracks
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.detections import Detections, per_block
+from projservo_cli.calibration.detections import Detections, cauchy_weights, deviation, per_block
 from projservo_cli.calibration.epipolar import (
     Epipolar,
     ImageFrame,
@@ -19,7 +19,6 @@ from projservo_cli.calibration.epipolar import (
     metric_guesses,
 )
 from projservo_cli.calibration.prediction import Parameters
-from projservo_cli.calibration.robust import cauchy_weights, deviation
 from projservo_cli.geometry.displacements import aligned, cross_matrix
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import (

@@ -13,9 +13,8 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import stdtrit
 
-from projservo_cli.calibration.detections import per_rad
+from projservo_cli.calibration.detections import MAD, per_rad
 from projservo_cli.calibration.prediction import joint_derivative, predict
-from projservo_cli.calibration.robust import MAD
 from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, Observation
 
 # Minimum time offset searched, s: stamps of another clock may be early.
