@@ -26,7 +26,7 @@ from projservo_cli.geometry.algebra import (
     vec_into,
 )
 from projservo_cli.geometry.displacements import composed_angle, composed_operator
-from projservo_cli.geometry.jit import composed, internal, merged, njit
+from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, least_squares
 from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
 from projservo_cli.geometry.lens import undistort_pixel
@@ -175,7 +175,7 @@ def reset(state: State) -> None:
     state.clock[0] = 0.0
 
 
-@composed
+@inline
 def make_split(state: State) -> Split:
     """The arrays of a state in which the task is partitioned."""
     return Split(
@@ -350,8 +350,8 @@ def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, 
     for i in range(operators.shape[0]):
         operator = mat(operators[i])
         for k in range(state.A.shape[0]):
-            vec_into(state.A_t[k], apply(operator, vec(state.A[k])))
-            _, _, u_dot, v_dot = image_velocity(model.P[view], vec(state.A[k]), vec(state.A_t[k]))
+            A = vec(state.A[k])
+            _, _, u_dot, v_dot = image_velocity(model.P[view], A, apply(operator, A))
             system.B[i, first + 2 * k] = u_dot
             system.B[i, first + 2 * k + 1] = v_dot
     for k in range(state.A.shape[0]):

@@ -1,4 +1,4 @@
-"""JIT compilation of the mathematics: one decorator, and a cache that never serves stale code.
+"""JIT compilation of the mathematics: its decorators, and a cache that never serves stale code.
 
 Numba checks cached machine code against the file of the function alone, and would miss an edited helper in
 another file. The cache folder therefore carries a hash of the sources of all compiled functions and of their
@@ -13,18 +13,17 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast, overload
 
 import numba
 import numpy as np
 from numba.core.caching import UserProvidedCacheLocator
 from numba.core.registry import CPUDispatcher
-from numba.extending import register_jitable
 
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
 
-_DECORATED = re.compile(rb"^@(?:allocating|composed|inline|internal|merged|njit)$", re.MULTILINE)
+_DECORATED = re.compile(rb"^@(?:inline|internal|merged|njit)\b", re.MULTILINE)
 _IMPORT = re.compile(rb"^\s*from projservo_cli(?:\.([\w.]+))? import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 
 
@@ -129,9 +128,17 @@ _OPTIONS: dict[str, Any] = {
 _UNCACHED = {name: value for name, value in _OPTIONS.items() if name != "cache"}
 
 
-def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a function that allocates nothing and may be called from Python."""
-    return cast(Callable[_Params, _Result], numba.njit(**_OPTIONS)(function))
+@overload
+def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]: ...
+@overload
+def njit(*, allocates: bool) -> Callable[[Callable[_Params, _Result]], Callable[_Params, _Result]]: ...
+def njit(function: Any = None, *, allocates: bool = False) -> Any:
+    """Compile a function that may be called from Python.
+
+    allocates : whether it makes arrays, as a structure of the compiler for what it keeps.
+    """
+    compiled = numba.njit(**{**_OPTIONS, "_nrt": allocates})
+    return compiled if function is None else compiled(function)
 
 
 class _Internal(CPUDispatcher):
@@ -167,21 +174,12 @@ def internal(function: Callable[_Params, _Result], **given: Any) -> Callable[_Pa
     return cast(Callable[_Params, _Result], dispatcher)
 
 
-def allocating(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a function that allocates arrays, for sweeps that take milliseconds a call."""
-    return cast(Callable[_Params, _Result], numba.njit(**{**_OPTIONS, "_nrt": True})(function))
-
-
-def composed(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a function as part of the compiled ones that call it.
-
-    Python interprets it, and it calls compiled functions, so a single run needs their machine code alone.
-    """
-    return register_jitable(**_UNCACHED)(function)
-
-
 def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a small helper that the optimiser merges into its callers; Python interprets it."""
+    """Compile a helper that the optimiser merges into its callers; Python interprets it.
+
+    Interpreted, a function of few calls, as of the begin of a run, needs the machine code of what it calls
+    alone.
+    """
     return internal(function, forceinline=True)
 
 

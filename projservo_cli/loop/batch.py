@@ -18,7 +18,7 @@ from projservo_cli.control.law import (
     reset,
 )
 from projservo_cli.geometry.algebra import as_array
-from projservo_cli.geometry.jit import composed, merged, njit
+from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.lens import undistort_into
 from projservo_cli.geometry.mechanisms import OWN, Span, make_span
@@ -138,7 +138,7 @@ def begin(
     return state, parts, arrives
 
 
-@composed
+@inline
 def _first_parts(
     model: Model, task: Task, s: FloatArray, q_start: FloatArray, state: State
 ) -> tuple[int, Parts]:
@@ -149,7 +149,7 @@ def _first_parts(
     return FOUND if parts.found else NOT_UNIQUE, parts
 
 
-@composed
+@inline
 def _is_half_turn(theta_p: float) -> bool:
     """Whether the rotation within the plane is so near to half a turn that its sense must be chosen."""
     return math.pi - abs(theta_p) < _HALF_TURN_BAND
@@ -266,7 +266,7 @@ def _open(setting: Setting, images: FloatArray, desk: _Desk) -> tuple[int, float
     return status, parts.theta_p
 
 
-@composed
+@inline
 def _measured_into(setting: Setting, model: Model, images: FloatArray, desk: _Desk, task: Task) -> int:
     """Measure a task from images (2, 2, b, 2) at its start and goal, px; return the verdict."""
     for view in range(2):

@@ -23,7 +23,7 @@ from numba.experimental import structref
 
 from projservo_cli.control import command
 from projservo_cli.control.law import ERRORS, OK, Gains, Law, State, new_state
-from projservo_cli.geometry.jit import COMPILED, allocating
+from projservo_cli.geometry.jit import COMPILED, njit
 from projservo_cli.geometry.mechanisms import make_span
 from projservo_cli.loop.verdicts import (
     FAILED,
@@ -66,13 +66,13 @@ else:
     structref.define_proxy(_Bound, _BoundType, ("law", "state"))
 
 
-@allocating
+@njit(allocates=True)
 def _bind(law: Law, state: State) -> Any:
     """Scratch memory of a law, whose arrays are shared."""
     return _Bound(law, state)
 
 
-@allocating
+@njit(allocates=True)
 def _bound_command(bound: Any, s: FloatArray, q: FloatArray) -> int:
     """One command of the bound law, as of ``command``: the status, the rest is written to the state."""
     return command(bound.law, s, q, bound.state)

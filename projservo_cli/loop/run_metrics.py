@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, sub, vec, vec_into
-from projservo_cli.geometry.jit import composed, merged, njit
+from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.loop.verdicts import CONVERGED, Log
 from projservo_cli.records import MM, FloatArray
@@ -116,7 +116,7 @@ def _distance(A: Vec4, B: Vec4) -> float:
     return math.sqrt(dot(distance, distance))
 
 
-@composed
+@inline
 def angle_between(A: Mat4, B: Mat4) -> float:
     """Angle of the rotation from pose A to pose B, rad."""
     trace = (A[0] * B[0] + A[4] * B[4] + A[8] * B[8]) + (A[1] * B[1] + A[5] * B[5] + A[9] * B[9])

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.geometry import stereo
 from projservo_cli.geometry.algebra import Vec4, add, axpy, dot, meet, scale, sub, unit, vec
-from projservo_cli.geometry.jit import composed, merged, njit
+from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, points_into
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
@@ -109,7 +109,7 @@ def face_plane(A: FloatArray, order: IntArray, A_c: Vec4) -> Vec4:
     return unit(total)
 
 
-@composed
+@inline
 def _order_into(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     """Order the markers around their midpoint; False if they lie on one line.
 
@@ -146,7 +146,7 @@ def _order_into(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     return True
 
 
-@composed
+@inline
 def _longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
     """Longest component perpendicular to an axis, if any, of the offsets of points (m, 4) from the middle."""
     size = dot(axis, axis)
@@ -177,7 +177,7 @@ def _require_three(m: int) -> None:
         raise WorkFailed(f"a face of {m} markers (3 required): add markers to markers.face")
 
 
-@composed
+@inline
 def task_into(
     model: Model, images: FloatArray, task: Task, A: FloatArray, angle: FloatArray
 ) -> tuple[int, int]:

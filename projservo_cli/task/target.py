@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import mul
 from projservo_cli.geometry.displacements import translation
-from projservo_cli.geometry.jit import composed
+from projservo_cli.geometry.jit import inline
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, operators_at, project
 from projservo_cli.geometry.lens import undistort
@@ -78,7 +78,7 @@ class TaskImages(NamedTuple):
         return task
 
 
-@composed
+@inline
 def body_task_into(
     model: Model, q_start: FloatArray, images: FloatArray, task: Task, split: Split, normal: FloatArray
 ) -> tuple[int, int]:
