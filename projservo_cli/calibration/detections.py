@@ -11,7 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Observation, WorkFailed
+from projservo_cli.records import (
+    BoolArray,
+    FloatArray,
+    InputError,
+    IntArray,
+    Observation,
+    WorkFailed,
+    prismatic_of,
+)
 
 # Difference, rad or m, below which two joint readings are equal: far below any encoder's resolution.
 SAME_READING = 1e-7
@@ -91,7 +99,7 @@ class Detections:
         present, marker_of_present = np.unique(marker_of, return_inverse=True)
         return cls(
             q=np.array(observation.q, dtype=np.float64),
-            prismatic=np.array([letter == "P" for letter in letters]),
+            prismatic=prismatic_of(letters),
             pose=observation.pose,
             marker=observation.marker[present],
             pose_of=pose_of,

@@ -45,7 +45,7 @@ from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.calibration.undecided import require_poses
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import ImageSize, border_distance, image_sizes
-from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation
+from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation, letters_of
 
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
@@ -500,7 +500,7 @@ def _record(
     return Calibration(
         method=method,
         source="",
-        joint_types="".join("P" if slides else "R" for slides in detections.prismatic),
+        joint_types=letters_of(detections.prismatic),
         usable=verdict.usable,
         reason=verdict.reason,
         advice=(f"{moved}: images that disagree are rejected; fix the cameras", *verdict.advice)

@@ -22,14 +22,13 @@ from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.displacements import aligned, cross_matrix
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import (
-    PRISMATIC,
-    REVOLUTE,
     BoolArray,
     FloatArray,
     InputError,
     IntArray,
     Model,
     WorkFailed,
+    letters_of,
 )
 
 Progress = Callable[[str, int, int], None]
@@ -419,14 +418,14 @@ class Nominal:
     @property
     def joint_types(self) -> str:
         """One letter a joint, R or P."""
-        return "".join("R" if H_hat[:3, :3].any() else "P" for H_hat in self.H_hat)
+        return letters_of(not H_hat[:3, :3].any() for H_hat in self.H_hat)
 
     def start(self, detections: Detections, q_reference: FloatArray) -> Parameters:
         """Initial parameters for detections, about their reference joints (n,), rad or m.
 
         Raises InputError if the joint types differ, or a detected marker is missing.
         """
-        own, letters = self.joint_types, "".join("P" if slides else "R" for slides in detections.prismatic)
+        own, letters = self.joint_types, letters_of(detections.prismatic)
         if own != letters:
             raise InputError(
                 f"{self.where}: its joints are {own}, those of the data {letters}; "
@@ -438,8 +437,8 @@ class Nominal:
                 f"{self.where}: marker {missing[0]} of the data is not in it; add the marker (marker_numbers "
                 "says which is which), or omit --init"
             )
-        types = np.where(detections.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
-        model = Model(self.P, self.H_hat, types, self.q_reference, np.array([0.0, 0.0, 0.0, 1.0]))
+        a_inf = np.array([0.0, 0.0, 0.0, 1.0])
+        model = Model(self.P, self.H_hat, detections.prismatic, self.q_reference, a_inf)
         column = {int(number): j for j, number in enumerate(self.marker)}
         M = self.M[[column[int(number)] for number in detections.marker]]
         M = M @ forward_kinematics(model, q_reference).T

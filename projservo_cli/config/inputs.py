@@ -27,11 +27,10 @@ from projservo_cli.geometry.displacements import twists
 from projservo_cli.records import (
     CORNERS,
     NO_LENS,
-    PRISMATIC,
-    REVOLUTE,
     FloatArray,
     InputError,
     position_limits,
+    prismatic_of,
 )
 from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings, SpeedLimits
 from projservo_cli.simulation.arm import Arm, Link, dh_twists
@@ -391,13 +390,13 @@ def arm_of(config: Config) -> Arm | None:
 def _arm(described: RobotSettings) -> Arm:
     """Arm of screws, or of a Denavit–Hartenberg table, whose reference is all joints zero."""
     kinds = described.joint_types
-    types = np.array([PRISMATIC if kind == "P" else REVOLUTE for kind in kinds], dtype=np.int64)
+    prismatic = prismatic_of(kinds)
     limits = position_limits(*np.array(described.ranges, dtype=np.float64).T.copy())
     if described.screws is not None:
         screws = described.screws
         H_hat = twists(np.array([[*joint.w, *joint.v] for joint in screws.joints], dtype=np.float64))
         q_reference = np.array(screws.reference.values(kinds))
-        return Arm(H_hat, types, q_reference, np.array(screws.base_tool), limits)
+        return Arm(H_hat, prismatic, q_reference, np.array(screws.base_tool), limits)
     assert described.dh is not None
     table = described.dh
     links = [
@@ -405,7 +404,7 @@ def _arm(described: RobotSettings) -> Arm:
         for row in table.joints
     ]
     H_hat, base_tool = dh_twists(links, np.array(table.tool), modified=table.convention == "modified")
-    return Arm(H_hat, types, np.zeros(len(kinds)), base_tool, limits)
+    return Arm(H_hat, prismatic, np.zeros(len(kinds)), base_tool, limits)
 
 
 @lru_cache(maxsize=32)

@@ -9,13 +9,13 @@ from projservo_cli.geometry.displacements import rotation, rotation_and_inverse,
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.image_size import BEHIND
-from projservo_cli.records import NO_LENS, PRISMATIC, FloatArray, Model
+from projservo_cli.records import NO_LENS, FloatArray, Model
 
 
 @internal
-def _joint_displacement(H_hat: Mat4, joint_type: int, q: float) -> Mat4:
+def _joint_displacement(H_hat: Mat4, prismatic: bool, q: float) -> Mat4:
     """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5)."""
-    if joint_type == PRISMATIC:
+    if prismatic:
         return translation(H_hat, q)
     return rotation(H_hat, q)
 
@@ -26,7 +26,7 @@ def forward(model: Model, q: FloatArray) -> Mat4:
     H = IDENTITY
     for i in range(q.shape[0]):
         amount = float(q[i]) - float(model.q_reference[i])
-        H = mul(H, _joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], amount))
+        H = mul(H, _joint_displacement(mat(model.H_hat_0[i]), model.prismatic[i], amount))
     return H
 
 
@@ -36,7 +36,7 @@ def backward(model: Model, q: FloatArray) -> Mat4:
     H = IDENTITY
     for i in range(q.shape[0]):
         amount = float(q[i]) - float(model.q_reference[i])
-        H = mul(_joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], -amount), H)
+        H = mul(_joint_displacement(mat(model.H_hat_0[i]), model.prismatic[i], -amount), H)
     return H
 
 
@@ -46,7 +46,7 @@ def forward_between(model: Model, q: FloatArray, i: int, x: float) -> Mat4:
     H = IDENTITY
     for l in range(q.shape[1]):
         amount = (1.0 - x) * float(q[i, l]) + x * float(q[i + 1, l]) - float(model.q_reference[l])
-        H = mul(H, _joint_displacement(mat(model.H_hat_0[l]), model.joint_types[l], amount))
+        H = mul(H, _joint_displacement(mat(model.H_hat_0[l]), model.prismatic[l], amount))
     return H
 
 
@@ -65,8 +65,8 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
         mat_into(H_hat[i], mul(mul(H, operator), H_inverse))
         amount = float(q[i]) - float(model.q_reference[i])
         if i == n - 1:
-            H = mul(H, _joint_displacement(operator, model.joint_types[i], amount))
-        elif model.joint_types[i] == PRISMATIC:
+            H = mul(H, _joint_displacement(operator, model.prismatic[i], amount))
+        elif model.prismatic[i]:
             H = mul(H, translation(operator, amount))
             H_inverse = mul(translation(operator, -amount), H_inverse)
         else:

@@ -46,7 +46,8 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     """Kernels and arguments of the types that all runs have; their values mean nothing."""
     q, O, matrices, order = np.zeros(4), np.zeros((2, 4)), np.zeros((4, 4, 4)), np.zeros(4, np.int64)
     limits = JointLimits(q, q, q, q)
-    model = Model(P=np.zeros((2, 3, 4)), H_hat_0=matrices, joint_types=order, q_reference=q, a_inf=q)
+    slides = np.zeros(4, np.bool_)
+    model = Model(P=np.zeros((2, 3, 4)), H_hat_0=matrices, prismatic=slides, q_reference=q, a_inf=q)
     task = Task(
         s_star=np.zeros((2, 4, 2)),
         A_star=matrices[0],

@@ -30,7 +30,7 @@ from projservo_cli.geometry.displacements import (
 )
 from projservo_cli.geometry.lens import TERMS, distort, undistort
 from projservo_cli.geometry.stereo import triangulate_points
-from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, WorkFailed, prismatic_of
 
 # Step of the differences that propagate covariances, in standard deviations of the calibration.
 _STEP = 0.05
@@ -402,7 +402,7 @@ class Metric:
     @property
     def prismatic(self) -> BoolArray:
         """Whether each joint (n,) is prismatic."""
-        return np.array([letter == "P" for letter in self.joint_types])
+        return prismatic_of(self.joint_types)
 
     @property
     def K(self) -> FloatArray:

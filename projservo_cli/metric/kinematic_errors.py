@@ -19,7 +19,7 @@ from projservo_cli.geometry.displacements import (
     screw_displacements,
 )
 from projservo_cli.metric.frame import Body, Metric, base_frame, base_joints, directions, in_frame
-from projservo_cli.records import MM, BoolArray, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import MM, BoolArray, FloatArray, InputError, IntArray, WorkFailed, letters_of
 
 # Errors of axes that any model has, of machining and assembly, rad and m.
 _LINK_STD = np.repeat([5e-4, 5e-4], 3)
@@ -72,7 +72,7 @@ class _ModelFit:
         self, metric: Metric, given: FloatArray, senses: IntArray | None = None, order: IntArray | None = None
     ) -> None:
         prismatic, n = metric.prismatic, len(metric.joint_types)
-        types = "".join("R" if w.any() else "P" for w in given[:, :3])
+        types = letters_of(not w.any() for w in given[:, :3])
         if types != metric.joint_types:
             raise InputError(
                 f"the model's joints are {types}, the calibrated ones {metric.joint_types}: choose the link "

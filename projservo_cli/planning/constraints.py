@@ -185,7 +185,7 @@ def twin_of(c: Constraints, j: int) -> Model:
     return Model(
         P=c.spread.P[j],
         H_hat_0=c.spread.H_hat[j],
-        joint_types=m.joint_types,
+        prismatic=m.prismatic,
         q_reference=m.q_reference,
         a_inf=m.a_inf,
         lens=m.lens,

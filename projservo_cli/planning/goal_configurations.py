@@ -26,7 +26,7 @@ from projservo_cli.planning.constraints import (
     twin_of,
 )
 from projservo_cli.planning.margins import IMAGE, straight_pixel
-from projservo_cli.records import PRISMATIC, FloatArray
+from projservo_cli.records import FloatArray
 
 # Maximum number of Newton steps from one start.
 STEPS = 400
@@ -224,7 +224,7 @@ def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bo
         maximum = 0.0
         for i in range(q.shape[0]):
             off = q[i] - base[g, i]
-            if c.model.joint_types[i] != PRISMATIC:
+            if not c.model.prismatic[i]:
                 off -= 2.0 * math.pi * math.floor(off / (2.0 * math.pi) + 0.5)
             maximum = max(maximum, abs(off))
         if maximum <= DISTINCT:
@@ -282,7 +282,7 @@ def _turns(c: Constraints, start: FloatArray, q: FloatArray, slack: FloatArray) 
 
     No more than ``TURNS`` to both sides of the nearest: of many joints that turn often there is no end.
     """
-    turn, slides = 2.0 * math.pi, c.model.joint_types == PRISMATIC
+    turn, slides = 2.0 * math.pi, c.model.prismatic
     half = np.where(slides, math.inf, 0.5 * turn)
     low = np.where(np.isfinite(c.limits.lower), c.limits.lower, start - half) - slack - q
     high = np.where(np.isfinite(c.limits.upper), c.limits.upper, start + half) + slack - q

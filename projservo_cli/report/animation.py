@@ -117,7 +117,7 @@ def _driven(robot: Arm, plant: Plant, markers: FloatArray, trace: Trace) -> _Dri
     selected, positions = _sample_times(trace.q), []
     for q in trace.q[selected]:
         H = forward_kinematics(plant.model, q)
-        polyline = skeleton(joint_operators(plant.model, q), robot.joint_types, (H @ robot.base_tool)[:3, 3])
+        polyline = skeleton(joint_operators(plant.model, q), robot.prismatic, (H @ robot.base_tool)[:3, 3])
         positions.append((polyline, (plant.M[plant.order] @ H.T)[:, :3], (markers @ H.T)[:, :3]))
     moved = (np.stack(kind) for kind in zip(*positions, strict=True))
     verdict, path = f"{trace.verdict}, {trace.steps} steps", _centers(plant, trace.q)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.displacements import rigid, twists
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.records import PRISMATIC, FloatArray, IntArray, JointLimits, Model, WorkFailed
+from projservo_cli.records import BoolArray, FloatArray, JointLimits, Model, WorkFailed
 
 METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 # Screws of a shift along z and of a turn about it.
@@ -20,7 +20,7 @@ class Arm(NamedTuple):
     """True kinematics of a serial robot in its base frame."""
 
     H_hat_0: FloatArray  # (n, 4, 4) twists at the reference, per rad or m
-    joint_types: IntArray  # (n,) ``REVOLUTE`` or ``PRISMATIC``
+    prismatic: BoolArray  # (n,) whether a joint is prismatic; it is revolute else
     q_reference: FloatArray  # (n,) rad or m
     base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
     limits: JointLimits  # of the joints
@@ -30,7 +30,7 @@ class Arm(NamedTuple):
         return Model(
             np.ascontiguousarray(P, dtype=np.float64),
             self.H_hat_0,
-            self.joint_types,
+            self.prismatic,
             self.q_reference,
             METRIC_A_INF.copy(),
         )
@@ -146,8 +146,8 @@ def _newton(robot: Arm, goal: FloatArray, q: FloatArray) -> FloatArray | None:
 def _unwind(robot: Arm, q: FloatArray, near: FloatArray) -> FloatArray:
     """Shift revolute joints by whole turns to within half a turn of ``near`` where limits allow."""
     turned = q.copy()
-    for i, kind in enumerate(robot.joint_types):
-        if kind == PRISMATIC:
+    for i, slides in enumerate(robot.prismatic):
+        if slides:
             continue
         candidates = q[i] + 2 * math.pi * np.arange(-4, 5)
         inside = candidates[(candidates >= robot.limits.lower[i]) & (candidates <= robot.limits.upper[i])]

@@ -16,7 +16,7 @@ import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.geometry.kinematics import joint_operators
-from projservo_cli.records import PRISMATIC, ByteArray, FloatArray
+from projservo_cli.records import ByteArray, FloatArray
 from projservo_cli.simulation.arm import Arm
 from projservo_cli.simulation.physics import Physics
 from projservo_cli.simulation.rendering import Frames, Scene, rendered_model
@@ -327,7 +327,7 @@ def full_reach(arm: Arm) -> float:
     rng = np.random.default_rng(0)
     low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
     postures = rng.uniform(low, high, (_POSTURES, len(low)))
-    turning = arm.joint_types != PRISMATIC
+    turning = ~arm.prismatic
     return float(max(np.linalg.norm(_tool_velocity(arm, q)[turning], axis=1).max() for q in postures))
 
 
@@ -392,7 +392,7 @@ class _Joints:
     def __init__(self, world: World, faults: Faults, moved: JointMoved | None) -> None:
         self.arm, self._moved = world.truth.robot, moved
         self._moved_at = math.inf if moved is None else moved.at_step * world.period
-        scale = per_rad(self.arm.joint_types == PRISMATIC)
+        scale = per_rad(self.arm.prismatic)
         self.tick = scale * (
             2.0 * math.pi / faults.encoder_counts_per_turn if faults.encoder_counts_per_turn else 0.0
         )
@@ -450,7 +450,7 @@ class _Joints:
         """Torque (n,) of gravity in each joint by the tool at joints (n,), 1 at full reach."""
         if not self._loaded:
             return np.zeros(len(q))
-        turning = self.arm.joint_types != PRISMATIC
+        turning = ~self.arm.prismatic
         return np.asarray(np.where(turning, -_tool_velocity(self.arm, q)[:, 2], 0.0) / self._reach)
 
 

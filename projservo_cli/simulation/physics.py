@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.records import PRISMATIC, FloatArray, InputError, WorkFailed
+from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.simulation.mjcf import mujoco
 from projservo_cli.simulation.rendering import RenderedModel
 
@@ -75,7 +75,7 @@ class Physics:
                 "disturbance.gravity_sag_deg: servos of robot.mjcf sag by their own gains: remove it, or set "
                 "plant.options.servo: position"
             )
-        turning = arm.joint_types != PRISMATIC
+        turning = ~arm.prismatic
         self._compensated = ~turning if sag > 0.0 else np.ones(len(q), dtype=np.bool_)
         inertia, load = self._heaviest(rendered)
         stiff = inertia * (_RATE / _LOOP_S if servo == "velocity" else _RATE**2)
@@ -204,7 +204,7 @@ class Physics:
         """Return the maximum inertia (n,) of each joint, kg m² or kg, and the maximum gravity torque, N m."""
         mj, rng, arm = mujoco(), np.random.default_rng(0), rendered.scene.arm
         low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
-        data, turning = rendered.begin(self._model, arm.q_reference), arm.joint_types != PRISMATIC
+        data, turning = rendered.begin(self._model, arm.q_reference), ~arm.prismatic
         unit, moved = np.eye(self._model.nv), np.zeros(self._model.nv)
         inertia, load = np.zeros(len(low)), 0.0
         for q in rng.uniform(low, high, (_POSTURES, len(low))):

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.canonical import File
 from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import undistort
-from projservo_cli.records import CORNERS, PRISMATIC, ByteArray, FloatArray, InputError, IntArray
+from projservo_cli.records import CORNERS, ByteArray, FloatArray, InputError, IntArray
 from projservo_cli.simulation.arm import Arm, roll_axis
 from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, no_gl, spec_of, tip_of
 
@@ -172,10 +172,10 @@ def _add_arm(spec: Any, arm: Arm) -> None:
     mj = mujoco()
     spec.compiler.degree = False
     points, axes = [np.zeros(3)], []
-    for twist, kind in zip(arm.H_hat_0, arm.joint_types, strict=True):
+    for twist, slides in zip(arm.H_hat_0, arm.prismatic, strict=True):
         w, v = np.array([twist[2, 1], twist[0, 2], twist[1, 0]]), twist[:3, 3]
-        axes.append(v if kind == PRISMATIC else w)
-        foot = points[-1] if kind == PRISMATIC else np.cross(w, v)
+        axes.append(v if slides else w)
+        foot = points[-1] if slides else np.cross(w, v)
         points.append(foot + axes[-1] * (axes[-1] @ (points[-1] - foot)))
     points.append(arm.base_tool[:3, 3])
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -184,7 +184,7 @@ def _add_arm(spec: Any, arm: Arm) -> None:
     for i, radius in enumerate(thickness):
         if i > 0:
             body = body.add_body(name=f"link {i}")
-            slides = arm.joint_types[i - 1] == PRISMATIC
+            slides = arm.prismatic[i - 1]
             body.add_joint(
                 name=f"joint {i}",
                 type=mj.mjtJoint.mjJNT_SLIDE if slides else mj.mjtJoint.mjJNT_HINGE,

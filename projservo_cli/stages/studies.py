@@ -17,7 +17,7 @@ from projservo_cli.geometry.displacements import (
     twist_exponential,
 )
 from projservo_cli.planning.margins import limits_alone
-from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.report.report_data import DIRECT, Studies
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
@@ -55,7 +55,7 @@ class Comparison:
         limits = self.scenario.limits
         speed = np.full(len(self.scenario.ends.q_start), math.inf)
         if limited:
-            prismatic = self.truth.robot.joint_types == PRISMATIC
+            prismatic = self.truth.robot.prismatic
             speed = np.where(prismatic, limits.speed, math.radians(STEP_LIMIT_DEG) / gains.period)
         scenario = replace(self.scenario, gains=gains, limits=limits._replace(speed=speed))
         return drive(scenario, self.sense, law, self.models[operators]).trace()
@@ -67,7 +67,7 @@ def projective_twin(model: Model) -> Model:
     return Model(
         np.ascontiguousarray(model.P @ H_PE),
         np.ascontiguousarray(inverse @ model.H_hat_0 @ H_PE),
-        model.joint_types,
+        model.prismatic,
         model.q_reference,
         model.a_inf @ H_PE,
         model.lens,

@@ -23,7 +23,7 @@ from projservo_cli.geometry.displacements import displacements
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import image_sizes, within_images
 from projservo_cli.laws import law_and_mode, names_of
-from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.source import source_hash
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.workspace import Truth
@@ -77,7 +77,7 @@ def random_tasks(
 def _poses(truth: Truth, q: FloatArray) -> FloatArray:
     """Displacements (k, 4, 4) from the reference at joints (k, n), [RH00] eq. (6) for many at once."""
     robot = truth.robot
-    E = displacements(robot.H_hat_0, robot.joint_types == PRISMATIC, q - robot.q_reference)
+    E = displacements(robot.H_hat_0, robot.prismatic, q - robot.q_reference)
     return np.swapaxes(moved_points(E, np.eye(4))[0], 1, 2)
 
 

@@ -12,7 +12,7 @@ from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, operators_at, project
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.geometry.mechanisms import make_span, workspace
-from projservo_cli.records import PRISMATIC, FloatArray, InputError, Model, Plan, WorkFailed
+from projservo_cli.records import FloatArray, InputError, Model, Plan, WorkFailed
 from projservo_cli.task.body import NO_BODY, SETTLED, Body, carry, fit_body
 from projservo_cli.task.face import (
     MISFIT_GOAL,
@@ -126,7 +126,7 @@ def followed(model: Model, task: Task, plan: Plan, period: float, rate: float) -
     until_next = np.append(np.diff(times), 0.0)
     _, _, _, s_next = _followed_at(model, task, plan, times + _DIFFERENCE * until_next)
     amplitudes = np.array([plan.tau, plan.theta_r, plan.theta_p])
-    room = np.zeros(0) if len(mu) else np.where(model.joint_types == PRISMATIC, _ROOM_M, _ROOM_RAD)
+    room = np.zeros(0) if len(mu) else np.where(model.prismatic, _ROOM_M, _ROOM_RAD)
     A, s, ahead = (np.ascontiguousarray(x) for x in (A, s, (s_next - s) / _DIFFERENCE))
     return task._replace(
         reference=Reference(

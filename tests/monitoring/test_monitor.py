@@ -73,7 +73,7 @@ def arm():
     config = configured("ur5", f"noise.calibration_px={SIGMA}")
     truth = truth_of(config)
     model = truth.model
-    scene = Parameters(model.P, model.H_hat_0, model.joint_types == 1, truth.M)
+    scene = Parameters(model.P, model.H_hat_0, model.prismatic, truth.M)
     return Arm(calibrate.run(config)[1], scene, model.q_reference, truth.image_size)
 
 

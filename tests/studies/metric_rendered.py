@@ -31,7 +31,7 @@ SEEDS = (1, 2, 3)
 def at_zero(truth):
     """Screws (n, 6) of the true arm at readings of zero."""
     robot = truth.robot
-    back = screw_displacements(screws(robot.H_hat_0), robot.joint_types == 1, -robot.q_reference)
+    back = screw_displacements(screws(robot.H_hat_0), robot.prismatic, -robot.q_reference)
     T, found = np.eye(4), []
     for H, E in zip(robot.H_hat_0, back, strict=True):
         found.append(screws(T @ H @ np.linalg.inv(T)))

@@ -90,7 +90,7 @@ def _data(report_data: Fit) -> Data:
         "position_std_mm": metric.position_std(q),
         "semi_axes": semi_axes,
         "factor": np.array(style.magnification(float(radius.max()), _SHOWN * extent)),
-        "robot": skeleton(joint_operators(arm, q[0]), arm.joint_types, tools[0]),
+        "robot": skeleton(joint_operators(arm, q[0]), arm.prismatic, tools[0]),
         "pyramids": pyramids(metric.body.P, rectangle(low, high), tools),
     }
 

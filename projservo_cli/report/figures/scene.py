@@ -7,7 +7,7 @@ import numpy as np
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.image_size import image_corners
-from projservo_cli.records import PRISMATIC, FloatArray
+from projservo_cli.records import BoolArray, FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, ReportData, registered
 from projservo_cli.simulation.analytic_plant import Plant
@@ -29,7 +29,7 @@ def _data(report_data: ReportData) -> Data:
     face = plant.M[plant.order]
     tool = (start @ robot.base_tool)[:3, 3]
     result: Data = {
-        "robot": skeleton(joint_operators(plant.model, q), robot.joint_types, tool),
+        "robot": skeleton(joint_operators(plant.model, q), robot.prismatic, tool),
         "face_start": (face @ start.T)[:, :3],
     }
     visible = plant_pyramids(plant, result["face_start"])
@@ -43,15 +43,15 @@ def _data(report_data: ReportData) -> Data:
     return result
 
 
-def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArray:
+def skeleton(H_hat: FloatArray, prismatic: BoolArray, tool: FloatArray) -> FloatArray:
     """Points (k, 3) of a polyline from the base over all revolute axes to the tool, m.
 
     From each point the perpendicular is dropped onto the next axis, known by the metric operators
     (n, 4, 4) at the current joints; a prismatic joint has a direction but no place.
     """
     points = [np.zeros(3)]
-    for operator, kind in zip(H_hat, joint_types, strict=True):
-        if kind == PRISMATIC:
+    for operator, slides in zip(H_hat, prismatic, strict=True):
+        if slides:
             continue
         w = np.array([operator[2, 1], operator[0, 2], operator[1, 0]])
         on_axis = np.cross(w, operator[:3, 3]) / (w @ w)
