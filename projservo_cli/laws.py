@@ -52,7 +52,7 @@ def must_converge(law: str, required: Sequence[str] | None) -> bool:
     return law not in POINT_LAWS if required is None else law in required
 
 
-def name_of(law: str, mode: str) -> str:
+def run_name(law: str, mode: str) -> str:
     """Return the name of the run of a law in a mode: ``exact`` where it replans, else ``exact_track``."""
     return law if mode == REGULATE else f"{law}_{mode}"
 
@@ -70,7 +70,7 @@ def mode_in(name: str) -> str:
     return f"is the run of {law} in mode {mode}: name {law}, with --set control.mode=[{mode}]"
 
 
-def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
+def run_names(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
     """Names of the runs of laws, each in those of the modes that it has.
 
     Raises InputError if a law has none of them.
@@ -84,5 +84,5 @@ def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
                 f"control.mode {' and '.join(modes)}: {law} has no such mode, only "
                 f"{' and '.join(own)}; laws that have one: {', '.join(able)} (--law, control.laws)"
             )
-        found += [name_of(law, mode) for mode in modes if mode in own]
+        found += [run_name(law, mode) for mode in modes if mode in own]
     return tuple(dict.fromkeys(found))

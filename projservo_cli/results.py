@@ -32,7 +32,7 @@ from projservo_cli.records import (
     Trace,
 )
 from projservo_cli.simulation.urdf import UrdfChain, urdf_chain
-from projservo_cli.task.trajectory import Trajectory
+from projservo_cli.task.trajectory import TrajectoryRequest
 
 _AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
 _MAX_BYTES = 10_000_000  # maximum size of a URDF
@@ -372,7 +372,7 @@ class Scene(NamedTuple):
     model: Model  # as calibrated
     limits: JointLimits  # infinite where none is set
     image_size: FloatArray | None  # (2, 2) px, of each; None where unknown
-    trajectory: Trajectory  # requested motion
+    trajectory: TrajectoryRequest  # requested motion
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

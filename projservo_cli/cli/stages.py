@@ -538,7 +538,7 @@ def _findings(call: _Call) -> Iterator[tuple[str, bool]]:
 
 def _of_runs(chain: Any) -> Iterator[tuple[str, bool]]:
     """A line on each run that did not converge or missed periods, and whether the call fails by it."""
-    from projservo_cli.laws import POINT_LAWS, must_converge, name_of
+    from projservo_cli.laws import POINT_LAWS, must_converge, run_name
 
     required = chain.config.control.must_converge
     for trace in (chain.run.traces[law] for law in chain.laws_done):
@@ -547,7 +547,7 @@ def _of_runs(chain: Any) -> Iterator[tuple[str, bool]]:
             continue  # failures are printed last
         but = " must converge, but" if must and not converged else ""
         reason = " ".join(trace.reason.split())
-        said = f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"
+        said = f"{run_name(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"
         if trace.overruns:
             said += (
                 f"; it missed {trace.overruns} periods of {trace.period:g} s: raise control.period_s, or "

@@ -33,19 +33,19 @@ from projservo_cli.records import (
     prismatic_of,
 )
 from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings, SpeedLimits
-from projservo_cli.simulation.arm import Arm, Link, dh_twists
+from projservo_cli.simulation.arm import Link, SerialArm, dh_twists
 from projservo_cli.simulation.faults import (
     CameraMoved,
+    EncoderStuck,
     Events,
     Faults,
     JointMoved,
-    LostMarkers,
     MarkerMoved,
+    MarkersLost,
     SimulatedRobot,
-    StuckEncoder,
 )
 from projservo_cli.simulation.mjcf import files_named
-from projservo_cli.simulation.rendering import Scene, Tag, lens_of
+from projservo_cli.simulation.rendering import MountedTag, RenderedScene, lens_of
 from projservo_cli.simulation.workspace import Truth, Turn, look_at, metric_camera
 from projservo_cli.stages.given import (
     CalibrationInputs,
@@ -71,7 +71,7 @@ from projservo_cli.stages.given import (
 )
 from projservo_cli.store.tables import identity_in
 from projservo_cli.task.face import MIDPOINT
-from projservo_cli.task.trajectory import KeptOut, Trajectory
+from projservo_cli.task.trajectory import KeepOutRegion, TrajectoryRequest
 
 _RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
 _TICKS = 4096  # in a turn of an encoder that is as coarse as any
@@ -381,13 +381,13 @@ def _made_truth(described: RobotSettings, rig: Rig, markers: Markers, k1: float,
     )
 
 
-def arm_of(config: Config) -> Arm | None:
+def arm_of(config: Config) -> SerialArm | None:
     """The arm of a configuration; None where its kinematics are not given."""
     return None if config.arm is None else _arm(config.arm)
 
 
 @lru_cache(maxsize=32)
-def _arm(described: RobotSettings) -> Arm:
+def _arm(described: RobotSettings) -> SerialArm:
     """Arm of screws, or of a Denavit–Hartenberg table, whose reference is all joints zero."""
     kinds = described.joint_types
     prismatic = prismatic_of(kinds)
@@ -396,7 +396,7 @@ def _arm(described: RobotSettings) -> Arm:
         screws = described.screws
         H_hat = twists(np.array([[*joint.w, *joint.v] for joint in screws.joints], dtype=np.float64))
         q_reference = np.array(screws.reference.values(kinds))
-        return Arm(H_hat, prismatic, q_reference, np.array(screws.base_tool), limits)
+        return SerialArm(H_hat, prismatic, q_reference, np.array(screws.base_tool), limits)
     assert described.dh is not None
     table = described.dh
     links = [
@@ -404,7 +404,7 @@ def _arm(described: RobotSettings) -> Arm:
         for row in table.joints
     ]
     H_hat, base_tool = dh_twists(links, np.array(table.tool), modified=table.convention == "modified")
-    return Arm(H_hat, prismatic, np.zeros(len(kinds)), base_tool, limits)
+    return SerialArm(H_hat, prismatic, np.zeros(len(kinds)), base_tool, limits)
 
 
 @lru_cache(maxsize=32)
@@ -431,7 +431,7 @@ def _center(markers: Markers) -> int:
     return MIDPOINT if midpoint else (markers.front or ()).index(int(markers.center))
 
 
-def scene_of(config: Config, files: Files | None = None) -> Scene | None:
+def scene_of(config: Config, files: Files | None = None) -> RenderedScene | None:
     """Return the scene of rendered cameras; None for cameras that see points."""
     options = config.plant.rendered
     if options is None:
@@ -445,13 +445,13 @@ def scene_of(config: Config, files: Files | None = None) -> Scene | None:
 @lru_cache(maxsize=8)
 def _scene(
     robot: RobotSettings, rig: Rig, markers: Markers, options: RenderedOptions, mjcf: File | None
-) -> Scene:
+) -> RenderedScene:
     assert markers.known is not None
-    return Scene(
+    return RenderedScene(
         arm=_arm(robot),
         P=cameras_of(rig),
         size=rig.image_size_px,
-        tags=tuple(Tag(tag.number, tag.size_m, tag.pose) for tag in markers.all_tags),
+        tags=tuple(MountedTag(tag.number, tag.size_m, tag.pose) for tag in markers.all_tags),
         numbers=markers.known,
         dictionary=markers.dictionary or DICTIONARY,
         mjcf=mjcf,
@@ -541,13 +541,13 @@ def events_of(config: Config) -> Events:
     """Return the events of the simulated robot in a run."""
     given, found = config.disturbance, dict[str, Any]()
     if given.lost_markers is not None:
-        found["lost_markers"] = _taken(LostMarkers, given.lost_markers)
+        found["lost_markers"] = _taken(MarkersLost, given.lost_markers)
     if (moved := given.joint_moved) is not None:
         by = moved.by_m or 0.0 if moved.by_deg is None else math.radians(moved.by_deg)
         found["joint_moved"] = JointMoved(moved.at_step, moved.joint - 1, by, moved.encoder_slip)
     if given.stuck_encoder is not None:
         found["stuck_encoder"] = _taken(
-            StuckEncoder, given.stuck_encoder, joint=given.stuck_encoder.joint - 1
+            EncoderStuck, given.stuck_encoder, joint=given.stuck_encoder.joint - 1
         )
     if given.camera_moved is not None:
         left, right = given.camera_moved.by_view()
@@ -642,16 +642,18 @@ def _goal(goal: GoalSettings, config: Config) -> Goal:
     return Goal(_readings(goal.joints), turn, images)
 
 
-def trajectory_of(config: Config) -> Trajectory:
+def trajectory_of(config: Config) -> TrajectoryRequest:
     """Return the requested motion."""
     given = config.trajectory
     return _taken(
-        Trajectory,
+        TrajectoryRequest,
         given,
         joint_margin=math.radians(given.joint_margin_deg),
         max_search_samples=given.search.max_samples,
         search_seed=given.search.seed,
-        keep_out=tuple(KeptOut(region.left, region.right, region.occludes) for region in given.keep_out),
+        keep_out=tuple(
+            KeepOutRegion(region.left, region.right, region.occludes) for region in given.keep_out
+        ),
     )
 
 

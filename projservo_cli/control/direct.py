@@ -25,7 +25,7 @@ from projservo_cli.geometry.algebra import Mat4, mul
 from projservo_cli.geometry.displacements import rotation, translation
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kinematics import backward
-from projservo_cli.geometry.mechanisms import SETTLED, Seen, reach
+from projservo_cli.geometry.mechanisms import SETTLED, MeasuredFace, reach
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
@@ -137,7 +137,7 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
     Returns false if a part does not settle or leaves the branch.
     """
     n, count = q.shape[0], step.pieces
-    face = Seen(state.A, backward(model, q))
+    face = MeasuredFace(state.A, backward(model, q))
     for i in range(n):
         state.path[0, i] = q[i]
     for j in range(1, count + 1):

@@ -13,7 +13,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar, cast, overload
+from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
@@ -23,7 +23,7 @@ from numba.core.registry import CPUDispatcher
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
 
-_DECORATED = re.compile(rb"^@(?:inline|internal|merged|njit)\b", re.MULTILINE)
+_DECORATED = re.compile(rb"^@(?:inline|internal|merged|njit)$|^\w.* = njit\(", re.MULTILINE)
 _IMPORT = re.compile(rb"^\s*from projservo_cli(?:\.([\w.]+))? import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 
 
@@ -128,17 +128,12 @@ _OPTIONS: dict[str, Any] = {
 _UNCACHED = {name: value for name, value in _OPTIONS.items() if name != "cache"}
 
 
-@overload
-def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]: ...
-@overload
-def njit(*, allocates: bool) -> Callable[[Callable[_Params, _Result]], Callable[_Params, _Result]]: ...
-def njit(function: Any = None, *, allocates: bool = False) -> Any:
+def njit(function: Callable[_Params, _Result], *, allocates: bool = False) -> Callable[_Params, _Result]:
     """Compile a function that may be called from Python.
 
-    allocates : whether it makes arrays, as a structure of the compiler for what it keeps.
+    allocates : whether it makes arrays, or a structure of the compiler.
     """
-    compiled = numba.njit(**{**_OPTIONS, "_nrt": allocates})
-    return compiled if function is None else compiled(function)
+    return cast(Callable[_Params, _Result], numba.njit(**{**_OPTIONS, "_nrt": allocates})(function))
 
 
 class _Internal(CPUDispatcher):

@@ -215,7 +215,7 @@ def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
     return minimum_norm(work.system, work.J, xi, q_hat)
 
 
-class Seen(NamedTuple):
+class MeasuredFace(NamedTuple):
     """A measured face and the joints at its measurement."""
 
     A: FloatArray  # (m, 4) its points
@@ -223,7 +223,7 @@ class Seen(NamedTuple):
 
 
 @internal
-def reach(model: Model, face: Seen, goal: Mat4, q: FloatArray, work: Work, settled: float) -> bool:
+def reach(model: Model, face: MeasuredFace, goal: Mat4, q: FloatArray, work: Work, settled: float) -> bool:
     """Newton steps on the joints ``q``, in place, until they displace a measured face by ``goal``.
 
     Steps have minimum norm with more than six joints; fewer bring the face as near as they can.

@@ -188,7 +188,7 @@ class _Desk(NamedTuple):
     log: Log  # of the run
 
 
-class Trials:
+class BatchRuns:
     """Runs of a setting, one after the other, in arrays that one run leaves to the next.
 
     images : number of markers whose images are given at the start and at the goal.

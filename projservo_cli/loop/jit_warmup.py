@@ -12,7 +12,7 @@ from numba import typeof
 from projservo_cli.control.law import ERRORS, new_state, pseudo_inverse, single_rotation, view_into
 from projservo_cli.geometry.algebra import IDENTITY
 from projservo_cli.geometry.jit import CACHE_FOLDER
-from projservo_cli.geometry.mechanisms import Seen, reach
+from projservo_cli.geometry.mechanisms import MeasuredFace, reach
 from projservo_cli.loop.run_metrics import Ended, path_deviation, summarize
 from projservo_cli.loop.verdicts import new_log
 from projservo_cli.planning.margins import Reaching, carried_into, carrier_of, limits_alone, room_along
@@ -80,7 +80,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         q_start=q,
     )
     along = room_along(reaching, 1)
-    yield reach, (model, Seen(matrices[0], IDENTITY), IDENTITY, q, state.work, 1.0)
+    yield reach, (model, MeasuredFace(matrices[0], IDENTITY), IDENTITY, q, state.work, 1.0)
     yield pseudo_inverse, (state, 8, q)
     yield view_into, (model, task, task.s_star, state, 0, 0)
     yield single_rotation, (model, NO_PARTS, 1.0, state)

@@ -66,16 +66,17 @@ else:
     structref.define_proxy(_Bound, _BoundType, ("law", "state"))
 
 
-@njit(allocates=True)
 def _bind(law: Law, state: State) -> Any:
     """Scratch memory of a law, whose arrays are shared."""
     return _Bound(law, state)
 
 
-@njit(allocates=True)
 def _bound_command(bound: Any, s: FloatArray, q: FloatArray) -> int:
     """One command of the bound law, as of ``command``: the status, the rest is written to the state."""
     return command(bound.law, s, q, bound.state)
+
+
+_compiled_bind, _compiled_command = njit(_bind, allocates=True), njit(_bound_command, allocates=True)
 
 
 # Optional attributes of a law and their defaults: the fraction of the amplitude that its own
@@ -229,8 +230,8 @@ class BuiltInLaw:
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant."""
         if self._bound is None:
-            self._bound = _bind(self.law, self.state)
-        status = _bound_command(self._bound, s, q)
+            self._bound = _compiled_bind(self.law, self.state)
+        status = _compiled_command(self._bound, s, q)
         return status, self.state.q_dot.copy()
 
 

@@ -52,7 +52,7 @@ _ALL_PARALLEL = (
 Scale = str | Sequence[int]
 
 
-class Body(NamedTuple):
+class MetricParameters(NamedTuple):
     """Cameras, arm and markers in the base frame, of one model or of many (…)."""
 
     P: FloatArray  # (…, 2, 3, 4) cameras to undistorted pixels
@@ -61,13 +61,13 @@ class Body(NamedTuple):
     tool: FloatArray  # (…, 4, 4) pose of the tool at readings of zero, m
     markers: FloatArray  # (…, m, 3) in the tool frame, m
 
-    def scaled(self, factor: FloatArray) -> "Body":
+    def scaled(self, factor: FloatArray) -> "MetricParameters":
         """Multiply all lengths by a factor (…)."""
         P, axes, tool = self.P.copy(), self.axes.copy(), self.tool.copy()
         P[..., 3] *= factor[..., None, None]
         axes[..., 3:] *= factor[..., None, None]
         tool[..., :3, 3] *= factor[..., None]
-        return Body(P, self.lens, axes, tool, self.markers * factor[..., None, None])
+        return MetricParameters(P, self.lens, axes, tool, self.markers * factor[..., None, None])
 
     def intrinsics(self) -> FloatArray:
         """Intrinsic matrices (…, 2, 3, 3), px, from K Kᵀ of the cameras."""
@@ -239,7 +239,7 @@ class _Projective(NamedTuple):
         )  # fmt: skip
 
 
-def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
+def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> MetricParameters:
     """Bodies (B, …) of models, the first of which decides what frames rest on. Their scale is arbitrary."""
     G = invariant_upgrade(models.H_hat, c.prismatic)
     G = G * np.sign(models.M[:, :1] @ G[:, 3, :, None])
@@ -258,7 +258,9 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
     P = models.P @ back[:, None] @ base[:, None]
     P /= np.linalg.norm(P[..., 2, :3], axis=-1)[..., None, None]
     markers = (homogeneous(M) @ rigid_inverse(tool).swapaxes(-1, -2))[..., :3]
-    return Body(P, models.lens, in_frame(axes, c.prismatic, base), inverse @ to_zero @ tool, markers)
+    return MetricParameters(
+        P, models.lens, in_frame(axes, c.prismatic, base), inverse @ to_zero @ tool, markers
+    )
 
 
 def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -279,7 +281,7 @@ def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, Float
     return flip[:, :, None] * G, points * flip[:, None, :3]
 
 
-def _length_of(body: Body, between: Scale, marker: list[int], prismatic: BoolArray) -> FloatArray:
+def _length_of(body: MetricParameters, between: Scale, marker: list[int], prismatic: BoolArray) -> FloatArray:
     """Length (…) that is known, in the unit of bodies. Raises InputError if there is none such."""
     if between == "joint":
         if not prismatic.any():
@@ -338,7 +340,7 @@ class Metric:
     joint_types: str  # one letter a joint, R or P
     marker: list[int]  # (m,) numbers of the markers
     sigma_px: float  # noise of a pixel, px
-    bodies: Body  # the model, then pairs off by plus and minus a step of each independent error
+    bodies: MetricParameters  # the model, then pairs off by plus and minus a step of each independent error
     range: FloatArray  # (n, 2) readings in the data, rad or m
     q_reference: FloatArray  # (n,) readings of the reference, rad or m
 
@@ -386,18 +388,18 @@ class Metric:
         bodies = bodies.scaled(length / known)
         if length_std_m > 0.0:  # one more independent error
             step = _STEP * length_std_m / length
-            off = Body(*(values[:1].repeat(2, axis=0) for values in bodies))
+            off = MetricParameters(*(values[:1].repeat(2, axis=0) for values in bodies))
             off = off.scaled(np.array([1.0 + step, 1.0 - step]))
             cut = 1 + factor.shape[1]
             parts = zip(bodies, off, strict=True)
-            bodies = Body(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
+            bodies = MetricParameters(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
         moved = np.stack([c.joint_min, c.joint_min + c.excitation], axis=1)
         return cls(c.joint_types, marker, c.sigma_px, bodies, moved, c.q_reference)
 
     @property
-    def body(self) -> Body:
+    def body(self) -> MetricParameters:
         """Cameras, arm and markers as calibrated."""
-        return Body(*(values[0] for values in self.bodies))
+        return MetricParameters(*(values[0] for values in self.bodies))
 
     @property
     def prismatic(self) -> BoolArray:
@@ -580,7 +582,7 @@ class Metric:
     def point_changes(self, q: FloatArray, point: FloatArray) -> FloatArray:
         """Changes (c, K, 3), m, by independent errors of a point (3,) of the tool at readings (K, n)."""
 
-        def position(body: Body) -> FloatArray:
+        def position(body: MetricParameters) -> FloatArray:
             T = body.tool_poses(self.prismatic, q)
             return np.asarray(T[..., :3, :3] @ point + T[..., :3, 3])
 
@@ -597,13 +599,13 @@ class Metric:
 
     def changes(
         self,
-        function: Callable[[Body], FloatArray],
+        function: Callable[[MetricParameters], FloatArray],
         difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract,
     ) -> FloatArray:
         """Changes (c, …) of a function of bodies by independent errors of unit variance."""
         count = (len(self.bodies.P) - 1) // 2
         up, down = (
-            function(Body(*(values[part] for values in self.bodies)))
+            function(MetricParameters(*(values[part] for values in self.bodies)))
             for part in (slice(1, 1 + count), slice(1 + count, None))
         )
         return np.asarray(difference(up, down) / (2.0 * _STEP))

@@ -18,7 +18,7 @@ from projservo_cli.geometry.displacements import (
     rigid_inverse,
     screw_displacements,
 )
-from projservo_cli.metric.frame import Body, Metric, base_frame, base_joints, directions, in_frame
+from projservo_cli.metric.frame import Metric, MetricParameters, base_frame, base_joints, directions, in_frame
 from projservo_cli.records import MM, BoolArray, FloatArray, InputError, IntArray, WorkFailed, letters_of
 
 # Errors of axes that any model has, of machining and assembly, rad and m.
@@ -262,7 +262,7 @@ def in_model_frames(metric: Metric, given: FloatArray, tip: FloatArray) -> Metri
     to_tip = rigid_inverse(tips) @ rigid_inverse(base) @ bodies.tool
     markers = (homogeneous(bodies.markers) @ to_tip.swapaxes(-1, -2))[..., :3]
     return dataclasses.replace(
-        metric, bodies=Body(bodies.P @ base[:, None], bodies.lens, axes, tips, markers)
+        metric, bodies=MetricParameters(bodies.P @ base[:, None], bodies.lens, axes, tips, markers)
     )
 
 

@@ -46,7 +46,7 @@ from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
 from projservo_cli.geometry.kinematics import backward, forward, image_motion, operators_at, project, row
 from projservo_cli.geometry.lens import distort_pixel, distorts
-from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, make_span, reach, workspace
+from projservo_cli.geometry.mechanisms import SETTLED, MeasuredFace, Work, make_span, reach, workspace
 from projservo_cli.image_size import BEHIND, border_distance
 from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.trajectory import displaced
@@ -270,7 +270,7 @@ def carry_joints(
     """
     reaching, work, before = carrier.reaching, carrier.work, carrier.before
     model = reaching.model
-    face = Seen(reaching.A, backward(model, reaching.q_start))
+    face = MeasuredFace(reaching.A, backward(model, reaching.q_start))
     operators_at(model, q, work.H_hat)
     first, last = ends
     goal = displaced(reaching.H_hat, reaching.amplitudes, first[0], first[1], first[2])

@@ -30,9 +30,9 @@ from projservo_cli.records import (
     Trace,
 )
 from projservo_cli.simulation.analytic_plant import Plant
-from projservo_cli.simulation.arm import Arm
+from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.store import Run
-from projservo_cli.task.trajectory import Trajectory
+from projservo_cli.task.trajectory import TrajectoryRequest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -106,14 +106,14 @@ class ReportData(Fit):
     """All that the figures of a run may show."""
 
     calibrated: Model  # model the laws use
-    robot: Arm
+    robot: SerialArm
     plant: Plant  # robot, plant: the truth
     plan: Plan  # the plan
     numbers: tuple[int, ...]  # numbers of the face markers
     traces: Mapping[str, Trace] = field(default_factory=dict)  # runs of the laws by name
     studies: Studies | None = None  # extra runs; None where they could not be made
     no_studies: str = ""  # why not
-    trajectory: Trajectory = field(kw_only=True)  # requested motion of the plan
+    trajectory: TrajectoryRequest = field(kw_only=True)  # requested motion of the plan
     stall_periods: int = 20  # steps in which the error of a run that stands still falls by less than 1 %
 
     def compared(self) -> list[str]:

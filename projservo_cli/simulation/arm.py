@@ -16,7 +16,7 @@ METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 _Z_SHIFT, _Z_TURN = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
-class Arm(NamedTuple):
+class SerialArm(NamedTuple):
     """True kinematics of a serial robot in its base frame."""
 
     H_hat_0: FloatArray  # (n, 4, 4) twists at the reference, per rad or m
@@ -97,7 +97,7 @@ def dh_twists(links: Sequence[Link], tool: FloatArray, *, modified: bool) -> tup
     return np.array(H_hat), T @ tool
 
 
-def inverse_kinematics(robot: Arm, goal: FloatArray, q_start: FloatArray) -> FloatArray:
+def inverse_kinematics(robot: SerialArm, goal: FloatArray, q_start: FloatArray) -> FloatArray:
     """Joints within the limits that put the tool at a pose, as near to the start as found.
 
     Damped Newton steps on the pose from the start and from 30 seeded places within the limits; the
@@ -122,7 +122,7 @@ def inverse_kinematics(robot: Arm, goal: FloatArray, q_start: FloatArray) -> Flo
     return min(found, key=lambda q: float(np.linalg.norm(q - q_start)))
 
 
-def _newton(robot: Arm, goal: FloatArray, q: FloatArray) -> FloatArray | None:
+def _newton(robot: SerialArm, goal: FloatArray, q: FloatArray) -> FloatArray | None:
     """Damped Newton steps to a pose; None where they do not arrive."""
     model = robot.model(np.zeros((2, 3, 4)))
     for _ in range(40):
@@ -143,7 +143,7 @@ def _newton(robot: Arm, goal: FloatArray, q: FloatArray) -> FloatArray | None:
     return q if np.abs(error).max() < 1e-10 else None
 
 
-def _unwind(robot: Arm, q: FloatArray, near: FloatArray) -> FloatArray:
+def _unwind(robot: SerialArm, q: FloatArray, near: FloatArray) -> FloatArray:
     """Shift revolute joints by whole turns to within half a turn of ``near`` where limits allow."""
     turned = q.copy()
     for i, slides in enumerate(robot.prismatic):

@@ -17,9 +17,9 @@ import numpy as np
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import ByteArray, FloatArray
-from projservo_cli.simulation.arm import Arm
+from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.physics import Physics
-from projservo_cli.simulation.rendering import Frames, Scene, rendered_model
+from projservo_cli.simulation.rendering import Frames, RenderedScene, rendered_model
 from projservo_cli.simulation.workspace import Truth
 
 # Joints are worked out this often at least, s, and taken as straight lines between.
@@ -50,7 +50,7 @@ class Faults(NamedTuple):
     backlash: float = 0.0  # between each encoder and its link, from end to end, rad
 
 
-class LostMarkers(NamedTuple):
+class MarkersLost(NamedTuple):
     """Markers that neither camera sees for a while; all of them where none is named."""
 
     from_step: int
@@ -67,7 +67,7 @@ class JointMoved(NamedTuple):
     encoder_slip: bool  # whether its reading stays
 
 
-class StuckEncoder(NamedTuple):
+class EncoderStuck(NamedTuple):
     """A joint whose reading stands still while it moves."""
 
     from_step: int
@@ -93,9 +93,9 @@ class MarkerMoved(NamedTuple):
 class Events(NamedTuple):
     """Events of a simulated robot and its images in a run."""
 
-    lost_markers: LostMarkers | None = None
+    lost_markers: MarkersLost | None = None
     joint_moved: JointMoved | None = None
-    stuck_encoder: StuckEncoder | None = None
+    stuck_encoder: EncoderStuck | None = None
     camera_moved: CameraMoved | None = None
     marker_moved: MarkerMoved | None = None
 
@@ -105,7 +105,7 @@ class SimulatedRobot(NamedTuple):
 
     truth: Truth
     faults: Faults
-    scene: Scene | None  # before rendered cameras; None for cameras that see points
+    scene: RenderedScene | None  # before rendered cameras; None for cameras that see points
     period: float  # of the loop, s
 
 
@@ -227,7 +227,7 @@ def robot_of(
 
 
 def observed_in_frames(
-    scene: Scene, frames: int, q: FloatArray, drawn: tuple[int, int]
+    scene: RenderedScene, frames: int, q: FloatArray, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
     """Pixels (2, m, 2) that frames of a robot at rest at joints (n,), rad or m, show on average.
 
@@ -241,7 +241,7 @@ def observed_in_frames(
 
 @lru_cache(maxsize=256)
 def _looked(
-    scene: Scene, frames: int, q_bytes: bytes, drawn: tuple[int, int]
+    scene: RenderedScene, frames: int, q_bytes: bytes, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
     eyes, q = Frames(rendered_model(scene)), np.frombuffer(q_bytes)[None]
     found = np.full((frames, 2, len(scene.numbers), 3), np.nan)
@@ -322,7 +322,7 @@ class FaultyRobot:
         return q
 
 
-def full_reach(arm: Arm) -> float:
+def full_reach(arm: SerialArm) -> float:
     """Return the longest lever of a joint to the tool, m: the maximum over random postures."""
     rng = np.random.default_rng(0)
     low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
@@ -331,7 +331,7 @@ def full_reach(arm: Arm) -> float:
     return float(max(np.linalg.norm(_tool_velocity(arm, q)[turning], axis=1).max() for q in postures))
 
 
-def _tool_velocity(arm: Arm, q: FloatArray) -> FloatArray:
+def _tool_velocity(arm: SerialArm, q: FloatArray) -> FloatArray:
     """Velocity (n, 3) of the tool by each joint at joints (n,), m per rad or m."""
     model = arm.model(np.zeros((2, 3, 4)))
     return np.asarray((joint_operators(model, q) @ arm.pose(q)[:, 3])[:, :3])
@@ -343,7 +343,7 @@ def _whole(q: FloatArray, tick: FloatArray) -> FloatArray:
     return np.where(coarse, tick * np.round(q / np.where(coarse, tick, 1.0)), q)
 
 
-def _lasts(event: StuckEncoder | LostMarkers, step: int) -> bool:
+def _lasts(event: EncoderStuck | MarkersLost, step: int) -> bool:
     """Whether it is so in a period."""
     return event.from_step <= step < event.from_step + (event.steps or math.inf)
 

@@ -15,7 +15,7 @@ from projservo_cli.canonical import File
 from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import CORNERS, ByteArray, FloatArray, InputError, IntArray
-from projservo_cli.simulation.arm import Arm, roll_axis
+from projservo_cli.simulation.arm import SerialArm, roll_axis
 from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, no_gl, spec_of, tip_of
 
 # Thickness of the first link of an arm and of the last, in lengths of the arm, and of none in any.
@@ -43,7 +43,7 @@ CAMERAS = ("left camera", "right camera")
 _STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
 
 
-class Tag(NamedTuple):
+class MountedTag(NamedTuple):
     """A tag on the tool."""
 
     number: int  # in its dictionary; its corners are markers 4 t to 4 t + 3
@@ -52,13 +52,13 @@ class Tag(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RenderedScene:
     """Scene and settings of rendered cameras."""
 
-    arm: Arm
+    arm: SerialArm
     P: FloatArray  # (2, 3, 4) cameras, px
     size: tuple[int, int]  # width and height of the images, px
-    tags: tuple[Tag, ...]
+    tags: tuple[MountedTag, ...]
     numbers: tuple[int, ...]  # of the markers, four corners a tag
     dictionary: str  # of the tags
     mjcf: File | None  # the model of the arm, with the files that it names; None for one of capsules
@@ -74,7 +74,7 @@ class Scene:
 class RenderedModel:
     """A compiled model, and what in it stands for what."""
 
-    scene: Scene
+    scene: RenderedScene
     finder: TagFinder
     model: Any  # MjModel, which nobody changes
     key: int  # of the keyframe that is its beginning, −1 for none
@@ -121,7 +121,7 @@ def lens_of(P: FloatArray, k1: float) -> FloatArray:
 
 
 @lru_cache(maxsize=4)
-def rendered_model(scene: Scene) -> RenderedModel:
+def rendered_model(scene: RenderedScene) -> RenderedModel:
     """The compiled model of a scene.
 
     Raises InputError if MuJoCo or OpenCV is missing, or the scene cannot be made.
@@ -163,7 +163,7 @@ def rendered_model(scene: Scene) -> RenderedModel:
     )
 
 
-def _add_arm(spec: Any, arm: Arm) -> None:
+def _add_arm(spec: Any, arm: SerialArm) -> None:
     """Add an arm of capsules.
 
     Every body has the axes of the base at the reference, where joints have their readings; a link reaches
@@ -200,11 +200,11 @@ def _add_arm(spec: Any, arm: Arm) -> None:
             body.add_geom(type=mj.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=points[i], **sights)
 
 
-def _name(tag: Tag, side: str) -> str:
+def _name(tag: MountedTag, side: str) -> str:
     return f"tag {tag.number} {side}"
 
 
-def _add_tags(spec: Any, tip: Any, tool: FloatArray, tags: Sequence[Tag], finder: TagFinder) -> None:
+def _add_tags(spec: Any, tip: Any, tool: FloatArray, tags: Sequence[MountedTag], finder: TagFinder) -> None:
     """Hang tags on a body of a specification; tool : (4, 4) pose of the tool in its frame, m."""
     mj = mujoco()
     body, origin = tip.add_body(name="tool with tags"), tool[:3, 3]

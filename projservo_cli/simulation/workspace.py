@@ -14,7 +14,7 @@ from projservo_cli.geometry.kinematics import project
 from projservo_cli.image_size import image_sizes, within_images
 from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model
 from projservo_cli.simulation.analytic_plant import Ends
-from projservo_cli.simulation.arm import Arm, about_axis, camera_center, inverse_kinematics, roll_axis
+from projservo_cli.simulation.arm import SerialArm, about_axis, camera_center, inverse_kinematics, roll_axis
 from projservo_cli.task.face import center_of
 
 _EDGE_ON = math.cos(math.radians(70.0))  # of the angle to a camera from which tags are not found
@@ -24,7 +24,7 @@ _EDGE_ON = math.cos(math.radians(70.0))  # of the angle to a camera from which t
 class Truth:
     """Robot, rig and markers as they are."""
 
-    robot: Arm  # true kinematics
+    robot: SerialArm  # true kinematics
     P: FloatArray  # (2, 3, 4) true cameras, px
     M: FloatArray  # (m, 4) all markers at the robot's reference, m
     number: tuple[int, ...]  # (m,) their numbers
@@ -92,7 +92,7 @@ class Turn(NamedTuple):
     # translation along the axes of the tool, m, and rotation vector in them, rad; None for neither
     displacement: tuple[tuple[float, float, float], tuple[float, float, float]] | None
 
-    def joints(self, arm: Arm, P: FloatArray, q_start: FloatArray) -> FloatArray:
+    def joints(self, arm: SerialArm, P: FloatArray, q_start: FloatArray) -> FloatArray:
         """Joints (n,) of an arm before cameras (2, 3, 4) after the turn from joints (n,), rad or m."""
         point, direction = roll_axis(P)
         pose = about_axis(point, direction, self.angle) @ arm.pose(q_start)

@@ -12,11 +12,11 @@ from projservo_cli.display import About
 from projservo_cli.image_size import ImageSize
 from projservo_cli.records import FloatArray
 from projservo_cli.robots.settings import Following, JointSettings, OwnRobot, Readings
-from projservo_cli.simulation.arm import Arm
+from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.faults import Events, SimulatedRobot
-from projservo_cli.simulation.rendering import Scene
+from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.workspace import Truth, Turn
-from projservo_cli.task.trajectory import Trajectory
+from projservo_cli.task.trajectory import TrajectoryRequest
 
 _Pixel = tuple[float, float]
 
@@ -203,9 +203,9 @@ class PlanInputs:
     task: ReachingTask | None
     seed: int  # of the noise of start and goal
     truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
-    arm: Arm | None  # kinematics as they are described, if they are
+    arm: SerialArm | None  # kinematics as they are described, if they are
     P: FloatArray | None  # (2, 3, 4) cameras as they are described, px, if they are
-    scene: Scene | None  # where cameras are rendered
+    scene: RenderedScene | None  # where cameras are rendered
     face: tuple[int, ...]  # numbers of the markers that must stay visible
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
     known: tuple[int, ...] | None  # numbers of all markers; None for those of the calibration
@@ -216,7 +216,7 @@ class PlanInputs:
     averaged_frames: int  # that are averaged of start and goal
     features: str | None  # points, body, or None for body where the calibration is usable
     tests_images: bool  # whether images are tested against the calibration
-    trajectory: Trajectory
+    trajectory: TrajectoryRequest
     # Width and height to which recorded images reach at least, px, where their size is not known.
     seen_px: ImageSize | None = None
 
@@ -277,7 +277,7 @@ class ReportInputs:
     about: About
     formats: tuple[str, ...]  # of the files of each figure
     extra: ServoInputs | None  # of laws by themselves on the ideal plant; None where there is no task
-    trajectory: Trajectory  # requested motion of the plan
+    trajectory: TrajectoryRequest  # requested motion of the plan
     lengths: KnownLengths
 
 

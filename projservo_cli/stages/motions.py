@@ -38,7 +38,7 @@ from projservo_cli.stages.scenario import Scenario
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
 from projservo_cli.task.target import TaskImages
-from projservo_cli.task.trajectory import Trajectory, profile_shares
+from projservo_cli.task.trajectory import TrajectoryRequest, profile_shares
 
 
 class Found(NamedTuple):
@@ -53,7 +53,7 @@ class Found(NamedTuple):
     entered: str = ""  # which region it enters that is kept out of, in words
 
 
-def coupled(reaching: Reaching, trajectory: Trajectory) -> Found:
+def coupled(reaching: Reaching, trajectory: TrajectoryRequest) -> Found:
     """Shares of translation and rotations that keep all constraints, [RH00] section 4.3."""
     sigma = np.linspace(0.0, 1.0, trajectory.n_samples)
     judged = plan_path(reaching)
@@ -65,7 +65,7 @@ def coupled(reaching: Reaching, trajectory: Trajectory) -> Found:
     return Found(judged, motion, _timed(sigma * duration(judged), sigma, trajectory), feasible, reason)
 
 
-def given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_translation: float) -> Found:
+def given(profile: str, reaching: Reaching, trajectory: TrajectoryRequest, pure_translation: float) -> Found:
     """Shares of a profile of the paper; ``pure_translation`` of the translation at most before a rotation."""
     sigma = np.linspace(0.0, 1.0, trajectory.n_samples)
     motion = along_shares(reaching, profile_shares(profile, sigma, pure_translation))
@@ -112,7 +112,7 @@ def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> st
     return "no search was given" if search is None else search.closed
 
 
-def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> FloatArray:
+def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: TrajectoryRequest) -> FloatArray:
     """Time (s,) of a motion: its shortest time, from rest to rest, stretched to the duration it is given.
 
     Where nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
@@ -165,7 +165,9 @@ def body_at_start(model: Model, task: Task, images: TaskImages, A: FloatArray) -
 _INTERPOLATED_PX = 0.05
 
 
-def _joint_constraints(reaching: Reaching, task: Task, trajectory: Trajectory, spread: Spread) -> Constraints:
+def _joint_constraints(
+    reaching: Reaching, task: Task, trajectory: TrajectoryRequest, spread: Spread
+) -> Constraints:
     """Return the constraints of the joints."""
     drawn = keep_out_of(trajectory.keep_out)
     c = constraints_of(reaching.model, reaching.body, task, reaching.q_start, reaching.demands, drawn)
@@ -184,14 +186,14 @@ def _entered(c: Constraints, q: FloatArray) -> str:
     return f"the body enters region {region} of trajectory.keep_out {at}" if region else ""
 
 
-def kept_out(found: Found, task: Task, trajectory: Trajectory, spread: Spread) -> Found:
+def kept_out(found: Found, task: Task, trajectory: TrajectoryRequest, spread: Spread) -> Found:
     """Return the motion, infeasible if it enters a keep-out region of the body."""
     c = _joint_constraints(found.motion.reaching, task, trajectory, spread)
     entered = _entered(c, found.motion.along.q)
     return found._replace(feasible=False, reason=entered, entered=entered) if entered else found
 
 
-def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: JointSearch) -> Found:
+def joint_path(reaching: Reaching, task: Task, trajectory: TrajectoryRequest, search: JointSearch) -> Found:
     """A path through joint space; the linear motion where there is none."""
     c = _joint_constraints(reaching, task, trajectory, search.spread)
     target = GoalFeatures(task.A_star, undistort(reaching.model.lens, task.s_star), search.sigma)

@@ -47,7 +47,7 @@ from projservo_cli.stages.scenario import NEAR_PX, Scenario, joints_showing, sce
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import TaskImages
-from projservo_cli.task.trajectory import Trajectory
+from projservo_cli.task.trajectory import TrajectoryRequest
 from projservo_cli.task.visibility import (
     arc_minimum,
     margin_coefficients,
@@ -57,7 +57,7 @@ from projservo_cli.task.visibility import (
 
 
 def _partitioned(
-    model: Model, images: TaskImages, trajectory: Trajectory, limits: JointLimits
+    model: Model, images: TaskImages, trajectory: TrajectoryRequest, limits: JointLimits
 ) -> tuple[State, Task, Parts, str]:
     """Measure and partition the task at its start; half turns are rehearsed within joint limits.
 
@@ -225,7 +225,7 @@ def _require_rigid(fit: RigidFit, advice: str) -> None:
 def plan_task(
     model: Model,
     images: TaskImages,
-    trajectory: Trajectory,
+    trajectory: TrajectoryRequest,
     demands: Demands,
     search: JointSearch | None = None,
 ) -> Plan:
@@ -261,7 +261,7 @@ def plan_task(
 def _found(
     reaching: Reaching,
     task: Task,
-    trajectory: Trajectory,
+    trajectory: TrajectoryRequest,
     search: JointSearch | None,
     tau_limit: float,
 ) -> Found:
@@ -283,7 +283,11 @@ def _found(
 
 
 def _planned(
-    model: Model, images: TaskImages, trajectory: Trajectory, demands: Demands, search: JointSearch | None
+    model: Model,
+    images: TaskImages,
+    trajectory: TrajectoryRequest,
+    demands: Demands,
+    search: JointSearch | None,
 ) -> tuple[Plan, str]:
     """Return the plan of one profile, and the constraints that fail, in words; empty if all hold."""
     face = images.by_points()

@@ -22,7 +22,7 @@ from projservo_cli.config.task import Goal, TaskSettings
 from projservo_cli.geometry.displacements import displacements
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import image_sizes, within_images
-from projservo_cli.laws import law_and_mode, names_of
+from projservo_cli.laws import law_and_mode, run_names
 from projservo_cli.records import FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.source import source_hash
 from projservo_cli.simulation.arm import METRIC_A_INF
@@ -204,7 +204,7 @@ class Design:
             found.append(_Axis(name, self.sweep.keys_of(name), axis.values, axis.also))
         if all(LAW not in axis.keys for axis in found):
             control = load_config("base", text=self.bases[0][1]).control
-            found.append(_Axis(LAW, (LAW,), names_of(control.laws, control.mode)))
+            found.append(_Axis(LAW, (LAW,), run_names(control.laws, control.mode)))
         return tuple(found)
 
     @cached_property
@@ -398,7 +398,7 @@ def require_sound(design: Design) -> None:
 
 def name_of_run(config: Config) -> str:
     """Name of the only run of a configuration: its law, with the mode where it follows the plan."""
-    names = names_of(config.control.laws, config.control.mode)
+    names = run_names(config.control.laws, config.control.mode)
     if len(names) != 1:
         raise InputError(
             f"a cell runs one law in one mode, not {', '.join(names)}: list them under grid.law, such as "

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.laws import BODY_LAWS, CODES
-from projservo_cli.loop.batch import NUMBERS, VERDICT, Setting, Trials
+from projservo_cli.loop.batch import NUMBERS, VERDICT, BatchRuns, Setting
 from projservo_cli.loop.compiled import Course
 from projservo_cli.loop.verdicts import FAILED, RUNNING, VERDICTS
 from projservo_cli.records import Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
@@ -246,7 +246,7 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
         course=Course(scenario.plant_of(law), scenario.limits, scenario.exact.q_start),
         ends=scenario.true_ends,
     )
-    trials = Trials(setting, len(scenario.numbers))
+    trials = BatchRuns(setting, len(scenario.numbers))
     found = np.empty((len(seeds), len(NUMBERS)))
     for first in range(0, len(seeds), TOGETHER):
         running, instants = list(range(first, min(first + TOGETHER, len(seeds)))), INSTANTS

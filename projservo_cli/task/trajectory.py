@@ -16,7 +16,7 @@ _PLATEAU = 0.5
 PROFILES = ("linear", "exponential", "rotation_first", "translation_first", "planar_first")
 
 
-class KeptOut(NamedTuple):
+class KeepOutRegion(NamedTuple):
     """Region of an obstacle in the images: polygons of corners u and v, px; None for none in an image."""
 
     left: tuple[tuple[float, float], ...] | None
@@ -24,7 +24,7 @@ class KeptOut(NamedTuple):
     occludes: bool  # whether the obstacle may hide markers: those of the face stay outside in both images
 
 
-class Trajectory(NamedTuple):
+class TrajectoryRequest(NamedTuple):
     """The requested motion and its constraints."""
 
     profile: str  # one of ``PROFILES``, ``constrained``, ``joint_space`` or ``auto``
@@ -40,7 +40,7 @@ class Trajectory(NamedTuple):
     max_goal_configurations: int  # joints that show the goal which a search tries
     max_search_samples: int  # joint vectors that two trees grow towards, at most
     search_seed: int
-    keep_out: tuple[KeptOut, ...]
+    keep_out: tuple[KeepOutRegion, ...]
 
     @property
     def rehearses(self) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.config.inputs import report_inputs
-from projservo_cli.laws import LAW_SPECS, LAWS, name_of
+from projservo_cli.laws import LAW_SPECS, LAWS, run_name
 from projservo_cli.records import Calibration
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import ReportData
@@ -44,7 +44,7 @@ def case(name="paper", steps=SHORT, whole=False):
     }
     traces["direct_three"] = filmed(traces["direct_three"], *true.image_size.astype(int))
     for law in FOLLOWING:
-        followed = name_of(law, LAW_SPECS[law].modes[1])
+        followed = run_name(law, LAW_SPECS[law].modes[1])
         traces[followed] = driven(scenario, plan, followed, model)
     clean = replace(
         known_scenario(config.idealized), limits=scenario.limits._replace(stop_at_joint_limit=False)
