@@ -7,15 +7,14 @@ from functools import partial
 
 import numpy as np
 
-from projservo_cli.calibration import predict
+from projservo_cli.calibration.prediction import predict
 from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.image_size import image_sizes
-from projservo_cli.masking import MASK
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
-from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import MASK, VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot

@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy.optimize import least_squares
 
-from projservo_cli.calibration import predict
+from projservo_cli.calibration.prediction import predict
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import image_sizes
