@@ -15,7 +15,7 @@ POINTS = "points"
 BODY = "body"
 
 
-class LawSpec(NamedTuple):
+class _LawSpec(NamedTuple):
     """Specification of one law for driving, storing and drawing."""
 
     title: str  # as figures write it
@@ -26,12 +26,12 @@ class LawSpec(NamedTuple):
 
 
 LAW_SPECS = {
-    "direct_three": LawSpec("directTHREE", (REGULATE, TRACK), BODY),
-    "direct_two": LawSpec("directTWO", (REGULATE, TRACK), BODY),
-    "stacked": LawSpec("stacked Jacobians", (REGULATE, IMAGE_TRACK), POINTS),
-    "blockwise": LawSpec("block-wise", (REGULATE,), POINTS),
-    "euclidean_points": LawSpec("Euclidean points", (REGULATE,), POINTS, metric=True),
-    "exact": LawSpec("exact", (REGULATE, TRACK), BODY, paper=False),
+    "direct_three": _LawSpec("directTHREE", (REGULATE, TRACK), BODY),
+    "direct_two": _LawSpec("directTWO", (REGULATE, TRACK), BODY),
+    "stacked": _LawSpec("stacked Jacobians", (REGULATE, IMAGE_TRACK), POINTS),
+    "blockwise": _LawSpec("block-wise", (REGULATE,), POINTS),
+    "euclidean_points": _LawSpec("Euclidean points", (REGULATE,), POINTS, metric=True),
+    "exact": _LawSpec("exact", (REGULATE, TRACK), BODY, paper=False),
 }
 LAWS = tuple(LAW_SPECS)
 CODES = {law: code for code, law in enumerate(LAWS)}  # codes of the laws in compiled code

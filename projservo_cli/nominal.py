@@ -16,9 +16,9 @@ from projservo_cli.records import FloatArray, InputError
 
 Number = Annotated[float, Strict()]
 Vector3 = tuple[Number, Number, Number]
-Vector4 = tuple[Number, Number, Number, Number]
-Matrix34 = tuple[Vector4, Vector4, Vector4]
-Matrix44 = tuple[Vector4, Vector4, Vector4, Vector4]
+_Vector4 = tuple[Number, Number, Number, Number]
+Matrix34 = tuple[_Vector4, _Vector4, _Vector4]
+Matrix44 = tuple[_Vector4, _Vector4, _Vector4, _Vector4]
 _MAX_BYTES = 10_000_000  # of the file
 _TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
 

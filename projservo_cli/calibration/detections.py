@@ -22,7 +22,7 @@ from projservo_cli.records import (
 )
 
 # Difference, rad or m, below which two joint readings are equal: far below any encoder's resolution.
-SAME_READING = 1e-7
+_SAME_READING = 1e-7
 # Minimum pixel noise, px per coordinate: exact images have round-off.
 MIN_SIGMA = 1e-4
 # Median of |x| over the standard deviation of a normal variable.
@@ -157,7 +157,7 @@ class Detections:
         q = self.q
         candidates = np.arange(len(q))
         for row in q:
-            changed = (np.abs(q[candidates] - row) > SAME_READING).sum(axis=1)
+            changed = (np.abs(q[candidates] - row) > _SAME_READING).sum(axis=1)
             candidates = candidates[changed <= 1]
         if candidates.size == 0:
             return None
@@ -167,7 +167,7 @@ class Detections:
 
     def trials(self, home: int) -> list[IntArray]:
         """Rows of q in which each joint differs from the reference, one array a joint."""
-        moved = np.abs(self.q - self.q[home]) > SAME_READING
+        moved = np.abs(self.q - self.q[home]) > _SAME_READING
         return [np.flatnonzero(column) for column in moved.T]
 
     def reference(self) -> FloatArray:

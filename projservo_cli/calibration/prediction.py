@@ -33,7 +33,7 @@ CAMERA = 12
 # Number of parameters of a lens about a given image centre, k1 and k2; two more are its centre.
 LENS = 2
 # Median held-out error, in the stated error and the noise of the images together, from which it contradicts.
-CONTRADICTED = 3.0
+_CONTRADICTED = 3.0
 # Minimum number of correspondences whose epipolar geometry determines their noise within a seventh.
 _NOISE_PAIRS = 32
 
@@ -248,7 +248,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
         if sigma_q := calibration.sigma_q:  # these readings have their own noise
             J = joint_derivative(calibration, observation.q)[:, :, order] * per_rad(calibration.prismatic)
             noise = float(np.hypot(noise, sigma_q * np.sqrt(np.median((J**2).sum(axis=(-2, -1))[compared]))))
-        limit = CONTRADICTED * float(np.hypot(stated, noise))
+        limit = _CONTRADICTED * float(np.hypot(stated, noise))
     return found | {
         "stated_px": stated,
         "noise_px": noise,

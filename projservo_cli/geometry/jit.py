@@ -88,7 +88,7 @@ PACKAGE = Path(__file__).parents[1]
 CACHE_FOLDER = cache_folder(PACKAGE) if COMPILED else None
 
 
-class PlaceInPackage(UserProvidedCacheLocator):
+class _PlaceInPackage(UserProvidedCacheLocator):
     """Locator of machine code by the place of its source in the package, wherever that is installed."""
 
     @classmethod
@@ -107,7 +107,7 @@ if CACHE_FOLDER is not None:
     SETTINGS.CACHE_DIR = str(CACHE_FOLDER)
     if "NUMBA_CACHE_LOCATOR_CLASSES" not in os.environ:
         SETTINGS.CACHE_LOCATOR_CLASSES = (
-            f"{__name__}.{PlaceInPackage.__name__},UserProvidedCacheLocator,IPythonCacheLocator"
+            f"{__name__}.{_PlaceInPackage.__name__},UserProvidedCacheLocator,IPythonCacheLocator"
         )
 # The third level of the optimiser takes a sixth more compilation time and saves a tenth of a step.
 if "NUMBA_OPT" not in os.environ:

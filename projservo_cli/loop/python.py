@@ -83,7 +83,7 @@ _compiled_bind, _compiled_command = njit(_bind, allocates=True), njit(_bound_com
 # joint-speed limit left, negative where the limit is up to the loop; what fitting a body left, and the image
 # error (px) of the face by which the run is judged; the joint at whose limit it ended a step, or −1; joints
 # (parts + 1, n) between the parts in which it wants a step sent.
-OPTIONAL: dict[str, tuple[float, ...]] = {
+_OPTIONAL: dict[str, tuple[float, ...]] = {
     "share": (-1.0,),
     "fit": (math.nan, math.nan, math.nan),
     "face_px": (math.nan,),
@@ -156,7 +156,7 @@ class Monitors(NamedTuple):
 
 
 class LoopLaw(Protocol):
-    """Interface of a law for the Python loop; it may also have the attributes of ``OPTIONAL``."""
+    """Interface of a law for the Python loop; it may also have the attributes of ``_OPTIONAL``."""
 
     errors: FloatArray
 
@@ -252,11 +252,11 @@ def run_in_python(
     s_star : (2, m, 2) target pixels; period : control period, s; scale : factor of every command.
     stall : of a robot that may lag behind its set-points; execution : of a plan that another may replace.
     Returns verdict, steps, log: as of the compiled loop, to the bit for the built-in laws. Raises InputError
-    if the law has an attribute that is a misspelt one of ``OPTIONAL``; WorkFailed if the plant or the law
+    if the law has an attribute that is a misspelt one of ``_OPTIONAL``; WorkFailed if the plant or the law
     fails before the first instant is complete.
     """
     try:
-        require_spelt(f"law {type(law).__name__}", law, ("errors", *OPTIONAL))
+        require_spelt(f"law {type(law).__name__}", law, ("errors", *_OPTIONAL))
         log = new_log(len(plant.plant.limits.lower), plant.markers, limits.max_steps, len(ERRORS))
         for column in (log.read, log.q, log.s, log.error, log.judged):
             column[:] = math.nan
@@ -329,4 +329,4 @@ def _send(
 
 def _optional(law: LoopLaw, name: str) -> Any:
     """Report of a law on its last step, in addition to the command."""
-    return getattr(law, name, OPTIONAL[name])
+    return getattr(law, name, _OPTIONAL[name])

@@ -39,7 +39,7 @@ _ANGLES, _FITTED, _NEAR_BEST = 72, 8, 30.0
 _MAX_REVERSED = 3
 
 
-class JointError(NamedTuple):
+class _JointError(NamedTuple):
     """Error of the model at one joint, each with its standard deviation."""
 
     joint: int  # number of the joint, from 1
@@ -54,7 +54,7 @@ class JointError(NamedTuple):
 class KinematicErrors(NamedTuple):
     """Errors of a model against the calibrated arm."""
 
-    joints: list[JointError]
+    joints: list[_JointError]
     length: float  # share by which the known length is too short for the links of the model
     length_std: float  # its standard deviation, which grows with what the model leaves beyond its own errors
 
@@ -228,7 +228,7 @@ def kinematic_errors(metric: Metric, given: FloatArray) -> KinematicErrors:
     std, zeros = np.sqrt(np.diag(np.linalg.pinv(fit.J.T @ fit.J))), fit.zeros()
     size, size_std = fit.axis_errors()
     joints = [
-        JointError(
+        _JointError(
             joint=i + 1,
             zero=float(zeros[i]) if 0 < i < n - 1 else None,
             zero_std=float(std[5 + i]) if 0 < i < n - 1 else None,

@@ -59,7 +59,7 @@ MARGINS = 10
 CONDITIONING = MARGINS
 
 
-class Words(NamedTuple):
+class _Words(NamedTuple):
     """Name of a constraint and of its value in its own unit; phrases take a joint's number or a view."""
 
     name: str
@@ -69,17 +69,17 @@ class Words(NamedTuple):
 
 
 CONSTRAINTS = {
-    JOINTS: Words("joints", "joints", "the limits of joint {}", "limit of joint {}"),
-    FRONT: Words("front", "front", "a marker behind the {} camera", "depth before the {} camera"),
-    VISIBILITY: Words(
+    JOINTS: _Words("joints", "joints", "the limits of joint {}", "limit of joint {}"),
+    FRONT: _Words("front", "front", "a marker behind the {} camera", "depth before the {} camera"),
+    VISIBILITY: _Words(
         "visibility", "visibility", "the face edge-on to the {} camera", "visibility from the {} camera"
     ),
-    WIDTH: Words(
+    WIDTH: _Words(
         "width", "width_px", "the width of the face in the {} image", "width of the face in the {} image"
     ),
-    IMAGE: Words("image", "border_px", "the border of the {} image", "border in the {} image"),
-    CLEAR: Words("clear", "clear_px", "a region that is kept out of", "distance from regions"),
-    CONDITIONING: Words(
+    IMAGE: _Words("image", "border_px", "the border of the {} image", "border in the {} image"),
+    CLEAR: _Words("clear", "clear_px", "a region that is kept out of", "distance from regions"),
+    CONDITIONING: _Words(
         "conditioning", "condition", "dependent operators", "reciprocal condition of the image Jacobian"
     ),
 }
@@ -87,17 +87,17 @@ CONSTRAINTS = {
 OF_MOTION = (VISIBILITY, IMAGE, JOINTS, CONDITIONING)
 
 
-def constraint_at(column: int) -> tuple[Words, int]:
+def constraint_at(column: int) -> tuple[_Words, int]:
     """Return the words of a margin, and its view if each camera has its own."""
     first = max(first for first in CONSTRAINTS if first <= column)
     return CONSTRAINTS[first], column - first
 
 
 # A margin this bad is as bad as it gets: joints out of reach.
-WORST = -10.0
+_WORST = -10.0
 # A joint that moves more than this between neighbours on a path, rad or m, asks for twice the parts between.
-MOST_PART = 0.2
-MOST_PARTS = 256
+_MOST_PART = 0.2
+_MOST_PARTS = 256
 
 
 class Demands(NamedTuple):
@@ -153,7 +153,7 @@ class Along(NamedTuple):
     q: FloatArray  # (s, n) joints, rad or m; NaN from where they cannot follow
     limit: FloatArray  # (s,) margins of the joint limits, NaN likewise
     condition: FloatArray  # (s,) reciprocal conditions of the image Jacobian, NaN likewise
-    # (s, 4) the smallest of each of ``OF_MOTION``; ``WORST`` where the joints cannot follow
+    # (s, 4) the smallest of each of ``OF_MOTION``; ``_WORST`` where the joints cannot follow
     margins: FloatArray
 
 
@@ -215,8 +215,8 @@ def image_margin(demands: Demands, distance: FloatArray) -> FloatArray:
     """Margins (...,) of distances from the border, px; 1 where images have no border."""
     half = 0.5 * float(demands.image_size.min())
     if not math.isfinite(half):
-        return np.where(distance > 0.0, 1.0, WORST)
-    return np.maximum(WORST, (distance - demands.border_px) / (half - demands.border_px))
+        return np.where(distance > 0.0, 1.0, _WORST)
+    return np.maximum(_WORST, (distance - demands.border_px) / (half - demands.border_px))
 
 
 @merged
@@ -225,7 +225,7 @@ def joint_margin(demands: Demands, q: FloatArray, i: int) -> float:
     lower, upper = float(demands.limits.lower[i]), float(demands.limits.upper[i])
     if not math.isfinite(upper - lower):
         return 1.0
-    return min(max(2.0 * min(float(q[i]) - lower, upper - float(q[i])) / (upper - lower), WORST), 1.0)
+    return min(max(2.0 * min(float(q[i]) - lower, upper - float(q[i])) / (upper - lower), _WORST), 1.0)
 
 
 @merged
@@ -330,11 +330,11 @@ def carried_into(carrier: Carrier, mu: FloatArray, found: Along) -> None:
         before = max(0, i - 1)
         parts = 0 if i == 0 else 1
         condition = -1.0
-        while condition < 0.0 and parts <= MOST_PARTS:
+        while condition < 0.0 and parts <= _MOST_PARTS:
             row_into(found.q[i], found.q[before])
             ends = (mu[before], mu[i])
-            condition = carry_joints(carrier, ends, parts, SETTLED, MOST_PART, found.q[i])
-            parts = 2 * parts if parts > 0 else MOST_PARTS + 1
+            condition = carry_joints(carrier, ends, parts, SETTLED, _MOST_PART, found.q[i])
+            parts = 2 * parts if parts > 0 else _MOST_PARTS + 1
         if condition < 0.0:
             for l in range(found.q.shape[1]):
                 found.q[i, l] = math.nan
@@ -401,7 +401,7 @@ def joint_margins_into(demands: Demands, found: Along) -> None:
     """Write the margins of joint limits and conditioning."""
     followed, excess = ~np.isnan(found.condition), found.condition - demands.conditioning
     found.margins[:, OF_MOTION.index(JOINTS)] = np.where(followed, found.limit, 1.0)
-    found.margins[:, OF_MOTION.index(CONDITIONING)] = np.where(followed, excess, WORST)
+    found.margins[:, OF_MOTION.index(CONDITIONING)] = np.where(followed, excess, _WORST)
 
 
 def tag_planes(tags: IntArray, body: FloatArray, m: int, a: FloatArray) -> FloatArray:

@@ -38,20 +38,20 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray
 # Values of each share; the second where no path stays in view on the first.
 NODES = (13, 19)
 # A joint that moves more than this between two nodes, rad or m, has changed its branch.
-MOST_STRIDE = 1.5
+_MOST_STRIDE = 1.5
 # Parts in which the path between them is made where the joints do not settle in one.
 BETWEEN = 4
 # Newton step, rad or m, after which joints at a node are good enough: they are off by its square.
-ROUGH = 1e-2
+_ROUGH = 1e-2
 # Of two paths equally short, that with longer straight steps: a share of the duration of a rad at 1 rad/s.
-STRAIGHTER = 1e-4
+_STRAIGHTER = 1e-4
 # A straight piece may take this much longer than the steps of the lattice that it replaces.
-DETOUR = 1.01
+_DETOUR = 1.01
 ROUND_OFF = 1e-9
 # Points of a path at which its joints and margins are looked at.
 CHECKS = 151
 # Shares of this part of the best one are as good; the quicker path is better.
-EQUALLY = 0.95
+_EQUALLY = 0.95
 VIEWS = [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]
 
 
@@ -83,7 +83,7 @@ def plan_path(reaching: Reaching) -> Motion:
     """
     short = abs(float(reaching.amplitudes[2])) <= 0.5 * math.pi
     paths = [along_shares(reaching, np.linspace(0.0, 1.0, CHECKS)[:, None] * np.ones(3))]
-    good = max(0.0, EQUALLY * float(paths[0].shares().min()))
+    good = max(0.0, _EQUALLY * float(paths[0].shares().min()))
     best: tuple[float, Reaching, int] = (-math.inf, reaching, NODES[0])
     for size in NODES:
         for amplitudes in _senses(reaching.amplitudes):
@@ -97,7 +97,7 @@ def plan_path(reaching: Reaching) -> Motion:
             if lattice.worth > good:  # no joints can compensate a loss of view
                 lattice = _with_joints(lattice)
                 paths += [_quickest(lattice)] if lattice.worth > good else []
-                good = max(good, EQUALLY * lattice.worth)
+                good = max(good, _EQUALLY * lattice.worth)
         if best[0] > 0.0 or good > 0.0:
             break
     if not any(path.holds() for path in paths):
@@ -116,7 +116,7 @@ def _best_of(paths: list[Motion]) -> Motion:
     """Of the paths in view, or of all if none is, the quickest whose smallest share is as good as any."""
     paths = [path for path in paths if path.shares()[:, VIEWS].min() > 0.0] or paths
     minimum = [float(path.shares().min()) for path in paths]
-    good = min(EQUALLY * max(minimum), max(minimum))
+    good = min(_EQUALLY * max(minimum), max(minimum))
     paths = [path for path, share in zip(paths, minimum, strict=True) if share >= good]
     return min(paths, key=lambda path: duration(path) if math.isfinite(duration(path)) else math.inf)
 
@@ -185,7 +185,7 @@ def _straightened(lattice: _Lattice, path: IntArray) -> FloatArray:
         """Whether the piece from one node of the path to another does."""
         x = np.linspace(0.0, 1.0, 2 * (j - i) + 1)[:, None]
         piece = along_shares(reaching, (1.0 - x) * mu[path[i]] + x * mu[path[j]], found.q[path[i]])
-        detour = minimum_time(speed, lattice.moved(piece)[0])[-1] > DETOUR * (time[j] - time[i]) + ROUND_OFF
+        detour = minimum_time(speed, lattice.moved(piece)[0])[-1] > _DETOUR * (time[j] - time[i]) + ROUND_OFF
         return not detour and bool(lattice.minimum(piece).min() >= worth - ROUND_OFF)
 
     kept, last = [0], len(path) - 1
@@ -257,7 +257,7 @@ def _shortest_into(
             if free[node] and before >= 0 and cost[before] < math.inf:
                 axes = (step >> 2) + (step >> 1 & 1) + (step & 1)
                 total = cost[before] + time_between(speed, q[before], q[node])
-                total += STRAIGHTER * math.sqrt(axes)
+                total += _STRAIGHTER * math.sqrt(axes)
                 if total < cost[node]:
                     cost[node], came[node] = total, before
 
@@ -288,7 +288,7 @@ def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int,
             continue
         for parts in (1, BETWEEN):
             ends = (mu[before], mu[node])
-            condition = carry_joints(carrier, ends, parts, ROUGH, MOST_STRIDE / parts, found.q[node])
+            condition = carry_joints(carrier, ends, parts, _ROUGH, _MOST_STRIDE / parts, found.q[node])
             if condition >= 0.0:
                 found.condition[node] = condition
                 found.limit[node] = limit = limit_margin(demands, found.q[node])

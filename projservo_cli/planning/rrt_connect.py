@@ -34,13 +34,13 @@ LEAST = 1e-9
 # Draws that the trees are given at a time.
 CHUNK = 250
 # Number of paths of the search, and draws after which no further one begins.
-WAYS, FURTHER = 2, 300
+_WAYS, FURTHER = 2, 300
 # A straight line that takes so much longer than to the nearest goal is held against what trees find.
 LONGER = 1.2
-SHORTENINGS = 60
+_SHORTENINGS = 60
 ROUND_OFF = 1e-9
 # Goals within this distance of excluded joints, rad or m, are excluded too.
-NEARBY = 0.1
+_NEARBY = 0.1
 
 
 class Tree(NamedTuple):
@@ -152,7 +152,7 @@ def find_path(
     every, rank, (solutions, hidden, blocked) = goals_of(c, target, start, known, starts)
     goals, rank = every[: search.max_goals], rank[: search.max_goals]
     off = np.abs(goals[:, None] - search.excluded)
-    far = np.all(np.max(off, axis=2, initial=0.0) > NEARBY, axis=1)
+    far = np.all(np.max(off, axis=2, initial=0.0) > _NEARBY, axis=1)
     goals, rank = goals[far], rank[far]
     clearance, _ = margins_at(c._replace(spread=NO_SPREAD), start)
     clearance[IMAGE:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
@@ -212,7 +212,7 @@ def _shortest(
         shortest = minimum_time(c.limits.speed, best)[-1]
     trees: tuple[Tree, Tree] | None = None
     if not shortest <= LONGER * (np.abs(goals - start) / c.limits.speed).max(axis=1).min():
-        for _ in range(WAYS):
+        for _ in range(_WAYS):
             left = (max_draws if math.isinf(shortest) else FURTHER) - draws
             if left <= 0:
                 break
@@ -333,7 +333,7 @@ def _branch(tree: Tree, node: int) -> FloatArray:
 def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
     """Shorten a path (k, n) by straight segments, first between random places on it."""
     time = minimum_time(c.limits.speed, path)
-    for ends in np.sort(rng.random((SHORTENINGS, 2)), axis=1):
+    for ends in np.sort(rng.random((_SHORTENINGS, 2)), axis=1):
         if len(path) <= 2:
             return path
         low, high = ends * time[-1]

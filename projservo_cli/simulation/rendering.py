@@ -36,7 +36,7 @@ _SENSOR_M = 1e-5  # width of a pixel of a camera's sensor; only ratios to it mat
 _NO_SKEW = 1e-9  # of a camera's pixels, which rounding leaves
 _NEAR_M, _FAR_M = 0.01, 50.0  # what cameras see
 _WALL, _WALL_M = "far wall", 40.0  # what stands behind everything, and how far
-FINER = 2
+_FINER = 2
 """Pixels of a drawing along each of a frame: of one alone, edges are drawn up to a tenth of a pixel off."""
 CAMERAS = ("left camera", "right camera")
 """Names of both in the model."""
@@ -305,7 +305,7 @@ def _add_cameras(spec: Any, K: FloatArray, R: FloatArray, t: FloatArray, size: t
     spec.stat.extent = 1.0
     visual = spec.visual
     visual.map.znear, visual.map.zfar = _NEAR_M, _FAR_M
-    visual.global_.offwidth, visual.global_.offheight = FINER * width, FINER * height
+    visual.global_.offwidth, visual.global_.offheight = _FINER * width, _FINER * height
     visual.quality.offsamples = 0  # the means of finer pixels do as much
 
 
@@ -331,7 +331,7 @@ class Frames:
         mj, rendered = mujoco(), self.rendered
         height, width = self.last.shape[1] + 2 * rendered.margin, self.last.shape[2] + 2 * rendered.margin
         try:
-            self._renderer = mj.Renderer(rendered.model, FINER * height, FINER * width)
+            self._renderer = mj.Renderer(rendered.model, _FINER * height, _FINER * width)
         except Exception as error:  # of another kind for each library of GL
             raise InputError(no_gl(error)) from error
         self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._scene.light == "side"
@@ -398,15 +398,15 @@ class Frames:
 
     def _mapped(self, P: FloatArray) -> list[tuple[FloatArray, FloatArray]] | None:
         """Return the places of finer pixels of a frame in the drawing, u and v of each view."""
-        width, height = FINER * self._scene.size[0], FINER * self._scene.size[1]
-        offset = 0.5 * (FINER - 1)  # centres of pixels have whole coordinates
+        width, height = _FINER * self._scene.size[0], _FINER * self._scene.size[1]
+        offset = 0.5 * (_FINER - 1)  # centres of pixels have whole coordinates
         u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-        pixels = (np.stack([u, v], axis=-1).reshape(-1, 2) - offset) / FINER
+        pixels = (np.stack([u, v], axis=-1).reshape(-1, 2) - offset) / _FINER
         lens = lens_of(P, self._scene.k1)
         drawn = drawn_at(P, lens, np.stack([pixels, pixels]))
         if np.array_equal(drawn[0], pixels) and np.array_equal(drawn[1], pixels):
             return None
         maps = (
-            (FINER * (drawn + self.rendered.margin) + offset).reshape(2, height, width, 2).astype(np.float32)
+            (_FINER * (drawn + self.rendered.margin) + offset).reshape(2, height, width, 2).astype(np.float32)
         )
         return [(np.ascontiguousarray(both[..., 0]), np.ascontiguousarray(both[..., 1])) for both in maps]

@@ -36,7 +36,7 @@ Sums = tuple[
     float, float, float, float, float, float, float, float, float, float, float, float, float,
 ]  # fmt: skip
 # Sums over no rows.
-NO_SUMS: Sums = (
+_NO_SUMS: Sums = (
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
 )  # fmt: skip
@@ -198,7 +198,7 @@ def _normal_equations(
     Arguments as of ``fit_body``; images are linearised in ξ about H. Writes the equations to ``normal``.
     Returns the sum of squared residuals, px², and the number of markers seen, counted once a view.
     """
-    N = NO_SUMS
+    N = _NO_SUMS
     squares = 0.0
     views = 0
     D_0, D_1, D_2 = vec(body.D[0]), vec(body.D[1]), vec(body.D[2])

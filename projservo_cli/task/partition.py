@@ -36,7 +36,7 @@ from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.visibility import CONTINUITY_BAND, HALF_TURN_TOLERANCE, choose_sense
 
 # Distance of two unit vectors below which they are equal to working precision.
-COINCIDENT = 1e-14
+_COINCIDENT = 1e-14
 
 
 class Split(NamedTuple):
@@ -114,7 +114,7 @@ def translation_part(work: Work, A_c: Vec4, A_cs: Vec4, q_hat: FloatArray) -> tu
     centres, hence as transversal as the coordinates allow. The sense has τ ≥ 0; for equal centres τ = 0.
     """
     D = sub(A_cs, A_c)
-    if dot(D, D) <= COINCIDENT * COINCIDENT * dot(A_cs, A_cs):
+    if dot(D, D) <= _COINCIDENT * _COINCIDENT * dot(A_cs, A_cs):
         q_hat[:] = 0.0
         return True, 0.0, NO_OPERATOR
     found, H_t = translation_mechanism(work, A_c, D, q_hat)
@@ -144,12 +144,12 @@ def onto_plane_part(
     # Both planes contain the centre: keep round-off of its distance from displacing the axis of nearly equal
     # planes.
     D = axpy(-dot(D, A_c) / dot(A_c, A_c), A_c, D)
-    if dot(D, D) <= COINCIDENT * COINCIDENT:
+    if dot(D, D) <= _COINCIDENT * _COINCIDENT:
         if same >= 0.0:
             q_hat[:] = 0.0
             return True, 0.0, NO_OPERATOR
         first = sub(vec(A[task.order[0]]), A_c)
-        if dot(first, first) <= COINCIDENT * COINCIDENT * dot(A_c, A_c):
+        if dot(first, first) <= _COINCIDENT * _COINCIDENT * dot(A_c, A_c):
             first = sub(vec(A[task.order[1]]), A_c)
         found, H_r = rotation_mechanism(work, unit(A_c), unit(first), q_hat)
     else:
