@@ -16,6 +16,13 @@ from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 # Pose of a base that stays where it is.
 _NOWHERE = np.eye(4)
+# Change of a quadratic form by the joints, over the largest, below which it is invariant.
+_INVARIANT = 1e-6
+# Orthonormal basis (6, 3, 3) of symmetric forms, by the rows and columns of their entries.
+_ROWS, _COLUMNS = np.triu_indices(3)
+_SYMMETRIC = np.zeros((6, 3, 3))
+_SYMMETRIC[range(6), _ROWS, _COLUMNS] = np.where(_ROWS == _COLUMNS, 1.0, 1.0 / np.sqrt(2.0))
+_SYMMETRIC[range(6), _COLUMNS, _ROWS] = _SYMMETRIC[range(6), _ROWS, _COLUMNS]
 
 
 @inline
@@ -232,22 +239,21 @@ def rigid_inverse(T: FloatArray) -> FloatArray:
     return result
 
 
-# Change of a quadratic form by the joints, over the largest, below which it is invariant.
-_INVARIANT = 1e-6
+def symmetric(coefficients: FloatArray) -> FloatArray:
+    """Symmetric forms (…, 3, 3) by their coefficients (…, 6) in an orthonormal basis."""
+    return np.einsum("...s,sab->...ab", coefficients, _SYMMETRIC)
 
 
 def invariant_forms(actions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Symmetric forms S (…, 6, 3, 3), orthonormal, by how much they change under actions L (…, n, 3, 3).
+    """Orthonormal coefficients (…, 6, 6) of forms Q, by how much actions L (…, n, 3, 3) change them.
 
-    The change is L S + S Lᵀ, of all actions together; its sizes (…, 6) come with the forms, largest first.
+    The change is LᵀQ + QL, of all actions together; its sizes (…, 6) come with them, largest first.
     """
-    i, j = np.triu_indices(3)
-    basis = np.zeros((6, 3, 3))
-    basis[range(6), i, j] = basis[range(6), j, i] = np.where(i == j, 1.0, np.sqrt(0.5))
-    moved = np.einsum("...nab,sbc->...nacs", actions, basis)
-    changes = (moved + np.einsum("...nacs->...ncas", moved)).reshape(*actions.shape[:-3], -1, 6)
+    changes = np.einsum("...nba,sbc->...snac", actions, _SYMMETRIC)
+    changes = changes + np.einsum("sab,...nbc->...snac", _SYMMETRIC, actions)
+    changes = changes.reshape(*actions.shape[:-3], 6, -1).swapaxes(-1, -2)
     _, sizes, rows = np.linalg.svd(changes)
-    return sizes, np.einsum("...ts,sab->...tab", rows, basis)
+    return sizes, rows
 
 
 def invariant_rotations(actions: FloatArray) -> FloatArray:
@@ -258,9 +264,9 @@ def invariant_rotations(actions: FloatArray) -> FloatArray:
 
     Raises WorkFailed if the joints preserve no metric.
     """
-    sizes, forms = invariant_forms(np.swapaxes(actions, 1, 2))
-    kept = forms[sizes <= _INVARIANT * max(sizes[0], 1.0)]
-    Q = np.einsum("s,sab->ab", np.einsum("saa->s", kept), kept)
+    sizes, rows = invariant_forms(actions)
+    kept = rows[sizes <= _INVARIANT * max(sizes[0], 1.0)]
+    Q = symmetric(kept.T @ (kept @ np.einsum("saa->s", _SYMMETRIC)))
     if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
         raise WorkFailed(
             "the joints preserve no metric of the calibrated frame: calibrate again, or measure point by "

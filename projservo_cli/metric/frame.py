@@ -26,6 +26,7 @@ from projservo_cli.geometry.displacements import (
     rigid_inverse,
     screw_displacements,
     screws,
+    symmetric,
     twists,
 )
 from projservo_cli.geometry.lens import TERMS, distort, undistort
@@ -116,11 +117,11 @@ def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
     U = np.linalg.svd(np.concatenate(np.moveaxis(H_hat, -3, 0), axis=-1))[0]
     D, a_inf = U[..., :3].swapaxes(-1, -2), U[..., 3]
     L = (D[..., None, :, :] @ H_hat @ D.swapaxes(-1, -2)[..., None, :, :])[..., turning, :, :]
-    sizes, forms = invariant_forms(L)
+    sizes, rows = invariant_forms(np.swapaxes(L, -1, -2))
     if (sizes[..., 4] < _SECOND_FORM * sizes[..., 0]).any():
         raise InputError(_ALL_PARALLEL)
-    S = forms[..., 5, :, :]
-    S = S * np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None]
+    S = symmetric(rows[..., 5, :])
+    S *= np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None]
     try:
         A = np.linalg.cholesky(S)
     except np.linalg.LinAlgError:
