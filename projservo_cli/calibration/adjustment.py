@@ -11,7 +11,8 @@ complement), so the cost is linear in the markers: W. A. Fuller, "Measurement er
 section 3.2; B. Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
 
 Levenberg–Marquardt with geodesic acceleration and a gauge penalty: M. Transtrum, J. Sethna,
-"Improvements to the Levenberg–Marquardt algorithm", arXiv:1201.5885.
+"Improvements to the Levenberg–Marquardt algorithm", arXiv:1201.5885. SciPy's solvers know neither the
+elimination nor the gauge, and hold the whole derivative.
 """
 
 import dataclasses

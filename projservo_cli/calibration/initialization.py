@@ -265,7 +265,10 @@ def _chain(w: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray:
 def _fit_axes(
     w: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Axes (S, n, 3) and losses (S,): Levenberg–Marquardt for all at once, Cauchy loss on log(R R_predᵀ)."""
+    """Axes (S, n, 3) and losses (S,): Levenberg–Marquardt for all at once, Cauchy loss on log(R R_predᵀ).
+
+    All random starts S are one array, of which each keeps its own damping; SciPy takes them one by one.
+    """
     S, n = w.shape[:2]
     away = np.swapaxes(_chain(w, q, prismatic)[:, n], -1, -2) @ R
     base = np.stack([Rotation.from_matrix(rotations).mean().as_matrix() for rotations in away])

@@ -241,7 +241,7 @@ def rigid_inverse(T: FloatArray) -> FloatArray:
 
 def symmetric(coefficients: FloatArray) -> FloatArray:
     """Symmetric forms (…, 3, 3) by their coefficients (…, 6) in an orthonormal basis."""
-    return np.einsum("...s,sab->...ab", coefficients, _SYMMETRIC)
+    return np.asarray(np.einsum("...s,sab->...ab", coefficients, _SYMMETRIC))
 
 
 def invariant_forms(actions: FloatArray) -> tuple[FloatArray, FloatArray]:

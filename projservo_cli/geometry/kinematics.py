@@ -9,7 +9,7 @@ from projservo_cli.geometry.displacements import rotation, rotation_and_inverse,
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.image_size import BEHIND
-from projservo_cli.records import NO_LENS, FloatArray, Model
+from projservo_cli.records import NO_LENS, FloatArray, JointLimits, Model
 
 
 @internal
@@ -77,10 +77,16 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
 
 
 @merged
-def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
-    """First joint outside its limits, or −1."""
+def limit_distance(limits: JointLimits, q: FloatArray, i: int) -> float:
+    """Distance of joint i of q (n,) from its nearer limit, rad or m; negative beyond it."""
+    return min(float(q[i]) - float(limits.lower[i]), float(limits.upper[i]) - float(q[i]))
+
+
+@merged
+def beyond_limits(limits: JointLimits, q: FloatArray, slack: float) -> int:
+    """First joint of q (n,) that is beyond its limits by more than a slack, rad or m; or −1."""
     for i in range(q.shape[0]):
-        if not lower[i] <= q[i] <= upper[i]:
+        if not limit_distance(limits, q, i) >= -slack:
             return i
     return -1
 

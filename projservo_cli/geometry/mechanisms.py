@@ -226,7 +226,9 @@ class MeasuredFace(NamedTuple):
 def reach(model: Model, face: MeasuredFace, goal: Mat4, q: FloatArray, work: Work, settled: float) -> bool:
     """Newton steps on the joints ``q``, in place, until they displace a measured face by ``goal``.
 
-    Steps have minimum norm with more than six joints; fewer bring the face as near as they can.
+    Steps have minimum norm with more than six joints; fewer bring the face as near as they can. It runs in
+    every period from joints nearby, so it has neither the damping nor the starts of
+    ``planning.goal_configurations``, which knows no joints nearby.
 
     work : for n joints and 4m rows.
     settled : maximum joint motion of the last step, rad or m.

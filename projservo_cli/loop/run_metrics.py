@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, sub, vec, vec_into
 from projservo_cli.geometry.jit import inline, merged, njit
-from projservo_cli.geometry.kinematics import forward
+from projservo_cli.geometry.kinematics import beyond_limits, forward
 from projservo_cli.loop.verdicts import CONVERGED, Log
 from projservo_cli.records import MM, FloatArray
 from projservo_cli.simulation.analytic_plant import Ends, Plant, shows_face
@@ -90,10 +90,8 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
 def _keeps_within(plant: Plant, log: Log, steps: int) -> bool:
     """Whether at each instant all joints are within their limits and the face within both true images."""
     for k in range(steps + 1):
-        for i in range(log.q.shape[1]):
-            q = log.q[k, i]
-            if not plant.limits.lower[i] - _ROUND_OFF <= q <= plant.limits.upper[i] + _ROUND_OFF:
-                return False
+        if beyond_limits(plant.limits, log.q[k], _ROUND_OFF) >= 0:
+            return False
         if not shows_face(plant, mat(log.H[k]), log.scratch[0]):
             return False
     return True

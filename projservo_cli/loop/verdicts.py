@@ -126,7 +126,7 @@ def note(log: Log, k: int, s_star: FloatArray, plant: Plant, limits: Limits) -> 
     left = _outside(log.s[k], s_star.shape[1], plant.image_size)
     if left and log.events[0] < 0.0:
         log.events[0] = k
-    joint = beyond_limits(log.read[k], plant.limits.lower, plant.limits.upper)
+    joint = beyond_limits(plant.limits, log.read[k], 0.0)
     if joint >= 0 and log.events[1] < 0.0 and not limits.stop_at_joint_limit:
         log.events[1] = k
         log.events[2] = joint

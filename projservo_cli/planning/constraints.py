@@ -15,7 +15,14 @@ import numpy as np
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import row_into
-from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, from_border, row
+from projservo_cli.geometry.kinematics import (
+    backward,
+    forward,
+    forward_kinematics,
+    from_border,
+    limit_distance,
+    row,
+)
 from projservo_cli.planning.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance, squared
 from projservo_cli.planning.margins import (
     CLEAR,
@@ -107,7 +114,7 @@ def constraints_of(
 def _limits_into(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
     minimum = math.inf
     for i in range(q.shape[0]):
-        minimum = min(minimum, min(q[i] - c.limits.lower[i], c.limits.upper[i] - q[i]) / c.keep[i])
+        minimum = min(minimum, limit_distance(c.limits, q, i) / c.keep[i])
     margins[JOINTS] = minimum
 
 
@@ -380,7 +387,7 @@ def _valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
         if not trial.margins[i] > trial.demands[i]:
             trial.failures[i] += 1
             for j in range(q.shape[0] if i == JOINTS else 0):
-                room = min(q[j] - c.limits.lower[j], c.limits.upper[j] - q[j]) / c.keep[j]
+                room = limit_distance(c.limits, q, j) / c.keep[j]
                 trial.failures[MARGINS + j] += not room > trial.demands[JOINTS]
             return False
     return True

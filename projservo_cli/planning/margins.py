@@ -44,7 +44,15 @@ from projservo_cli.geometry.algebra import (
 )
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
-from projservo_cli.geometry.kinematics import backward, forward, image_motion, operators_at, project, row
+from projservo_cli.geometry.kinematics import (
+    backward,
+    forward,
+    image_motion,
+    limit_distance,
+    operators_at,
+    project,
+    row,
+)
 from projservo_cli.geometry.lens import distort_pixel, distorts
 from projservo_cli.geometry.mechanisms import SETTLED, MeasuredFace, Work, make_span, reach, workspace
 from projservo_cli.image_size import BEHIND, border_distance
@@ -222,10 +230,10 @@ def image_margin(demands: Demands, distance: FloatArray) -> FloatArray:
 @merged
 def joint_margin(demands: Demands, q: FloatArray, i: int) -> float:
     """Margin of the limits of joint i of q (n,); 1 for a joint without."""
-    lower, upper = float(demands.limits.lower[i]), float(demands.limits.upper[i])
-    if not math.isfinite(upper - lower):
+    size = float(demands.limits.upper[i]) - float(demands.limits.lower[i])
+    if not math.isfinite(size):
         return 1.0
-    return min(max(2.0 * min(float(q[i]) - lower, upper - float(q[i])) / (upper - lower), _WORST), 1.0)
+    return min(max(2.0 * limit_distance(demands.limits, q, i) / size, _WORST), 1.0)
 
 
 @merged

@@ -123,7 +123,10 @@ def inverse_kinematics(robot: SerialArm, goal: FloatArray, q_start: FloatArray) 
 
 
 def _newton(robot: SerialArm, goal: FloatArray, q: FloatArray) -> FloatArray | None:
-    """Damped Newton steps to a pose; None where they do not arrive."""
+    """Damped Newton steps to a pose; None where they do not arrive.
+
+    The truth of a simulation is a metric pose, to 1e-13, whereas planning has images of a face alone.
+    """
     model = robot.model(np.zeros((2, 3, 4)))
     for _ in range(40):
         pose = forward_kinematics(model, q) @ robot.base_tool

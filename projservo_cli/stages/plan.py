@@ -92,7 +92,7 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
     """Refuse a task whose goal leaves more than ``LEFT_PX`` wherever the joints bring the face.
 
     The joints that bring the face A (m, 4) nearest to its planned images (s, 2, m, 2), in px, are carried
-    along the plan from those at the start (n,).
+    along the plan from those at the start (n,); SciPy's least squares do for twenty images.
     """
     M = A @ np.linalg.inv(forward_kinematics(model, q_start)).T
     q = q_start

@@ -293,7 +293,8 @@ def joints_showing(
     """Joints (n,) at which markers are predicted where images (2, b, 2) show them, and the median error, px.
 
     Least squares from joints (n,) and from others about them, until a start leads near enough; else the
-    nearest. s : NaN where unseen.
+    nearest. Markers may be wrong here, so the loss is robust, which ``planning.goal_configurations`` has not.
+    s : NaN where unseen.
     """
     places, seen, rng = calibration.indices_of(numbers), np.isfinite(s), np.random.default_rng(0)
 
