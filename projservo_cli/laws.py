@@ -75,7 +75,7 @@ def run_names(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
 
     Raises InputError if a law has none of them.
     """
-    found = []
+    names = []
     for law in laws:
         own = LAW_SPECS[law].modes if law in LAW_SPECS else (REGULATE,)
         if not set(own) & set(modes):
@@ -84,5 +84,5 @@ def run_names(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
                 f"control.mode {' and '.join(modes)}: {law} has no such mode, only "
                 f"{' and '.join(own)}; laws that have one: {', '.join(able)} (--law, control.laws)"
             )
-        found += [run_name(law, mode) for mode in modes if mode in own]
-    return tuple(dict.fromkeys(found))
+        names += [run_name(law, mode) for mode in modes if mode in own]
+    return tuple(dict.fromkeys(names))

@@ -89,18 +89,18 @@ def read_nominal(path: Path | str) -> dict[str, Any]:
     (m) with ``T_base_tool_at_reference``, and perhaps ``marker_numbers`` (0, 1 …).
     Raises InputError ``file: key: what`` when it cannot be read or makes no sense.
     """
-    found = _believed(path)
-    for key, what in found.contradictions():
+    believed = _believed(path)
+    for key, what in believed.contradictions():
         raise InputError(f"{path}: {key}: {what}")
-    numbers = found.marker_numbers or range(len(found.markers_tool))
-    body = np.c_[np.array(found.markers_tool), np.ones(len(numbers))]
+    numbers = believed.marker_numbers or range(len(believed.markers_tool))
+    body = np.c_[np.array(believed.markers_tool), np.ones(len(numbers))]
     return {
         "where": str(path),
-        "P": np.array([found.camera_left, found.camera_right]),
-        "H_hat": np.array([_twist(f"{path}: screws.{i}", screw) for i, screw in enumerate(found.screws)]),
-        "q_reference": np.array(found.q_reference, dtype=np.float64),
+        "P": np.array([believed.camera_left, believed.camera_right]),
+        "H_hat": np.array([_twist(f"{path}: screws.{i}", screw) for i, screw in enumerate(believed.screws)]),
+        "q_reference": np.array(believed.q_reference, dtype=np.float64),
         "marker": np.array(numbers, dtype=np.int64),
-        "M": body @ np.array(found.T_base_tool_at_reference).T,
+        "M": body @ np.array(believed.T_base_tool_at_reference).T,
     }
 
 

@@ -83,7 +83,7 @@ _PARAMETER = re.compile(
 def masked(value: Any) -> Any:
     """A text without passwords and tokens of URLs; of mappings and lists, each value so."""
     if isinstance(value, str):
-        value = _USERINFO.sub(lambda found: f"://{found[1] or ''}{MASK}@", value) if "://" in value else value
+        value = _USERINFO.sub(lambda match: f"://{match[1] or ''}{MASK}@", value) if "://" in value else value
         return _PARAMETER.sub(rf"\1{MASK}", value) if "=" in value else value
     if isinstance(value, dict):
         return {key: masked(inner) for key, inner in value.items()}

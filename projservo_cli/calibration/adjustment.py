@@ -217,8 +217,8 @@ class LeastSquares:
         result[: 2 * CAMERA, :-2] = -(params.P @ motions[:, None]).reshape(len(motions), -1).T
         for i, (H_hat, reach) in enumerate(zip(params.H_hat, moved_operators(params), strict=True)):
             wanted = (motions @ H_hat - H_hat @ motions).reshape(-1, 16).T
-            found = np.linalg.lstsq(reach.reshape(-1, 16).T, wanted, rcond=None)[0]
-            result[self.joint[i] : self.joint[i + 1], :-2] = found
+            coefficients = np.linalg.lstsq(reach.reshape(-1, 16).T, wanted, rcond=None)[0]
+            result[self.joint[i] : self.joint[i + 1], :-2] = coefficients
         moved = (params.M @ motions.swapaxes(1, 2))[..., :3]
         result[self.shared :, :-2] = moved.reshape(len(motions), -1).T
         for v in (0, 1):
@@ -447,10 +447,10 @@ class _Expansion:
         for v, columns in enumerate(self.problem.columns):
             J = part.shared[v].reshape(-1, len(columns))
             A[np.ix_(columns, columns)] += J.T @ J
-            one = part.shared[[v]]
-            C[part.gone.blocks, :, columns] += part.gone._replace(J=part.gone.J[[v]]).across(one)
+            of_view = part.shared[[v]]
+            C[part.gone.blocks, :, columns] += part.gone._replace(J=part.gone.J[[v]]).across(of_view)
             if other is not None:
-                crossed = other._replace(J=other.J[[v]]).across(one).reshape(-1, len(columns))
+                crossed = other._replace(J=other.J[[v]]).across(of_view).reshape(-1, len(columns))
                 A[own.reshape(-1, 1), columns] += crossed
                 A[columns[:, None], own.ravel()] += crossed.T
         if other is not None:

@@ -231,10 +231,10 @@ def _refine(F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArr
         return sampson(turned(x), left, right, weight)[0]
 
     scale = 2.0 * deviation(sampson(F, left, right, weight)[0], 1e-12)
-    found = least_squares(
+    fit = least_squares(
         distances, np.zeros(7), "3-point", loss="cauchy", f_scale=scale, ftol=_TIGHT, xtol=_TIGHT, gtol=_TIGHT
     )
-    return turned(found.x)
+    return turned(fit.x)
 
 
 def _transfer(left: FloatArray, right: FloatArray) -> FloatArray:
@@ -341,12 +341,12 @@ def metric_guesses(
     # A minimum at which the body deforms far more than at the best one is no start.
     minima = minima[spread[minima] <= max(4.0 * spread[minima[0]], 0.05)]
     step = float(grid[1] - grid[0])
-    found = []
+    guesses = []
     for i in minima:
         bounds = float(grid[i]) - step, float(grid[i]) + step
         fine = minimize_scalar(spread_at, bounds=bounds, method="bounded", options={"xatol": _FINE * step})
-        found.append(guess(fine.x if fine.fun < spread[i] else grid[i], factor))
-    return found
+        guesses.append(guess(fine.x if fine.fun < spread[i] else grid[i], factor))
+    return guesses
 
 
 def _guess_at(

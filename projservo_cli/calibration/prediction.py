@@ -240,16 +240,17 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     seen: BoolArray = np.asarray(np.isfinite(images).all(axis=-1))
     ahead = np.isfinite(pixels[..., 0])
     compared = seen[:, :, known] & ahead
-    found = distance_statistics(np.linalg.norm((pixels - observation.images[:, :, known])[compared], axis=1))
+    off = (pixels - observation.images[:, :, known])[compared]
+    statistics = distance_statistics(np.linalg.norm(off, axis=1))
     stated = noise = limit = None
-    if found["count"] and np.isfinite(calibration.sqrt_cov_shared).all():
+    if statistics["count"] and np.isfinite(calibration.sqrt_cov_shared).all():
         of_pairs = prediction_variance(calibration, observation.q).sum(axis=-1)[:, :, order][compared]
         stated, noise = float(np.sqrt(np.median(of_pairs))), _image_noise(calibration, observation)
         if sigma_q := calibration.sigma_q:  # these readings have their own noise
             J = joint_derivative(calibration, observation.q)[:, :, order] * per_rad(calibration.prismatic)
             noise = float(np.hypot(noise, sigma_q * np.sqrt(np.median((J**2).sum(axis=(-2, -1))[compared]))))
         limit = _CONTRADICTED * float(np.hypot(stated, noise))
-    return found | {
+    return statistics | {
         "stated_px": stated,
         "noise_px": noise,
         "limit_px": limit,

@@ -224,8 +224,8 @@ def _require_space(P: FloatArray, points: FloatArray, sigma_px: float) -> None:
     plane = np.linalg.svd(points)[2][3]
     center = np.linalg.svd(P[0])[2][3]
     on_plane = points - np.outer(points @ plane / (center @ plane), center)
-    seen, flat = points @ P[1].T, on_plane @ P[1].T
-    parallax = np.linalg.norm(seen[:, :2] / seen[:, 2:] - flat[:, :2] / flat[:, 2:], axis=1)
+    in_space, flat = points @ P[1].T, on_plane @ P[1].T
+    parallax = np.linalg.norm(in_space[:, :2] / in_space[:, 2:] - flat[:, :2] / flat[:, 2:], axis=1)
     if float(np.sqrt((parallax**2).mean())) < _COPLANAR * sigma_px:
         raise WorkFailed(
             "the markers lie in one plane: a plane's motion does not determine a 4×4 homography; "

@@ -62,8 +62,8 @@ def direct_two(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatAr
     status, parts = partitioned(model, task, s, q, state)
     if status != OK:
         return status
-    found, theta_s, sense, _ = single_rotation(model, parts, gains.ratio_rp, state)
-    if not found:
+    unique, theta_s, sense, _ = single_rotation(model, parts, gains.ratio_rp, state)
+    if not unique:
         return SINGULAR
     rate = gains.gain_s * theta_s * sense
     t = translation_rate(task, gains, parts, state)
@@ -216,8 +216,8 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     status, parts = partitioned(model, task, s, q, state)
     if status != OK:
         return status
-    found, theta_s, sense, H_s = single_rotation(model, parts, 1.0, state)
-    if not found:
+    unique, theta_s, sense, H_s = single_rotation(model, parts, 1.0, state)
+    if not unique:
         return SINGULAR
     tau = translation_rate(task, gains, parts, state) * gains.period
     theta = gains.gain_s * theta_s * gains.period

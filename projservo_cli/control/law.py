@@ -201,8 +201,8 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
             and math.isfinite(s[1, k, 1])
         ):
             return False
-        found, M = triangulate(model.P, task.F, model.a_inf, s[0, k], s[1, k])
-        if not found:
+        finite, M = triangulate(model.P, task.F, model.a_inf, s[0, k], s[1, k])
+        if not finite:
             return False
         vec_into(state.A[k], M)
     return True
@@ -336,9 +336,9 @@ def single_rotation(
     if not turns:
         return True, 0.0, 0.0, H_s
     axis = _axis_direction(H_s, model.a_inf, parts.A_c)
-    found, H = rotation_mechanism(state.work, unit(parts.A_c), axis, state.q_hat[3])
+    unique, H = rotation_mechanism(state.work, unit(parts.A_c), axis, state.q_hat[3])
     size = inner(H, H)
-    if not found or size == 0.0:
+    if not unique or size == 0.0:
         return False, theta_s, 0.0, H_s
     return True, theta_s, inner(H, H_s) / size, H_s
 

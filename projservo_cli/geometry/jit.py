@@ -30,14 +30,14 @@ _IMPORT = re.compile(rb"^\s*from projservo_cli(?:\.([\w.]+))? import (\([^)]*\)|
 def compiled_sources(root: Path) -> dict[str, bytes]:
     """Sources of a package, by their paths in it, with compiled functions, and those that they import."""
     sources = {file.relative_to(root).as_posix(): file.read_bytes() for file in root.rglob("*.py")}
-    found: dict[str, bytes] = {}
+    needed: dict[str, bytes] = {}
     due = [name for name, source in sources.items() if _DECORATED.search(source)]
     while due:
         name = due.pop()
-        if name in sources and name not in found:
-            found[name] = sources[name]
+        if name in sources and name not in needed:
+            needed[name] = sources[name]
             due += _imported(sources[name])
-    return dict(sorted(found.items()))
+    return dict(sorted(needed.items()))
 
 
 def _imported(source: bytes) -> Iterator[str]:
@@ -154,15 +154,15 @@ class _Internal(CPUDispatcher):
         return self._caller(*arguments)
 
 
-def internal(function: Callable[_Params, _Result], **given: Any) -> Callable[_Params, _Result]:
+def internal(function: Callable[_Params, _Result], **further: Any) -> Callable[_Params, _Result]:
     """Compile a function that only compiled ones and tests call.
 
     Without the interface to Python it compiles a fifth faster, for a record of a hundred arrays.
-    given : further options of the compiler.
+    further : further options of the compiler.
     """
     if not COMPILED:
         return function
-    options = {**_UNCACHED, "nopython": True, "no_cpython_wrapper": True, **given}
+    options = {**_UNCACHED, "nopython": True, "no_cpython_wrapper": True, **further}
     dispatcher = _Internal(function, targetoptions=options)
     if _OPTIONS["cache"]:
         dispatcher.enable_caching()

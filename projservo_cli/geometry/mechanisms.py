@@ -146,8 +146,8 @@ def _moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
 @internal
 def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Kernel vector and operator with the scale ν of [RH00] eqs. (9), (10): trace(Ĥ²) = −2."""
-    found, H = _moving(work, q_hat)
-    if not found:
+    unique, H = _moving(work, q_hat)
+    if not unique:
         return False, NO_OPERATOR
     # The sum is written out, since dynamic indices of a tuple need memory.
     trace = (H[0] * H[0] + H[5] * H[5]) + (H[10] * H[10] + H[15] * H[15])

@@ -124,8 +124,8 @@ def triangulate_points(P: FloatArray, a_inf: FloatArray, s: FloatArray) -> Float
 def points_into(P: FloatArray, F: FloatArray, a_inf: FloatArray, s: FloatArray, M: FloatArray) -> int:
     """Triangulate the first m stereo pixels into M (m, 4); the first pixel without a point, or −1."""
     for k in range(M.shape[0]):
-        found, point = triangulate(P, F, a_inf, s[0, k], s[1, k])
-        if not found:
+        finite, point = triangulate(P, F, a_inf, s[0, k], s[1, k])
+        if not finite:
             return k
         vec_into(M[k], point)
     return -1

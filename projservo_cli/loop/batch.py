@@ -84,11 +84,11 @@ class _Rehearsal:
         model = self.model
         # Cameras have no sign of their own; the plant distinguishes front and back by positive depths.
         depth = model.P[:, 2] @ np.array(center_of(state.A, MIDPOINT))
-        seen = model._replace(P=model.P * np.sign(depth)[:, None, None])
+        oriented = model._replace(P=model.P * np.sign(depth)[:, None, None])
         M = np.ascontiguousarray(state.A @ as_array(backward(model, self.q_start)).T)
         endless = np.full((2, 2), np.inf)
-        plant = Plant(seen, M, task.order, task.center, task.O, task.visible, endless, self.bounds, False)
-        law = Law(_DIRECT_TWO, seen, task._replace(body=NO_BODY), _REHEARSAL)
+        plant = Plant(oriented, M, task.order, task.center, task.O, task.visible, endless, self.bounds, False)
+        law = Law(_DIRECT_TWO, oriented, task._replace(body=NO_BODY), _REHEARSAL)
         step = np.full(len(self.q_start), _REHEARSAL_STEP)
         q_hat_p = state.q_hat[2].copy()
 
@@ -300,8 +300,8 @@ def _drive(setting: Setting, status: int, noise: FloatArray, desk: _Desk, number
     numbers[STEPS] = steps
     if verdict != RUNNING:
         ended, period = Ended(verdict, steps, state.limited[0]), setting.gains.period
-        found = summarize(setting.course.plant, desk.log, ended, period, setting.ends)
+        summary = summarize(setting.course.plant, desk.log, ended, period, setting.ends)
         column = 2
-        for value in literal_unroll(found):
+        for value in literal_unroll(summary):
             numbers[column] = value
             column += 1

@@ -152,8 +152,9 @@ class ExecutionMonitor:
         predicted = np.array([self.replanner.predicted(q) for q in log.read[rows]])
         b = min(log.s.shape[2], predicted.shape[2])
         off = log.s[rows, :, :b] - predicted[:, :, :b]
-        seen = np.isfinite(off)
-        return np.asarray(np.where(seen, off, 0.0).sum(axis=(0, 2)) / np.maximum(seen.sum(axis=(0, 2)), 1))
+        visible = np.isfinite(off)
+        count = np.maximum(visible.sum(axis=(0, 2)), 1)
+        return np.asarray(np.where(visible, off, 0.0).sum(axis=(0, 2)) / count)
 
     def _leaves_image(self, log: Log, k: int, ahead: FloatArray) -> bool:
         """Whether the face leaves an image along joints (s, n), by what images are off now and there."""

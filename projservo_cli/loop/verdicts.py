@@ -142,15 +142,15 @@ def _image_error(s: FloatArray, s_star: FloatArray) -> float:
     NaN where none is. Further markers in ``s`` do not count.
     """
     total = 0.0
-    seen = 0
+    count = 0
     for view in range(2):
         for k in range(s_star.shape[1]):
             du = s[view, k, 0] - s_star[view, k, 0]
             dv = s[view, k, 1] - s_star[view, k, 1]
             if math.isfinite(du) and math.isfinite(dv):
                 total += du * du + dv * dv
-                seen += 1
-    return math.sqrt(total / seen) if seen > 0 else math.nan
+                count += 1
+    return math.sqrt(total / count) if count > 0 else math.nan
 
 
 @merged

@@ -161,9 +161,9 @@ def base_frame(axes: FloatArray, prismatic: BoolArray, joints: tuple[int, int, i
 
 def in_frame(axes: FloatArray, prismatic: BoolArray, frame: FloatArray) -> FloatArray:
     """Screws (…, n, 6) in a frame, by its poses (…, 4, 4)."""
-    found = screws(rigid_inverse(frame)[..., None, :, :] @ twists(axes) @ frame[..., None, :, :])
-    found[..., prismatic, :3] = 0.0
-    return found
+    moved = screws(rigid_inverse(frame)[..., None, :, :] @ twists(axes) @ frame[..., None, :, :])
+    moved[..., prismatic, :3] = 0.0
+    return moved
 
 
 def links(axes: FloatArray, prismatic: BoolArray, like: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -510,10 +510,10 @@ class Metric:
         WorkFailed
             If two rays determine no finite point.
         """
-        s, seen, shape = self._pixels(pixels)
-        points = np.full((len(seen), 3), np.nan)
+        s, in_both, shape = self._pixels(pixels)
+        points = np.full((len(in_both), 3), np.nan)
         a_inf = np.array([0.0, 0.0, 0.0, 1.0])
-        points[seen] = triangulate_points(self.body.P, a_inf, undistort(self.body.lens, s))[:, :3]
+        points[in_both] = triangulate_points(self.body.P, a_inf, undistort(self.body.lens, s))[:, :3]
         return points.reshape(*shape, 3)
 
     def triangulation_covariance(self, pixels: npt.ArrayLike) -> FloatArray:
@@ -532,16 +532,16 @@ class Metric:
         InputError, WorkFailed
             As for ``triangulate``.
         """
-        _, seen, shape = self._pixels(pixels)
-        X = self.triangulate(pixels).reshape(-1, 3)[seen]
+        _, in_both, shape = self._pixels(pixels)
+        X = self.triangulate(pixels).reshape(-1, 3)[in_both]
         step = _PROBE * np.linalg.norm(self.poses[0, :3, 3] - X, axis=1)[:, None]
         moves = [self.body.pixels(X + step * e) - self.body.pixels(X - step * e) for e in np.eye(3)]
         J = np.moveaxis(np.stack(moves).reshape(3, len(X), 4) / (2.0 * step), 0, -1)
         pinv = np.linalg.pinv(J)
         moved = self.changes(lambda body: body.pixels(np.broadcast_to(X, (len(body.P), *X.shape))))
         of = np.einsum("kij,ckj->cki", pinv, moved.reshape(len(moved), len(X), 4))
-        C = np.full((len(seen), 3, 3), np.nan)
-        C[seen] = _covariances(of) + self.sigma_px**2 * (pinv @ pinv.swapaxes(-1, -2))
+        C = np.full((len(in_both), 3, 3), np.nan)
+        C[in_both] = _covariances(of) + self.sigma_px**2 * (pinv @ pinv.swapaxes(-1, -2))
         return C.reshape(*shape, 3, 3)
 
     def covariance(self, name: str) -> FloatArray:
@@ -626,8 +626,8 @@ class Metric:
             raise InputError(f"pixels of shape {s.shape}: expected (…, 2, m, 2), left and right view")
         views = np.moveaxis(s, -3, 0)
         flat = np.ascontiguousarray(views.reshape(2, -1, 2))
-        seen: BoolArray = np.isfinite(flat[0, :, 0]) & np.isfinite(flat[1, :, 0])
-        return flat[:, seen], seen, views.shape[1:-1]
+        in_both: BoolArray = np.isfinite(flat[0, :, 0]) & np.isfinite(flat[1, :, 0])
+        return flat[:, in_both], in_both, views.shape[1:-1]
 
 
 def _covariances(changes: FloatArray) -> FloatArray:

@@ -54,17 +54,17 @@ def _fit_link(metric: Metric, table: Positions) -> _Link:
     Raises WorkFailed if the table does not determine them, or is of a frame that is left-handed.
     """
     T = metric.pose(table.q)
-    found, mirrored = _least_squares(T, table.xyz), _least_squares(T, table.xyz * _MIRROR)
-    if mirrored.cost < _MIRRORED * found.cost:
-        rms = (MM * np.sqrt(2.0 * one.cost / len(table.q)) for one in (found, mirrored))
+    fit, mirrored = _least_squares(T, table.xyz), _least_squares(T, table.xyz * _MIRROR)
+    if mirrored.cost < _MIRRORED * fit.cost:
+        rms = (MM * np.sqrt(2.0 * each.cost / len(table.q)) for each in (fit, mirrored))
         raise WorkFailed(
             "the frame of the instrument is left-handed: positions are {:.3g} mm rms off, with an axis "
             "negated {:.3g} mm; negate x, y or z in the table".format(*rms)
         )
-    J = np.asarray(found.jac)
+    J = np.asarray(fit.jac)
     if np.linalg.matrix_rank(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), tol=1e-6) < _UNKNOWNS:
         raise WorkFailed("the positions do not determine the point on the tool: turn the tool about two axes")
-    return _Link(found.x)
+    return _Link(fit.x)
 
 
 def _least_squares(T: FloatArray, xyz: FloatArray) -> Any:
@@ -137,8 +137,8 @@ def position_errors(
     else:
         of = np.arange(len(table.q)) % _PARTS
         parts = [(np.flatnonzero(of == k), table.rows(of != k)) for k in range(min(_PARTS, len(of)))]
-    found = [_held_out(metric, table.rows(at), rest, arm_std_m) for at, rest in parts if rest is not None]
-    error, C, scale = (np.concatenate(part) for part in zip(*found, strict=True))
+    compared = [_held_out(metric, table.rows(at), rest, arm_std_m) for at, rest in parts if rest is not None]
+    error, C, scale = (np.concatenate(part) for part in zip(*compared, strict=True))
     distance = MM * np.linalg.norm(error, axis=1)
     apart = np.linalg.norm(metric.markers[:, None] - metric.markers, axis=-1)
     i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(apart)), apart.shape))

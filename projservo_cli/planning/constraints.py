@@ -306,12 +306,12 @@ def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
 
 
 @njit
-def margins_along_into(c: Constraints, q: FloatArray, trial: "Trial", found: FloatArray) -> None:
+def margins_along_into(c: Constraints, q: FloatArray, trial: "Trial", margins: FloatArray) -> None:
     """Write margins and required margins (2, k, 10) along joints (k, n)."""
     for i in range(q.shape[0]):
         margins_into(c, q[i], trial)
-        row_into(found[0, i], trial.margins)
-        row_into(found[1, i], trial.demands)
+        row_into(margins[0, i], trial.margins)
+        row_into(margins[1, i], trial.demands)
 
 
 @njit
@@ -367,10 +367,10 @@ class Trial(NamedTuple):
 
 def new_trial(n: int, b: int) -> Trial:
     """Workspace for n joints and b markers."""
-    one, s = np.zeros(MARGINS), np.zeros((2, b, 2))
+    margins, s = np.zeros(MARGINS), np.zeros((2, b, 2))
     return Trial(
-        margins=one,
-        demands=one.copy(),
+        margins=margins,
+        demands=margins.copy(),
         sight=np.zeros(6),
         s=s,
         s_before=s.copy(),

@@ -239,28 +239,28 @@ def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bo
 def _solutions_into(
     c: Constraints,
     goal: GoalFeatures,
-    known: FloatArray,
+    shown: FloatArray,
     starts: FloatArray,
-    found: _Solutions,
+    solutions: _Solutions,
     scratch: _Scratch,
 ) -> int:
     """Write solutions; how many. First those known, which need no proof: the goal was seen there."""
-    count, last, maximum = len(known), 0, found.q.shape[0]
+    count, last, maximum = len(shown), 0, solutions.q.shape[0]
     for k in range(count):
-        row_into(found.q[k], known[k])
-        _explained(c, goal, known[k], scratch, found.deviation[k])
+        row_into(solutions.q[k], shown[k])
+        _explained(c, goal, shown[k], scratch, solutions.deviation[k])
     for k in range(starts.shape[0]):
         if count == maximum or k > _AT_LEAST + _PATIENCE * last:
             break
         q = starts[k]
         _settled(c, goal, False, NEAR, q, scratch)
-        if _is_known(c, q, found.q, count):
+        if _is_known(c, q, solutions.q, count):
             continue
         left = _settled(c, goal, True, SETTLED, q, scratch)
-        explained = _explained(c, goal, q, scratch, found.deviation[count])
-        if left <= explained and not _is_known(c, q, found.q, count):
-            row_into(found.q[count], q)
-            found.left[count] = left
+        explained = _explained(c, goal, q, scratch, solutions.deviation[count])
+        if left <= explained and not _is_known(c, q, solutions.q, count):
+            row_into(solutions.q[count], q)
+            solutions.left[count] = left
             count += 1
             last = k
     return count
@@ -315,27 +315,28 @@ def _rank(
 
 
 def goals_of(
-    c: Constraints, goal: GoalFeatures, start: FloatArray, known: FloatArray, starts: FloatArray
+    c: Constraints, goal: GoalFeatures, start: FloatArray, shown: FloatArray, starts: FloatArray
 ) -> tuple[FloatArray, FloatArray, tuple[int, int, int]]:
     """Return goal configurations (g, n) and their rank (g,), the smallest first.
 
     Rank is the time from the start, s, or ``UNSURE`` and more. A solution that leaves much more than the best
     is a local minimum next to it.
 
-    start : (n,) joints at the start; known : (l, n) joints at which the goal was shown.
+    start : (n,) joints at the start; shown : (l, n) joints at which the goal was shown.
     starts : (k, n) from which solutions are sought, those known first; overwritten.
     Also returns how many solutions there are, apart from whole turns; how many of those do not show the face
     or lie beyond the limits; how many lie within a region kept out of.
     """
     n, maximum = len(start), STARTS if len(start) <= 6 else _SAMPLED
-    found = _Solutions(np.zeros((maximum, n)), np.zeros(maximum), np.zeros((maximum, n)))
+    solutions = _Solutions(np.zeros((maximum, n)), np.zeros(maximum), np.zeros((maximum, n)))
     shapes = (n, 4, 4), (n, n + 1), (c.face, n + 1, 4), (n, n + 1), (n,)
-    count = _solutions_into(c, goal, known, starts, found, _Scratch(*(np.zeros(shape) for shape in shapes)))
-    minimum = max(found.left[len(known) : count].min(initial=math.inf), 4.0 * c.face * _LEAST_SIGMA**2)
-    good = np.flatnonzero(found.left[:count] <= _MUCH**2 * minimum)
+    scratch = _Scratch(*(np.zeros(shape) for shape in shapes))
+    count = _solutions_into(c, goal, shown, starts, solutions, scratch)
+    minimum = max(solutions.left[len(shown) : count].min(initial=math.inf), 4.0 * c.face * _LEAST_SIGMA**2)
+    good = np.flatnonzero(solutions.left[:count] <= _MUCH**2 * minimum)
     goals, ranks, met, trial = [np.zeros((0, n))], [np.zeros(0)], [0, 0, 0], new_trial(n, len(c.M))
     for k in good:
-        solution, deviation, certain = found.q[k], found.deviation[k], found.left[k] == 0.0
+        solution, deviation, certain = solutions.q[k], solutions.deviation[k], solutions.left[k] == 0.0
         slack = ROUND_OFF + (0.0 if certain else 1.0) * np.minimum(DEVIATIONS * deviation, _DEFINITE)
         turns = _turns(c, start, solution, slack)
         where = _where(c, solution, trial) if len(turns) > 0 else HIDDEN

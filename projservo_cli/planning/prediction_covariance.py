@@ -80,9 +80,9 @@ def _showing(calibration: Calibration, face: int, bounds: _Bounds, seed: int) ->
     low = np.where(np.isfinite(lower), lower, calibration.q_reference - np.pi)
     high = np.where(np.isfinite(upper), upper, calibration.q_reference + np.pi)
     corners = image_corners(np.array(image_size, dtype=np.float64))
-    region, found = Region(low, high, corners), np.zeros((0, len(low)))
-    for q, seen in drawn_poses(calibration, region, _MOST_BATCHES, np.random.default_rng(seed)):
-        found = np.concatenate([found, q[seen[:, :, :face].all(axis=(1, 2))]])
-        if len(found) >= _LOOKED_AT:
+    region, joints = Region(low, high, corners), np.zeros((0, len(low)))
+    for q, in_view in drawn_poses(calibration, region, _MOST_BATCHES, np.random.default_rng(seed)):
+        joints = np.concatenate([joints, q[in_view[:, :, :face].all(axis=(1, 2))]])
+        if len(joints) >= _LOOKED_AT:
             break
-    return found[:_LOOKED_AT]
+    return joints[:_LOOKED_AT]

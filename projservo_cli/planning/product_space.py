@@ -93,7 +93,8 @@ def plan_path(reaching: Reaching) -> Motion:
             if best[0] > 0.0 and amplitudes[1] != best[1].amplitudes[1]:
                 continue
             lattice = _in_view(reaching._replace(amplitudes=amplitudes), size)
-            best = max(best, (lattice.worth, lattice.nodes.reaching, size), key=lambda found: found[0])
+            if lattice.worth > best[0]:
+                best = (lattice.worth, lattice.nodes.reaching, size)
             if lattice.worth > good:  # no joints can compensate a loss of view
                 lattice = _with_joints(lattice)
                 paths += [_quickest(lattice)] if lattice.worth > good else []
@@ -149,17 +150,17 @@ class _Lattice(NamedTuple):
 def _in_view(reaching: Reaching, size: int) -> _Lattice:
     """A lattice of the views alone, with so many values of each share."""
     mu = np.ascontiguousarray(np.indices((size, size, size)).reshape(3, -1).T / (size - 1.0))
-    found = room_along(reaching, len(mu))
-    _displacements_into(reaching, mu, found)
-    return _Lattice(measured(Motion(reaching, mu, found)), False)
+    along = room_along(reaching, len(mu))
+    _displacements_into(reaching, mu, along)
+    return _Lattice(measured(Motion(reaching, mu, along)), False)
 
 
 def _with_joints(view: _Lattice) -> _Lattice:
     """The same with joints, in place, sought where a path in view leads."""
-    reaching, mu, found = view.nodes
+    reaching, mu, along = view.nodes
     value = widest(view.minimum(view.nodes))
-    _joints_into(carrier_of(reaching), mu, value, _size(value), found)
-    joint_margins_into(reaching.demands, found)
+    _joints_into(carrier_of(reaching), mu, value, _size(value), along)
+    joint_margins_into(reaching.demands, along)
     return _Lattice(view.nodes, True)
 
 
@@ -178,13 +179,13 @@ def _straightened(lattice: _Lattice, path: IntArray) -> FloatArray:
 
     A piece is as long as bisection finds one whose shares are as good and that takes no longer.
     """
-    (reaching, mu, found), (q, speed) = lattice.nodes, lattice.moved(lattice.nodes)
+    (reaching, mu, along), (q, speed) = lattice.nodes, lattice.moved(lattice.nodes)
     worth, time = lattice.worth, minimum_time(speed, q[path])
 
     def serves(i: int, j: int) -> bool:
         """Whether the piece from one node of the path to another does."""
         x = np.linspace(0.0, 1.0, 2 * (j - i) + 1)[:, None]
-        piece = along_shares(reaching, (1.0 - x) * mu[path[i]] + x * mu[path[j]], found.q[path[i]])
+        piece = along_shares(reaching, (1.0 - x) * mu[path[i]] + x * mu[path[j]], along.q[path[i]])
         detour = minimum_time(speed, lattice.moved(piece)[0])[-1] > _DETOUR * (time[j] - time[i]) + ROUND_OFF
         return not detour and bool(lattice.minimum(piece).min() >= worth - ROUND_OFF)
 
@@ -263,13 +264,13 @@ def _shortest_into(
 
 
 @njit
-def _displacements_into(reaching: Reaching, mu: FloatArray, found: Along) -> None:
+def _displacements_into(reaching: Reaching, mu: FloatArray, along: Along) -> None:
     for i in range(mu.shape[0]):
-        displacement_into(reaching, mu[i], found, i)
+        displacement_into(reaching, mu[i], along, i)
 
 
 @njit
-def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int, found: Along) -> None:
+def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int, along: Along) -> None:
     """Write joints, limit and condition at those nodes (size³,) whose value is positive.
 
     Each is continued from the best before it: the values become the minimum margin of both on the path there,
@@ -283,15 +284,15 @@ def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int,
             other = _before(node, step, size)
             if other >= 0 and value[other] > best:
                 before, best = other, value[other]
-        row_into(found.q[node], carrier.reaching.q_start if node == 0 else found.q[before])
+        row_into(along.q[node], carrier.reaching.q_start if node == 0 else along.q[before])
         if not free or best == 0.0:
             continue
         for parts in (1, BETWEEN):
             ends = (mu[before], mu[node])
-            condition = carry_joints(carrier, ends, parts, _ROUGH, _MOST_STRIDE / parts, found.q[node])
+            condition = carry_joints(carrier, ends, parts, _ROUGH, _MOST_STRIDE / parts, along.q[node])
             if condition >= 0.0:
-                found.condition[node] = condition
-                found.limit[node] = limit = limit_margin(demands, found.q[node])
+                along.condition[node] = condition
+                along.limit[node] = limit = limit_margin(demands, along.q[node])
                 value[node] = max(min(best, limit, condition - demands.conditioning), 0.0)
                 break
-            row_into(found.q[node], found.q[before])
+            row_into(along.q[node], along.q[before])

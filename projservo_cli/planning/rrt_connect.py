@@ -90,9 +90,9 @@ def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
     that share is as much as is asked for everywhere are asked for no less.
     """
     demands = np.array([margins_at(c, q)[0] for q in ends])
-    seen = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
-    seen = np.where(np.isfinite(seen), seen, 0.0)
-    less = np.where(seen > 0.0, demands - (1.0 - SHARE) * seen, demands - ROUND_OFF)
+    measured = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
+    measured = np.where(np.isfinite(measured), measured, 0.0)
+    less = np.where(measured > 0.0, demands - (1.0 - SHARE) * measured, demands - ROUND_OFF)
     demands = np.where(SHARE * demands >= c.full, c.full, np.minimum(c.full, less))
     poor = (demands < c.full).any(axis=1)
     return c._replace(ends=np.ascontiguousarray(ends[poor]), end_demands=np.ascontiguousarray(demands[poor]))
@@ -139,17 +139,17 @@ def find_path(
     c: Constraints,
     target: GoalFeatures,
     start: FloatArray,
-    known: FloatArray,
+    shown: FloatArray,
     search: SearchLimits,
 ) -> JointPath:
     """Find a path from the start to joints that show the goal.
 
     start : (n,) joints, rad or m.
-    known : (k, n) joints known to show the goal, k ≥ 0.
+    shown : (k, n) joints known to show the goal, k ≥ 0.
     """
     n, rng = len(start), np.random.default_rng(search.seed)
-    starts = np.vstack([known, start[None], _drawn(c, start, STARTS, rng)])
-    every, rank, (solutions, hidden, blocked) = goals_of(c, target, start, known, starts)
+    starts = np.vstack([shown, start[None], _drawn(c, start, STARTS, rng)])
+    every, rank, (solutions, hidden, blocked) = goals_of(c, target, start, shown, starts)
     goals, rank = every[: search.max_goals], rank[: search.max_goals]
     off = np.abs(goals[:, None] - search.excluded)
     far = np.all(np.max(off, axis=2, initial=0.0) > _NEARBY, axis=1)
@@ -216,12 +216,12 @@ def _shortest(
             left = (max_draws if math.isinf(shortest) else FURTHER) - draws
             if left <= 0:
                 break
-            found, used, grown = _by_trees(c, start, goals, left, rng, trial)
+            path, used, grown = _by_trees(c, start, goals, left, rng, trial)
             draws, trees = draws + used, trees or grown
-            if found is not None:
-                found = _shortened(c, found, rng, trial)
-                if (time := minimum_time(c.limits.speed, found)[-1]) < shortest:
-                    best, shortest, trees = found, time, grown
+            if path is not None:
+                path = _shortened(c, path, rng, trial)
+                if (time := minimum_time(c.limits.speed, path)[-1]) < shortest:
+                    best, shortest, trees = path, time, grown
     return best, draws, trees
 
 

@@ -54,14 +54,14 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
     a = face_plane(M, plant.order, center_of(M, plant.center))
     in_front = True
     for view in range(2):
-        seen = plant.visible[view] * dot(a, vec(plant.O[view])) > 0.0
-        hidden[view] = 0.0 if seen else 1.0
+        visible = plant.visible[view] * dot(a, vec(plant.O[view])) > 0.0
+        hidden[view] = 0.0 if visible else 1.0
         camera, lens = plant.model.P[view], plant.model.lens[view]
         for k in range(m):
             A = vec(M[k])
             if not _put_pixel(camera, lens, A, s[view, k]):
                 in_front = False
-            elif plant.opaque and not seen:
+            elif plant.opaque and not visible:
                 s[view, k, :] = math.nan
         for k in range(plant.pins.shape[0]):
             pixel = s[view, m + k]

@@ -106,20 +106,20 @@ def inverse_kinematics(robot: SerialArm, goal: FloatArray, q_start: FloatArray) 
     rng = np.random.default_rng(0)
     span_lower = np.maximum(robot.limits.lower, q_start - 2 * math.pi)
     span_upper = np.minimum(robot.limits.upper, q_start + 2 * math.pi)
-    found = []
+    solutions = []
     for trial in range(31):
         q = _newton(robot, goal, q_start if trial == 0 else rng.uniform(span_lower, span_upper))
         if q is not None:
             q = _unwind(robot, q, q_start)
             if np.all(q >= robot.limits.lower) and np.all(q <= robot.limits.upper):
-                found.append(q)
-    if not found:
+                solutions.append(q)
+    if not solutions:
         x, y, z = goal[:3, 3]
         raise WorkFailed(
             f"task.goal: the robot cannot put its tool at ({x:.3f}, {y:.3f}, {z:.3f}) m with this rotation "
             "within its joint limits: choose a nearer goal, another start or wider limits"
         )
-    return min(found, key=lambda q: float(np.linalg.norm(q - q_start)))
+    return min(solutions, key=lambda q: float(np.linalg.norm(q - q_start)))
 
 
 def _newton(robot: SerialArm, goal: FloatArray, q: FloatArray) -> FloatArray | None:

@@ -244,16 +244,16 @@ def _looked(
     scene: RenderedScene, frames: int, q_bytes: bytes, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
     eyes, q = Frames(rendered_model(scene)), np.frombuffer(q_bytes)[None]
-    found = np.full((frames, 2, len(scene.numbers), 3), np.nan)
+    detected = np.full((frames, 2, len(scene.numbers), 3), np.nan)
     eyes.open()
     try:
         for k, view in np.ndindex(frames, 2):
             pixels, sigma = eyes.capture(view, q, None, _random(*drawn, view, k))
-            found[k, view] = np.column_stack([pixels, sigma])
+            detected[k, view] = np.column_stack([pixels, sigma])
     finally:
         eyes.close()
-    count = np.isfinite(found[..., :1]).sum(axis=0)
-    mean = np.where(2 * count > frames, np.nansum(found, axis=0) / np.maximum(count, 1), np.nan)
+    count = np.isfinite(detected[..., :1]).sum(axis=0)
+    mean = np.where(2 * count > frames, np.nansum(detected, axis=0) / np.maximum(count, 1), np.nan)
     return np.ascontiguousarray(mean[..., :2]), np.ascontiguousarray(mean[..., 2])
 
 

@@ -127,7 +127,7 @@ def files_named(path: str) -> list[str]:
 
     Names are relative to the folder of the model, or to one of the folders of its compiler settings.
     """
-    home, found, due = Path(path).parent, dict[str, None](), [Path(path)]
+    home, named, due = Path(path).parent, dict[str, None](), [Path(path)]
     folders = [home]
     while due:
         try:
@@ -140,7 +140,7 @@ def files_named(path: str) -> list[str]:
             for name in (value for key, value in element.items() if key.startswith("file")):
                 files = (folder / part for folder in folders for part in (name, Path(name).name))
                 file = next((file for file in files if file.is_file()), None)
-                if file is not None and str(file) not in found:
-                    found[str(file)] = None
+                if file is not None and str(file) not in named:
+                    named[str(file)] = None
                     due += [file] if file.suffix == ".xml" else []
-    return list(found)
+    return list(named)

@@ -223,7 +223,7 @@ def _take(model: Any, joint: int, *, keep: bool) -> _Actuator | None:
     Those that are not kept are put out of action.
     """
     mj = mujoco()
-    found = []
+    actuators = []
     for number in range(model.nu):
         moves = mj.mjtTrn(int(model.actuator_trntype[number])) in (
             mj.mjtTrn.mjTRN_JOINT,
@@ -233,9 +233,13 @@ def _take(model: Any, joint: int, *, keep: bool) -> _Actuator | None:
             if not keep:
                 model.actuator_gainprm[number], model.actuator_biasprm[number] = 0.0, 0.0
                 continue
-            found.append(_actuator(model, number))
+            actuators.append(_actuator(model, number))
     # One that follows lengths comes first, then one that follows speeds, which else damps, then a motor.
-    return min(found, key=lambda one: ([b != 0.0 for b in one.bias[1:]] + [True]).index(True), default=None)
+    return min(
+        actuators,
+        key=lambda actuator: ([b != 0.0 for b in actuator.bias[1:]] + [True]).index(True),
+        default=None,
+    )
 
 
 def _actuator(model: Any, number: int) -> _Actuator:

@@ -241,8 +241,8 @@ def _add_tags(spec: Any, tip: Any, tool: FloatArray, tags: Sequence[MountedTag],
 def _put_light(spec: Any, light: str, P: FloatArray) -> None:
     """Light from all around and a little from above, or hard light from one side of the rig alone."""
     mj = mujoco()
-    for given in list(spec.lights):
-        spec.delete(given)
+    for original in list(spec.lights):
+        spec.delete(original)
     head, (_, ahead) = spec.visual.headlight, roll_axis(P)
     soft = light == "soft"
     head.active = 1

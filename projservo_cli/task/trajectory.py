@@ -105,8 +105,8 @@ def trajectory_displacement(
     H_hat : (3, 4, 4) operators t, r, p; amplitudes : τ in the unit of Ĥ_t, θ_r and θ_p in rad.
     """
     H_hat, sizes = np.ascontiguousarray(H_hat), np.array(amplitudes, dtype=np.float64)
-    found = [displaced(H_hat, sizes, *shares) for shares in mu.reshape(-1, 3).tolist()]
-    return np.array(found).reshape(*mu.shape[:-1], 4, 4)
+    displacements = [displaced(H_hat, sizes, *shares) for shares in mu.reshape(-1, 3).tolist()]
+    return np.array(displacements).reshape(*mu.shape[:-1], 4, 4)
 
 
 class Reference(NamedTuple):
