@@ -272,7 +272,10 @@ def _canonical_pair(F: FloatArray) -> FloatArray:
 
 
 def triangulated(P: FloatArray, m: FloatArray) -> FloatArray:
-    """Points (N, 4) of unit norm from homogeneous pixels (2, N, 3) of cameras (2, N, 3, 4): [HZ04] 12.2."""
+    """Points (N, 4) of unit norm from homogeneous pixels (2, N, 3) of cameras (2, N, 3, 4): [HZ04] 12.2.
+
+    Linear and all at once, to start fits; ``geometry.stereo`` has the point of minimum reprojection error.
+    """
     rows = m[..., :2, None] * P[:, :, 2:] - P[:, :, :2]
     return np.linalg.svd(rows.swapaxes(0, 1).reshape(-1, 4, 4))[2][:, 3]
 

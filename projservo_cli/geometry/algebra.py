@@ -195,13 +195,13 @@ def as_array(H: Mat4) -> FloatArray:
 
 
 @njit
-def _wrap(theta: float) -> float:
+def wrapped(theta: float) -> float:
     """Equal angle in (−π, π], rad."""
     turns = math.floor((theta + math.pi) / (2.0 * math.pi))
-    wrapped = theta - 2.0 * math.pi * turns
-    if wrapped <= -math.pi:
-        wrapped += 2.0 * math.pi
-    return wrapped
+    angle = theta - 2.0 * math.pi * turns
+    if angle <= -math.pi:
+        angle += 2.0 * math.pi
+    return angle
 
 
 @njit
@@ -218,4 +218,4 @@ def incidence_angles(p_0: float, p_s: float, p_c: float) -> tuple[bool, float, f
         return False, 0.0, 0.0
     middle = math.atan2(p_s, p_c)
     spread = math.acos(-p_0 / amplitude)
-    return True, _wrap(middle + spread), _wrap(middle - spread)
+    return True, wrapped(middle + spread), wrapped(middle - spread)
