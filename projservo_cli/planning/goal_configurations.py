@@ -239,16 +239,16 @@ def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bo
 def _solutions_into(
     c: Constraints,
     goal: GoalFeatures,
-    shown: FloatArray,
+    taught: FloatArray,
     starts: FloatArray,
     solutions: _Solutions,
     scratch: _Scratch,
 ) -> int:
-    """Write solutions; how many. First those known, which need no proof: the goal was seen there."""
-    count, last, maximum = len(shown), 0, solutions.q.shape[0]
+    """Write solutions; how many. First those taught, which need no proof: the goal was seen there."""
+    count, last, maximum = len(taught), 0, solutions.q.shape[0]
     for k in range(count):
-        row_into(solutions.q[k], shown[k])
-        _explained(c, goal, shown[k], scratch, solutions.deviation[k])
+        row_into(solutions.q[k], taught[k])
+        _explained(c, goal, taught[k], scratch, solutions.deviation[k])
     for k in range(starts.shape[0]):
         if count == maximum or k > _AT_LEAST + _PATIENCE * last:
             break
@@ -315,15 +315,15 @@ def _rank(
 
 
 def goals_of(
-    c: Constraints, goal: GoalFeatures, start: FloatArray, shown: FloatArray, starts: FloatArray
+    c: Constraints, goal: GoalFeatures, start: FloatArray, taught: FloatArray, starts: FloatArray
 ) -> tuple[FloatArray, FloatArray, tuple[int, int, int]]:
     """Return goal configurations (g, n) and their rank (g,), the smallest first.
 
     Rank is the time from the start, s, or ``UNSURE`` and more. A solution that leaves much more than the best
     is a local minimum next to it.
 
-    start : (n,) joints at the start; shown : (l, n) joints at which the goal was shown.
-    starts : (k, n) from which solutions are sought, those known first; overwritten.
+    start : (n,) joints at the start; taught : (l, n) joints at which the goal was taught.
+    starts : (k, n) from which solutions are sought, those taught first; overwritten.
     Also returns how many solutions there are, apart from whole turns; how many of those do not show the face
     or lie beyond the limits; how many lie within a region kept out of.
     """
@@ -331,8 +331,8 @@ def goals_of(
     solutions = _Solutions(np.zeros((maximum, n)), np.zeros(maximum), np.zeros((maximum, n)))
     shapes = (n, 4, 4), (n, n + 1), (c.face, n + 1, 4), (n, n + 1), (n,)
     scratch = _Scratch(*(np.zeros(shape) for shape in shapes))
-    count = _solutions_into(c, goal, shown, starts, solutions, scratch)
-    minimum = max(solutions.left[len(shown) : count].min(initial=math.inf), 4.0 * c.face * _LEAST_SIGMA**2)
+    count = _solutions_into(c, goal, taught, starts, solutions, scratch)
+    minimum = max(solutions.left[len(taught) : count].min(initial=math.inf), 4.0 * c.face * _LEAST_SIGMA**2)
     good = np.flatnonzero(solutions.left[:count] <= _MUCH**2 * minimum)
     goals, ranks, met, trial = [np.zeros((0, n))], [np.zeros(0)], [0, 0, 0], new_trial(n, len(c.M))
     for k in good:

@@ -139,17 +139,17 @@ def find_path(
     c: Constraints,
     target: GoalFeatures,
     start: FloatArray,
-    shown: FloatArray,
+    taught: FloatArray,
     search: SearchLimits,
 ) -> JointPath:
     """Find a path from the start to joints that show the goal.
 
     start : (n,) joints, rad or m.
-    shown : (k, n) joints known to show the goal, k ≥ 0.
+    taught : (k, n) joints at which the goal was taught, k ≥ 0.
     """
     n, rng = len(start), np.random.default_rng(search.seed)
-    starts = np.vstack([shown, start[None], _drawn(c, start, STARTS, rng)])
-    every, rank, (solutions, hidden, blocked) = goals_of(c, target, start, shown, starts)
+    starts = np.vstack([taught, start[None], _drawn(c, start, STARTS, rng)])
+    every, rank, (solutions, hidden, blocked) = goals_of(c, target, start, taught, starts)
     goals, rank = every[: search.max_goals], rank[: search.max_goals]
     off = np.abs(goals[:, None] - search.excluded)
     far = np.all(np.max(off, axis=2, initial=0.0) > _NEARBY, axis=1)

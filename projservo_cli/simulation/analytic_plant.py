@@ -66,8 +66,8 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
         for k in range(plant.pins.shape[0]):
             pixel = s[view, m + k]
             A = apply(H, vec(plant.pins[k]))
-            shown = _put_pixel(camera, lens, A, pixel)
-            if shown and from_border(plant.image_size[view], pixel[0], pixel[1]) < 0.0:
+            projected = _put_pixel(camera, lens, A, pixel)
+            if projected and from_border(plant.image_size[view], pixel[0], pixel[1]) < 0.0:
                 pixel[:] = math.nan
     return in_front
 
