@@ -27,7 +27,7 @@ from projservo_cli.display import checked_array, numbers_in, require_radians
 from projservo_cli.experiment import Experiment, law_target, plan_scene_of
 from projservo_cli.files import working_in
 from projservo_cli.keys import File
-from projservo_cli.laws import CODES, REGULATE, law_and_mode, name_of, names_of
+from projservo_cli.laws import CODES, REGULATE, law_and_mode, run_name, run_names
 from projservo_cli.observations import Observations, require_observations, rows_of
 from projservo_cli.records import Calibration, InputError, JointList, Plan
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
@@ -328,7 +328,7 @@ def servo(
     if isinstance(plan, MotionPlan):
         config = _with_task(config, calibration.joint_types, *plan.asked)
     asked = config.replace({"control.mode": [of_name if mode is None else mode]})
-    (name,) = names_of((name,), asked.control.mode)
+    (name,) = run_names((name,), asked.control.mode)
     if robot is not None:
         asked = _with_robot(asked, robot)
     _say_compilation()
@@ -519,7 +519,7 @@ def _law_of_sweep(law: str | type, workers: int) -> str:
         raise InputError(_NO_LAW.format(law))
     if isinstance(law, str):
         name, mode = law_and_mode(law)
-        return law if name in CODES else name_of(law_target(name), mode)
+        return law if name in CODES else run_name(law_target(name), mode)
     target = plugins.bring("law", law)
     if workers > 1 and not plugins.importable(law):
         raise InputError(

@@ -14,7 +14,7 @@ from projservo_cli.config import Config, stored_yaml
 from projservo_cli.config.inputs import about_of, joints_of, recording_inputs, scenery_of, suggestion_inputs
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.keys import digest
-from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, name_of
+from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, run_name
 from projservo_cli.progress import Bar
 from projservo_cli.records import (
     InputError,
@@ -302,7 +302,9 @@ class Chain:
                 continue  # failures are printed last
             but = " must converge, but" if must and not converged else ""
             reason = " ".join(trace.reason.split())
-            text = f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"
+            text = (
+                f"{run_name(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"
+            )
             if trace.overruns:
                 text += (
                     f"; it missed {trace.overruns} periods of {trace.period:g} s: raise control.period_s, or "

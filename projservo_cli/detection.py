@@ -267,6 +267,8 @@ def _edge_model(x: FloatArray, strips: _Strips) -> tuple[FloatArray, FloatArray]
 def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
     """Edges (S, 6) of least squares by Levenberg–Marquardt steps, together, and their normal matrices.
 
+    All edges of a frame are one array, of which each keeps its own damping; SciPy takes them one by one.
+
     The noise (S,) of grey values sets the weight of a prior on the arcs.
     """
     stiff = np.zeros((len(x), _EDGE))

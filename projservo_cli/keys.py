@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.masking import masked
-from projservo_cli.records import InputError
+from projservo_cli.records import InputError, masked
 
 
 class File(NamedTuple):

@@ -15,7 +15,7 @@ POINTS = "points"
 BODY = "body"
 
 
-class LawSpec(NamedTuple):
+class _LawSpec(NamedTuple):
     """Specification of one law for driving, storing and drawing."""
 
     title: str  # as figures write it
@@ -26,12 +26,12 @@ class LawSpec(NamedTuple):
 
 
 LAW_SPECS = {
-    "direct_three": LawSpec("directTHREE", (REGULATE, TRACK), BODY),
-    "direct_two": LawSpec("directTWO", (REGULATE, TRACK), BODY),
-    "stacked": LawSpec("stacked Jacobians", (REGULATE, IMAGE_TRACK), POINTS),
-    "blockwise": LawSpec("block-wise", (REGULATE,), POINTS),
-    "euclidean_points": LawSpec("Euclidean points", (REGULATE,), POINTS, metric=True),
-    "exact": LawSpec("exact", (REGULATE, TRACK), BODY, paper=False),
+    "direct_three": _LawSpec("directTHREE", (REGULATE, TRACK), BODY),
+    "direct_two": _LawSpec("directTWO", (REGULATE, TRACK), BODY),
+    "stacked": _LawSpec("stacked Jacobians", (REGULATE, IMAGE_TRACK), POINTS),
+    "blockwise": _LawSpec("block-wise", (REGULATE,), POINTS),
+    "euclidean_points": _LawSpec("Euclidean points", (REGULATE,), POINTS, metric=True),
+    "exact": _LawSpec("exact", (REGULATE, TRACK), BODY, paper=False),
 }
 LAWS = tuple(LAW_SPECS)
 CODES = {law: code for code, law in enumerate(LAWS)}  # codes of the laws in compiled code
@@ -52,7 +52,7 @@ def must_converge(law: str, required: Sequence[str] | None) -> bool:
     return law not in POINT_LAWS if required is None else law in required
 
 
-def name_of(law: str, mode: str) -> str:
+def run_name(law: str, mode: str) -> str:
     """Return the name of the run of a law in a mode: ``exact`` where it replans, else ``exact_track``."""
     return law if mode == REGULATE else f"{law}_{mode}"
 
@@ -70,12 +70,12 @@ def mode_in(name: str) -> str:
     return f"is the run of {law} in mode {mode}: name {law}, with --set control.mode=[{mode}]"
 
 
-def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
+def run_names(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
     """Names of the runs of laws, each in those of the modes that it has.
 
     Raises InputError if a law has none of them.
     """
-    found = []
+    names = []
     for law in laws:
         own = LAW_SPECS[law].modes if law in LAW_SPECS else (REGULATE,)
         if not set(own) & set(modes):
@@ -84,5 +84,5 @@ def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
                 f"control.mode {' and '.join(modes)}: {law} has no such mode, only "
                 f"{' and '.join(own)}; laws that have one: {', '.join(able)} (--law, control.laws)"
             )
-        found += [name_of(law, mode) for mode in modes if mode in own]
-    return tuple(dict.fromkeys(found))
+        names += [run_name(law, mode) for mode in modes if mode in own]
+    return tuple(dict.fromkeys(names))

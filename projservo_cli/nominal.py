@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from projservo_cli.files import text_of
+from projservo_cli.geometry.displacements import twists
 from projservo_cli.records import FloatArray, InputError
 from projservo_cli.settings.sections import Matrix34, Matrix44, Vector3, not_a_screw, not_rigid
 
@@ -60,18 +61,18 @@ def read_nominal(path: Path | str) -> dict[str, Any]:
     (m) with ``T_base_tool_at_reference``, and perhaps ``marker_numbers`` (0, 1 …).
     Raises InputError ``file: key: what`` when it cannot be read or makes no sense.
     """
-    found = _believed(path)
-    for key, what in found.contradictions():
+    believed = _believed(path)
+    for key, what in believed.contradictions():
         raise InputError(f"{path}: {key}: {what}")
-    numbers = found.marker_numbers or range(len(found.markers_tool))
-    body = np.c_[np.array(found.markers_tool), np.ones(len(numbers))]
+    numbers = believed.marker_numbers or range(len(believed.markers_tool))
+    body = np.c_[np.array(believed.markers_tool), np.ones(len(numbers))]
     return {
         "where": str(path),
-        "P": np.array([found.camera_left, found.camera_right]),
-        "H_hat": np.array([_twist(f"{path}: screws.{i}", screw) for i, screw in enumerate(found.screws)]),
-        "q_reference": np.array(found.q_reference, dtype=np.float64),
+        "P": np.array([believed.camera_left, believed.camera_right]),
+        "H_hat": np.array([_twist(f"{path}: screws.{i}", screw) for i, screw in enumerate(believed.screws)]),
+        "q_reference": np.array(believed.q_reference, dtype=np.float64),
         "marker": np.array(numbers, dtype=np.int64),
-        "M": body @ np.array(found.T_base_tool_at_reference).T,
+        "M": body @ np.array(believed.T_base_tool_at_reference).T,
     }
 
 
@@ -109,11 +110,7 @@ def _twist(where: str, screw: _Screw) -> FloatArray:
     w, v = np.array(screw.w), np.array(screw.v)
     for key, what in not_a_screw("R" if w.any() else "P", screw.w, screw.v):
         raise InputError(f"{where}: {key} {what}")
-    twist = np.zeros((4, 4))
     if not w.any():
-        twist[:3, 3] = v / np.linalg.norm(v)
-        return twist
+        return twists(np.r_[w, v / np.linalg.norm(v)])
     w = w / np.linalg.norm(w)
-    twist[:3, :3] = np.cross(np.eye(3), w)
-    twist[:3, 3] = v - w * (w @ v)
-    return twist
+    return twists(np.r_[w, v - w * (w @ v)])

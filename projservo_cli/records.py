@@ -6,14 +6,13 @@ knows how it is stored.
 """
 
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-
-from projservo_cli.masking import masked
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -70,6 +69,27 @@ def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
     return field(metadata={"units": units, "about": about}, **default)
 
 
+MASK = "***"
+"""Stands for a password in what is shown or stored."""
+# Passwords of URLs (RFC 3986, section 3.2.1), which users write with slashes and @ too, unlike ports; and
+# values of parameters.
+_USERINFO = re.compile(r"://(?:([^\s/?#:@]*:)(?!\d*(?:[/?#\s]|$))\S*|[^\s/?#:@]*)@")
+_PARAMETER = re.compile(
+    r"""(?i)([?&](?:key|pass|pw|sig)=|(?<![^\s?&;#/"'=])[\w.-]*(?:token|passw|pwd|loginpas|user-pw|secret|api_?key"""
+    r"""|signature|credential|auth)[\w.-]*=)[^\s&"']+?(?=[)\]:,.;']*(?:[\s&"]|$))"""
+)
+
+
+def masked(value: Any) -> Any:
+    """A text without passwords and tokens of URLs; of mappings and lists, each value so."""
+    if isinstance(value, str):
+        value = _USERINFO.sub(lambda match: f"://{match[1] or ''}{MASK}@", value) if "://" in value else value
+        return _PARAMETER.sub(rf"\1{MASK}", value) if "=" in value else value
+    if isinstance(value, dict):
+        return {key: masked(inner) for key, inner in value.items()}
+    return type(value)(map(masked, value)) if type(value) in (list, tuple) else value
+
+
 class InputError(ValueError):
     """Usage, configuration or data that cannot be read or make no sense (exit code 2).
 
@@ -91,9 +111,6 @@ class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming err
         self.refutes = refutes
 
 
-REVOLUTE = 0
-PRISMATIC = 1
-
 NO_LENS = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2)
 
 
@@ -104,6 +121,16 @@ class JointLimits(NamedTuple):
     upper: FloatArray  # rad or m
     speed: FloatArray  # rad/s or m/s
     acceleration: FloatArray  # rad/s² or m/s²
+
+
+def prismatic_of(letters: Iterable[str]) -> BoolArray:
+    """Tell which joints (n,) are prismatic, by one letter each, R or P, as users and files write them."""
+    return np.array([letter == "P" for letter in letters], dtype=np.bool_)
+
+
+def letters_of(prismatic: Iterable[bool]) -> str:
+    """Return one letter a joint, R or P, of joints (n,) that are prismatic or not."""
+    return "".join("P" if slides else "R" for slides in prismatic)
 
 
 def position_limits(lower: FloatArray, upper: FloatArray) -> JointLimits:
@@ -121,7 +148,7 @@ class Model(NamedTuple):
 
     P: FloatArray  # (2, 3, 4) cameras, left and right, to pixels
     H_hat_0: FloatArray  # (n, 4, 4) joint operators at the reference, one unit of motion per rad or m
-    joint_types: IntArray  # (n,) ``REVOLUTE`` or ``PRISMATIC``
+    prismatic: BoolArray  # (n,) whether a joint is prismatic; it is revolute else
     q_reference: FloatArray  # (n,) joint reading at the reference, rad or m
     a_inf: FloatArray  # (4,) plane at infinity, the common left null vector of the operators
     # (2, 5) radial distortion of both views: image centre u, v and radius, px, then k1, k2
@@ -482,12 +509,11 @@ class Calibration:
 
     def model(self) -> Model:
         """The kernels' view of the calibration."""
-        types = np.array([PRISMATIC if t == "P" else REVOLUTE for t in self.joint_types], dtype=np.int64)
         lens = NO_LENS if self.lens is None else self.lens
         return Model(
             P=self.P,
             H_hat_0=self.H_hat_0,
-            joint_types=types,
+            prismatic=self.prismatic,
             q_reference=self.q_reference,
             a_inf=self.a_inf,
             lens=lens,
@@ -496,7 +522,7 @@ class Calibration:
     @property
     def prismatic(self) -> BoolArray:
         """Whether each joint (n,) is prismatic."""
-        return np.array([letter == "P" for letter in self.joint_types])
+        return prismatic_of(self.joint_types)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from projservo_cli.config.inputs import (
     servo_inputs,
 )
 from projservo_cli.keys import key_of
-from projservo_cli.laws import law_and_mode, names_of
+from projservo_cli.laws import law_and_mode, run_names
 from projservo_cli.records import InputError
 from projservo_cli.report.report_data import CLAIMS_FILE, PAGE_FILE
 from projservo_cli.robots.source import source_hash
@@ -126,7 +126,7 @@ def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
     plant = "" if config.plant.simulated else config.plant.use or ""
     robot = f"source of {plant}"
     found: dict[str, _Read] = {}
-    for law in names_of(laws, config.control.mode):
+    for law in run_names(laws, config.control.mode):
         name, stored = law_and_mode(law)[0], run.results.get(f"{SERVO}{law}")
         before = {} if stored is None else stored.inputs
         own, note = source_hash(name) if ":" in name else "", ""

@@ -10,8 +10,7 @@ from projservo_cli.config import load_config
 from projservo_cli.report import page
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.simulation import faults, streams, workspace
-from projservo_cli.simulation.cameras import Frames
-from projservo_cli.simulation.scene import rendered_model
+from projservo_cli.simulation.rendering import Frames, rendered_model
 from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.stages import external_robot, scenario, studies
 from projservo_cli.stages import plan as planning

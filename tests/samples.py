@@ -7,7 +7,7 @@ the oracles of the kinematics.
 import numpy as np
 from scipy.linalg import expm
 
-from projservo_cli.records import PRISMATIC, REVOLUTE, Model
+from projservo_cli.records import Model, prismatic_of
 
 METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -59,7 +59,7 @@ def arm(types="RRRRRR"):
     return Model(
         rig(),
         np.array(twists),
-        np.array([PRISMATIC if kind == "P" else REVOLUTE for kind in types], dtype=np.int64),
+        prismatic_of(types),
         np.linspace(-0.4, 0.5, len(types)),
         METRIC_A_INF.copy(),
     )
@@ -98,7 +98,7 @@ def in_frame(model, G):
     return Model(
         np.ascontiguousarray(model.P @ back),
         np.ascontiguousarray(G @ model.H_hat_0 @ back),
-        model.joint_types,
+        model.prismatic,
         model.q_reference,
         model.a_inf @ back,
         model.lens,

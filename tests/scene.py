@@ -10,9 +10,9 @@ from projservo_cli.geometry.lens import distort
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.step import VERDICTS, Limits, new_log
+from projservo_cli.loop.verdicts import VERDICTS, Limits, new_log
 from projservo_cli.records import FloatArray, Model, position_limits
-from projservo_cli.simulation.ideal import Plant
+from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.task.body import make_body
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
 from projservo_cli.task.target import TaskImages

@@ -15,7 +15,7 @@ from projservo_cli import records
 from projservo_cli.cli import main
 from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
-from projservo_cli.loop import step
+from projservo_cli.loop import verdicts as loop_verdicts
 from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED
 
 # Where a run file holds which record.
@@ -118,7 +118,7 @@ def verdicts() -> Iterator[str]:
     """All verdicts of a run, and their order."""
     yield ", ".join(f"`{verdict}`" for verdict in ALL_VERDICTS) + "."
     yield ""
-    yield from python.markdown(inspect.cleandoc(step.__doc__ or "").split("\n\n", 1)[1])
+    yield from python.markdown(inspect.cleandoc(loop_verdicts.__doc__ or "").split("\n\n", 1)[1])
 
 
 WRITERS: dict[str, Callable[[], Iterator[str]]] = {

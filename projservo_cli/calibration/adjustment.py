@@ -11,7 +11,8 @@ complement), so the cost is linear in the markers: W. A. Fuller, "Measurement er
 section 3.2; B. Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
 
 Levenberg–Marquardt with geodesic acceleration and a gauge penalty: M. Transtrum, J. Sethna,
-"Improvements to the Levenberg–Marquardt algorithm", arXiv:1201.5885.
+"Improvements to the Levenberg–Marquardt algorithm", arXiv:1201.5885. SciPy's solvers know neither the
+elimination nor the gauge, and hold the whole derivative.
 """
 
 import dataclasses
@@ -23,10 +24,10 @@ import numpy as np
 from scipy.linalg import expm, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
-from projservo_cli.calibration.detections import RAYLEIGH, Detections, per_block
+from projservo_cli.calibration.detections import RAYLEIGH, Detections, cauchy_weights, per_block
 from projservo_cli.calibration.prediction import CAMERA, Parameters, image_points
+from projservo_cli.geometry.displacements import cross_matrix
 from projservo_cli.geometry.lens import TERMS, distort
-from projservo_cli.geometry.rigid import cross_matrix
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray
 
 
@@ -216,8 +217,8 @@ class LeastSquares:
         result[: 2 * CAMERA, :-2] = -(params.P @ motions[:, None]).reshape(len(motions), -1).T
         for i, (H_hat, reach) in enumerate(zip(params.H_hat, moved_operators(params), strict=True)):
             wanted = (motions @ H_hat - H_hat @ motions).reshape(-1, 16).T
-            found = np.linalg.lstsq(reach.reshape(-1, 16).T, wanted, rcond=None)[0]
-            result[self.joint[i] : self.joint[i + 1], :-2] = found
+            coefficients = np.linalg.lstsq(reach.reshape(-1, 16).T, wanted, rcond=None)[0]
+            result[self.joint[i] : self.joint[i + 1], :-2] = coefficients
         moved = (params.M @ motions.swapaxes(1, 2))[..., :3]
         result[self.shared :, :-2] = moved.reshape(len(motions), -1).T
         for v in (0, 1):
@@ -446,10 +447,10 @@ class _Expansion:
         for v, columns in enumerate(self.problem.columns):
             J = part.shared[v].reshape(-1, len(columns))
             A[np.ix_(columns, columns)] += J.T @ J
-            one = part.shared[[v]]
-            C[part.gone.blocks, :, columns] += part.gone._replace(J=part.gone.J[[v]]).across(one)
+            of_view = part.shared[[v]]
+            C[part.gone.blocks, :, columns] += part.gone._replace(J=part.gone.J[[v]]).across(of_view)
             if other is not None:
-                crossed = other._replace(J=other.J[[v]]).across(one).reshape(-1, len(columns))
+                crossed = other._replace(J=other.J[[v]]).across(of_view).reshape(-1, len(columns))
                 A[own.reshape(-1, 1), columns] += crossed
                 A[columns[:, None], own.ravel()] += crossed.T
         if other is not None:
@@ -652,7 +653,7 @@ def _weights(residual: FloatArray, rows: BoolArray, robust: bool) -> FloatArray:
         return rows.astype(np.float64)
     distance = np.linalg.norm(residual, axis=2)
     width = _CAUCHY * max(float(np.median(distance[rows])) / RAYLEIGH, 1e-9)
-    return np.where(rows, 1.0 / (1.0 + (distance / width) ** 2), 0.0)
+    return np.where(rows, cauchy_weights((distance / width) ** 2), 0.0)
 
 
 def _cost(weight: FloatArray, residual: FloatArray, strain: FloatArray) -> float:

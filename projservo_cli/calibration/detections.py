@@ -1,6 +1,8 @@
 """Detections of a calibration as flat lists, and refusals of data without motion or without two dimensions.
 
-The checks need joint readings, marker numbers and pixels, and no geometry yet.
+The checks need joint readings, marker numbers and pixels, and no geometry yet. At the end stand deviations
+and weights of residuals. Fits by reweighting solve other equations in each round, in closed form and many at
+once, so that each keeps its own loop: two-view geometry, rigid motions, axis points and the adjustment.
 """
 
 import dataclasses
@@ -9,10 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Observation, WorkFailed
+from projservo_cli.records import (
+    BoolArray,
+    FloatArray,
+    InputError,
+    IntArray,
+    Observation,
+    WorkFailed,
+    prismatic_of,
+)
 
 # Difference, rad or m, below which two joint readings are equal: far below any encoder's resolution.
-SAME_READING = 1e-7
+_SAME_READING = 1e-7
 # Minimum pixel noise, px per coordinate: exact images have round-off.
 MIN_SIGMA = 1e-4
 # Median of |x| over the standard deviation of a normal variable.
@@ -89,7 +99,7 @@ class Detections:
         present, marker_of_present = np.unique(marker_of, return_inverse=True)
         return cls(
             q=np.array(observation.q, dtype=np.float64),
-            prismatic=np.array([letter == "P" for letter in letters]),
+            prismatic=prismatic_of(letters),
             pose=observation.pose,
             marker=observation.marker[present],
             pose_of=pose_of,
@@ -147,7 +157,7 @@ class Detections:
         q = self.q
         candidates = np.arange(len(q))
         for row in q:
-            changed = (np.abs(q[candidates] - row) > SAME_READING).sum(axis=1)
+            changed = (np.abs(q[candidates] - row) > _SAME_READING).sum(axis=1)
             candidates = candidates[changed <= 1]
         if candidates.size == 0:
             return None
@@ -157,7 +167,7 @@ class Detections:
 
     def trials(self, home: int) -> list[IntArray]:
         """Rows of q in which each joint differs from the reference, one array a joint."""
-        moved = np.abs(self.q - self.q[home]) > SAME_READING
+        moved = np.abs(self.q - self.q[home]) > _SAME_READING
         return [np.flatnonzero(column) for column in moved.T]
 
     def reference(self) -> FloatArray:
@@ -428,3 +438,13 @@ def _require_no_line(detections: Detections, sigma: float) -> None:
                 off.append(across**2 > sigma**2 * chdtri(len(pixels) - 2, _OFF_LINE_TAIL))
     if off and np.mean(off) < 0.5:
         raise WorkFailed(ON_A_LINE)
+
+
+def deviation(residual: FloatArray, floor: float) -> float:
+    """Robust standard deviation of residuals about zero, at least ``floor``."""
+    return max(float(np.median(np.abs(residual))) / MAD, floor)
+
+
+def cauchy_weights(square: FloatArray) -> FloatArray:
+    """Weights (…) of the Cauchy loss log(1 + x²), by the squares x² of residuals over its width."""
+    return np.asarray(1.0 / (1.0 + square))

@@ -19,8 +19,8 @@ from projservo_cli.calibration.initialization import Search, starting_markers, s
 from projservo_cli.calibration.lens_estimation import undistorted
 from projservo_cli.calibration.model_error import image_motions
 from projservo_cli.calibration.prediction import CAMERA, Parameters
-from projservo_cli.geometry.rigid import cross_matrix
-from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray, WorkFailed
+from projservo_cli.geometry.displacements import cross_matrix
+from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray, WorkFailed, letters_of
 
 # Median residual, in σ, below which a corrected joint reading explains a pose.
 _CORRECTED = 3.0
@@ -406,7 +406,7 @@ def _hypotheses(detections: Detections, q_reference: FloatArray) -> list[tuple[s
         flipped = detections.prismatic.copy()
         flipped[i] = not slides
         given, fits = ("prismatic", "revolute") if slides else ("revolute", "prismatic")
-        letters = "".join("P" if one else "R" for one in flipped)
+        letters = letters_of(flipped)
         remedy = f"check the types of joints ({letters} would fit)"
         words = f"by the images joint {i + 1} is {fits}, not {given}: {remedy}"
         other = dataclasses.replace(detections, prismatic=flipped)

@@ -14,8 +14,8 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-from projservo_cli.calibration.detections import MAD, MIN_SIGMA, Detections, medians
-from projservo_cli.geometry.rigid import homogeneous
+from projservo_cli.calibration.detections import MIN_SIGMA, Detections, deviation, medians
+from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
@@ -100,12 +100,12 @@ class Epipolar:
         F = candidates[np.argmin(medians)]
         for _ in range(10):
             r, slope = sampson(F, a, b, weight)
-            F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * _deviation(r, 1e-12))) ** 2)))
+            F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * deviation(r, 1e-12))) ** 2)))
         F = _refine(F, a, b, weight)
         product = T_.T @ F @ T
         in_pixels: FloatArray = product / float(np.linalg.norm(product))
         residual, _ = sampson(in_pixels, homogeneous(left), homogeneous(right), weight)
-        inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
+        inlier = np.abs(residual) <= OUTLIER * deviation(residual, 1e-9)
         if inlier.sum() <= _PARAMETERS:
             raise WorkFailed("the observations of the two cameras share no epipolar geometry: check the rows")
         sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
@@ -148,7 +148,7 @@ class Core(NamedTuple):
     @classmethod
     def of(cls, residual: FloatArray, pose_of: IntArray) -> "Core":
         """Estimate it from residuals (N,) at poses (N,), less the parameters of the fundamental matrix."""
-        r, s = np.abs(residual), _deviation(residual, 1e-12)
+        r, s = np.abs(residual), deviation(residual, 1e-12)
         for _ in range(_CORE_ROUNDS):
             before, s = s, s * float(np.sqrt(min(max(_core_square(r / s), 0.25), 4.0)))
             if abs(s - before) <= _CORE_SETTLED * s:
@@ -176,11 +176,6 @@ def _core_square(ratio: FloatArray) -> float:
     flat = min(int(np.count_nonzero((ratio >= _CORE) & (ratio < 2.0 * _CORE))), count // 2)
     square = float((ratio[inside] ** 2).sum()) - flat * _CORE**2 / 3.0
     return square / max(count - flat, 1) / _CORE_MEAN
-
-
-def _deviation(r: FloatArray, floor: float) -> float:
-    """Robust standard deviation of residuals about zero, at least ``floor``."""
-    return max(float(np.median(np.abs(r))) / MAD, floor)
 
 
 def _normalization(pixels: FloatArray) -> FloatArray:
@@ -235,11 +230,11 @@ def _refine(F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArr
     def distances(x: FloatArray) -> FloatArray:
         return sampson(turned(x), left, right, weight)[0]
 
-    scale = 2.0 * _deviation(sampson(F, left, right, weight)[0], 1e-12)
-    found = least_squares(
+    scale = 2.0 * deviation(sampson(F, left, right, weight)[0], 1e-12)
+    fit = least_squares(
         distances, np.zeros(7), "3-point", loss="cauchy", f_scale=scale, ftol=_TIGHT, xtol=_TIGHT, gtol=_TIGHT
     )
-    return turned(found.x)
+    return turned(fit.x)
 
 
 def _transfer(left: FloatArray, right: FloatArray) -> FloatArray:
@@ -277,7 +272,10 @@ def _canonical_pair(F: FloatArray) -> FloatArray:
 
 
 def triangulated(P: FloatArray, m: FloatArray) -> FloatArray:
-    """Points (N, 4) of unit norm from homogeneous pixels (2, N, 3) of cameras (2, N, 3, 4): [HZ04] 12.2."""
+    """Points (N, 4) of unit norm from homogeneous pixels (2, N, 3) of cameras (2, N, 3, 4): [HZ04] 12.2.
+
+    Linear and all at once, to start fits; ``geometry.stereo`` has the point of minimum reprojection error.
+    """
     rows = m[..., :2, None] * P[:, :, 2:] - P[:, :, :2]
     return np.linalg.svd(rows.swapaxes(0, 1).reshape(-1, 4, 4))[2][:, 3]
 
@@ -346,12 +344,12 @@ def metric_guesses(
     # A minimum at which the body deforms far more than at the best one is no start.
     minima = minima[spread[minima] <= max(4.0 * spread[minima[0]], 0.05)]
     step = float(grid[1] - grid[0])
-    found = []
+    guesses = []
     for i in minima:
         bounds = float(grid[i]) - step, float(grid[i]) + step
         fine = minimize_scalar(spread_at, bounds=bounds, method="bounded", options={"xatol": _FINE * step})
-        found.append(guess(fine.x if fine.fun < spread[i] else grid[i], factor))
-    return found
+        guesses.append(guess(fine.x if fine.fun < spread[i] else grid[i], factor))
+    return guesses
 
 
 def _guess_at(

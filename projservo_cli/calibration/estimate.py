@@ -44,8 +44,8 @@ from projservo_cli.calibration.quality import WEAK_NOISE, assess, check_model, c
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.calibration.undecided import require_poses
 from projservo_cli.geometry.lens import K1
-from projservo_cli.image_size import ImageSize, image_sizes
-from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation
+from projservo_cli.image_size import ImageSize, border_distance, image_sizes
+from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation, letters_of
 
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
@@ -215,9 +215,8 @@ def _is_positive(value: Any) -> bool:
 
 def _require_inside(detections: Detections, image_size: ImageSize, strays: float) -> None:
     """Refuse an image size, width and height in px, with more than a share of a view's pixels outside."""
-    beyond, pixels, sizes = 0.5 + _BEYOND_PX, detections.pixels, image_sizes(image_size)
-    inside = ((pixels >= -beyond) & (pixels <= sizes[:, None] - 1.0 + beyond)).all(axis=2)
-    outside = detections.seen & ~inside
+    pixels, sizes = detections.pixels, image_sizes(image_size)
+    outside = detections.seen & (border_distance(pixels, sizes[:, None]) < -_BEYOND_PX)
     for view, name in enumerate(VIEWS):
         seen = detections.seen[view]
         share = float(outside[view].sum() / max(seen.sum(), 1.0))
@@ -501,7 +500,7 @@ def _record(
     return Calibration(
         method=method,
         source="",
-        joint_types="".join("P" if slides else "R" for slides in detections.prismatic),
+        joint_types=letters_of(detections.prismatic),
         usable=verdict.usable,
         reason=verdict.reason,
         advice=(f"{moved}: images that disagree are rejected; fix the cameras", *verdict.advice)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.detections import MAD, Detections, per_block
+from projservo_cli.calibration.detections import Detections, cauchy_weights, deviation, per_block
 from projservo_cli.calibration.epipolar import (
     Epipolar,
     ImageFrame,
@@ -19,17 +19,16 @@ from projservo_cli.calibration.epipolar import (
     metric_guesses,
 )
 from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.geometry.displacements import aligned, cross_matrix
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.geometry.rigid import cross_matrix
 from projservo_cli.records import (
-    PRISMATIC,
-    REVOLUTE,
     BoolArray,
     FloatArray,
     InputError,
     IntArray,
     Model,
     WorkFailed,
+    letters_of,
 )
 
 Progress = Callable[[str, int, int], None]
@@ -173,23 +172,6 @@ def _rigid_body(local: FloatArray) -> FloatArray:
     return body
 
 
-def _align(body: FloatArray, points: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rigid motions (K, 3, 3), (K, 3) of bodies (…, m, 3) to points (K, m, 3) of weights (K, m).
-
-    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point
-    patterns", PAMI 13(4), 1991. All poses at once: ``Rotation.align_vectors`` takes them one by one.
-    """
-    share = (weight / weight.sum(axis=1)[:, None])[:, None]
-    center_body, center_points = (share @ body)[:, 0], (share @ points)[:, 0]
-    moments = np.swapaxes(points - center_points[:, None], 1, 2) @ (
-        weight[..., None] * (body - center_body[:, None])
-    )
-    U, _, Vt = np.linalg.svd(moments)
-    U[:, :, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[:, None]
-    R = U @ Vt
-    return R, center_points - np.einsum("kij,kj->ki", R, center_body)
-
-
 def _consensus(
     body: FloatArray, points: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
@@ -199,7 +181,7 @@ def _consensus(
     """
     m = len(body)
     three = np.argsort(rng.random((_TRIPLES, m)), axis=1)[:, :_MIN_MARKERS]
-    R, t = _align(body[three], points[three], np.ones(three.shape))
+    R, t = aligned(body[three], points[three], np.ones(three.shape))
     distance = np.sort(np.linalg.norm(points - body @ np.swapaxes(R, 1, 2) - t[:, None], axis=2), axis=1)
     best = int(np.argmin(distance[:, min(max(m // 2, _MIN_MARKERS + 1), m - 1)]))
     return R[best], t[best]
@@ -208,12 +190,12 @@ def _consensus(
 def _robust_align(
     body: FloatArray, points: FloatArray, seen: BoolArray, motion: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Align as ``_align`` under a Cauchy loss by reweighting, from initial motions."""
+    """Align as ``aligned`` under a Cauchy loss by reweighting, from initial motions."""
     R, t = motion
     for _ in range(_ROUNDS):
         residual = np.linalg.norm(points - body @ np.swapaxes(R, 1, 2) - t[:, None], axis=2)
-        scale = max(float(np.median(residual[seen])) / MAD, 1e-12)
-        R, t = _align(body, points, np.where(seen, 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2), 0.0))
+        square = (residual / (2.0 * deviation(residual[seen], 1e-12))) ** 2
+        R, t = aligned(body, points, np.where(seen, cauchy_weights(square), 0.0))
     return R, t
 
 
@@ -283,7 +265,10 @@ def _chain(w: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray:
 def _fit_axes(
     w: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Axes (S, n, 3) and losses (S,): Levenberg–Marquardt for all at once, Cauchy loss on log(R R_predᵀ)."""
+    """Axes (S, n, 3) and losses (S,): Levenberg–Marquardt for all at once, Cauchy loss on log(R R_predᵀ).
+
+    All random starts S are one array, of which each keeps its own damping; SciPy takes them one by one.
+    """
     S, n = w.shape[:2]
     away = np.swapaxes(_chain(w, q, prismatic)[:, n], -1, -2) @ R
     base = np.stack([Rotation.from_matrix(rotations).mean().as_matrix() for rotations in away])
@@ -336,7 +321,7 @@ def _axis_residuals(
 def _cauchy(residual: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Cauchy loss (S,) of rotations (S, K, 3), and the weights (S, K)."""
     square = (residual**2).sum(axis=2) / _WIDTH**2
-    return np.log1p(square).sum(axis=1), 1.0 / (1.0 + square)
+    return np.log1p(square).sum(axis=1), cauchy_weights(square)
 
 
 def _solve_points(
@@ -395,8 +380,7 @@ def _robust_solve(
         A = np.tensordot(left * weight[:, None, None], left, axes=((0, 1), (0, 1)))
         x = np.linalg.solve(A[:-1, :-1] + np.diag(ridge), A[:-1, -1])
         residual = np.linalg.norm(left[..., -1] - left[..., :-1] @ x, axis=1)
-        scale = max(float(np.median(residual)) / MAD, _MIN_SCALE)
-        weight = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)
+        weight = cauchy_weights((residual / (2.0 * deviation(residual, _MIN_SCALE))) ** 2)
     return np.asarray(x), np.asarray(means[..., -1] - means[..., :-1] @ x)
 
 
@@ -437,14 +421,14 @@ class Nominal:
     @property
     def joint_types(self) -> str:
         """One letter a joint, R or P."""
-        return "".join("R" if H_hat[:3, :3].any() else "P" for H_hat in self.H_hat)
+        return letters_of(not H_hat[:3, :3].any() for H_hat in self.H_hat)
 
     def start(self, detections: Detections, q_reference: FloatArray) -> Parameters:
         """Initial parameters for detections, about their reference joints (n,), rad or m.
 
         Raises InputError if the joint types differ, or a detected marker is missing.
         """
-        own, letters = self.joint_types, "".join("P" if slides else "R" for slides in detections.prismatic)
+        own, letters = self.joint_types, letters_of(detections.prismatic)
         if own != letters:
             raise InputError(
                 f"{self.where}: its joints are {own}, those of the data {letters}; "
@@ -456,8 +440,8 @@ class Nominal:
                 f"{self.where}: marker {missing[0]} of the data is not in it; add the marker (marker_numbers "
                 "says which is which), or leave calibration.init out"
             )
-        types = np.where(detections.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
-        model = Model(self.P, self.H_hat, types, self.q_reference, np.array([0.0, 0.0, 0.0, 1.0]))
+        a_inf = np.array([0.0, 0.0, 0.0, 1.0])
+        model = Model(self.P, self.H_hat, detections.prismatic, self.q_reference, a_inf)
         column = {int(number): j for j, number in enumerate(self.marker)}
         M = self.M[[column[int(number)] for number in detections.marker]]
         M = M @ forward_kinematics(model, q_reference).T

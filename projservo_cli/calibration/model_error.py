@@ -27,7 +27,7 @@ from projservo_cli.calibration.adjustment import LeastSquares, minimize
 from projservo_cli.calibration.detections import Detections, per_rad
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.prediction import LENS, Images, Parameters
-from projservo_cli.geometry.rigid import cross_matrix
+from projservo_cli.geometry.displacements import cross_matrix
 from projservo_cli.records import CORNERS, VIEWS, BoolArray, Errors, FloatArray, IntArray, ModelError
 
 # Probability of chance above which no nuisance is found.

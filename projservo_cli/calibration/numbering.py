@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, sampson
-from projservo_cli.geometry.rigid import homogeneous
+from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation, WorkFailed
 
 # Minimum number of poses at which both views saw a marker, to judge its number.

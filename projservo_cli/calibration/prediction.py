@@ -14,8 +14,8 @@ import numpy as np
 from projservo_cli.calibration.detections import Detections, per_rad
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.screening import without_placeholders
+from projservo_cli.geometry.displacements import displacements, sine_and_versine
 from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible, undistort
-from projservo_cli.geometry.rigid import sine_and_versine
 from projservo_cli.records import (
     BoolArray,
     Calibration,
@@ -33,19 +33,9 @@ CAMERA = 12
 # Number of parameters of a lens about a given image centre, k1 and k2; two more are its centre.
 LENS = 2
 # Median held-out error, in the stated error and the noise of the images together, from which it contradicts.
-CONTRADICTED = 3.0
+_CONTRADICTED = 3.0
 # Minimum number of correspondences whose epipolar geometry determines their noise within a seventh.
 _NOISE_PAIRS = 32
-
-
-def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
-    """Displacements exp(q Ĥ) (n, K, 4, 4) of operators (n, 4, 4) at joints (K, n), [RH00] eqs. (4), (5).
-
-    Joint values are from the reference, rad or m.
-    """
-    squared = H_hat @ H_hat
-    sine, versine = (part.T[..., None, None] for part in sine_and_versine(prismatic, q))
-    return np.eye(4) + sine * H_hat[:, None] + versine * squared[:, None]
 
 
 def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
@@ -250,16 +240,17 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     seen: BoolArray = np.asarray(np.isfinite(images).all(axis=-1))
     ahead = np.isfinite(pixels[..., 0])
     compared = seen[:, :, known] & ahead
-    found = distance_statistics(np.linalg.norm((pixels - observation.images[:, :, known])[compared], axis=1))
+    off = (pixels - observation.images[:, :, known])[compared]
+    statistics = distance_statistics(np.linalg.norm(off, axis=1))
     stated = noise = limit = None
-    if found["count"] and np.isfinite(calibration.sqrt_cov_shared).all():
+    if statistics["count"] and np.isfinite(calibration.sqrt_cov_shared).all():
         of_pairs = prediction_variance(calibration, observation.q).sum(axis=-1)[:, :, order][compared]
         stated, noise = float(np.sqrt(np.median(of_pairs))), _image_noise(calibration, observation)
         if sigma_q := calibration.sigma_q:  # these readings have their own noise
             J = joint_derivative(calibration, observation.q)[:, :, order] * per_rad(calibration.prismatic)
             noise = float(np.hypot(noise, sigma_q * np.sqrt(np.median((J**2).sum(axis=(-2, -1))[compared]))))
-        limit = CONTRADICTED * float(np.hypot(stated, noise))
-    return found | {
+        limit = _CONTRADICTED * float(np.hypot(stated, noise))
+    return statistics | {
         "stated_px": stated,
         "noise_px": noise,
         "limit_px": limit,

@@ -14,7 +14,7 @@ from projservo_cli.calibration.detections import MAX_JUDGED, ON_A_LINE, Detectio
 from projservo_cli.calibration.epipolar import reconstruct
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
 from projservo_cli.calibration.prediction import Parameters
-from projservo_cli.geometry.algebra import normalize_displacement
+from projservo_cli.geometry.displacements import normalize_displacement
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
 
 # Minimum distance of the markers from their best line, in units of its noise.
@@ -224,8 +224,8 @@ def _require_space(P: FloatArray, points: FloatArray, sigma_px: float) -> None:
     plane = np.linalg.svd(points)[2][3]
     center = np.linalg.svd(P[0])[2][3]
     on_plane = points - np.outer(points @ plane / (center @ plane), center)
-    seen, flat = points @ P[1].T, on_plane @ P[1].T
-    parallax = np.linalg.norm(seen[:, :2] / seen[:, 2:] - flat[:, :2] / flat[:, 2:], axis=1)
+    in_space, flat = points @ P[1].T, on_plane @ P[1].T
+    parallax = np.linalg.norm(in_space[:, :2] / in_space[:, 2:] - flat[:, :2] / flat[:, 2:], axis=1)
     if float(np.sqrt((parallax**2).mean())) < _COPLANAR * sigma_px:
         raise WorkFailed(
             "the markers lie in one plane: a plane's motion does not determine a 4×4 homography; "

@@ -13,8 +13,8 @@ from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.detections import per_block
 from projservo_cli.calibration.epipolar import triangulated
 from projservo_cli.calibration.prediction import Parameters, projection_derivative
+from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.geometry.lens import undistort
-from projservo_cli.geometry.rigid import homogeneous
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 # Number of initial points tried for each marker, triangulated from single observations.

@@ -34,7 +34,7 @@ REGISTER = (
     _entry(
         "2",
         "Projective displacement, conjugate to a rigid motion, of unit determinant",
-        "geometry.algebra.normalize_displacement",
+        "geometry.displacements.normalize_displacement",
         "geometry/test_displacement.py::test_scale_of_a_homography_keeps_points_on_their_side_of_infinity",
         "det = 1 leaves ±H in dimension 4 (the trace is 0 at 180°): choose the sign that keeps the sign "
         "of a_inf·M.",
@@ -48,8 +48,8 @@ REGISTER = (
     _entry(
         "4",
         "Projective rotation: algebra to group and group to algebra",
-        "geometry.algebra.rotation calibration.projective.closed_form_operators "
-        "calibration.prediction.displacements",
+        "geometry.displacements.rotation calibration.projective.closed_form_operators "
+        "geometry.displacements.displacements",
         "geometry/test_displacement.py::test_rotation_is_the_matrix_exponential "
         "calibration/test_contract_structure.py::test_the_closed_form_finds_the_same_operators_without_noise",
         "Group to algebra is undefined at 0 and ±π: such trial motions are refused.",
@@ -57,8 +57,8 @@ REGISTER = (
     _entry(
         "5",
         "Projective translation: algebra to group and group to algebra",
-        "geometry.algebra.translation calibration.projective.closed_form_operators "
-        "calibration.prediction.displacements",
+        "geometry.displacements.translation calibration.projective.closed_form_operators "
+        "geometry.displacements.displacements",
         "geometry/test_displacement.py::test_translation_is_the_matrix_exponential "
         "calibration/test_contract_structure.py::test_the_closed_form_finds_the_same_operators_without_noise",
         "Group to algebra is undefined at 0: such trial motions are refused.",
@@ -176,7 +176,7 @@ REGISTER = (
     _entry(
         "22",
         "Translation and rotation at once",
-        "control.direct.direct_two control.exact.exact",
+        "control.direct.direct_two control.direct.exact",
         "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit "
         "control/test_exact.py::test_the_centre_keeps_to_its_line",
         "exp(τĤ_t) exp(θĤ_s) = exp(τĤ_t + θĤ_s) holds only to first order, or where the translation is "
@@ -194,14 +194,14 @@ REGISTER = (
     _entry(
         "24",
         "One rotation for both rotations",
-        "geometry.algebra.composed_angle geometry.algebra.composed_operator",
+        "geometry.displacements.composed_angle geometry.displacements.composed_operator",
         "geometry/test_composition.py::test_one_rotation_equals_two "
         "control/test_direct.py::test_error_of_both_rotations_is_the_true_angle",
     ),
     _entry(
         "25",
         "Coefficients of the composed rotation",
-        "geometry.algebra.composed_angle",
+        "geometry.displacements.composed_angle",
         "geometry/test_composition.py::test_the_printed_factor_two_is_wrong",
         "c = sin(θ_p/2) sin(θ_r/2), without the factor 2, with [Ĥ_r, Ĥ_p] = Ĥ_r Ĥ_p − Ĥ_p Ĥ_r.",
     ),

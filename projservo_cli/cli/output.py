@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
-from projservo_cli.masking import masked
 from projservo_cli.progress import Bar
+from projservo_cli.records import masked
 
 _UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _NOTES = {  # on runs, and their reasons
@@ -316,7 +316,7 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
 
 
 def _of_laws(value: dict[str, Any]) -> Iterator[str]:
-    from projservo_cli.laws import name_of
+    from projservo_cli.laws import run_name
 
     known = any(trace["position_error_mm"] is not None for trace in value["laws"])
     keys = ("position_error_mm", "rotation_error_deg", "center_deviation_mm")
@@ -333,7 +333,7 @@ def _of_laws(value: dict[str, Any]) -> Iterator[str]:
     for trace in value["laws"]:
         first, second, last = (_number(trace[key]) if key else "" for key in keys)
         yield (
-            f"  {name_of(trace['law'], trace['mode']):<20}{trace['verdict']:<15}{trace['steps']:>5}"
+            f"  {run_name(trace['law'], trace['mode']):<20}{trace['verdict']:<15}{trace['steps']:>5}"
             f"{first:>9}{second:>9}"
             f"{trace['self_occluded_steps_left']:>5}/{trace['self_occluded_steps_right']:<3}{last:>10}"
         ).rstrip()

@@ -29,7 +29,7 @@ from projservo_cli.simulation.described import (
 )
 from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.mjcf import files_named
-from projservo_cli.simulation.scene import Scene
+from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.stage_inputs import (
     CalibrationInputs,
@@ -336,7 +336,7 @@ def _truth(config: Config, *, face: bool) -> Truth:
     return described_truth(config.arm, config.rig, markers, k1, face)
 
 
-def scene_of(config: Config, files: Files | None = None) -> Scene | None:
+def scene_of(config: Config, files: Files | None = None) -> RenderedScene | None:
     """Return the scene of rendered cameras; None for cameras that see points."""
     options = config.plant.rendered
     if options is None:

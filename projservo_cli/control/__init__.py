@@ -3,9 +3,8 @@
 Run files and tables know a law by its name, compiled code by its code in ``laws``.
 """
 
-from projservo_cli.control import exact
 from projservo_cli.control.classical import blockwise, euclidean_points, stacked
-from projservo_cli.control.direct import direct_three, direct_two
+from projservo_cli.control.direct import direct_three, direct_two, exact
 from projservo_cli.control.law import LOST, OK, Gains, Law, State, limit_speed
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.lens import distorts, undistort_into
@@ -27,29 +26,29 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
     Returns the status of the law; ``LOST`` for a state made for another number of markers.
     """
     code, model, task, gains = law
-    seen = s
+    straight = s
     if distorts(model.lens):
         if state.straight.shape[1] != s.shape[1]:
             return LOST
         undistort_into(model.lens, s, state.straight)
-        seen = state.straight
+        straight = state.straight
     if following(task.reference):
         lead = 1.0 / (gains.gain * gains.period)
         reference_into(
             model, task.reference, float(state.clock[0]), lead, state.A_ref, state.s_ref, state.q_ahead
         )
     if code == _DIRECT_THREE:
-        status = direct_three(model, task, gains, seen, q, state)
+        status = direct_three(model, task, gains, straight, q, state)
     elif code == _DIRECT_TWO:
-        status = direct_two(model, task, gains, seen, q, state)
+        status = direct_two(model, task, gains, straight, q, state)
     elif code == _STACKED:
-        status = stacked(model, task, gains, seen, q, state)
+        status = stacked(model, task, gains, straight, q, state)
     elif code == _BLOCKWISE:
-        status = blockwise(model, task, gains, seen, q, state)
+        status = blockwise(model, task, gains, straight, q, state)
     elif code == _EUCLIDEAN_POINTS:
-        status = euclidean_points(model, task, gains, seen, q, state)
+        status = euclidean_points(model, task, gains, straight, q, state)
     else:
-        status = exact.exact(model, task, gains, seen, q, state)
+        status = exact(model, task, gains, straight, q, state)
     if following(task.reference):
         limited = code == _EXACT
         if status != LOST and on_joint_path(task.reference, float(state.clock[0])):

@@ -16,8 +16,6 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     apply,
     axpy,
-    composed_angle,
-    composed_operator,
     dot,
     inner,
     mat,
@@ -27,7 +25,8 @@ from projservo_cli.geometry.algebra import (
     vec,
     vec_into,
 )
-from projservo_cli.geometry.jit import composed, internal, merged, njit
+from projservo_cli.geometry.displacements import composed_angle, composed_operator
+from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, least_squares
 from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
 from projservo_cli.geometry.lens import undistort_pixel
@@ -176,7 +175,7 @@ def reset(state: State) -> None:
     state.clock[0] = 0.0
 
 
-@composed
+@inline
 def make_split(state: State) -> Split:
     """The arrays of a state in which the task is partitioned."""
     return Split(
@@ -202,8 +201,8 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
             and math.isfinite(s[1, k, 1])
         ):
             return False
-        found, M = triangulate(model.P, task.F, model.a_inf, s[0, k], s[1, k])
-        if not found:
+        finite, M = triangulate(model.P, task.F, model.a_inf, s[0, k], s[1, k])
+        if not finite:
             return False
         vec_into(state.A[k], M)
     return True
@@ -337,9 +336,9 @@ def single_rotation(
     if not turns:
         return True, 0.0, 0.0, H_s
     axis = _axis_direction(H_s, model.a_inf, parts.A_c)
-    found, H = rotation_mechanism(state.work, unit(parts.A_c), axis, state.q_hat[3])
+    unique, H = rotation_mechanism(state.work, unit(parts.A_c), axis, state.q_hat[3])
     size = inner(H, H)
-    if not found or size == 0.0:
+    if not unique or size == 0.0:
         return False, theta_s, 0.0, H_s
     return True, theta_s, inner(H, H_s) / size, H_s
 
@@ -351,8 +350,8 @@ def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, 
     for i in range(operators.shape[0]):
         operator = mat(operators[i])
         for k in range(state.A.shape[0]):
-            vec_into(state.A_t[k], apply(operator, vec(state.A[k])))
-            _, _, u_dot, v_dot = image_velocity(model.P[view], vec(state.A[k]), vec(state.A_t[k]))
+            A = vec(state.A[k])
+            _, _, u_dot, v_dot = image_velocity(model.P[view], A, apply(operator, A))
             system.B[i, first + 2 * k] = u_dot
             system.B[i, first + 2 * k + 1] = v_dot
     for k in range(state.A.shape[0]):

@@ -1,4 +1,4 @@
-"""JIT compilation of the mathematics: one decorator, and a cache that never serves stale code.
+"""JIT compilation of the mathematics: its decorators, and a cache that never serves stale code.
 
 Numba checks cached machine code against the file of the function alone, and would miss an edited helper in
 another file. The cache folder therefore carries a hash of the sources of all compiled functions and of their
@@ -19,26 +19,25 @@ import numba
 import numpy as np
 from numba.core.caching import UserProvidedCacheLocator
 from numba.core.registry import CPUDispatcher
-from numba.extending import register_jitable
 
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
 
-_DECORATED = re.compile(rb"^@(?:allocating|composed|inline|internal|merged|njit)$", re.MULTILINE)
+_DECORATED = re.compile(rb"^@(?:inline|internal|merged|njit)$|^\w.* = njit\(", re.MULTILINE)
 _IMPORT = re.compile(rb"^\s*from projservo_cli(?:\.([\w.]+))? import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 
 
 def compiled_sources(root: Path) -> dict[str, bytes]:
     """Sources of a package, by their paths in it, with compiled functions, and those that they import."""
     sources = {file.relative_to(root).as_posix(): file.read_bytes() for file in root.rglob("*.py")}
-    found: dict[str, bytes] = {}
+    needed: dict[str, bytes] = {}
     due = [name for name, source in sources.items() if _DECORATED.search(source)]
     while due:
         name = due.pop()
-        if name in sources and name not in found:
-            found[name] = sources[name]
+        if name in sources and name not in needed:
+            needed[name] = sources[name]
             due += _imported(sources[name])
-    return dict(sorted(found.items()))
+    return dict(sorted(needed.items()))
 
 
 def _imported(source: bytes) -> Iterator[str]:
@@ -89,7 +88,7 @@ PACKAGE = Path(__file__).parents[1]
 CACHE_FOLDER = cache_folder(PACKAGE) if COMPILED else None
 
 
-class PlaceInPackage(UserProvidedCacheLocator):
+class _PlaceInPackage(UserProvidedCacheLocator):
     """Locator of machine code by the place of its source in the package, wherever that is installed."""
 
     @classmethod
@@ -108,7 +107,7 @@ if CACHE_FOLDER is not None:
     SETTINGS.CACHE_DIR = str(CACHE_FOLDER)
     if "NUMBA_CACHE_LOCATOR_CLASSES" not in os.environ:
         SETTINGS.CACHE_LOCATOR_CLASSES = (
-            f"{__name__}.{PlaceInPackage.__name__},UserProvidedCacheLocator,IPythonCacheLocator"
+            f"{__name__}.{_PlaceInPackage.__name__},UserProvidedCacheLocator,IPythonCacheLocator"
         )
 # The third level of the optimiser takes a sixth more compilation time and saves a tenth of a step.
 if "NUMBA_OPT" not in os.environ:
@@ -129,9 +128,12 @@ _OPTIONS: dict[str, Any] = {
 _UNCACHED = {name: value for name, value in _OPTIONS.items() if name != "cache"}
 
 
-def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a function that allocates nothing and may be called from Python."""
-    return cast(Callable[_Params, _Result], numba.njit(**_OPTIONS)(function))
+def njit(function: Callable[_Params, _Result], *, allocates: bool = False) -> Callable[_Params, _Result]:
+    """Compile a function that may be called from Python.
+
+    allocates : whether it makes arrays, or a structure of the compiler.
+    """
+    return cast(Callable[_Params, _Result], numba.njit(**{**_OPTIONS, "_nrt": allocates})(function))
 
 
 class _Internal(CPUDispatcher):
@@ -152,36 +154,27 @@ class _Internal(CPUDispatcher):
         return self._caller(*arguments)
 
 
-def internal(function: Callable[_Params, _Result], **given: Any) -> Callable[_Params, _Result]:
+def internal(function: Callable[_Params, _Result], **further: Any) -> Callable[_Params, _Result]:
     """Compile a function that only compiled ones and tests call.
 
     Without the interface to Python it compiles a fifth faster, for a record of a hundred arrays.
-    given : further options of the compiler.
+    further : further options of the compiler.
     """
     if not COMPILED:
         return function
-    options = {**_UNCACHED, "nopython": True, "no_cpython_wrapper": True, **given}
+    options = {**_UNCACHED, "nopython": True, "no_cpython_wrapper": True, **further}
     dispatcher = _Internal(function, targetoptions=options)
     if _OPTIONS["cache"]:
         dispatcher.enable_caching()
     return cast(Callable[_Params, _Result], dispatcher)
 
 
-def allocating(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a function that allocates arrays, for sweeps that take milliseconds a call."""
-    return cast(Callable[_Params, _Result], numba.njit(**{**_OPTIONS, "_nrt": True})(function))
-
-
-def composed(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a function as part of the compiled ones that call it.
-
-    Python interprets it, and it calls compiled functions, so a single run needs their machine code alone.
-    """
-    return register_jitable(**_UNCACHED)(function)
-
-
 def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a small helper that the optimiser merges into its callers; Python interprets it."""
+    """Compile a helper that the optimiser merges into its callers; Python interprets it.
+
+    Interpreted, a function of few calls, as of the begin of a run, needs the machine code of what it calls
+    alone.
+    """
     return internal(function, forceinline=True)
 
 

@@ -1,29 +1,21 @@
 """Forward kinematics and image Jacobian in projective space: [RH00] equations (6), (7) and (19)."""
 
+import math
+
 import numpy as np
 
-from projservo_cli.geometry.algebra import (
-    IDENTITY,
-    Mat4,
-    Vec4,
-    as_array,
-    mat,
-    mat_into,
-    mul,
-    rotation,
-    rotation_and_inverse,
-    translation,
-    vec,
-)
+from projservo_cli.geometry.algebra import IDENTITY, Mat4, Vec4, as_array, mat, mat_into, mul, vec
+from projservo_cli.geometry.displacements import rotation, rotation_and_inverse, translation
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import distort_visible
-from projservo_cli.records import NO_LENS, PRISMATIC, FloatArray, Model
+from projservo_cli.image_size import BEHIND
+from projservo_cli.records import NO_LENS, FloatArray, JointLimits, Model
 
 
 @internal
-def _joint_displacement(H_hat: Mat4, joint_type: int, q: float) -> Mat4:
+def _joint_displacement(H_hat: Mat4, prismatic: bool, q: float) -> Mat4:
     """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5)."""
-    if joint_type == PRISMATIC:
+    if prismatic:
         return translation(H_hat, q)
     return rotation(H_hat, q)
 
@@ -34,7 +26,7 @@ def forward(model: Model, q: FloatArray) -> Mat4:
     H = IDENTITY
     for i in range(q.shape[0]):
         amount = float(q[i]) - float(model.q_reference[i])
-        H = mul(H, _joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], amount))
+        H = mul(H, _joint_displacement(mat(model.H_hat_0[i]), model.prismatic[i], amount))
     return H
 
 
@@ -44,7 +36,7 @@ def backward(model: Model, q: FloatArray) -> Mat4:
     H = IDENTITY
     for i in range(q.shape[0]):
         amount = float(q[i]) - float(model.q_reference[i])
-        H = mul(_joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], -amount), H)
+        H = mul(_joint_displacement(mat(model.H_hat_0[i]), model.prismatic[i], -amount), H)
     return H
 
 
@@ -54,7 +46,7 @@ def forward_between(model: Model, q: FloatArray, i: int, x: float) -> Mat4:
     H = IDENTITY
     for l in range(q.shape[1]):
         amount = (1.0 - x) * float(q[i, l]) + x * float(q[i + 1, l]) - float(model.q_reference[l])
-        H = mul(H, _joint_displacement(mat(model.H_hat_0[l]), model.joint_types[l], amount))
+        H = mul(H, _joint_displacement(mat(model.H_hat_0[l]), model.prismatic[l], amount))
     return H
 
 
@@ -73,8 +65,8 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
         mat_into(H_hat[i], mul(mul(H, operator), H_inverse))
         amount = float(q[i]) - float(model.q_reference[i])
         if i == n - 1:
-            H = mul(H, _joint_displacement(operator, model.joint_types[i], amount))
-        elif model.joint_types[i] == PRISMATIC:
+            H = mul(H, _joint_displacement(operator, model.prismatic[i], amount))
+        elif model.prismatic[i]:
             H = mul(H, translation(operator, amount))
             H_inverse = mul(translation(operator, -amount), H_inverse)
         else:
@@ -85,10 +77,16 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
 
 
 @merged
-def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
-    """First joint outside its limits, or −1."""
+def limit_distance(limits: JointLimits, q: FloatArray, i: int) -> float:
+    """Distance of joint i of q (n,) from its nearer limit, rad or m; negative beyond it."""
+    return min(float(q[i]) - float(limits.lower[i]), float(limits.upper[i]) - float(q[i]))
+
+
+@merged
+def beyond_limits(limits: JointLimits, q: FloatArray, slack: float) -> int:
+    """First joint of q (n,) that is beyond its limits by more than a slack, rad or m; or −1."""
     for i in range(q.shape[0]):
-        if not lower[i] <= q[i] <= upper[i]:
+        if not limit_distance(limits, q, i) >= -slack:
             return i
     return -1
 
@@ -112,6 +110,17 @@ def image_motion(P: FloatArray, A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
     u, v, u_dot, v_dot = image_velocity(P[0], A, D)
     x, y, x_dot, y_dot = image_velocity(P[1], A, D)
     return (u, v, x, y), (u_dot, v_dot, x_dot, y_dot)
+
+
+@merged
+def from_border(image_size: FloatArray, u: float, v: float) -> float:
+    """Distance of a pixel from the border of an image, px; negative outside, ``BEHIND`` of none.
+
+    The compiled twin of ``image_size.border_distance``, for one image of a width and height (2,).
+    """
+    if not math.isfinite(u + v):
+        return BEHIND
+    return min(u + 0.5, v + 0.5, float(image_size[0]) - 0.5 - u, float(image_size[1]) - 0.5 - v)
 
 
 @inline

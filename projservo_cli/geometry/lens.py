@@ -114,13 +114,13 @@ def distorts(lens: FloatArray) -> bool:
 
 
 @merged
-def undistort_into(lens: FloatArray, s: FloatArray, found: FloatArray) -> None:
-    """Undistort pixels (2, N, 2) by lenses (2, 5) into ``found``; NaN as for ``undistort_pixel``."""
+def undistort_into(lens: FloatArray, s: FloatArray, straight: FloatArray) -> None:
+    """Undistort pixels (2, N, 2) by lenses (2, 5) into ``straight``; NaN as for ``undistort_pixel``."""
     for view in range(s.shape[0]):
         for k in range(s.shape[1]):
             pixel = undistort_pixel(lens[view], float(s[view, k, 0]), float(s[view, k, 1]))
-            found[view, k, 0] = pixel[0]
-            found[view, k, 1] = pixel[1]
+            straight[view, k, 0] = pixel[0]
+            straight[view, k, 1] = pixel[1]
 
 
 @njit
@@ -156,9 +156,9 @@ def undistort(lens: FloatArray, s: FloatArray) -> FloatArray:
     s = np.ascontiguousarray(s, dtype=np.float64)
     if not distorts(lens):
         return s
-    found = np.empty_like(s)
-    undistort_into(lens, s, found)
-    return found
+    straight = np.empty_like(s)
+    undistort_into(lens, s, straight)
+    return straight
 
 
 def before_fold(lens: FloatArray, pixels: FloatArray) -> BoolArray:

@@ -17,7 +17,6 @@ from projservo_cli.geometry.algebra import (
     combine,
     dual_pencil,
     inner,
-    invariant_rotations,
     mat,
     mul,
     multiple,
@@ -25,6 +24,7 @@ from projservo_cli.geometry.algebra import (
     vec,
     vec_into,
 )
+from projservo_cli.geometry.displacements import invariant_rotations
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kernels import (
     COORDINATES,
@@ -146,8 +146,8 @@ def _moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
 @internal
 def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Kernel vector and operator with the scale ν of [RH00] eqs. (9), (10): trace(Ĥ²) = −2."""
-    found, H = _moving(work, q_hat)
-    if not found:
+    unique, H = _moving(work, q_hat)
+    if not unique:
         return False, NO_OPERATOR
     # The sum is written out, since dynamic indices of a tuple need memory.
     trace = (H[0] * H[0] + H[5] * H[5]) + (H[10] * H[10] + H[15] * H[15])
@@ -215,7 +215,7 @@ def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
     return minimum_norm(work.system, work.J, xi, q_hat)
 
 
-class Seen(NamedTuple):
+class MeasuredFace(NamedTuple):
     """A measured face and the joints at its measurement."""
 
     A: FloatArray  # (m, 4) its points
@@ -223,10 +223,12 @@ class Seen(NamedTuple):
 
 
 @internal
-def reach(model: Model, face: Seen, goal: Mat4, q: FloatArray, work: Work, settled: float) -> bool:
+def reach(model: Model, face: MeasuredFace, goal: Mat4, q: FloatArray, work: Work, settled: float) -> bool:
     """Newton steps on the joints ``q``, in place, until they displace a measured face by ``goal``.
 
-    Steps have minimum norm with more than six joints; fewer bring the face as near as they can.
+    Steps have minimum norm with more than six joints; fewer bring the face as near as they can. It runs in
+    every period from joints nearby, so it has neither the damping nor the starts of
+    ``planning.goal_configurations``, which knows no joints nearby.
 
     work : for n joints and 4m rows.
     settled : maximum joint motion of the last step, rad or m.

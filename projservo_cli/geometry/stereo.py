@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from projservo_cli.geometry.algebra import Vec4, dot, meet, scale, vec, vec_into
-from projservo_cli.geometry.jit import composed, merged
+from projservo_cli.geometry.jit import inline, merged
 from projservo_cli.records import FloatArray, WorkFailed
 
 NO_POINT = "marker {} of the face: its two rays do not meet in a finite point"
@@ -120,12 +120,12 @@ def triangulate_points(P: FloatArray, a_inf: FloatArray, s: FloatArray) -> Float
     return M
 
 
-@composed
+@inline
 def points_into(P: FloatArray, F: FloatArray, a_inf: FloatArray, s: FloatArray, M: FloatArray) -> int:
     """Triangulate the first m stereo pixels into M (m, 4); the first pixel without a point, or −1."""
     for k in range(M.shape[0]):
-        found, point = triangulate(P, F, a_inf, s[0, k], s[1, k])
-        if not found:
+        finite, point = triangulate(P, F, a_inf, s[0, k], s[1, k])
+        if not finite:
             return k
         vec_into(M[k], point)
     return -1

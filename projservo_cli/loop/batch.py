@@ -16,14 +16,14 @@ from projservo_cli.control.law import (
     new_state,
     reset,
 )
-from projservo_cli.geometry.jit import composed, merged, njit
+from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.lens import undistort_into
 from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.metrics import Ended, Summary, summarize
 from projservo_cli.loop.rehearsal import Rehearsal, first_parts, is_half_turn
-from projservo_cli.loop.step import RUNNING, Log, new_log
+from projservo_cli.loop.run_metrics import Ended, Summary, summarize
+from projservo_cli.loop.verdicts import RUNNING, Log, new_log
 from projservo_cli.records import FloatArray, Model
-from projservo_cli.simulation.ideal import Ends
+from projservo_cli.simulation.analytic_plant import Ends
 from projservo_cli.task.body import Body
 from projservo_cli.task.face import (
     FOUND,
@@ -55,7 +55,7 @@ class Setting(NamedTuple):
     ends: Ends  # true poses of the tool
 
 
-class _Desk(NamedTuple):
+class _Scratch(NamedTuple):
     """Workspace in which the task of a run is measured, and the run driven."""
 
     images: FloatArray  # (2, 2, b, 2) straight pixels of the images at the start and at the goal
@@ -79,7 +79,7 @@ class Batch:
         observed, s_star = m + len(plant.pins), np.zeros((2, m, 2))
         body = setting.body._replace(in_goal=np.zeros((2, len(setting.body.M)), dtype=np.bool_))
         self.setting = setting
-        self.desk = _Desk(
+        self.scratch = _Scratch(
             images=np.zeros((2, 2, images, 2)),
             task=new_task(setting.model, s_star, plant.center)._replace(body=body),
             own_task=new_task(setting.believed, s_star, plant.center),
@@ -99,7 +99,7 @@ class Batch:
             short.
         """
         numbers = np.full((len(images), len(NUMBERS)), math.nan)
-        at, made, opened = self.desk, 0, _NOT_OPENED
+        at, made, opened = self.scratch, 0, _NOT_OPENED
         while made < len(images):
             made += _until_rehearsal(self.setting, images[made:], noise[made:], at, opened, numbers[made:])
             if made < len(images):
@@ -109,7 +109,12 @@ class Batch:
 
 @njit
 def _until_rehearsal(
-    setting: Setting, images: FloatArray, noise: FloatArray, desk: _Desk, opened: int, numbers: FloatArray
+    setting: Setting,
+    images: FloatArray,
+    noise: FloatArray,
+    scratch: _Scratch,
+    opened: int,
+    numbers: FloatArray,
 ) -> int:
     """Runs up to one whose half turn is to be rehearsed, and how many; that one is opened.
 
@@ -121,65 +126,67 @@ def _until_rehearsal(
     for made in range(len(images)):
         status = opened
         if made > 0 or opened == _NOT_OPENED:
-            status, theta_p = _open(setting, images[made], desk)
+            status, theta_p = _open(setting, images[made], scratch)
             if status == FOUND and setting.rehearse and is_half_turn(theta_p):
                 return made
-        _drive(setting, status, noise[made], desk, numbers[made])
+        _drive(setting, status, noise[made], scratch, numbers[made])
     return len(images)
 
 
 @merged
-def _open(setting: Setting, images: FloatArray, desk: _Desk) -> tuple[int, float]:
+def _open(setting: Setting, images: FloatArray, scratch: _Scratch) -> tuple[int, float]:
     """Measure and partition a task, also as the law measures it; the verdict and the angle θ_p, rad."""
-    reset(desk.own_state)
+    reset(scratch.own_state)
     if not setting.shares_task:
-        status = _measured_into(setting, setting.believed, images, desk, desk.own_task)
+        status = _measured_into(setting, setting.believed, images, scratch, scratch.own_task)
         if status != FOUND:
             return status, 0.0
-    status = _measured_into(setting, setting.model, images, desk, desk.task)
+    status = _measured_into(setting, setting.model, images, scratch, scratch.task)
     if status != FOUND:
         return status, 0.0
-    reset(desk.state)
-    status, parts = first_parts(setting.model, desk.task, desk.images[0], setting.course.q_start, desk.state)
+    reset(scratch.state)
+    status, parts = first_parts(
+        setting.model, scratch.task, scratch.images[0], setting.course.q_start, scratch.state
+    )
     return status, parts.theta_p
 
 
-@composed
-def _measured_into(setting: Setting, model: Model, images: FloatArray, desk: _Desk, task: Task) -> int:
+@inline
+def _measured_into(setting: Setting, model: Model, images: FloatArray, scratch: _Scratch, task: Task) -> int:
     """Measure a task from images (2, 2, b, 2) at its start and goal, px; return the verdict."""
     for view in range(2):
         for k in range(task.s_star.shape[1]):
             for i in range(2):
                 task.s_star[view, k, i] = images[1, view, k, i]
-    undistort_into(model.lens, images[0], desk.images[0])
-    undistort_into(model.lens, images[1], desk.images[1])
-    state = desk.state
-    status, _ = task_into(model, desk.images, task, state.A, state.work.system.rhs)
+    undistort_into(model.lens, images[0], scratch.images[0])
+    undistort_into(model.lens, images[1], scratch.images[1])
+    state = scratch.state
+    status, _ = task_into(model, scratch.images, task, state.A, state.work.system.rhs)
     if status == FOUND and task.body.M.shape[0] > 0:
         q_start = setting.course.q_start
-        status, _ = body_task_into(model, q_start, desk.images, task, make_split(state), state.normal)
+        status, _ = body_task_into(model, q_start, scratch.images, task, make_split(state), state.normal)
     return status
 
 
 @merged
-def _drive(setting: Setting, status: int, noise: FloatArray, desk: _Desk, numbers: FloatArray) -> None:
+def _drive(setting: Setting, status: int, noise: FloatArray, scratch: _Scratch, numbers: FloatArray) -> None:
     """Drive the law of a run that was opened; its numbers."""
     numbers[VERDICT] = NOT_STARTED
     if status != FOUND:
         return
-    state = desk.own_state
+    state = scratch.own_state
     for part in range(2):
         for i in range(state.driven.shape[1]):
-            state.driven[part, i] = desk.state.driven[part, i]
-    task = desk.task if setting.shares_task else desk.own_task
+            state.driven[part, i] = scratch.state.driven[part, i]
+    task = scratch.task if setting.shares_task else scratch.own_task
     law = Law(setting.code, setting.believed, task, setting.gains)
-    verdict, steps = run_compiled(law, setting.course, noise, state, desk.log)
+    verdict, steps = run_compiled(law, setting.course, noise, state, scratch.log)
     numbers[VERDICT] = verdict
     numbers[STEPS] = steps
     if verdict != RUNNING:
         ended, period = Ended(verdict, steps, state.limited[0]), setting.gains.period
-        found = summarize(setting.course.plant, desk.log, ended, period, setting.ends)
+        summary = summarize(setting.course.plant, scratch.log, ended, period, setting.ends)
         column = 2
-        for value in literal_unroll(found):
+        for value in literal_unroll(summary):
             numbers[column] = value
             column += 1

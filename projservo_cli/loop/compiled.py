@@ -8,9 +8,19 @@ from projservo_cli.control.law import OK, Law, State
 from projservo_cli.geometry.algebra import mat, mat_into
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward
-from projservo_cli.loop.step import RUNNING, WAITING, Command, Instant, Limits, Log, bounded, note, verdict_at
+from projservo_cli.loop.verdicts import (
+    RUNNING,
+    WAITING,
+    Command,
+    Instant,
+    Limits,
+    Log,
+    bounded,
+    note,
+    verdict_at,
+)
 from projservo_cli.records import FloatArray
-from projservo_cli.simulation.ideal import Plant, observe, rig_distance
+from projservo_cli.simulation.analytic_plant import Plant, observe, rig_distance
 
 
 class Course(NamedTuple):

@@ -12,12 +12,12 @@ from numba import typeof
 from projservo_cli.control.law import ERRORS, new_state, pseudo_inverse, single_rotation, view_into
 from projservo_cli.geometry.algebra import IDENTITY
 from projservo_cli.geometry.jit import CACHE_FOLDER
-from projservo_cli.geometry.mechanisms import Seen, reach
-from projservo_cli.loop.metrics import Ended, path_deviation, summarize
-from projservo_cli.loop.step import new_log
+from projservo_cli.geometry.mechanisms import MeasuredFace, reach
+from projservo_cli.loop.run_metrics import Ended, path_deviation, summarize
+from projservo_cli.loop.verdicts import new_log
 from projservo_cli.planning.margins import Reaching, carried_into, carrier_of, limits_alone, room_along
 from projservo_cli.records import JointLimits, Model
-from projservo_cli.simulation.ideal import Ends, Plant
+from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import NO_PARTS
 
@@ -46,7 +46,8 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     """Kernels and arguments of the types that all runs have; their values mean nothing."""
     q, O, matrices, order = np.zeros(4), np.zeros((2, 4)), np.zeros((4, 4, 4)), np.zeros(4, np.int64)
     limits = JointLimits(q, q, q, q)
-    model = Model(P=np.zeros((2, 3, 4)), H_hat_0=matrices, joint_types=order, q_reference=q, a_inf=q)
+    slides = np.zeros(4, np.bool_)
+    model = Model(P=np.zeros((2, 3, 4)), H_hat_0=matrices, prismatic=slides, q_reference=q, a_inf=q)
     task = Task(
         s_star=np.zeros((2, 4, 2)),
         A_star=matrices[0],
@@ -79,7 +80,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         q_start=q,
     )
     along = room_along(reaching, 1)
-    yield reach, (model, Seen(matrices[0], IDENTITY), IDENTITY, q, state.work, 1.0)
+    yield reach, (model, MeasuredFace(matrices[0], IDENTITY), IDENTITY, q, state.work, 1.0)
     yield pseudo_inverse, (state, 8, q)
     yield view_into, (model, task, task.s_star, state, 0, 0)
     yield single_rotation, (model, NO_PARTS, 1.0, state)

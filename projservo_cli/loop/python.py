@@ -1,4 +1,18 @@
-"""The closed loop in Python: any law on any plant, the same limits, counting and verdicts."""
+"""The closed loop in Python: any law on any plant, the same limits, counting and verdicts.
+
+Monitors end a run in this order. Each is given the verdict of those before it and returns its own:
+
+1. the fault monitor holds the robot where images contradict the calibration, and ends the run once it is
+   known why, before the law is asked;
+2. ``verdict_at``, which alone rules over the compiled loop too;
+3. the stall monitor, of a robot that may lag behind its set-points: it has ``converged`` once it stands,
+   and makes no progress where it stands still away from the goal;
+4. the execution monitor, of a plan that gives way to another one: it replans instead of ending the run;
+5. the fault monitor again: nothing ends while it is not known what images mean;
+6. ``bounded``, over the command of a run that goes on, and the execution monitor over its joint limit.
+
+``failed`` ends a run wherever a robot or a law of somebody else raises once it has begun.
+"""
 
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -9,12 +23,25 @@ from numba.experimental import structref
 
 from projservo_cli.control import command
 from projservo_cli.control.law import ERRORS, OK, Gains, Law, State, new_state
-from projservo_cli.geometry.jit import COMPILED, allocating
+from projservo_cli.geometry.jit import COMPILED, njit
 from projservo_cli.geometry.mechanisms import make_span
-from projservo_cli.loop.monitors import Monitor, Monitored, Monitors
-from projservo_cli.loop.step import FAILED, RUNNING, WAITING, Command, Instant, Limits, Log, new_log, note
+from projservo_cli.loop.verdicts import (
+    FAILED,
+    FAULT_DETECTED,
+    RUNNING,
+    WAITING,
+    Command,
+    Instant,
+    Limits,
+    Log,
+    bounded,
+    new_log,
+    note,
+    verdict_at,
+)
 from projservo_cli.plugins import require_spelt
 from projservo_cli.records import FloatArray, Model, WorkFailed
+from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.task.face import Task
 
 # Handing some forty arrays over to compiled code takes longer than a control step. They are handed over
@@ -39,23 +66,24 @@ else:
     structref.define_proxy(_Bound, _BoundType, ("law", "state"))
 
 
-@allocating
 def _bind(law: Law, state: State) -> Any:
     """Scratch memory of a law, whose arrays are shared."""
     return _Bound(law, state)
 
 
-@allocating
 def _bound_command(bound: Any, s: FloatArray, q: FloatArray) -> int:
     """One command of the bound law, as of ``command``: the status, the rest is written to the state."""
     return command(bound.law, s, q, bound.state)
+
+
+_compiled_bind, _compiled_command = njit(_bind, allocates=True), njit(_bound_command, allocates=True)
 
 
 # Optional attributes of a law and their defaults: the fraction of the amplitude that its own
 # joint-speed limit left, negative where the limit is up to the loop; what fitting a body left, and the image
 # error (px) of the face by which the run is judged; the joint at whose limit it ended a step, or −1; joints
 # (parts + 1, n) between the parts in which it wants a step sent.
-OPTIONAL: dict[str, tuple[float, ...]] = {
+_OPTIONAL: dict[str, tuple[float, ...]] = {
     "share": (-1.0,),
     "fit": (math.nan, math.nan, math.nan),
     "face_px": (math.nan,),
@@ -64,8 +92,71 @@ OPTIONAL: dict[str, tuple[float, ...]] = {
 }
 
 
+class Monitored(Protocol):
+    """Interface of a plant for the fault monitor."""
+
+    plant: Plant  # the truth, or its calibrated model: image size, joint limits
+    # why the run cannot go on, the images no longer agree with the calibration or something failed; empty
+    # where it can
+    disturbance: str
+
+    @property
+    def holds(self) -> bool:
+        """Whether images disagree with the calibration so that nothing should move."""
+
+    @property
+    def pending(self) -> bool:
+        """Tell whether images disagreed and have not agreed since."""
+
+    def give_up(self) -> None:
+        """Return the maximum-likelihood fault without further frames."""
+
+
+class Monitor(Protocol):
+    """Interface of a monitor, which may change the verdict and the joint velocity (n,)."""
+
+    def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
+        """Return the new verdict."""
+
+
+class Monitors(NamedTuple):
+    """Monitors of a run, asked in the order that the module states."""
+
+    plant: Monitored
+    limits: Limits
+    stall: Monitor | None = None
+    execution: Monitor | None = None
+
+    def of_faults(self, k: int) -> int:
+        """Verdict before the law is asked: ``RUNNING`` where it may be."""
+        if self.plant.disturbance:
+            return FAULT_DETECTED
+        if not self.plant.holds:
+            return RUNNING
+        if k < self.limits.max_steps:
+            return WAITING
+        self.plant.give_up()
+        return FAULT_DETECTED
+
+    def of_instant(self, log: Log, k: int, now: Instant) -> int:
+        """Verdict of an instant at which the law was asked."""
+        verdict = verdict_at(log, k, now, self.limits)
+        for monitor in (self.stall, self.execution):
+            if monitor is not None:
+                verdict = monitor.ruled(log, k, verdict, now.q_dot)
+        waits = self.plant.pending and k < self.limits.max_steps
+        return WAITING if waits and verdict != RUNNING else verdict
+
+    def of_command(self, log: Log, k: int, asked: Command) -> int:
+        """Verdict of a command, which is bounded."""
+        verdict = bounded(log, k, asked, self.plant.plant, self.limits)
+        if verdict != RUNNING and self.execution is not None:
+            verdict = self.execution.ruled(log, k, verdict, asked.q_dot)
+        return verdict
+
+
 class LoopLaw(Protocol):
-    """Interface of a law for the Python loop; it may also have the attributes of ``OPTIONAL``."""
+    """Interface of a law for the Python loop; it may also have the attributes of ``_OPTIONAL``."""
 
     errors: FloatArray
 
@@ -82,7 +173,7 @@ class _LoopPlant(Monitored, Protocol):
     q: FloatArray  # (n,) joints as they are, or as they were read
     H: FloatArray  # (4, 4) displacement of the face from the reference
     hidden: FloatArray
-    in_front: bool  # hidden, in_front: as of ``simulation.ideal.observe``, when last observed
+    in_front: bool  # hidden, in_front: as of ``simulation.analytic_plant.observe``, when last observed
     markers: int  # how many are observed, those of the face first
     takes_parts: bool  # whether a long step is sent in the parts that the law split it into
     weight: FloatArray | None  # (2, markers) of the pixels last observed in a fit; None for one
@@ -139,8 +230,8 @@ class BuiltInLaw:
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant."""
         if self._bound is None:
-            self._bound = _bind(self.law, self.state)
-        status = _bound_command(self._bound, s, q)
+            self._bound = _compiled_bind(self.law, self.state)
+        status = _compiled_command(self._bound, s, q)
         return status, self.state.q_dot.copy()
 
 
@@ -161,11 +252,11 @@ def run_in_python(
     s_star : (2, m, 2) target pixels; period : control period, s; scale : factor of every command.
     stall : of a robot that may lag behind its set-points; execution : of a plan that another may replace.
     Returns verdict, steps, log: as of the compiled loop, to the bit for the built-in laws. Raises InputError
-    if the law has an attribute that is a misspelt one of ``OPTIONAL``; WorkFailed if the plant or the law
+    if the law has an attribute that is a misspelt one of ``_OPTIONAL``; WorkFailed if the plant or the law
     fails before the first instant is complete.
     """
     try:
-        require_spelt(f"law {type(law).__name__}", law, ("errors", *OPTIONAL))
+        require_spelt(f"law {type(law).__name__}", law, ("errors", *_OPTIONAL))
         log = new_log(len(plant.plant.limits.lower), plant.markers, limits.max_steps, len(ERRORS))
         for column in (log.read, log.q, log.s, log.error, log.judged):
             column[:] = math.nan
@@ -238,4 +329,4 @@ def _send(
 
 def _optional(law: LoopLaw, name: str) -> Any:
     """Report of a law on its last step, in addition to the command."""
-    return getattr(law, name, OPTIONAL[name])
+    return getattr(law, name, _OPTIONAL[name])

@@ -6,14 +6,14 @@ import numpy as np
 
 from projservo_cli.control.law import ERRORS, Gains, Law, State, make_split, measure, new_state, reset
 from projservo_cli.geometry.algebra import as_array
-from projservo_cli.geometry.jit import composed
+from projservo_cli.geometry.jit import inline
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.mechanisms import OWN, Span, make_span
 from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.step import CONVERGED, Limits, new_log
+from projservo_cli.loop.verdicts import CONVERGED, Limits, new_log
 from projservo_cli.records import FloatArray, JointLimits, Model
-from projservo_cli.simulation.ideal import Plant
+from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.task.body import NO_BODY
 from projservo_cli.task.face import FOUND, MIDPOINT, NOT_MEASURED, NOT_UNIQUE, Task, center_of, require_found
 from projservo_cli.task.partition import NO_PARTS, Parts, partition
@@ -113,7 +113,7 @@ def begin(
     return state, parts, arrives
 
 
-@composed
+@inline
 def first_parts(
     model: Model, task: Task, s: FloatArray, q_start: FloatArray, state: State
 ) -> tuple[int, Parts]:
@@ -124,7 +124,7 @@ def first_parts(
     return FOUND if parts.found else NOT_UNIQUE, parts
 
 
-@composed
+@inline
 def is_half_turn(theta_p: float) -> bool:
     """Whether the rotation within the plane is so near to half a turn that its sense must be chosen."""
     return math.pi - abs(theta_p) < _HALF_TURN_BAND

@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 
 from projservo_cli.loop.python import BuiltInLaw
-from projservo_cli.loop.settling import StallMonitor
-from projservo_cli.loop.step import (
+from projservo_cli.loop.stall_monitor import StallMonitor
+from projservo_cli.loop.verdicts import (
     CONVERGED,
     DIVERGED,
     JOINT_LIMIT,
@@ -32,12 +32,12 @@ from projservo_cli.records import FloatArray, Plan
 from projservo_cli.task.face import Task
 
 # Periods between checks of the path ahead, by the mean offset of the images in the last ones.
-EVERY, LAST = 10, 5
+_EVERY, LAST = 10, 5
 # What stops a law.
-STOPPED = {JOINT_LIMIT: "a joint limit", SINGULAR_VERDICT: "a singularity", DIVERGED: "growing errors"}
+_STOPPED = {JOINT_LIMIT: "a joint limit", SINGULAR_VERDICT: "a singularity", DIVERGED: "growing errors"}
 
 
-class Replanner(Protocol):
+class _Replanner(Protocol):
     """Paths to the goal of a task."""
 
     def predicted(self, q: FloatArray) -> FloatArray:
@@ -64,7 +64,7 @@ class ExecutionMonitor:
         self,
         law: BuiltInLaw,
         follow: Callable[[Plan], Task],
-        replanner: Replanner,
+        replanner: _Replanner,
         searches: int,
         limits: Limits,
         stall: StallMonitor | None = None,
@@ -94,10 +94,10 @@ class ExecutionMonitor:
                 verdict = RUNNING  # a path may lead away from the goal
             return self._on_path(log, k, verdict, path[int(clock) :])
         self._alone += 1
-        if verdict not in STOPPED and not self._stalls(log, k, verdict):
+        if verdict not in _STOPPED and not self._stalls(log, k, verdict):
             return verdict
         self._excluded += [path[-1].copy(), log.read[k].copy()]
-        return self._replanned(log, k, verdict, f"{STOPPED.get(verdict, 'no progress')} at the goal")
+        return self._replanned(log, k, verdict, f"{_STOPPED.get(verdict, 'no progress')} at the goal")
 
     def _stalls(self, log: Log, k: int, verdict: int) -> bool:
         """Whether the law that ends the motion comes no nearer."""
@@ -110,9 +110,9 @@ class ExecutionMonitor:
     def _on_path(self, log: Log, k: int, verdict: int, ahead: FloatArray) -> int:
         """Return the new verdict with joints (s, n) ahead."""
         self._alone = 0
-        if verdict in STOPPED:
-            return self._replanned(log, k, verdict, f"{STOPPED[verdict]} on the path")
-        checks = verdict == RUNNING and k % EVERY == 0 and self.left > 0
+        if verdict in _STOPPED:
+            return self._replanned(log, k, verdict, f"{_STOPPED[verdict]} on the path")
+        checks = verdict == RUNNING and k % _EVERY == 0 and self.left > 0
         if checks and self._leaves_image(log, k, ahead):
             return self._replanned(log, k, verdict, "the path ahead would leave an image")
         return verdict
@@ -152,8 +152,9 @@ class ExecutionMonitor:
         predicted = np.array([self.replanner.predicted(q) for q in log.read[rows]])
         b = min(log.s.shape[2], predicted.shape[2])
         off = log.s[rows, :, :b] - predicted[:, :, :b]
-        seen = np.isfinite(off)
-        return np.asarray(np.where(seen, off, 0.0).sum(axis=(0, 2)) / np.maximum(seen.sum(axis=(0, 2)), 1))
+        visible = np.isfinite(off)
+        count = np.maximum(visible.sum(axis=(0, 2)), 1)
+        return np.asarray(np.where(visible, off, 0.0).sum(axis=(0, 2)) / count)
 
     def _leaves_image(self, log: Log, k: int, ahead: FloatArray) -> bool:
         """Whether the face leaves an image along joints (s, n), by what images are off now and there."""

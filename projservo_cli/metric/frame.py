@@ -19,10 +19,19 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.geometry.displacements import (
+    carried_screws,
+    homogeneous,
+    invariant_forms,
+    rigid_inverse,
+    screw_displacements,
+    screws,
+    symmetric,
+    twists,
+)
 from projservo_cli.geometry.lens import TERMS, distort, undistort
-from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid_inverse, screws, twists
 from projservo_cli.geometry.stereo import triangulate_points
-from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, WorkFailed, prismatic_of
 
 # Step of the differences that propagate covariances, in standard deviations of the calibration.
 _STEP = 0.05
@@ -44,7 +53,7 @@ _ALL_PARALLEL = (
 Scale = str | Sequence[int]
 
 
-class Body(NamedTuple):
+class MetricParameters(NamedTuple):
     """Cameras, arm and markers in the base frame, of one model or of many (…)."""
 
     P: FloatArray  # (…, 2, 3, 4) cameras to undistorted pixels
@@ -53,13 +62,13 @@ class Body(NamedTuple):
     tool: FloatArray  # (…, 4, 4) pose of the tool at readings of zero, m
     markers: FloatArray  # (…, m, 3) in the tool frame, m
 
-    def scaled(self, factor: FloatArray) -> "Body":
+    def scaled(self, factor: FloatArray) -> "MetricParameters":
         """Multiply all lengths by a factor (…)."""
         P, axes, tool = self.P.copy(), self.axes.copy(), self.tool.copy()
         P[..., 3] *= factor[..., None, None]
         axes[..., 3:] *= factor[..., None, None]
         tool[..., :3, 3] *= factor[..., None]
-        return Body(P, self.lens, axes, tool, self.markers * factor[..., None, None])
+        return MetricParameters(P, self.lens, axes, tool, self.markers * factor[..., None, None])
 
     def intrinsics(self) -> FloatArray:
         """Intrinsic matrices (…, 2, 3, 3), px, from K Kᵀ of the cameras."""
@@ -79,7 +88,7 @@ class Body(NamedTuple):
 
     def tool_poses(self, prismatic: BoolArray, q: FloatArray) -> FloatArray:
         """Poses (…, K, 4, 4) of the tool at readings (K, n), [RH00] eq. (6), m."""
-        moved = exponentials(self.axes[..., None, :, :], prismatic, q)
+        moved = screw_displacements(self.axes[..., None, :, :], prismatic, q)
         factors = [moved[..., i, :, :] for i in range(len(prismatic))]
         return np.asarray(reduce(np.matmul, factors) @ self.tool[..., None, :, :])
 
@@ -108,15 +117,10 @@ def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
     U = np.linalg.svd(np.concatenate(np.moveaxis(H_hat, -3, 0), axis=-1))[0]
     D, a_inf = U[..., :3].swapaxes(-1, -2), U[..., 3]
     L = (D[..., None, :, :] @ H_hat @ D.swapaxes(-1, -2)[..., None, :, :])[..., turning, :, :]
-    i, j = np.triu_indices(3)
-    basis = np.zeros((6, 3, 3))
-    basis[range(6), i, j] = basis[range(6), j, i] = np.where(i == j, 1.0, np.sqrt(0.5))
-    moved = np.einsum("...nab,sbc->...nacs", L, basis)
-    changes = (moved + np.einsum("...nacs->...ncas", moved)).reshape(*L.shape[:-3], -1, 6)
-    _, sizes, rows = np.linalg.svd(changes)
+    sizes, rows = invariant_forms(np.swapaxes(L, -1, -2))
     if (sizes[..., 4] < _SECOND_FORM * sizes[..., 0]).any():
         raise InputError(_ALL_PARALLEL)
-    S = np.einsum("...s,sab->...ab", rows[..., 5, :], basis)
+    S = symmetric(rows[..., 5, :])
     S *= np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None]
     try:
         A = np.linalg.cholesky(S)
@@ -157,9 +161,9 @@ def base_frame(axes: FloatArray, prismatic: BoolArray, joints: tuple[int, int, i
 
 def in_frame(axes: FloatArray, prismatic: BoolArray, frame: FloatArray) -> FloatArray:
     """Screws (…, n, 6) in a frame, by its poses (…, 4, 4)."""
-    found = screws(rigid_inverse(frame)[..., None, :, :] @ twists(axes) @ frame[..., None, :, :])
-    found[..., prismatic, :3] = 0.0
-    return found
+    moved = screws(rigid_inverse(frame)[..., None, :, :] @ twists(axes) @ frame[..., None, :, :])
+    moved[..., prismatic, :3] = 0.0
+    return moved
 
 
 def links(axes: FloatArray, prismatic: BoolArray, like: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -236,7 +240,7 @@ class _Projective(NamedTuple):
         )  # fmt: skip
 
 
-def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
+def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> MetricParameters:
     """Bodies (B, …) of models, the first of which decides what frames rest on. Their scale is arbitrary."""
     G = invariant_upgrade(models.H_hat, c.prismatic)
     G = G * np.sign(models.M[:, :1] @ G[:, 3, :, None])
@@ -247,12 +251,7 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
     at_reference[:, c.prismatic, :3] = 0.0
     w, v = at_reference[:, turning, :3], at_reference[:, turning, 3:]
     at_reference[:, turning, 3:] = v - w * (w * v).sum(axis=-1, keepdims=True) / (w * w).sum(-1)[..., None]
-    to_zero = exponentials(at_reference, c.prismatic, -c.q_reference)
-    chain = [np.broadcast_to(np.eye(4), G.shape)]
-    for i in range(len(c.prismatic)):
-        chain.append(chain[-1] @ to_zero[:, i])
-    moved = np.stack(chain[:-1], axis=1)
-    axes = screws(moved @ twists(at_reference) @ rigid_inverse(moved))
+    axes, to_zero = carried_screws(at_reference, c.prismatic, -c.q_reference)
     axes[:, c.prismatic, :3] = 0.0
     base = base_frame(axes, c.prismatic, base_joints(axes[0], c.prismatic))
     tool = _tool_frame(M, face, _off_line(M[0], face))
@@ -260,7 +259,9 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> Body:
     P = models.P @ back[:, None] @ base[:, None]
     P /= np.linalg.norm(P[..., 2, :3], axis=-1)[..., None, None]
     markers = (homogeneous(M) @ rigid_inverse(tool).swapaxes(-1, -2))[..., :3]
-    return Body(P, models.lens, in_frame(axes, c.prismatic, base), inverse @ chain[-1] @ tool, markers)
+    return MetricParameters(
+        P, models.lens, in_frame(axes, c.prismatic, base), inverse @ to_zero @ tool, markers
+    )
 
 
 def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -281,7 +282,7 @@ def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, Float
     return flip[:, :, None] * G, points * flip[:, None, :3]
 
 
-def _length_of(body: Body, between: Scale, marker: list[int], prismatic: BoolArray) -> FloatArray:
+def _length_of(body: MetricParameters, between: Scale, marker: list[int], prismatic: BoolArray) -> FloatArray:
     """Length (…) that is known, in the unit of bodies. Raises InputError if there is none such."""
     if between == "joint":
         if not prismatic.any():
@@ -340,7 +341,7 @@ class Metric:
     joint_types: str  # one letter a joint, R or P
     marker: list[int]  # (m,) numbers of the markers
     sigma_px: float  # noise of a pixel, px
-    bodies: Body  # the model, then pairs off by plus and minus a step of each independent error
+    bodies: MetricParameters  # the model, then pairs off by plus and minus a step of each independent error
     range: FloatArray  # (n, 2) readings in the data, rad or m
     q_reference: FloatArray  # (n,) readings of the reference, rad or m
 
@@ -388,23 +389,23 @@ class Metric:
         bodies = bodies.scaled(length / known)
         if length_std_m > 0.0:  # one more independent error
             step = _STEP * length_std_m / length
-            off = Body(*(values[:1].repeat(2, axis=0) for values in bodies))
+            off = MetricParameters(*(values[:1].repeat(2, axis=0) for values in bodies))
             off = off.scaled(np.array([1.0 + step, 1.0 - step]))
             cut = 1 + factor.shape[1]
             parts = zip(bodies, off, strict=True)
-            bodies = Body(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
+            bodies = MetricParameters(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
         moved = np.stack([c.joint_min, c.joint_min + c.excitation], axis=1)
         return cls(c.joint_types, marker, c.sigma_px, bodies, moved, c.q_reference)
 
     @property
-    def body(self) -> Body:
+    def body(self) -> MetricParameters:
         """Cameras, arm and markers as calibrated."""
-        return Body(*(values[0] for values in self.bodies))
+        return MetricParameters(*(values[0] for values in self.bodies))
 
     @property
     def prismatic(self) -> BoolArray:
         """Whether each joint (n,) is prismatic."""
-        return np.array([letter == "P" for letter in self.joint_types])
+        return prismatic_of(self.joint_types)
 
     @property
     def K(self) -> FloatArray:
@@ -509,10 +510,10 @@ class Metric:
         WorkFailed
             If two rays determine no finite point.
         """
-        s, seen, shape = self._pixels(pixels)
-        points = np.full((len(seen), 3), np.nan)
+        s, in_both, shape = self._pixels(pixels)
+        points = np.full((len(in_both), 3), np.nan)
         a_inf = np.array([0.0, 0.0, 0.0, 1.0])
-        points[seen] = triangulate_points(self.body.P, a_inf, undistort(self.body.lens, s))[:, :3]
+        points[in_both] = triangulate_points(self.body.P, a_inf, undistort(self.body.lens, s))[:, :3]
         return points.reshape(*shape, 3)
 
     def triangulation_covariance(self, pixels: npt.ArrayLike) -> FloatArray:
@@ -531,16 +532,16 @@ class Metric:
         InputError, WorkFailed
             As for ``triangulate``.
         """
-        _, seen, shape = self._pixels(pixels)
-        X = self.triangulate(pixels).reshape(-1, 3)[seen]
+        _, in_both, shape = self._pixels(pixels)
+        X = self.triangulate(pixels).reshape(-1, 3)[in_both]
         step = _PROBE * np.linalg.norm(self.poses[0, :3, 3] - X, axis=1)[:, None]
         moves = [self.body.pixels(X + step * e) - self.body.pixels(X - step * e) for e in np.eye(3)]
         J = np.moveaxis(np.stack(moves).reshape(3, len(X), 4) / (2.0 * step), 0, -1)
         pinv = np.linalg.pinv(J)
         moved = self.changes(lambda body: body.pixels(np.broadcast_to(X, (len(body.P), *X.shape))))
         of = np.einsum("kij,ckj->cki", pinv, moved.reshape(len(moved), len(X), 4))
-        C = np.full((len(seen), 3, 3), np.nan)
-        C[seen] = _covariances(of) + self.sigma_px**2 * (pinv @ pinv.swapaxes(-1, -2))
+        C = np.full((len(in_both), 3, 3), np.nan)
+        C[in_both] = _covariances(of) + self.sigma_px**2 * (pinv @ pinv.swapaxes(-1, -2))
         return C.reshape(*shape, 3, 3)
 
     def covariance(self, name: str) -> FloatArray:
@@ -582,7 +583,7 @@ class Metric:
     def point_changes(self, q: FloatArray, point: FloatArray) -> FloatArray:
         """Changes (c, K, 3), m, by independent errors of a point (3,) of the tool at readings (K, n)."""
 
-        def position(body: Body) -> FloatArray:
+        def position(body: MetricParameters) -> FloatArray:
             T = body.tool_poses(self.prismatic, q)
             return np.asarray(T[..., :3, :3] @ point + T[..., :3, 3])
 
@@ -594,18 +595,18 @@ class Metric:
         Those at the reference stay, which trial motions of single joints show.
         """
         q, prismatic = self.q_reference, self.prismatic
-        there = _carried(axes, prismatic, q)[..., order, :]
-        return _carried(there, prismatic[order], -q[order])
+        there = carried_screws(axes, prismatic, q)[0][..., order, :]
+        return carried_screws(there, prismatic[order], -q[order])[0]
 
     def changes(
         self,
-        function: Callable[[Body], FloatArray],
+        function: Callable[[MetricParameters], FloatArray],
         difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract,
     ) -> FloatArray:
         """Changes (c, …) of a function of bodies by independent errors of unit variance."""
         count = (len(self.bodies.P) - 1) // 2
         up, down = (
-            function(Body(*(values[part] for values in self.bodies)))
+            function(MetricParameters(*(values[part] for values in self.bodies)))
             for part in (slice(1, 1 + count), slice(1 + count, None))
         )
         return np.asarray(difference(up, down) / (2.0 * _STEP))
@@ -625,17 +626,8 @@ class Metric:
             raise InputError(f"pixels of shape {s.shape}: expected (…, 2, m, 2), left and right view")
         views = np.moveaxis(s, -3, 0)
         flat = np.ascontiguousarray(views.reshape(2, -1, 2))
-        seen: BoolArray = np.isfinite(flat[0, :, 0]) & np.isfinite(flat[1, :, 0])
-        return flat[:, seen], seen, views.shape[1:-1]
-
-
-def _carried(axes: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
-    """Screws (…, n, 6) after motions by readings (n,) of the joints before each."""
-    T, moved = np.broadcast_to(np.eye(4), (*axes.shape[:-2], 4, 4)), axes.copy()
-    for i, step in enumerate(np.moveaxis(exponentials(axes, prismatic, q), -3, 0)):
-        moved[..., i, :] = screws(T @ twists(axes[..., i, :]) @ rigid_inverse(T))
-        T = T @ step
-    return moved
+        in_both: BoolArray = np.isfinite(flat[0, :, 0]) & np.isfinite(flat[1, :, 0])
+        return flat[:, in_both], in_both, views.shape[1:-1]
 
 
 def _covariances(changes: FloatArray) -> FloatArray:

@@ -11,9 +11,15 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.rigid import exponentials, homogeneous, rigid, rigid_inverse, screws, twists
-from projservo_cli.metric.frame import Body, Metric, base_frame, base_joints, directions, in_frame
-from projservo_cli.records import MM, BoolArray, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.geometry.displacements import (
+    carried_screws,
+    homogeneous,
+    rigid,
+    rigid_inverse,
+    screw_displacements,
+)
+from projservo_cli.metric.frame import Metric, MetricParameters, base_frame, base_joints, directions, in_frame
+from projservo_cli.records import MM, BoolArray, FloatArray, InputError, IntArray, WorkFailed, letters_of
 
 # Errors of axes that any model has, of machining and assembly, rad and m.
 _LINK_STD = np.repeat([5e-4, 5e-4], 3)
@@ -33,7 +39,7 @@ _ANGLES, _FITTED, _NEAR_BEST = 72, 8, 30.0
 _MAX_REVERSED = 3
 
 
-class JointError(NamedTuple):
+class _JointError(NamedTuple):
     """Error of the model at one joint, each with its standard deviation."""
 
     joint: int  # number of the joint, from 1
@@ -48,7 +54,7 @@ class JointError(NamedTuple):
 class KinematicErrors(NamedTuple):
     """Errors of a model against the calibrated arm."""
 
-    joints: list[JointError]
+    joints: list[_JointError]
     length: float  # share by which the known length is too short for the links of the model
     length_std: float  # its standard deviation, which grows with what the model leaves beyond its own errors
 
@@ -63,19 +69,25 @@ class _ModelFit:
     """
 
     def __init__(
-        self, metric: Metric, given: FloatArray, senses: IntArray | None = None, order: IntArray | None = None
+        self,
+        metric: Metric,
+        model_axes: FloatArray,
+        senses: IntArray | None = None,
+        order: IntArray | None = None,
     ) -> None:
         prismatic, n = metric.prismatic, len(metric.joint_types)
-        types = "".join("R" if w.any() else "P" for w in given[:, :3])
+        types = letters_of(not w.any() for w in model_axes[:, :3])
         if types != metric.joint_types:
             raise InputError(
                 f"the model's joints are {types}, the calibrated ones {metric.joint_types}: choose the link "
                 "of the tool as its tip"
             )
         self.senses = np.ones(n, dtype=np.int64) if senses is None else senses
-        self.given, self.prismatic, self.order = given * self.senses[:, None], prismatic, order
+        self.model_axes, self.prismatic, self.order = model_axes * self.senses[:, None], prismatic, order
         self._near = metric.pose(np.zeros(n))[:3, 3]
-        self._base = rigid_inverse(base_frame(self.given, prismatic, base_joints(self.given, prismatic)))
+        self._base = rigid_inverse(
+            base_frame(self.model_axes, prismatic, base_joints(self.model_axes, prismatic))
+        )
         self.axes, changes = metric.axes, metric.deviations("axes")
         if order is not None:
             self.axes = metric.in_order(metric.axes, order)
@@ -103,23 +115,23 @@ class _ModelFit:
 
     def aligned(self) -> "_ModelFit":
         """Start where each joint in turn brings the next axis nearest to the calibrated one."""
-        n = len(self.given)
+        n = len(self.model_axes)
         zeros, size = np.zeros(n), float(np.linalg.norm(self._near))
         for i in np.flatnonzero(~self.prismatic[:-1]):
             for width in (np.pi, 2.0 * np.pi / _ANGLES):
                 at = np.tile(zeros, (_ANGLES + 1, 1))
                 at[:, i] += width * np.linspace(-1.0, 1.0, _ANGLES + 1)
-                moved = _moved(self._base, at, self.given, self.prismatic)
+                moved, _ = carried_screws(self.model_axes, self.prismatic, at, self._base)
                 off = _differences(self.axes, moved, self.prismatic, self._near)[:, i + 1]
                 misfit = (off[:, :3] ** 2).sum(axis=1) + (off[:, 3:] ** 2).sum(axis=1) / size**2
                 zeros[i] = at[np.argmin(misfit.round(9) + 1e-6 * np.abs(at[:, i])), i]
-        self._base = self._base @ exponentials(self.given, self.prismatic, zeros)[0]
+        self._base = self._base @ screw_displacements(self.model_axes, self.prismatic, zeros)[0]
         self.x[6:] = zeros[1:-1]
         return self
 
     def zeros(self) -> FloatArray:
         """Zeros (n,), rad or m, those of revolute joints within half a turn."""
-        zeros = _zeros_of(self.x, len(self.given))
+        zeros = _zeros_of(self.x, len(self.model_axes))
         around = ~self.prismatic & (np.abs(zeros) > np.pi)
         return np.where(around, (zeros + np.pi) % (2.0 * np.pi) - np.pi, zeros)
 
@@ -156,48 +168,48 @@ class _ModelFit:
         if size[i, kind] <= limit[i, kind]:
             return ""
         unit, factor = (" mm", MM) if kind else ("°", float(np.degrees(1.0)))
-        found, allowed = factor * size[i, kind], factor * limit[i, kind]
-        return f"the axis of joint {i + 1} is off by {found:.3g}{unit}, {allowed:.3g}{unit} allowed"
+        deviation, allowed = factor * size[i, kind], factor * limit[i, kind]
+        return f"the axis of joint {i + 1} is off by {deviation:.3g}{unit}, {allowed:.3g}{unit} allowed"
 
-    def left(self, x: FloatArray, found: FloatArray, factor: float = 1.0) -> FloatArray:
+    def left(self, x: FloatArray, calibrated: FloatArray, factor: float = 1.0) -> FloatArray:
         """Differences (…, 6 n) of axes (…, n, 6) from those of the model, its lengths times a factor."""
-        base, given = self._base.copy(), self.given.copy()
+        base, model_axes = self._base.copy(), self.model_axes.copy()
         base[:3, 3] *= factor
-        given[~self.prismatic, 3:] *= factor
-        model = _moved(_placed(base, x), _zeros_of(x, len(given)), given, self.prismatic)
-        return _differences(found, model, self.prismatic, self._near).reshape(*found.shape[:-2], -1)
+        model_axes[~self.prismatic, 3:] *= factor
+        model, _ = carried_screws(model_axes, self.prismatic, _zeros_of(x, len(model_axes)), _placed(base, x))
+        return _differences(calibrated, model, self.prismatic, self._near).reshape(*calibrated.shape[:-2], -1)
 
     def bases_and_zeros(self, axes: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Poses (B, 4, 4) of the model's base and its zeros (B, n) for axes (B, n, 6) near the calibrated."""
         off = self.left(self.x, axes) - self.left(self.x, self.axes)
         x = self.x - off @ (self.pinv @ self.root).T
-        return np.array([_placed(self._base, row) for row in x]), _zeros_of(x, len(self.given))
+        return np.array([_placed(self._base, row) for row in x]), _zeros_of(x, len(self.model_axes))
 
 
-def _model_fit(metric: Metric, given: FloatArray) -> _ModelFit:
+def _model_fit(metric: Metric, model_axes: FloatArray) -> _ModelFit:
     """Fit a model, and refuse one that another sense, order or far zero of joints would fit better.
 
     Raises WorkFailed naming it, or the axis that is off, where the model does not describe the arm.
     """
-    fit = _ModelFit(metric, given).fitted()
+    fit = _ModelFit(metric, model_axes).fitted()
     wrong = fit.implausible() or " and ".join(fit.differences())
     if not wrong and fit.chi2 <= _DOUBTED * len(fit.residual):
         return fit
-    n = len(given)
+    n = len(model_axes)
     few = [which for k in range(_MAX_REVERSED + 1) for which in itertools.combinations(range(n), k)]
-    starts = [_ModelFit(metric, given, np.where(np.isin(range(n), which), -1, 1)) for which in few]
+    starts = [_ModelFit(metric, model_axes, np.where(np.isin(range(n), which), -1, 1)) for which in few]
     for i, j in itertools.combinations(range(n), 2):
         order = np.arange(n)
         order[[i, j]] = j, i
         if metric.prismatic[i] == metric.prismatic[j]:
-            starts.append(_ModelFit(metric, given, order=order))
+            starts.append(_ModelFit(metric, model_axes, order=order))
     starts = [start.aligned() for start in starts]
     least = min(start.chi2 for start in starts)
     near = [start for start in starts if start.chi2 <= _NEAR_BEST * least]
-    near = sorted(near, key=lambda one: (len(one.differences()), one.chi2))[:_FITTED]
-    fits = [one for one in (start.fitted() for start in near) if not one.implausible()]
-    least = min((one.chi2 for one in fits), default=np.inf)
-    equal = [one.differences() for one in fits if one.chi2 <= _EQUAL * least]
+    near = sorted(near, key=lambda other: (len(other.differences()), other.chi2))[:_FITTED]
+    fits = [other for other in (start.fitted() for start in near) if not other.implausible()]
+    least = min((other.chi2 for other in fits), default=np.inf)
+    equal = [other.differences() for other in fits if other.chi2 <= _EQUAL * least]
     fewest = min(map(len, equal), default=0)
     best = sorted(" and ".join(words) for words in equal if len(words) == fewest)  # senses before zeros
     if fewest and (wrong or least < _DECISIVE * fit.chi2):
@@ -209,20 +221,20 @@ def _model_fit(metric: Metric, given: FloatArray) -> _ModelFit:
     return fit
 
 
-def kinematic_errors(metric: Metric, given: FloatArray) -> KinematicErrors:
+def kinematic_errors(metric: Metric, model_axes: FloatArray) -> KinematicErrors:
     """Compare a model with the calibrated arm, joint by joint, and its links with the known length.
 
     The base and the zeros of the inner joints are fitted first. What remains are errors of axes.
 
     metric : of the calibration, in metres.
-    given : (n, 6) screws of the model at readings of zero, rad and m.
+    model_axes : (n, 6) screws of the model at readings of zero, rad and m.
     Raises InputError if the joint types differ, WorkFailed if the model is not of this arm.
     """
-    fit, n = _model_fit(metric, given), len(given)
+    fit, n = _model_fit(metric, model_axes), len(model_axes)
     std, zeros = np.sqrt(np.diag(np.linalg.pinv(fit.J.T @ fit.J))), fit.zeros()
     size, size_std = fit.axis_errors()
     joints = [
-        JointError(
+        _JointError(
             joint=i + 1,
             zero=float(zeros[i]) if 0 < i < n - 1 else None,
             zero_std=float(std[5 + i]) if 0 < i < n - 1 else None,
@@ -240,23 +252,23 @@ def kinematic_errors(metric: Metric, given: FloatArray) -> KinematicErrors:
     )
 
 
-def in_model_frames(metric: Metric, given: FloatArray, tip: FloatArray) -> Metric:
+def in_model_frames(metric: Metric, model_axes: FloatArray, tip: FloatArray) -> Metric:
     """Express a metric in the base of a model, and its tool in that of the model's tip.
 
     The base is where it fits the calibrated axes best; the tip is where the model has it, with the zeros that
     were found. Covariances include those of both.
 
-    given : (n, 6) screws of the model at readings of zero, rad and m; tip : (4, 4) its tip there, m.
+    model_axes : (n, 6) screws of the model at readings of zero, rad and m; tip : (4, 4) its tip there, m.
     Raises InputError if the joint types differ, WorkFailed if the model is not of this arm.
     """
-    fit, bodies = _model_fit(metric, given), metric.bodies
+    fit, bodies = _model_fit(metric, model_axes), metric.bodies
     base, zeros = fit.bases_and_zeros(bodies.axes)
-    tips = metric.body._replace(axes=given, tool=tip).tool_poses(metric.prismatic, zeros)
+    tips = metric.body._replace(axes=model_axes, tool=tip).tool_poses(metric.prismatic, zeros)
     axes = in_frame(bodies.axes, metric.prismatic, base)
     to_tip = rigid_inverse(tips) @ rigid_inverse(base) @ bodies.tool
     markers = (homogeneous(bodies.markers) @ to_tip.swapaxes(-1, -2))[..., :3]
     return dataclasses.replace(
-        metric, bodies=Body(bodies.P @ base[:, None], bodies.lens, axes, tips, markers)
+        metric, bodies=MetricParameters(bodies.P @ base[:, None], bodies.lens, axes, tips, markers)
     )
 
 
@@ -284,19 +296,12 @@ def _zeros_of(x: FloatArray, n: int) -> FloatArray:
     return zeros
 
 
-def _moved(base: FloatArray, zeros: FloatArray, given: FloatArray, prismatic: BoolArray) -> FloatArray:
-    """Screws (…, n, 6) of a model at a base (4, 4), whose joints move by zeros (…, n)."""
-    T, moved, steps = base, [], exponentials(given, prismatic, zeros)
-    for i, twist in enumerate(twists(given)):
-        moved.append(screws(T @ twist @ rigid_inverse(T)))
-        T = T @ steps[..., i, :, :]
-    return np.stack(np.broadcast_arrays(*moved), axis=-2)
-
-
-def _differences(found: FloatArray, model: FloatArray, prismatic: BoolArray, near: FloatArray) -> FloatArray:
+def _differences(
+    calibrated: FloatArray, model: FloatArray, prismatic: BoolArray, near: FloatArray
+) -> FloatArray:
     """Differences (…, n, 6) of directions, and of lines at their points nearest to ``near`` (3,), m."""
-    d, d0 = directions(found, prismatic), directions(model, prismatic)
-    p, p0 = np.cross(found[..., :3], found[..., 3:]), np.cross(model[..., :3], model[..., 3:])
+    d, d0 = directions(calibrated, prismatic), directions(model, prismatic)
+    p, p0 = np.cross(calibrated[..., :3], calibrated[..., 3:]), np.cross(model[..., :3], model[..., 3:])
     at = p0 + d0 * ((near - p0) * d0).sum(axis=-1, keepdims=True)
     offset = p - at
     offset = offset - d * (offset * d).sum(axis=-1, keepdims=True)

@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.detections import MIN_SIGMA
 from projservo_cli.calibration.prediction import predict
+from projservo_cli.geometry.displacements import rigid_inverse
 from projservo_cli.geometry.lens import distort, undistort
-from projservo_cli.geometry.rigid import rigid_inverse
-from projservo_cli.metric.frame import Body, Metric
+from projservo_cli.metric.frame import Metric, MetricParameters
 from projservo_cli.records import Calibration, FloatArray
 
 # Arrays that move along with the cameras.
@@ -19,7 +19,7 @@ _MOVED = ("lens", "poses", "axes", "tool", "markers")
 class OpenCV(NamedTuple):
     """Robot and rig whose cameras are OpenCV's, and what that costs."""
 
-    body: Body  # without lenses
+    body: MetricParameters  # without lenses
     distortion: FloatArray  # (2, 5) k1, k2, p1, p2, k3
     skew_chi2: float  # increase of the squared residuals over the squared noise, for no skew
     lens_chi2: float  # the same for its lens, all else as it is
@@ -60,7 +60,9 @@ def opencv_cameras(metric: Metric, calibration: Calibration) -> OpenCV:
     rigs = np.array([_shifted(T, by) for T, by in zip(metric.poses, change["poses"], strict=True)])
     tool = _shifted(metric.body.tool, change["tool"][0])
     straight = lens * [1.0, 1.0, 1.0, 0.0, 0.0]
-    body = Body(K @ rigid_inverse(rigs)[:, :3], straight, axes, tool, metric.markers + change["markers"])
+    body = MetricParameters(
+        K @ rigid_inverse(rigs)[:, :3], straight, axes, tool, metric.markers + change["markers"]
+    )
     seen = _straight_detections(calibration)
     coefficients, off = zip(*(_fitted_lens(K[v], lens[v], seen[v]) for v in (0, 1)), strict=True)
     mean = float(np.concatenate(off).mean())  # px², of a detection

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.geometry.displacements import aligned
 from projservo_cli.metric.frame import Metric
 from projservo_cli.records import MM, FloatArray, InputError, IntArray, WorkFailed
 
@@ -53,27 +54,26 @@ def _fit_link(metric: Metric, table: Positions) -> _Link:
     Raises WorkFailed if the table does not determine them, or is of a frame that is left-handed.
     """
     T = metric.pose(table.q)
-    found, mirrored = _least_squares(T, table.xyz), _least_squares(T, table.xyz * _MIRROR)
-    if mirrored.cost < _MIRRORED * found.cost:
-        rms = (MM * np.sqrt(2.0 * one.cost / len(table.q)) for one in (found, mirrored))
+    fit, mirrored = _least_squares(T, table.xyz), _least_squares(T, table.xyz * _MIRROR)
+    if mirrored.cost < _MIRRORED * fit.cost:
+        rms = (MM * np.sqrt(2.0 * each.cost / len(table.q)) for each in (fit, mirrored))
         raise WorkFailed(
             "the frame of the instrument is left-handed: positions are {:.3g} mm rms off, with an axis "
             "negated {:.3g} mm; negate x, y or z in the table".format(*rms)
         )
-    J = np.asarray(found.jac)
+    J = np.asarray(fit.jac)
     if np.linalg.matrix_rank(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300), tol=1e-6) < _UNKNOWNS:
         raise WorkFailed("the positions do not determine the point on the tool: turn the tool about two axes")
-    return _Link(found.x)
+    return _Link(fit.x)
 
 
 def _least_squares(T: FloatArray, xyz: FloatArray) -> Any:
     """Fit of a link to positions (K, 3) at poses (K, 4, 4) of the tool, m."""
     t = T[:, :3, 3]
     centered, target = t - t.mean(axis=0), xyz - xyz.mean(axis=0)
-    U, s, Vt = np.linalg.svd(target.T @ centered)  # Umeyama 1991, with the point at the tool's origin
-    turn = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    scale = float(np.trace(np.diag(s) @ turn) / (centered**2).sum())
-    rotation = U @ turn @ Vt
+    # With the point at the tool's origin, and the scale that S. Umeyama gives with the rotation.
+    rotation = aligned(centered[None], target[None], np.ones((1, len(t))))[0][0]
+    scale = float((target * (centered @ rotation.T)).sum() / (centered**2).sum())
     shift = xyz.mean(axis=0) - scale * rotation @ t.mean(axis=0)
     start = np.r_[np.log(scale), Rotation.from_matrix(rotation).as_rotvec(), shift, np.zeros(3)]
 
@@ -137,8 +137,8 @@ def position_errors(
     else:
         of = np.arange(len(table.q)) % _PARTS
         parts = [(np.flatnonzero(of == k), table.rows(of != k)) for k in range(min(_PARTS, len(of)))]
-    found = [_held_out(metric, table.rows(at), rest, arm_std_m) for at, rest in parts if rest is not None]
-    error, C, scale = (np.concatenate(part) for part in zip(*found, strict=True))
+    compared = [_held_out(metric, table.rows(at), rest, arm_std_m) for at, rest in parts if rest is not None]
+    error, C, scale = (np.concatenate(part) for part in zip(*compared, strict=True))
     distance = MM * np.linalg.norm(error, axis=1)
     apart = np.linalg.norm(metric.markers[:, None] - metric.markers, axis=-1)
     i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(apart)), apart.shape))

@@ -11,7 +11,7 @@ from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.statistics import TOLD, ErrorModel, Residual, relative_to_others, rigid_motions
-from projservo_cli.records import MM, PRISMATIC, BoolArray, Calibration, FloatArray, InputError, Model
+from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, Model
 
 # Variance of corners from a side that the calibration has not seen, over that of others; chance of a test.
 _UNUSUAL, _CHANCE = 2.0, 1e-4
@@ -24,7 +24,7 @@ _STEPS = 4
 def metric_points(model: Model, M: FloatArray) -> FloatArray | None:
     """Points (m, 3) of markers (m, 4) in the metric of the arm, up to scale; None if axes leave it open."""
     try:
-        X = M @ invariant_upgrade(model.H_hat_0, model.joint_types == PRISMATIC).T
+        X = M @ invariant_upgrade(model.H_hat_0, model.prismatic).T
     except (InputError, np.linalg.LinAlgError):
         return None
     return np.asarray(X[:, :3] / X[:, 3:])
@@ -64,7 +64,7 @@ class Posture:
 
     def _changes(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (2, m, 2, d) of pixels of markers (m, 4) by motions of the tool, and the pixels."""
-        model, prismatic = self._model, self._model.joint_types == PRISMATIC
+        model, prismatic = self._model, self._model.prismatic
         images = Parameters(model.P, model.H_hat_0, prismatic, M, model.lens).everywhere(self._away)
         return images.by_point[-1] @ np.moveaxis(M @ self._twists.swapaxes(1, 2), 0, -1), images.pixels
 

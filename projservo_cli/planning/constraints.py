@@ -4,7 +4,7 @@ The margins are those of ``planning.margins``. Of a tool with several tags visib
 those of the tag that keeps them best.
 
 Joints are valid if each margin is above the required one, which is at most a fraction of those of start
-and goal have themselves, rising to its full value within ``RISE`` of them.
+and goal have themselves, rising to its full value within ``_RISE`` of them.
 """
 
 import math
@@ -15,7 +15,14 @@ import numpy as np
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import row_into
-from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
+from projservo_cli.geometry.kinematics import (
+    backward,
+    forward,
+    forward_kinematics,
+    from_border,
+    limit_distance,
+    row,
+)
 from projservo_cli.planning.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance, squared
 from projservo_cli.planning.margins import (
     CLEAR,
@@ -25,7 +32,6 @@ from projservo_cli.planning.margins import (
     MARGINS,
     VISIBILITY,
     Demands,
-    from_border,
     pixel,
     straight_pixel,
     tag_planes,
@@ -36,14 +42,14 @@ from projservo_cli.task.face import Task, center_of, face_plane
 # Required fraction of the margins of start and goal near them.
 SHARE = 0.5
 # Motion, s at the speed limits, from start or goal within which demands rise to their full value.
-RISE = 0.5
+_RISE = 0.5
 # Between two checks no marker moves more than this in an image, px, and no joint more than that, rad or m.
 FINE_PX = 4.0
-FINE_STEP = 0.2
+_FINE_STEP = 0.2
 # So many standard deviations a prediction may be off.
 DEVIATIONS = 3.0
 # Maximum error of a marker of the body, over the maximum error of the face.
-FAR_OFF = 5.0
+_FAR_OFF = 5.0
 # Half the length, px, of the shortest pieces of a segment that are checked at a region.
 PIECE = 0.5
 
@@ -108,7 +114,7 @@ def constraints_of(
 def _limits_into(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
     minimum = math.inf
     for i in range(q.shape[0]):
-        minimum = min(minimum, min(q[i] - c.limits.lower[i], c.limits.upper[i] - q[i]) / c.keep[i])
+        minimum = min(minimum, limit_distance(c.limits, q, i) / c.keep[i])
     margins[JOINTS] = minimum
 
 
@@ -186,7 +192,7 @@ def twin_of(c: Constraints, j: int) -> Model:
     return Model(
         P=c.spread.P[j],
         H_hat_0=c.spread.H_hat[j],
-        joint_types=m.joint_types,
+        prismatic=m.prismatic,
         q_reference=m.q_reference,
         a_inf=m.a_inf,
         lens=m.lens,
@@ -248,9 +254,9 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
     while done < 1.0:
         step = min(step, 1.0 - done)
         first, middle, last = (
-            combined(done, A, B),
-            combined(done + 0.5 * step, A, B),
-            combined(done + step, A, B),
+            _combined(done, A, B),
+            _combined(done + 0.5 * step, A, B),
+            _combined(done + step, A, B),
         )
         here, along, half = -math.inf, -math.inf, 0.0
         for view in range(2):
@@ -271,7 +277,7 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
 
 
 @merged
-def combined(x: float, A: Vec4, B: Vec4) -> Vec4:
+def _combined(x: float, A: Vec4, B: Vec4) -> Vec4:
     """Point (1 − x) A + x B."""
     return axpy(x, sub(B, A), A)
 
@@ -288,7 +294,7 @@ def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
     margins[CLEAR] = clear_by(c, H, s) if visible else -math.inf
     # Error of a prediction: its maximum or, if that could decide, its value there.
     left = right = maximum = c.spread.most
-    anywhere = FAR_OFF * maximum
+    anywhere = _FAR_OFF * maximum
     room = min(margins[IMAGE] - c.full[IMAGE], margins[IMAGE + 1] - c.full[IMAGE + 1])
     near = room < DEVIATIONS * maximum or margins[CLEAR] - c.full[CLEAR] < DEVIATIONS * anywhere
     if visible and maximum > 0.0 and near:
@@ -300,12 +306,12 @@ def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
 
 
 @njit
-def margins_along_into(c: Constraints, q: FloatArray, trial: "Trial", found: FloatArray) -> None:
+def margins_along_into(c: Constraints, q: FloatArray, trial: "Trial", margins: FloatArray) -> None:
     """Write margins and required margins (2, k, 10) along joints (k, n)."""
     for i in range(q.shape[0]):
         margins_into(c, q[i], trial)
-        row_into(found[0, i], trial.margins)
-        row_into(found[1, i], trial.demands)
+        row_into(margins[0, i], trial.margins)
+        row_into(margins[1, i], trial.demands)
 
 
 @njit
@@ -314,7 +320,7 @@ def demands_into(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
     for i in range(MARGINS):
         demands[i] = c.full[i]
     for e in range(c.ends.shape[0]):
-        rise = time_between(c.limits.speed, q, c.ends[e]) / RISE
+        rise = time_between(c.limits.speed, q, c.ends[e]) / _RISE
         if rise < 1.0:
             for i in range(MARGINS):
                 demands[i] = min(demands[i], c.end_demands[e, i] + rise * (c.full[i] - c.end_demands[e, i]))
@@ -361,10 +367,10 @@ class Trial(NamedTuple):
 
 def new_trial(n: int, b: int) -> Trial:
     """Workspace for n joints and b markers."""
-    one, s = np.zeros(MARGINS), np.zeros((2, b, 2))
+    margins, s = np.zeros(MARGINS), np.zeros((2, b, 2))
     return Trial(
-        margins=one,
-        demands=one.copy(),
+        margins=margins,
+        demands=margins.copy(),
         sight=np.zeros(6),
         s=s,
         s_before=s.copy(),
@@ -374,14 +380,14 @@ def new_trial(n: int, b: int) -> Trial:
 
 
 @internal
-def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
+def _valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
     """Tell whether joints keep all margins; count failures, write the images."""
     margins_into(c, q, trial)
     for i in range(MARGINS):
         if not trial.margins[i] > trial.demands[i]:
             trial.failures[i] += 1
             for j in range(q.shape[0] if i == JOINTS else 0):
-                room = min(q[j] - c.limits.lower[j], c.limits.upper[j] - q[j]) / c.keep[j]
+                room = limit_distance(c.limits, q, j) / c.keep[j]
                 trial.failures[MARGINS + j] += not room > trial.demands[JOINTS]
             return False
     return True
@@ -392,7 +398,7 @@ def reached(c: Constraints, start: FloatArray, end: FloatArray, trial: Trial) ->
     """Share of the straight path from valid joints that is valid: 1 for all of it.
 
     Checks are so dense that between two of them no marker moves more than ``FINE_PX`` and no joint more
-    than ``FINE_STEP``: a step that did is halved, and the next one made to do so by its speed.
+    than ``_FINE_STEP``: a step that did is halved, and the next one made to do so by its speed.
     """
     n = start.shape[0]
     stride = 0.0
@@ -401,8 +407,8 @@ def reached(c: Constraints, start: FloatArray, end: FloatArray, trial: Trial) ->
     if stride == 0.0:
         return 1.0
     minimum = min(1.0, 1e-6 / stride)
-    maximum = FINE_STEP / stride
-    valid(c, start, trial)
+    maximum = _FINE_STEP / stride
+    _valid(c, start, trial)
     _keep_images(trial)
     done, step = 0.0, 0.25 * maximum
     while done < 1.0:
@@ -410,7 +416,7 @@ def reached(c: Constraints, start: FloatArray, end: FloatArray, trial: Trial) ->
         share = 1.0 if done + step >= 1.0 - 1e-12 else done + step
         for i in range(n):
             trial.q[i] = end[i] if share == 1.0 else start[i] + share * (end[i] - start[i])
-        if not valid(c, trial.q, trial):
+        if not _valid(c, trial.q, trial):
             return done
         moved = _moved(trial.s, trial.s_before)
         if moved > FINE_PX and step > minimum:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, sub, vec, vec_into
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, sub, vec, vec_into, wrapped
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import row_into, solve_normal
 from projservo_cli.geometry.kinematics import forward, image_motion, operators_at
@@ -26,40 +26,40 @@ from projservo_cli.planning.constraints import (
     twin_of,
 )
 from projservo_cli.planning.margins import IMAGE, straight_pixel
-from projservo_cli.records import PRISMATIC, FloatArray
+from projservo_cli.records import FloatArray
 
 # Maximum number of Newton steps from one start.
 STEPS = 400
 # Step at which a start is given up that still has more than this share of its squares.
-JUDGED_AT, GIVEN_UP = 20, 0.25
-DAMPED = 1e6
+_JUDGED_AT, _GIVEN_UP = 20, 0.25
+_DAMPED = 1e6
 # A Newton step below this, rad or m, is the last: of points, which are near then, and of images.
 NEAR, SETTLED = 1e-3, 1e-7
 # Longest Newton step of a joint, rad or m.
-STRIDE = 0.7
+_STRIDE = 0.7
 # Noise that is allowed for where none is known, px.
-LEAST_SIGMA = 0.2
+_LEAST_SIGMA = 0.2
 # Maximum residual of a solution, px, as a multiple of the minimum.
-MUCH = 2.0
-DISTINCT = math.radians(1.0)
+_MUCH = 2.0
+_DISTINCT = math.radians(1.0)
 # A joint of a solution that deviates more than this, rad or m, is near a singularity: the reach of the model
 # there the robot may not. No solution is taken to be nearer to a limit than that by its deviation alone.
-DEFINITE = 0.05
-REDUNDANT = 0.01
+_DEFINITE = 0.05
+_REDUNDANT = 0.01
 # Variance of joints that the images do not determine, rad² or m².
-UNTOLD = 1e6
+_UNTOLD = 1e6
 # Rank, s, from which on goals are unsure.
 UNSURE = 1e3
 ROUND_OFF = 1e-9
 # Starts; the search for further goals ends early if this multiple of the starts until the last new one, and
-# ``AT_LEAST``, have found none.
-STARTS, PATIENCE, AT_LEAST = 400, 3, 40
+# ``_AT_LEAST``, have found none.
+STARTS, _PATIENCE, _AT_LEAST = 400, 3, 40
 # Whole turns to both sides of the nearest goal that are separate goals.
 TURNS = 2
 # Solutions of an arm of more joints than six.
-SAMPLED = 96
+_SAMPLED = 96
 # Where the body is at a solution: in sight, or not, or within a region that is kept out of.
-SHOWN, HIDDEN, BLOCKED = range(3)
+_SHOWN, HIDDEN, _BLOCKED = range(3)
 
 
 class GoalFeatures(NamedTuple):
@@ -70,7 +70,7 @@ class GoalFeatures(NamedTuple):
     sigma: float  # standard deviation of a coordinate of them, px
 
 
-class Solutions(NamedTuple):
+class _Solutions(NamedTuple):
     """Joints that show the goal, none of them whole turns of others."""
 
     q: FloatArray  # (k, n) rad or m
@@ -78,7 +78,7 @@ class Solutions(NamedTuple):
     deviation: FloatArray  # (k, n) standard deviations of their joints, rad or m
 
 
-class Scratch(NamedTuple):
+class _Scratch(NamedTuple):
     """Workspace of the solver."""
 
     H_hat: FloatArray  # (n, 4, 4) operators at the joints
@@ -90,7 +90,7 @@ class Scratch(NamedTuple):
 
 @internal
 def _normal_equations_into(
-    c: Constraints, goal: GoalFeatures, q: FloatArray, images: bool, scratch: Scratch
+    c: Constraints, goal: GoalFeatures, q: FloatArray, images: bool, scratch: _Scratch
 ) -> float:
     """Write the normal equations of points, or images, at joints; returns the sum of squares left.
 
@@ -135,24 +135,25 @@ def _damped_step_into(N: FloatArray, damping: float, L: FloatArray) -> bool:
 
 @internal
 def _settled(
-    c: Constraints, goal: GoalFeatures, images: bool, settled: float, q: FloatArray, scratch: Scratch
+    c: Constraints, goal: GoalFeatures, images: bool, settled: float, q: FloatArray, scratch: _Scratch
 ) -> float:
     """Minimize squared errors of points or images by damped Newton steps; return the residual.
 
     K. Levenberg, Quarterly of Applied Mathematics 2, 1944; scaled as by D. Marquardt, SIAM Journal 11, 1963.
+    Compiled for hundreds of starts a goal: SciPy's least squares takes a hundred times as long.
     """
     n = q.shape[0]
     damping = 1e-3
     left = first = _normal_equations_into(c, goal, q, images, scratch)
     for step in range(STEPS):
-        if (step == JUDGED_AT and left > GIVEN_UP * first and not images) or not _damped_step_into(
+        if (step == _JUDGED_AT and left > _GIVEN_UP * first and not images) or not _damped_step_into(
             scratch.N, damping, scratch.L
         ):
             break
         longest = 0.0
         for i in range(n):
             longest = max(longest, abs(scratch.L[i, n]))
-        share = min(1.0, STRIDE / longest) if longest > 0.0 else 1.0
+        share = min(1.0, _STRIDE / longest) if longest > 0.0 else 1.0
         for i in range(n):
             scratch.q[i] = q[i] + share * scratch.L[i, n]
         trial = _normal_equations_into(c, goal, scratch.q, images, scratch)
@@ -160,7 +161,7 @@ def _settled(
             left = trial
             row_into(q, scratch.q)
             damping *= 0.1
-        elif longest >= settled and damping <= DAMPED:
+        elif longest >= settled and damping <= _DAMPED:
             damping *= 10.0
             _normal_equations_into(c, goal, q, images, scratch)
             continue
@@ -178,24 +179,26 @@ def _seen(P: FloatArray, H: Mat4, M: FloatArray) -> Vec4:
 
 @internal
 def _explained(
-    c: Constraints, goal: GoalFeatures, q: FloatArray, scratch: Scratch, deviation: FloatArray
+    c: Constraints, goal: GoalFeatures, q: FloatArray, scratch: _Scratch, deviation: FloatArray
 ) -> float:
     """Return the sum of squared residuals, px², that noise and calibration explain at a goal configuration.
 
     Of each way in which the calibration may be off, what no motion of the joints makes up for. The motion
     that makes up for the rest, and for noise, is the error of the joints: its standard deviation (n,), rad
-    or m, is written; ``REDUNDANT`` of an arm of more joints than six, which can move them at will.
+    or m, is written; ``_REDUNDANT`` of an arm of more joints than six, which can move them at will.
     """
     n = q.shape[0]
-    noise = goal.sigma * goal.sigma + LEAST_SIGMA * LEAST_SIGMA + c.spread.rest * c.spread.rest
+    noise = goal.sigma * goal.sigma + _LEAST_SIGMA * _LEAST_SIGMA + c.spread.rest * c.spread.rest
     total: float = (4.0 * c.face - min(n, 6)) * noise
     _normal_equations_into(c, goal, q, True, scratch)
     for i in range(n):
         for j in range(n):
             scratch.N[j, n] = 1.0 if i == j else 0.0
-        deviation[i] = REDUNDANT * REDUNDANT
+        deviation[i] = _REDUNDANT * _REDUNDANT
         if n <= 6:
-            deviation[i] = noise * scratch.L[i, n] if _damped_step_into(scratch.N, 0.0, scratch.L) else UNTOLD
+            deviation[i] = (
+                noise * scratch.L[i, n] if _damped_step_into(scratch.N, 0.0, scratch.L) else _UNTOLD
+            )
     H = operators_at(c.model, q, scratch.H_hat)
     for j in range(1, c.spread.P.shape[0]):
         twin = twin_of(c, j)
@@ -224,10 +227,10 @@ def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bo
         maximum = 0.0
         for i in range(q.shape[0]):
             off = q[i] - base[g, i]
-            if c.model.joint_types[i] != PRISMATIC:
-                off -= 2.0 * math.pi * math.floor(off / (2.0 * math.pi) + 0.5)
+            if not c.model.prismatic[i]:
+                off = wrapped(off)
             maximum = max(maximum, abs(off))
-        if maximum <= DISTINCT:
+        if maximum <= _DISTINCT:
             return True
     return False
 
@@ -236,28 +239,28 @@ def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bo
 def _solutions_into(
     c: Constraints,
     goal: GoalFeatures,
-    known: FloatArray,
+    taught: FloatArray,
     starts: FloatArray,
-    found: Solutions,
-    scratch: Scratch,
+    solutions: _Solutions,
+    scratch: _Scratch,
 ) -> int:
-    """Write solutions; how many. First those known, which need no proof: the goal was seen there."""
-    count, last, maximum = len(known), 0, found.q.shape[0]
+    """Write solutions; how many. First those taught, which need no proof: the goal was seen there."""
+    count, last, maximum = len(taught), 0, solutions.q.shape[0]
     for k in range(count):
-        row_into(found.q[k], known[k])
-        _explained(c, goal, known[k], scratch, found.deviation[k])
+        row_into(solutions.q[k], taught[k])
+        _explained(c, goal, taught[k], scratch, solutions.deviation[k])
     for k in range(starts.shape[0]):
-        if count == maximum or k > AT_LEAST + PATIENCE * last:
+        if count == maximum or k > _AT_LEAST + _PATIENCE * last:
             break
         q = starts[k]
         _settled(c, goal, False, NEAR, q, scratch)
-        if _is_known(c, q, found.q, count):
+        if _is_known(c, q, solutions.q, count):
             continue
         left = _settled(c, goal, True, SETTLED, q, scratch)
-        explained = _explained(c, goal, q, scratch, found.deviation[count])
-        if left <= explained and not _is_known(c, q, found.q, count):
-            row_into(found.q[count], q)
-            found.left[count] = left
+        explained = _explained(c, goal, q, scratch, solutions.deviation[count])
+        if left <= explained and not _is_known(c, q, solutions.q, count):
+            row_into(solutions.q[count], q)
+            solutions.left[count] = left
             count += 1
             last = k
     return count
@@ -265,7 +268,7 @@ def _solutions_into(
 
 @njit
 def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
-    """Whether joints (n,) show the goal, but for their limits: ``SHOWN``, ``HIDDEN`` or ``BLOCKED``."""
+    """Whether joints (n,) show the goal, but for their limits: ``_SHOWN``, ``HIDDEN`` or ``_BLOCKED``."""
     margins_into(c, q, trial)
     for j in range(1, IMAGE):
         if not trial.margins[j] > 0.0:
@@ -274,7 +277,7 @@ def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
     H = forward(c.model, q)
     left, right = max_error(c, q, H)
     doubt = min(DEVIATIONS * max(left, right), FINE_PX)
-    return SHOWN if clear_by(c, H, trial.s) > -doubt else BLOCKED
+    return _SHOWN if clear_by(c, H, trial.s) > -doubt else _BLOCKED
 
 
 def _turns(c: Constraints, start: FloatArray, q: FloatArray, slack: FloatArray) -> FloatArray:
@@ -282,7 +285,7 @@ def _turns(c: Constraints, start: FloatArray, q: FloatArray, slack: FloatArray) 
 
     No more than ``TURNS`` to both sides of the nearest: of many joints that turn often there is no end.
     """
-    turn, slides = 2.0 * math.pi, c.model.joint_types == PRISMATIC
+    turn, slides = 2.0 * math.pi, c.model.prismatic
     half = np.where(slides, math.inf, 0.5 * turn)
     low = np.where(np.isfinite(c.limits.lower), c.limits.lower, start - half) - slack - q
     high = np.where(np.isfinite(c.limits.upper), c.limits.upper, start + half) + slack - q
@@ -303,7 +306,7 @@ def _rank(
     ``UNSURE`` and more where it may be near a singularity, or beyond a limit if it is not certain: the less
     within in standard deviations, the more.
     """
-    sure = np.full(len(q), min(1.0, DEFINITE / deviation.max()))
+    sure = np.full(len(q), min(1.0, _DEFINITE / deviation.max()))
     if not certain:
         room = np.minimum(q - c.limits.lower, c.limits.upper - q) / (DEVIATIONS * deviation)
         sure = np.minimum(sure, room.min(axis=1))
@@ -312,34 +315,35 @@ def _rank(
 
 
 def goals_of(
-    c: Constraints, goal: GoalFeatures, start: FloatArray, known: FloatArray, starts: FloatArray
+    c: Constraints, goal: GoalFeatures, start: FloatArray, taught: FloatArray, starts: FloatArray
 ) -> tuple[FloatArray, FloatArray, tuple[int, int, int]]:
     """Return goal configurations (g, n) and their rank (g,), the smallest first.
 
     Rank is the time from the start, s, or ``UNSURE`` and more. A solution that leaves much more than the best
     is a local minimum next to it.
 
-    start : (n,) joints at the start; known : (l, n) joints at which the goal was shown.
-    starts : (k, n) from which solutions are sought, those known first; overwritten.
+    start : (n,) joints at the start; taught : (l, n) joints at which the goal was taught.
+    starts : (k, n) from which solutions are sought, those taught first; overwritten.
     Also returns how many solutions there are, apart from whole turns; how many of those do not show the face
     or lie beyond the limits; how many lie within a region kept out of.
     """
-    n, maximum = len(start), STARTS if len(start) <= 6 else SAMPLED
-    found = Solutions(np.zeros((maximum, n)), np.zeros(maximum), np.zeros((maximum, n)))
+    n, maximum = len(start), STARTS if len(start) <= 6 else _SAMPLED
+    solutions = _Solutions(np.zeros((maximum, n)), np.zeros(maximum), np.zeros((maximum, n)))
     shapes = (n, 4, 4), (n, n + 1), (c.face, n + 1, 4), (n, n + 1), (n,)
-    count = _solutions_into(c, goal, known, starts, found, Scratch(*(np.zeros(shape) for shape in shapes)))
-    minimum = max(found.left[len(known) : count].min(initial=math.inf), 4.0 * c.face * LEAST_SIGMA**2)
-    good = np.flatnonzero(found.left[:count] <= MUCH**2 * minimum)
+    scratch = _Scratch(*(np.zeros(shape) for shape in shapes))
+    count = _solutions_into(c, goal, taught, starts, solutions, scratch)
+    minimum = max(solutions.left[len(taught) : count].min(initial=math.inf), 4.0 * c.face * _LEAST_SIGMA**2)
+    good = np.flatnonzero(solutions.left[:count] <= _MUCH**2 * minimum)
     goals, ranks, met, trial = [np.zeros((0, n))], [np.zeros(0)], [0, 0, 0], new_trial(n, len(c.M))
     for k in good:
-        solution, deviation, certain = found.q[k], found.deviation[k], found.left[k] == 0.0
-        slack = ROUND_OFF + (0.0 if certain else 1.0) * np.minimum(DEVIATIONS * deviation, DEFINITE)
+        solution, deviation, certain = solutions.q[k], solutions.deviation[k], solutions.left[k] == 0.0
+        slack = ROUND_OFF + (0.0 if certain else 1.0) * np.minimum(DEVIATIONS * deviation, _DEFINITE)
         turns = _turns(c, start, solution, slack)
         where = _where(c, solution, trial) if len(turns) > 0 else HIDDEN
         met[where] += 1
-        if where == SHOWN:
+        if where == _SHOWN:
             goals.append(np.clip(turns, c.limits.lower, c.limits.upper))
             ranks.append(_rank(c, start, turns, deviation, certain))
     rank = np.concatenate(ranks)
     order = np.argsort(rank, kind="stable")
-    return np.vstack(goals)[order], rank[order], (len(good), met[HIDDEN], met[BLOCKED])
+    return np.vstack(goals)[order], rank[order], (len(good), met[HIDDEN], met[_BLOCKED])

@@ -44,9 +44,18 @@ from projservo_cli.geometry.algebra import (
 )
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
-from projservo_cli.geometry.kinematics import backward, forward, image_motion, operators_at, project, row
+from projservo_cli.geometry.kinematics import (
+    backward,
+    forward,
+    image_motion,
+    limit_distance,
+    operators_at,
+    project,
+    row,
+)
 from projservo_cli.geometry.lens import distort_pixel, distorts
-from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, make_span, reach, workspace
+from projservo_cli.geometry.mechanisms import SETTLED, MeasuredFace, Work, make_span, reach, workspace
+from projservo_cli.image_size import BEHIND, border_distance
 from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients
@@ -58,7 +67,7 @@ MARGINS = 10
 CONDITIONING = MARGINS
 
 
-class Words(NamedTuple):
+class _Words(NamedTuple):
     """Name of a constraint and of its value in its own unit; phrases take a joint's number or a view."""
 
     name: str
@@ -68,17 +77,17 @@ class Words(NamedTuple):
 
 
 CONSTRAINTS = {
-    JOINTS: Words("joints", "joints", "the limits of joint {}", "limit of joint {}"),
-    FRONT: Words("front", "front", "a marker behind the {} camera", "depth before the {} camera"),
-    VISIBILITY: Words(
+    JOINTS: _Words("joints", "joints", "the limits of joint {}", "limit of joint {}"),
+    FRONT: _Words("front", "front", "a marker behind the {} camera", "depth before the {} camera"),
+    VISIBILITY: _Words(
         "visibility", "visibility", "the face edge-on to the {} camera", "visibility from the {} camera"
     ),
-    WIDTH: Words(
+    WIDTH: _Words(
         "width", "width_px", "the width of the face in the {} image", "width of the face in the {} image"
     ),
-    IMAGE: Words("image", "border_px", "the border of the {} image", "border in the {} image"),
-    CLEAR: Words("clear", "clear_px", "a region that is kept out of", "distance from regions"),
-    CONDITIONING: Words(
+    IMAGE: _Words("image", "border_px", "the border of the {} image", "border in the {} image"),
+    CLEAR: _Words("clear", "clear_px", "a region that is kept out of", "distance from regions"),
+    CONDITIONING: _Words(
         "conditioning", "condition", "dependent operators", "reciprocal condition of the image Jacobian"
     ),
 }
@@ -86,19 +95,17 @@ CONSTRAINTS = {
 OF_MOTION = (VISIBILITY, IMAGE, JOINTS, CONDITIONING)
 
 
-def constraint_at(column: int) -> tuple[Words, int]:
+def constraint_at(column: int) -> tuple[_Words, int]:
     """Return the words of a margin, and its view if each camera has its own."""
     first = max(first for first in CONSTRAINTS if first <= column)
     return CONSTRAINTS[first], column - first
 
 
 # A margin this bad is as bad as it gets: joints out of reach.
-WORST = -10.0
-# Distance, px, from the border of an image of what no camera shows.
-BEHIND = -1e9
+_WORST = -10.0
 # A joint that moves more than this between neighbours on a path, rad or m, asks for twice the parts between.
-MOST_PART = 0.2
-MOST_PARTS = 256
+_MOST_PART = 0.2
+_MOST_PARTS = 256
 
 
 class Demands(NamedTuple):
@@ -154,7 +161,7 @@ class Along(NamedTuple):
     q: FloatArray  # (s, n) joints, rad or m; NaN from where they cannot follow
     limit: FloatArray  # (s,) margins of the joint limits, NaN likewise
     condition: FloatArray  # (s,) reciprocal conditions of the image Jacobian, NaN likewise
-    # (s, 4) the smallest of each of ``OF_MOTION``; ``WORST`` where the joints cannot follow
+    # (s, 4) the smallest of each of ``OF_MOTION``; ``_WORST`` where the joints cannot follow
     margins: FloatArray
 
 
@@ -212,29 +219,21 @@ def pixel(model: Model, view: int, A: Vec4) -> tuple[float, float]:
     return distort_pixel(model.lens[view], u, v) if distorts(model.lens) else (u, v)
 
 
-@merged
-def from_border(image_size: FloatArray, u: float, v: float) -> float:
-    """Distance of a pixel from the border of the image, px; negative outside, ``BEHIND`` of none."""
-    if not math.isfinite(u + v):
-        return BEHIND
-    return min(u + 0.5, v + 0.5, float(image_size[0]) - 0.5 - u, float(image_size[1]) - 0.5 - v)
-
-
 def image_margin(demands: Demands, distance: FloatArray) -> FloatArray:
     """Margins (...,) of distances from the border, px; 1 where images have no border."""
     half = 0.5 * float(demands.image_size.min())
     if not math.isfinite(half):
-        return np.where(distance > 0.0, 1.0, WORST)
-    return np.maximum(WORST, (distance - demands.border_px) / (half - demands.border_px))
+        return np.where(distance > 0.0, 1.0, _WORST)
+    return np.maximum(_WORST, (distance - demands.border_px) / (half - demands.border_px))
 
 
 @merged
 def joint_margin(demands: Demands, q: FloatArray, i: int) -> float:
     """Margin of the limits of joint i of q (n,); 1 for a joint without."""
-    lower, upper = float(demands.limits.lower[i]), float(demands.limits.upper[i])
-    if not math.isfinite(upper - lower):
+    size = float(demands.limits.upper[i]) - float(demands.limits.lower[i])
+    if not math.isfinite(size):
         return 1.0
-    return min(max(2.0 * min(float(q[i]) - lower, upper - float(q[i])) / (upper - lower), WORST), 1.0)
+    return min(max(2.0 * limit_distance(demands.limits, q, i) / size, _WORST), 1.0)
 
 
 @merged
@@ -279,7 +278,7 @@ def carry_joints(
     """
     reaching, work, before = carrier.reaching, carrier.work, carrier.before
     model = reaching.model
-    face = Seen(reaching.A, backward(model, reaching.q_start))
+    face = MeasuredFace(reaching.A, backward(model, reaching.q_start))
     operators_at(model, q, work.H_hat)
     first, last = ends
     goal = displaced(reaching.H_hat, reaching.amplitudes, first[0], first[1], first[2])
@@ -320,97 +319,97 @@ def _reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
 
 
 @merged
-def displacement_into(reaching: Reaching, mu: FloatArray, found: Along, i: int) -> None:
+def displacement_into(reaching: Reaching, mu: FloatArray, along: Along, i: int) -> None:
     """Write displacement and visibility of one instant, at shares (3,)."""
-    mat_into(found.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2]))
+    mat_into(along.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2]))
     for view in range(2):
-        found.visibility[i, view] = _visibility(reaching, view, mu[0], mu[1])
+        along.visibility[i, view] = _visibility(reaching, view, mu[0], mu[1])
 
 
 @njit
-def carried_into(carrier: Carrier, mu: FloatArray, found: Along) -> None:
+def carried_into(carrier: Carrier, mu: FloatArray, along: Along) -> None:
     """Write all but images and margins at shares mu (s, 3), from the joints at the first on.
 
     Where the joints would move too far between two of them, the path is made in parts.
     """
     for i in range(mu.shape[0]):
-        displacement_into(carrier.reaching, mu[i], found, i)
+        displacement_into(carrier.reaching, mu[i], along, i)
     for i in range(mu.shape[0]):
         before = max(0, i - 1)
         parts = 0 if i == 0 else 1
         condition = -1.0
-        while condition < 0.0 and parts <= MOST_PARTS:
-            row_into(found.q[i], found.q[before])
+        while condition < 0.0 and parts <= _MOST_PARTS:
+            row_into(along.q[i], along.q[before])
             ends = (mu[before], mu[i])
-            condition = carry_joints(carrier, ends, parts, SETTLED, MOST_PART, found.q[i])
-            parts = 2 * parts if parts > 0 else MOST_PARTS + 1
+            condition = carry_joints(carrier, ends, parts, SETTLED, _MOST_PART, along.q[i])
+            parts = 2 * parts if parts > 0 else _MOST_PARTS + 1
         if condition < 0.0:
-            for l in range(found.q.shape[1]):
-                found.q[i, l] = math.nan
+            for l in range(along.q.shape[1]):
+                along.q[i, l] = math.nan
             return
-        found.condition[i], found.limit[i] = condition, limit_margin(carrier.reaching.demands, found.q[i])
+        along.condition[i], along.limit[i] = condition, limit_margin(carrier.reaching.demands, along.q[i])
 
 
 @njit
-def _moved_into(carrier: Carrier, found: Along) -> None:
+def _moved_into(carrier: Carrier, along: Along) -> None:
     """Write displacement, visibility, limit and condition at joints (s, n), by the forward kinematics."""
     reaching, model = carrier.reaching, carrier.reaching.model
     a, start = vec(reaching.a), forward(model, reaching.q_start)
     back = backward(model, reaching.q_start)
-    for i in range(found.q.shape[0]):
-        H = mul(operators_at(model, found.q[i], carrier.work.H_hat), back)
-        mat_into(found.H_d[i], H)
-        found.condition[i] = _reciprocal_condition(carrier, H)
-        found.limit[i] = limit_margin(reaching.demands, found.q[i])
-        H_back = mul(start, backward(model, found.q[i]))
+    for i in range(along.q.shape[0]):
+        H = mul(operators_at(model, along.q[i], carrier.work.H_hat), back)
+        mat_into(along.H_d[i], H)
+        along.condition[i] = _reciprocal_condition(carrier, H)
+        along.limit[i] = limit_margin(reaching.demands, along.q[i])
+        H_back = mul(start, backward(model, along.q[i]))
         for view in range(2):
             O = vec(reaching.O[view])
-            found.visibility[i, view] = dot(a, apply(H_back, O)) / dot(a, O)
+            along.visibility[i, view] = dot(a, apply(H_back, O)) / dot(a, O)
 
 
 def along_shares(reaching: Reaching, mu: FloatArray, q: FloatArray | None = None) -> Motion:
     """The motion of shares mu (s, 3) from joints q (n,) at the first; none where it begins at the start."""
-    found = room_along(reaching, len(mu))
-    found.q[0] = reaching.q_start if q is None else q
-    carried_into(carrier_of(reaching), np.ascontiguousarray(mu), found)
-    return measured(Motion(reaching, mu, found))
+    along = room_along(reaching, len(mu))
+    along.q[0] = reaching.q_start if q is None else q
+    carried_into(carrier_of(reaching), np.ascontiguousarray(mu), along)
+    return measured(Motion(reaching, mu, along))
 
 
 def along_joints(reaching: Reaching, q: FloatArray) -> Motion:
     """Return the motion of joints (s, n) by the forward kinematics, [RH00] eq. (6)."""
-    found = room_along(reaching, len(q))
-    found.q[:] = q
-    _moved_into(carrier_of(reaching), found)
-    return measured(Motion(reaching, np.full((len(q), 3), np.nan), found))
+    along = room_along(reaching, len(q))
+    along.q[:] = q
+    _moved_into(carrier_of(reaching), along)
+    return measured(Motion(reaching, np.full((len(q), 3), np.nan), along))
 
 
 def measured(motion: Motion) -> Motion:
     """The motion with its images, distances and margins, where all else is known."""
-    reaching, found = motion.reaching, motion.along
+    reaching, along = motion.reaching, motion.along
     demands, model, m = reaching.demands, reaching.model, len(reaching.A)
     A = reaching.body if len(demands.tags) else reaching.A
-    M = A @ np.swapaxes(found.H_d, 1, 2)
+    M = A @ np.swapaxes(along.H_d, 1, 2)
     s = np.moveaxis(project(model.P, M, model.lens), 0, 1)
-    found.s[:] = s[:, :, :m]
+    along.s[:] = s[:, :, :m]
     # A camera has a marker before it as long as it has it on the side on which it had it at the start.
     depth = A @ model.P[:, 2].T
     visible = np.swapaxes((M @ model.P[:, 2].T) * depth > 1e-9 * depth**2, 1, 2)
-    border = np.minimum(s + 0.5, demands.image_size[:, None] - 0.5 - s).min(axis=3)
+    border = border_distance(s, demands.image_size[:, None])
     border = np.where(visible & np.isfinite(border), border, BEHIND)
-    found.distance[:] = border[:, :, :m].min(axis=2)
+    along.distance[:] = border[:, :, :m].min(axis=2)
     if len(demands.tags):
-        _best_tag_into(reaching, border, found)
-    found.margins[:, OF_MOTION.index(VISIBILITY)] = found.visibility.min(axis=1)
-    found.margins[:, OF_MOTION.index(IMAGE)] = image_margin(demands, found.distance.min(axis=1))
-    joint_margins_into(demands, found)
+        _best_tag_into(reaching, border, along)
+    along.margins[:, OF_MOTION.index(VISIBILITY)] = along.visibility.min(axis=1)
+    along.margins[:, OF_MOTION.index(IMAGE)] = image_margin(demands, along.distance.min(axis=1))
+    joint_margins_into(demands, along)
     return motion
 
 
-def joint_margins_into(demands: Demands, found: Along) -> None:
+def joint_margins_into(demands: Demands, along: Along) -> None:
     """Write the margins of joint limits and conditioning."""
-    followed, excess = ~np.isnan(found.condition), found.condition - demands.conditioning
-    found.margins[:, OF_MOTION.index(JOINTS)] = np.where(followed, found.limit, 1.0)
-    found.margins[:, OF_MOTION.index(CONDITIONING)] = np.where(followed, excess, WORST)
+    followed, excess = ~np.isnan(along.condition), along.condition - demands.conditioning
+    along.margins[:, OF_MOTION.index(JOINTS)] = np.where(followed, along.limit, 1.0)
+    along.margins[:, OF_MOTION.index(CONDITIONING)] = np.where(followed, excess, _WORST)
 
 
 def tag_planes(tags: IntArray, body: FloatArray, m: int, a: FloatArray) -> FloatArray:
@@ -427,12 +426,12 @@ def tag_planes(tags: IntArray, body: FloatArray, m: int, a: FloatArray) -> Float
     return np.asarray(planes * (float(a @ face) / float(face @ face)))
 
 
-def _best_tag_into(reaching: Reaching, border: FloatArray, found: Along) -> None:
+def _best_tag_into(reaching: Reaching, border: FloatArray, along: Along) -> None:
     """Write visibility and distance of the tag that keeps them best, of distances (s, 2, b) of markers."""
     tags = reaching.demands.tags
     planes = tag_planes(tags, reaching.body, len(reaching.A), reaching.a)
-    back = np.linalg.inv(found.H_d) @ (reaching.O / (reaching.O @ reaching.a)[:, None]).T
+    back = np.linalg.inv(along.H_d) @ (reaching.O / (reaching.O @ reaching.a)[:, None]).T
     side, distance = planes @ back, border[:, :, tags].min(axis=3).swapaxes(1, 2)  # (s, t, 2) both
     worst = np.minimum(side.min(axis=2), image_margin(reaching.demands, distance.min(axis=2)))
     best = np.arange(len(worst)), worst.argmax(axis=1)
-    found.visibility[:], found.distance[:] = side[best], distance[best]
+    along.visibility[:], along.distance[:] = side[best], distance[best]

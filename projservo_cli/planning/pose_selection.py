@@ -77,7 +77,7 @@ def suggest(
     gram = rows.T @ rows
     C /= sigma
     left = np.ones(len(q), dtype=np.bool_)
-    found: list[Suggestion] = []
+    suggestions: list[Suggestion] = []
     for _ in range(min(count, len(q))):
         before = float(np.trace(gram)) / coordinates
         inner = np.eye(C.shape[1]) + C @ np.swapaxes(C, 1, 2)
@@ -90,7 +90,7 @@ def suggest(
         after = float(np.trace(gram)) / coordinates
         nearest = int(np.argmin(np.linalg.norm(observation.q - q[best], axis=1)))
         number = int(observation.pose[nearest])
-        found.append(
+        suggestions.append(
             Suggestion(
                 q=q[best],
                 from_pose=number,
@@ -99,7 +99,7 @@ def suggest(
                 variance_after=after,
             )
         )
-    return tuple(found)
+    return tuple(suggestions)
 
 
 def _visible_poses(
@@ -112,14 +112,14 @@ def _visible_poses(
     scene = parameters_from(calibration)
     poses: list[FloatArray] = []
     rows: list[FloatArray] = []
-    for q, seen in drawn_poses(calibration, region, _BATCHES, rng):
-        enough = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)[: count - len(poses)]
+    for q, in_view in drawn_poses(calibration, region, _BATCHES, rng):
+        enough = np.flatnonzero(in_view.all(axis=1).sum(axis=1) >= _LEAST_SEEN)[: count - len(poses)]
         if enough.size:
             J = dense_pixel_changes(scene, calibration.errors, q[enough] - calibration.q_reference)
             sharp = np.sqrt((J**2).sum(axis=-1)).max(axis=-1) <= _VAGUE * np.ptp(region.image, axis=1).max()
-            seen = seen[enough] & sharp
-            J[~seen] = 0.0
-            useful = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)
+            in_view = in_view[enough] & sharp
+            J[~in_view] = 0.0
+            useful = np.flatnonzero(in_view.all(axis=1).sum(axis=1) >= _LEAST_SEEN)
             poses += list(q[enough[useful]])
             rows += list(J.reshape(len(J), -1, J.shape[-1])[useful])
         if len(poses) >= count:

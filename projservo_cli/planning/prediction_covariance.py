@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from projservo_cli.calibration.prediction import dense_pixel_changes, error_factor, parameters_from
+from projservo_cli.image_size import image_corners
 from projservo_cli.records import NO_SPREAD, BoolArray, Calibration, FloatArray, Spread
 
 _BATCH = 1500  # poses drawn at once
@@ -78,10 +79,10 @@ def _showing(calibration: Calibration, face: int, bounds: _Bounds, seed: int) ->
     lower, upper, image_size = bounds
     low = np.where(np.isfinite(lower), lower, calibration.q_reference - np.pi)
     high = np.where(np.isfinite(upper), upper, calibration.q_reference + np.pi)
-    corners = np.stack([np.full((2, 2), -0.5), np.array(image_size) - 0.5], axis=1)
-    region, found = Region(low, high, corners), np.zeros((0, len(low)))
-    for q, seen in drawn_poses(calibration, region, _MOST_BATCHES, np.random.default_rng(seed)):
-        found = np.concatenate([found, q[seen[:, :, :face].all(axis=(1, 2))]])
-        if len(found) >= _LOOKED_AT:
+    corners = image_corners(np.array(image_size, dtype=np.float64))
+    region, joints = Region(low, high, corners), np.zeros((0, len(low)))
+    for q, in_view in drawn_poses(calibration, region, _MOST_BATCHES, np.random.default_rng(seed)):
+        joints = np.concatenate([joints, q[in_view[:, :, :face].all(axis=(1, 2))]])
+        if len(joints) >= _LOOKED_AT:
             break
-    return found[:_LOOKED_AT]
+    return joints[:_LOOKED_AT]

@@ -38,20 +38,20 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray
 # Values of each share; the second where no path stays in view on the first.
 NODES = (13, 19)
 # A joint that moves more than this between two nodes, rad or m, has changed its branch.
-MOST_STRIDE = 1.5
+_MOST_STRIDE = 1.5
 # Parts in which the path between them is made where the joints do not settle in one.
 BETWEEN = 4
 # Newton step, rad or m, after which joints at a node are good enough: they are off by its square.
-ROUGH = 1e-2
+_ROUGH = 1e-2
 # Of two paths equally short, that with longer straight steps: a share of the duration of a rad at 1 rad/s.
-STRAIGHTER = 1e-4
+_STRAIGHTER = 1e-4
 # A straight piece may take this much longer than the steps of the lattice that it replaces.
-DETOUR = 1.01
+_DETOUR = 1.01
 ROUND_OFF = 1e-9
 # Points of a path at which its joints and margins are looked at.
 CHECKS = 151
 # Shares of this part of the best one are as good; the quicker path is better.
-EQUALLY = 0.95
+_EQUALLY = 0.95
 VIEWS = [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]
 
 
@@ -83,7 +83,7 @@ def plan_path(reaching: Reaching) -> Motion:
     """
     short = abs(float(reaching.amplitudes[2])) <= 0.5 * math.pi
     paths = [along_shares(reaching, np.linspace(0.0, 1.0, CHECKS)[:, None] * np.ones(3))]
-    good = max(0.0, EQUALLY * float(paths[0].shares().min()))
+    good = max(0.0, _EQUALLY * float(paths[0].shares().min()))
     best: tuple[float, Reaching, int] = (-math.inf, reaching, NODES[0])
     for size in NODES:
         for amplitudes in _senses(reaching.amplitudes):
@@ -93,11 +93,12 @@ def plan_path(reaching: Reaching) -> Motion:
             if best[0] > 0.0 and amplitudes[1] != best[1].amplitudes[1]:
                 continue
             lattice = _in_view(reaching._replace(amplitudes=amplitudes), size)
-            best = max(best, (lattice.worth, lattice.nodes.reaching, size), key=lambda found: found[0])
+            if lattice.worth > best[0]:
+                best = (lattice.worth, lattice.nodes.reaching, size)
             if lattice.worth > good:  # no joints can compensate a loss of view
                 lattice = _with_joints(lattice)
                 paths += [_quickest(lattice)] if lattice.worth > good else []
-                good = max(good, EQUALLY * lattice.worth)
+                good = max(good, _EQUALLY * lattice.worth)
         if best[0] > 0.0 or good > 0.0:
             break
     if not any(path.holds() for path in paths):
@@ -116,7 +117,7 @@ def _best_of(paths: list[Motion]) -> Motion:
     """Of the paths in view, or of all if none is, the quickest whose smallest share is as good as any."""
     paths = [path for path in paths if path.shares()[:, VIEWS].min() > 0.0] or paths
     minimum = [float(path.shares().min()) for path in paths]
-    good = min(EQUALLY * max(minimum), max(minimum))
+    good = min(_EQUALLY * max(minimum), max(minimum))
     paths = [path for path, share in zip(paths, minimum, strict=True) if share >= good]
     return min(paths, key=lambda path: duration(path) if math.isfinite(duration(path)) else math.inf)
 
@@ -149,17 +150,17 @@ class _Lattice(NamedTuple):
 def _in_view(reaching: Reaching, size: int) -> _Lattice:
     """A lattice of the views alone, with so many values of each share."""
     mu = np.ascontiguousarray(np.indices((size, size, size)).reshape(3, -1).T / (size - 1.0))
-    found = room_along(reaching, len(mu))
-    _displacements_into(reaching, mu, found)
-    return _Lattice(measured(Motion(reaching, mu, found)), False)
+    along = room_along(reaching, len(mu))
+    _displacements_into(reaching, mu, along)
+    return _Lattice(measured(Motion(reaching, mu, along)), False)
 
 
 def _with_joints(view: _Lattice) -> _Lattice:
     """The same with joints, in place, sought where a path in view leads."""
-    reaching, mu, found = view.nodes
+    reaching, mu, along = view.nodes
     value = widest(view.minimum(view.nodes))
-    _joints_into(carrier_of(reaching), mu, value, _size(value), found)
-    joint_margins_into(reaching.demands, found)
+    _joints_into(carrier_of(reaching), mu, value, _size(value), along)
+    joint_margins_into(reaching.demands, along)
     return _Lattice(view.nodes, True)
 
 
@@ -178,14 +179,14 @@ def _straightened(lattice: _Lattice, path: IntArray) -> FloatArray:
 
     A piece is as long as bisection finds one whose shares are as good and that takes no longer.
     """
-    (reaching, mu, found), (q, speed) = lattice.nodes, lattice.moved(lattice.nodes)
+    (reaching, mu, along), (q, speed) = lattice.nodes, lattice.moved(lattice.nodes)
     worth, time = lattice.worth, minimum_time(speed, q[path])
 
     def serves(i: int, j: int) -> bool:
         """Whether the piece from one node of the path to another does."""
         x = np.linspace(0.0, 1.0, 2 * (j - i) + 1)[:, None]
-        piece = along_shares(reaching, (1.0 - x) * mu[path[i]] + x * mu[path[j]], found.q[path[i]])
-        detour = minimum_time(speed, lattice.moved(piece)[0])[-1] > DETOUR * (time[j] - time[i]) + ROUND_OFF
+        piece = along_shares(reaching, (1.0 - x) * mu[path[i]] + x * mu[path[j]], along.q[path[i]])
+        detour = minimum_time(speed, lattice.moved(piece)[0])[-1] > _DETOUR * (time[j] - time[i]) + ROUND_OFF
         return not detour and bool(lattice.minimum(piece).min() >= worth - ROUND_OFF)
 
     kept, last = [0], len(path) - 1
@@ -257,19 +258,19 @@ def _shortest_into(
             if free[node] and before >= 0 and cost[before] < math.inf:
                 axes = (step >> 2) + (step >> 1 & 1) + (step & 1)
                 total = cost[before] + time_between(speed, q[before], q[node])
-                total += STRAIGHTER * math.sqrt(axes)
+                total += _STRAIGHTER * math.sqrt(axes)
                 if total < cost[node]:
                     cost[node], came[node] = total, before
 
 
 @njit
-def _displacements_into(reaching: Reaching, mu: FloatArray, found: Along) -> None:
+def _displacements_into(reaching: Reaching, mu: FloatArray, along: Along) -> None:
     for i in range(mu.shape[0]):
-        displacement_into(reaching, mu[i], found, i)
+        displacement_into(reaching, mu[i], along, i)
 
 
 @njit
-def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int, found: Along) -> None:
+def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int, along: Along) -> None:
     """Write joints, limit and condition at those nodes (size³,) whose value is positive.
 
     Each is continued from the best before it: the values become the minimum margin of both on the path there,
@@ -283,15 +284,15 @@ def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int,
             other = _before(node, step, size)
             if other >= 0 and value[other] > best:
                 before, best = other, value[other]
-        row_into(found.q[node], carrier.reaching.q_start if node == 0 else found.q[before])
+        row_into(along.q[node], carrier.reaching.q_start if node == 0 else along.q[before])
         if not free or best == 0.0:
             continue
         for parts in (1, BETWEEN):
             ends = (mu[before], mu[node])
-            condition = carry_joints(carrier, ends, parts, ROUGH, MOST_STRIDE / parts, found.q[node])
+            condition = carry_joints(carrier, ends, parts, _ROUGH, _MOST_STRIDE / parts, along.q[node])
             if condition >= 0.0:
-                found.condition[node] = condition
-                found.limit[node] = limit = limit_margin(demands, found.q[node])
+                along.condition[node] = condition
+                along.limit[node] = limit = limit_margin(demands, along.q[node])
                 value[node] = max(min(best, limit, condition - demands.conditioning), 0.0)
                 break
-            row_into(found.q[node], found.q[before])
+            row_into(along.q[node], along.q[before])

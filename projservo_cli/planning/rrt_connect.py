@@ -34,13 +34,13 @@ LEAST = 1e-9
 # Draws that the trees are given at a time.
 CHUNK = 250
 # Number of paths of the search, and draws after which no further one begins.
-WAYS, FURTHER = 2, 300
+_WAYS, FURTHER = 2, 300
 # A straight line that takes so much longer than to the nearest goal is held against what trees find.
 LONGER = 1.2
-SHORTENINGS = 60
+_SHORTENINGS = 60
 ROUND_OFF = 1e-9
 # Goals within this distance of excluded joints, rad or m, are excluded too.
-NEARBY = 0.1
+_NEARBY = 0.1
 
 
 class Tree(NamedTuple):
@@ -90,9 +90,9 @@ def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
     that share is as much as is asked for everywhere are asked for no less.
     """
     demands = np.array([margins_at(c, q)[0] for q in ends])
-    seen = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
-    seen = np.where(np.isfinite(seen), seen, 0.0)
-    less = np.where(seen > 0.0, demands - (1.0 - SHARE) * seen, demands - ROUND_OFF)
+    measured = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
+    measured = np.where(np.isfinite(measured), measured, 0.0)
+    less = np.where(measured > 0.0, demands - (1.0 - SHARE) * measured, demands - ROUND_OFF)
     demands = np.where(SHARE * demands >= c.full, c.full, np.minimum(c.full, less))
     poor = (demands < c.full).any(axis=1)
     return c._replace(ends=np.ascontiguousarray(ends[poor]), end_demands=np.ascontiguousarray(demands[poor]))
@@ -139,20 +139,20 @@ def find_path(
     c: Constraints,
     target: GoalFeatures,
     start: FloatArray,
-    known: FloatArray,
+    taught: FloatArray,
     search: SearchLimits,
 ) -> JointPath:
     """Find a path from the start to joints that show the goal.
 
     start : (n,) joints, rad or m.
-    known : (k, n) joints known to show the goal, k ≥ 0.
+    taught : (k, n) joints at which the goal was taught, k ≥ 0.
     """
     n, rng = len(start), np.random.default_rng(search.seed)
-    starts = np.vstack([known, start[None], _drawn(c, start, STARTS, rng)])
-    every, rank, (solutions, hidden, blocked) = goals_of(c, target, start, known, starts)
+    starts = np.vstack([taught, start[None], _drawn(c, start, STARTS, rng)])
+    every, rank, (solutions, hidden, blocked) = goals_of(c, target, start, taught, starts)
     goals, rank = every[: search.max_goals], rank[: search.max_goals]
     off = np.abs(goals[:, None] - search.excluded)
-    far = np.all(np.max(off, axis=2, initial=0.0) > NEARBY, axis=1)
+    far = np.all(np.max(off, axis=2, initial=0.0) > _NEARBY, axis=1)
     goals, rank = goals[far], rank[far]
     clearance, _ = margins_at(c._replace(spread=NO_SPREAD), start)
     clearance[IMAGE:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
@@ -212,16 +212,16 @@ def _shortest(
         shortest = minimum_time(c.limits.speed, best)[-1]
     trees: tuple[Tree, Tree] | None = None
     if not shortest <= LONGER * (np.abs(goals - start) / c.limits.speed).max(axis=1).min():
-        for _ in range(WAYS):
+        for _ in range(_WAYS):
             left = (max_draws if math.isinf(shortest) else FURTHER) - draws
             if left <= 0:
                 break
-            found, used, grown = _by_trees(c, start, goals, left, rng, trial)
+            path, used, grown = _by_trees(c, start, goals, left, rng, trial)
             draws, trees = draws + used, trees or grown
-            if found is not None:
-                found = _shortened(c, found, rng, trial)
-                if (time := minimum_time(c.limits.speed, found)[-1]) < shortest:
-                    best, shortest, trees = found, time, grown
+            if path is not None:
+                path = _shortened(c, path, rng, trial)
+                if (time := minimum_time(c.limits.speed, path)[-1]) < shortest:
+                    best, shortest, trees = path, time, grown
     return best, draws, trees
 
 
@@ -333,7 +333,7 @@ def _branch(tree: Tree, node: int) -> FloatArray:
 def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
     """Shorten a path (k, n) by straight segments, first between random places on it."""
     time = minimum_time(c.limits.speed, path)
-    for ends in np.sort(rng.random((SHORTENINGS, 2)), axis=1):
+    for ends in np.sort(rng.random((_SHORTENINGS, 2)), axis=1):
         if len(path) <= 2:
             return path
         low, high = ends * time[-1]

@@ -20,12 +20,12 @@ from projservo_cli.records import FloatArray
 # Share of the limits of speed and acceleration that is planned with, so that feedback has room.
 ROOM = 0.9
 # Straight chords by which the validity of a rounded corner is checked.
-CHORDS = 8
+_CHORDS = 8
 # Most halvings of a rounded corner.
-HALVINGS = 12
+_HALVINGS = 12
 # Intervals of the grid on each straight piece and on each rounded corner.
-STRAIGHT, ROUNDED = 64, 24
-BISECTIONS = 48
+_STRAIGHT, _ROUNDED = 64, 24
+_BISECTIONS = 48
 # Motion between two corners, rad or m, or s, below which it is none.
 LEAST = 1e-12
 
@@ -80,10 +80,10 @@ def _rounding(c: Constraints, corner: FloatArray, slopes: FloatArray, size: floa
 
     The smallest blend leaves the waypoint by less than the distance of two checks.
     """
-    x = np.linspace(0.0, 1.0, CHORDS + 1)[:, None]
-    for _ in range(HALVINGS):
+    x = np.linspace(0.0, 1.0, _CHORDS + 1)[:, None]
+    for _ in range(_HALVINGS):
         path = _parabola(corner, slopes, size, x)
-        if all(reached(c, path[k], path[k + 1], trial) == 1.0 for k in range(CHORDS)):
+        if all(reached(c, path[k], path[k + 1], trial) == 1.0 for k in range(_CHORDS)):
             break
         size *= 0.5
     return size
@@ -92,12 +92,12 @@ def _rounding(c: Constraints, corner: FloatArray, slopes: FloatArray, size: floa
 def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: FloatArray) -> TimedPath:
     """The rounded path on its grid, its pace still to be found."""
     steps, q, dq, ddq = [np.zeros(1)], [path[:1]], [slopes[:1]], []
-    even = np.ones((STRAIGHT, 1))
-    x = np.arange(1, ROUNDED + 1)[:, None] / ROUNDED
+    even = np.ones((_STRAIGHT, 1))
+    x = np.arange(1, _ROUNDED + 1)[:, None] / _ROUNDED
     for k, slope in enumerate(slopes):
         straight = times[k] - sizes[k] - sizes[k + 1]
         if straight > LEAST:
-            step = straight / STRAIGHT * even
+            step = straight / _STRAIGHT * even
             steps.append(step[:, 0])
             q.append(path[k] + (sizes[k] + np.cumsum(step, axis=0)) * slope)
             dq.append(even * slope)
@@ -105,10 +105,10 @@ def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: Flo
         size = sizes[k + 1]
         if size > 0.0:
             change = slopes[k + 1] - slope
-            steps.append(np.full(ROUNDED, 2.0 * size / ROUNDED))
+            steps.append(np.full(_ROUNDED, 2.0 * size / _ROUNDED))
             q.append(_parabola(path[k + 1], slopes[k : k + 2], size, x))
             dq.append(slope + x * change)
-            ddq.append(np.tile(change / (2.0 * size), (ROUNDED, 1)))
+            ddq.append(np.tile(change / (2.0 * size), (_ROUNDED, 1)))
     s = np.cumsum(np.concatenate(steps))
     return TimedPath(
         s=s, q=np.vstack(q), dq=np.vstack(dq), ddq=np.vstack(ddq), x=np.zeros(len(s)), time=np.zeros(len(s))
@@ -151,7 +151,7 @@ def _speeds_into(timed: TimedPath, acceleration: FloatArray) -> None:
         a, b = _accelerations(timed, i, high, timed.x[i + 1], acceleration)
         if a <= b:
             continue
-        for _ in range(BISECTIONS):
+        for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
             a, b = _accelerations(timed, i, middle, timed.x[i + 1], acceleration)
             if a <= b:

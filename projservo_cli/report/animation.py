@@ -22,8 +22,8 @@ from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
 from projservo_cli.report.figures.scene import plant_pyramids, skeleton
 from projservo_cli.report.page import template
 from projservo_cli.report.report_data import PAGE_FILE, VIEWS, title
-from projservo_cli.simulation.arm import Arm
-from projservo_cli.simulation.ideal import Plant
+from projservo_cli.simulation.analytic_plant import Plant
+from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.task.face import center_of
 
 MOST_INSTANTS = 60
@@ -85,7 +85,7 @@ class _Motion(NamedTuple):
 
 
 def motion_of(
-    robot: Arm, plant: Plant, markers: FloatArray, plan: Plan, traces: Mapping[str, Trace]
+    robot: SerialArm, plant: Plant, markers: FloatArray, plan: Plan, traces: Mapping[str, Trace]
 ) -> _Motion:
     """Return the view of runs with at least one step; ``markers`` (p, 4) at the robot's reference, m."""
     face = plant.M[plant.order]
@@ -113,11 +113,11 @@ def _sample_times(q: FloatArray) -> IntArray:
     return np.unique(np.minimum(np.searchsorted(done, marks), len(q) - 1))
 
 
-def _driven(robot: Arm, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
+def _driven(robot: SerialArm, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
     selected, positions = _sample_times(trace.q), []
     for q in trace.q[selected]:
         H = forward_kinematics(plant.model, q)
-        polyline = skeleton(joint_operators(plant.model, q), robot.joint_types, (H @ robot.base_tool)[:3, 3])
+        polyline = skeleton(joint_operators(plant.model, q), robot.prismatic, (H @ robot.base_tool)[:3, 3])
         positions.append((polyline, (plant.M[plant.order] @ H.T)[:, :3], (markers @ H.T)[:, :3]))
     moved = (np.stack(kind) for kind in zip(*positions, strict=True))
     verdict, path = f"{trace.verdict}, {trace.steps} steps", _centers(plant, trace.q)

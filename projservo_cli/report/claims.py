@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.laws import title_of
-from projservo_cli.loop.step import plateau_stretch
-from projservo_cli.records import PRISMATIC, BoolArray, FloatArray, Trace
+from projservo_cli.loop.verdicts import plateau_stretch
+from projservo_cli.records import BoolArray, FloatArray, Trace
 from projservo_cli.report.figures.path_deviation import study_numbers
 from projservo_cli.report.report_data import (
     DIRECT,
@@ -205,7 +205,7 @@ def _drift_claims(report_data: ReportData, studies: Studies) -> Iterator[_Claim]
         "smaller largest deviation, true operators",
         own[1] < own[0],
     )
-    yield from _rate(studies, report_data.robot.joint_types != PRISMATIC)
+    yield from _rate(studies, ~report_data.robot.prismatic)
     yield _joints(report_data, studies.own[DIRECT[0], "true", False])
 
 

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from projservo_cli.calibration import WEAK_NOISE, chi2_band
 from projservo_cli.calibration.detections import REACH_M, REACH_RAD
+from projservo_cli.calibration.fit import chi2_band
+from projservo_cli.calibration.quality import WEAK_NOISE
 from projservo_cli.display import About
 from projservo_cli.files import lies_inside, write_whole
-from projservo_cli.laws import must_converge, name_of
+from projservo_cli.laws import must_converge, run_name
 from projservo_cli.records import Plan, Report
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows
@@ -111,7 +112,7 @@ def _law_words(trace: Mapping[str, Any]) -> str:
     took = f"{steps} step{'s' * (steps != 1)} ({_short(steps * trace['period'])} s)"
     because = ", because the " if reason.startswith("image error") else ": "
     why = because + reason if reason else ""
-    return f"{title(name_of(trace['law'], trace['mode']))}: {trace['verdict']} after {took}{why}."
+    return f"{title(run_name(trace['law'], trace['mode']))}: {trace['verdict']} after {took}{why}."
 
 
 SECTIONS = ("calibration", "metric", "plan", "control")
@@ -310,7 +311,7 @@ def _visibility(plan: Plan) -> dict[str, Any]:
 
 
 def _law(trace: dict[str, Any], about: About) -> dict[str, Any]:
-    values = {"title": title(name_of(trace["law"], trace["mode"])), "words": _law_words(trace)}
+    values = {"title": title(run_name(trace["law"], trace["mode"])), "words": _law_words(trace)}
     must = must_converge(trace["law"], about.required)
     return trace | values | {"converged": trace["verdict"] == "converged", "must": must}
 

@@ -45,7 +45,7 @@ def of_plan(plan: Plan, scene: Any) -> "Figure":
     extent = image_sizes(np.nanmax(plan.s, axis=(0, 2)) if scene.image_size is None else scene.image_size)
     lowest, highest = plan.q.min(axis=0), plan.q.max(axis=0)
     robot = SimpleNamespace(
-        joint_types=scene.model.joint_types,
+        prismatic=scene.model.prismatic,
         limits=position_limits(
             np.where(np.isfinite(scene.limits.lower), scene.limits.lower, lowest),
             np.where(np.isfinite(scene.limits.upper), scene.limits.upper, highest),

@@ -30,8 +30,8 @@ from projservo_cli.records import (
     Trace,
 )
 from projservo_cli.settings.task import Trajectory
-from projservo_cli.simulation.arm import Arm
-from projservo_cli.simulation.ideal import Plant
+from projservo_cli.simulation.analytic_plant import Plant
+from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.store import Run
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class ReportData(Fit):
     """All that the figures of a run may show."""
 
     calibrated: Model  # model the laws use
-    robot: Arm
+    robot: SerialArm
     plant: Plant  # robot, plant: the truth
     plan: Plan  # the plan
     numbers: tuple[int, ...]  # numbers of the face markers

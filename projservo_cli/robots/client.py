@@ -21,7 +21,7 @@ from projservo_cli.robots.contract import PluginRobot
 from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.robots.latency import DelayPrior, Delays, squares_by_joints
 from projservo_cli.robots.pacing import Steered
-from projservo_cli.simulation.ideal import Plant, observe
+from projservo_cli.simulation.analytic_plant import Plant, observe
 
 # Markers that no detector sees at one pixel.
 _AT_ONE_PIXEL = 3

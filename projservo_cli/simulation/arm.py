@@ -1,23 +1,26 @@
-"""The true kinematics of a serial arm, and the geometry of the rig before it."""
+"""The true serial arm: its screws, forward and inverse kinematics, and the geometry of the rig before it."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.kinematics import forward_kinematics
-from projservo_cli.geometry.rigid import rigid
-from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
+from projservo_cli.geometry.displacements import rigid, twists
+from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.records import BoolArray, FloatArray, JointLimits, Model, WorkFailed
 
 METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
+# Screws of a shift along z and of a turn about it.
+_Z_SHIFT, _Z_TURN = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
-class Arm(NamedTuple):
+class SerialArm(NamedTuple):
     """True kinematics of a serial robot in its base frame."""
 
     H_hat_0: FloatArray  # (n, 4, 4) twists at the reference, per rad or m
-    joint_types: IntArray  # (n,) ``REVOLUTE`` or ``PRISMATIC``
+    prismatic: BoolArray  # (n,) whether a joint is prismatic; it is revolute else
     q_reference: FloatArray  # (n,) rad or m
     base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
     limits: JointLimits  # of the joints
@@ -27,7 +30,7 @@ class Arm(NamedTuple):
         return Model(
             np.ascontiguousarray(P, dtype=np.float64),
             self.H_hat_0,
-            self.joint_types,
+            self.prismatic,
             self.q_reference,
             METRIC_A_INF.copy(),
         )
@@ -59,12 +62,98 @@ def roll_axis(P: FloatArray) -> tuple[FloatArray, FloatArray]:
     return point, direction / np.linalg.norm(direction)
 
 
-def twist(w: Sequence[float], v: Sequence[float]) -> FloatArray:
-    """4×4 twist of an angular velocity w (rad) and a velocity v of the origin (m)."""
-    return np.array([[0.0, -w[2], w[1], v[0]], [w[2], 0.0, -w[0], v[1]], [-w[1], w[0], 0.0, v[2]], [0.0] * 4])
-
-
 def about_axis(point: FloatArray, direction: FloatArray, theta: float) -> FloatArray:
     """4×4 rotation by θ, rad, about the axis through a point (3,), m, along a direction (3,)."""
     R = Rotation.from_rotvec(theta * direction / np.linalg.norm(direction))
     return rigid(R, point - R.as_matrix() @ point)
+
+
+class Link(NamedTuple):
+    """A row of the table; the joint reading adds to theta (R) or d (P)."""
+
+    type: str  # R or P
+    theta: float  # turn about z, rad
+    d: float  # shift along z, m
+    a: float  # shift along x, m
+    alpha: float  # turn about x, rad
+
+
+def dh_twists(links: Sequence[Link], tool: FloatArray, *, modified: bool) -> tuple[FloatArray, FloatArray]:
+    """Return the twists (n, 4, 4) of the joints at the reference, all joints zero, and the pose of the tool.
+
+    tool : (4, 4) pose of the tool in the frame of the last joint, m.
+    modified : in Craig's convention a and α come before θ and d.
+    Source: P. Corke, Robotics, Vision and Control, 2nd ed., section 7.1.
+    """
+    T, H_hat = np.eye(4), []
+    for link in links:
+        turn = rigid(Rotation.from_rotvec([0.0, 0.0, link.theta]), [0.0, 0.0, link.d])
+        tilt = rigid(Rotation.from_rotvec([link.alpha, 0.0, 0.0]), [link.a, 0.0, 0.0])
+        if modified:
+            T, tilt = T @ tilt, np.eye(4)
+        axis = twists(_Z_SHIFT if link.type == "P" else _Z_TURN)
+        H_hat.append(T @ axis @ np.linalg.inv(T))
+        T = T @ turn @ tilt
+    return np.array(H_hat), T @ tool
+
+
+def inverse_kinematics(robot: SerialArm, goal: FloatArray, q_start: FloatArray) -> FloatArray:
+    """Joints within the limits that put the tool at a pose, as near to the start as found.
+
+    Damped Newton steps on the pose from the start and from 30 seeded places within the limits; the
+    solution with the minimum joint motion wins. goal : (4, 4) pose of the tool, m; q_start : (n,) rad or m.
+    """
+    rng = np.random.default_rng(0)
+    span_lower = np.maximum(robot.limits.lower, q_start - 2 * math.pi)
+    span_upper = np.minimum(robot.limits.upper, q_start + 2 * math.pi)
+    solutions = []
+    for trial in range(31):
+        q = _newton(robot, goal, q_start if trial == 0 else rng.uniform(span_lower, span_upper))
+        if q is not None:
+            q = _unwind(robot, q, q_start)
+            if np.all(q >= robot.limits.lower) and np.all(q <= robot.limits.upper):
+                solutions.append(q)
+    if not solutions:
+        x, y, z = goal[:3, 3]
+        raise WorkFailed(
+            f"task.goal: the robot cannot put its tool at ({x:.3f}, {y:.3f}, {z:.3f}) m with this rotation "
+            "within its joint limits: choose a nearer goal, another start or wider limits"
+        )
+    return min(solutions, key=lambda q: float(np.linalg.norm(q - q_start)))
+
+
+def _newton(robot: SerialArm, goal: FloatArray, q: FloatArray) -> FloatArray | None:
+    """Damped Newton steps to a pose; None where they do not arrive.
+
+    The truth of a simulation is a metric pose, to 1e-13, whereas planning has images of a face alone.
+    """
+    model = robot.model(np.zeros((2, 3, 4)))
+    for _ in range(40):
+        pose = forward_kinematics(model, q) @ robot.base_tool
+        gap = goal @ np.linalg.inv(pose)
+        error = np.r_[Rotation.from_matrix(gap[:3, :3]).as_rotvec(), goal[:3, 3] - pose[:3, 3]]
+        if np.abs(error).max() < 1e-13:
+            return q
+        H_hat = joint_operators(model, q)
+        tip = H_hat @ pose[:, 3]
+        J = np.stack([H_hat[:, 2, 1], H_hat[:, 0, 2], H_hat[:, 1, 0], *tip.T[:3]])
+        damping = 1e-9 * float(error @ error)
+        if len(q) > len(error):  # of minimum norm
+            step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(len(error)), error)
+        else:
+            step = np.linalg.solve(J.T @ J + damping * np.eye(len(q)), J.T @ error)
+        q = q + step / max(1.0, float(np.abs(step).max()) / 0.5)
+    return q if np.abs(error).max() < 1e-10 else None
+
+
+def _unwind(robot: SerialArm, q: FloatArray, near: FloatArray) -> FloatArray:
+    """Shift revolute joints by whole turns to within half a turn of ``near`` where limits allow."""
+    turned = q.copy()
+    for i, slides in enumerate(robot.prismatic):
+        if slides:
+            continue
+        candidates = q[i] + 2 * math.pi * np.arange(-4, 5)
+        inside = candidates[(candidates >= robot.limits.lower[i]) & (candidates <= robot.limits.upper[i])]
+        if len(inside):
+            turned[i] = inside[np.argmin(np.abs(inside - near[i]))]
+    return turned

@@ -10,37 +10,37 @@ from functools import lru_cache
 import numpy as np
 
 from projservo_cli.detection import DICTIONARY
+from projservo_cli.geometry.displacements import twists
 from projservo_cli.keys import File
-from projservo_cli.records import NO_LENS, PRISMATIC, REVOLUTE, FloatArray, position_limits
+from projservo_cli.records import NO_LENS, FloatArray, position_limits, prismatic_of
 from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.robot import Camera, Rig, RobotSettings
-from projservo_cli.simulation import dh
-from projservo_cli.simulation.arm import Arm, twist
-from projservo_cli.simulation.scene import Scene, lens_of
+from projservo_cli.simulation.arm import Link, SerialArm, dh_twists
+from projservo_cli.simulation.rendering import RenderedScene, lens_of
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.task.face import MIDPOINT
 
 
 @lru_cache(maxsize=32)
-def arm_of(robot: RobotSettings) -> Arm:
+def arm_of(robot: RobotSettings) -> SerialArm:
     """Arm of screws, or of a Denavit–Hartenberg table, whose reference is all joints zero."""
     kinds = robot.joint_types
-    types = np.array([PRISMATIC if kind == "P" else REVOLUTE for kind in kinds], dtype=np.int64)
+    prismatic = prismatic_of(kinds)
     limits = position_limits(*np.array(robot.ranges, dtype=np.float64).T.copy())
     if robot.screws is not None:
         screws = robot.screws
-        twists = np.array([twist(joint.w, joint.v) for joint in screws.joints])
+        H_hat = twists(np.array([[*joint.w, *joint.v] for joint in screws.joints], dtype=np.float64))
         q_reference = screws.reference.values(kinds)
-        return Arm(twists, types, q_reference, np.array(screws.base_tool), limits)
+        return SerialArm(H_hat, prismatic, q_reference, np.array(screws.base_tool), limits)
     assert robot.dh is not None
     table = robot.dh
     links = [
-        dh.Link(row.type, math.radians(row.theta_deg), row.d_m, row.a_m, math.radians(row.alpha_deg))
+        Link(row.type, math.radians(row.theta_deg), row.d_m, row.a_m, math.radians(row.alpha_deg))
         for row in table.joints
     ]
-    twists, base_tool = dh.screws_of(links, np.array(table.tool), modified=table.convention == "modified")
-    return Arm(twists, types, np.zeros(len(kinds)), base_tool, limits)
+    H_hat, base_tool = dh_twists(links, np.array(table.tool), modified=table.convention == "modified")
+    return SerialArm(H_hat, prismatic, np.zeros(len(kinds)), base_tool, limits)
 
 
 @lru_cache(maxsize=32)
@@ -111,10 +111,10 @@ def described_truth(robot: RobotSettings, rig: Rig, markers: Markers, k1: float,
 @lru_cache(maxsize=8)
 def described_scene(
     robot: RobotSettings, rig: Rig, markers: Markers, options: RenderedOptions, mjcf: File | None
-) -> Scene:
+) -> RenderedScene:
     """Return the scene before rendered cameras; ``mjcf`` is the model of the arm, None for capsules."""
     assert markers.known is not None
-    return Scene(
+    return RenderedScene(
         arm=arm_of(robot),
         P=cameras_of(rig),
         size=rig.image_size_px,

@@ -16,12 +16,11 @@ import numpy as np
 
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.geometry.kinematics import joint_operators
-from projservo_cli.records import PRISMATIC, ByteArray, FloatArray
+from projservo_cli.records import ByteArray, FloatArray
 from projservo_cli.settings.disturbance import Events, Faults, JointMoved, LostMarkers, StuckEncoder
-from projservo_cli.simulation.arm import Arm
-from projservo_cli.simulation.cameras import Frames
+from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.physics import Physics
-from projservo_cli.simulation.scene import Scene, rendered_model
+from projservo_cli.simulation.rendering import Frames, RenderedScene, rendered_model
 from projservo_cli.simulation.streams import generator
 from projservo_cli.simulation.workspace import Truth
 
@@ -38,7 +37,7 @@ class SimulatedRobot(NamedTuple):
 
     truth: Truth
     faults: Faults
-    scene: Scene | None  # before rendered cameras; None for cameras that see points
+    scene: RenderedScene | None  # before rendered cameras; None for cameras that see points
     period: float  # of the loop, s
 
 
@@ -155,7 +154,7 @@ def robot_of(
 
 
 def observed_in_frames(
-    scene: Scene, frames: int, q: FloatArray, drawn: tuple[int, int]
+    scene: RenderedScene, frames: int, q: FloatArray, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
     """Pixels (2, m, 2) that frames of a robot at rest at joints (n,), rad or m, show on average.
 
@@ -169,19 +168,19 @@ def observed_in_frames(
 
 @lru_cache(maxsize=256)
 def _looked(
-    scene: Scene, frames: int, q_bytes: bytes, drawn: tuple[int, int]
+    scene: RenderedScene, frames: int, q_bytes: bytes, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
     eyes, q = Frames(rendered_model(scene)), np.frombuffer(q_bytes)[None]
-    found = np.full((frames, 2, len(scene.numbers), 3), np.nan)
+    detected = np.full((frames, 2, len(scene.numbers), 3), np.nan)
     eyes.open()
     try:
         for k, view in np.ndindex(frames, 2):
             pixels, sigma = eyes.capture(view, q, None, generator(*drawn, view, k))
-            found[k, view] = np.column_stack([pixels, sigma])
+            detected[k, view] = np.column_stack([pixels, sigma])
     finally:
         eyes.close()
-    count = np.isfinite(found[..., :1]).sum(axis=0)
-    mean = np.where(2 * count > frames, np.nansum(found, axis=0) / np.maximum(count, 1), np.nan)
+    count = np.isfinite(detected[..., :1]).sum(axis=0)
+    mean = np.where(2 * count > frames, np.nansum(detected, axis=0) / np.maximum(count, 1), np.nan)
     return np.ascontiguousarray(mean[..., :2]), np.ascontiguousarray(mean[..., 2])
 
 
@@ -250,16 +249,16 @@ class FaultyRobot:
         return q
 
 
-def full_reach(arm: Arm) -> float:
+def full_reach(arm: SerialArm) -> float:
     """Return the longest lever of a joint to the tool, m: the maximum over random postures."""
     rng = np.random.default_rng(0)
     low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
     postures = rng.uniform(low, high, (_POSTURES, len(low)))
-    turning = arm.joint_types != PRISMATIC
+    turning = ~arm.prismatic
     return float(max(np.linalg.norm(_tool_velocity(arm, q)[turning], axis=1).max() for q in postures))
 
 
-def _tool_velocity(arm: Arm, q: FloatArray) -> FloatArray:
+def _tool_velocity(arm: SerialArm, q: FloatArray) -> FloatArray:
     """Velocity (n, 3) of the tool by each joint at joints (n,), m per rad or m."""
     model = arm.model(np.zeros((2, 3, 4)))
     return np.asarray((joint_operators(model, q) @ arm.pose(q)[:, 3])[:, :3])
@@ -320,7 +319,7 @@ class _Joints:
     def __init__(self, world: World, faults: Faults, moved: JointMoved | None) -> None:
         self.arm, self._moved = world.truth.robot, moved
         self._moved_at = math.inf if moved is None else moved.at_step * world.period
-        scale = per_rad(self.arm.joint_types == PRISMATIC)
+        scale = per_rad(self.arm.prismatic)
         self.tick = scale * (
             2.0 * math.pi / faults.encoder_counts_per_turn if faults.encoder_counts_per_turn else 0.0
         )
@@ -378,7 +377,7 @@ class _Joints:
         """Torque (n,) of gravity in each joint by the tool at joints (n,), 1 at full reach."""
         if not self._loaded:
             return np.zeros(len(q))
-        turning = self.arm.joint_types != PRISMATIC
+        turning = ~self.arm.prismatic
         return np.asarray(np.where(turning, -_tool_velocity(self.arm, q)[:, 2], 0.0) / self._reach)
 
 

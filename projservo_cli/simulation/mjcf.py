@@ -35,10 +35,10 @@ def mujoco() -> Any:
 
 def no_gl(error: BaseException) -> str:
     """Return the packages to install if rendering fails."""
-    told = " ".join(str(error).split())
+    reason = " ".join(str(error).split())
     return (
         "MuJoCo finds no OpenGL to draw with: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri, "
-        f"MUJOCO_GL=egl ({type(error).__name__}: {told:.120})"
+        f"MUJOCO_GL=egl ({type(error).__name__}: {reason:.120})"
     )
 
 
@@ -86,7 +86,7 @@ def chain_of(model: Any, body: int, where: str) -> list[int]:
 
     Raises InputError if no joint moves it, or one neither turns nor slides.
     """
-    mj, told = mujoco(), model.body(body).name
+    mj, body_name = mujoco(), model.body(body).name
     chain: list[int] = []
     while body:
         first = int(model.body_jntadr[body])
@@ -95,9 +95,9 @@ def chain_of(model: Any, body: int, where: str) -> list[int]:
     for joint in chain:
         if mj.mjtJoint(int(model.jnt_type[joint])) not in (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_SLIDE):
             name = model.joint(joint).name or joint
-            raise InputError(f"{where}: joint {name}, on the chain to {told}, has more than one axis")
+            raise InputError(f"{where}: joint {name}, on the chain to {body_name}, has more than one axis")
     if not chain:
-        raise InputError(f"{where}: no joint moves body {told}")
+        raise InputError(f"{where}: no joint moves body {body_name}")
     return chain
 
 
@@ -127,20 +127,22 @@ def files_named(path: str) -> list[str]:
 
     Names are relative to the folder of the model, or to one of the folders of its compiler settings.
     """
-    home, found, due = Path(path).parent, dict[str, None](), [Path(path)]
+    home, named, due = Path(path).parent, dict[str, None](), [Path(path)]
     folders = [home]
     while due:
         try:
             elements = list(ET.parse(due.pop()).getroot().iter())
         except (OSError, ET.ParseError):  # MuJoCo reports it
             continue
-        told = [element.get(key) for element in elements for key in ("assetdir", "meshdir", "texturedir")]
-        folders += [home / folder for folder in told if folder]
+        subfolders = [
+            element.get(key) for element in elements for key in ("assetdir", "meshdir", "texturedir")
+        ]
+        folders += [home / folder for folder in subfolders if folder]
         for element in elements:
             for name in (value for key, value in element.items() if key.startswith("file")):
                 files = (folder / part for folder in folders for part in (name, Path(name).name))
                 file = next((file for file in files if file.is_file()), None)
-                if file is not None and str(file) not in found:
-                    found[str(file)] = None
+                if file is not None and str(file) not in named:
+                    named[str(file)] = None
                     due += [file] if file.suffix == ".xml" else []
-    return list(found)
+    return list(named)

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.records import PRISMATIC, FloatArray, InputError, WorkFailed
+from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.simulation.mjcf import mujoco
-from projservo_cli.simulation.scene import RenderedModel
+from projservo_cli.simulation.rendering import RenderedModel
 
 _STEP_S = 0.002  # longest step of the integration
 _RATE = 100.0  # 1/s, at which a servo that need not sag takes back an error
@@ -75,7 +75,7 @@ class Physics:
                 "disturbance.gravity_sag_deg: servos of robot.mjcf sag by their own gains: remove it, or set "
                 "plant.options.servo: position"
             )
-        turning = arm.joint_types != PRISMATIC
+        turning = ~arm.prismatic
         self._compensated = ~turning if sag > 0.0 else np.ones(len(q), dtype=np.bool_)
         inertia, load = self._heaviest(rendered)
         stiff = inertia * (_RATE / _LOOP_S if servo == "velocity" else _RATE**2)
@@ -204,7 +204,7 @@ class Physics:
         """Return the maximum inertia (n,) of each joint, kg m² or kg, and the maximum gravity torque, N m."""
         mj, rng, arm = mujoco(), np.random.default_rng(0), rendered.scene.arm
         low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
-        data, turning = rendered.begin(self._model, arm.q_reference), arm.joint_types != PRISMATIC
+        data, turning = rendered.begin(self._model, arm.q_reference), ~arm.prismatic
         unit, moved = np.eye(self._model.nv), np.zeros(self._model.nv)
         inertia, load = np.zeros(len(low)), 0.0
         for q in rng.uniform(low, high, (_POSTURES, len(low))):
@@ -223,7 +223,7 @@ def _take(model: Any, joint: int, *, keep: bool) -> _Actuator | None:
     Those that are not kept are put out of action.
     """
     mj = mujoco()
-    found = []
+    actuators = []
     for number in range(model.nu):
         moves = mj.mjtTrn(int(model.actuator_trntype[number])) in (
             mj.mjtTrn.mjTRN_JOINT,
@@ -233,9 +233,13 @@ def _take(model: Any, joint: int, *, keep: bool) -> _Actuator | None:
             if not keep:
                 model.actuator_gainprm[number], model.actuator_biasprm[number] = 0.0, 0.0
                 continue
-            found.append(_actuator(model, number))
+            actuators.append(_actuator(model, number))
     # One that follows lengths comes first, then one that follows speeds, which else damps, then a motor.
-    return min(found, key=lambda one: ([b != 0.0 for b in one.bias[1:]] + [True]).index(True), default=None)
+    return min(
+        actuators,
+        key=lambda actuator: ([b != 0.0 for b in actuator.bias[1:]] + [True]).index(True),
+        default=None,
+    )
 
 
 def _actuator(model: Any, number: int) -> _Actuator:

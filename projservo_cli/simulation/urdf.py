@@ -104,10 +104,10 @@ def _chain(path: str, tip: str, content: bytes) -> list[ET.Element]:
     """Joints from the root of a URDF to a link. Raises InputError if links and joints are no tree."""
     root = _parsed(path, content)
     links, names = ([one.get("name", "") for one in root.findall(kind)] for kind in ("link", "joint"))
-    for kind, given in (("link", links), ("joint", names)):
-        if twice := [name for name in dict.fromkeys(given) if given.count(name) > 1]:
+    for kind, declared in (("link", links), ("joint", names)):
+        if twice := [name for name in dict.fromkeys(declared) if declared.count(name) > 1]:
             raise InputError(
-                f"{path}: {kind} {twice[0]} stands there {given.count(twice[0])} times: keep one"
+                f"{path}: {kind} {twice[0]} stands there {declared.count(twice[0])} times: keep one"
             )
     above: dict[str, ET.Element] = {}
     for joint in root.findall("joint"):
@@ -142,10 +142,10 @@ def joint_screw(
     """A joint along or about an axis (3,) through a point (3,), m."""
     axis = np.asarray(axis) / np.linalg.norm(axis)
     w, v = (np.zeros(3), axis) if kind == "P" else (axis, np.cross(point, axis))
-    given = (
+    bounds = (
         {} if limits is None else {"limits_m" if kind == "P" else "limits_rad": [float(x) for x in limits]}
     )
-    return {"type": kind, "name": name or None, "w": w.tolist(), "v": v.tolist(), **given}
+    return {"type": kind, "name": name or None, "w": w.tolist(), "v": v.tolist(), **bounds}
 
 
 def arm_screws(joints: list[dict[str, Any]], q: FloatArray, tool: FloatArray) -> dict[str, Any]:
@@ -181,10 +181,12 @@ def _limits(joint: ET.Element, path: str) -> list[float]:
 
 def _of(joint: ET.Element, tag: str, key: str, default: str, path: str) -> str:
     """An attribute of an element of a joint."""
-    found = joint.findall(tag)
-    if len(found) > 1:
-        raise InputError(f"{path}: joint {joint.get('name', '')} has {len(found)} elements {tag}: keep one")
-    value = found[0].get(key, default) if found else default
+    elements = joint.findall(tag)
+    if len(elements) > 1:
+        raise InputError(
+            f"{path}: joint {joint.get('name', '')} has {len(elements)} elements {tag}: keep one"
+        )
+    value = elements[0].get(key, default) if elements else default
     if not value:
         raise InputError(f"{path}: joint {joint.get('name', '')}: its {tag} has no {key}")
     return value
@@ -192,15 +194,15 @@ def _of(joint: ET.Element, tag: str, key: str, default: str, path: str) -> str:
 
 def _numbers(joint: ET.Element, tag: str, key: str, default: str, path: str) -> FloatArray:
     """The numbers in an attribute of an element of a joint."""
-    given = _of(joint, tag, key, default, path)
+    text = _of(joint, tag, key, default, path)
     try:
-        values = np.array([float(part) for part in given.split()])
+        values = np.array([float(part) for part in text.split()])
     except ValueError:
         values = np.array([math.nan])
     many = len(default.split())
     if len(values) != many or not np.isfinite(values).all():
         name = joint.get("name", "")
-        raise InputError(f"{path}: joint {name}: {key} of its {tag} is {given!r}: expected {many} numbers")
+        raise InputError(f"{path}: joint {name}: {key} of its {tag} is {text!r}: expected {many} numbers")
     return values
 
 

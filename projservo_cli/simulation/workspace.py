@@ -8,15 +8,21 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.geometry.displacements import rigid
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.geometry.rigid import rigid
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.image_size import image_sizes
+from projservo_cli.image_size import image_sizes, within_images
 from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model, WorkFailed
 from projservo_cli.settings.task import Goal
-from projservo_cli.simulation.arm import METRIC_A_INF, Arm, about_axis, camera_center, roll_axis
-from projservo_cli.simulation.ideal import Ends, Plant
-from projservo_cli.simulation.inverse_kinematics import inverse_kinematics
+from projservo_cli.simulation.analytic_plant import Ends, Plant
+from projservo_cli.simulation.arm import (
+    METRIC_A_INF,
+    SerialArm,
+    about_axis,
+    camera_center,
+    inverse_kinematics,
+    roll_axis,
+)
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 
 _EDGE_ON = math.cos(math.radians(70.0))  # of the angle to a camera from which tags are not found
@@ -26,7 +32,7 @@ _EDGE_ON = math.cos(math.radians(70.0))  # of the angle to a camera from which t
 class Truth:
     """Robot, rig and markers as they are."""
 
-    robot: Arm  # true kinematics
+    robot: SerialArm  # true kinematics
     P: FloatArray  # (2, 3, 4) true cameras, px
     M: FloatArray  # (m, 4) all markers at the robot's reference, m
     number: tuple[int, ...]  # (m,) their numbers
@@ -75,8 +81,8 @@ class Truth:
 
     def within(self, pixels: FloatArray, view: int | slice = slice(None)) -> FloatArray:
         """Pixels (..., 2, m, 2), or (m, 2) of a view, NaN outside an image: centres reach to size − ½."""
-        inside = (pixels >= -0.5) & (pixels <= image_sizes(self.image_size)[view, ..., None, :] - 0.5)
-        return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)
+        inside = within_images(pixels, image_sizes(self.image_size)[view, ..., None, :])
+        return np.where(inside[..., None], pixels, np.nan)
 
     def displacement(self, q: FloatArray) -> FloatArray:
         """True displacement (4, 4) of the face from the reference at the joints q (n,)."""
@@ -87,7 +93,7 @@ class Truth:
         return np.asarray(np.linalg.inv(self.robot.base_tool), dtype=np.float64)
 
 
-def turned(goal: Goal, arm: Arm, P: FloatArray, q_start: FloatArray) -> FloatArray:
+def turned(goal: Goal, arm: SerialArm, P: FloatArray, q_start: FloatArray) -> FloatArray:
     """Joints (n,) of a goal that is a turn of the tool about the roll axis of the rig from joints (n,).
 
     arm, P : the arm before cameras (2, 3, 4), m. The pose is perhaps displaced a little along the axes of the

@@ -18,9 +18,9 @@ from projservo_cli.control.law import ERRORS, Law, State, new_state
 from projservo_cli.laws import CODES, LAWS
 from projservo_cli.loop.compiled import Course, many_steps, run_compiled
 from projservo_cli.loop.python import BuiltInLaw
-from projservo_cli.loop.step import Log, new_log
+from projservo_cli.loop.verdicts import Log, new_log
 from projservo_cli.records import FloatArray
-from projservo_cli.simulation.ideal import Plant
+from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.stages.scenario import run_scenario
 from projservo_cli.stages.stage_inputs import ServoInputs
 from projservo_cli.task.face import Task

@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.calibration import Nominal, Solution, calibrate, cross_validate
+from projservo_cli.calibration.estimate import calibrate
+from projservo_cli.calibration.fit import Solution
+from projservo_cli.calibration.initialization import Nominal
+from projservo_cli.calibration.quality import cross_validate
 from projservo_cli.calibration.screening import screened
 from projservo_cli.calibration.undecided import undecided_pairs
 from projservo_cli.files import write_whole
-from projservo_cli.image_size import image_sizes
+from projservo_cli.image_size import image_corners, image_sizes
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import Suggestion, suggest
@@ -136,7 +139,7 @@ def suggest_motions(
     pixels, size = observation.images, inputs.image_size
     image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
     if size is not None:
-        image = np.array([[[-0.5, -0.5], one - 0.5] for one in image_sizes(size)])
+        image = image_corners(image_sizes(size))
     targets = _region(inputs.joints, observation.q, WIDER, image)
     candidates = targets if inputs.recorded else _region(inputs.joints, observation.q, FARTHER, image)
     rng = generator(inputs.seed, SUGGESTIONS)

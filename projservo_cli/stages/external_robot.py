@@ -12,10 +12,9 @@ from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.image_size import image_sizes
-from projservo_cli.masking import MASK
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
-from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.records import MASK, Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
 from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior
@@ -23,6 +22,7 @@ from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
 from projservo_cli.settings.disturbance import Events
+from projservo_cli.simulation.analytic_plant import Plant, observe
 from projservo_cli.simulation.faults import (
     FaultyRobot,
     Points,
@@ -30,7 +30,6 @@ from projservo_cli.simulation.faults import (
     obstruction_of,
     robot_of,
 )
-from projservo_cli.simulation.ideal import Plant, observe
 from projservo_cli.simulation.streams import SERVO_NOISE
 from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.stages.stage_inputs import Contract, Drive, OwnRobot

@@ -27,7 +27,6 @@ from projservo_cli.planning.time_parameterization import TimedPath, joints_at, m
 from projservo_cli.records import (
     LIMITS_MISSING,
     NO_SPREAD,
-    PRISMATIC,
     FloatArray,
     Model,
     Plan,
@@ -108,7 +107,7 @@ def search_of(scenario: Scenario) -> JointSearch:
 def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
     """Return the reason why no path through joint space can be searched or timed; empty if it can."""
     for i in np.flatnonzero(~np.isfinite(demands.limits.speed)):
-        kind = "prismatic" if model.joint_types[i] == PRISMATIC else "joint"
+        kind = "prismatic" if model.prismatic[i] else "joint"
         unit = "m_s" if kind == "prismatic" else "deg_s"
         return f"joint {i + 1} has no speed limit: set control.{kind}_speed_limit_{unit}"
     return "no search was given" if search is None else search.closed

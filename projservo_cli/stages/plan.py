@@ -7,7 +7,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from projservo_cli.control.law import State
-from projservo_cli.geometry.algebra import as_array, composed_angle, vec
+from projservo_cli.geometry.algebra import as_array, vec
+from projservo_cli.geometry.displacements import composed_angle
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import undistort
@@ -92,7 +93,7 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
     """Refuse a task whose goal leaves more than ``LEFT_PX`` wherever the joints bring the face.
 
     The joints that bring the face A (m, 4) nearest to its planned images (s, 2, m, 2), in px, are carried
-    along the plan from those at the start (n,).
+    along the plan from those at the start (n,); SciPy's least squares do for twenty images.
     """
     M = A @ np.linalg.inv(forward_kinematics(model, q_start)).T
     q = q_start
@@ -283,7 +284,11 @@ def _found(
 
 
 def _planned(
-    model: Model, images: TaskImages, trajectory: Trajectory, demands: Demands, search: JointSearch | None
+    model: Model,
+    images: TaskImages,
+    trajectory: Trajectory,
+    demands: Demands,
+    search: JointSearch | None,
 ) -> tuple[Plan, str]:
     """Return the plan of one profile, and the constraints that fail, in words; empty if all hold."""
     face = images.by_points()

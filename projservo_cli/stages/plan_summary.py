@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from projservo_cli.image_size import BEHIND
 from projservo_cli.planning.constraints import Constraints, demands_into, margins_along_into, new_trial
 from projservo_cli.planning.margins import (
-    BEHIND,
     CONDITIONING,
     CONSTRAINTS,
     IMAGE,
@@ -23,7 +23,7 @@ from projservo_cli.planning.margins import (
 )
 from projservo_cli.planning.rrt_connect import JointPath, Tree, may_start
 from projservo_cli.planning.time_parameterization import TimedPath
-from projservo_cli.records import PRISMATIC, VIEWS, FloatArray, IntArray, in_unit
+from projservo_cli.records import VIEWS, FloatArray, IntArray, in_unit
 
 
 def verdict_of(motion: Motion) -> tuple[bool, str, str]:
@@ -174,7 +174,7 @@ def _requirement(c: Constraints, q: FloatArray, margin: int, asked: float) -> st
     if margin != JOINTS:
         return f"{words.asked.format(VIEWS[view])} {asked:.2g} px ({c.full[margin]:g} px required)"
     i = int(np.argmin(np.minimum(q - c.limits.lower, c.limits.upper - q) / c.keep))
-    slides = c.model.joint_types[i] == PRISMATIC
+    slides = c.model.prismatic[i]
     full, unit = (1e3 * c.keep[i], " mm") if slides else (math.degrees(c.keep[i]), "°")
     return f"{words.asked.format(i + 1)} {asked * full:.2g}{unit} away ({full:.3g}{unit} required)"
 

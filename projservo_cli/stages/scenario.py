@@ -11,11 +11,11 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from projservo_cli.calibration import predict
+from projservo_cli.calibration.prediction import predict
 from projservo_cli.control.law import Gains
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import BODY_LAWS, LAW_SPECS
-from projservo_cli.loop.step import Limits
+from projservo_cli.loop.verdicts import Limits
 from projservo_cli.planning.margins import Demands
 from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
@@ -31,8 +31,8 @@ from projservo_cli.records import (
 from projservo_cli.robots.client import weights
 from projservo_cli.robots.settings import Joints, limit_passed
 from projservo_cli.settings.task import GoalImages, TaskSettings
+from projservo_cli.simulation.analytic_plant import NO_PINS, Ends, Plant
 from projservo_cli.simulation.faults import observed_in_frames
-from projservo_cli.simulation.ideal import NO_PINS, Ends, Plant
 from projservo_cli.simulation.streams import (
     GOAL_FRAMES,
     PIN_NOISE,

@@ -18,11 +18,11 @@ from projservo_cli.geometry.mechanisms import in_span
 from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.laws import CODES, REGULATE, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.metrics import Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
-from projservo_cli.loop.settling import StallMonitor
-from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
+from projservo_cli.loop.run_metrics import Ended, Summary, angle_between, path_deviation, summarize
+from projservo_cli.loop.stall_monitor import StallMonitor
+from projservo_cli.loop.verdicts import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.monitoring.accuracy import Posture, rigid_fit
 from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.plugins import what_failed
@@ -43,8 +43,8 @@ from projservo_cli.records import (
 from projservo_cli.results import ImageModel
 from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.contract import at_rest_after
+from projservo_cli.simulation.analytic_plant import AnalyticPlant, Plant
 from projservo_cli.simulation.faults import obstruction_of
-from projservo_cli.simulation.ideal import AnalyticPlant, Plant
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import external_robot
 from projservo_cli.stages.motions import PathReplanner, search_of, why_closed

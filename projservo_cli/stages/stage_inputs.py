@@ -14,9 +14,9 @@ from projservo_cli.settings.control import Stop
 from projservo_cli.settings.disturbance import Events
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import TaskSettings, Trajectory
-from projservo_cli.simulation.arm import Arm
+from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.faults import SimulatedRobot
-from projservo_cli.simulation.scene import Scene
+from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.workspace import Truth
 
 
@@ -169,9 +169,9 @@ class PlanInputs:
     task: TaskSettings | None
     seed: int  # of the noise of start and goal
     truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
-    arm: Arm | None  # kinematics as they are described, if they are
+    arm: SerialArm | None  # kinematics as they are described, if they are
     P: FloatArray | None  # (2, 3, 4) cameras as they are described, px, if they are
-    scene: Scene | None  # where cameras are rendered
+    scene: RenderedScene | None  # where cameras are rendered
     face: tuple[int, ...]  # numbers of the markers that must stay visible
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
     known: tuple[int, ...] | None  # numbers of all markers; None for those of the calibration

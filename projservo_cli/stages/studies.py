@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.control.law import Gains
-from projservo_cli.geometry.algebra import (
-    as_array,
+from projservo_cli.geometry.algebra import as_array, mat
+from projservo_cli.geometry.displacements import (
     composed_angle,
     composed_operator,
     exp_rotation,
-    mat,
     twist_exponential,
 )
 from projservo_cli.planning.margins import limits_alone
-from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.report.report_data import DIRECT, Studies
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
@@ -56,7 +55,7 @@ class Comparison:
         limits = self.scenario.termination
         speed = np.full(len(self.scenario.ends.q_start), math.inf)
         if limited:
-            prismatic = self.truth.robot.joint_types == PRISMATIC
+            prismatic = self.truth.robot.prismatic
             speed = np.where(prismatic, limits.speed, math.radians(STEP_LIMIT_DEG) / gains.period)
         scenario = replace(self.scenario, gains=gains, termination=limits._replace(speed=speed))
         return drive(scenario, self.sense, law, self.models[operators]).trace()
@@ -68,7 +67,7 @@ def projective_twin(model: Model) -> Model:
     return Model(
         np.ascontiguousarray(model.P @ H_PE),
         np.ascontiguousarray(inverse @ model.H_hat_0 @ H_PE),
-        model.joint_types,
+        model.prismatic,
         model.q_reference,
         model.a_inf @ H_PE,
         model.lens,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration import predict
+from projservo_cli.calibration.prediction import predict
 from projservo_cli.display import require_radians
 from projservo_cli.hardware.preflight import MIN_SHARED
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed

@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.geometry.rigid import rigid_inverse
+from projservo_cli.geometry.displacements import rigid_inverse
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.metric.frame import Metric
 from projservo_cli.metric.opencv import OpenCV

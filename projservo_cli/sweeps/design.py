@@ -12,15 +12,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import displacements, image_points, moved_points
+from projservo_cli.calibration.prediction import image_points, moved_points
 from projservo_cli.config import Config, Override, load_config, to_yaml
 from projservo_cli.config.inputs import calibration_inputs, truth_of
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
+from projservo_cli.geometry.displacements import displacements
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.image_size import image_sizes
+from projservo_cli.image_size import image_sizes, within_images
 from projservo_cli.keys import digest, key_of
-from projservo_cli.laws import law_and_mode, names_of
-from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.laws import law_and_mode, run_names
+from projservo_cli.records import FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.source import source_hash
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, TaskSettings
@@ -75,7 +76,7 @@ def random_tasks(
 def _poses(truth: Truth, q: FloatArray) -> FloatArray:
     """Displacements (k, 4, 4) from the reference at joints (k, n), [RH00] eq. (6) for many at once."""
     robot = truth.robot
-    E = displacements(robot.H_hat_0, robot.joint_types == PRISMATIC, q - robot.q_reference)
+    E = displacements(robot.H_hat_0, robot.prismatic, q - robot.q_reference)
     return np.swapaxes(moved_points(E, np.eye(4))[0], 1, 2)
 
 
@@ -97,7 +98,7 @@ def _accepted(truth: Truth, poses: FloatArray, front: float) -> IntArray:
     before = (m[..., 2] > 0.0).all(axis=(1, 2))
     facing = (front * _cosines(truth, poses) >= LEAST_COSINE).all(axis=1)
     pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
-    inside = ((pixels >= -0.5) & (pixels <= image_sizes(truth.image_size)[:, None] - 0.5)).all(axis=(1, 2, 3))
+    inside = within_images(pixels, image_sizes(truth.image_size)[:, None]).all(axis=(1, 2))
     return np.flatnonzero(before & facing & inside)
 
 
@@ -202,7 +203,7 @@ class Design:
             found.append(_Axis(name, self.sweep.keys_of(name), axis.values, axis.also))
         if all(LAW not in axis.keys for axis in found):
             control = load_config("base", text=self.bases[0][1]).control
-            found.append(_Axis(LAW, (LAW,), names_of(control.laws, control.mode)))
+            found.append(_Axis(LAW, (LAW,), run_names(control.laws, control.mode)))
         return tuple(found)
 
     @cached_property
@@ -396,7 +397,7 @@ def require_sound(design: Design) -> None:
 
 def name_of_run(config: Config) -> str:
     """Name of the only run of a configuration: its law, with the mode where it follows the plan."""
-    names = names_of(config.control.laws, config.control.mode)
+    names = run_names(config.control.laws, config.control.mode)
     if len(names) != 1:
         raise InputError(
             f"a cell runs one law in one mode, not {', '.join(names)}: list them under grid.law, such as "

@@ -15,7 +15,7 @@ from projservo_cli.keys import key_of
 from projservo_cli.laws import BODY_LAWS, CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled import Course
-from projservo_cli.loop.step import FAILED, RUNNING, VERDICTS
+from projservo_cli.loop.verdicts import FAILED, RUNNING, VERDICTS
 from projservo_cli.records import Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rotation_sense

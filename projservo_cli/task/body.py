@@ -17,14 +17,13 @@ from projservo_cli.geometry.algebra import (
     apply_transposed,
     combine,
     dot,
-    invariant_rotations,
     mat,
     mul,
     scale,
-    twist_exponential,
     vec,
     vec_into,
 )
+from projservo_cli.geometry.displacements import invariant_rotations, twist_exponential
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, solve_normal
 from projservo_cli.records import BoolArray, FloatArray, Model
@@ -37,7 +36,7 @@ Sums = tuple[
     float, float, float, float, float, float, float, float, float, float, float, float, float,
 ]  # fmt: skip
 # Sums over no rows.
-NO_SUMS: Sums = (
+_NO_SUMS: Sums = (
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
 )  # fmt: skip
@@ -199,7 +198,7 @@ def _normal_equations(
     Arguments as of ``fit_body``; images are linearised in ξ about H. Writes the equations to ``normal``.
     Returns the sum of squared residuals, px², and the number of markers seen, counted once a view.
     """
-    N = NO_SUMS
+    N = _NO_SUMS
     squares = 0.0
     views = 0
     D_0, D_1, D_2 = vec(body.D[0]), vec(body.D[1]), vec(body.D[2])

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.geometry import stereo
 from projservo_cli.geometry.algebra import Vec4, add, axpy, dot, meet, scale, sub, unit, vec
-from projservo_cli.geometry.jit import composed, merged, njit
+from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, points_into
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
@@ -18,18 +18,18 @@ MIDPOINT = -1
 # Offset across the longest one, over its length, below which markers lie on one line.
 ON_A_LINE = 1e-6
 # No axis, in a search for the longest offset.
-NO_AXIS: Vec4 = (0.0, 0.0, 0.0, 0.0)
+_NO_AXIS: Vec4 = (0.0, 0.0, 0.0, 0.0)
 
 # Codes of the check of a task's images: no problem.
 FOUND = 0
 # A marker cannot be triangulated.
 NO_POINT = 1
 # The markers lie on one line.
-ONE_LINE = 2
+_ONE_LINE = 2
 # The left camera sees other sides of the face at start and goal.
-OTHER_SIDE_LEFT = 3
+_OTHER_SIDE_LEFT = 3
 # The right camera does.
-OTHER_SIDE_RIGHT = 4
+_OTHER_SIDE_RIGHT = 4
 # A joint motion of the task is not unique at the start.
 NOT_UNIQUE = 5
 # The images at the start show too few markers of the body.
@@ -54,11 +54,11 @@ _MISFIT = (
     "the images at the {} fit no pose of the calibrated body: check the marker numbers, or measure point by "
     "point with control.features: points"
 )
-PROBLEMS = {
+_PROBLEMS = {
     NO_POINT: stereo.NO_POINT,
-    ONE_LINE: "the face markers lie on one line: choose markers.face that span a plane",
-    OTHER_SIDE_LEFT: _OTHER_SIDE.format("left"),
-    OTHER_SIDE_RIGHT: _OTHER_SIDE.format("right"),
+    _ONE_LINE: "the face markers lie on one line: choose markers.face that span a plane",
+    _OTHER_SIDE_LEFT: _OTHER_SIDE.format("left"),
+    _OTHER_SIDE_RIGHT: _OTHER_SIDE.format("right"),
     NOT_UNIQUE: "the joint motion of the task is not unique at the start: the robot is near a singularity or "
     "moves the face in fewer than six directions",
     UNSEEN_START: _UNSEEN.format("start"),
@@ -109,7 +109,7 @@ def face_plane(A: FloatArray, order: IntArray, A_c: Vec4) -> Vec4:
     return unit(total)
 
 
-@composed
+@inline
 def _order_into(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     """Order the markers around their midpoint; False if they lie on one line.
 
@@ -122,7 +122,7 @@ def _order_into(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     """
     m = A.shape[0]
     middle = center_of(A, MIDPOINT)
-    x_axis = _longest_offset(A, middle, NO_AXIS)
+    x_axis = _longest_offset(A, middle, _NO_AXIS)
     y_axis = _longest_offset(A, middle, x_axis)
     if not dot(y_axis, y_axis) > ON_A_LINE * ON_A_LINE * dot(x_axis, x_axis):
         return False
@@ -146,11 +146,11 @@ def _order_into(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     return True
 
 
-@composed
+@inline
 def _longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
     """Longest component perpendicular to an axis, if any, of the offsets of points (m, 4) from the middle."""
     size = dot(axis, axis)
-    longest = NO_AXIS
+    longest = _NO_AXIS
     for k in range(A.shape[0]):
         offset = sub(vec(A[k]), middle)
         if size > 0.0:
@@ -168,7 +168,7 @@ def cyclic_order(A: FloatArray) -> IntArray:
     _require_three(len(A))
     order = np.zeros(len(A), dtype=np.int64)
     if not _order_into(A, order, np.zeros(len(A))):
-        raise WorkFailed(PROBLEMS[ONE_LINE])
+        raise WorkFailed(_PROBLEMS[_ONE_LINE])
     return order
 
 
@@ -177,7 +177,7 @@ def _require_three(m: int) -> None:
         raise WorkFailed(f"a face of {m} markers (3 required): add markers to markers.face")
 
 
-@composed
+@inline
 def task_into(
     model: Model, images: FloatArray, task: Task, A: FloatArray, angle: FloatArray
 ) -> tuple[int, int]:
@@ -197,7 +197,7 @@ def task_into(
     if lost >= 0:
         return NO_POINT, lost
     if not _order_into(task.A_star, task.order, angle):
-        return ONE_LINE, 0
+        return _ONE_LINE, 0
     if task.body.M.shape[0] > 0:  # the body determines the plane better than points do edge-on
         return FOUND, 0
     return sides_into(task, A), 0
@@ -212,14 +212,14 @@ def sides_into(task: Task, A: FloatArray) -> int:
         O = vec(task.O[view])
         task.visible[view] = 1.0 if dot(O, a) > 0.0 else -1.0
         if task.visible[view] * dot(O, a_star) <= 0.0:
-            return OTHER_SIDE_LEFT if view == 0 else OTHER_SIDE_RIGHT
+            return _OTHER_SIDE_LEFT if view == 0 else _OTHER_SIDE_RIGHT
     return FOUND
 
 
 def require_found(status: int, detail: int) -> None:
     """Raise WorkFailed with the message of a code other than ``FOUND``."""
     if status != FOUND:
-        raise WorkFailed(PROBLEMS[status].format(detail))
+        raise WorkFailed(_PROBLEMS[status].format(detail))
 
 
 def new_task(model: Model, s_star: FloatArray, center: int) -> Task:

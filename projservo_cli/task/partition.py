@@ -16,13 +16,13 @@ from projservo_cli.geometry.algebra import (
     meet,
     mul,
     multiple,
-    rotation,
     scale,
     sub,
     unit,
     vec,
     vec_into,
 )
+from projservo_cli.geometry.displacements import rotation
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.mechanisms import (
     NO_OPERATOR,
@@ -36,7 +36,7 @@ from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.visibility import CONTINUITY_BAND, HALF_TURN_TOLERANCE, choose_sense
 
 # Distance of two unit vectors below which they are equal to working precision.
-COINCIDENT = 1e-14
+_COINCIDENT = 1e-14
 
 
 class Split(NamedTuple):
@@ -114,13 +114,13 @@ def translation_part(work: Work, A_c: Vec4, A_cs: Vec4, q_hat: FloatArray) -> tu
     centres, hence as transversal as the coordinates allow. The sense has τ ≥ 0; for equal centres τ = 0.
     """
     D = sub(A_cs, A_c)
-    if dot(D, D) <= COINCIDENT * COINCIDENT * dot(A_cs, A_cs):
+    if dot(D, D) <= _COINCIDENT * _COINCIDENT * dot(A_cs, A_cs):
         q_hat[:] = 0.0
         return True, 0.0, NO_OPERATOR
-    found, H_t = translation_mechanism(work, A_c, D, q_hat)
+    unique, H_t = translation_mechanism(work, A_c, D, q_hat)
     a_cs = axpy(-dot(D, A_cs) / dot(A_cs, A_cs), A_cs, D)
     rate = dot(a_cs, apply(H_t, A_c))
-    if not found or rate == 0.0:
+    if not unique or rate == 0.0:
         return False, 0.0, NO_OPERATOR
     tau = -dot(a_cs, A_c) / rate
     if tau < 0.0:
@@ -144,21 +144,21 @@ def onto_plane_part(
     # Both planes contain the centre: keep round-off of its distance from displacing the axis of nearly equal
     # planes.
     D = axpy(-dot(D, A_c) / dot(A_c, A_c), A_c, D)
-    if dot(D, D) <= COINCIDENT * COINCIDENT:
+    if dot(D, D) <= _COINCIDENT * _COINCIDENT:
         if same >= 0.0:
             q_hat[:] = 0.0
             return True, 0.0, NO_OPERATOR
         first = sub(vec(A[task.order[0]]), A_c)
-        if dot(first, first) <= COINCIDENT * COINCIDENT * dot(A_c, A_c):
+        if dot(first, first) <= _COINCIDENT * _COINCIDENT * dot(A_c, A_c):
             first = sub(vec(A[task.order[1]]), A_c)
-        found, H_r = rotation_mechanism(work, unit(A_c), unit(first), q_hat)
+        unique, H_r = rotation_mechanism(work, unit(A_c), unit(first), q_hat)
     else:
         A_1, A_2 = dual_pencil(a, D)
-        found, H_r = rotation_mechanism(work, A_1, A_2, q_hat)
-    if not found:
+        unique, H_r = rotation_mechanism(work, A_1, A_2, q_hat)
+    if not unique:
         return False, 0.0, NO_OPERATOR
-    found, theta = _oriented_angle(A, a, a_t, H_r)
-    if not found:
+    unique, theta = _oriented_angle(A, a, a_t, H_r)
+    if not unique:
         return False, 0.0, NO_OPERATOR
     if theta < 0.0:
         _negate(q_hat)
@@ -191,8 +191,8 @@ def _oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool,
             p_0 = dot(a_t, A_d) - c
             p_s = s
             p_c = c
-    found, plus, minus = incidence_angles(p_0, p_s, p_c)
-    if not found:
+    meets, plus, minus = incidence_angles(p_0, p_s, p_c)
+    if not meets:
         return False, 0.0
     turned = apply_transposed(rotation(H_r, -plus), a)
     return True, plus if dot(turned, a_t) > 0.0 else minus
@@ -209,8 +209,8 @@ def _within_plane_part(
     θ_p is comparable between steps; half a turn counts as +π unless the previous step had the other sense.
     """
     A, a, A_c = face.A, face.a, face.A_c
-    found, H_p = planar_mechanism(work, a, unit(A_c), q_hat)
-    if not found:
+    unique, H_p = planar_mechanism(work, a, unit(A_c), q_hat)
+    if not unique:
         return False, 0.0, NO_OPERATOR
     H_p2 = mul(H_p, H_p)
     e = 0
@@ -233,10 +233,10 @@ def _within_plane_part(
     second = apply(H_p2, A_e)
     # In the sense of the operator a_iᵀ A_e grows where A_e passes its target, and falls beyond the axis: of
     # both solutions θ⁻ grows.
-    found, _, theta = incidence_angles(
+    unique, _, theta = incidence_angles(
         dot(a_i, A_e) + dot(a_i, second), dot(a_i, velocity), -dot(a_i, second)
     )
-    if not found:
+    if not unique:
         return False, 0.0, NO_OPERATOR
     if math.pi - abs(theta) <= HALF_TURN_TOLERANCE:
         theta = abs(theta)
@@ -260,7 +260,7 @@ def partition(task: Task, split: Split) -> Parts:
     A_cs = center_of(task.A_star, task.center)
     a = face_plane(A, task.order, A_c)
     a_star = face_plane(task.A_star, task.order, A_cs)
-    found, tau, H_t = translation_part(work, A_c, A_cs, q_hat[0])
+    unique, tau, H_t = translation_part(work, A_c, A_cs, q_hat[0])
     a_t = unit(axpy(tau, apply_transposed(H_t, a_star), a_star))
     for k in range(A.shape[0]):
         A_ks = vec(task.A_star[k])
@@ -268,19 +268,19 @@ def partition(task: Task, split: Split) -> Parts:
     face = _Face(A, a, A_c)
     theta_r, theta_p = 0.0, 0.0
     H_r, H_p = NO_OPERATOR, NO_OPERATOR
-    if found:
-        found, theta_r, H_r = onto_plane_part(work, task, face, a_t, q_hat[1], split.driven[0])
-    if found:
+    if unique:
+        unique, theta_r, H_r = onto_plane_part(work, task, face, a_t, q_hat[1], split.driven[0])
+    if unique:
         back = rotation(H_r, -theta_r)
         for k in range(A.shape[0]):
             vec_into(split.A_r[k], apply(back, vec(split.A_t[k])))
-        found, theta_p, H_p = _within_plane_part(work, face, split.A_r, q_hat[2], split.driven[1])
-    if found:
+        unique, theta_p, H_p = _within_plane_part(work, face, split.A_r, q_hat[2], split.driven[1])
+    if unique:
         for i in range(q_hat.shape[1]):
             split.driven[0, i] = q_hat[1, i] if theta_r >= 0.0 else -q_hat[1, i]
             split.driven[1, i] = q_hat[2, i] if theta_p >= 0.0 else -q_hat[2, i]
     return Parts(
-        found=found,
+        found=unique,
         tau=tau,
         theta_r=theta_r,
         theta_p=theta_p,

@@ -5,13 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import mul, translation
-from projservo_cli.geometry.jit import composed
+from projservo_cli.geometry.algebra import mul
+from projservo_cli.geometry.displacements import translation
+from projservo_cli.geometry.jit import inline
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, operators_at, project
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.geometry.mechanisms import make_span, workspace
-from projservo_cli.records import PRISMATIC, FloatArray, InputError, Model, Plan, WorkFailed
+from projservo_cli.records import FloatArray, InputError, Model, Plan, WorkFailed
 from projservo_cli.task.body import NO_BODY, SETTLED, Body, carry, fit_body
 from projservo_cli.task.face import (
     MISFIT_GOAL,
@@ -77,7 +78,7 @@ class TaskImages(NamedTuple):
         return task
 
 
-@composed
+@inline
 def body_task_into(
     model: Model, q_start: FloatArray, images: FloatArray, task: Task, split: Split, normal: FloatArray
 ) -> tuple[int, int]:
@@ -125,7 +126,7 @@ def followed(model: Model, task: Task, plan: Plan, period: float, rate: float) -
     until_next = np.append(np.diff(times), 0.0)
     _, _, _, s_next = _followed_at(model, task, plan, times + _DIFFERENCE * until_next)
     amplitudes = np.array([plan.tau, plan.theta_r, plan.theta_p])
-    room = np.zeros(0) if len(mu) else np.where(model.joint_types == PRISMATIC, _ROOM_M, _ROOM_RAD)
+    room = np.zeros(0) if len(mu) else np.where(model.prismatic, _ROOM_M, _ROOM_RAD)
     A, s, ahead = (np.ascontiguousarray(x) for x in (A, s, (s_next - s) / _DIFFERENCE))
     return task._replace(
         reference=Reference(

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, rotation, translation, vec, vec_into
+from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, vec, vec_into
+from projservo_cli.geometry.displacements import rotation, translation
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import backward, forward_between
 from projservo_cli.records import FloatArray, Model
@@ -67,8 +68,8 @@ def trajectory_displacement(
     H_hat : (3, 4, 4) operators t, r, p; amplitudes : τ in the unit of Ĥ_t, θ_r and θ_p in rad.
     """
     H_hat, sizes = np.ascontiguousarray(H_hat), np.array(amplitudes, dtype=np.float64)
-    found = [displaced(H_hat, sizes, *shares) for shares in mu.reshape(-1, 3).tolist()]
-    return np.array(found).reshape(*mu.shape[:-1], 4, 4)
+    displacements = [displaced(H_hat, sizes, *shares) for shares in mu.reshape(-1, 3).tolist()]
+    return np.array(displacements).reshape(*mu.shape[:-1], 4, 4)
 
 
 class Reference(NamedTuple):

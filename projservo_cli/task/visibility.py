@@ -85,13 +85,13 @@ def choose_sense(a: Vec4, a_t: Vec4, H_r: Mat4, theta: float, task: Task, agains
     face, so a camera that sees the face at both ends of the shorter arc sees it throughout, and that common
     case needs no search.
     """
-    seen = True
+    visible = True
     for view in range(2):
         O = vec(task.O[view])
         sign = float(task.visible[view])
-        seen = seen and sign * dot(a, O) > 0.0 and sign * dot(a_t, O) > 0.0
+        visible = visible and sign * dot(a, O) > 0.0 and sign * dot(a_t, O) > 0.0
     near_half_turn = math.pi - theta < CONTINUITY_BAND
-    if seen and math.pi - theta > HALF_TURN_TOLERANCE:
+    if visible and math.pi - theta > HALF_TURN_TOLERANCE:
         return theta
     other = theta - 2.0 * math.pi
     lost, worst = _violations(a, H_r, theta, task)
@@ -125,5 +125,7 @@ def visibility_angles(a: FloatArray, H_hat: FloatArray, O: FloatArray) -> tuple[
     """
     first = H_hat @ O
     second = H_hat @ first
-    found, plus, minus = incidence_angles(float(a @ (O + second)), float(-(a @ first)), float(-(a @ second)))
-    return (plus, minus) if found else None
+    changes, plus, minus = incidence_angles(
+        float(a @ (O + second)), float(-(a @ first)), float(-(a @ second))
+    )
+    return (plus, minus) if changes else None

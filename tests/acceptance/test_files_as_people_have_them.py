@@ -10,9 +10,8 @@ from projservo_cli import cli
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.config.inputs import plan_inputs, truth_of
 from projservo_cli.detection import TagFinder
-from projservo_cli.masking import masked
 from projservo_cli.nominal import read_nominal
-from projservo_cli.records import VIEWS, InputError
+from projservo_cli.records import VIEWS, InputError, masked
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.store import load
 from projservo_cli.store.tables import read_table

@@ -12,7 +12,7 @@ import numpy as np
 from projservo_cli.config import load_config, shipped
 from projservo_cli.config.inputs import scene_of
 from projservo_cli.simulation.mjcf import mujoco
-from projservo_cli.simulation.scene import rendered_model
+from projservo_cli.simulation.rendering import rendered_model
 
 STEP_S = 0.002  # of the integration
 STALL_NM = 1.9  # torque of a servo at the end of what it can do

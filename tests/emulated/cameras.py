@@ -8,7 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
-from projservo_cli.simulation.cameras import Frames
+from projservo_cli.simulation.rendering import Frames
 
 _BOUNDARY = "frame"
 _KEPT = 90  # frames of each camera for whoever comes late

@@ -8,13 +8,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from projservo_cli.geometry.algebra import (
-    as_array,
-    composed_angle,
-    composed_operator,
-    incidence_angles,
-    mat,
-)
+from projservo_cli.geometry.algebra import as_array, incidence_angles, mat
+from projservo_cli.geometry.displacements import composed_angle, composed_operator
 from tests.samples import frame, revolute
 
 angles = st.floats(-2 * math.pi, 2 * math.pi)

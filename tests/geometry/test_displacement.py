@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.geometry.algebra import (
-    as_array,
+from projservo_cli.geometry.algebra import as_array, mat
+from projservo_cli.geometry.displacements import (
     exp_rotation,
-    mat,
     normalize_displacement,
     translation,
     twist_exponential,

@@ -27,7 +27,7 @@ def copy(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["records.py", "control/law.py", "geometry/stereo.py", "simulation/ideal.py"]
+    "name", ["records.py", "control/law.py", "geometry/stereo.py", "simulation/analytic_plant.py"]
 )
 def test_an_edited_helper_or_a_new_kernel_makes_another_cache(copy, name, tmp_path, monkeypatch):
     monkeypatch.setenv("PROJSERVO_CACHE_DIR", str(tmp_path / "cache"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators, project
-from projservo_cli.records import PRISMATIC, REVOLUTE, Model
+from projservo_cli.records import Model, prismatic_of
 from tests.samples import arm, face, frame, hat, in_frame, operators, pixels, poe
 
 TYPES = ["RRRRRR", "RRPRRR", "PRR", "RRRRRRR", "R", "RRRPP"]
@@ -79,11 +79,10 @@ def test_pixels_of_points():
 def test_true_kinematics_reproduce_the_reference_pixels(reference_truth, shared_data, name):
     """200 poses of another software's robot and cameras, to the 1e-6 px its table is written with."""
     truth = reference_truth(name)
-    types = [PRISMATIC if kind == "P" else REVOLUTE for kind in truth["joint_types"]]
     model = Model(
         np.array([truth["camera_left"], truth["camera_right"]]),
         np.array([hat(screw["w"], screw["v"]) for screw in truth["screws"]]),
-        np.array(types, dtype=np.int64),
+        prismatic_of(truth["joint_types"]),
         np.array(truth["q_reference"]),
         np.array([0, 0, 0, 1.0]),
     )
@@ -97,7 +96,7 @@ def test_true_kinematics_reproduce_the_reference_pixels(reference_truth, shared_
     for row in rows:
         if row["pose"] != last:
             last = row["pose"]
-            q = np.array([float(row[f"q{i + 1}"]) for i in range(len(types))])
+            q = np.array([float(row[f"q{i + 1}"]) for i in range(len(truth["joint_types"]))])
             s = project(model.P, M_0 @ forward_kinematics(model, q).T)
         seen = [[float(row[f"{axis}_{view}"]) for axis in "uv"] for view in ("left", "right")]
         worst = max(worst, np.abs(s[:, int(row["marker"])] - seen).max())

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.algebra import invariant_rotations, mat
+from projservo_cli.geometry.algebra import mat
+from projservo_cli.geometry.displacements import invariant_rotations
 from projservo_cli.geometry.kinematics import backward, forward_kinematics, joint_operators
-from projservo_cli.geometry.mechanisms import Seen, in_span, joint_motion, make_span, reach, workspace
+from projservo_cli.geometry.mechanisms import MeasuredFace, in_span, joint_motion, make_span, reach, workspace
 from projservo_cli.records import WorkFailed
 from tests.samples import arm, face, frame, in_frame
 
@@ -80,7 +81,7 @@ def test_newton_finds_the_joints_of_a_redundant_arm(types, rng):
         goal = forward_kinematics(model, q_start + size * rng.normal(size=n))
         goal = goal @ np.linalg.inv(forward_kinematics(model, q_start))
         q = q_start.copy()
-        assert reach(model, Seen(A, backward(model, q_start)), mat(goal), q, work, 1e-8)
+        assert reach(model, MeasuredFace(A, backward(model, q_start)), mat(goal), q, work, 1e-8)
         found = forward_kinematics(model, q) @ np.linalg.inv(forward_kinematics(model, q_start))
         assert found == pytest.approx(goal, abs=1e-12)
         # What the arm can do without moving the face is left alone, to first order.

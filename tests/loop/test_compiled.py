@@ -8,9 +8,9 @@ import pytest
 from projservo_cli.control.law import Law, reset
 from projservo_cli.laws import CODES, LAWS
 from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.metrics import SUBSAMPLES, Ended, path_deviation, summarize
-from projservo_cli.loop.step import CONVERGED, MAX_STEPS, RUNNING
-from projservo_cli.simulation.ideal import Ends
+from projservo_cli.loop.run_metrics import SUBSAMPLES, Ended, path_deviation, summarize
+from projservo_cli.loop.verdicts import CONVERGED, MAX_STEPS, RUNNING
+from projservo_cli.simulation.analytic_plant import Ends
 from tests.samples import displacement, pixels, poe
 from tests.scene import GAINS, STEP, Run, limits, scene
 

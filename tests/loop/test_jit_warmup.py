@@ -4,9 +4,9 @@ from numba import typeof
 
 from projservo_cli.control.law import ERRORS, State, new_state
 from projservo_cli.loop.jit_warmup import calls
-from projservo_cli.loop.step import Log, new_log
+from projservo_cli.loop.verdicts import Log, new_log
 from projservo_cli.records import Model
-from projservo_cli.simulation.ideal import Ends, Plant
+from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.task.face import Task
 from tests.known import configured, known_scenario
 

@@ -5,8 +5,8 @@ import pytest
 
 from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
-from projservo_cli.loop.step import VERDICTS
-from projservo_cli.simulation.ideal import AnalyticPlant
+from projservo_cli.loop.verdicts import VERDICTS
+from projservo_cli.simulation.analytic_plant import AnalyticPlant
 from tests.loop.test_python_loop import Towards, in_python, same_logs
 from tests.scene import GAINS, Run, limits, scene
 

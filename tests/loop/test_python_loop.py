@@ -8,9 +8,9 @@ import pytest
 from projservo_cli.control.law import ERRORS, OK
 from projservo_cli.laws import CODES, LAWS
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
-from projservo_cli.loop.step import VERDICTS
+from projservo_cli.loop.verdicts import VERDICTS
 from projservo_cli.records import InputError
-from projservo_cli.simulation.ideal import AnalyticPlant
+from projservo_cli.simulation.analytic_plant import AnalyticPlant
 from tests.control.following import Followed, tracked
 from tests.loop.bits import FOLLOWING
 from tests.samples import frame

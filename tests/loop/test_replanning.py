@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.loop.replanning import ExecutionMonitor
-from projservo_cli.loop.step import (
+from projservo_cli.loop.verdicts import (
     BEHIND_CAMERA,
     CONVERGED,
     DIVERGED,

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from projservo_cli.loop.settling import StallMonitor
-from projservo_cli.loop.step import CONVERGED, FOLLOWING_ERROR, NO_PROGRESS, RUNNING, WAITING, new_log
+from projservo_cli.loop.stall_monitor import StallMonitor
+from projservo_cli.loop.verdicts import CONVERGED, FOLLOWING_ERROR, NO_PROGRESS, RUNNING, WAITING, new_log
 from projservo_cli.records import JointLimits
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.latency import NOTHING_KNOWN

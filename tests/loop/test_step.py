@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.control.law import LOST, OK, SINGULAR
 from projservo_cli.geometry.kinematics import beyond_limits
-from projservo_cli.loop.step import (
+from projservo_cli.loop.verdicts import (
     BEHIND_CAMERA,
     CONVERGED,
     DIVERGED,
@@ -199,9 +199,10 @@ def test_markers_outside_an_image(place, value):
 
 def test_first_joint_beyond_its_limits():
     lower, upper = np.array([-1.0, -2.0, 0.0]), np.array([1.0, 2.0, 0.5])
-    assert beyond_limits(np.array([1.0, -2.0, 0.5]), lower, upper) == -1
-    assert beyond_limits(np.array([0.0, 2.1, 0.6]), lower, upper) == 1
-    assert beyond_limits(np.array([math.nan, 0.0, 0.0]), lower, upper) == 0
+    bounds = position_limits(lower, upper)
+    assert beyond_limits(bounds, np.array([1.0, -2.0, 0.5]), 0.0) == -1
+    assert beyond_limits(bounds, np.array([0.0, 2.1, 0.6]), 0.0) == 1
+    assert beyond_limits(bounds, np.array([math.nan, 0.0, 0.0]), 0.0) == 0
     s, read = np.zeros((2, 3, 2)), np.array([0, 0, 9.1, 9.2, 0, 0])
     assert noted(s, s, read=read)[0].events.tolist() == [-1, 1, 2]
     assert noted(s, s, read=read, stop_at_joint_limit=True)[0].events.tolist() == [-1, -1, -1]

@@ -13,11 +13,11 @@ from projservo_cli.calibration import predict
 from projservo_cli.calibration.prediction import (
     Parameters,
     dense_pixel_changes,
-    displacements,
     image_points,
     moved_points,
     parameters_from,
 )
+from projservo_cli.geometry.displacements import displacements
 from projservo_cli.monitoring import statistics
 from projservo_cli.monitoring.accuracy import Posture
 from projservo_cli.monitoring.frame_pairs import FramePair
@@ -73,7 +73,7 @@ def arm():
     config = configured("ur5", f"noise.calibration_px={SIGMA}")
     truth = truth_of(config)
     model = truth.model
-    scene = Parameters(model.P, model.H_hat_0, model.joint_types == 1, truth.M)
+    scene = Parameters(model.P, model.H_hat_0, model.prismatic, truth.M)
     return Arm(calibrate.run(config)[1], scene, model.q_reference, truth.image_size)
 
 

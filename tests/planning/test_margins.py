@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from projservo_cli.image_size import BEHIND
 from projservo_cli.planning.margins import (
-    BEHIND,
     along_shares,
     image_margin,
     joint_margin,

@@ -7,8 +7,8 @@ import numpy as np
 
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.config.inputs import report_inputs
-from projservo_cli.laws import LAW_SPECS, LAWS, name_of
-from projservo_cli.records import PRISMATIC, Calibration
+from projservo_cli.laws import LAW_SPECS, LAWS, run_name
+from projservo_cli.records import Calibration
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import ReportData
 from projservo_cli.robots.frame_recorder import FrameRecorder
@@ -44,7 +44,7 @@ def case(name="paper", steps=SHORT, whole=False):
     }
     traces["direct_three"] = filmed(traces["direct_three"], *true.image_size.astype(int))
     for law in FOLLOWING:
-        followed = name_of(law, LAW_SPECS[law].modes[1])
+        followed = run_name(law, LAW_SPECS[law].modes[1])
         traces[followed] = driven(scenario, plan, followed, model)
     clean = replace(
         known_scenario(config.idealized), termination=scenario.termination._replace(stop_at_joint_limit=False)
@@ -92,7 +92,7 @@ def filmed(trace, width, height):
 def known(config, true, model, q):
     """The record of a model known in the frame of ``projective_twin``, as if it had been fitted freely."""
     M = np.linalg.solve(studies.H_PE, true.M.T).T
-    scene = Parameters(model.P, model.H_hat_0, model.joint_types == PRISMATIC, M)
+    scene = Parameters(model.P, model.H_hat_0, model.prismatic, M)
     J, own = scene.derivative(q - model.q_reference)
     own = np.einsum("kvmia,mn->kvmina", own, np.eye(len(M))).reshape(*own.shape[:-1], -1)
     J, first = np.concatenate([J, own], axis=-1), J.shape[-1]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from projservo_cli.control.law import OK
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.loop.step import NO_PROGRESS, Instant, new_log, plateau_stretch, verdict_at
+from projservo_cli.loop.verdicts import NO_PROGRESS, Instant, new_log, plateau_stretch, verdict_at
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.report_data import curve_difference
 from tests.report.cases import SPECS, case

@@ -3,9 +3,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.algebra import exp_rotation
+from projservo_cli.geometry.displacements import exp_rotation
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.records import PRISMATIC, REVOLUTE
 from projservo_cli.report import style
 from projservo_cli.report.figures import planned, scene
 from projservo_cli.report.figures.path_deviation import study_numbers
@@ -82,7 +81,7 @@ def test_steep_profile_does_the_translation_early_and_the_same_rotations(materia
 
 def test_skeleton_passes_the_axes_of_revolute_joints():
     H_hat = np.array([revolute([0, 0, 0], [0, 0, 1]), prismatic([1, 0, 0]), revolute([2, 5, 3], [0, 1, 0])])
-    kinds = np.array([REVOLUTE, PRISMATIC, REVOLUTE])
+    kinds = np.array([False, True, False])
     points = scene.skeleton(H_hat, kinds, np.array([4.0, 0, 3]))
     np.testing.assert_allclose(points, [[0, 0, 0], [0, 0, 0], [2, 0, 3], [4, 0, 3]], atol=1e-15)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config, plain_yaml
-from projservo_cli.records import REVOLUTE, position_limits
-from projservo_cli.simulation.arm import Arm
+from projservo_cli.records import position_limits
+from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.faults import FaultyRobot, Points, World, full_reach
 from projservo_cli.simulation.workspace import Truth
 from tests.samples import displacement, pixels, revolute, rig
@@ -28,7 +28,7 @@ def arm():
     twists = np.array([revolute([x, 0, 0], [0, 1, 0]) for x in (0.0, 0.4)])
     limits = np.full(2, math.pi)
     tool = displacement([0, 0, 0], [0.7, 0, 0])
-    return Arm(twists, np.full(2, REVOLUTE), np.zeros(2), tool, position_limits(-limits, limits))
+    return SerialArm(twists, np.zeros(2, dtype=np.bool_), np.zeros(2), tool, position_limits(-limits, limits))
 
 
 def displaced(q):

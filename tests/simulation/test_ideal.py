@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.geometry.algebra import mat
-from projservo_cli.simulation.ideal import AnalyticPlant, observe
+from projservo_cli.simulation.analytic_plant import AnalyticPlant, observe
 from tests.samples import displacement, poe
 from tests.scene import STEP, scene
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from projservo_cli.loop.step import plateau_stretch
+from projservo_cli.loop.verdicts import plateau_stretch
 from projservo_cli.stages.servo import drive
 from tests.stages.cases import Case, case
 

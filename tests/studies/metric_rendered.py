@@ -14,8 +14,8 @@ import numpy as np
 from scipy.linalg import expm
 
 import projservo_cli as projservo
+from projservo_cli.geometry.displacements import screw_displacements, screws
 from projservo_cli.geometry.kinematics import forward_kinematics
-from projservo_cli.geometry.rigid import exponentials, screws
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.metric.frame import base_frame, base_joints
 from projservo_cli.metric.kinematic_errors import kinematic_errors
@@ -31,7 +31,7 @@ SEEDS = (1, 2, 3)
 def at_zero(truth):
     """Screws (n, 6) of the true arm at readings of zero."""
     robot = truth.robot
-    back = exponentials(screws(robot.H_hat_0), robot.joint_types == 1, -robot.q_reference)
+    back = screw_displacements(screws(robot.H_hat_0), robot.prismatic, -robot.q_reference)
     T, found = np.eye(4), []
     for H, E in zip(robot.H_hat_0, back, strict=True):
         found.append(screws(T @ H @ np.linalg.inv(T)))
@@ -78,7 +78,9 @@ def study(name, seed):
         true_zero, ~np.ones(len(true_zero), bool), base_joints(true_zero, ~np.ones(len(true_zero), bool))
     )
     ours = m.triangulate(s) @ base[:3, :3].T + base[:3, 3]
-    hands = np.array([np.linalg.multi_dot(exponentials(model, np.zeros(6, bool), q)) for q in observation.q])
+    hands = np.array(
+        [np.linalg.multi_dot(screw_displacements(model, np.zeros(6, bool), q)) for q in observation.q]
+    )
     points = M[:, :3] - M[:, :3].mean(axis=0)
     views = [hand_eye.calibrated(P, points, hands, images[:, v]) for v, P in enumerate(truth.P)]
     P = np.array([view.K @ view.base[:3] for view in views])

@@ -5,13 +5,14 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.calibration.detections import MAX_JUDGED, even_choice, per_rad
 from projservo_cli.calibration.prediction import (
     error_factor,
     joint_derivative,
     parameters_from,
     pixel_changes,
+    predict,
+    prediction_variance,
 )
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
 from projservo_cli.report import style

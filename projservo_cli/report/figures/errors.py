@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from projservo_cli.records import PRISMATIC, FloatArray, Trace
+from projservo_cli.records import FloatArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, ReportData, curve_difference, percent, registered
 
@@ -146,7 +146,7 @@ def _draw_three(data: Data, figure: "style.Figure") -> None:
 
 def _data_joints(report_data: ReportData) -> Data:
     """Joints and their steps under directTHREE with calibrated operators, in deg and in mm."""
-    prismatic = report_data.robot.joint_types == PRISMATIC
+    prismatic = report_data.robot.prismatic
     scale = np.where(prismatic, 1e3, np.degrees(1.0))
     result: Data = {"prismatic": prismatic, "step_limit_deg": np.array(report_data.extra.step_limit_deg)}
     for name, limited in _WAYS:

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import POINT_LAWS, title_of
-from projservo_cli.loop.step import plateau_stretch
+from projservo_cli.loop.verdicts import plateau_stretch
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.report_data import DIRECT, VIEWS, Data, ReportData, percent, registered

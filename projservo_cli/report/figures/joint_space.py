@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics, project
-from projservo_cli.planning.margins import BEHIND, CLEAR, CONSTRAINTS, IMAGE, WIDTH
-from projservo_cli.records import PRISMATIC, FloatArray, IntArray, Plan
+from projservo_cli.image_size import BEHIND
+from projservo_cli.planning.margins import CLEAR, CONSTRAINTS, IMAGE, WIDTH
+from projservo_cli.records import FloatArray, IntArray, Plan
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import image_border, near_pixels
 from projservo_cli.report.report_data import VIEWS, Data, ReportData, registered
@@ -49,7 +50,7 @@ _DISTANCES = {
 def _data(report_data: ReportData) -> Data:
     """Images, joints and margins along the plan; trees as lines with NaN between their edges."""
     plan, order, model = report_data.plan, report_data.plant.order, report_data.calibrated
-    slides = report_data.robot.joint_types == PRISMATIC
+    slides = report_data.robot.prismatic
     unit = np.where(slides, 1e3, np.degrees(1.0))
     timed = bool(np.isfinite(plan.time).all())
     name = f"{plan.profile.replace('_', ' ')} profile"

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from projservo_cli.geometry.displacements import twists
 from projservo_cli.geometry.kinematics import joint_operators
-from projservo_cli.geometry.rigid import twists
 from projservo_cli.metric.frame import Metric, links
 from projservo_cli.records import MM, VIEWS, FloatArray
 from projservo_cli.report import style
@@ -90,7 +90,7 @@ def _data(report_data: Fit) -> Data:
         "position_std_mm": metric.position_std(q),
         "semi_axes": semi_axes,
         "factor": np.array(style.magnification(float(radius.max()), _SHOWN * extent)),
-        "robot": skeleton(joint_operators(arm, q[0]), arm.joint_types, tools[0]),
+        "robot": skeleton(joint_operators(arm, q[0]), arm.prismatic, tools[0]),
         "pyramids": pyramids(metric.body.P, rectangle(low, high), tools),
     }
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import exp_rotation
+from projservo_cli.geometry.displacements import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import exp_rotation
+from projservo_cli.geometry.displacements import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.geometry.stereo import triangulate_points
+from projservo_cli.image_size import border_distance
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.report_data import VIEWS, Data, ReportData, registered
@@ -193,13 +194,13 @@ def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
     M = np.einsum("rij,pmj->mrpi", onto, plan.A @ np.swapaxes(within, 1, 2)).copy()
     moved = M @ plan.H_hat[0].T
     depth = np.sign(np.einsum("vc,mc->vm", P[:, 2], plan.A))[:, :, None, None]
-    wide, high = (report_data.plant.image_size - 0.5).T[:, :, None, None, None]
+    size = report_data.plant.image_size[:, None, None, None]
     result = np.empty((2, len(mu), len(mu)))
     for i, share in enumerate(mu):
         there = (M + share * plan.tau * moved).reshape(-1, 4)
         m = (there @ P.swapaxes(1, 2)).reshape(2, *M.shape[:3], 3)
-        u, v = np.moveaxis(distort_visible(lens[:, None, None, None], m[..., :2] / m[..., 2:]), -1, 0)
-        lowest = np.minimum(np.minimum(u + 0.5, wide - u), np.minimum(v + 0.5, high - v)).min(axis=1)
+        pixels = distort_visible(lens[:, None, None, None], m[..., :2] / m[..., 2:])
+        lowest = border_distance(pixels, size).min(axis=1)
         front = (m[..., 2] * depth > 0.0).all(axis=1)
         lowest = np.where(front & np.isfinite(lowest), lowest, -np.inf)
         best = lowest.min(axis=0).argmax(axis=1)

@@ -4,13 +4,14 @@ from typing import Any
 
 import numpy as np
 
+from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.geometry.rigid import homogeneous
-from projservo_cli.records import PRISMATIC, FloatArray
+from projservo_cli.image_size import image_corners
+from projservo_cli.records import BoolArray, FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, ReportData, registered
+from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import camera_center
-from projservo_cli.simulation.ideal import Plant
 from projservo_cli.task.face import center_of
 
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
@@ -28,7 +29,7 @@ def _data(report_data: ReportData) -> Data:
     face = plant.M[plant.order]
     tool = (start @ robot.base_tool)[:3, 3]
     result: Data = {
-        "robot": skeleton(joint_operators(plant.model, q), robot.joint_types, tool),
+        "robot": skeleton(joint_operators(plant.model, q), robot.prismatic, tool),
         "face_start": (face @ start.T)[:, :3],
     }
     visible = plant_pyramids(plant, result["face_start"])
@@ -42,15 +43,15 @@ def _data(report_data: ReportData) -> Data:
     return result
 
 
-def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArray:
+def skeleton(H_hat: FloatArray, prismatic: BoolArray, tool: FloatArray) -> FloatArray:
     """Points (k, 3) of a polyline from the base over all revolute axes to the tool, m.
 
     From each point the perpendicular is dropped onto the next axis, known by the metric operators
     (n, 4, 4) at the current joints; a prismatic joint has a direction but no place.
     """
     points = [np.zeros(3)]
-    for operator, kind in zip(H_hat, joint_types, strict=True):
-        if kind == PRISMATIC:
+    for operator, slides in zip(H_hat, prismatic, strict=True):
+        if slides:
             continue
         w = np.array([operator[2, 1], operator[0, 2], operator[1, 0]])
         on_axis = np.cross(w, operator[:3, 3]) / (w @ w)
@@ -60,7 +61,7 @@ def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArra
 
 def plant_pyramids(plant: Plant, face: FloatArray) -> FloatArray:
     """Pyramids (2, 5, 3) of the whole images of a plant, by ``pyramids``."""
-    return pyramids(plant.model.P, rectangle(np.full(2, -0.5), plant.image_size - 0.5), face)
+    return pyramids(plant.model.P, rectangle(*np.moveaxis(image_corners(plant.image_size), -2, 0)), face)
 
 
 def pyramids(P: FloatArray, corners: FloatArray, face: FloatArray) -> FloatArray:

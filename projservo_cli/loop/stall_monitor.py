@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from projservo_cli.loop.step import (
+from projservo_cli.loop.verdicts import (
     CONVERGED,
     FOLLOWING_ERROR,
     NO_PROGRESS,

@@ -1,5 +1,6 @@
-"""The scene before rendered cameras: an arm, tags on its tool, two cameras and light."""
+"""Rendered cameras: the scene before them, an arm with tags and light, and the frames that they take."""
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.keys import File
-from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray
+from projservo_cli.records import CORNERS, ByteArray, FloatArray, InputError, IntArray
 from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Tag
-from projservo_cli.simulation.arm import Arm, roll_axis
-from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, spec_of, tip_of
+from projservo_cli.simulation.arm import SerialArm, roll_axis
+from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, no_gl, spec_of, tip_of
 
 # Thickness of the first link of an arm and of the last, in lengths of the arm, and of none in any.
 _THICK, _THIN, _LEAST_LINK_M = 0.05, 0.03, 1e-3
@@ -37,17 +38,18 @@ _SENSOR_M = 1e-5  # width of a pixel of a camera's sensor; only ratios to it mat
 _NO_SKEW = 1e-9  # of a camera's pixels, which rounding leaves
 _NEAR_M, _FAR_M = 0.01, 50.0  # what cameras see
 _WALL, _WALL_M = "far wall", 40.0  # what stands behind everything, and how far
-FINER = 2
+_FINER = 2
 """Pixels of a drawing along each of a frame: of one alone, edges are drawn up to a tenth of a pixel off."""
 CAMERAS = ("left camera", "right camera")
 """Names of both in the model."""
+_STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RenderedScene:
     """Scene and settings of rendered cameras."""
 
-    arm: Arm
+    arm: SerialArm
     P: FloatArray  # (2, 3, 4) cameras, px
     size: tuple[int, int]  # width and height of the images, px
     tags: tuple[Tag, ...]
@@ -62,7 +64,7 @@ class Scene:
 class RenderedModel:
     """A compiled model, and what in it stands for what."""
 
-    scene: Scene
+    scene: RenderedScene
     finder: TagFinder
     model: Any  # MjModel, which nobody changes
     key: int  # of the keyframe that is its beginning, −1 for none
@@ -109,7 +111,7 @@ def lens_of(P: FloatArray, k1: float) -> FloatArray:
 
 
 @lru_cache(maxsize=4)
-def rendered_model(scene: Scene) -> RenderedModel:
+def rendered_model(scene: RenderedScene) -> RenderedModel:
     """The compiled model of a scene.
 
     Raises InputError if MuJoCo or OpenCV is missing, or the scene cannot be made.
@@ -151,7 +153,7 @@ def rendered_model(scene: Scene) -> RenderedModel:
     )
 
 
-def _add_arm(spec: Any, arm: Arm) -> None:
+def _add_arm(spec: Any, arm: SerialArm) -> None:
     """Add an arm of capsules.
 
     Every body has the axes of the base at the reference, where joints have their readings; a link reaches
@@ -160,10 +162,10 @@ def _add_arm(spec: Any, arm: Arm) -> None:
     mj = mujoco()
     spec.compiler.degree = False
     points, axes = [np.zeros(3)], []
-    for twist, kind in zip(arm.H_hat_0, arm.joint_types, strict=True):
+    for twist, slides in zip(arm.H_hat_0, arm.prismatic, strict=True):
         w, v = np.array([twist[2, 1], twist[0, 2], twist[1, 0]]), twist[:3, 3]
-        axes.append(v if kind == PRISMATIC else w)
-        foot = points[-1] if kind == PRISMATIC else np.cross(w, v)
+        axes.append(v if slides else w)
+        foot = points[-1] if slides else np.cross(w, v)
         points.append(foot + axes[-1] * (axes[-1] @ (points[-1] - foot)))
     points.append(arm.base_tool[:3, 3])
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -172,7 +174,7 @@ def _add_arm(spec: Any, arm: Arm) -> None:
     for i, radius in enumerate(thickness):
         if i > 0:
             body = body.add_body(name=f"link {i}")
-            slides = arm.joint_types[i - 1] == PRISMATIC
+            slides = arm.prismatic[i - 1]
             body.add_joint(
                 name=f"joint {i}",
                 type=mj.mjtJoint.mjJNT_SLIDE if slides else mj.mjtJoint.mjJNT_HINGE,
@@ -229,8 +231,8 @@ def _add_tags(spec: Any, tip: Any, tool: FloatArray, tags: Sequence[Tag], finder
 def _put_light(spec: Any, light: str, P: FloatArray) -> None:
     """Light from all around and a little from above, or hard light from one side of the rig alone."""
     mj = mujoco()
-    for given in list(spec.lights):
-        spec.delete(given)
+    for original in list(spec.lights):
+        spec.delete(original)
     head, (_, ahead) = spec.visual.headlight, roll_axis(P)
     soft = light == "soft"
     head.active = 1
@@ -293,5 +295,110 @@ def _add_cameras(spec: Any, K: FloatArray, R: FloatArray, t: FloatArray, size: t
     spec.stat.extent = 1.0
     visual = spec.visual
     visual.map.znear, visual.map.zfar = _NEAR_M, _FAR_M
-    visual.global_.offwidth, visual.global_.offheight = FINER * width, FINER * height
+    visual.global_.offwidth, visual.global_.offheight = _FINER * width, _FINER * height
     visual.quality.offsamples = 0  # the means of finer pixels do as much
+
+
+class Frames:
+    """Both cameras of a scene, which a thread opens, looks with and closes.
+
+    ``rendered``: their scene. ``last``: (2, height, width) the last frames of both.
+    """
+
+    borders = True
+
+    def __init__(self, rendered: RenderedModel) -> None:
+        scene = rendered.scene
+        self.rendered, self._finder, self._scene = rendered, rendered.finder, scene
+        self._places = {number: i for i, number in enumerate(scene.numbers)}
+        width, height = scene.size
+        self.last: ByteArray = np.zeros((2, height, width), dtype=np.uint8)
+        self._maps = self._mapped(scene.P)
+        self._renderer: Any = None
+
+    def open(self) -> None:
+        """Make ready to draw, in the thread that looks; an InputError says what to install for that."""
+        mj, rendered = mujoco(), self.rendered
+        height, width = self.last.shape[1] + 2 * rendered.margin, self.last.shape[2] + 2 * rendered.margin
+        try:
+            self._renderer = mj.Renderer(rendered.model, _FINER * height, _FINER * width)
+        except Exception as error:  # of another kind for each library of GL
+            raise InputError(no_gl(error)) from error
+        self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._scene.options.light == "side"
+        self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SKYBOX] = 0  # of a file: it takes longer than the rest
+        self._model = copy.copy(rendered.model)
+        self._data = rendered.begin(self._model, rendered.model.qpos0[rendered.positions])
+        self._shown = mj.MjvOption()
+        self._shown.sitegroup[:] = 0
+
+    def close(self) -> None:
+        """Let go of what draws."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def capture(
+        self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pixels (m, 2) that are found in a frame, NaN where unseen, and their deviations (m,), px.
+
+        q : (k, n) joints at instants of its exposure, rad or m.
+        moved : number of a marker whose tag was moved, and by how much in the frame of the tool, (3,) m.
+        """
+        self._move(moved)
+        still = np.abs(q - q[len(q) // 2]).max() < _STILL
+        shots = [self._drawn(view, joints) for joints in (q[len(q) // 2 :][:1] if still else q)]
+        image = np.mean(shots, axis=0, dtype=np.float32)
+        cv = self._finder.cv
+        if self._scene.options.blur_px > 0.0:
+            image = cv.GaussianBlur(image, (0, 0), self._scene.options.blur_px)
+        image += np.float32(self._scene.options.grey_noise) * rng.standard_normal(
+            image.shape, dtype=np.float32
+        )
+        self.last[view] = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return self._found(view)
+
+    def _found(self, view: int) -> tuple[FloatArray, FloatArray]:
+        """Pixels (m, 2) of the corners in the last frame of a view, NaN where unseen, and deviations (m,)."""
+        pixels, sigma = np.full((len(self._places), 2), np.nan), np.full(len(self._places), np.nan)
+        tags, _ = self._finder.find(self.last[view].astype(np.float64))
+        for number, tag in tags.items():
+            for k in range(CORNERS):
+                if (place := self._places.get(CORNERS * number + k)) is not None:
+                    pixels[place], sigma[place] = tag.pixels[k], tag.sigma[k]
+        return pixels, sigma
+
+    def _drawn(self, view: int, q: FloatArray) -> ByteArray:
+        """Return the grey values (height, width) of a camera at joints (n,), without blur and noise."""
+        mj = mujoco()
+        self._data.qpos[self.rendered.positions] = q
+        mj.mj_kinematics(self._model, self._data)
+        mj.mj_camlight(self._model, self._data)
+        self._renderer.update_scene(self._data, CAMERAS[view], self._shown)
+        # Tags, their holder and light have no colour: green alone stands for grey.
+        fine, cv = np.ascontiguousarray(self._renderer.render()[..., 1]), self._finder.cv
+        if self._maps is not None:
+            fine = cv.remap(fine, *self._maps[view], cv.INTER_LANCZOS4)
+        return np.asarray(cv.resize(fine, self._scene.size, interpolation=cv.INTER_AREA))
+
+    def _move(self, moved: tuple[int, FloatArray] | None) -> None:
+        """Put every plate where it is, but for one that was moved."""
+        self._model.geom_pos[:] = self.rendered.model.geom_pos
+        if moved is not None:
+            plate = self.rendered.plates[self._places[moved[0]] // CORNERS]
+            self._model.geom_pos[list(plate)] += self.rendered.tool @ moved[1]
+
+    def _mapped(self, P: FloatArray) -> list[tuple[FloatArray, FloatArray]] | None:
+        """Return the places of finer pixels of a frame in the drawing, u and v of each view."""
+        width, height = _FINER * self._scene.size[0], _FINER * self._scene.size[1]
+        offset = 0.5 * (_FINER - 1)  # centres of pixels have whole coordinates
+        u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+        pixels = (np.stack([u, v], axis=-1).reshape(-1, 2) - offset) / _FINER
+        lens = lens_of(P, self._scene.options.k1)
+        drawn = drawn_at(P, lens, np.stack([pixels, pixels]))
+        if np.array_equal(drawn[0], pixels) and np.array_equal(drawn[1], pixels):
+            return None
+        maps = (
+            (_FINER * (drawn + self.rendered.margin) + offset).reshape(2, height, width, 2).astype(np.float32)
+        )
+        return [(np.ascontiguousarray(both[..., 0]), np.ascontiguousarray(both[..., 1])) for both in maps]

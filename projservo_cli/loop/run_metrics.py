@@ -4,11 +4,11 @@ import math
 from typing import NamedTuple
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, sub, vec, vec_into
-from projservo_cli.geometry.jit import composed, merged, njit
-from projservo_cli.geometry.kinematics import forward
-from projservo_cli.loop.step import CONVERGED, Log
+from projservo_cli.geometry.jit import inline, merged, njit
+from projservo_cli.geometry.kinematics import beyond_limits, forward
+from projservo_cli.loop.verdicts import CONVERGED, Log
 from projservo_cli.records import MM, FloatArray
-from projservo_cli.simulation.ideal import Ends, Plant, shows_face
+from projservo_cli.simulation.analytic_plant import Ends, Plant, shows_face
 from projservo_cli.task.face import center_of
 
 _ROUND_OFF = 1e-9  # rad or m, by which a joint at its limit may seem to be beyond
@@ -90,10 +90,8 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
 def _keeps_within(plant: Plant, log: Log, steps: int) -> bool:
     """Whether at each instant all joints are within their limits and the face within both true images."""
     for k in range(steps + 1):
-        for i in range(log.q.shape[1]):
-            q = log.q[k, i]
-            if not plant.limits.lower[i] - _ROUND_OFF <= q <= plant.limits.upper[i] + _ROUND_OFF:
-                return False
+        if beyond_limits(plant.limits, log.q[k], _ROUND_OFF) >= 0:
+            return False
         if not shows_face(plant, mat(log.H[k]), log.scratch[0]):
             return False
     return True
@@ -116,7 +114,7 @@ def _distance(A: Vec4, B: Vec4) -> float:
     return math.sqrt(dot(distance, distance))
 
 
-@composed
+@inline
 def angle_between(A: Mat4, B: Mat4) -> float:
     """Angle of the rotation from pose A to pose B, rad."""
     trace = (A[0] * B[0] + A[4] * B[4] + A[8] * B[8]) + (A[1] * B[1] + A[5] * B[5] + A[9] * B[9])

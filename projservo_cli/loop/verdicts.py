@@ -1,6 +1,6 @@
 """One period of the loop without the law: limits, counting, verdict.
 
-Precedence of the verdicts of ``verdict_at`` at one instant, first match wins; ``loop.monitors`` states what
+Precedence of the verdicts of ``verdict_at`` at one instant, first match wins; ``loop.python`` states what
 rules before and after it:
 
 1. ``behind camera``: a marker is not in front of a camera.
@@ -26,9 +26,9 @@ import numpy as np
 
 from projservo_cli.control.law import LOST, SINGULAR, limit_speed
 from projservo_cli.geometry.jit import merged
-from projservo_cli.geometry.kinematics import beyond_limits
+from projservo_cli.geometry.kinematics import beyond_limits, from_border
 from projservo_cli.records import FloatArray, IntArray
-from projservo_cli.simulation.ideal import Plant, inside
+from projservo_cli.simulation.analytic_plant import Plant
 
 RUNNING = -1
 WAITING = -3  # for lost markers; no verdict of a run
@@ -126,7 +126,7 @@ def note(log: Log, k: int, s_star: FloatArray, plant: Plant, limits: Limits) -> 
     left = _outside(log.s[k], s_star.shape[1], plant.image_size)
     if left and log.events[0] < 0.0:
         log.events[0] = k
-    joint = beyond_limits(log.read[k], plant.limits.lower, plant.limits.upper)
+    joint = beyond_limits(plant.limits, log.read[k], 0.0)
     if joint >= 0 and log.events[1] < 0.0 and not limits.stop_at_joint_limit:
         log.events[1] = k
         log.events[2] = joint
@@ -142,15 +142,15 @@ def _image_error(s: FloatArray, s_star: FloatArray) -> float:
     NaN where none is. Further markers in ``s`` do not count.
     """
     total = 0.0
-    seen = 0
+    count = 0
     for view in range(2):
         for k in range(s_star.shape[1]):
             du = s[view, k, 0] - s_star[view, k, 0]
             dv = s[view, k, 1] - s_star[view, k, 1]
             if math.isfinite(du) and math.isfinite(dv):
                 total += du * du + dv * dv
-                seen += 1
-    return math.sqrt(total / seen) if seen > 0 else math.nan
+                count += 1
+    return math.sqrt(total / count) if count > 0 else math.nan
 
 
 @merged
@@ -158,8 +158,8 @@ def _outside(s: FloatArray, m: int, image_size: FloatArray) -> bool:
     """Whether one of the first m markers was seen outside an image."""
     for view in range(2):
         for k in range(m):
-            seen = math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])
-            if seen and not inside(s[view, k], image_size[view]):
+            u, v = s[view, k, 0], s[view, k, 1]
+            if math.isfinite(u + v) and from_border(image_size[view], u, v) < 0.0:
                 return True
     return False
 

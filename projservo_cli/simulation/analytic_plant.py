@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, as_array, axpy, dot, mat, vec, vec_into
 from projservo_cli.geometry.jit import merged, njit
-from projservo_cli.geometry.kinematics import forward, row
+from projservo_cli.geometry.kinematics import forward, from_border, row
 from projservo_cli.geometry.lens import distort_pixel
 from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.face import center_of, face_plane
@@ -54,19 +54,20 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
     a = face_plane(M, plant.order, center_of(M, plant.center))
     in_front = True
     for view in range(2):
-        seen = plant.visible[view] * dot(a, vec(plant.O[view])) > 0.0
-        hidden[view] = 0.0 if seen else 1.0
+        visible = plant.visible[view] * dot(a, vec(plant.O[view])) > 0.0
+        hidden[view] = 0.0 if visible else 1.0
         camera, lens = plant.model.P[view], plant.model.lens[view]
         for k in range(m):
             A = vec(M[k])
             if not _put_pixel(camera, lens, A, s[view, k]):
                 in_front = False
-            elif plant.opaque and not seen:
+            elif plant.opaque and not visible:
                 s[view, k, :] = math.nan
         for k in range(plant.pins.shape[0]):
             pixel = s[view, m + k]
             A = apply(H, vec(plant.pins[k]))
-            if _put_pixel(camera, lens, A, pixel) and not inside(pixel, plant.image_size[view]):
+            projected = _put_pixel(camera, lens, A, pixel)
+            if projected and from_border(plant.image_size[view], pixel[0], pixel[1]) < 0.0:
                 pixel[:] = math.nan
     return in_front
 
@@ -83,15 +84,6 @@ def _put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray)
 
 
 @merged
-def inside(pixel: FloatArray, image_size: FloatArray) -> bool:
-    """Whether a pixel lies within an image; pixel centres reach from −½ to size − ½."""
-    for j in range(2):
-        if not -0.5 <= pixel[j] <= image_size[j] - 0.5:
-            return False
-    return True
-
-
-@merged
 def shows_face(plant: Plant, H: Mat4, pixel: FloatArray) -> bool:
     """Whether both images truly show every marker of the face after the displacement H.
 
@@ -102,7 +94,7 @@ def shows_face(plant: Plant, H: Mat4, pixel: FloatArray) -> bool:
         for view in range(2):
             if not _put_pixel(plant.model.P[view], plant.model.lens[view], A, pixel):
                 return False
-            if not inside(pixel, plant.image_size[view]):
+            if from_border(plant.image_size[view], pixel[0], pixel[1]) < 0.0:
                 return False
     return True
 

@@ -3,7 +3,13 @@
 import numpy as np
 from scipy.linalg import expm
 
-from projservo_cli.geometry.rigid import cross_matrix, exponentials, rigid_inverse, screws, twists
+from projservo_cli.geometry.displacements import (
+    cross_matrix,
+    rigid_inverse,
+    screw_displacements,
+    screws,
+    twists,
+)
 
 RNG = np.random.default_rng(5)
 
@@ -22,7 +28,7 @@ def test_exponentials_of_screws_are_rigid_and_those_of_scipy():
     # A pure rotation has no velocity along its axis.
     axes[~prismatic, 3:] = np.cross(axes[~prismatic, :3], axes[~prismatic, 3:])
     q = RNG.uniform(-3.0, 3.0, 6)
-    T = exponentials(axes, prismatic, q)
+    T = screw_displacements(axes, prismatic, q)
     np.testing.assert_allclose(T, [expm(x * H) for x, H in zip(q, twists(axes), strict=True)], atol=1e-12)
     np.testing.assert_allclose(T @ rigid_inverse(T), np.broadcast_to(np.eye(4), T.shape), atol=1e-12)
     np.testing.assert_allclose(screws(twists(axes)), axes, atol=1e-15)
