@@ -23,6 +23,7 @@ from projservo_cli.config.task import Goal as GoalSettings
 from projservo_cli.control.law import UNLIMITED, Gains
 from projservo_cli.detection import DICTIONARY
 from projservo_cli.display import About
+from projservo_cli.image_size import image_sizes
 from projservo_cli.records import (
     CORNERS,
     NO_LENS,
@@ -376,7 +377,7 @@ def _made_truth(described: RobotSettings, rig: Rig, markers: Markers, k1: float,
         number=numbers,
         face=tuple(numbers.index(number) for number in markers.front or ()) if face else (),
         center=_center(markers),
-        image_size=np.array(rig.image_size_px, dtype=np.float64),
+        image_size=image_sizes(rig.image_size_px),
         lens=lens_of(P, k1) if k1 else NO_LENS,
         normals=np.zeros(3) if markers.normals is None else markers.normals @ robot.base_tool[:3, :3].T,
     )

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.rigid import rigid
-from projservo_cli.image_size import image_sizes
 from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model
 from projservo_cli.simulation.arm import Arm, about_axis, camera_center, roll_axis
 from projservo_cli.simulation.ideal import Ends
@@ -31,7 +30,7 @@ class Truth:
     number: tuple[int, ...]  # (m,) their numbers
     face: tuple[int, ...]  # indices of the face markers; none where the configuration has no face
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
-    image_size: FloatArray  # (2,) px of both images, or (2, 2) of each
+    image_size: FloatArray  # (2, 2) width and height of each image, px
     lens: FloatArray = field(default_factory=NO_LENS.copy)  # (2, 5) true lenses
     # (m, 3) directions that markers look in at the robot's reference; zero where they are seen from anywhere
     normals: FloatArray = field(default_factory=lambda: np.zeros(3))
@@ -74,7 +73,7 @@ class Truth:
 
     def within(self, pixels: FloatArray, view: int | slice = slice(None)) -> FloatArray:
         """Pixels (..., 2, m, 2), or (m, 2) of a view, NaN outside an image: centres reach to size − ½."""
-        inside = (pixels >= -0.5) & (pixels <= image_sizes(self.image_size)[view, ..., None, :] - 0.5)
+        inside = (pixels >= -0.5) & (pixels <= self.image_size[view, ..., None, :] - 0.5)
         return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)
 
     def displacement(self, q: FloatArray) -> FloatArray:

@@ -534,7 +534,7 @@ def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
         center=truth.center,
         O=O,
         visible=np.where(sides > 0.0, 1.0, -1.0),
-        image_size=image_sizes(truth.image_size),
+        image_size=truth.image_size,
         limits=truth.robot.limits,
         opaque=opaque,
     )

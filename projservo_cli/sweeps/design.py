@@ -20,7 +20,6 @@ from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.config.task import Goal, TaskSettings
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import law_and_mode, names_of
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.source import source_hash
@@ -98,7 +97,7 @@ def _accepted(truth: Truth, poses: FloatArray, front: float) -> IntArray:
     before = (m[..., 2] > 0.0).all(axis=(1, 2))
     facing = (front * _cosines(truth, poses) >= LEAST_COSINE).all(axis=1)
     pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
-    inside = ((pixels >= -0.5) & (pixels <= image_sizes(truth.image_size)[:, None] - 0.5)).all(axis=(1, 2, 3))
+    inside = ((pixels >= -0.5) & (pixels <= truth.image_size[:, None] - 0.5)).all(axis=(1, 2, 3))
     return np.flatnonzero(before & facing & inside)
 
 

@@ -54,7 +54,7 @@ class Arm(NamedTuple):
             start, end = self.reference + rng.uniform(-0.7, 0.7, (2, len(self.reference)))
             q = start + share * (end - start)
             s = self.scene.predict(q - self.reference)
-            if ((s > 0.0) & (s < self.image_size)).all():
+            if ((s > 0.0) & (s < self.image_size[:, None])).all():
                 return q, np.gradient(q, axis=0) / PERIOD
 
     def images(self, q, moved=None):
