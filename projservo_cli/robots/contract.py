@@ -87,11 +87,12 @@ class Robot(Protocol):
     A class may also have ``now() -> float``, its clock, s, without which ``time.monotonic`` is taken;
     ``release()`` and ``hold()``, which let go of the arm, so that somebody can move it for ``projservo
     teach``, and hold it again; ``identity() -> str``, without spaces, which changes where readings mean
-    something else, such as after homing, and without which no recording holds; and, if it is a simulator,
-    ``truth()``, the pose (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A
-    simulator's time passes in ``command`` alone, which moves it to ``due``. And ``frames``, both images
-    (2, height, width) of its last reading in grey, uint8, or None: a run keeps some, which the report shows.
-    A class that takes an argument ``limits`` is given those of its joints, ``JointLimits``.
+    something else, such as after homing, and without which no recording holds; ``remarks() -> list[str]``,
+    what is wrong with its last images, such as darkness; and, if it is a simulator, ``truth()``, the pose
+    (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's time passes
+    in ``command`` alone, which moves it to ``due``. And ``frames``, both images (2, height, width) of its
+    last reading in grey, uint8, or None: a run keeps some, which the report shows. A class that takes an
+    argument ``limits`` is given those of its joints, ``JointLimits``.
     """
 
     def open(self) -> None:
@@ -214,13 +215,20 @@ class PluginRobot:
 
     def health(self) -> dict[str, float | str]:
         """Return the measurements of the robot on itself, such as its voltage, by name; may be empty."""
-        method = getattr(self.robot, "health", None)
-        return {} if method is None else dict(self._ask("health", method))
+        return dict(self._optional("health", {}))
+
+    def remarks(self) -> list[str]:
+        """Return what the robot finds wrong with its last images, in words; may be empty."""
+        return list(self._optional("remarks", ()))
 
     def identity(self) -> str:
         """Return a text that changes with the meaning of the readings; may be empty."""
-        method = getattr(self.robot, "identity", None)
-        return "" if method is None else "".join(str(self._ask("identity", method)).split())
+        return "".join(str(self._optional("identity", "")).split())
+
+    def _optional(self, name: str, default: Any) -> Any:
+        """Return the answer of a method that a class may have; the default without it."""
+        method = getattr(self.robot, name, None)
+        return self._ask(name, method) if callable(method) else default
 
     def require_identity(self, recorded: str) -> None:
         """Refuse a robot whose readings mean something else than when they were recorded; a WorkFailed."""

@@ -14,7 +14,6 @@ from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, T
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span
-from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.laws import CODES, REGULATE, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import Ended, Summary, angle_between, path_deviation, summarize
@@ -496,11 +495,11 @@ class _Asked:
 
     def _require_images(self, driven: DrivenRobot, what: str, least: int) -> str:
         """Refuse to move a robot of which so many cameras or more show nothing, unless that was asked for."""
-        unseen, own = driven.unseen(least), driven.robot.robot
+        unseen = driven.unseen(least)
         if unseen and not self.given.blind:
-            seen = "; ".join([unseen, *(own.remarks() if isinstance(own, CameraRobot) else ())])
+            remarks = "; ".join([unseen, *driven.robot.remarks()])
             raise WorkFailed(
-                f"{what} {seen}: uncover both cameras and look at their light, or move the arm by hand to "
+                f"{what} {remarks}: uncover both cameras and look at their light, or move the arm by hand to "
                 "where they see the tags; --blind (blind=True) drives it without images"
             )
         return unseen
