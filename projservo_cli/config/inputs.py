@@ -153,12 +153,14 @@ def preflight_inputs(config: Config) -> PreflightInputs:
         )
     numbers = _numbers(config, "doctor")
     assert config.markers is not None
+    face = config.markers.front or ()
     return PreflightInputs(
         robot=_own(config),
         following=_following(config, config.plant.speed_scale),
         joints=joints_of(config),
         numbers=numbers,
-        face=config.markers.front or (),
+        face=face,
+        lengths=config.markers.lengths(face),
         dictionary=_dictionary(config),
     )
 

@@ -1,4 +1,4 @@
-"""The page of a preflight, and both images live in a browser of this machine."""
+"""The page of findings on a robot, and both images live in a browser of this machine."""
 
 import base64
 import html
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.detection import opencv
-from projservo_cli.hardware.preflight import Finding
+from projservo_cli.hardware.checks_at_rest import Finding
 from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray
 
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:80rem;margin:1.5rem auto;padding:0 1rem}
@@ -47,7 +47,7 @@ def annotated(grey: ByteArray, marker: Sequence[int], pixels: FloatArray, goal: 
 
 
 def page(name: str, findings: Sequence[Finding], pictures: Sequence[bytes]) -> str:
-    """One file of HTML with the findings of a preflight and both pictures, JPEG."""
+    """One file of HTML with the findings on a robot and both pictures, JPEG."""
     rows = "".join(
         f'<tr class="{one.level}"><td>{one.level}</td>'
         + "".join(f"<td>{html.escape(text)}</td>" for text in (one.where, one.text, one.remedy))

@@ -1,5 +1,6 @@
 """Accuracy of an arrival: pixels by which images are off, or may be, carried to the face in millimetres."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -7,11 +8,20 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.special import chdtri
 
-from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.calibration.prediction import Parameters, predict
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.statistics import TOLD, ErrorModel, Residual, relative_to_others, rigid_motions
-from projservo_cli.records import MM, PRISMATIC, BoolArray, Calibration, FloatArray, InputError, Model
+from projservo_cli.records import (
+    MM,
+    PRISMATIC,
+    BoolArray,
+    Calibration,
+    FloatArray,
+    InputError,
+    IntArray,
+    Model,
+)
 
 # Variance of corners from a side that the calibration has not seen, over that of others; chance of a test.
 _UNUSUAL, _CHANCE = 2.0, 1e-4
@@ -19,6 +29,8 @@ _UNUSUAL, _CHANCE = 2.0, 1e-4
 _ALONE, _FREE = 0.25, 1e4
 # Steps of Gauss and Newton towards a pose that is some degrees away.
 _STEPS = 4
+# Markers of a view that show the pose of the tool.
+_LEAST_MARKERS = 3
 
 
 def metric_points(model: Model, M: FloatArray) -> FloatArray | None:
@@ -133,7 +145,7 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
         agrees=bool(max(over[:2]) <= 1.0),
         reached=bool(over[2] <= 1.0),
         rms_px=float(rms),
-        limit_px=float(rms / np.sqrt(over[1])),
+        limit_px=float(rms / np.sqrt(max(over[1], 1e-300))),
         seen=left.reshape(at.seen.shape),
         off_px=np.linalg.norm(at.r.reshape(2, -1, 2), axis=2),
         shift=shift,
@@ -143,12 +155,44 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
     )
 
 
+def resting_error_mm(
+    calibration: Calibration, q: FloatArray, face: Sequence[int], lengths: FloatArray, images: FloatArray
+) -> float | None:
+    """Return how far a face at rest may be from where its joints put it, rms mm, by images that agree.
+
+    It is what images are off, and what one image may be shifted by without a test that shows it. None where
+    no length is known, or a view shows less than three markers.
+
+    q : (n,) joint readings, rad or m; face : numbers of its markers; lengths : (f, f) between them, m, NaN if
+        unknown.
+    images : (2, m, 2) mean pixels of the markers of the calibration, NaN where unseen.
+    """
+    seen = np.isfinite(images[..., 0])
+    if not {*face} <= {*calibration.marker.tolist()} or seen.sum(axis=1).min() < _LEAST_MARKERS:
+        return None
+    M = calibration.M
+    posture = Posture(calibration.model(), q, M[calibration.indices_of(face)], lengths)
+    if not posture.known:
+        return None
+    off = np.where(seen[..., None], images - predict(calibration, q[None])[0], 0.0).ravel()
+    hidden_mm = rigid_fit(calibration, q, images, np.zeros(seen.shape)).off_mm(posture, M)
+    return float(np.hypot(np.linalg.norm(posture.carry(M, seen) @ off), hidden_mm))
+
+
 def _free(at: Residual, J: FloatArray) -> FloatArray:
     """Covariance (4 m, 4 m) of residuals whose changes along J (4 m, k) are not known."""
     S = at.R + at.B @ at.B.T
     J = J * np.repeat(at.seen.ravel(), 2)[:, None]
     J = J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     return np.asarray(S + _FREE * S.diagonal().max() * J @ J.T)
+
+
+def of_calibration(calibration: Calibration, marker: IntArray, images: FloatArray) -> FloatArray:
+    """Values (2, m, …) of the markers of a calibration among those (2, b, …) of the numbers marker (b,)."""
+    known = np.isin(marker, calibration.marker)
+    values = np.full((2, len(calibration.marker), *images.shape[2:]), np.nan)
+    values[:, calibration.indices_of(marker[known])] = images[:, known]
+    return values
 
 
 def mean_image(images: FloatArray) -> FloatArray:

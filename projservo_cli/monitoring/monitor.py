@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import predict
-from projservo_cli.monitoring.accuracy import Posture, mean_image, still
+from projservo_cli.monitoring.accuracy import Posture, mean_image, of_calibration, still
 from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
@@ -486,9 +486,7 @@ def detected_fault(
     """
     if not calibration.usable or not calibration.has_covariance:
         return ""
-    known = np.isin(marker, calibration.marker)
-    pixels = np.full((2, len(calibration.marker), 2), np.nan)
-    pixels[:, calibration.indices_of(marker[known])] = images[:, known]
+    pixels = of_calibration(calibration, marker, images)
     rest, instants, new = np.zeros((2, len(q))), np.zeros(2), np.ones(2, dtype=np.bool_)
 
     def fault_of(pixels: FloatArray) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from projservo_cli.calibration import predict
 from projservo_cli.display import require_radians
-from projservo_cli.hardware.preflight import MIN_SHARED
+from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
 from projservo_cli.robots.settings import Joints, OwnRobot, Readings

@@ -38,7 +38,7 @@ class Finding(NamedTuple):
 
 
 @dataclass(eq=False)
-class Seen:
+class RobotAtRest:
     """A robot at rest, as its joints and cameras show it."""
 
     marker: Sequence[int]  # numbers of the markers
@@ -57,7 +57,7 @@ class Seen:
 
 
 def findings_at_rest(
-    seen: Seen, finder: TagFinder, dictionary: str, *, moves: bool = False
+    seen: RobotAtRest, finder: TagFinder, dictionary: str, *, moves: bool = False
 ) -> Iterator[Finding]:
     """All findings at rest.
 
@@ -100,7 +100,9 @@ def _of_camera(camera: Camera) -> Iterator[Finding]:
     yield Finding(FINE, where, f"{text}, edges blurred by {light.blur_px:.1f} px" if sharp else text)
 
 
-def _of_tags(name: str, view: View, seen: Seen, finder: TagFinder, dictionary: str) -> Iterator[Finding]:
+def _of_tags(
+    name: str, view: View, seen: RobotAtRest, finder: TagFinder, dictionary: str
+) -> Iterator[Finding]:
     """Tags in the image of a camera: which, how large, how certain."""
     where, known = f"{name} image", {number // CORNERS for number in seen.marker}
     for number in view.repeated:
@@ -157,7 +159,7 @@ def other_dictionary(grey: ByteArray, dictionary: str) -> tuple[str, int]:
     return best, counts[best][0]
 
 
-def _of_both(seen: Seen) -> Iterator[Finding]:
+def _of_both(seen: RobotAtRest) -> Iterator[Finding]:
     """Markers that both cameras see, the face among them, and whether the views differ enough for depth."""
     visible = np.isfinite(seen.s[..., 0])
     shared = int(visible.all(axis=0).sum())
@@ -240,7 +242,7 @@ def _directions(pixels: FloatArray, sigma: FloatArray) -> list[FloatArray]:
     return [np.array([*side, z]), np.array([*-side, z])]
 
 
-def _of_joints(seen: Seen, endless: str) -> Iterator[Finding]:
+def _of_joints(seen: RobotAtRest, endless: str) -> Iterator[Finding]:
     """Readings within their limits, and the measurements of the arm itself.
 
     endless : level of a joint without limits.

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from projservo_cli.calibration.detections import per_rad
-from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding
+from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding
 from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.pacing import Steered

@@ -1,4 +1,4 @@
-"""Preflight: look at robot and cameras before anything is recorded, and move each joint a little."""
+"""Doctor: look at robot and cameras before anything is recorded, and move each joint a little."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -9,10 +9,10 @@ import numpy as np
 
 from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.hardware.camera_robot import CameraRobot
-from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding, Seen, findings_at_rest
-from projservo_cli.hardware.wiggle import Strokes, findings_of, reach_of, strokes
+from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding, RobotAtRest, findings_at_rest
+from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
 from projservo_cli.image_size import ImageSize, image_sizes
-from projservo_cli.monitoring.accuracy import mean_image
+from projservo_cli.monitoring.accuracy import mean_image, of_calibration, resting_error_mm
 from projservo_cli.monitoring.monitor import detected_fault
 from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
@@ -23,20 +23,26 @@ from projservo_cli.stages.given import PreflightInputs
 
 # Time of observation of a robot at rest, s, and minimum number of readings.
 _LOOK_S, _MIN_LOOKS = 1.5, 8
-CALIBRATION = "calibration"  # subject of the finding of a comparison with one
+_CALIBRATION = "calibration"  # subject of the finding of a comparison with one
 
 
 class Checked(NamedTuple):
-    """Findings of a preflight, and what they rest on."""
+    """Findings on a robot and its cameras, and what they rest on."""
 
     findings: tuple[Finding, ...]
-    seen: Seen | None  # None where robot or cameras did not open
+    seen: RobotAtRest | None  # None where robot or cameras did not open
     moved: tuple[Strokes, ...]  # of the joints that were moved
 
     @property
     def works(self) -> bool:
         """Whether nothing stands against a recording."""
         return all(finding.level != FAULT for finding in self.findings)
+
+    @property
+    def refuted(self) -> str | None:
+        """Reason why the calibration holds no more, empty where it does; None where it was not compared."""
+        compared = (one for one in self.findings if one.where == _CALIBRATION and one.level != WARNING)
+        return next((one.text if one.level == FAULT else "" for one in compared), None)
 
 
 def check(
@@ -63,7 +69,7 @@ def check(
             seen = _seen(robot, inputs, progress)
             found += findings_at_rest(seen, TagFinder(dictionary), dictionary, moves=confirmed is not None)
             if calibration is not None:
-                found.append(_against(calibration, seen, robot.image_size))
+                found.append(calibration_finding(calibration, seen, robot.image_size, inputs.lengths))
             works = all(finding.level != FAULT for finding in found)
             if confirmed is not None and not works:
                 found.append(
@@ -88,7 +94,7 @@ def check(
     return Checked(tuple(found), seen, tuple(moved))
 
 
-def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Seen:
+def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> RobotAtRest:
     """Look for a while at a robot that stands where it is."""
     period, readings = robot.bounds.period, [robot.read()]
     wanted = max(_MIN_LOOKS, round(_LOOK_S / period))
@@ -100,7 +106,7 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Se
     own = robot.robot
     cameras = own.cameras if isinstance(own, CameraRobot) else []
     views = [view for view in own.views if view is not None] if isinstance(own, CameraRobot) else []
-    return Seen(
+    return RobotAtRest(
         marker=inputs.numbers,
         face=inputs.face,
         q=np.mean([look.q for look in readings], axis=0),
@@ -126,14 +132,22 @@ def _mean(readings: Sequence[Reading], view: int) -> tuple[FloatArray, FloatArra
     return mean, scatter
 
 
-def _against(calibration: Calibration, seen: Seen, image_size: ImageSize | None) -> Finding:
-    """Whether images at rest still agree with a calibration, and what changed if they do not."""
+def calibration_finding(
+    calibration: Calibration, seen: RobotAtRest, image_size: ImageSize | None, lengths: FloatArray
+) -> Finding:
+    """Whether images at rest still agree with a calibration, and what changed if they do not.
+
+    lengths : (f, f) between the markers of the face, m, NaN if unknown.
+    """
     if not calibration.usable or not calibration.has_covariance:
-        return Finding(WARNING, CALIBRATION, "is not usable", "record and calibrate again")
+        return Finding(WARNING, _CALIBRATION, "is not usable", "record and calibrate again")
     size = image_sizes(image_size or [view.frame.grey.shape[::-1] for view in seen.views] or None)
     marker = np.array(seen.marker, dtype=np.int64)
     if not np.isfinite(seen.s[:, np.isin(marker, calibration.marker)]).any():
-        return Finding(WARNING, CALIBRATION, "was not compared: no marker of it is seen", "show the tags")
+        return Finding(WARNING, _CALIBRATION, "was not compared: no marker of it is seen", "show the tags")
     if fault := detected_fault(calibration, seen.q, marker, seen.s, size):
-        return Finding(FAULT, CALIBRATION, fault, "put that back, or record and calibrate again")
-    return Finding(FINE, CALIBRATION, "agrees with the images")
+        return Finding(FAULT, _CALIBRATION, fault, "put that back, or record and calibrate again")
+    images = of_calibration(calibration, marker, seen.s)
+    mm = resting_error_mm(calibration, seen.q, seen.face, lengths, images)
+    within = "" if mm is None else f", which show the tool within {mm:.2g} mm of where its joints put it"
+    return Finding(FINE, _CALIBRATION, f"agrees with the images{within}")
