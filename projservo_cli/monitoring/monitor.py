@@ -247,7 +247,7 @@ class ImageMonitor:
             memory.keep(clean, float(pair.t.mean()), not tested.aside.any())
         self._kept = [
             *kept,
-            _Kept(pair=pair, residual=residual, view=self._view, views=memory.views, covered=covered),
+            _Kept(pair=pair, residual=residual, view=self._view, views=memory.state.views, covered=covered),
         ]
         crowd = (tested.aside.sum(axis=1) >= _MOST_FOR_LONG * residual.seen.sum(axis=1)).any()
         self._crowded = (self._crowded + 1) * bool(crowd and not covered)

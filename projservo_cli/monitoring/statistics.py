@@ -99,17 +99,6 @@ class Sums(NamedTuple):
             bias=self.bias + factor * other.bias,
         )
 
-    def times(self, factor: float) -> "Sums":
-        """The same with another weight."""
-        return self._replace(
-            normal=factor * self.normal,
-            by_corner=factor * self.by_corner,
-            weight=factor * self.weight,
-            weight_squares=factor**2 * self.weight_squares,
-            seen=factor * self.seen,
-            bias=factor * self.bias,
-        )
-
 
 class ErrorModel:
     """Covariance of images by a calibration, and directions in which faults would change them.
@@ -296,10 +285,15 @@ class ErrorModel:
 class MemoryState(NamedTuple):
     """Observations that agreed up to one time."""
 
-    closed: tuple[Sums, ...]
-    view: Sums
-    length: float  # observations of that view, fading
-    first: FloatArray | None
+    closed: tuple[Sums, ...]  # up to the end of each view, of the older ones fewer
+    view: Sums  # observations of the view that lasts, fading
+    length: float  # how many these are
+    first: FloatArray | None  # (2, m, 2) px predicted at its beginning
+
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return self.closed[-1].views + (self.length > 0.0)
 
 
 class Memory:
@@ -307,11 +301,8 @@ class Memory:
 
     def __init__(self, errors: ErrorModel) -> None:
         self._errors = errors
-        self._closed = [errors.nothing()]
+        self.state = MemoryState((errors.nothing(),), errors.nothing(), 0.0, None)
         self._total: Sums | None = None  # as last asked for
-        self._view = errors.nothing()  # observations of the view that lasts, fading
-        self._count = 0.0
-        self._first: FloatArray | None = None  # (2, m, 2) px predicted at its beginning
         # The last observation, as ``learn`` is given it.
         self._before: tuple[Residual, BoolArray, bool] | None = None
         # Of differences from observation to observation, over σ²: in motion, at rest, and between views.
@@ -355,35 +346,24 @@ class Memory:
         return observations / (self.fresh + observations * (1.0 - self.fresh)) if observations else 0.0
 
     @property
-    def views(self) -> int:
-        """Number of views that agreed."""
-        return self._closed[-1].views + (self._count > 0.0)
-
-    @property
     def total(self) -> Sums:
         """Sums of all observations."""
         if self._total is None:
-            self._total = self._closed[-1]
-            if self._count:
-                worth = self.worth(self._count)
-                view = self._view.times(worth / self._count)
-                self._total = self._total.plus(view._replace(weight_squares=worth**2))
+            self._total = before = self.state.closed[-1]
+            if count := self.state.length:
+                worth = self.worth(count)
+                squares = before.weight_squares + worth**2
+                self._total = before.plus(self.state.view, worth / count)._replace(weight_squares=squares)
         return self._total
-
-    @property
-    def state(self) -> MemoryState:
-        """Observations so far, to return to."""
-        return MemoryState(closed=tuple(self._closed), view=self._view, length=self._count, first=self._first)
 
     def return_to(self, state: MemoryState) -> None:
         """Forget the observations since a state."""
-        self._closed, self._total = list(state.closed), None
-        self._view, self._count, self._first = state.view, state.length, state.first
+        self.state, self._total = state, None
 
     def onsets(self) -> list[Sums]:
         """Sums before each time that something may have begun, the earliest first."""
         seen = self.total.seen.sum()
-        return [sums for sums in self._closed if sums.seen.sum() < seen]
+        return [sums for sums in self.state.closed if sums.seen.sum() < seen]
 
     def keep(self, residual: Residual, t: float, whole: bool) -> None:
         """Add an observation; of earlier views those stay that date an onset to a quarter of its age.
@@ -394,19 +374,12 @@ class Memory:
         new = self._errors.sums(residual, t)
         if not whole and self._errors.strays(self.total.plus(new)):
             return
-        if self._first is None or not is_same_view(self._first, residual.predicted):
-            if self._count:
-                self._closed.append(self.total)
-                age = [max(1, (self._closed[-1].views - sums.views) // 4) for sums in self._closed]
-                self._closed = [
-                    sums
-                    for sums, a in zip(self._closed, age, strict=True)
-                    if sums.views % (1 << (a.bit_length() - 1)) == 0
-                ]
-            self._view, self._count, self._first = self._errors.nothing(), 0.0, residual.predicted
-        self._total = None
-        self._view = self._view.times(_FORGET).plus(new)._replace(views=1)
-        self._count = _FORGET * self._count + 1.0
+        state = self.state
+        if state.first is None or not is_same_view(state.first, residual.predicted):
+            closed = _thinned([*state.closed, self.total]) if state.length else state.closed
+            state = MemoryState(closed, self._errors.nothing(), 0.0, residual.predicted)
+        view = new.plus(state.view, _FORGET)._replace(views=1, t=t)
+        self.return_to(state._replace(view=view, length=_FORGET * state.length + 1.0))
 
     def learn(self, now: Residual, aside: BoolArray, disagrees: bool) -> None:
         """Learn the fresh error of each frame from two in a row, free of errors of joints and instants.
@@ -446,6 +419,13 @@ class Memory:
         self._squares[kind] = 0.99 * self._squares[kind] + 0.5 * square
         self._freedom[kind] = 0.99 * self._freedom[kind] + freedom
         self._total = None
+
+
+def _thinned(closed: list[Sums]) -> tuple[Sums, ...]:
+    """Sums up to the end of each view, of the older ones fewer: dates to a quarter of their age."""
+    ages = [max(1, (closed[-1].views - sums.views) // 4) for sums in closed]
+    both = zip(closed, ages, strict=True)
+    return tuple(sums for sums, age in both if sums.views % (1 << (age.bit_length() - 1)) == 0)
 
 
 def is_same_view(before: FloatArray, now: FloatArray) -> bool:

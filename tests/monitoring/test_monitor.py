@@ -315,7 +315,7 @@ def test_a_look_with_sightings_aside_is_not_kept_where_it_moves_the_calibration_
         noise = np.full((2, len(arm.scene.M)), SIGMA)
         look = FramePair(np.full(2, PERIOD * k), q, still, np.zeros(2), s, noise, np.zeros(6))
         memory.keep(errors.residual(look), PERIOD * k, whole)
-        assert memory.views == views
+        assert memory.state.views == views
 
 
 @pytest.mark.parametrize(("backlash", "slip", "sign"), [(0.0, 0, 1), (0.022, 1, 1), (0.05, 1, 0)])
@@ -504,7 +504,7 @@ def test_looks_in_which_a_hand_comes_and_goes_are_not_kept(arm):
     test, new, views = ImageMonitor(arm.calibration, SIGMA, LOOKS), np.ones(2, dtype=bool), []
     for k in range(len(q)):
         test.observe(np.full(2, PERIOD * k), at_once(q)[k], np.zeros((2, 6)), np.zeros(2), s[k], new)
-        views.append(test._detector.memory.views)
+        views.append(test._detector.memory.state.views)
     assert views[7] < views[11]
     assert views[12] == views[17] == views[7]
     assert views[-1] > views[17]
