@@ -49,10 +49,10 @@ def annotated(grey: ByteArray, marker: Sequence[int], pixels: FloatArray, goal: 
 def page(name: str, findings: Sequence[Finding], pictures: Sequence[bytes]) -> str:
     """One file of HTML with the findings on a robot and both pictures, JPEG."""
     rows = "".join(
-        f'<tr class="{one.level}"><td>{one.level}</td>'
-        + "".join(f"<td>{html.escape(text)}</td>" for text in (one.where, one.text, one.remedy))
+        f'<tr class="{finding.level}"><td>{finding.level}</td>'
+        + "".join(f"<td>{html.escape(text)}</td>" for text in (finding.where, finding.text, finding.remedy))
         + "</tr>"
-        for one in findings
+        for finding in findings
     )
     head = "<tr><th></th><th>part</th><th>found</th><th>remedy</th></tr>"
     return _document(f"Preflight of {name}", f"<p>{_images(pictures)}</p><table>{head}{rows}</table>")
@@ -66,10 +66,10 @@ def recording_page(name: str, done: str, pictures: Sequence[bytes], *, whole: bo
 
 def _images(pictures: Sequence[bytes]) -> str:
     """Elements of both pictures, JPEG, inside the page itself."""
-    both = zip(VIEWS, map(base64.b64encode, pictures), strict=False)
+    encoded = zip(VIEWS, map(base64.b64encode, pictures), strict=False)
     return " ".join(
         f'<img alt="{view} image with the tags found" src="data:image/jpeg;base64,{data.decode()}">'
-        for view, data in both
+        for view, data in encoded
     )
 
 

@@ -11,7 +11,13 @@ from scipy.special import chdtri
 from projservo_cli.calibration.prediction import Parameters, predict
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.monitoring.frame_pairs import FramePair
-from projservo_cli.monitoring.statistics import TOLD, ErrorModel, Residual, relative_to_others, rigid_motions
+from projservo_cli.monitoring.innovation_tests import (
+    TOLD,
+    ErrorModel,
+    Residual,
+    relative_to_others,
+    rigid_motions,
+)
 from projservo_cli.records import (
     MM,
     PRISMATIC,
@@ -167,16 +173,16 @@ def resting_error_mm(
         unknown.
     images : (2, m, 2) mean pixels of the markers of the calibration, NaN where unseen.
     """
-    seen = np.isfinite(images[..., 0])
-    if not {*face} <= {*calibration.marker.tolist()} or seen.sum(axis=1).min() < _LEAST_MARKERS:
+    detected = np.isfinite(images[..., 0])
+    if not {*face} <= {*calibration.marker.tolist()} or detected.sum(axis=1).min() < _LEAST_MARKERS:
         return None
     M = calibration.M
     posture = Posture(calibration.model(), q, M[calibration.indices_of(face)], lengths)
     if not posture.known:
         return None
-    off = np.where(seen[..., None], images - predict(calibration, q[None])[0], 0.0).ravel()
-    hidden_mm = rigid_fit(calibration, q, images, np.zeros(seen.shape)).off_mm(posture, M)
-    return float(np.hypot(np.linalg.norm(posture.carry(M, seen) @ off), hidden_mm))
+    off = np.where(detected[..., None], images - predict(calibration, q[None])[0], 0.0).ravel()
+    hidden_mm = rigid_fit(calibration, q, images, np.zeros(detected.shape)).off_mm(posture, M)
+    return float(np.hypot(np.linalg.norm(posture.carry(M, detected) @ off), hidden_mm))
 
 
 def _free(at: Residual, J: FloatArray) -> FloatArray:
@@ -189,9 +195,9 @@ def _free(at: Residual, J: FloatArray) -> FloatArray:
 
 def of_calibration(calibration: Calibration, marker: IntArray, images: FloatArray) -> FloatArray:
     """Values (2, m, …) of the markers of a calibration among those (2, b, …) of the numbers marker (b,)."""
-    known = np.isin(marker, calibration.marker)
+    has = np.isin(marker, calibration.marker)
     values = np.full((2, len(calibration.marker), *images.shape[2:]), np.nan)
-    values[:, calibration.indices_of(marker[known])] = images[:, known]
+    values[:, calibration.indices_of(marker[has])] = images[:, has]
     return values
 
 

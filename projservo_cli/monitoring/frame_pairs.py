@@ -72,17 +72,17 @@ class Pairing:
             waiting.pop(0) if waiting and due and (together or v == first) else None
             for v, waiting in enumerate(self._waiting)
         ]
-        one = frames[0] or frames[1]
-        return None if one is None else self._pair(one, frames)
+        earliest = frames[0] or frames[1]
+        return None if earliest is None else self._pair(earliest, frames)
 
-    def _pair(self, one: Frame, frames: list[Frame | None]) -> FramePair:
+    def _pair(self, frame_now: Frame, frames: list[Frame | None]) -> FramePair:
         """Pair of the frames of both views, at least one of them."""
-        both = [frame or one._replace(image=np.full_like(one.image, np.nan)) for frame in frames]
-        last, self._last = self._last or one, one
-        self._start = one.t if self._start is None else self._start
-        stacked = (np.array([frame[i] for frame in both]) for i in range(len(one)))
+        both = [frame or frame_now._replace(image=np.full_like(frame_now.image, np.nan)) for frame in frames]
+        last, self._last = self._last or frame_now, frame_now
+        self._start = frame_now.t if self._start is None else self._start
+        stacked = (np.array([frame[i] for frame in both]) for i in range(len(frame_now)))
         t, q, q_dot, sigma_t, images, noise = stacked
-        curved = _STRAIGHT * np.abs(one.q_dot - last.q_dot) * abs(one.t - last.t)
+        curved = _STRAIGHT * np.abs(frame_now.q_dot - last.q_dot) * abs(frame_now.t - last.t)
         return FramePair(
             t=t - self._start, q=q, q_dot=q_dot, sigma_t=sigma_t, images=images, noise=noise, curved=curved
         )

@@ -9,7 +9,7 @@ from scipy.linalg import cho_factor, cho_solve, expm
 
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.monitoring.frame_pairs import FramePair
-from projservo_cli.monitoring.statistics import ErrorModel, Residual, Sums
+from projservo_cli.monitoring.innovation_tests import ErrorModel, Residual, Sums
 from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
 
 # Images are expected to be changed by so much by any cause, px rms: the prior of its parameters.
@@ -132,8 +132,8 @@ class Evidence:
 
     def _whitened(self, rows: FloatArray) -> FloatArray:
         """Rows (K, 4 m, …) over the root of their covariance, (K 4 m, …)."""
-        found = self._inverses @ rows.reshape(*rows.shape[:2], -1)
-        return np.asarray(found.reshape(-1, *rows.shape[2:]))
+        whitened = self._inverses @ rows.reshape(*rows.shape[:2], -1)
+        return np.asarray(whitened.reshape(-1, *rows.shape[2:]))
 
     def _off(self, changed: Changed) -> FloatArray:
         """Return the residuals (K, 4 m) of images from the prediction of a cause, px; zero if unseen."""
@@ -162,21 +162,21 @@ class Evidence:
         The first step of a joint that is far off says little, since its images move on curves.
         """
         tried = [self._tried(cause) for cause in causes]
-        tried.sort(key=lambda one: -one[0])
+        tried.sort(key=lambda trial: -trial[0])
         return [
             self._refitted(self._fitted(cause, start))
             for rank, (_, cause, start) in enumerate(tried)
             if rank < _FITTED or start.size <= 1
         ]
 
-    def _refitted(self, found: Explanation) -> Explanation:
+    def _refitted(self, fit: Explanation) -> Explanation:
         """Explanation of a cause that is far off, with errors of joints and calibration as they act there.
 
         The fit takes observations back to the state without the cause, and fits its remainder there.
         """
-        kind, changed = found.cause.kind, found.cause.change(self.nothing, found.theta)
-        if kind not in ("exchanged", "mirrored", "slipped", "sized") or found.changed_px < _NEAR_PX:
-            return found
+        kind, changed = fit.cause.kind, fit.cause.change(self.nothing, fit.theta)
+        if kind not in ("exchanged", "mirrored", "slipped", "sized") or fit.changed_px < _NEAR_PX:
+            return fit
         pairs = []
         for pair, away in zip(self.pairs, changed.away, strict=True):
             images, noise = pair.images, pair.noise
@@ -188,11 +188,11 @@ class Evidence:
             pairs.append(pair._replace(q=q, images=images, noise=noise))
         residuals = [self._errors.residual(pair) for pair in pairs]
         there = Evidence(self._errors, pairs, residuals, self._weights, self._agreed)
-        left, theta = there.before, found.theta
+        left, theta = there.before, fit.theta
         if theta.size:
-            nearer = there._fitted(found.cause, np.full(1, 1.0 if kind == "sized" else 0.0))
+            nearer = there._fitted(fit.cause, np.full(1, 1.0 if kind == "sized" else 0.0))
             left, theta = nearer.left, theta * nearer.theta if kind == "sized" else theta + nearer.theta
-        return found._replace(theta=theta, gain=self.before - left, left=left)
+        return fit._replace(theta=theta, gain=self.before - left, left=left)
 
     def _changed_by(self, cause: Cause, theta: FloatArray) -> FloatArray:
         return self._off(cause.change(self.nothing, theta))
@@ -306,8 +306,8 @@ def _joint_causes(evidence: Evidence) -> Iterator[Cause]:
         return s._replace(away=s.away + theta)
 
     def late(s: Changed, theta: FloatArray, v: int) -> Changed:
-        both = theta if v < 0 else np.eye(2)[v] * theta
-        return s._replace(away=s.away - both[:, None] * velocity)
+        delays = theta if v < 0 else np.eye(2)[v] * theta
+        return s._replace(away=s.away - delays[:, None] * velocity)
 
     turns = np.linspace(-np.pi, np.pi, _TURNS, endpoint=False)[:, None] + np.pi / _TURNS
     for i in range(n):
@@ -409,14 +409,14 @@ def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
 def together(moved: list[Explanation]) -> Explanation:
     """Displacements of markers, each fitted by itself, as one cause."""
     first = moved[0]
-    markers = tuple(j for one in moved for j in one.cause.markers)
+    markers = tuple(j for fit in moved for j in fit.cause.markers)
     return first._replace(
         cause=first.cause._replace(markers=markers),
-        gain=sum(one.gain for one in moved),
-        cost=sum(one.cost for one in moved),
-        left=first.left - sum(one.gain for one in moved[1:]),
-        changed_px=max(one.changed_px for one in moved),
-        min_px=min(one.min_px for one in moved),
+        gain=sum(fit.gain for fit in moved),
+        cost=sum(fit.cost for fit in moved),
+        left=first.left - sum(fit.gain for fit in moved[1:]),
+        changed_px=max(fit.changed_px for fit in moved),
+        min_px=min(fit.min_px for fit in moved),
     )
 
 
@@ -432,13 +432,13 @@ _CONTAINS = {
 }
 
 
-def contains(one: Cause, other: Cause) -> bool:
+def contains(cause: Cause, other: Cause) -> bool:
     """Whether a cause explains what another one does, with more parameters."""
-    alike = one.which in (-1, other.which) or set(other.markers) <= set(one.markers) != set()
-    more = one.starts.shape[1] > other.starts.shape[1]
-    return alike and more and other.kind in _CONTAINS.get(one.kind, ())
+    alike = cause.which in (-1, other.which) or set(other.markers) <= set(cause.markers) != set()
+    more = cause.starts.shape[1] > other.starts.shape[1]
+    return alike and more and other.kind in _CONTAINS.get(cause.kind, ())
 
 
-def is_possible(found: Explanation) -> bool:
+def is_possible(fit: Explanation) -> bool:
     """Whether a cause can be of that size: links flex by a little only."""
-    return found.cause.kind != "flexible" or bool(np.abs(found.theta).max() <= _MOST_FLEXIBLE)
+    return fit.cause.kind != "flexible" or bool(np.abs(fit.theta).max() <= _MOST_FLEXIBLE)

@@ -15,8 +15,8 @@ import numpy as np
 from projservo_cli.calibration.detections import MIN_SIGMA
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
-from projservo_cli.monitoring.monitor import ImageMonitor
-from projservo_cli.monitoring.statistics import WINDOW
+from projservo_cli.monitoring.image_monitor import ImageMonitor
+from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import VIEWS, BoolArray, ByteArray, FloatArray, IntArray, WorkFailed
 from projservo_cli.robots.contract import PluginRobot
 from projservo_cli.robots.latency import DelayPrior, Delays, squares_by_joints
@@ -69,11 +69,11 @@ class FrameRecorder:
         shots = [*self._kept]
         if not shots or shots[-1].instant != instant:
             shots.append(_Shot(instant, s, _as_jpeg(frames)))
-        whole = b"".join(one for shot in shots for one in shot.jpeg)
+        whole = b"".join(jpeg for shot in shots for jpeg in shot.jpeg)
         return {
             "frame_index": np.array([shot.instant for shot in shots], dtype=np.int64),
             "frame_s": np.array([shot.s for shot in shots]),
-            "frame_size": np.array([[len(one) for one in shot.jpeg] for shot in shots], dtype=np.int64),
+            "frame_size": np.array([[len(jpeg) for jpeg in shot.jpeg] for shot in shots], dtype=np.int64),
             "frame_jpeg": np.frombuffer(whole, dtype=np.uint8),
         }
 
@@ -306,8 +306,8 @@ class DrivenRobot:
 
 def _require_apart(name: str, s: FloatArray) -> None:
     """Raise WorkFailed for images (2, k, 2) with several markers at one pixel, as zeros for unseen ones."""
-    for view, one in zip(VIEWS, s, strict=True):
-        at, count = np.unique(one[np.isfinite(one[:, 0])], axis=0, return_counts=True)
+    for view, pixels in zip(VIEWS, s, strict=True):
+        at, count = np.unique(pixels[np.isfinite(pixels[:, 0])], axis=0, return_counts=True)
         if (count >= _AT_ONE_PIXEL).any():
             u, v = at[np.argmax(count)]
             raise WorkFailed(
@@ -318,9 +318,9 @@ def _require_apart(name: str, s: FloatArray) -> None:
 
 def weights(sigma: FloatArray, s: FloatArray) -> FloatArray:
     """Weights (2, k) of pixels (2, k, 2) of deviations (2, k) in a fit: the rms of those seen over each."""
-    seen = np.isfinite(s[..., 0])
-    weight = np.ones(seen.shape)
-    if seen.any():
+    detected = np.isfinite(s[..., 0])
+    weight = np.ones(detected.shape)
+    if detected.any():
         sigma = np.maximum(sigma, MIN_SIGMA)
-        weight[seen] = np.sqrt(np.mean(sigma[seen] ** 2)) / sigma[seen]
+        weight[detected] = np.sqrt(np.mean(sigma[detected] ** 2)) / sigma[detected]
     return weight

@@ -103,7 +103,9 @@ def _chain(path: str, tip: str | None, content: bytes) -> tuple[list[str], list[
 def _tree(path: str, content: bytes) -> tuple[list[str], dict[str, ET.Element]]:
     """Names of the links of a URDF, and the joint above each but the root, by the name of the link."""
     root = _parsed(path, content)
-    links, joints = ([one.get("name", "") for one in root.findall(kind)] for kind in ("link", "joint"))
+    links, joints = (
+        [element.get("name", "") for element in root.findall(kind)] for kind in ("link", "joint")
+    )
     for kind, names in (("link", links), ("joint", joints)):
         if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
             count = names.count(twice[0])
@@ -132,8 +134,8 @@ def _parsed(path: str, content: bytes) -> ET.Element:
         try:
             root = ET.fromstring(content)
         except ValueError:  # of several bytes a character, which the parser leaves to its caller
-            found = re.search(rb"""encoding\s*=\s*["']([\w.:-]+)""", content[:200])
-            root = ET.fromstring(content.decode(found[1].decode() if found else "utf-8"))
+            declared = re.search(rb"""encoding\s*=\s*["']([\w.:-]+)""", content[:200])
+            root = ET.fromstring(content.decode(declared[1].decode() if declared else "utf-8"))
     except (ET.ParseError, LookupError, ValueError) as error:
         raise InputError(
             f"{path}: not XML: {error}; its text must be in the encoding that its first line declares, by "
@@ -142,7 +144,7 @@ def _parsed(path: str, content: bytes) -> ET.Element:
     if root.tag != "robot":
         raise InputError(f"{path}: not a URDF: its outermost element is {root.tag}, not robot")
     spaces = {str(name).partition("}")[0] for e in root.iter() for name in (e.tag, *e.keys()) if "}" in name}
-    used = [part for name in ("joint", "link") for one in root.findall(name) for part in one.iter()]
+    used = [part for name in ("joint", "link") for element in root.findall(name) for part in element.iter()]
     values = [value for e in (root, *used) for value in e.attrib.values()]
     if any(space.endswith("xacro") for space in spaces) or any(mark in v for v in values for mark in _MACRO):
         raise InputError(f"{path}: is a xacro file: expand it first, xacro {Path(path).name} > robot.urdf")
@@ -155,10 +157,10 @@ def joint_screw(
     """A joint along or about an axis (3,) through a point (3,), m."""
     axis = np.asarray(axis) / np.linalg.norm(axis)
     w, v = (np.zeros(3), axis) if kind == "P" else (axis, np.cross(point, axis))
-    given = (
+    bounds = (
         {} if limits is None else {"limits_m" if kind == "P" else "limits_rad": [float(x) for x in limits]}
     )
-    return {"type": kind, "name": name or None, "w": w.tolist(), "v": v.tolist(), **given}
+    return {"type": kind, "name": name or None, "w": w.tolist(), "v": v.tolist(), **bounds}
 
 
 def arm_screws(joints: list[dict[str, Any]], q: FloatArray, tool: FloatArray) -> dict[str, Any]:
@@ -178,8 +180,8 @@ def _origin(joint: ET.Element, path: str) -> FloatArray:
 
 def _limits(joint: ET.Element, path: str) -> list[float]:
     """Lower and upper limit of a joint, rad or m."""
-    name, given = joint.get("name", ""), joint.find("limit")
-    if missing := [key for key in ("lower", "upper") if given is None or given.get(key) is None]:
+    name, element = joint.get("name", ""), joint.find("limit")
+    if missing := [key for key in ("lower", "upper") if element is None or element.get(key) is None]:
         raise InputError(
             f"{path}: joint {name} of type {joint.get('type')} has no {' and no '.join(missing)} limit: give "
             "lower and upper in its element limit, rad or m; a joint that turns without end is continuous"
@@ -199,10 +201,12 @@ def _link(joint: ET.Element, end: str, path: str) -> str:
 
 def _attribute(joint: ET.Element, tag: str, key: str, default: str, path: str) -> str:
     """An attribute of an element of a joint."""
-    found = joint.findall(tag)
-    if len(found) > 1:
-        raise InputError(f"{path}: joint {joint.get('name', '')} has {len(found)} elements {tag}: keep one")
-    value = found[0].get(key, default) if found else default
+    elements = joint.findall(tag)
+    if len(elements) > 1:
+        raise InputError(
+            f"{path}: joint {joint.get('name', '')} has {len(elements)} elements {tag}: keep one"
+        )
+    value = elements[0].get(key, default) if elements else default
     if not value:
         raise InputError(f"{path}: joint {joint.get('name', '')}: its {tag} has no {key}")
     return value
@@ -210,15 +214,15 @@ def _attribute(joint: ET.Element, tag: str, key: str, default: str, path: str) -
 
 def _numbers(joint: ET.Element, tag: str, key: str, default: str, path: str) -> FloatArray:
     """The numbers in an attribute of an element of a joint."""
-    given = _attribute(joint, tag, key, default, path)
+    text = _attribute(joint, tag, key, default, path)
     try:
-        values = np.array([float(part) for part in given.split()])
+        values = np.array([float(part) for part in text.split()])
     except ValueError:
         values = np.array([math.nan])
     many = len(default.split())
     if len(values) != many or not np.isfinite(values).all():
         name = joint.get("name", "")
-        raise InputError(f"{path}: joint {name}: {key} of its {tag} is {given!r}: expected {many} numbers")
+        raise InputError(f"{path}: joint {name}: {key} of its {tag} is {text!r}: expected {many} numbers")
     return values
 
 

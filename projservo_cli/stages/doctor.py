@@ -1,19 +1,20 @@
 """Doctor: look at robot and cameras before anything is recorded, and move each joint a little."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.detection import DICTIONARY, TagFinder
-from projservo_cli.hardware.camera_robot import CameraRobot
+from projservo_cli.hardware.camera_robot import CameraRobot, View
+from projservo_cli.hardware.cameras import Camera
 from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding, RobotAtRest, findings_at_rest
 from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.monitoring.accuracy import mean_image, of_calibration, resting_error_mm
-from projservo_cli.monitoring.monitor import detected_fault
+from projservo_cli.monitoring.image_monitor import detected_fault
 from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
@@ -41,8 +42,10 @@ class Checked(NamedTuple):
     @property
     def refuted(self) -> str | None:
         """Reason why the calibration holds no more, empty where it does; None where it was not compared."""
-        compared = (one for one in self.findings if one.where == _CALIBRATION and one.level != WARNING)
-        return next((one.text if one.level == FAULT else "" for one in compared), None)
+        for finding in self.findings:
+            if finding.where == _CALIBRATION and finding.level != WARNING:
+                return finding.text if finding.level == FAULT else ""
+        return None
 
 
 def check(
@@ -60,38 +63,45 @@ def check(
     """
     joints, dictionary = inputs.joints.joints("", calibration), inputs.dictionary or DICTIONARY
     robot = plugin_robot(inputs.robot, inputs.following.bounds(joints), joints.types, inputs.numbers)
-    found: list[Finding] = []
-    seen, moved = None, list[Strokes]()
+    findings: list[Finding] = []
+    at_rest, moved = None, list[Strokes]()
     try:
         with at_rest_after(robot):
             if watch is not None:
                 watch(robot)
-            seen = _seen(robot, inputs, progress)
-            found += findings_at_rest(seen, TagFinder(dictionary), dictionary, moves=confirmed is not None)
+            at_rest = _seen(robot, inputs, progress)
+            findings += findings_at_rest(
+                at_rest, TagFinder(dictionary), dictionary, moves=confirmed is not None
+            )
             if calibration is not None:
-                found.append(calibration_finding(calibration, seen, robot.image_size, inputs.lengths))
-            works = all(finding.level != FAULT for finding in found)
+                findings.append(calibration_finding(calibration, at_rest, robot.image_size, inputs.lengths))
+            works = all(finding.level != FAULT for finding in findings)
             if confirmed is not None and not works:
-                found.append(
+                findings.append(
                     Finding(WARNING, "joints", "were not moved: something above is a fault", "mend it first")
                 )
             elif confirmed is not None and confirmed(reach_of(joints.types)):
-                steered = Steered(robot)
-                for joint in range(len(seen.q)):
-                    one = strokes(steered, joint)
-                    progress("move", joint + 1, len(seen.q))
-                    if isinstance(one, str):
-                        what, _, remedy = one.partition(": ")
-                        found.append(Finding(WARNING, f"joint {joint + 1}", what, remedy))
-                    else:
-                        moved.append(one)
-                found += findings_of(moved, seen.marker)
+                findings += _move_joints(robot, moved, progress)
+                findings += findings_of(moved, at_rest.marker)
     except (InputError, WorkFailed) as error:
-        if isinstance(error, InputError) and seen is None:
+        if isinstance(error, InputError) and at_rest is None:
             raise
         what, _, remedy = str(error).partition(": look ")
-        found.append(Finding(FAULT, "robot and cameras", what, f"look {remedy}" if remedy else ""))
-    return Checked(tuple(found), seen, tuple(moved))
+        findings.append(Finding(FAULT, "robot and cameras", what, f"look {remedy}" if remedy else ""))
+    return Checked(tuple(findings), at_rest, tuple(moved))
+
+
+def _move_joints(robot: PluginRobot, moved: list[Strokes], progress: Progress) -> Iterator[Finding]:
+    """Move each joint to and fro, and add its strokes; findings on those without room."""
+    steered, joints = Steered(robot), len(robot.bounds.lead)
+    for joint in range(joints):
+        trial = strokes(steered, joint)
+        progress("move", joint + 1, joints)
+        if isinstance(trial, str):
+            what, _, remedy = trial.partition(": ")
+            yield Finding(WARNING, f"joint {joint + 1}", what, remedy)
+        else:
+            moved.append(trial)
 
 
 def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> RobotAtRest:
@@ -102,17 +112,17 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Ro
         time.sleep(period)
         readings.append(robot.read())
         progress("look", len(readings), wanted)
-    s, scatter = (np.stack(both) for both in zip(*(_mean(readings, view) for view in range(2)), strict=True))
-    own = robot.robot
-    cameras = own.cameras if isinstance(own, CameraRobot) else []
-    views = [view for view in own.views if view is not None] if isinstance(own, CameraRobot) else []
+    (left, scatter_left), (right, scatter_right) = (_mean(readings, view) for view in range(2))
+    own, cameras, views = robot.robot, list[Camera](), list[View]()
+    if isinstance(own, CameraRobot):
+        cameras, views = own.cameras, [view for view in own.views if view is not None]
     return RobotAtRest(
         marker=inputs.numbers,
         face=inputs.face,
         q=np.mean([look.q for look in readings], axis=0),
-        s=s,
+        s=np.stack([left, right]),
         sigma=readings[-1].sigma_px,
-        scatter=scatter,
+        scatter=np.stack([scatter_left, scatter_right]),
         limits=robot.bounds.limits,
         units=robot.bounds.units,
         views=views,
@@ -133,7 +143,7 @@ def _mean(readings: Sequence[Reading], view: int) -> tuple[FloatArray, FloatArra
 
 
 def calibration_finding(
-    calibration: Calibration, seen: RobotAtRest, image_size: ImageSize | None, lengths: FloatArray
+    calibration: Calibration, at_rest: RobotAtRest, image_size: ImageSize | None, lengths: FloatArray
 ) -> Finding:
     """Whether images at rest still agree with a calibration, and what changed if they do not.
 
@@ -141,13 +151,13 @@ def calibration_finding(
     """
     if not calibration.usable or not calibration.has_covariance:
         return Finding(WARNING, _CALIBRATION, "is not usable", "record and calibrate again")
-    size = image_sizes(image_size or [view.frame.grey.shape[::-1] for view in seen.views] or None)
-    marker = np.array(seen.marker, dtype=np.int64)
-    if not np.isfinite(seen.s[:, np.isin(marker, calibration.marker)]).any():
+    size = image_sizes(image_size or [view.frame.grey.shape[::-1] for view in at_rest.views] or None)
+    marker = np.array(at_rest.marker, dtype=np.int64)
+    if not np.isfinite(at_rest.s[:, np.isin(marker, calibration.marker)]).any():
         return Finding(WARNING, _CALIBRATION, "was not compared: no marker of it is seen", "show the tags")
-    if fault := detected_fault(calibration, seen.q, marker, seen.s, size):
+    if fault := detected_fault(calibration, at_rest.q, marker, at_rest.s, size):
         return Finding(FAULT, _CALIBRATION, fault, "put that back, or record and calibrate again")
-    images = of_calibration(calibration, marker, seen.s)
-    mm = resting_error_mm(calibration, seen.q, seen.face, lengths, images)
+    images = of_calibration(calibration, marker, at_rest.s)
+    mm = resting_error_mm(calibration, at_rest.q, at_rest.face, lengths, images)
     within = "" if mm is None else f", which show the tool within {mm:.2g} mm of where its joints put it"
     return Finding(FINE, _CALIBRATION, f"agrees with the images{within}")

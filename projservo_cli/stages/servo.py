@@ -22,7 +22,7 @@ from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.monitoring.accuracy import Posture, rigid_fit
-from projservo_cli.monitoring.statistics import WINDOW
+from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import (
     MM,
     VIEWS,

@@ -54,26 +54,25 @@ class _Taught:
     @property
     def images(self) -> GoalImages:
         """Return the images as the goal of a task."""
-        left, right = (
-            tuple(None if math.isnan(u) else (u, v) for u, v in pixels.round(_DIGITS).tolist())
-            for pixels in self.s
+        sides = (
+            tuple(None if math.isnan(u) else (u, v) for u, v in pixels)
+            for pixels in self.s.round(_DIGITS).tolist()
         )
-        sigma = [
-            tuple(None if math.isnan(x) else x for x in side.round(_DIGITS).tolist())
-            if np.isfinite(side).any()
-            else None
-            for side in self.sigma
-        ]
-        readings = Readings(tuple(self.q.tolist()), "rad")
-        return GoalImages(tuple(self.marker.tolist()), left, right, sigma[0], sigma[1], readings)
+        sigma = (
+            tuple(None if math.isnan(px) else px for px in side) if np.isfinite(side).any() else None
+            for side in self.sigma.round(_DIGITS).tolist()
+        )
+        return GoalImages(
+            tuple(self.marker.tolist()), *sides, *sigma, Readings(tuple(self.q.tolist()), "rad")
+        )
 
     def as_goal(self) -> dict[str, Any]:
         """Return the section ``task.goal`` of a configuration."""
-        seen = self.images
-        images: dict[str, Any] = {"markers": [*seen.markers]}
-        for name, pixels in zip(VIEWS, (seen.left, seen.right), strict=True):
+        goal = self.images
+        images: dict[str, Any] = {"markers": [*goal.markers]}
+        for name, pixels in zip(VIEWS, (goal.left, goal.right), strict=True):
             images[name] = [None if pixel is None else [*pixel] for pixel in pixels]
-        for name, sigma in (("sigma_left_px", seen.sigma_left), ("sigma_right_px", seen.sigma_right)):
+        for name, sigma in (("sigma_left_px", goal.sigma_left), ("sigma_right_px", goal.sigma_right)):
             if sigma is not None:
                 images[name] = [*sigma]
         return {"images": images | {"joints": {"joints": self.q.tolist(), "unit": "rad"}}}
@@ -225,10 +224,10 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     except WorkFailed as error:
         reached, reason, q = False, str(error), taught.q
     numbers = taught.marker.tolist()
-    both = np.flatnonzero(np.isin(numbers, calibration.marker))
+    known_to_both = np.flatnonzero(np.isin(numbers, calibration.marker))
     off = np.full(taught.sigma.shape, np.nan)
-    expected = predict(calibration, q[None])[0][:, calibration.indices_of(taught.marker[both])]
-    off[:, both] = np.linalg.norm(taught.s[:, both] - expected, axis=2)
+    expected = predict(calibration, q[None])[0][:, calibration.indices_of(taught.marker[known_to_both])]
+    off[:, known_to_both] = np.linalg.norm(taught.s[:, known_to_both] - expected, axis=2)
     noise = np.maximum(np.nan_to_num(taught.sigma), calibration.sigma_px)
     far = [
         (numbers[k], VIEWS[view], float(off[view, k]))
@@ -240,9 +239,9 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
 def require_start(taught: _Taught) -> None:
     """Refuse a start from which nothing can be recorded, since both cameras see too little; a WorkFailed."""
     if taught.shared < MIN_SHARED:
-        known, (left, right) = len(taught.marker), np.isfinite(taught.s[..., 0]).sum(axis=1)
+        count, (left, right) = len(taught.marker), np.isfinite(taught.s[..., 0]).sum(axis=1)
         raise WorkFailed(
-            f"teach: both cameras see {taught.shared} of {known} markers ({MIN_SHARED} at least; "
+            f"teach: both cameras see {taught.shared} of {count} markers ({MIN_SHARED} at least; "
             f"left {left}, right {right}): turn the tool towards both cameras, and look at light and focus"
         )
 

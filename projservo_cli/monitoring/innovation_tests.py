@@ -395,8 +395,8 @@ class Memory:
         if last is None or last[2] != disagrees:
             return
         before, n = last[0], len(self._errors.sigma_q)
-        seen = before.seen & now.seen
-        rows = np.repeat((seen & ~aside & ~last[1]).ravel(), 2)
+        in_both = before.seen & now.seen
+        rows = np.repeat((in_both & ~aside & ~last[1]).ravel(), 2)
         weight, columns = 1.0 / np.repeat(now.noise.ravel(), 2)[:, None], [*range(n), 2 * n, 2 * n + 1]
         off, moved = (now.r - before.r) * weight[:, 0], now.F[:, columns] * weight
         if kind == _BETWEEN_VIEWS:
@@ -413,8 +413,8 @@ class Memory:
             square = max(0.0, square - float(np.square(by_errors - basis @ (basis.T @ by_errors)).sum()))
         elif kind == _AT_REST:
             off -= moved @ np.linalg.lstsq(R, along)[0]
-            step = 0.5 * np.square(off / weight[:, 0]).reshape(*seen.shape, 2).sum(axis=2)
-            self._steps.append(np.where(seen, step, np.nan))
+            step = 0.5 * np.square(off / weight[:, 0]).reshape(*in_both.shape, 2).sum(axis=2)
+            self._steps.append(np.where(in_both, step, np.nan))
         # Fading, so that the errors of a finder in one light do not count for ever.
         self._squares[kind] = 0.99 * self._squares[kind] + 0.5 * square
         self._freedom[kind] = 0.99 * self._freedom[kind] + freedom
@@ -460,9 +460,9 @@ class _Reduced(NamedTuple):
     def of(self, rows: FloatArray) -> FloatArray:
         """Other right-hand sides (e + f, k) of the equations, (f, k) after the same steps."""
         e = len(self.root)
-        found = self.line @ rows[e:]
-        found -= self.along.T @ solve_triangular(self.root, rows[:e], lower=True, check_finite=False)
-        return np.asarray(found - self.solved.T @ found[self.nuisance])
+        reduced = self.line @ rows[e:]
+        reduced -= self.along.T @ solve_triangular(self.root, rows[:e], lower=True, check_finite=False)
+        return np.asarray(reduced - self.solved.T @ reduced[self.nuisance])
 
 
 class Tested(NamedTuple):
@@ -508,10 +508,10 @@ class Detector:
         """Test χ² of each view and each marker in one observation, without detections off by themselves."""
         errors, (_, m) = self._errors, residual.seen.shape
         total = self.memory.total
-        both = np.concatenate([residual.B.T, total.normal[: errors.e, -1:]], axis=1)
-        both = solve_triangular(errors.root(total), both, lower=True, check_finite=False)
-        W = both[:, :-1]
-        S, r = W.T @ W + residual.R, residual.r - W.T @ both[:, -1]
+        columns = np.concatenate([residual.B.T, total.normal[: errors.e, -1:]], axis=1)
+        columns = solve_triangular(errors.root(total), columns, lower=True, check_finite=False)
+        W = columns[:, :-1]
+        S, r = W.T @ W + residual.R, residual.r - W.T @ columns[:, -1]
         rows = np.arange(4 * m).reshape(2, m, 2)
         single = self._beyond(S, r, rows.reshape(2 * m, 2), residual).reshape(2, m)
         markers = self._beyond(S, r, rows.swapaxes(0, 1).reshape(m, 4), residual)
@@ -544,10 +544,10 @@ class Detector:
 
     def _beyond(self, S: FloatArray, r: FloatArray, parts: IntArray, residual: Residual) -> BoolArray:
         """Which parts (h,) of residuals, by their rows (h, p), are beyond chance and errors of the model."""
-        seen = np.repeat(residual.seen.ravel(), 2)[parts]
+        detected = np.repeat(residual.seen.ravel(), 2)[parts]
         bias = np.repeat((self._errors.bias_px / residual.noise.ravel()) ** 2, 2)[parts]
         bias = bias + _UNUSUAL**2 * (1.0 - self.memory.fresh)
-        maximum = self._most_once[seen.sum(axis=1)] + np.sqrt((seen * bias).sum(axis=1))
+        maximum = self._most_once[detected.sum(axis=1)] + np.sqrt((detected * bias).sum(axis=1))
         gain = gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
         return np.asarray(gain > maximum**2)
 
@@ -565,7 +565,7 @@ class Detector:
         lengths = _LONGER ** np.arange(1 + int(np.log(total.views) / np.log(_LONGER)))
         tail = self._chance / (count + _SOON) / len(self._sizes)
         by_chance = np.sqrt(chdtri(self._sizes, tail))
-        found: Sums | None = None
+        likeliest: Sums | None = None
         maximum = 0.0
         self._last = np.full(len(self._sizes), -np.inf)
         for length in lengths if thorough else lengths[[count % len(lengths)]]:
@@ -574,8 +574,8 @@ class Detector:
             self._last = np.maximum(self._last, excess)
             most = float((excess - self._accepted).max())
             if most > maximum:
-                found, maximum = since, most
-        return found
+                likeliest, maximum = since, most
+        return likeliest
 
     def _reduced(self, since: Sums, total: Sums, sigma_t: FloatArray, free: list[IntArray]) -> _Reduced:
         """Normal equations of faults since an onset without errors of the calibration and lasting ones."""
@@ -667,9 +667,9 @@ class Detector:
                 size = np.sqrt(np.maximum(reduced.normal.diagonal(), _LEAST_INFORMATION))[part]
                 unit, block = np.outer(size, size), np.ix_(part, part)
                 inverse = np.linalg.inv(reduced.normal[block] / unit + RIDGE * np.eye(len(part))) / unit
-                found = carry @ at.F[:, part] @ inverse
-                off = np.square(found @ reduced.normal[part, -1]).sum()
-                may = np.trace(found @ spread[block] @ found.T)
+                by_score = carry @ at.F[:, part] @ inverse
+                off = np.square(by_score @ reduced.normal[part, -1]).sum()
+                may = np.trace(by_score @ spread[block] @ by_score.T)
                 greatest = max(greatest, float(off + TOLD**2 * may))
         return float(np.sqrt(greatest))
 
@@ -732,8 +732,8 @@ def _rays(scene: Parameters, directions: FloatArray, q: FloatArray) -> FloatArra
 def rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) -> FloatArray:
     """Basis (d, 4, 4) of rigid motions: translations, and those that the joints generate together."""
     brackets = [A @ B - B @ A for A in H_hat for B in H_hat]
-    known = np.concatenate([H_hat, np.array(brackets), directions[:, :, None] * a_inf])
-    sizes, rows = np.linalg.svd(known.reshape(-1, 16))[1:]
+    motions = np.concatenate([H_hat, np.array(brackets), directions[:, :, None] * a_inf])
+    sizes, rows = np.linalg.svd(motions.reshape(-1, 16))[1:]
     return np.asarray(rows[:6][sizes[:6] > _RANK * sizes[0]].reshape(-1, 4, 4))
 
 
@@ -748,15 +748,15 @@ def _directions_of(n: int, m: int, d: int) -> tuple[list[IntArray], FloatArray, 
     at_camera, free = 2 * n + 2, CAMERA - 1
     at_marker = at_camera + 2 * free
     at_tool = at_marker + 3 * m
-    found = [*((np.array([i]), everything) for i in range(2 * n))]
-    found += [(n + np.arange(n), everything), (np.arange(n), everything)]
+    directions = [*((np.array([i]), everything) for i in range(2 * n))]
+    directions += [(n + np.arange(n), everything), (np.arange(n), everything)]
     for v in (0, 1):
-        found += [(np.array([2 * n + v]), views[v]), (at_camera + v * free + np.arange(free), views[v])]
-    found += [(2 * n + np.arange(2), everything)]
+        directions += [(np.array([2 * n + v]), views[v]), (at_camera + v * free + np.arange(free), views[v])]
+    directions += [(2 * n + np.arange(2), everything)]
     for j in range(m):
-        found += [(at_marker + 3 * j + np.arange(3), everything * (np.arange(m) == j))]
-    found += [(at_tool + np.arange(d), everything), (at_tool + d + np.arange(d), everything)]
-    columns, touches = zip(*found, strict=True)
+        directions += [(at_marker + 3 * j + np.arange(3), everything * (np.arange(m) == j))]
+    directions += [(at_tool + np.arange(d), everything), (at_tool + d + np.arange(d), everything)]
+    columns, touches = zip(*directions, strict=True)
     return list(columns), np.array([part.ravel() for part in touches]), at_tool + 2 * d
 
 
