@@ -12,22 +12,14 @@ from projservo_cli.calibration.prediction import Parameters, predict
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.innovation_tests import (
-    TOLD,
+    DISTINCT,
     ErrorModel,
     Residual,
-    relative_to_others,
+    coordinate_rows,
+    farthest_alone,
     rigid_motions,
 )
-from projservo_cli.records import (
-    MM,
-    PRISMATIC,
-    BoolArray,
-    Calibration,
-    FloatArray,
-    InputError,
-    IntArray,
-    Model,
-)
+from projservo_cli.records import MM, PRISMATIC, BoolArray, Calibration, FloatArray, InputError, Model
 
 # Variance of corners from a side that the calibration has not seen, over that of others; chance of a test.
 _UNUSUAL, _CHANCE = 2.0, 1e-4
@@ -113,7 +105,7 @@ class RigidFit(NamedTuple):
     def off_mm(self, posture: Posture, M: FloatArray) -> float:
         """Return how far off the face may be, mm, where one of the images is shifted within chance."""
         carry = posture.carry(M, self.seen)[:, : 2 * len(M)].reshape(-1, len(M), 2).sum(axis=1)
-        may = TOLD**2 * np.trace(carry @ self.covariance @ carry.T)
+        may = DISTINCT**2 * np.trace(carry @ self.covariance @ carry.T)
         return float(np.sqrt(np.square(carry @ self.shift).sum() + may))
 
 
@@ -122,7 +114,7 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
 
     images : (2, m, 2) px of the markers of the calibration, NaN where unseen; sigma : (2, m) deviations.
     """
-    pair, n = still(q, images, np.maximum(sigma, calibration.sigma_px)), len(q)
+    pair, n = FramePair.at_rest(q, images, np.maximum(sigma, calibration.sigma_px)), len(q)
     errors, moved = ErrorModel(calibration, calibration.sigma_px), np.eye(4)
     at = by_joints = errors.residual(pair)
     for _ in range(_STEPS):
@@ -132,21 +124,21 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
         at = errors.residual(pair)
     free, left = _free(at, at.F[:, errors.tool]), at.seen.ravel().copy()
     for _ in range(int(_ALONE * left.sum())):
-        rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
-        square = relative_to_others(free[np.ix_(rows, rows)], at.r[rows])
-        if square.max() <= _UNUSUAL * chdtri(2, _CHANCE / left.sum()):
+        limit = _UNUSUAL * chdtri(2, _CHANCE / left.sum())
+        if (stray := farthest_alone(free, at.r, np.flatnonzero(left), limit)) is None:
             break
-        left[np.flatnonzero(left)[np.argmax(square)]] = False
-    rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
-    bias = 2.0 * float(np.square(errors.bias_px / at.noise).ravel()[left].sum())
-    freedom = np.maximum([2, len(rows) - len(errors.twists), len(rows) - n], 1)
-    limits = _UNUSUAL * chdtri(freedom, _CHANCE) + bias
+        left[stray] = False
+    rows = coordinate_rows(np.flatnonzero(left))
     P, r, r_joints = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows], by_joints.r[rows]
     F = np.eye(2)[rows % 2] * (rows < len(at.r) // 2)[:, None]
     covariance = np.linalg.inv(F.T @ P @ F)
     shift = covariance @ F.T @ P @ r
     joints = np.linalg.solve(_free(by_joints, by_joints.F[:, :n])[np.ix_(rows, rows)], r_joints)
-    over, rms = np.array([shift @ F.T @ P @ r, r @ P @ r, r_joints @ joints]) / limits, np.sqrt(np.mean(r**2))
+    # χ² of the shift, of what is left, and of that where joints show it best, over their limits.
+    bias = 2.0 * float(np.square(errors.bias_px / at.noise).ravel()[left].sum())
+    freedom = np.maximum([2, len(rows) - len(errors.twists), len(rows) - n], 1)
+    squares = np.array([shift @ F.T @ P @ r, r @ P @ r, r_joints @ joints])
+    over, rms = squares / (_UNUSUAL * chdtri(freedom, _CHANCE) + bias), np.sqrt(np.mean(r**2))
     return RigidFit(
         agrees=bool(max(over[:2]) <= 1.0),
         reached=bool(over[2] <= 1.0),
@@ -166,8 +158,8 @@ def resting_error_mm(
 ) -> float | None:
     """Return how far a face at rest may be from where its joints put it, rms mm, by images that agree.
 
-    It is what images are off, and what one image may be shifted by without a test that shows it. None where
-    no length is known, or a view shows less than three markers.
+    The error of the images, and the shift of one of them that no test shows. None where no length is known,
+    or a view shows less than three markers.
 
     q : (n,) joint readings, rad or m; face : numbers of its markers; lengths : (f, f) between them, m, NaN if
         unknown.
@@ -191,24 +183,3 @@ def _free(at: Residual, J: FloatArray) -> FloatArray:
     J = J * np.repeat(at.seen.ravel(), 2)[:, None]
     J = J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     return np.asarray(S + _FREE * S.diagonal().max() * J @ J.T)
-
-
-def of_calibration(calibration: Calibration, marker: IntArray, images: FloatArray) -> FloatArray:
-    """Values (2, m, …) of the markers of a calibration among those (2, b, …) of the numbers marker (b,)."""
-    has = np.isin(marker, calibration.marker)
-    values = np.full((2, len(calibration.marker), *images.shape[2:]), np.nan)
-    values[:, calibration.indices_of(marker[has])] = images[:, has]
-    return values
-
-
-def mean_image(images: FloatArray) -> FloatArray:
-    """Mean (…, 2) of images (K, …, 2) of an arm that stands still; NaN where most show no marker."""
-    often, mean = 2 * np.isfinite(images).sum(axis=0) > len(images), np.full(images.shape[1:], np.nan)
-    mean[often] = np.nanmean(images[:, often], axis=0)
-    return mean
-
-
-def still(q: FloatArray, images: FloatArray, noise: FloatArray) -> FramePair:
-    """Observation of an arm that stands still at joints (n,), of pixels (2, m, 2) with deviations (2, m)."""
-    none = np.zeros(2)
-    return FramePair(none, np.stack([q, q]), np.zeros((2, len(q))), none, images, noise, np.zeros(len(q)))

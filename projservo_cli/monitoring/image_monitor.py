@@ -8,8 +8,8 @@ import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import predict
-from projservo_cli.monitoring.accuracy import Posture, mean_image, of_calibration, still
-from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
+from projservo_cli.monitoring.accuracy import Posture
+from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing, at_known_markers, mean_image
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
     Explanation,
@@ -213,7 +213,7 @@ class ImageMonitor:
         if not self._kept:
             return 0.0
         used = used[:, self._shown]
-        pair = still(q, np.where(used[..., None], np.zeros(2), np.nan), np.ones(used.shape))
+        pair = FramePair.at_rest(q, np.where(used[..., None], np.zeros(2), np.nan), np.ones(used.shape))
         carry = posture.carry(self.calibration.M, used)
         return self._detector.undetected(carry, self._errors.residual(pair), self._kept[-1].pair.sigma_t)
 
@@ -488,7 +488,7 @@ def detected_fault(
     """
     if not calibration.usable or not calibration.has_covariance:
         return ""
-    pixels = of_calibration(calibration, marker, images)
+    pixels = at_known_markers(calibration, marker, images)
     rest, instants, new = np.zeros((2, len(q))), np.zeros(2), np.ones(2, dtype=np.bool_)
 
     def fault_of(pixels: FloatArray) -> str:
@@ -523,7 +523,7 @@ def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> s
     """
     tags = {int(tag): np.flatnonzero(numbers // CORNERS == tag) for tag in np.unique(numbers // CORNERS)}
     tags = {tag: at for tag, at in tags.items() if len(at) == CORNERS and np.isfinite(pixels[:, at]).any()}
-    places: dict[int, tuple[int, int]] = {}
+    moved_to: dict[int, tuple[int, int]] = {}
 
     def rms(tag: int, place: int, turn: int) -> float:
         off = pixels[:, tags[tag]] - np.roll(expected[:, tags[place]], turn, axis=1)
@@ -533,14 +533,14 @@ def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> s
         side = np.linalg.norm(expected[:, at] - np.roll(expected[:, at], 1, axis=1), axis=-1).mean()
         own, best = rms(tag, tag, 0), min(product(tags, range(CORNERS)), key=lambda to: rms(tag, *to))
         if own > _SIDE * side and best != (tag, 0) and rms(tag, *best) < _LEFT * own:
-            places[tag] = best
+            moved_to[tag] = best
     said = []
-    for tag, (place, turn) in places.items():
+    for tag, (place, turn) in moved_to.items():
         if place == tag:
             said.append(f"tag {tag} is {'upside down' if turn == 2 else 'turned by a quarter'}")
-        elif place not in places or tag < place:
+        elif place not in moved_to or tag < place:
             said.append(f"tags {tag} and {place} are exchanged")
-    if not places or 2 * len(places) > len(tags):
+    if not moved_to or 2 * len(moved_to) > len(tags):
         return ""
     return f"{' and '.join(said)} on the tool; put them back as they were, or recalibrate"
 

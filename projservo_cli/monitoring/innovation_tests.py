@@ -50,8 +50,10 @@ _DIFFERENCES, _MEDIAN, _MEDIAN_AT_MOST = 9, 1.386, 5.6
 _OFF_ALONE = 18.4
 # Minimum information on a direction, in units of its deviations: one that no image shows has some.
 _LEAST_INFORMATION = 1e-12
-# Share of the views after which a fault that grows is seen nearly whole; deviations that are told from none.
-_LATE, TOLD = 2.0 / 3.0, 2.0
+# Share of the views after which a fault that grows is seen nearly whole.
+_NEARLY_WHOLE = 2.0 / 3.0
+# Deviations from which a difference is distinguished from none.
+DISTINCT = 2.0
 # Share of the markers of a view that may be off one by one before the view itself is.
 _MOST_ASIDE = 0.5
 
@@ -153,7 +155,7 @@ class ErrorModel:
         predicted = scene.predict(away)[views, views]
         r = pair.images - predicted
         seen = np.isfinite(r[..., 0])
-        noise = pair.noise * np.sqrt(self._excess(away))
+        noise = pair.noise * np.sqrt(self._corner_variance(away))
         at = scene.everywhere(away)
         B = dense_pixel_changes(scene, self.errors, away, at)[views, views]
         D = at.by_point.reshape(n + 1, 2, 2, m, 2, 4)[:, views, views]
@@ -178,7 +180,7 @@ class ErrorModel:
             seen=seen, noise=noise, predicted=predicted, r=r.ravel(), B=B.reshape(rows, -1), F=F, R=R
         )
 
-    def _excess(self, away: FloatArray) -> FloatArray:
+    def _corner_variance(self, away: FloatArray) -> FloatArray:
         """Variance of corners (2, m) over their noise, as detections of the calibration from near them err.
 
         A corner that is seen from another side, or under another slant, errs otherwise.
@@ -263,7 +265,7 @@ class ErrorModel:
         """Root (e, e) of the information on the errors of the calibration."""
         return np.asarray(np.linalg.cholesky(np.eye(self.e) + sums.normal[: self.e, : self.e]))
 
-    def strays(self, sums: Sums) -> bool:
+    def contradicts(self, sums: Sums) -> bool:
         """Whether sums put the calibration where it is not by chance, once in ten thousand."""
         root = self.root(sums)
         off = cho_solve((root, True), sums.normal[: self.e, -1], check_finite=False)
@@ -372,7 +374,7 @@ class Memory:
         not agree where the calibration would have to be off beyond chance.
         """
         new = self._errors.sums(residual, t)
-        if not whole and self._errors.strays(self.total.plus(new)):
+        if not whole and self._errors.contradicts(self.total.plus(new)):
             return
         state = self.state
         if state.first is None or not is_same_view(state.first, residual.predicted):
@@ -533,13 +535,11 @@ class Detector:
         allowed = _MOST_ASIDE * visible.sum(axis=1)
         while ((aside & visible).sum(axis=1) <= allowed).all():
             left = np.flatnonzero(visible.ravel() & ~out)
-            rows = (2 * left[:, None] + np.arange(2)).ravel()
-            if not self._beyond(S, r, rows[None], residual)[0]:
+            if not self._beyond(S, r, coordinate_rows(left)[None], residual)[0]:
                 return False
-            square = relative_to_others(S[np.ix_(rows, rows)], r[rows])
-            if square.max() <= _OFF_ALONE:
+            if (stray := farthest_alone(S, r, left, _OFF_ALONE)) is None:
                 return True
-            out[left[np.argmax(square)]] = True
+            out[stray] = True
         return True
 
     def _beyond(self, S: FloatArray, r: FloatArray, parts: IntArray, residual: Residual) -> BoolArray:
@@ -654,7 +654,7 @@ class Detector:
         total, onsets, n = self.memory.total, self.memory.onsets(), len(self._errors.sigma_q)
         if not onsets:
             return 0.0
-        late, greatest = min(onsets, key=lambda sums: abs(sums.views - _LATE * total.views)), 0.0
+        late, greatest = min(onsets, key=lambda sums: abs(sums.views - _NEARLY_WHOLE * total.views)), 0.0
         cameras = 2 * n + 2 + 2 * (CAMERA - 1)
         for since, end in ((onsets[0], self._errors.f), (late, cameras)):
             reduced = self._reduced(since, total, sigma_t, [])
@@ -670,7 +670,7 @@ class Detector:
                 by_score = carry @ at.F[:, part] @ inverse
                 off = np.square(by_score @ reduced.normal[part, -1]).sum()
                 may = np.trace(by_score @ spread[block] @ by_score.T)
-                greatest = max(greatest, float(off + TOLD**2 * may))
+                greatest = max(greatest, float(off + DISTINCT**2 * may))
         return float(np.sqrt(greatest))
 
     def _root_gains(self, reduced: _Reduced, more: FloatArray | float) -> FloatArray:
@@ -709,14 +709,23 @@ def _greatest(spread: FloatArray, reduced: _Reduced, part: IntArray) -> float:
         return np.inf
 
 
-def relative_to_others(S: FloatArray, r: FloatArray) -> FloatArray:
-    """Return χ² (k,) of each detection given all others, of residuals r (2 k,) with covariance S.
+def farthest_alone(S: FloatArray, r: FloatArray, detections: IntArray, limit: float) -> int | None:
+    """Return the detection, among some (k,), that is the farthest off given all others; None within a limit.
 
     Errors of joints move all of them: one by itself hardly shows its own error.
+
+    S, r : covariance and residuals of all coordinates, px² and px; limit : of χ².
     """
-    P, k = np.linalg.inv(S), np.arange(len(r) // 2)
-    u, blocks = (P @ r).reshape(-1, 2, 1), P.reshape(len(k), 2, len(k), 2)[k, :, k]
-    return np.asarray((u * np.linalg.solve(blocks, u)).sum(axis=(1, 2)))
+    rows, k = coordinate_rows(detections), np.arange(len(detections))
+    P = np.linalg.inv(S[np.ix_(rows, rows)])
+    u, blocks = (P @ r[rows]).reshape(-1, 2, 1), P.reshape(len(k), 2, len(k), 2)[k, :, k]
+    square = (u * np.linalg.solve(blocks, u)).sum(axis=(1, 2))
+    return int(detections[np.argmax(square)]) if square.max() > limit else None
+
+
+def coordinate_rows(detections: IntArray) -> IntArray:
+    """Rows (2 k,) of the coordinates of detections (k,)."""
+    return np.asarray((2 * detections[:, None] + np.arange(2)).ravel())
 
 
 def _rays(scene: Parameters, directions: FloatArray, q: FloatArray) -> FloatArray:

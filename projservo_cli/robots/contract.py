@@ -88,7 +88,7 @@ class Robot(Protocol):
     ``release()`` and ``hold()``, which let go of the arm, so that somebody can move it for ``projservo
     teach``, and hold it again; ``identity() -> str``, without spaces, which changes where readings mean
     something else, such as after homing, and without which no recording holds; ``remarks() -> list[str]``,
-    what is wrong with its last images, such as darkness; and, if it is a simulator, ``truth()``, the pose
+    faults of its last images, such as darkness; and, if it is a simulator, ``truth()``, the pose
     (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's time passes
     in ``command`` alone, which moves it to ``due``. And ``frames``, both images (2, height, width) of its
     last reading in grey, uint8, or None: a run keeps some, which the report shows. A class that takes an
@@ -218,7 +218,7 @@ class PluginRobot:
         return dict(self._optional("health", {}))
 
     def remarks(self) -> list[str]:
-        """Return what the robot finds wrong with its last images, in words; may be empty."""
+        """Return the faults of the last images that the robot finds, in words; may be empty."""
         return list(self._optional("remarks", ()))
 
     def identity(self) -> str:

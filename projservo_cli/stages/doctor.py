@@ -13,7 +13,8 @@ from projservo_cli.hardware.cameras import Camera
 from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding, RobotAtRest, findings_at_rest
 from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
 from projservo_cli.image_size import ImageSize, image_sizes
-from projservo_cli.monitoring.accuracy import mean_image, of_calibration, resting_error_mm
+from projservo_cli.monitoring.accuracy import resting_error_mm
+from projservo_cli.monitoring.frame_pairs import at_known_markers, mean_image
 from projservo_cli.monitoring.image_monitor import detected_fault
 from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
@@ -157,7 +158,7 @@ def calibration_finding(
         return Finding(WARNING, _CALIBRATION, "was not compared: no marker of it is seen", "show the tags")
     if fault := detected_fault(calibration, at_rest.q, marker, at_rest.s, size):
         return Finding(FAULT, _CALIBRATION, fault, "put that back, or record and calibrate again")
-    images = of_calibration(calibration, marker, at_rest.s)
+    images = at_known_markers(calibration, marker, at_rest.s)
     mm = resting_error_mm(calibration, at_rest.q, at_rest.face, lengths, images)
     within = "" if mm is None else f", which show the tool within {mm:.2g} mm of where its joints put it"
     return Finding(FINE, _CALIBRATION, f"agrees with the images{within}")
