@@ -77,7 +77,7 @@ def _tags(
     from projservo_cli.config.markers import GROUND, Markers
     from projservo_cli.detection import TagFinder
     from projservo_cli.files import write_whole
-    from projservo_cli.hardware import tags as sheets
+    from projservo_cli.hardware import tag_sheets as sheets
 
     if numbers is not None and kind != "single":
         raise click.UsageError(

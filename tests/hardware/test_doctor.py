@@ -20,11 +20,13 @@ from projservo_cli.calibration import predict
 from projservo_cli.config import Override, load_config
 from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.detection import TagFinder
-from projservo_cli.hardware.checks_at_rest import view_angle_deg
+from projservo_cli.files import working_in
+from projservo_cli.hardware.checks_at_rest import FAULT, FINE, Finding, view_angle_deg
 from projservo_cli.hardware.live_page import LivePage
 from projservo_cli.records import InputError
 from projservo_cli.stages import calibrate
-from projservo_cli.stages.doctor import calibration_finding
+from projservo_cli.stages.doctor import Checked, calibration_finding
+from projservo_cli.store import load
 from tests.conftest import ROOT
 from tests.hardware.arms_in_motion import Faults, Rail, findings
 from tests.hardware.streams import Stream, picture
@@ -453,3 +455,28 @@ def test_a_live_page_serves_both_images_to_this_machine_alone():
         assert head[:2] == [b"--frame\r\n", b"Content-Type: image/jpeg\r\n"]
         assert answer.read(6) == b"JPEG-1"
     page.close()
+
+
+def test_a_run_that_images_contradict_is_marked_unless_another_process_is_at_work_in_it(
+    projservo, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert projservo("calibrate", "-c", ROOT / "configs" / "hobby.yaml", "-o", "out").code == 0
+    text = CONFIGURATION.format(left="left.mp4", right="right.mp4", rate=20, options="")
+    (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
+    moved = Finding(FAULT, "calibration", "the left camera was moved", "put it back")
+
+    def answer_to(finding):
+        checked = Checked((finding,), None, ())
+        monkeypatch.setattr("projservo_cli.stages.doctor.check", lambda *_, **__: checked)
+        return projservo("doctor", "out", "-c", "arm.yaml")
+
+    assert answer_to(moved).code == 1
+    assert load("out").refuted == "the left camera was moved"
+    with working_in(tmp_path / "out"):
+        answer = answer_to(Finding(FINE, "calibration", "agrees with the images"))
+    assert answer.code == 2
+    assert "is at work there" in answer.err
+    assert load("out").refuted == "the left camera was moved"
+    assert answer_to(Finding(FINE, "calibration", "agrees with the images")).code == 0
+    assert load("out").refuted == ""
