@@ -12,7 +12,7 @@ from projservo_cli.calibration import predict
 from projservo_cli.display import require_radians
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
-from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
+from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.settings import Joints, OwnRobot, Readings
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.stages import plan as planning
@@ -101,24 +101,12 @@ def teach(
     Raises InputError if ``at`` is missing, does not fit or is beyond a limit, or an arm without limits would
     have to hold; WorkFailed if the robot fails.
     """
-    joints, driven, period = inputs.joints.joints(), inputs.driven, inputs.driven.following.period
-    moved = None
-    if isinstance(driven.robot, OwnRobot):
-        if at is not None:
-            raise InputError("--at is where a simulated robot is put to; move yours by hand")
-        bounds = driven.following.bounds(joints)
-        robot = plugin_robot(driven.robot, bounds, joints.types, inputs.numbers)
-        if wait is not None and robot.lets_go and takes_limits(driven.robot):
-            _require_limits(joints)
-    else:
-        if at is None:
-            raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
-        q = _within_limits(at, joints)
-        robot = simulated_robot(driven, joints, _put_to(inputs, driven.robot, q))
+    (robot, q), moved = _robot_to_teach(inputs, at, by_hand=wait is not None), None
+    period = robot.bounds.period
 
     def observe() -> Reading:
         """A look after a period, in which a simulated robot holds where it was put to."""
-        if at is None:
+        if q is None:
             time.sleep(period)
         else:
             robot.command(q, np.zeros_like(q), robot.now() + period)
@@ -151,6 +139,28 @@ def teach(
         moved=None if moved is None else mean.q - moved,
         bounds=robot.bounds,
     )
+
+
+def _robot_to_teach(
+    inputs: TeachInputs, at: Readings | None, *, by_hand: bool
+) -> tuple[PluginRobot, FloatArray | None]:
+    """Return the robot, and the joints (n,), rad or m, that a simulated one was put to.
+
+    by_hand : whether somebody moves it, so that it must hold again where it was released.
+    """
+    joints, driven = inputs.joints.joints(), inputs.driven
+    if not isinstance(driven.robot, OwnRobot):
+        if at is None:
+            raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
+        q = _within_limits(at, joints)
+        return simulated_robot(driven, joints, _put_to(inputs, driven.robot, q)), q
+    if at is not None:
+        raise InputError("--at is where a simulated robot is put to; move yours by hand")
+    bounds = driven.following.bounds(joints)
+    robot = plugin_robot(driven.robot, bounds, joints.types, inputs.numbers)
+    if by_hand and robot.lets_go and takes_limits(driven.robot):
+        _require_limits(joints)
+    return robot, None
 
 
 def _require_limits(joints: Joints) -> None:
