@@ -31,8 +31,8 @@ TARGET = rf"^{DOTTED}:{DOTTED}$"
 
 def registered(kind: str) -> dict[str, str]:
     """Names of a ``plant`` or ``law``, projservo's own and those of installed packages, with the classes."""
-    targets = {point.name: point.value for point in metadata.entry_points(group=GROUPS[kind])}
-    return targets | (_OWN_PLANTS if kind == "plant" else {})
+    found = {point.name: point.value for point in metadata.entry_points(group=GROUPS[kind])}
+    return found | (_OWN_PLANTS if kind == "plant" else {})
 
 
 def short_name(target: str) -> str:
@@ -53,10 +53,10 @@ def find(kind: str, target: str) -> Any:
     Raises InputError if there is no such class or it lacks a method that its objects must have.
     """
     where = f"{kind} {target}"
-    imported = _found(where, *target.split(":"))
-    if isinstance(imported, type):
-        _require_methods(where, imported, kind)
-    return imported
+    found = _found(where, *target.split(":"))
+    if isinstance(found, type):
+        _require_methods(where, found, kind)
+    return found
 
 
 def make(kind: str, target: str, arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
@@ -69,21 +69,21 @@ def make(kind: str, target: str, arguments: Sequence[Any], options: Mapping[str,
     return called(kind, target, find(kind, target), arguments, options)
 
 
-def called(kind: str, target: str, factory: Any, arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
+def called(kind: str, target: str, found: Any, arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
     """Call a class, or a function that makes objects; the object, which has all methods it must have.
 
     kind, target : as for ``find``, for messages. Raises as ``make`` does.
     """
     where = f"{kind} {target}"
     try:
-        inspect.signature(factory).bind(*arguments, **options)
+        inspect.signature(found).bind(*arguments, **options)
     except TypeError as error:
-        given_by = f"{kind}.options" if kind == "plant" else "the setting it is given"
-        raise InputError(f"{where}: does not take {given_by}: {error}") from error
+        given = f"{kind}.options" if kind == "plant" else "the setting it is given"
+        raise InputError(f"{where}: does not take {given}: {error}") from error
     except ValueError:
         pass  # a class in C does not show its arguments; the call itself checks them
     try:
-        result = factory(*arguments, **options)
+        result = found(*arguments, **options)
     except InputError:  # says itself which option is wrong
         raise
     except Exception as error:
@@ -109,7 +109,7 @@ def _found(where: str, module: str, name: str) -> Any:
     if os.getcwd() not in sys.path:  # last, so that a file there never stands in for an installed module
         sys.path.append(os.getcwd())
     try:
-        named: Any = importlib.import_module(module)
+        found: Any = importlib.import_module(module)
     except (Exception, SystemExit) as error:
         if (
             isinstance(error, ModuleNotFoundError)
@@ -120,87 +120,87 @@ def _found(where: str, module: str, name: str) -> Any:
             raise InputError(f"{where}: there is no module {error.name} {place}") from error
         raise InputError(f"{where}: importing {module} failed: {what_failed(error)}") from error
     for step in name.split("."):
-        if not hasattr(named, step):
+        if not hasattr(found, step):
             classes = [
-                key for key, value in vars(named).items() if getattr(value, "__module__", "") == module
+                key for key, value in vars(found).items() if getattr(value, "__module__", "") == module
             ]
             near = difflib.get_close_matches(step, classes, n=1)
             hint = f"did you mean {near[0]}?" if near else f"classes: {', '.join(classes) or 'none'}"
             raise InputError(f"{where}: {module} has no {step}; {hint}")
-        named = getattr(named, step)
-    if not callable(named):
-        raise InputError(f"{where}: is no class, but of type {type(named).__name__}")
-    return named
+        found = getattr(found, step)
+    if not callable(found):
+        raise InputError(f"{where}: is no class, but of type {type(found).__name__}")
+    return found
 
 
-def require_object(kind: str, target: str, instance: Any) -> None:
+def require_object(kind: str, target: str, given: Any) -> None:
     """Refuse an object that lacks a method it must have, with an InputError."""
-    _require_methods(f"{kind} {target}", instance, kind)
+    _require_methods(f"{kind} {target}", given, kind)
 
 
-def name_of(named: Any) -> str:
+def name_of(given: Any) -> str:
     """Return ``module:Class`` of a class, of a function or of an object's class."""
-    kind = named if hasattr(named, "__qualname__") else type(named)
+    kind = given if hasattr(given, "__qualname__") else type(given)
     steps = [step for step in kind.__qualname__.split(".") if step.isidentifier()]
     return f"{kind.__module__}:{'.'.join(steps or [kind.__class__.__name__])}"
 
 
-def bring(kind: str, named: Any) -> str:
+def bring(kind: str, given: Any) -> str:
     """Make a class that this process has be found by its name, which is returned."""
-    target = name_of(named)
-    _require_methods(f"{kind} {target}", named, kind)
-    _BROUGHT[target] = named
+    target = name_of(given)
+    _require_methods(f"{kind} {target}", given, kind)
+    _BROUGHT[target] = given
     return target
 
 
-def importable(named: Any) -> bool:
+def importable(given: Any) -> bool:
     """Whether another process finds a class by its name, unlike those of a notebook or a function."""
-    module, path = sys.modules.get(named.__module__), named.__qualname__.split(".")
-    imported: Any = module if getattr(module, "__file__", None) is not None else None
+    module, path = sys.modules.get(given.__module__), given.__qualname__.split(".")
+    found: Any = module if getattr(module, "__file__", None) is not None else None
     for step in path:
-        imported = getattr(imported, step, None)
-    return imported is named
+        found = getattr(found, step, None)
+    return found is given
 
 
-def _require_methods(where: str, owner: Any, kind: str) -> None:
+def _require_methods(where: str, found: Any, kind: str) -> None:
     methods = _METHODS[kind]
-    if kind == "plant" and not callable(getattr(owner, "read", None)) and brings_no_pixels(owner):
+    if kind == "plant" and not callable(getattr(found, "read", None)) and brings_no_pixels(found):
         methods = tuple("joints" if name == "read" else name for name in methods)
-    lacking = [name for name in methods if not (callable(getattr(owner, name, None)) or _sets(owner, name))]
+    lacking = [name for name in methods if not (callable(getattr(found, name, None)) or _sets(found, name))]
     if lacking:
-        require_spelt(where, owner, lacking)
+        require_spelt(where, found, lacking)
         raise InputError(
             f"{where}: lacks {', '.join(f'{name}()' for name in lacking)}; needed: {', '.join(methods)}"
         )
     for name in _OPTIONAL[kind]:
-        if not hasattr(owner, name):
-            require_spelt(where, owner, (name,))
-        elif not callable(getattr(owner, name)):
+        if not hasattr(found, name):
+            require_spelt(where, found, (name,))
+        elif not callable(getattr(found, name)):
             raise InputError(f"{where}: has {name}, which is to be a method; give it another name")
 
 
-def brings_no_pixels(owner: object) -> bool:
+def brings_no_pixels(found: object) -> bool:
     """Whether a robot class, or an object of it, reads joints alone and leaves images to projservo."""
-    return callable(getattr(owner, "joints", None)) or _sets(owner, "joints")
+    return callable(getattr(found, "joints", None)) or _sets(found, "joints")
 
 
-def _sets(owner: object, name: str) -> bool:
+def _sets(found: object, name: str) -> bool:
     """Whether a class may give its objects an attribute as they are made; these are checked then."""
-    kinds = owner.__mro__ if isinstance(owner, type) else ()
+    kinds = found.__mro__ if isinstance(found, type) else ()
     codes = [getattr(vars(kind).get("__init__"), "__code__", None) for kind in kinds]
     codes += [inner for code in codes if code is not None for inner in code.co_consts]  # comprehensions
     used = {word for code in codes for word in getattr(code, "co_names", ())}
     return bool(used & {name, "setattr"}) or any("__getattr__" in vars(kind) for kind in kinds)
 
 
-def require_spelt(where: str, owner: Any, names: Sequence[str]) -> None:
+def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:
     """Refuse an object with an attribute that is spelt almost as one of the known ones.
 
     It would else count as one that the object does not have.
 
     Raises InputError if there is one whose right name is not there as well.
     """
-    own = [name for name in dir(owner) if not name.startswith("_")]
+    own = [name for name in dir(found) if not name.startswith("_")]
     for name in own:
         near = difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
         if near and near[0] not in own:

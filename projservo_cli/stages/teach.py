@@ -54,25 +54,26 @@ class _Taught:
     @property
     def images(self) -> GoalImages:
         """Return the images as the goal of a task."""
-        sides = (
-            tuple(None if math.isnan(u) else (u, v) for u, v in pixels)
-            for pixels in self.s.round(_DIGITS).tolist()
+        left, right = (
+            tuple(None if math.isnan(u) else (u, v) for u, v in pixels.round(_DIGITS).tolist())
+            for pixels in self.s
         )
-        sigma = (
-            tuple(None if math.isnan(px) else px for px in side) if np.isfinite(side).any() else None
-            for side in self.sigma.round(_DIGITS).tolist()
-        )
-        return GoalImages(
-            tuple(self.marker.tolist()), *sides, *sigma, Readings(tuple(self.q.tolist()), "rad")
-        )
+        sigma = [
+            tuple(None if math.isnan(x) else x for x in side.round(_DIGITS).tolist())
+            if np.isfinite(side).any()
+            else None
+            for side in self.sigma
+        ]
+        readings = Readings(tuple(self.q.tolist()), "rad")
+        return GoalImages(tuple(self.marker.tolist()), left, right, sigma[0], sigma[1], readings)
 
     def as_goal(self) -> dict[str, Any]:
         """Return the section ``task.goal`` of a configuration."""
-        goal = self.images
-        images: dict[str, Any] = {"markers": [*goal.markers]}
-        for name, pixels in zip(VIEWS, (goal.left, goal.right), strict=True):
+        seen = self.images
+        images: dict[str, Any] = {"markers": [*seen.markers]}
+        for name, pixels in zip(VIEWS, (seen.left, seen.right), strict=True):
             images[name] = [None if pixel is None else [*pixel] for pixel in pixels]
-        for name, sigma in (("sigma_left_px", goal.sigma_left), ("sigma_right_px", goal.sigma_right)):
+        for name, sigma in (("sigma_left_px", seen.sigma_left), ("sigma_right_px", seen.sigma_right)):
             if sigma is not None:
                 images[name] = [*sigma]
         return {"images": images | {"joints": {"joints": self.q.tolist(), "unit": "rad"}}}
