@@ -1,4 +1,4 @@
-"""The page of findings on a robot, and both images live in a browser of this machine."""
+"""The page of a preflight, and both images live in a browser of this machine."""
 
 import base64
 import html
@@ -47,12 +47,12 @@ def annotated(grey: ByteArray, marker: Sequence[int], pixels: FloatArray, goal: 
 
 
 def page(name: str, findings: Sequence[Finding], pictures: Sequence[bytes]) -> str:
-    """One file of HTML with the findings on a robot and both pictures, JPEG."""
+    """One file of HTML with the findings of a preflight and both pictures, JPEG."""
     rows = "".join(
-        f'<tr class="{finding.level}"><td>{finding.level}</td>'
-        + "".join(f"<td>{html.escape(text)}</td>" for text in (finding.where, finding.text, finding.remedy))
+        f'<tr class="{one.level}"><td>{one.level}</td>'
+        + "".join(f"<td>{html.escape(text)}</td>" for text in (one.where, one.text, one.remedy))
         + "</tr>"
-        for finding in findings
+        for one in findings
     )
     head = "<tr><th></th><th>part</th><th>found</th><th>remedy</th></tr>"
     return _document(f"Preflight of {name}", f"<p>{_images(pictures)}</p><table>{head}{rows}</table>")
@@ -66,10 +66,10 @@ def recording_page(name: str, done: str, pictures: Sequence[bytes], *, whole: bo
 
 def _images(pictures: Sequence[bytes]) -> str:
     """Elements of both pictures, JPEG, inside the page itself."""
-    encoded = zip(VIEWS, map(base64.b64encode, pictures), strict=False)
+    both = zip(VIEWS, map(base64.b64encode, pictures), strict=False)
     return " ".join(
         f'<img alt="{view} image with the tags found" src="data:image/jpeg;base64,{data.decode()}">'
-        for view, data in encoded
+        for view, data in both
     )
 
 
