@@ -29,10 +29,10 @@ DICTIONARY = "4X4_50"
 
 def cells_of(dictionary: str) -> int:
     """Cells along a side of a tag, border included, by the name of its dictionary."""
-    found = re.search(r"(\d+)([XH])\d", dictionary.upper())
-    if found is None:  # ARUCO_ORIGINAL
+    code = re.search(r"(\d+)([XH])\d", dictionary.upper())
+    if code is None:  # ARUCO_ORIGINAL
         return 7
-    return 2 + (int(found[1]) if found[2] == "X" else math.isqrt(int(found[1])))
+    return 2 + (int(code[1]) if code[2] == "X" else math.isqrt(int(code[1])))
 
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
@@ -119,9 +119,9 @@ def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
         fitting = [file for file in files if [*map(int, re.findall(r"\d+", file.stem))][-1:] == [pose]]
         if len(fitting) != 1:
             names = ", ".join(file.name for file in fitting)
-            found = f"the names of {names} end" if fitting else "no image has a name that ends"
+            ending = f"the names of {names} end" if fitting else "no image has a name that ends"
             raise InputError(
-                f"{source}: {found} in {pose}, the pose of {where}; name the images in columns left and "
+                f"{source}: {ending} in {pose}, the pose of {where}; name the images in columns left and "
                 "right, or leave the column pose out to take them in the order of their names"
             )
         chosen += fitting
@@ -328,17 +328,17 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
     model: blur from the next edge, one cell away, which depends on the code, and clipped white.
     """
     line, variance, edge = (np.full((len(before), size), np.nan) for size in (3, 2, _EDGE))
-    found = _Edges(line, variance, edge, np.zeros(len(before), dtype=np.bool_))
+    edges = _Edges(line, variance, edge, np.zeros(len(before), dtype=np.bool_))
     fits = np.flatnonzero((all_sides.length > _MIN_SIDE) & (all_sides.cell > MIN_CELL))
     if fits.size == 0:
-        return found
+        return edges
     sides, blur = _Sides(*(part[fits] for part in all_sides)), before[fits, 4]
-    known = np.isfinite(blur)
-    reach = np.clip(0.5 * sides.cell, _MIN_REACH, np.where(known, 3.0 * blur + 1.0, _MAX_REACH))
-    margin = np.where(known, np.maximum(0.08 * sides.length, 2.0 * blur) + 1.0, 0.12 * sides.length + 1.0)
+    has_blur = np.isfinite(blur)
+    reach = np.clip(0.5 * sides.cell, _MIN_REACH, np.where(has_blur, 3.0 * blur + 1.0, _MAX_REACH))
+    margin = np.where(has_blur, np.maximum(0.08 * sides.length, 2.0 * blur) + 1.0, 0.12 * sides.length + 1.0)
     strips = _Strips.of(image, sides, reach, margin, _ROUGH_PROFILES if rough else image.size)
     x = _first_edges(strips)
-    x[known, 4] = blur[known]
+    x[has_blur, 4] = blur[has_blur]
     noise = np.full(len(x), _RIGID) if rough else _noise(strips)
     x, A = _fitted(x, strips, noise, _STEPS[0 if rough else 1])
     clean = tried = strips.weight.any(axis=(1, 2))
@@ -346,7 +346,7 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
         strips, x, A, clean = _uncovered(strips, noise, x, A)
     count = strips.weight.sum(axis=(1, 2))
     good = clean & (count > 5.0) & (x[:, 1] > 0.0) & (np.abs(x[:, 2]) + 0.5 * np.abs(x[:, 3]) < reach)
-    found.spoilt[fits] = tried & ~good
+    edges.spoilt[fits] = tried & ~good
     sides, x, A, fits = _Sides(*(part[good] for part in sides)), x[good], A[good], fits[good]
     strips = _Strips(*(part[good] for part in strips))
     residual = _edge_model(x, strips)[0]
@@ -361,9 +361,9 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
     direction = sides.along * sides.length[:, None] + sides.normal * x[:, 3:4]
     across = np.stack([direction[:, 1], -direction[:, 0]], axis=1)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    found.line[fits] = np.column_stack([across, -(across * middle).sum(axis=1)])
-    found.variance[fits], found.x[fits] = ends + left_out[:, None], x
-    return found
+    edges.line[fits] = np.column_stack([across, -(across * middle).sum(axis=1)])
+    edges.variance[fits], edges.x[fits] = ends + left_out[:, None], x
+    return edges
 
 
 def _clipped(strips: _Strips) -> FloatArray:
@@ -400,11 +400,11 @@ def _rms_of_profiles(x: FloatArray, strips: _Strips) -> FloatArray:
 
 def _noise(strips: _Strips) -> FloatArray:
     """Noise (S,) of a pixel, about the median difference of neighbours along the sides."""
-    both = (strips.weight[:, 1:] * strips.weight[:, :-1]).reshape(len(strips.t), -1) > 0.0
-    steps = np.abs(np.diff(strips.grey, axis=1)).reshape(both.shape)
-    middle = both.sum(axis=1, keepdims=True) // 2
-    ordered = np.sort(np.where(both, steps, np.inf), axis=1)
-    return np.take_along_axis(ordered, np.minimum(middle, both.shape[1] - 1), axis=1)[:, 0]
+    pairs = (strips.weight[:, 1:] * strips.weight[:, :-1]).reshape(len(strips.t), -1) > 0.0
+    steps = np.abs(np.diff(strips.grey, axis=1)).reshape(pairs.shape)
+    middle = pairs.sum(axis=1, keepdims=True) // 2
+    ordered = np.sort(np.where(pairs, steps, np.inf), axis=1)
+    return np.take_along_axis(ordered, np.minimum(middle, pairs.shape[1] - 1), axis=1)[:, 0]
 
 
 class Corners(NamedTuple):
@@ -460,8 +460,8 @@ def _unrefined(cell: FloatArray, blur: FloatArray) -> FloatArray:
     """
     cell = np.maximum(cell, _MIN_UNREFINED).reshape(-1, 4)
     cell = np.minimum(cell, np.roll(cell, 1, axis=1))
-    known = blur[np.isfinite(blur)]
-    typical = float(np.median(known)) if known.size else _BLURRED * cell
+    blurs = blur[np.isfinite(blur)]
+    typical = float(np.median(blurs)) if blurs.size else _BLURRED * cell
     return np.asarray(_UNREFINED * np.sqrt(np.where(np.isfinite(blur), blur, typical)) * cell**_BY_CELL)
 
 
@@ -534,11 +534,11 @@ class TagFinder:
         quads, numbers, _ = self._detector.detectMarkers(image.astype(np.uint8))
         if numbers is None:
             return {}, ()
-        found = [int(number) for number in np.ravel(numbers)]
-        ambiguous = {number for number in found if found.count(number) > 1}
+        occurring = [int(number) for number in np.ravel(numbers)]
+        ambiguous = {number for number in occurring if occurring.count(number) > 1}
         corners = refine_corners(image, np.reshape(quads, (-1, 4, 2)).astype(np.float64), self.cells)
         each = (Corners(*tag) for tag in zip(*corners, strict=True))
-        tags = dict(zip(found, each, strict=True))
+        tags = dict(zip(occurring, each, strict=True))
         return {number: tag for number, tag in tags.items() if number not in ambiguous}, tuple(
             sorted(ambiguous)
         )
@@ -594,7 +594,7 @@ def observe_tags(
     Raises InputError if an image cannot be read, or has another size than earlier ones of the same camera;
     WorkFailed if there is no tag in any image, or none that both views saw at a pose.
     """
-    found = _Findings()
+    findings = _Findings()
     shapes: dict[int, tuple[int, ...]] = {}
     for k, (_, *views) in enumerate(pairs):
         for view, path in enumerate(views):
@@ -606,29 +606,29 @@ def observe_tags(
                     f"{width}×{height}; one camera takes images of one size"
                 )
             tags, ambiguous = finder.find(image)
-            found.ambiguous += len(ambiguous)
-            found.empty += not tags
+            findings.ambiguous += len(ambiguous)
+            findings.empty += not tags
             for number, tag in tags.items():
                 in_corners = points == "corners"
-                found.unrefined += int((~tag.clean).sum()) if in_corners else int(not tag.clean.all())
-                found.images[k, view, number] = np.column_stack(tag[:2]) if in_corners else _center(tag)
+                findings.unrefined += int((~tag.clean).sum()) if in_corners else int(not tag.clean.all())
+                findings.images[k, view, number] = np.column_stack(tag[:2]) if in_corners else _center(tag)
         progress("detect", k + 1, len(pairs))
-    if not found.images:
+    if not findings.images:
         raise WorkFailed(
             f"no tag in any of {2 * len(pairs)} images: check that --dictionary is that of your tags, and "
             "that a bright margin of one cell surrounds each"
         )
-    numbers, each = found.tags, 4 if points == "corners" else 1
-    seen = np.full((len(pairs), 2, len(numbers), each, 3), np.nan)
-    for (k, view, number), pixels in found.images.items():
-        seen[k, view, numbers.index(number)] = pixels
+    numbers, each = findings.tags, 4 if points == "corners" else 1
+    values = np.full((len(pairs), 2, len(numbers), each, 3), np.nan)
+    for (k, view, number), pixels in findings.images.items():
+        values[k, view, numbers.index(number)] = pixels
     marker = (each * np.array(numbers, dtype=np.int64)[:, None] + np.arange(each)).ravel()
     pose = np.array([number for number, *_ in pairs], dtype=np.int64)
-    seen = seen.reshape(len(pairs), 2, len(marker), 3)
-    observation = Observation(pose, marker, q, seen[..., :2], sigma=seen[..., 2])
+    values = values.reshape(len(pairs), 2, len(marker), 3)
+    observation = Observation(pose, marker, q, values[..., :2], sigma=values[..., 2])
     if not np.isfinite(observation.images[..., 0]).all(axis=1).any():
         raise WorkFailed("no tag was seen by both cameras at the same pose: check the pairing of the images")
-    return observation, found
+    return observation, findings
 
 
 def _center(tag: Corners) -> FloatArray:

@@ -54,16 +54,18 @@ class Observations(Displayable, Observation):
         require_size_and_noise(self.image_size, self.noise_px)
 
     @classmethod
-    def of(cls, observation: Observation, **known: Any) -> "Observations":
+    def of(cls, observation: Observation, **properties: Any) -> "Observations":
         """Return the observations of a record, with further properties."""
         fields = {field.name: getattr(observation, field.name) for field in dataclasses.fields(Observation)}
-        types = known.pop("joint_types", None) or "R" * observation.q.shape[1]
-        return cls(**fields, joint_types=types, **known)
+        types = properties.pop("joint_types", None) or "R" * observation.q.shape[1]
+        return cls(**fields, joint_types=types, **properties)
 
     @property
     def record(self) -> Observation:
         """Record that a run file stores."""
-        return Observation(**{one.name: getattr(self, one.name) for one in dataclasses.fields(Observation)})
+        return Observation(
+            **{field.name: getattr(self, field.name) for field in dataclasses.fields(Observation)}
+        )
 
     @classmethod
     def from_arrays(
@@ -100,32 +102,32 @@ class Observations(Displayable, Observation):
             When an array has another shape, readings are not finite or look like degrees, or an image size
             or a noise is none.
         """
-        seen = checked_array("pixels", pixels, (None, 2, None, 2), "(K, 2, m, 2)")
-        readings = checked_array("q", q, (len(seen), None), f"({len(seen)}, n), a row for each pose")
+        images = checked_array("pixels", pixels, (None, 2, None, 2), "(K, 2, m, 2)")
+        readings = checked_array("q", q, (len(images), None), f"({len(images)}, n), a row for each pose")
         if not np.isfinite(readings).all():
             raise InputError("q: holds a number that is not finite; leave such poses out")
-        n, m = readings.shape[1], seen.shape[2]
+        n, m = readings.shape[1], images.shape[2]
         types = _types_of(joint_types, n) or "R" * n
-        numbers = _numbers("marker", marker, m), _numbers("pose", pose, len(seen))
+        numbers = _numbers("marker", marker, m), _numbers("pose", pose, len(images))
         readings = in_radians("q", types, numbers[1], readings, joint_unit, "joint_unit={!r}")
-        wrong = np.isinf(seen).any(axis=-1) | (np.isnan(seen).sum(axis=-1) == 1)
+        wrong = np.isinf(images).any(axis=-1) | (np.isnan(images).sum(axis=-1) == 1)
         if wrong.any():
             k, view, j = np.argwhere(wrong)[0]
-            u, v = seen[k, view, j]
+            u, v = images[k, view, j]
             raise InputError(
                 f"pixels: marker {j} at pose {k}, view {view} is at ({u:g}, {v:g}): give two finite "
                 "numbers, or NaN for both"
             )
         stated = None
         if sigma is not None:
-            stated = checked_array("sigma", sigma, seen.shape[:3], f"{seen.shape[:3]}")
-            if not (stated[np.isfinite(seen[..., 0])] > 0.0).all():
+            stated = checked_array("sigma", sigma, images.shape[:3], f"{images.shape[:3]}")
+            if not (stated[np.isfinite(images[..., 0])] > 0.0).all():
                 raise InputError("sigma: must be positive wherever a marker is seen")
         order = np.argsort(numbers[0])
-        seen = np.where(np.isfinite(seen).all(axis=-1, keepdims=True), seen, np.nan)[:, :, order]
+        images = np.where(np.isfinite(images).all(axis=-1, keepdims=True), images, np.nan)[:, :, order]
         stated = None if stated is None else np.ascontiguousarray(stated[:, :, order])
         record = Observation(
-            numbers[1], numbers[0][order], readings, np.ascontiguousarray(seen), sigma=stated
+            numbers[1], numbers[0][order], readings, np.ascontiguousarray(images), sigma=stated
         )
         return cls.of(record, joint_types=types, image_size=image_size, noise_px=noise_px)
 
@@ -156,10 +158,10 @@ class Observations(Displayable, Observation):
         """
         types = _types_of(joint_types)
         if isinstance(table, (str, Path)):
-            found = read_table(table, types, joint_unit)
+            observation = read_table(table, types, joint_unit)
         else:
-            found = _read(_text_of(table), types, joint_unit)
-        return cls.of(found, joint_types=types, image_size=image_size, noise_px=noise_px)
+            observation = _read(_text_of(table), types, joint_unit)
+        return cls.of(observation, joint_types=types, image_size=image_size, noise_px=noise_px)
 
     def to_frame(self) -> Any:
         """Return the observation table as a pandas table; an InputError without pandas."""
@@ -171,7 +173,7 @@ class Observations(Displayable, Observation):
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""
-        seen = np.isfinite(self.images[..., 0])
+        detected = np.isfinite(self.images[..., 0])
         moving = 0 if self.moving is None else int((self.moving > 0).sum())
         noise = "to be estimated" if self.noise_px is None else f"{self.noise_px:g} px"
         return {
@@ -179,29 +181,29 @@ class Observations(Displayable, Observation):
             "joints": self.joint_types,
             "poses": f"{len(self.pose) - moving}" + (f" and {moving} in motion" if moving else ""),
             "markers": str(len(self.marker)),
-            "seen": f"{seen.mean():.0%} of {seen.size} marker-view pairs",
+            "seen": f"{detected.mean():.0%} of {detected.size} marker-view pairs",
             "noise": "stated for each pixel" if self.noise_px is None and self.sigma is not None else noise,
         }
 
 
-def _types_of(given: str | Sequence[str] | None, n: int | None = None) -> str | None:
+def _types_of(joint_types: str | Sequence[str] | None, n: int | None = None) -> str | None:
     """Letters of the types of joints, of which there are n where that is known; None where none are given."""
-    if given is None:
+    if joint_types is None:
         return None
-    letters = [*given] if np.iterable(given) else [given]
+    letters = [*joint_types] if np.iterable(joint_types) else [joint_types]
     types = "".join(map(str, letters)).upper()
     if set(types) - {"R", "P"} or len(types) != (len(types) if n is None else n):
         some = "letters" if n is None else f"{n} letters"
-        raise InputError(f"joint_types: {given!r}: expected {some} R or P, one a joint")
+        raise InputError(f"joint_types: {joint_types!r}: expected {some} R or P, one a joint")
     return types
 
 
-def _numbers(name: str, given: Sequence[int] | None, count: int) -> npt.NDArray[np.int64]:
-    numbers = np.arange(count) if given is None else _unmasked(given)
+def _numbers(name: str, wanted: Sequence[int] | None, count: int) -> npt.NDArray[np.int64]:
+    numbers = np.arange(count) if wanted is None else _unmasked(wanted)
     if numbers.dtype.kind == "f" and (numbers == np.rint(numbers)).all():
         numbers = numbers.astype(np.int64)
     if numbers.shape != (count,) or numbers.dtype.kind not in "iu" or len(set(numbers.tolist())) < count:
-        raise InputError(f"{name}: expected {count} different whole numbers, not {given!r:.60}")
+        raise InputError(f"{name}: expected {count} different whole numbers, not {wanted!r:.60}")
     return numbers.astype(np.int64)
 
 
@@ -243,10 +245,10 @@ def rows_of(q: npt.ArrayLike, n: int) -> FloatArray:
     return checked_array("q", np.atleast_2d(numbers_in("q", q, said)), (None, n), said, finite=True)
 
 
-def require_observations(what: str, given: Any, kind: type[Observation] = Observations) -> None:
+def require_observations(what: str, observations: Any, kind: type[Observation] = Observations) -> None:
     """Raise InputError unless observations are of their kind."""
-    if not isinstance(given, kind):
+    if not isinstance(observations, kind):
         raise InputError(
-            f"{what}: observations of type {type(given).__name__}; make them with "
+            f"{what}: observations of type {type(observations).__name__}; make them with "
             "Observations.from_arrays or Observations.from_frame"
         )

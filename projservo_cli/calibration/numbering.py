@@ -1,4 +1,4 @@
-"""Numbers of markers that differ between both views, as of a tag turned or exchanged in one of them.
+"""Numbers of markers, or poses, that differ between both views: tags exchanged or images late in one of them.
 
 A robot fits such a table with half of these detections rejected: only the epipolar geometry shows it.
 """
@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, sampson
 from projservo_cli.geometry.displacements import homogeneous
-from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation, WorkFailed
+from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray, Observation, WorkFailed
 
 # Minimum number of poses at which both views saw a marker, to judge its number.
 _MIN_POSES = 8
@@ -33,22 +33,42 @@ _EXAMPLES = 3
 
 
 def epipolar_geometry(detections: Detections, rng: np.random.Generator) -> Epipolar:
-    """Estimate the epipolar geometry, and refuse markers whose numbers differ between both views.
+    """Estimate the epipolar geometry, and refuse views that number markers differently, or show other poses.
 
     The images do not tell which view is right, and goals are given by numbers, so nothing is renumbered.
 
-    Raises WorkFailed naming the tags or markers, or as ``Epipolar.of`` does.
+    Raises WorkFailed naming the tags or markers or the view that is late, or as ``Epipolar.of`` does.
     """
     try:
         found = Epipolar.of(detections, rng)
     except WorkFailed:
         _require_alike(detections, _by_tags(detections))
+        _require_one_pose(detections)
         raise
     order = _true_order(detections, found, OUTLIER)
     if found.sigma_px > _MUCH_NOISE_PX and (order == np.arange(order.size)).all():
         order = _by_tags(detections)
+        _require_one_pose(detections)
     _require_alike(detections, order)
     return found
+
+
+def _require_one_pose(detections: Detections) -> None:
+    """Refuse images of one view that show the pose before that of the other."""
+    left, right = _dense(detections, np.arange(detections.marker.size))
+    for late, together in enumerate(((left[1:], right[:-1]), (left[:-1], right[1:]))):
+        pairs = Observation(
+            detections.pose[1:], detections.marker, detections.q[1:], np.stack(together, axis=1)
+        )
+        shifted, noise_px = Detections.of(pairs, "R" * detections.q.shape[1]), np.inf
+        with suppress(WorkFailed):
+            noise_px = Epipolar.of(shifted, np.random.default_rng(0)).sigma_px
+        if noise_px < _MUCH_NOISE_PX:
+            raise WorkFailed(
+                f"each {VIEWS[late]} image shows the pose before that of the {VIEWS[1 - late]} one, by the "
+                "epipolar geometry: let each pose settle for longer (plant.settle_s), and take the newest "
+                "frame of both cameras"
+            )
 
 
 def _require_alike(detections: Detections, order: IntArray) -> None:

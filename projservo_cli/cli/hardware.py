@@ -14,10 +14,10 @@ from projservo_cli.cli.program import FAILED, main
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
-    from projservo_cli.hardware.preflight import Seen
+    from projservo_cli.hardware.checks_at_rest import RobotAtRest
     from projservo_cli.records import FloatArray
     from projservo_cli.robots.contract import PluginRobot
-    from projservo_cli.stages.preflight import Checked
+    from projservo_cli.stages.doctor import Checked
 
 _SIZE_MM = 30.0  # of tags: what webcams at arm's length see with 25 px and more
 _BODIES = ("roof", "plate")
@@ -76,7 +76,7 @@ def _tags(
 
     from projservo_cli.detection import TagFinder
     from projservo_cli.files import write_whole
-    from projservo_cli.hardware import tags as sheets
+    from projservo_cli.hardware import tag_sheets as sheets
     from projservo_cli.settings.markers import GROUND, Markers
 
     if numbers is not None and kind != "single":
@@ -135,7 +135,7 @@ _INSTRUCTIONS = {
 }
 
 
-def preflight(
+def doctor(
     console: Console,
     run: Path | None,
     config: str,
@@ -149,9 +149,7 @@ def preflight(
     from projservo_cli.config.inputs import preflight_inputs
     from projservo_cli.files import write_whole
     from projservo_cli.hardware.live_page import page
-    from projservo_cli.hardware.preflight import FAULT, WARNING
-    from projservo_cli.stages.preflight import CALIBRATION, check
-    from projservo_cli.store import save
+    from projservo_cli.stages.doctor import check
 
     settings = option.configured(config, options, teaching=True)
     stored = option.calibrated_run(run, settings)
@@ -168,18 +166,26 @@ def preflight(
         )
         pictures = [] if checked.seen is None else _pictures(settings, checked.seen)
         write_whole(output, page(settings.name, checked.findings, pictures))
-    for told in checked.findings:
-        refuted = told.text if told.level == FAULT else ""
-        compared = told.where == CALIBRATION and told.level != WARNING
-        if stored is not None and compared and refuted != stored.refuted:
-            save(replace(stored, refuted=refuted))
     value = {
         "page": output.resolve(),
         "works": checked.works,
         "findings": [finding._asdict() for finding in checked.findings],
     }
     console.report(value, [*_table(checked), f"page: {output}"])
+    if stored is not None and checked.refuted is not None:
+        _note_refuted(stored.path, checked.refuted)
     return 0 if checked.works else FAILED
+
+
+def _note_refuted(path: Path, refuted: str) -> None:
+    """Store what contradicts the recording of a run, empty for nothing, if that has changed."""
+    from projservo_cli.files import working_in
+    from projservo_cli.store import load, save
+
+    with working_in(path.parent):
+        run = load(path)
+        if refuted != run.refuted:
+            save(replace(run, refuted=refuted))
 
 
 _QUESTION = (
@@ -209,7 +215,7 @@ def _goal_pixels(settings: "Config") -> "list[FloatArray]":
     return [np.array([at or (np.nan, np.nan) for at in side or ()]).reshape(-1, 2) for side in sides]
 
 
-def _pictures(settings: "Config", seen: "Seen") -> list[bytes]:
+def _pictures(settings: "Config", seen: "RobotAtRest") -> list[bytes]:
     from projservo_cli.hardware.live_page import annotated
 
     both = zip(seen.views, seen.s, _goal_pixels(settings), strict=False)

@@ -108,10 +108,10 @@ def _doctor(
     measures latency, hysteresis, sag, and whether tags sit fast. Exit code 1 where a recording would fail.
     """
     if config is not None:
-        from projservo_cli.cli.hardware import preflight
+        from projservo_cli.cli.hardware import doctor
 
         options = {"sets": sets, "move": move, "watch": watch}
-        return preflight(console, run, config, options, output or Path("preflight.html"))
+        return doctor(console, run, config, options, output or Path("preflight.html"))
     if run is not None or sets or output is not None or move or watch:
         raise click.UsageError("doctor checks a robot with -c alone: projservo doctor -c arm.yaml")
     packages, extras = _requirements()

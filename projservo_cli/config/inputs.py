@@ -123,11 +123,13 @@ def preflight_inputs(config: Config) -> PreflightInputs:
         )
     numbers = _numbers(config, "doctor")
     assert config.markers is not None
+    face = config.markers.front or ()
     return PreflightInputs(
         driven=_drive(config, None),
         joints=joints_of(config),
         numbers=numbers,
-        face=config.markers.front or (),
+        face=face,
+        lengths=config.markers.lengths(face),
         dictionary=_dictionary(config),
     )
 

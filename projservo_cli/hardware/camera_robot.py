@@ -66,11 +66,13 @@ class CameraRobot:
     def __init__(self, arm: Arm, stereo: Cameras, finder: TagFinder, numbers: Sequence[int]) -> None:
         self.arm, self.finder, self._numbers = arm, finder, np.array(numbers, dtype=np.int64)
         for name in ("now", "truth", "release", "hold", "health", "identity"):
-            if callable(found := getattr(arm, name, None)):
-                setattr(self, name, found)
+            if callable(method := getattr(arm, name, None)):
+                setattr(self, name, method)
         now: Callable[[], float] = getattr(arm, "now", time.monotonic)
-        both = zip(VIEWS, (stereo.left, stereo.right), strict=True)
-        self.cameras = [Camera(view, one, stereo.max_age_s, stereo.reconnect_s, now) for view, one in both]
+        sources = zip(VIEWS, (stereo.left, stereo.right), strict=True)
+        self.cameras = [
+            Camera(view, settings, stereo.max_age_s, stereo.reconnect_s, now) for view, settings in sources
+        ]
         self.views: list[View | None] = [None, None]
         self._begun, self._blind = False, [0, 0]
 
@@ -85,9 +87,9 @@ class CameraRobot:
     def read(self) -> tuple[Any, FloatArray, float | None, float, float, FloatArray]:
         """Readings of the joints, corners of the tags, their stamps and standard deviations."""
         q, t_q = self.arm.joints()
-        seen = [self._looked(view) for view in range(2)]
-        pixels, sigma = (np.stack(both) for both in zip(*map(self._corners, seen), strict=True))
-        return q, pixels, t_q, seen[0].frame.t, seen[1].frame.t, sigma
+        views = [self._looked(view) for view in range(2)]
+        pixels, sigma = (np.stack(sides) for sides in zip(*map(self._corners, views), strict=True))
+        return q, pixels, t_q, views[0].frame.t, views[1].frame.t, sigma
 
     @property
     def frames(self) -> ByteArray | None:
@@ -110,11 +112,11 @@ class CameraRobot:
     def _require_not_mirrored(self, view: int, grey: ByteArray) -> None:
         """Raise WorkFailed for an image (height, width) without tags whose mirror image shows them."""
         tags = self.finder.find(grey[:, ::-1].astype(np.float64))[0].keys()
-        if found := tags & {*(self._numbers // CORNERS).tolist()}:
-            listed = ", ".join(map(str, sorted(found)))
+        if mirrored := tags & {*(self._numbers // CORNERS).tolist()}:
+            tags_shown = f"tag{'s' * (len(mirrored) > 1)} {', '.join(map(str, sorted(mirrored)))}"
             raise WorkFailed(
                 f"the {VIEWS[view]} camera's image is mirrored: it shows no tag, its mirror image "
-                f"tag{'s' * (len(found) > 1)} {listed}; switch off mirror or flip of the {VIEWS[view]} camera"
+                f"{tags_shown}; switch off mirror or flip of the {VIEWS[view]} camera"
             )
 
     def _corners(self, view: View) -> tuple[FloatArray, FloatArray]:

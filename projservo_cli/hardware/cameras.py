@@ -349,13 +349,13 @@ def _wrong_device(device: Path) -> str:
         return f"there is no {device}; devices: {_listed(others)}"
     if not os.access(device, os.R_OK | os.W_OK):
         return f"{device} may not be read: sudo usermod -aG video $USER, then log in again"
-    found = _capabilities(device)
-    if found is None or found[0] & _GIVES_PICTURES:
+    own = _capabilities(device)
+    if own is None or own[0] & _GIVES_PICTURES:
         return ""
     same = [
         str(node)
         for node in others
-        if (other := _capabilities(node)) and other[1] == found[1] and other[0] & _GIVES_PICTURES
+        if (other := _capabilities(node)) and other[1] == own[1] and other[0] & _GIVES_PICTURES
     ]
     remedy = f"take {same[0]}" if same else "take another device"
     return f"{device} gives no pictures: it is the second node of a webcam, for metadata: {remedy}"

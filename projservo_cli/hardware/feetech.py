@@ -79,16 +79,16 @@ class FeetechBus:
         together : all are asked again, so that all replies are of ``read_at``.
         Raises ServoSilent, or PortLost.
         """
-        found: dict[int, Reply] = {}
+        answered: dict[int, Reply] = {}
         garbled: set[int] = set()
         end = self.now() + _PATIENCE_S
-        while missing := [i for i in ids if i not in found]:
+        while missing := [i for i in ids if i not in answered]:
             if self.now() > end:
                 raise ServoSilent(missing, sorted(garbled.intersection(missing)))
             replies, broken = self._asked([*ids] if together else missing, address, size)
-            found = replies if together else found | replies
+            answered = replies if together else answered | replies
             garbled |= broken
-        return {i: found[i] for i in ids}
+        return {i: answered[i] for i in ids}
 
     def write(self, address: int, values: Mapping[int, bytes]) -> None:
         """Write as many bytes into the memory of each servo at once; none answers."""
@@ -119,24 +119,24 @@ class FeetechBus:
             start = min(address, _MEMORY - longer)
             self._checked(self._serial.reset_input_buffer)
             sent = self._send(_SYNC_READ, bytes([start, longer, *ids]))
-            found: dict[int, Reply] = {}
+            answered: dict[int, Reply] = {}
             before = self.now()
             heard, end = b"", before + self._reply_s
-            while len(found) < len(ids) and self.now() < end:
+            while len(answered) < len(ids) and self.now() < end:
                 heard += self._received()
                 for number, status, values in _packets(heard):
                     if number in ids and len(values) == longer:
-                        found[number] = Reply(status, values[address - start :][:size])
+                        answered[number] = Reply(status, values[address - start :][:size])
             self.read_at = 0.5 * (before + self.now())
-            missing = {*ids} - {*found}
+            missing = {*ids} - {*answered}
             self._failed += bool(missing)
             slower = 2.0 if missing else 0.5
             self._reply_s = min(max(slower * self._reply_s, _REPLY_S), _SLOW_S)
-            garbled = len(heard.removeprefix(sent)) >= _HEAD and not found  # some adapters echo requests
-            return found, missing if garbled else set()
+            garbled = len(heard.removeprefix(sent)) >= _HEAD and not answered  # some adapters echo requests
+            return answered, missing if garbled else set()
 
-    def _send(self, instruction: int, given: bytes) -> bytes:
-        body = bytes([_ALL, len(given) + 2, instruction]) + given
+    def _send(self, instruction: int, parameters: bytes) -> bytes:
+        body = bytes([_ALL, len(parameters) + 2, instruction]) + parameters
         packet = b"\xff\xff" + body + _checksum(body)
         with self._lock:
             self._checked(self._serial.write, packet)
@@ -148,10 +148,10 @@ class FeetechBus:
         self.sleep(_PAUSE_S)
         return b""
 
-    def _checked(self, call: Callable[..., Any], *given: Any) -> Any:
+    def _checked(self, call: Callable[..., Any], *arguments: Any) -> Any:
         """Call the port; PortLost where it is gone."""
         try:
-            return call(*given)
+            return call(*arguments)
         except Exception as error:  # of another kind on each system
             raise PortLost(f"port {self.port} is gone: look at its USB cable ({error})") from error
 

@@ -25,17 +25,17 @@ class Moved(NamedTuple):
 
 def watch(servos: Servos, done: Callable[[], bool]) -> dict[int, Moved]:
     """Return how far each joint is moved until that is done, by the number of its servo."""
-    last = {i: one.at for i, one in servos.measured().items()}
-    seen = {i: deque([float(last[i])] * _MEDIAN, _MEDIAN) for i in servos.ids}
-    found = {i: Moved(last[i], last[i]) for i in servos.ids}
+    last = {i: measured.at for i, measured in servos.measured().items()}
+    counts = {i: deque([float(last[i])] * _MEDIAN, _MEDIAN) for i in servos.ids}
+    ranges = {i: Moved(last[i], last[i]) for i in servos.ids}
     while not done():
         servos.bus.sleep(_PERIOD_S)
-        for i, one in servos.measured().items():
-            if i in seen:
-                seen[i].append(seen[i][-1] + (one.at - last[i] + MIDDLE) % TURN - MIDDLE)
-                last[i], now = one.at, int(np.median(seen[i]))
-                found[i] = Moved(min(found[i].lowest, now), max(found[i].highest, now))
-    return found
+        for i, measured in servos.measured().items():
+            if i in counts:
+                counts[i].append(counts[i][-1] + (measured.at - last[i] + MIDDLE) % TURN - MIDDLE)
+                last[i], now = measured.at, int(np.median(counts[i]))
+                ranges[i] = Moved(min(ranges[i].lowest, now), max(ranges[i].highest, now))
+    return ranges
 
 
 def limits_deg(
@@ -51,7 +51,7 @@ def limits_deg(
     for k, i in enumerate(servos.ids, 1):
         if wrong := _unusable(moved[i], k, shift) or _kept_from(moved[i], kept[i]):
             raise WorkFailed(f"{servos.name(i)} {wrong}")
-    found, shifted = [], list[int]()
+    limits, shifted = [], list[int]()
     for k, i in enumerate(servos.ids, 1):
         low, high = moved[i]
         if _crosses(moved[i]):
@@ -66,8 +66,8 @@ def limits_deg(
         low, high = max(low, kept[i].lowest), min(high, kept[i].highest)
         least, most = (math.degrees((x - MIDDLE) * COUNT) for x in (low, high))
         tenths = math.ceil(10.0 * (least + _WITHIN_DEG)), math.floor(10.0 * (most - _WITHIN_DEG))
-        found.append((tenths[0] / 10.0, tenths[1] / 10.0))
-    return found
+        limits.append((tenths[0] / 10.0, tenths[1] / 10.0))
+    return limits
 
 
 def _crosses(moved: Moved) -> bool:

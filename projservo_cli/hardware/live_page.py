@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.detection import opencv
-from projservo_cli.hardware.preflight import Finding
+from projservo_cli.hardware.checks_at_rest import Finding
 from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray
 
 _STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:80rem;margin:1.5rem auto;padding:0 1rem}

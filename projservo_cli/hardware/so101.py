@@ -104,7 +104,7 @@ class Servos:
         """Read the first registers of all servos; an InputError for missing, double and other ones."""
         where = f"port {self.bus.port}:"
         try:
-            found = self.bus.read(self.alive, _MODEL, 13)
+            replies = self.bus.read(self.alive, _MODEL, 13)
         except ServoSilent as error:
             there = [i for i in self.alive if i not in error.silent]
             if there and not whole:
@@ -129,10 +129,10 @@ class Servos:
                 f"{where} no servo answers: switch the supply on, look at the cable to the first servo, and "
                 "whether this is the port of the arm"
             ) from error
-        for i, reply in found.items():
+        for i, reply in replies.items():
             if (model := _number(reply.values)) != _STS3215:
                 raise InputError(f"{where} servo {i} is of model {model}, no STS3215 ({_STS3215})")
-        return found
+        return replies
 
     @property
     def alive(self) -> list[int]:
@@ -146,17 +146,17 @@ class Servos:
 
     def measured(self) -> dict[int, Measured]:
         """Return what each servo measures that is not lost."""
-        found = self.bus.read(self.alive, _PRESENT, 8, together=True).items()
-        return {i: Measured(_number(x), 0.1 * x[6], x[7], status) for i, (status, x) in found}
+        replies = self.bus.read(self.alive, _PRESENT, 8, together=True).items()
+        return {i: Measured(_number(x), 0.1 * x[6], x[7], status) for i, (status, x) in replies}
 
     def registers(self) -> dict[int, Registers]:
         """Return the registers of each servo."""
         first, last = self.bus.read(self.all, _LOWEST, 10), self.bus.read(self.all, _OFFSET, 3)
-        found = {}
+        stored = {}
         for i in self.all:
             a, b = first[i].values, last[i].values
-            found[i] = Registers(_number(a), _number(a[2:]), a[9], _signed(_number(b)), b[2])
-        return found
+            stored[i] = Registers(_number(a), _number(a[2:]), a[9], _signed(_number(b)), b[2])
+        return stored
 
     def torque(self) -> dict[int, bool]:
         """Whether each servo holds, by its number."""
@@ -269,20 +269,20 @@ class SO101:
     def identity(self) -> str:
         """Registers on which the meaning of readings hangs: a recording holds as long as they do."""
         return ";".join(
-            f"servo{i}:{one.lowest}..{one.highest}/phase{one.phase}/offset{one.offset}/mode{one.mode}"
-            for i, one in ((i, self.registers[i]) for i in self._ids)
+            f"servo{i}:{registers.lowest}..{registers.highest}/phase{registers.phase}/offset{registers.offset}/mode{registers.mode}"
+            for i, registers in ((i, self.registers[i]) for i in self._ids)
         )
 
     def health(self) -> dict[str, float | str]:
         """Return the voltage and temperature of the servo that is worst off."""
-        found = self._read().values()
-        volts = min(one.volts for one in found)
-        return {"supply_v": round(volts, 1), "hottest_c": max(one.heat for one in found)}
+        servos = self._read().values()
+        volts = min(servo.volts for servo in servos)
+        return {"supply_v": round(volts, 1), "hottest_c": max(servo.heat for servo in servos)}
 
     def joints(self) -> tuple[FloatArray, float]:
         """Joint readings (n,), rad, and when they were read, s."""
-        found = self._read()
-        return np.array([found[i].angle for i in self._ids]), self._servos.bus.read_at
+        servos = self._read()
+        return np.array([servos[i].angle for i in self._ids]), self._servos.bus.read_at
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Send the set-points; at the first, torque comes on. A released arm is sent nothing."""
@@ -303,7 +303,7 @@ class SO101:
         self._require_limits()
         self._lease.moving()
         grips = {i for i, on in self._servos.torque().items() if on and i in self._others}
-        self._sent = {i: one.at for i, one in self._read().items() if i not in grips}
+        self._sent = {i: servo.at for i, servo in self._read().items() if i not in grips}
         self._servos.enable(self._sent, self._speeds())
         self._on, self._released = True, False
         self.sleep(_SWITCH_S)
@@ -328,7 +328,7 @@ class SO101:
         failure = WorkFailed("")
         for _ in self._servos.all:  # a servo that fails is left out of the next reading
             try:
-                there = {i: one.at for i, one in self._read().items()}
+                there = {i: servo.at for i, servo in self._read().items()}
                 sent = {i: at for i, at in self._sent.items() if i in there}
                 moving = {i: there[i] for i, at in sent.items() if abs(there[i] - at) * COUNT > _LEAP}
                 self._servos.send(moving, self._speeds())
@@ -341,10 +341,10 @@ class SO101:
         """Release the port, and report whether the arm holds."""
         if self._opened:
             self._opened = False
-            words, known = torque_reported(self._servos)
+            words, all_answer = torque_reported(self._servos)
             _say(words)
             self._servos.bus.close()
-            self._lease.end(moves=self._on and not known)
+            self._lease.end(moves=self._on and not all_answer)
 
     def _keeps(self, number: int) -> tuple[int, int]:
         """Least and most counts that a servo goes to; over 4095 it goes the long way round."""
@@ -361,9 +361,9 @@ class SO101:
         """Refuse to move an arm without limits, or one that stands beyond them."""
         if self._limits is None:
             raise InputError("nothing was moved: the arm has no limits: projservo limits -c FILE finds them")
-        found = self._read()
+        servos = self._read()
         for i, low, high in zip(self._ids, self._limits.lower, self._limits.upper, strict=True):
-            q = found[i].angle
+            q = servos[i].angle
             beyond = max(low - q, q - high)
             if beyond > _LEAP:
                 raise WorkFailed(
@@ -396,46 +396,46 @@ class SO101:
 
         The first one counts where a second agrees with it.
         """
-        found, wrong = dict[int, Measured](), ""
+        servos, wrong = dict[int, Measured](), ""
         for _ in range(_REPEATS):
             try:
-                found = self._servos.measured()
+                servos = self._servos.measured()
             except (ServoSilent, PortLost) as error:
                 raise WorkFailed(self._servos.described(error)) from error
             now = self.now()
-            wrong = self._leapt(found, now - self._read_at) or self._faulty(found)
+            wrong = self._leapt(servos, now - self._read_at) or self._faulty(servos)
             agreed = not wrong and bool(self._before)
             if agreed or not self._agreed:
-                self._before, self._read_at, self._agreed = found, now, agreed
+                self._before, self._read_at, self._agreed = servos, now, agreed
             if agreed:
-                return found
-        self._servos.lost |= {i for i, one in found.items() if one.status}
+                return servos
+        self._servos.lost |= {i for i, servo in servos.items() if servo.status}
         raise WorkFailed(wrong)
 
-    def _leapt(self, found: Mapping[int, Measured], seconds: float) -> str:
+    def _leapt(self, servos: Mapping[int, Measured], seconds: float) -> str:
         """Return the joint whose reading is impossible since the last one; empty for none."""
         most = _FASTEST * seconds + _SCATTER
         if self._on and self._limits is not None:
             fastest = 2.0 * _CATCHES_UP * max(_GRIPPER, float(self._limits.speed.max()))
             most = min(_FASTEST, fastest) * seconds + _SCATTER
-        for i, one in found.items():
+        for i, servo in servos.items():
             before = self._before.get(i)
-            if one.at >= TURN or (before is not None and abs(one.at - before.at) * COUNT > most):
+            if servo.at >= TURN or (before is not None and abs(servo.at - before.at) * COUNT > most):
                 last = "" if before is None else f", {1000 * seconds:.0f} ms after {_deg(before.angle)}"
                 return (
-                    f"{self._servos.name(i)} reads {_deg(one.angle)}{last}: no joint turns so fast: look at "
-                    "its gear and its cable"
+                    f"{self._servos.name(i)} reads {_deg(servo.angle)}{last}: no joint turns so fast: look "
+                    "at its gear and its cable"
                 )
         return ""
 
-    def _faulty(self, found: Mapping[int, Measured]) -> str:
+    def _faulty(self, servos: Mapping[int, Measured]) -> str:
         """Return the servo that reports a fault, with the remedy; empty for none."""
-        for i, one in found.items():
+        for i, servo in servos.items():
             for bit, words in _WRONG.items():
                 # The first set-point ends an overload of before.
-                if one.status & bit and (self._on or bit != _OVERLOADED):
+                if servo.status & bit and (self._on or bit != _OVERLOADED):
                     least, most = self._servos.volts[i]
-                    what = words.format(volts=one.volts, heat=one.heat, least=least, most=most)
+                    what = words.format(volts=servo.volts, heat=servo.heat, least=least, most=most)
                     return f"{self._servos.name(i)}: {what}; it is sent nothing more, and may sink"
         return ""
 
@@ -457,12 +457,12 @@ def torque_reported(servos: Servos) -> tuple[str, bool]:
         on = servos.torque()
     except (ServoSilent, PortLost):
         return "whether torque is on is not known, since servos do not answer: hold the arm", False
-    holding, known = [i for i in servos.ids if on.get(i)], not servos.lost
+    holding, all_answer = [i for i in servos.ids if on.get(i)], not servos.lost
     if not holding:
-        return "torque is off: nothing holds the arm", known
+        return "torque is off: nothing holds the arm", all_answer
     if len(holding) < len(servos.ids):
-        return f"torque is on in {', '.join(map(servos.name, holding))} alone: hold the arm", known
-    return "torque is on: the arm holds where it is; projservo release lets go of it", known
+        return f"torque is on in {', '.join(map(servos.name, holding))} alone: hold the arm", all_answer
+    return "torque is on: the arm holds where it is; projservo release lets go of it", all_answer
 
 
 class _Lease:

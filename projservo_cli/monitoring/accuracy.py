@@ -1,5 +1,6 @@
 """Accuracy of an arrival: pixels by which images are off, or may be, carried to the face in millimetres."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -7,10 +8,17 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.special import chdtri
 
-from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.calibration.prediction import Parameters, predict
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.monitoring.frame_pairs import FramePair
-from projservo_cli.monitoring.statistics import TOLD, ErrorModel, Residual, relative_to_others, rigid_motions
+from projservo_cli.monitoring.innovation_tests import (
+    DISTINCT,
+    ErrorModel,
+    Residual,
+    coordinate_rows,
+    farthest_alone,
+    rigid_motions,
+)
 from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, Model
 
 # Variance of corners from a side that the calibration has not seen, over that of others; chance of a test.
@@ -19,6 +27,8 @@ _UNUSUAL, _CHANCE = 2.0, 1e-4
 _ALONE, _FREE = 0.25, 1e4
 # Steps of Gauss and Newton towards a pose that is some degrees away.
 _STEPS = 4
+# Markers of a view that show the pose of the tool.
+_LEAST_MARKERS = 3
 
 
 def metric_points(model: Model, M: FloatArray) -> FloatArray | None:
@@ -95,7 +105,7 @@ class RigidFit(NamedTuple):
     def off_mm(self, posture: Posture, M: FloatArray) -> float:
         """Return how far off the face may be, mm, where one of the images is shifted within chance."""
         carry = posture.carry(M, self.seen)[:, : 2 * len(M)].reshape(-1, len(M), 2).sum(axis=1)
-        may = TOLD**2 * np.trace(carry @ self.covariance @ carry.T)
+        may = DISTINCT**2 * np.trace(carry @ self.covariance @ carry.T)
         return float(np.sqrt(np.square(carry @ self.shift).sum() + may))
 
 
@@ -104,7 +114,7 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
 
     images : (2, m, 2) px of the markers of the calibration, NaN where unseen; sigma : (2, m) deviations.
     """
-    pair, n = still(q, images, np.maximum(sigma, calibration.sigma_px)), len(q)
+    pair, n = FramePair.at_rest(q, images, np.maximum(sigma, calibration.sigma_px)), len(q)
     errors, moved = ErrorModel(calibration, calibration.sigma_px), np.eye(4)
     at = by_joints = errors.residual(pair)
     for _ in range(_STEPS):
@@ -114,26 +124,26 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
         at = errors.residual(pair)
     free, left = _free(at, at.F[:, errors.tool]), at.seen.ravel().copy()
     for _ in range(int(_ALONE * left.sum())):
-        rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
-        square = relative_to_others(free[np.ix_(rows, rows)], at.r[rows])
-        if square.max() <= _UNUSUAL * chdtri(2, _CHANCE / left.sum()):
+        limit = _UNUSUAL * chdtri(2, _CHANCE / left.sum())
+        if (stray := farthest_alone(free, at.r, np.flatnonzero(left), limit)) is None:
             break
-        left[np.flatnonzero(left)[np.argmax(square)]] = False
-    rows = (2 * np.flatnonzero(left)[:, None] + np.arange(2)).ravel()
-    bias = 2.0 * float(np.square(errors.bias_px / at.noise).ravel()[left].sum())
-    freedom = np.maximum([2, len(rows) - len(errors.twists), len(rows) - n], 1)
-    limits = _UNUSUAL * chdtri(freedom, _CHANCE) + bias
+        left[stray] = False
+    rows = coordinate_rows(np.flatnonzero(left))
     P, r, r_joints = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows], by_joints.r[rows]
     F = np.eye(2)[rows % 2] * (rows < len(at.r) // 2)[:, None]
-    covariance = np.linalg.inv(F.T @ P @ F)
+    covariance: FloatArray = np.linalg.inv(F.T @ P @ F)
     shift = covariance @ F.T @ P @ r
     joints = np.linalg.solve(_free(by_joints, by_joints.F[:, :n])[np.ix_(rows, rows)], r_joints)
-    over, rms = np.array([shift @ F.T @ P @ r, r @ P @ r, r_joints @ joints]) / limits, np.sqrt(np.mean(r**2))
+    # χ² of the shift, of what is left, and of that where joints show it best, over their limits.
+    bias = 2.0 * float(np.square(errors.bias_px / at.noise).ravel()[left].sum())
+    freedom = np.maximum([2, len(rows) - len(errors.twists), len(rows) - n], 1)
+    squares = np.array([shift @ F.T @ P @ r, r @ P @ r, r_joints @ joints])
+    over, rms = squares / (_UNUSUAL * chdtri(freedom, _CHANCE) + bias), np.sqrt(np.mean(r**2))
     return RigidFit(
         agrees=bool(max(over[:2]) <= 1.0),
         reached=bool(over[2] <= 1.0),
         rms_px=float(rms),
-        limit_px=float(rms / np.sqrt(over[1])),
+        limit_px=float(rms / np.sqrt(max(over[1], 1e-300))),
         seen=left.reshape(at.seen.shape),
         off_px=np.linalg.norm(at.r.reshape(2, -1, 2), axis=2),
         shift=shift,
@@ -143,22 +153,33 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
     )
 
 
+def resting_error_mm(
+    calibration: Calibration, q: FloatArray, face: Sequence[int], lengths: FloatArray, images: FloatArray
+) -> float | None:
+    """Return how far a face at rest may be from where its joints put it, rms mm, by images that agree.
+
+    The error of the images, and the shift of one of them that no test shows. None where no length is known,
+    or a view shows less than three markers.
+
+    q : (n,) joint readings, rad or m; face : numbers of its markers; lengths : (f, f) between them, m, NaN if
+        unknown.
+    images : (2, m, 2) mean pixels of the markers of the calibration, NaN where unseen.
+    """
+    detected = np.isfinite(images[..., 0])
+    if not {*face} <= {*calibration.marker.tolist()} or detected.sum(axis=1).min() < _LEAST_MARKERS:
+        return None
+    M = calibration.M
+    posture = Posture(calibration.model(), q, M[calibration.indices_of(face)], lengths)
+    if not posture.known:
+        return None
+    off = np.where(detected[..., None], images - predict(calibration, q[None])[0], 0.0).ravel()
+    hidden_mm = rigid_fit(calibration, q, images, np.zeros(detected.shape)).off_mm(posture, M)
+    return float(np.hypot(np.linalg.norm(posture.carry(M, detected) @ off), hidden_mm))
+
+
 def _free(at: Residual, J: FloatArray) -> FloatArray:
     """Covariance (4 m, 4 m) of residuals whose changes along J (4 m, k) are not known."""
     S = at.R + at.B @ at.B.T
     J = J * np.repeat(at.seen.ravel(), 2)[:, None]
     J = J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     return np.asarray(S + _FREE * S.diagonal().max() * J @ J.T)
-
-
-def mean_image(images: FloatArray) -> FloatArray:
-    """Mean (…, 2) of images (K, …, 2) of an arm that stands still; NaN where most show no marker."""
-    often, mean = 2 * np.isfinite(images).sum(axis=0) > len(images), np.full(images.shape[1:], np.nan)
-    mean[often] = np.nanmean(images[:, often], axis=0)
-    return mean
-
-
-def still(q: FloatArray, images: FloatArray, noise: FloatArray) -> FramePair:
-    """Observation of an arm that stands still at joints (n,), of pixels (2, m, 2) with deviations (2, m)."""
-    none = np.zeros(2)
-    return FramePair(none, np.stack([q, q]), np.zeros((2, len(q))), none, images, noise, np.zeros(len(q)))

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.records import BoolArray, FloatArray
+from projservo_cli.records import Calibration, FloatArray, IntArray
 
 # Frames of both views within this time, s, are one observation; number that waits for the other view.
 _TOGETHER_S, _WAITING = 0.025, 25
@@ -35,10 +35,11 @@ class FramePair(NamedTuple):
     noise: FloatArray  # (2, m) px
     curved: FloatArray  # (n,) how far joints may be off since they do not go straight between readings
 
-    @property
-    def seen(self) -> BoolArray:
-        """Markers (2, m) that are seen."""
-        return np.asarray(np.isfinite(self.images[..., 0]))
+    @classmethod
+    def at_rest(cls, q: FloatArray, images: FloatArray, noise: FloatArray) -> "FramePair":
+        """Images (2, m, 2) of an arm that stands still at joints (n,), with deviations (2, m) of pixels."""
+        none = np.zeros(2)
+        return cls(none, np.stack([q, q]), np.zeros((2, len(q))), none, images, noise, np.zeros(len(q)))
 
 
 class Pairing:
@@ -72,17 +73,32 @@ class Pairing:
             waiting.pop(0) if waiting and due and (together or v == first) else None
             for v, waiting in enumerate(self._waiting)
         ]
-        one = frames[0] or frames[1]
-        return None if one is None else self._pair(one, frames)
+        earliest = frames[0] or frames[1]
+        return None if earliest is None else self._pair(earliest, frames)
 
-    def _pair(self, one: Frame, frames: list[Frame | None]) -> FramePair:
+    def _pair(self, frame_now: Frame, frames: list[Frame | None]) -> FramePair:
         """Pair of the frames of both views, at least one of them."""
-        both = [frame or one._replace(image=np.full_like(one.image, np.nan)) for frame in frames]
-        last, self._last = self._last or one, one
-        self._start = one.t if self._start is None else self._start
-        stacked = (np.array([frame[i] for frame in both]) for i in range(len(one)))
+        both = [frame or frame_now._replace(image=np.full_like(frame_now.image, np.nan)) for frame in frames]
+        last, self._last = self._last or frame_now, frame_now
+        self._start = frame_now.t if self._start is None else self._start
+        stacked = (np.array([frame[i] for frame in both]) for i in range(len(frame_now)))
         t, q, q_dot, sigma_t, images, noise = stacked
-        curved = _STRAIGHT * np.abs(one.q_dot - last.q_dot) * abs(one.t - last.t)
+        curved = _STRAIGHT * np.abs(frame_now.q_dot - last.q_dot) * abs(frame_now.t - last.t)
         return FramePair(
             t=t - self._start, q=q, q_dot=q_dot, sigma_t=sigma_t, images=images, noise=noise, curved=curved
         )
+
+
+def at_known_markers(calibration: Calibration, marker: IntArray, images: FloatArray) -> FloatArray:
+    """Values (2, m, …) of the markers of a calibration among those (2, b, …) of the numbers marker (b,)."""
+    has = np.isin(marker, calibration.marker)
+    values = np.full((2, len(calibration.marker), *images.shape[2:]), np.nan)
+    values[:, calibration.indices_of(marker[has])] = images[:, has]
+    return values
+
+
+def mean_image(images: FloatArray) -> FloatArray:
+    """Mean (…, 2) of images (K, …, 2) of an arm that stands still; NaN where most show no marker."""
+    often, mean = 2 * np.isfinite(images).sum(axis=0) > len(images), np.full(images.shape[1:], np.nan)
+    mean[often] = np.nanmean(images[:, often], axis=0)
+    return mean

@@ -1,6 +1,7 @@
 """Causes that may explain why images disagree, each by the images that it predicts."""
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.linalg import cho_factor, cho_solve, expm
 
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.monitoring.frame_pairs import FramePair
-from projservo_cli.monitoring.statistics import ErrorModel, Residual, Sums
+from projservo_cli.monitoring.innovation_tests import ErrorModel, Residual, Sums
 from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
 
 # Images are expected to be changed by so much by any cause, px rms: the prior of its parameters.
@@ -90,8 +91,10 @@ class Evidence:
         self._weights, self._agreed = weights[few] * (weights.sum() / weights[few].sum()), agreed
         factor = np.sqrt(self._weights)
         self._errors = errors
+        self.twists, self.directions = errors.twists, errors.directions
+        self.q_reference = errors.calibration.q_reference
         self.scene: Parameters = errors.scene
-        self.away = np.array([pair.q for pair in self.pairs]) - errors.calibration.q_reference
+        self.away = np.array([pair.q for pair in self.pairs]) - self.q_reference
         self._images = np.array([pair.images for pair in self.pairs])
         self.seen = np.array([residual.seen for residual in residuals])
         self._images[~self.seen] = 0.0
@@ -129,8 +132,8 @@ class Evidence:
 
     def _whitened(self, rows: FloatArray) -> FloatArray:
         """Rows (K, 4 m, …) over the root of their covariance, (K 4 m, …)."""
-        found = self._inverses @ rows.reshape(*rows.shape[:2], -1)
-        return np.asarray(found.reshape(-1, *rows.shape[2:]))
+        whitened = self._inverses @ rows.reshape(*rows.shape[:2], -1)
+        return np.asarray(whitened.reshape(-1, *rows.shape[2:]))
 
     def _off(self, changed: Changed) -> FloatArray:
         """Return the residuals (K, 4 m) of images from the prediction of a cause, px; zero if unseen."""
@@ -159,21 +162,21 @@ class Evidence:
         The first step of a joint that is far off says little, since its images move on curves.
         """
         tried = [self._tried(cause) for cause in causes]
-        tried.sort(key=lambda one: -one[0])
+        tried.sort(key=lambda trial: -trial[0])
         return [
             self._refitted(self._fitted(cause, start))
             for rank, (_, cause, start) in enumerate(tried)
             if rank < _FITTED or start.size <= 1
         ]
 
-    def _refitted(self, found: Explanation) -> Explanation:
+    def _refitted(self, fit: Explanation) -> Explanation:
         """Explanation of a cause that is far off, with errors of joints and calibration as they act there.
 
         The fit takes observations back to the state without the cause, and fits its remainder there.
         """
-        kind, changed = found.cause.kind, found.cause.change(self.nothing, found.theta)
-        if kind not in ("exchanged", "mirrored", "slipped", "sized") or found.changed_px < _NEAR_PX:
-            return found
+        kind, changed = fit.cause.kind, fit.cause.change(self.nothing, fit.theta)
+        if kind not in ("exchanged", "mirrored", "slipped", "sized") or fit.changed_px < _NEAR_PX:
+            return fit
         pairs = []
         for pair, away in zip(self.pairs, changed.away, strict=True):
             images, noise = pair.images, pair.noise
@@ -181,15 +184,15 @@ class Evidence:
                 images, noise = images[::-1], noise[::-1]
             images = (images - changed.shift[:, None] + 0.5) / changed.scale[:, None, None] - 0.5
             noise = noise / changed.scale[:, None]
-            q = away + self._errors.calibration.q_reference
+            q = away + self.q_reference
             pairs.append(pair._replace(q=q, images=images, noise=noise))
         residuals = [self._errors.residual(pair) for pair in pairs]
         there = Evidence(self._errors, pairs, residuals, self._weights, self._agreed)
-        left, theta = there.before, found.theta
+        left, theta = there.before, fit.theta
         if theta.size:
-            nearer = there._fitted(found.cause, np.full(1, 1.0 if kind == "sized" else 0.0))
+            nearer = there._fitted(fit.cause, np.full(1, 1.0 if kind == "sized" else 0.0))
             left, theta = nearer.left, theta * nearer.theta if kind == "sized" else theta + nearer.theta
-        return found._replace(theta=theta, gain=self.before - left, left=left)
+        return fit._replace(theta=theta, gain=self.before - left, left=left)
 
     def _changed_by(self, cause: Cause, theta: FloatArray) -> FloatArray:
         return self._off(cause.change(self.nothing, theta))
@@ -259,189 +262,161 @@ class Evidence:
         )
 
 
-_NONE = np.zeros((1, 0))
-
-
 def causes_of(evidence: Evidence, numbers: IntArray, centre: FloatArray | None) -> Iterator[Cause]:
     """All causes that may be named, the simplest of a kind first.
 
     numbers : (m,) of the markers; centre : (2, 2) of the images, px; None where their size is not known.
     """
-    yield Cause(
-        "exchanged",
-        -1,
-        _NONE,
-        lambda s, _: s._replace(P=s.P[::-1], lens=None if s.lens is None else s.lens[::-1]),
-    )
+
+    def exchanged(s: Changed, _: FloatArray) -> Changed:
+        return s._replace(P=s.P[::-1], lens=None if s.lens is None else s.lens[::-1])
+
+    yield Cause("exchanged", -1, _start(0), exchanged)
     yield from _joint_causes(evidence)
     yield from _image_causes(centre)
-    yield from _camera_causes(evidence)
+    yield from _camera_causes(evidence.twists)
     yield from _body_causes(evidence, numbers)
 
 
+def _start(parameters: int) -> FloatArray:
+    """The start (1, p) of a fit without a change."""
+    return np.zeros((1, parameters))
+
+
 def _joint_causes(evidence: Evidence) -> Iterator[Cause]:
-    q_reference = evidence._errors.calibration.q_reference
-    n, K = len(q_reference), len(evidence.pairs)
+    """Causes in the joints, their readings and when these were taken."""
+    q = np.array([pair.q for pair in evidence.pairs])
     velocity = np.array([pair.q_dot for pair in evidence.pairs])
+    (K, _, n), q_reference = q.shape, evidence.q_reference
+
+    def mirrored(s: Changed, _: FloatArray, i: int) -> Changed:
+        away = s.away.copy()
+        away[..., i] = -(away[..., i] + 2.0 * q_reference[i])
+        return s._replace(away=away)
+
+    def slipped(s: Changed, theta: FloatArray, i: int) -> Changed:
+        return s._replace(away=s.away + theta[0] * np.eye(n)[i])
+
+    def frozen(s: Changed, theta: FloatArray, which: slice) -> Changed:
+        away = s.away.copy()
+        away[..., which] += theta.reshape(K, 1, -1)
+        return s._replace(away=away)
+
+    def flexible(s: Changed, theta: FloatArray) -> Changed:
+        return s._replace(away=s.away + theta)
+
+    def late(s: Changed, theta: FloatArray, v: int) -> Changed:
+        delays = theta if v < 0 else np.eye(2)[v] * theta
+        return s._replace(away=s.away - delays[:, None] * velocity)
+
+    turns = np.linspace(-np.pi, np.pi, _TURNS, endpoint=False)[:, None] + np.pi / _TURNS
     for i in range(n):
-
-        def mirrored(s: Changed, _: FloatArray, i: int = i) -> Changed:
-            away = s.away.copy()
-            away[..., i] = -(away[..., i] + 2.0 * q_reference[i])
-            return s._replace(away=away)
-
-        def slipped(s: Changed, theta: FloatArray, i: int = i) -> Changed:
-            return s._replace(away=s.away + theta[0] * np.eye(n)[i])
-
-        starts = np.zeros((1, 1))
-        if not evidence.scene.prismatic[i]:
-            starts = np.linspace(-np.pi, np.pi, _TURNS, endpoint=False)[:, None] + np.pi / _TURNS
-            starts = np.concatenate([np.zeros((1, 1)), starts])
-        yield Cause("mirrored", i, _NONE, mirrored)
-        yield Cause("slipped", i, starts, slipped)
-    read = np.array([pair.q for pair in evidence.pairs])
-    still: BoolArray = np.ptp(read, axis=(0, 1)) <= _STILL
-    for j in np.flatnonzero(still) if K > 1 and not still.all() else ():
-
-        def frozen(s: Changed, theta: FloatArray, i: int = int(j)) -> Changed:
-            away = s.away.copy()
-            away[..., i] += theta[:, None]
-            return s._replace(away=away)
-
-        yield Cause("frozen", int(j), np.zeros((1, K)), frozen)
-    if K > 2 and still.all():
-        yield Cause(
-            "frozen",
-            -1,
-            np.zeros((1, n * K)),
-            lambda s, theta: s._replace(away=s.away + theta.reshape(K, 1, n)),
-        )
-    yield Cause("flexible", -1, np.zeros((1, n)), lambda s, theta: s._replace(away=s.away + theta))
-    for v in (0, 1, -1):
-
-        def late(s: Changed, theta: FloatArray, v: int = v) -> Changed:
-            both = theta if v < 0 else np.eye(2)[v] * theta
-            return s._replace(away=s.away - both[:, None] * velocity)
-
-        if velocity.any():
-            yield Cause("late", v, np.zeros((1, 2 if v < 0 else 1)), late)
+        yield Cause("mirrored", i, _start(0), partial(mirrored, i=i))
+        starts = _start(1) if evidence.scene.prismatic[i] else np.concatenate([_start(1), turns])
+        yield Cause("slipped", i, starts, partial(slipped, i=i))
+    still: BoolArray = np.ptp(q, axis=(0, 1)) <= _STILL
+    if K > 1 and not still.all():
+        for i in np.flatnonzero(still).tolist():
+            yield Cause("frozen", i, _start(K), partial(frozen, which=slice(i, i + 1)))
+    elif K > 2:
+        yield Cause("frozen", -1, _start(n * K), partial(frozen, which=slice(n)))
+    yield Cause("flexible", -1, _start(n), flexible)
+    for v in (0, 1, -1) if velocity.any() else ():
+        yield Cause("late", v, _start(2 if v < 0 else 1), partial(late, v=v))
 
 
 def _image_causes(centre: FloatArray | None) -> Iterator[Cause]:
-    for v in (0, 1, -1):
-        views = np.ones(2) if v < 0 else np.eye(2)[v]
+    """Causes in the images: cropped, of another size, or of another focal length."""
 
-        def shifted(s: Changed, theta: FloatArray, views: FloatArray = views) -> Changed:
-            return s._replace(shift=s.shift + views[:, None] * theta)
+    def shifted(s: Changed, theta: FloatArray, views: FloatArray) -> Changed:
+        return s._replace(shift=s.shift + views[:, None] * theta)
 
-        def sized(s: Changed, theta: FloatArray, views: FloatArray = views) -> Changed:
-            factor = 1.0 + views * (theta[0] - 1.0)
-            return s._replace(scale=factor * s.scale, shift=factor[:, None] * s.shift)
+    def sized(s: Changed, theta: FloatArray, views: FloatArray) -> Changed:
+        factor = 1.0 + views * (theta[0] - 1.0)
+        return s._replace(scale=factor * s.scale, shift=factor[:, None] * s.shift)
 
-        yield Cause("shifted", v, np.zeros((1, 2)), shifted)
-        yield Cause("sized", v, np.array(_FACTORS)[:, None], sized)
-        if centre is not None and v >= 0:
+    def focused(s: Changed, theta: FloatArray, views: FloatArray) -> Changed:
+        factor = 1.0 + views * theta[0]
+        about_centre = (
+            views[:, None] * theta[1:] if centre is None else (1.0 - factor)[:, None] * (centre + 0.5)
+        )
+        return s._replace(scale=factor, shift=about_centre)
 
-            def focused(s: Changed, theta: FloatArray, views: FloatArray = views) -> Changed:
-                factor = 1.0 + views * theta[0]
-                return s._replace(scale=factor, shift=(1.0 - factor)[:, None] * (centre + 0.5))
-
-            yield Cause("focused", v, np.zeros((1, 1)), focused)
-        elif v >= 0:
-
-            def zoomed(s: Changed, theta: FloatArray, views: FloatArray = views) -> Changed:
-                return s._replace(scale=1.0 + views * theta[0], shift=views[:, None] * theta[1:])
-
-            yield Cause("focused", v, np.zeros((1, 3)), zoomed)
+    for v, views in ((0, np.array([1.0, 0.0])), (1, np.array([0.0, 1.0])), (-1, np.ones(2))):
+        yield Cause("shifted", v, _start(2), partial(shifted, views=views))
+        yield Cause("sized", v, np.array(_FACTORS)[:, None], partial(sized, views=views))
+        if v >= 0:
+            yield Cause("focused", v, _start(3 if centre is None else 1), partial(focused, views=views))
 
 
-def _camera_causes(evidence: Evidence) -> Iterator[Cause]:
-    twists, d = evidence._errors.twists, len(evidence._errors.twists)
+def _camera_causes(twists: FloatArray) -> Iterator[Cause]:
+    """Causes in where the cameras stand, by rigid motions (d, 4, 4)."""
+    d = len(twists)
 
     def turned(s: Changed, theta: FloatArray, views: tuple[int, ...]) -> Changed:
         P = s.P.copy()
-        for part, v in zip(theta.reshape(-1, d), views, strict=False):
+        for part, v in zip(theta.reshape(-1, d), views, strict=True):
             P[v] = P[v] @ expm(np.tensordot(part, twists, 1))
         return s._replace(P=P)
 
-    for v in (0, 1):
-
-        def rigid(s: Changed, theta: FloatArray, v: int = v) -> Changed:
-            return turned(s, theta, (v,))
-
-        yield Cause("camera", v, np.zeros((1, d)), rigid)
-    yield Cause("cameras", -1, np.zeros((1, 2 * d)), lambda s, theta: turned(s, theta, (0, 1)))
-    yield Cause(
-        "cameras",
-        -1,
-        np.zeros((1, 4)),
-        lambda s, theta: s._replace(shift=s.shift + theta.reshape(2, 2)),
-    )
+    def both_shifted(s: Changed, theta: FloatArray) -> Changed:
+        return s._replace(shift=s.shift + theta.reshape(2, 2))
 
     def rig(s: Changed, theta: FloatArray) -> Changed:
         return s._replace(P=s.P @ expm(np.tensordot(theta, twists, 1)))
 
-    yield Cause("rig", -1, np.zeros((1, d)), rig)
+    for v in (0, 1):
+        yield Cause("camera", v, _start(d), partial(turned, views=(v,)))
+    yield Cause("cameras", -1, _start(2 * d), partial(turned, views=(0, 1)))
+    yield Cause("cameras", -1, _start(4), both_shifted)
+    yield Cause("rig", -1, _start(d), rig)
 
 
 def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
     """Causes on the tool: its markers, tags, and all of them."""
-    twists, m = evidence._errors.twists, len(numbers)
+    twists, d = evidence.twists, len(evidence.twists)
     visible: BoolArray = np.any(evidence.seen, axis=(0, 1))
-    d = len(twists)
+    tags = [np.flatnonzero(numbers // CORNERS == t) for t in np.unique(numbers // CORNERS)]
+    tags = [tag for tag in tags if len(tag) == CORNERS]
 
     def displaced(s: Changed, theta: FloatArray, which: IntArray) -> Changed:
         M = s.M.copy()
         M[which] = M[which] @ expm(np.tensordot(theta, twists, 1)).T
         return s._replace(M=M)
 
-    yield Cause("tool", -1, np.zeros((1, d)), lambda s, theta: displaced(s, theta, np.arange(m)))
-    tags = [np.flatnonzero(numbers // CORNERS == t) for t in np.unique(numbers // CORNERS)]
-    tags = [which for which in tags if len(which) == CORNERS]
+    def larger(s: Changed, theta: FloatArray) -> Changed:
+        M = s.M.copy()
+        for tag in tags:
+            centre = M[tag].mean(axis=0)
+            M[tag] = centre + (1.0 + theta[0]) * (M[tag] - centre)
+        return s._replace(M=M)
+
+    def moved(s: Changed, theta: FloatArray, j: int) -> Changed:
+        M = s.M.copy()
+        M[j] += evidence.directions.T @ theta * np.linalg.norm(M[j])
+        return s._replace(M=M)
+
+    yield Cause("tool", -1, _start(d), partial(displaced, which=np.arange(len(numbers))))
     if tags:
-
-        def larger(s: Changed, theta: FloatArray) -> Changed:
-            M = s.M.copy()
-            for which in tags:
-                centre = M[which].mean(axis=0)
-                M[which] = centre + (1.0 + theta[0]) * (M[which] - centre)
-            return s._replace(M=M)
-
-        yield Cause("larger", -1, np.zeros((1, 1)), larger)
-    for which in tags:
-
-        def loose(s: Changed, theta: FloatArray, which: IntArray = which) -> Changed:
-            return displaced(s, theta, which)
-
-        if visible[which].any() and len(tags) > 1:
-            yield Cause(
-                kind="tag",
-                which=int(which[0]),
-                starts=np.zeros((1, d)),
-                change=loose,
-                markers=tuple(which.tolist()),
-            )
-    for j in np.flatnonzero(visible):
-
-        def moved(s: Changed, theta: FloatArray, j: int = int(j)) -> Changed:
-            M = s.M.copy()
-            M[j] += evidence._errors.directions.T @ theta * np.linalg.norm(M[j])
-            return s._replace(M=M)
-
-        yield Cause(kind="marker", which=int(j), starts=np.zeros((1, 3)), change=moved, markers=(int(j),))
+        yield Cause("larger", -1, _start(1), larger)
+    for tag in tags if len(tags) > 1 else ():
+        if visible[tag].any():
+            yield Cause("tag", int(tag[0]), _start(d), partial(displaced, which=tag), tuple(tag.tolist()))
+    for j in np.flatnonzero(visible).tolist():
+        yield Cause("marker", j, _start(3), partial(moved, j=j), (j,))
 
 
 def together(moved: list[Explanation]) -> Explanation:
     """Displacements of markers, each fitted by itself, as one cause."""
     first = moved[0]
-    markers = tuple(j for one in moved for j in one.cause.markers)
+    markers = tuple(j for fit in moved for j in fit.cause.markers)
     return first._replace(
         cause=first.cause._replace(markers=markers),
-        gain=sum(one.gain for one in moved),
-        cost=sum(one.cost for one in moved),
-        left=first.left - sum(one.gain for one in moved[1:]),
-        changed_px=max(one.changed_px for one in moved),
-        min_px=min(one.min_px for one in moved),
+        gain=sum(fit.gain for fit in moved),
+        cost=sum(fit.cost for fit in moved),
+        left=first.left - sum(fit.gain for fit in moved[1:]),
+        changed_px=max(fit.changed_px for fit in moved),
+        min_px=min(fit.min_px for fit in moved),
     )
 
 
@@ -457,13 +432,13 @@ _CONTAINS = {
 }
 
 
-def contains(one: Cause, other: Cause) -> bool:
+def contains(cause: Cause, other: Cause) -> bool:
     """Whether a cause explains what another one does, with more parameters."""
-    alike = one.which in (-1, other.which) or set(other.markers) <= set(one.markers) != set()
-    more = one.starts.shape[1] > other.starts.shape[1]
-    return alike and more and other.kind in _CONTAINS.get(one.kind, ())
+    alike = cause.which in (-1, other.which) or set(other.markers) <= set(cause.markers) != set()
+    more = cause.starts.shape[1] > other.starts.shape[1]
+    return alike and more and other.kind in _CONTAINS.get(cause.kind, ())
 
 
-def is_possible(found: Explanation) -> bool:
+def is_possible(fit: Explanation) -> bool:
     """Whether a cause can be of that size: links flex by a little only."""
-    return found.cause.kind != "flexible" or bool(np.abs(found.theta).max() <= _MOST_FLEXIBLE)
+    return fit.cause.kind != "flexible" or bool(np.abs(fit.theta).max() <= _MOST_FLEXIBLE)

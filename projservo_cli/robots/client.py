@@ -14,8 +14,8 @@ import numpy as np
 from projservo_cli.calibration.detections import MIN_SIGMA
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
-from projservo_cli.monitoring.monitor import ImageMonitor
-from projservo_cli.monitoring.statistics import WINDOW
+from projservo_cli.monitoring.image_monitor import ImageMonitor
+from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray, WorkFailed
 from projservo_cli.robots.contract import PluginRobot
 from projservo_cli.robots.frame_recorder import FrameRecorder
@@ -251,8 +251,8 @@ class DrivenRobot:
 
 def _require_apart(name: str, s: FloatArray) -> None:
     """Raise WorkFailed for images (2, k, 2) with several markers at one pixel, as zeros for unseen ones."""
-    for view, one in zip(VIEWS, s, strict=True):
-        at, count = np.unique(one[np.isfinite(one[:, 0])], axis=0, return_counts=True)
+    for view, pixels in zip(VIEWS, s, strict=True):
+        at, count = np.unique(pixels[np.isfinite(pixels[:, 0])], axis=0, return_counts=True)
         if (count >= _AT_ONE_PIXEL).any():
             u, v = at[np.argmax(count)]
             raise WorkFailed(
@@ -263,9 +263,9 @@ def _require_apart(name: str, s: FloatArray) -> None:
 
 def weights(sigma: FloatArray, s: FloatArray) -> FloatArray:
     """Weights (2, k) of pixels (2, k, 2) of deviations (2, k) in a fit: the rms of those seen over each."""
-    seen = np.isfinite(s[..., 0])
-    weight = np.ones(seen.shape)
-    if seen.any():
+    detected = np.isfinite(s[..., 0])
+    weight = np.ones(detected.shape)
+    if detected.any():
         sigma = np.maximum(sigma, MIN_SIGMA)
-        weight[seen] = np.sqrt(np.mean(sigma[seen] ** 2)) / sigma[seen]
+        weight[detected] = np.sqrt(np.mean(sigma[detected] ** 2)) / sigma[detected]
     return weight

@@ -50,8 +50,8 @@ class Reading(NamedTuple):
         """Whether each view has another frame than in the reading before."""
         if before is None:
             return True, True
-        both = zip(self.t_view, self.s, before.t_view, before.s, strict=True)
-        left, right = (not is_repeated_frame(*frames) for frames in both)
+        frames_of_views = zip(self.t_view, self.s, before.t_view, before.s, strict=True)
+        left, right = (not is_repeated_frame(*frames) for frames in frames_of_views)
         return left, right
 
 
@@ -87,11 +87,12 @@ class Robot(Protocol):
     A class may also have ``now() -> float``, its clock, s, without which ``time.monotonic`` is taken;
     ``release()`` and ``hold()``, which let go of the arm, so that somebody can move it for ``projservo
     teach``, and hold it again; ``identity() -> str``, without spaces, which changes where readings mean
-    something else, such as after homing, and without which no recording holds; and, if it is a simulator,
-    ``truth()``, the pose (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A
-    simulator's time passes in ``command`` alone, which moves it to ``due``. And ``frames``, both images
-    (2, height, width) of its last reading in grey, uint8, or None: a run keeps some, which the report shows.
-    A class that takes an argument ``limits`` is given those of its joints, ``JointLimits``.
+    something else, such as after homing, and without which no recording holds; ``remarks() -> list[str]``,
+    faults of its last images, such as darkness; and, if it is a simulator, ``truth()``, the pose
+    (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's time passes
+    in ``command`` alone, which moves it to ``due``. And ``frames``, both images (2, height, width) of its
+    last reading in grey, uint8, or None: a run keeps some, which the report shows. A class that takes an
+    argument ``limits`` is given those of its joints, ``JointLimits``.
     """
 
     def open(self) -> None:
@@ -214,13 +215,20 @@ class PluginRobot:
 
     def health(self) -> dict[str, float | str]:
         """Return the measurements of the robot on itself, such as its voltage, by name; may be empty."""
-        method = getattr(self.robot, "health", None)
-        return {} if method is None else dict(self._ask("health", method))
+        return dict(self._optional("health", {}))
+
+    def remarks(self) -> list[str]:
+        """Return the faults of the last images that the robot finds, in words; may be empty."""
+        return list(self._optional("remarks", ()))
 
     def identity(self) -> str:
         """Return a text that changes with the meaning of the readings; may be empty."""
-        method = getattr(self.robot, "identity", None)
-        return "" if method is None else "".join(str(self._ask("identity", method)).split())
+        return "".join(str(self._optional("identity", "")).split())
+
+    def _optional(self, name: str, default: Any) -> Any:
+        """Return the answer of a method that a class may have; the default without it."""
+        method = getattr(self.robot, name, None)
+        return self._ask(name, method) if callable(method) else default
 
     def require_identity(self, recorded: str) -> None:
         """Refuse a robot whose readings mean something else than when they were recorded; a WorkFailed."""
@@ -259,8 +267,8 @@ class PluginRobot:
         """Send the set-point (n,), rad or m, with its speed (n,), per s, and when it is due, s."""
         if wrong := self._wrong(target, speed, due):
             raise WorkFailed(f"{self.name}: a command was not sent: {wrong}")
-        given = target.copy(), speed.copy(), due
-        self._ask("command", lambda: self.robot.command(*given))
+        sent = target.copy(), speed.copy(), due
+        self._ask("command", lambda: self.robot.command(*sent))
         self._sent, self._due = target.copy(), due
 
     def wait_until(self, due: float) -> bool:
@@ -459,7 +467,7 @@ class PluginRobot:
         far = _SURGE * self.bounds.limits.speed * seconds + self.bounds.sag + _LEAP
         leaps = (np.abs(now.q - before.q) > far) & (np.abs(now.q - sent) > np.abs(before.q - sent))
         for i in np.flatnonzero(leaps).tolist():
-            first, then = (self.bounds.text(i, one.q[i]) for one in (before, now))
+            first, then = (self.bounds.text(i, reading.q[i]) for reading in (before, now))
             what = f"joint {i + 1} read {first} and {then} within {seconds:.3g} s"
             return f"{what}: check its encoder and unit, or what moved it"
         return ""
@@ -467,18 +475,18 @@ class PluginRobot:
     def _numbers(self, what: str, answer: Any, shape: tuple[int, ...], *, finite: bool = False) -> FloatArray:
         """The answer as new numbers of the right shape."""
         try:
-            found = np.asarray(answer)
+            numbers = np.asarray(answer)
         except ValueError:
-            found = np.empty(0, dtype=object)
-        if found.dtype.kind not in "fiu":
+            numbers = np.empty(0, dtype=object)
+        if numbers.dtype.kind not in "fiu":
             raise WorkFailed(
                 f"{self.name}: {what} as {type(answer).__name__}: expected numbers of shape {shape}"
             )
-        if found.shape != shape:
-            raise WorkFailed(f"{self.name}: {what} of shape {found.shape}, expected {shape}")
-        if finite and not np.isfinite(found).all():
-            raise WorkFailed(f"{self.name}: {what} as {found}: must be finite")
-        return np.array(found, dtype=np.float64)
+        if numbers.shape != shape:
+            raise WorkFailed(f"{self.name}: {what} of shape {numbers.shape}, expected {shape}")
+        if finite and not np.isfinite(numbers).all():
+            raise WorkFailed(f"{self.name}: {what} as {numbers}: must be finite")
+        return np.array(numbers, dtype=np.float64)
 
 
 def _difference(before: str, now: str) -> str:

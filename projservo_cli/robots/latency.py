@@ -247,9 +247,9 @@ class _View:
     def _misfit(self, image: FloatArray, t: FloatArray, history: History) -> FloatArray:
         """Mean squares (k,) by which an image is off those predicted at instants (k,), px²."""
         off = (image - self._seen(history, t)) ** 2
-        known = np.isfinite(off)
-        square = np.where(known, off, 0.0).sum(axis=(1, 2)) / np.maximum(known.sum(axis=(1, 2)), 1)
-        return np.where(known.any(axis=(1, 2)), square, math.inf)
+        detected = np.isfinite(off)
+        square = np.where(detected, off, 0.0).sum(axis=(1, 2)) / np.maximum(detected.sum(axis=(1, 2)), 1)
+        return np.where(detected.any(axis=(1, 2)), square, math.inf)
 
     def _searched(self, image: FloatArray, nominal: float, history: History) -> float:
         """Instant of a fresh image, s, among all; each delay has its chance."""
@@ -298,12 +298,12 @@ class _View:
         An image gives its instant only where it moved in the same direction before and after.
         """
         predicted = self._seen(history, t + _APART_S * np.array([-1.0, 0.0, 1.0]))
-        known = np.isfinite(image[:, 0]) & np.isfinite(predicted[..., 0]).all(axis=0)
-        before, after = np.diff(predicted[:, known], axis=0) / _APART_S
-        square = float(np.mean(before * after)) if known.any() else 0.0
+        detected = np.isfinite(image[:, 0]) & np.isfinite(predicted[..., 0]).all(axis=0)
+        before, after = np.diff(predicted[:, detected], axis=0) / _APART_S
+        square = float(np.mean(before * after)) if detected.any() else 0.0
         if not square > 0.0:
             return 0.0, math.inf
-        off, speed = image[known] - predicted[1, known], 0.5 * (before + after)
+        off, speed = image[detected] - predicted[1, detected], 0.5 * (before + after)
         shift = float(np.sum(speed * off) / np.sum(speed**2))
         left = float(np.sqrt(np.mean((off - shift * speed) ** 2)))
         return shift, max(self.error_px, left) / math.sqrt(square)

@@ -23,17 +23,17 @@ def source_hash(target: str) -> str:
     """
     module = target.split(":")[0]
     top = module.split(".")[0]
-    found: dict[str, bytes] = {}
+    sources: dict[str, bytes] = {}
     due = [module]
     while due:
         for spec in _specs(due.pop()):
-            if spec.name not in found and (source := _source(spec, top)) is not None:
-                found[spec.name] = source
+            if spec.name not in sources and (source := _source(spec, top)) is not None:
+                sources[spec.name] = source
                 due += _imports(spec, source)
-    if module not in found:
+    if module not in sources:
         return ""
     digest = hashlib.sha256()
-    for name, source in sorted(found.items()):
+    for name, source in sorted(sources.items()):
         digest.update(f"{name}\0{len(source)}\0".encode() + source)
     return digest.hexdigest()
 
@@ -44,7 +44,7 @@ def _specs(module: str) -> Iterator[ModuleSpec]:
     for i in range(len(parts)):
         name = ".".join(parts[: i + 1])
         finders = (finder.find_spec(name, path) for finder in sys.meta_path)
-        spec = next((one for one in finders if one is not None), None)
+        spec = next((candidate for candidate in finders if candidate is not None), None)
         if spec is None and path is None:
             spec = PathFinder.find_spec(name, [os.getcwd()])
         if spec is None:

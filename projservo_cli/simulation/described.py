@@ -11,6 +11,7 @@ import numpy as np
 
 from projservo_cli.detection import DICTIONARY
 from projservo_cli.geometry.displacements import twists
+from projservo_cli.image_size import image_sizes
 from projservo_cli.keys import File
 from projservo_cli.records import NO_LENS, FloatArray, position_limits, prismatic_of
 from projservo_cli.settings.control import RenderedOptions
@@ -102,7 +103,7 @@ def described_truth(robot: RobotSettings, rig: Rig, markers: Markers, k1: float,
         number=numbers,
         face=tuple(numbers.index(number) for number in markers.front or ()) if face else (),
         center=center_in_face(markers),
-        image_size=np.array(rig.image_size_px, dtype=np.float64),
+        image_size=image_sizes(rig.image_size_px),
         lens=lens_of(P, k1) if k1 else NO_LENS,
         normals=np.zeros(3) if markers.normals is None else markers.normals @ arm.base_tool[:3, :3].T,
     )

@@ -19,16 +19,42 @@ _MOVING = {"revolute": "R", "continuous": "R", "prismatic": "P"}
 _MACRO = ("${", "$(")  # marks of what xacro replaces in attributes
 
 
-def read_urdf(path: str, tip: str, content: bytes, *, bounded: bool = True) -> dict[str, Any]:
+def read_urdf(path: str, tip: str, content: bytes) -> dict[str, Any]:
     """Screws of the joints of a URDF from its root to a link, as ``robot.screws`` takes them.
 
     content : of the file, as bytes in the encoding that it declares.
-    bounded : whether joints that the URDF gives limits must state both.
     Raises InputError if it is no URDF or no tree, there is no such link, or a joint on the chain to it is
-    none of those that turn or slide by themselves.
+    none of those that turn or slide by themselves, or has limits without bounds.
+    """
+    return _arm(path, *_chain(path, tip, content), bounded=True)
+
+
+class UrdfChain(NamedTuple):
+    """Joints of a URDF from its root to a link, at readings of zero."""
+
+    root: str  # name of the first link
+    axes: FloatArray  # (n, 6) screws, rad and m
+    tip: FloatArray  # (4, 4) pose of the link, m
+
+
+def urdf_chain(path: str, tip: str | None, content: bytes) -> UrdfChain:
+    """Joints of a URDF from its root to a link, by default the last one; limits do not count.
+
+    Raises InputError as ``read_urdf``, or if several links are last.
+    """
+    links, chain = _chain(path, tip, content)
+    arm = _arm(path, links, chain, bounded=False)
+    axes = np.array([[*joint["w"], *joint["v"]] for joint in arm["joints"]])
+    return UrdfChain(links[0], axes, np.array(arm["base_tool"]))
+
+
+def _arm(path: str, links: list[str], chain: list[ET.Element], *, bounded: bool) -> dict[str, Any]:
+    """Screws of the joints of a chain of links, root to tip.
+
+    bounded : whether joints that turn or slide within limits must state both.
     """
     T, joints = np.eye(4), []
-    for joint in _chain(path, tip, content):
+    for joint in chain:
         T = T @ _origin(joint, path)
         name, kind = joint.get("name", ""), joint.get("type", "")
         if joint.find("mimic") is not None:
@@ -47,34 +73,59 @@ def read_urdf(path: str, tip: str, content: bytes, *, bounded: bool = True) -> d
             joint_screw(_MOVING[kind], name, T[:3, :3] @ axis / np.linalg.norm(axis), T[:3, 3], limits)
         )
     if not joints:
-        raise InputError(f"{path}: no joint moves link {tip}")
+        raise InputError(f"{path}: no joint moves link {links[-1]}")
     return arm_screws(joints, np.zeros(len(joints)), T)
 
 
-class UrdfChain(NamedTuple):
-    """Joints of a URDF from its root to a link, at readings of zero."""
+def _chain(path: str, tip: str | None, content: bytes) -> tuple[list[str], list[ET.Element]]:
+    """Names of the links from the root of a URDF to one, by default the only last one, and joints between.
 
-    root: str  # name of the first link
-    axes: FloatArray  # (n, 6) screws, rad and m
-    tip: FloatArray  # (4, 4) pose of the link, m
-
-
-def urdf_chain(path: str, tip: str | None, content: bytes) -> UrdfChain:
-    """Joints of a URDF from its root to a link, by default the last one; limits do not count.
-
-    Raises InputError as ``read_urdf``, or if several links are last.
+    Raises InputError if several links are last, there is no such link, or links and joints are no tree.
     """
+    links, above = _tree(path, content)
     if tip is None:
-        root = _parsed(path, content)
-        above = {_of(joint, "parent", "link", "", path) for joint in root.findall("joint")}
-        ends = [name for name in (link.get("name", "") for link in root.findall("link")) if name not in above]
+        parents = {_link(joint, "parent", path) for joint in above.values()}
+        ends = [name for name in links if name not in parents]
         if len(ends) != 1:
             raise InputError(f"{path}: has {len(ends)} last links ({listed(ends)}): name one as the tip")
         tip = ends[0]
-    arm = read_urdf(path, tip, content, bounded=False)
-    first = _of(_chain(path, tip, content)[0], "parent", "link", "", path)
-    axes = np.array([[*joint["w"], *joint["v"]] for joint in arm["joints"]])
-    return UrdfChain(first, axes, np.array(arm["base_tool"]))
+    if tip not in links and tip not in above:
+        raise InputError(f"{path}: there is no link {tip}; links: {listed(links)}")
+    names, chain = [tip], list[ET.Element]()
+    while names[0] in above:
+        chain.insert(0, above.pop(names[0]))
+        names.insert(0, _link(chain[0], "parent", path))
+        if names[0] == tip:
+            raise InputError(f"{path}: joint {chain[0].get('name')} closes a loop of links: a URDF is a tree")
+    return names, chain
+
+
+def _tree(path: str, content: bytes) -> tuple[list[str], dict[str, ET.Element]]:
+    """Names of the links of a URDF, and the joint above each but the root, by the name of the link."""
+    root = _parsed(path, content)
+    links, joints = (
+        [element.get("name", "") for element in root.findall(kind)] for kind in ("link", "joint")
+    )
+    for kind, names in (("link", links), ("joint", joints)):
+        if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+            count = names.count(twice[0])
+            raise InputError(f"{path}: {kind} {twice[0]} stands there {count} times: keep one")
+    above: dict[str, ET.Element] = {}
+    for joint in root.findall("joint"):
+        link = _link(joint, "child", path)
+        if link in above:
+            raise InputError(
+                f"{path}: link {link} has two parent joints, {above[link].get('name')} and "
+                f"{joint.get('name')}: a URDF is a tree; remove the one that closes the loop"
+            )
+        above[link] = joint
+    for joint in above.values():
+        if links and (link := _link(joint, "parent", path)) not in (*links, *above):
+            raise InputError(
+                f"{path}: joint {joint.get('name')}: there is no link {link}, its parent; links: "
+                f"{listed(links)}"
+            )
+    return links, above
 
 
 def _parsed(path: str, content: bytes) -> ET.Element:
@@ -83,8 +134,8 @@ def _parsed(path: str, content: bytes) -> ET.Element:
         try:
             root = ET.fromstring(content)
         except ValueError:  # of several bytes a character, which the parser leaves to its caller
-            found = re.search(rb"""encoding\s*=\s*["']([\w.:-]+)""", content[:200])
-            root = ET.fromstring(content.decode(found[1].decode() if found else "utf-8"))
+            declared = re.search(rb"""encoding\s*=\s*["']([\w.:-]+)""", content[:200])
+            root = ET.fromstring(content.decode(declared[1].decode() if declared else "utf-8"))
     except (ET.ParseError, LookupError, ValueError) as error:
         raise InputError(
             f"{path}: not XML: {error}; its text must be in the encoding that its first line declares, by "
@@ -93,47 +144,11 @@ def _parsed(path: str, content: bytes) -> ET.Element:
     if root.tag != "robot":
         raise InputError(f"{path}: not a URDF: its outermost element is {root.tag}, not robot")
     spaces = {str(name).partition("}")[0] for e in root.iter() for name in (e.tag, *e.keys()) if "}" in name}
-    used = [part for name in ("joint", "link") for one in root.findall(name) for part in one.iter()]
+    used = [part for name in ("joint", "link") for element in root.findall(name) for part in element.iter()]
     values = [value for e in (root, *used) for value in e.attrib.values()]
     if any(space.endswith("xacro") for space in spaces) or any(mark in v for v in values for mark in _MACRO):
         raise InputError(f"{path}: is a xacro file: expand it first, xacro {Path(path).name} > robot.urdf")
     return root
-
-
-def _chain(path: str, tip: str, content: bytes) -> list[ET.Element]:
-    """Joints from the root of a URDF to a link. Raises InputError if links and joints are no tree."""
-    root = _parsed(path, content)
-    links, names = ([one.get("name", "") for one in root.findall(kind)] for kind in ("link", "joint"))
-    for kind, declared in (("link", links), ("joint", names)):
-        if twice := [name for name in dict.fromkeys(declared) if declared.count(name) > 1]:
-            raise InputError(
-                f"{path}: {kind} {twice[0]} stands there {declared.count(twice[0])} times: keep one"
-            )
-    above: dict[str, ET.Element] = {}
-    for joint in root.findall("joint"):
-        link = _of(joint, "child", "link", "", path)
-        if link in above:
-            raise InputError(
-                f"{path}: link {link} has two parent joints, {above[link].get('name')} and "
-                f"{joint.get('name')}: a URDF is a tree; remove the one that closes the loop"
-            )
-        above[link] = joint
-    for joint in above.values():
-        if links and (link := _of(joint, "parent", "link", "", path)) not in (*links, *above):
-            raise InputError(
-                f"{path}: joint {joint.get('name')}: there is no link {link}, its parent; links: "
-                f"{listed(links)}"
-            )
-    if tip not in links and tip not in above:
-        raise InputError(f"{path}: there is no link {tip}; links: {listed(links)}")
-    chain: list[ET.Element] = []
-    link = tip
-    while link in above:
-        chain.insert(0, above.pop(link))
-        link = _of(chain[0], "parent", "link", "", path)
-        if link == tip:
-            raise InputError(f"{path}: joint {chain[0].get('name')} closes a loop of links: a URDF is a tree")
-    return chain
 
 
 def joint_screw(
@@ -165,8 +180,8 @@ def _origin(joint: ET.Element, path: str) -> FloatArray:
 
 def _limits(joint: ET.Element, path: str) -> list[float]:
     """Lower and upper limit of a joint, rad or m."""
-    name, given = joint.get("name", ""), joint.find("limit")
-    if missing := [key for key in ("lower", "upper") if given is None or given.get(key) is None]:
+    name, element = joint.get("name", ""), joint.find("limit")
+    if missing := [key for key in ("lower", "upper") if element is None or element.get(key) is None]:
         raise InputError(
             f"{path}: joint {name} of type {joint.get('type')} has no {' and no '.join(missing)} limit: give "
             "lower and upper in its element limit, rad or m; a joint that turns without end is continuous"
@@ -179,7 +194,12 @@ def _limits(joint: ET.Element, path: str) -> list[float]:
     return [lower, upper]
 
 
-def _of(joint: ET.Element, tag: str, key: str, default: str, path: str) -> str:
+def _link(joint: ET.Element, end: str, path: str) -> str:
+    """Name of the link at an end of a joint, parent or child."""
+    return _attribute(joint, end, "link", "", path)
+
+
+def _attribute(joint: ET.Element, tag: str, key: str, default: str, path: str) -> str:
     """An attribute of an element of a joint."""
     elements = joint.findall(tag)
     if len(elements) > 1:
@@ -194,7 +214,7 @@ def _of(joint: ET.Element, tag: str, key: str, default: str, path: str) -> str:
 
 def _numbers(joint: ET.Element, tag: str, key: str, default: str, path: str) -> FloatArray:
     """The numbers in an attribute of an element of a joint."""
-    text = _of(joint, tag, key, default, path)
+    text = _attribute(joint, tag, key, default, path)
     try:
         values = np.array([float(part) for part in text.split()])
     except ValueError:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.geometry.displacements import rigid
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.image_size import image_sizes, within_images
+from projservo_cli.image_size import within_images
 from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model, WorkFailed
 from projservo_cli.settings.task import Goal
 from projservo_cli.simulation.analytic_plant import Ends, Plant
@@ -38,7 +38,7 @@ class Truth:
     number: tuple[int, ...]  # (m,) their numbers
     face: tuple[int, ...]  # indices of the face markers; none where the configuration has no face
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
-    image_size: FloatArray  # (2,) px of both images, or (2, 2) of each
+    image_size: FloatArray  # (2, 2) width and height of each image, px
     lens: FloatArray = field(default_factory=NO_LENS.copy)  # (2, 5) true lenses
     # (m, 3) directions that markers look in at the robot's reference; zero where they are seen from anywhere
     normals: FloatArray = field(default_factory=lambda: np.zeros(3))
@@ -81,7 +81,7 @@ class Truth:
 
     def within(self, pixels: FloatArray, view: int | slice = slice(None)) -> FloatArray:
         """Pixels (..., 2, m, 2), or (m, 2) of a view, NaN outside an image: centres reach to size − ½."""
-        inside = within_images(pixels, image_sizes(self.image_size)[view, ..., None, :])
+        inside = within_images(pixels, self.image_size[view, ..., None, :])
         return np.where(inside[..., None], pixels, np.nan)
 
     def displacement(self, q: FloatArray) -> FloatArray:
@@ -139,7 +139,7 @@ def _plant_at(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
         center=truth.center,
         O=O,
         visible=np.where(sides > 0.0, 1.0, -1.0),
-        image_size=image_sizes(truth.image_size),
+        image_size=truth.image_size,
         limits=truth.robot.limits,
         opaque=opaque,
     )

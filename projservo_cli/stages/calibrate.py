@@ -59,12 +59,12 @@ def simulated(
     """Simulate the trial motions, or poses (K, n), rad or m; the observations."""
     observation, noise_px = observed(trials, q, seed, progress=progress)
     assert trials.truth is not None
-    ideal, size = trials.driven is None, trials.truth.image_size.astype(int).tolist()
-    sizes = tuple(map(tuple, size)) if trials.truth.image_size.ndim > 1 else tuple(size)
+    ideal = trials.driven is None
+    left, right = map(tuple, trials.truth.image_size.astype(int).tolist())
     return Observations.of(
         observation,
         joint_types=trials.joints.types,
-        image_size=sizes,
+        image_size=left if left == right else (left, right),
         noise_px=noise_px,
         # Where joints or images have faults, χ² of pixel noise alone decides no more than in a recording.
         joint_noise=0.0 if ideal else None,

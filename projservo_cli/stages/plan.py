@@ -15,7 +15,7 @@ from projservo_cli.geometry.lens import undistort
 from projservo_cli.image_size import image_sizes
 from projservo_cli.loop.rehearsal import begin
 from projservo_cli.monitoring.accuracy import RigidFit, metric_points, rigid_fit
-from projservo_cli.monitoring.monitor import detected_fault
+from projservo_cli.monitoring.image_monitor import detected_fault
 from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (

@@ -15,8 +15,8 @@ import numpy as np
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
 from projservo_cli.files import write_whole
+from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.hardware.live_page import annotated, recording_page
-from projservo_cli.hardware.preflight import MIN_SHARED
 from projservo_cli.records import (
     CORNERS,
     VIEWS,

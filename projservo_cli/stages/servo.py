@@ -15,7 +15,6 @@ from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, T
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span
-from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.laws import CODES, REGULATE, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
@@ -24,7 +23,7 @@ from projservo_cli.loop.run_metrics import Ended, Summary, angle_between, path_d
 from projservo_cli.loop.stall_monitor import StallMonitor
 from projservo_cli.loop.verdicts import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.monitoring.accuracy import Posture, rigid_fit
-from projservo_cli.monitoring.statistics import WINDOW
+from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
     MM,
@@ -151,11 +150,11 @@ class LawRun:
 
     def _require_images(self, driven: DrivenRobot, what: str, least: int) -> str:
         """Refuse to move a robot of which so many cameras or more show nothing, unless that was asked for."""
-        unseen, own = driven.unseen(least), driven.robot.robot
+        unseen = driven.unseen(least)
         if unseen and not self.blind:
-            seen = "; ".join([unseen, *(own.remarks() if isinstance(own, CameraRobot) else ())])
+            remarks = "; ".join([unseen, *driven.robot.remarks()])
             raise WorkFailed(
-                f"{what} {seen}: uncover both cameras and look at their light, or move the arm by hand to "
+                f"{what} {remarks}: uncover both cameras and look at their light, or move the arm by hand to "
                 "where they see the tags; --blind (blind=True) drives it without images"
             )
         return unseen

@@ -159,6 +159,7 @@ class PreflightInputs:
     joints: JointSettings
     numbers: tuple[int, ...]  # of the markers
     face: tuple[int, ...]  # numbers of the markers that must stay visible; may be empty
+    lengths: FloatArray  # (f, f) distances between these, m; NaN if unknown
     dictionary: str | None  # of the tags; None if not configured
 
 

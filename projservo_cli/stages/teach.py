@@ -10,9 +10,9 @@ import numpy as np
 
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.display import require_radians
-from projservo_cli.hardware.preflight import MIN_SHARED
+from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
-from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
+from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import at_rest, averaged
 from projservo_cli.settings.sections import JointVector
@@ -104,24 +104,12 @@ def teach(
     Raises InputError if ``at`` is missing, does not fit or is beyond a limit, or an arm without limits would
     have to hold; WorkFailed if the robot fails.
     """
-    joints, driven, period = inputs.joints.joints(), inputs.driven, inputs.driven.following.period
-    moved = None
-    if isinstance(driven.robot, OwnRobot):
-        if at is not None:
-            raise InputError("--at is where a simulated robot is put to; move yours by hand")
-        bounds = driven.following.bounds(joints)
-        robot = plugin_robot(driven.robot, bounds, joints.types, inputs.numbers)
-        if wait is not None and robot.lets_go and takes_limits(driven.robot):
-            _require_limits(joints)
-    else:
-        if at is None:
-            raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
-        q = _within_limits(at, joints)
-        robot = simulated_robot(driven, joints, _put_to(inputs, driven.robot, q))
+    (robot, q), moved = _robot_to_teach(inputs, at, by_hand=wait is not None), None
+    period = robot.bounds.period
 
     def observe() -> Reading:
         """A look after a period, in which a simulated robot holds where it was put to."""
-        if at is None:
+        if q is None:
             time.sleep(period)
         else:
             robot.command(q, np.zeros_like(q), robot.now() + period)
@@ -154,6 +142,28 @@ def teach(
         moved=None if moved is None else mean.q - moved,
         bounds=robot.bounds,
     )
+
+
+def _robot_to_teach(
+    inputs: TeachInputs, at: JointVector | None, *, by_hand: bool
+) -> tuple[PluginRobot, FloatArray | None]:
+    """Return the robot, and the joints (n,), rad or m, that a simulated one was put to.
+
+    by_hand : whether somebody moves it, so that it must hold again where it was released.
+    """
+    joints, driven = inputs.joints.joints(), inputs.driven
+    if not isinstance(driven.robot, OwnRobot):
+        if at is None:
+            raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
+        q = _within_limits(at, joints)
+        return simulated_robot(driven, joints, _put_to(inputs, driven.robot, q)), q
+    if at is not None:
+        raise InputError("--at is where a simulated robot is put to; move yours by hand")
+    bounds = driven.following.bounds(joints)
+    robot = plugin_robot(driven.robot, bounds, joints.types, inputs.numbers)
+    if by_hand and robot.lets_go and takes_limits(driven.robot):
+        _require_limits(joints)
+    return robot, None
 
 
 def _require_limits(joints: Joints) -> None:
@@ -228,10 +238,10 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     except WorkFailed as error:
         reached, reason, q = False, str(error), taught.q
     numbers = taught.marker.tolist()
-    both = np.flatnonzero(np.isin(numbers, calibration.marker))
+    known_to_both = np.flatnonzero(np.isin(numbers, calibration.marker))
     off = np.full(taught.sigma.shape, np.nan)
-    expected = predict(calibration, q[None])[0][:, calibration.indices_of(taught.marker[both])]
-    off[:, both] = np.linalg.norm(taught.s[:, both] - expected, axis=2)
+    expected = predict(calibration, q[None])[0][:, calibration.indices_of(taught.marker[known_to_both])]
+    off[:, known_to_both] = np.linalg.norm(taught.s[:, known_to_both] - expected, axis=2)
     noise = np.maximum(np.nan_to_num(taught.sigma), calibration.sigma_px)
     far = [
         (numbers[k], VIEWS[view], float(off[view, k]))
@@ -243,9 +253,9 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
 def require_start(taught: _Taught) -> None:
     """Refuse a start from which nothing can be recorded, since both cameras see too little; a WorkFailed."""
     if taught.shared < MIN_SHARED:
-        known, (left, right) = len(taught.marker), np.isfinite(taught.s[..., 0]).sum(axis=1)
+        count, (left, right) = len(taught.marker), np.isfinite(taught.s[..., 0]).sum(axis=1)
         raise WorkFailed(
-            f"teach: both cameras see {taught.shared} of {known} markers ({MIN_SHARED} at least; "
+            f"teach: both cameras see {taught.shared} of {count} markers ({MIN_SHARED} at least; "
             f"left {left}, right {right}): turn the tool towards both cameras, and look at light and focus"
         )
 

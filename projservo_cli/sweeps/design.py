@@ -18,7 +18,7 @@ from projservo_cli.config.inputs import calibration_inputs, truth_of
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.geometry.displacements import displacements
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.image_size import image_sizes, within_images
+from projservo_cli.image_size import within_images
 from projservo_cli.keys import digest, key_of
 from projservo_cli.laws import law_and_mode, run_names
 from projservo_cli.records import FloatArray, InputError, IntArray, WorkFailed
@@ -98,7 +98,7 @@ def _accepted(truth: Truth, poses: FloatArray, front: float) -> IntArray:
     before = (m[..., 2] > 0.0).all(axis=(1, 2))
     facing = (front * _cosines(truth, poses) >= LEAST_COSINE).all(axis=1)
     pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
-    inside = within_images(pixels, image_sizes(truth.image_size)[:, None]).all(axis=(1, 2))
+    inside = within_images(pixels, truth.image_size[:, None]).all(axis=(1, 2))
     return np.flatnonzero(before & facing & inside)
 
 

@@ -475,3 +475,16 @@ def test_images_of_another_pose_than_their_readings_are_named(told, recorded, tm
     code, _, err = told("calibrate", "--data", tmp_path / "t.csv", "-o", tmp_path / "out")
     assert (code, f"each image shows the pose {words} its reading" in err) == (1, True)
     assert ("plant.settle_s" in err) == (shift == 1)
+
+
+@pytest.mark.parametrize("late", VIEWS)
+def test_images_of_one_camera_that_come_a_pose_late_are_named(told, recorded, tmp_path, late):
+    header, *rows = (line.split(",") for line in recorded.read_text().splitlines())
+    at = header.index(f"u_{late}")
+    seen = {(int(row[0]), row[1]): row[at : at + 2] for row in rows}
+    for row in rows:
+        row[at : at + 2] = seen.get((max(int(row[0]) - 1, 0), row[1]), ["", ""])
+    (tmp_path / "t.csv").write_text("\n".join(map(",".join, [header, *rows])) + "\n")
+    code, _, err = told("calibrate", "--data", tmp_path / "t.csv", "-o", tmp_path / "out")
+    assert (code, f"each {late} image shows the pose before that of" in err) == (1, True)
+    assert "plant.settle_s" in err

@@ -86,7 +86,7 @@ def put_sheet(folder, arm="stanford", name="sheet.json"):
         "markers_tool": truth.M[:, :3].tolist(),
         "marker_numbers": list(truth.number),
         "T_base_tool_at_reference": np.eye(4).tolist(),
-        "image_size": truth.image_size.tolist(),
+        "image_size": truth.image_size[0].tolist(),
     }
     (folder / name).write_text(json.dumps(sheet))
 

@@ -72,7 +72,7 @@ TERMS = {
     "ground truth": "simulation/workspace",
     "hypothes": "monitoring/hypotheses",
     "image-based": "control/classical",
-    "innovation": "monitoring/statistics",
+    "innovation": "monitoring/innovation_tests",
     "inverse kinematics": "planning/goal_configurations",
     "Jacobian": "geometry/kinematics",
     "JIT": "geometry/jit",

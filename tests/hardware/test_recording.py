@@ -5,7 +5,7 @@ import pytest
 import yaml
 
 from tests.hardware.streams import Stream, picture
-from tests.hardware.test_preflight import CONFIGURATION
+from tests.hardware.test_doctor import CONFIGURATION
 
 
 class Walking:

@@ -6,7 +6,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.monitoring.monitor import detected_fault
+from projservo_cli.monitoring.image_monitor import detected_fault
 from tests.monitoring.corners import SIDES, CornerMap, pose_of, view_of
 from tests.monitoring.stand_in import (
     ARMS,

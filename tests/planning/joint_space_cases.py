@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.image_size import image_sizes
 from projservo_cli.planning.constraints import Constraints, constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.margins import Demands
@@ -45,6 +44,6 @@ def case(name, k):
     speed = np.where(np.isfinite(joints.limits.speed), joints.limits.speed, 1.0)
     keep = np.array([0.002 if kind == "P" else np.radians(1.0) for kind in joints.types])
     limits = joints.limits._replace(speed=speed)
-    demands = Demands(limits, image_sizes(truth.image_size), 5.0, 0.0, keep, 8.0)
+    demands = Demands(limits, truth.image_size, 5.0, 0.0, keep, 8.0)
     c = constraints_of(truth.model, A, task, q_start, demands)
     return Case(truth, q_start, q_goal, c, GoalFeatures(task.A_star, s_star, 0.0))

@@ -35,7 +35,7 @@ def test_signs_are_those_of_the_metric_truth(name):
         if (depth > 0.0).all():
             np.testing.assert_array_equal(margins[FRONT : FRONT + 2] > 0.0, True)
             np.testing.assert_allclose(s, truth.images(q, truth.M_face), atol=1e-6)
-            inside = np.minimum(s + 0.5, truth.image_size - 0.5 - s).min(axis=(1, 2))
+            inside = np.minimum(s + 0.5, truth.image_size[:, None] - 0.5 - s).min(axis=(1, 2))
             np.testing.assert_allclose(margins[IMAGE : IMAGE + 2], inside, atol=1e-6)
         signs.add((*(margins[VISIBILITY : VISIBILITY + 2] > 0.0), *(depth > 0.0)))
         nearest = np.minimum(q - c.limits.lower, c.limits.upper - q) / c.keep

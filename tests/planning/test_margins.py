@@ -43,7 +43,7 @@ def test_margins_of_the_views_are_those_of_the_displaced_face(name):
         s = pixels(reaching.model.P, plan.A @ H.T)
         np.testing.assert_allclose(found.H_d[i], H, atol=1e-12)
         np.testing.assert_allclose(found.s[i], s, atol=1e-7)
-        border = np.minimum(s + 0.5, size - 0.5 - s).min(axis=(1, 2))
+        border = np.minimum(s + 0.5, size[:, None] - 0.5 - s).min(axis=(1, 2))
         np.testing.assert_allclose(found.distance[i], border, atol=1e-7)
         sight = plan.a @ np.linalg.inv(H) @ plan.optical_center.T / (plan.optical_center @ plan.a)
         np.testing.assert_allclose(found.visibility[i], sight, atol=1e-12)

@@ -28,7 +28,7 @@ class Judged:
     def __init__(self, config, truth, model, q_start, q_goal):
         s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
         H = [truth.robot.pose(q) @ np.linalg.inv(truth.robot.base_tool) for q in (q_start, q_goal)]
-        self.true = TrueTask(truth.P, truth.image_size, *((truth.M_face @ T.T)[:, :3] for T in H))
+        self.true = TrueTask(truth.P, truth.image_size[0], *((truth.M_face @ T.T)[:, :3] for T in H))
         shown = TaskImages(q_start, s_start, s_star, truth.center)
         self.plan = plan = plan_task(model, shown, asked("constrained"), known_scenario(config).demands)
         fine = np.linspace(0.0, 1.0, 1001)
@@ -73,7 +73,7 @@ def test_a_planned_motion_keeps_what_it_says(name):
     s = np.stack([pixels(example.truth.P, points) for points in M])
     np.testing.assert_allclose(s, plan.s, atol=1e-5)
     np.testing.assert_allclose(s[-1], example.ends.s_star, atol=1e-5)
-    border = np.minimum(s + 0.5, example.truth.image_size - 0.5 - s).min(axis=(2, 3))
+    border = np.minimum(s + 0.5, example.truth.image_size[:, None] - 0.5 - s).min(axis=(2, 3))
     np.testing.assert_allclose(plan.border_distance, border, atol=1e-5)
     assert plan.margin.min() > 0.0
     steps = (np.abs(np.diff(plan.q, axis=0)) / math.radians(125)).max(axis=1)
@@ -196,13 +196,13 @@ def test_random_tasks_are_what_they_say():
         H = poe(truth.model, q)
         M = (truth.M_face @ H.T)[:, :3]
         normal = np.cross(M[1] - M[0], M[2] - M[0])
-        for P in truth.P:
+        for P, size in zip(truth.P, truth.image_size, strict=True):
             ray = -np.linalg.solve(P[:, :3], P[:, 3]) - M.mean(axis=0)
             cosine = abs(ray @ normal) / np.linalg.norm(ray) / np.linalg.norm(normal)
             assert cosine >= math.cos(math.radians(75)) - 1e-9
             s = M @ P[:, :3].T + P[:, 3]
             s = s[:, :2] / s[:, 2:]
-            assert ((s >= -0.5) & (s <= truth.image_size - 0.5)).all()
+            assert ((s >= -0.5) & (s <= size - 0.5)).all()
 
 
 def test_random_tasks_need_limits():

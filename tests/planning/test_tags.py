@@ -48,7 +48,7 @@ def in_truth(truth, q):
         edges = [np.roll(hull, -1, axis=0) - hull for hull in hulls]
         across = [np.c_[-e[:, 1], e[:, 0]] / np.linalg.norm(e, axis=1)[:, None] for e in edges]
         widths = [np.ptp(hull @ a.T, axis=0).min() for hull, a in zip(hulls, across, strict=True)]
-        border = np.minimum(s[:, t] + 0.5, truth.image_size - 0.5 - s[:, t]).min(axis=(1, 2))
+        border = np.minimum(s[:, t] + 0.5, truth.image_size[:, None] - 0.5 - s[:, t]).min(axis=(1, 2))
         rows.append([*((O - X[t].mean(axis=0)) @ normal), *widths, *border])
     return np.array(rows)
 

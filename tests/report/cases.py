@@ -42,7 +42,7 @@ def case(name="paper", steps=SHORT, whole=False):
     traces = {
         law: driven(scenario, sense, law, true.model if LAW_SPECS[law].metric else model) for law in LAWS
     }
-    traces["direct_three"] = filmed(traces["direct_three"], *true.image_size.astype(int))
+    traces["direct_three"] = filmed(traces["direct_three"], *true.image_size[0].astype(int))
     for law in FOLLOWING:
         followed = run_name(law, LAW_SPECS[law].modes[1])
         traces[followed] = driven(scenario, plan, followed, model)

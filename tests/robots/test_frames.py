@@ -65,7 +65,7 @@ class Seeing(Sound):
 
     def read(self):
         q, s = super().read()
-        width, height = self.world.image_size.astype(int)
+        width, height = self.world.image_size[0].astype(int)
         self.frames = np.full((2, height, width), 30, dtype=np.uint8)
         for view, marker in np.ndindex(s.shape[:2]):
             u, v = s[view, marker].round().astype(int)

@@ -119,7 +119,7 @@ def test_no_size_and_no_images_that_agree_are_no_measure():
         told = replace(run, log=run.log._replace(fit=fit)).trace()
         assert told.fit_px[-1] == pytest.approx(left_px)
         assert (told.estimated_position_error_mm is not None) == agrees
-    unsized = example.config.markers.model_copy(update={"positions_m": None})
+    unsized = example.settings.markers.model_copy(update={"positions_m": None})
     for markers, size in ((unsized, None), (unsized.model_copy(update={"tag_size_m": 0.1}), 0.1)):
         given = replace(run.scenario.servo, lengths=markers.lengths(example.config.face_numbers))
         told = replace(run, scenario=replace(run.scenario, servo=given)).trace()

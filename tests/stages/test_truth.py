@@ -68,10 +68,10 @@ def test_the_benchmark_is_within_its_promised_dimensions():
     spread = np.linalg.norm(face[:, None, :3] - face[None, :, :3], axis=2).max()
     assert spread <= 0.12 * math.sqrt(2)
     assert 5 <= len(truth.M) <= 10
-    for P in truth.P:
+    for P, (width, _) in zip(truth.P, truth.image_size, strict=True):
         K = np.linalg.inv(np.linalg.qr(np.linalg.inv(P[:, :3]))[1])
         focal = abs(K[0, 0] / K[2, 2])
-        assert 2 * math.degrees(math.atan(truth.image_size[0] / 2 / focal)) <= 60.0
+        assert 2 * math.degrees(math.atan(width / 2 / focal)) <= 60.0
     # Transversal to the image planes: the normal lies far from the viewing direction.
     M = face[:, :3]
     normal = np.cross(M[1] - M[0], M[2] - M[0])

@@ -91,7 +91,7 @@ class Way:
         truth = truth_of(config)
         self.q, self.numbers = trace.q, truth.number
         s = np.array([truth.images(q, truth.M) for q in trace.q])
-        self.in_sight = ((s >= 0.0) & (s <= truth.image_size - 1.0)).all(axis=(1, 3))
+        self.in_sight = ((s >= 0.0) & (s <= truth.image_size[:, None] - 1.0)).all(axis=(1, 3))
 
 
 def tasks(config, count, seed):

@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.monitoring.statistics import ErrorModel
+from projservo_cli.monitoring.innovation_tests import ErrorModel
 from projservo_cli.records import WorkFailed
 from tests.configured import calibrate, plan, record, servo
 from tests.monitoring.stand_in import ARMS, KINDS, LAST, TAG_M, StandIn, seen, tool_pose

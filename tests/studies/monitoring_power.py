@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import chi2, ncx2, norm
 
 from projservo_cli.monitoring.frame_pairs import FramePair
-from projservo_cli.monitoring.statistics import ErrorModel, is_same_view
+from projservo_cli.monitoring.innovation_tests import ErrorModel, is_same_view
 from tests.monitoring.stand_in import ARMS, seen, tool_pose
 from tests.studies.monitoring import CAMERA, SEED, calibrated, fault_of, rigs, tasks
 

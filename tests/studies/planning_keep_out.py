@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.image_size import image_sizes
 from projservo_cli.planning.constraints import constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.keep_out import keep_out_of
@@ -101,10 +100,10 @@ def outlines(truth: Truth, box: Box):
     if not (m[..., 2] > 0.1).all():
         return None
     drawn = []
-    for s in m[..., :2] / m[..., 2:]:
+    for s, size in zip(m[..., :2] / m[..., 2:], truth.image_size, strict=True):
         polygon = s[ConvexHull(s).vertices]
         for axis, bound, sign in ((0, -0.5, 1), (1, -0.5, 1), (0, None, -1), (1, None, -1)):
-            edge = truth.image_size[axis] - 0.5 if bound is None else bound
+            edge = size[axis] - 0.5 if bound is None else bound
             polygon = clipped(polygon, axis, edge, sign)
         if len(polygon) < 3:
             return None
@@ -161,7 +160,7 @@ def true_constraints(config, truth: Truth, task: Drawn, q):
     s_start, s_star = (truth.images(x, truth.M_face) for x in (q, task.q_goal))
     aimed = TaskImages(q, s_start, s_star, truth.center).task(truth.model)
     joints = joints_of(config)
-    demands = limits_alone(joints.limits)._replace(image_size=image_sizes(truth.image_size))
+    demands = limits_alone(joints.limits)._replace(image_size=truth.image_size)
     A = truth.M[[*truth.face, *truth.pins]] @ truth.displacement(q).T
     c = constraints_of(truth.model, A, aimed, q, demands)
     return c._replace(

@@ -64,7 +64,7 @@ def broken(config, trace):
         return "behind the face"
     truth = truth_of(config)
     seen = np.array([truth.images(q, truth.M_face) for q in trace.q])
-    inside = (seen >= -0.5) & (seen <= truth.image_size - 0.5)
+    inside = (seen >= -0.5) & (seen <= truth.image_size[:, None] - 0.5)
     return "past a limit" if inside.all() else "out of an image"
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.stats import binomtest
 from tqdm import tqdm
 
-from projservo_cli.image_size import image_sizes
 from projservo_cli.planning.constraints import constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.margins import limits_alone
@@ -53,7 +52,7 @@ def true_search(config, *, margins=False):
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
     task = TaskImages(q_start, s_start, s_star, truth.center).task(truth.model)
     A = truth.M_face @ truth.displacement(q_start).T
-    demands = limits_alone(joints.limits)._replace(image_size=image_sizes(truth.image_size))
+    demands = limits_alone(joints.limits)._replace(image_size=truth.image_size)
     if margins:
         deg = np.radians(asked.joint_margin_deg)
         keep = np.array([asked.joint_margin_m if kind == "P" else deg for kind in joints.types])

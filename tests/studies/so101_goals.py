@@ -34,7 +34,7 @@ def goals(truth, count):
     while len(found) < count:
         q = np.array(START) + np.array(SPREAD_DEG) * rng.uniform(-1.0, 1.0, 5)
         s = truth.images(np.radians(q), truth.M_face)
-        if (np.minimum(s, truth.image_size - s).min() > INSIDE_PX) and (s > INSIDE_PX).all():
+        if (np.minimum(s, truth.image_size[:, None] - s).min() > INSIDE_PX) and (s > INSIDE_PX).all():
             found.append(q)
     return found
 

@@ -82,7 +82,7 @@ def test_every_run_redone_by_the_stages_is_its_row(name):
         truth = truth_of(config)
         seen = np.array([truth.images(q, truth.M_face) for q in trace.q])
         kept = (trace.q >= truth.robot.limits.lower) & (trace.q <= truth.robot.limits.upper)
-        inside = (seen >= -0.5) & (seen <= truth.image_size - 0.5)
+        inside = (seen >= -0.5) & (seen <= truth.image_size[:, None] - 0.5)
         good = kept.all() and inside.all() and not trace.self_occluded.any()
         assert row["success"] == (trace.verdict == "converged" and good)
         R = trace.pose[0, :3, :3].T @ trace.goal_pose[:3, :3]

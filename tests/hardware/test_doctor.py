@@ -20,13 +20,16 @@ from projservo_cli.calibration import predict
 from projservo_cli.config import Override, load_config
 from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.detection import TagFinder
+from projservo_cli.files import working_in
+from projservo_cli.hardware.checks_at_rest import FAULT, FINE, Finding, view_angle_deg
 from projservo_cli.hardware.live_page import LivePage
-from projservo_cli.hardware.preflight import view_angle_deg
 from projservo_cli.records import InputError
-from projservo_cli.stages import calibrate, preflight
+from projservo_cli.stages import calibrate
+from projservo_cli.stages.doctor import Checked, calibration_finding
+from projservo_cli.store import load
 from tests.conftest import ROOT
+from tests.hardware.arms_in_motion import Faults, Rail, findings
 from tests.hardware.streams import Stream, picture
-from tests.hardware.wiggled import Faults, Rail, findings
 
 LEFT = picture(at=(60.0, 80.0), numbers=(0, 1, 2), side=50.0, step=75.0)
 CONFIGURATION = """\
@@ -285,7 +288,8 @@ def calibrated():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda s: s, "agrees with the images"),
+        (lambda s: s, "agrees with the images, which show the tool within 0."),
+        (lambda s: _with_noise(s, 0.2), "agrees with the images, which show the tool within 0."),
         (lambda s: s[::-1], "exchanged"),
         (lambda s: s + np.array([[[12.0, 0.0]], [[0.0, 0.0]]]), "the left camera"),
         (lambda s: _tag(s, 1, np.roll(s[:, 4:8], 2, axis=1)), "tag 1 is upside down on the tool; put"),
@@ -296,15 +300,27 @@ def calibrated():
             "all tags are 6 % smaller than those of the calibration; print them in their size",
         ),
     ],
-    ids=["sound", "exchanged", "moved", "upside down", "two tags", "loose", "fit to page"],
+    ids=["sound", "noisy", "exchanged", "moved", "upside down", "two tags", "loose", "fit to page"],
 )
 def test_a_calibrated_run_tells_what_changed_since(calibrated, change, words):
     q = calibrated.q_reference
     s = change(predict(calibrated, q[None])[0])
-    seen = SimpleNamespace(marker=calibrated.marker.tolist(), q=q, s=s, views=())
-    finding = preflight._against(calibrated, seen, (640, 480))
+    known = {"marker": calibrated.marker.tolist(), "face": (0, 1, 2, 3), "views": ()}
+    seen = SimpleNamespace(q=q, s=s, **known)
+    side, diagonal = 0.04, 0.04 * np.sqrt(2.0)
+    lengths = np.array([[0.0, side, diagonal, side], [side, 0.0, side, diagonal]])
+    lengths = np.concatenate([lengths, np.roll(lengths, 2, axis=1)])
+    finding = calibration_finding(calibrated, seen, (640, 480), lengths)
     assert words in f"{finding.text}: {finding.remedy}"
-    assert (finding.level == "fine") == (words == "agrees with the images")
+    assert (finding.level == "fine") == (words.startswith("agrees with the images"))
+    unknown = calibration_finding(calibrated, seen, (640, 480), np.full((4, 4), np.nan))
+    assert unknown.level == finding.level
+    assert "mm" not in unknown.text
+
+
+def _with_noise(s, px):
+    """Images with normal noise."""
+    return s + px * np.random.default_rng(0).standard_normal(s.shape)
 
 
 def _tag(s, tag, pixels):
@@ -354,7 +370,7 @@ def test_motions_name_what_a_recording_would_fail_at(faults, where, words):
 
 RAIL = """\
 name: rail
-plant: {{use: "tests.hardware.wiggled:Rail"{options}}}
+plant: {{use: "tests.hardware.arms_in_motion:Rail"{options}}}
 data: {{table: rail.csv, joints: RP}}
 markers: {{numbers: [0, 1, 2, 3, 4, 5, 6, 7], face: [0, 1, 2, 3]}}
 robot: {{limits: {limits}}}
@@ -439,3 +455,28 @@ def test_a_live_page_serves_both_images_to_this_machine_alone():
         assert head[:2] == [b"--frame\r\n", b"Content-Type: image/jpeg\r\n"]
         assert answer.read(6) == b"JPEG-1"
     page.close()
+
+
+def test_a_run_that_images_contradict_is_marked_unless_another_process_is_at_work_in_it(
+    projservo, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert projservo("calibrate", "-c", ROOT / "configs" / "hobby.yaml", "-o", "out").code == 0
+    text = CONFIGURATION.format(left="left.mp4", right="right.mp4", rate=20, options="")
+    (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
+    moved = Finding(FAULT, "calibration", "the left camera was moved", "put it back")
+
+    def answer_to(finding):
+        checked = Checked((finding,), None, ())
+        monkeypatch.setattr("projservo_cli.stages.doctor.check", lambda *_, **__: checked)
+        return projservo("doctor", "out", "-c", "arm.yaml")
+
+    assert answer_to(moved).code == 1
+    assert load("out").refuted == "the left camera was moved"
+    with working_in(tmp_path / "out"):
+        answer = answer_to(Finding(FINE, "calibration", "agrees with the images"))
+    assert answer.code == 2
+    assert "is at work there" in answer.err
+    assert load("out").refuted == "the left camera was moved"
+    assert answer_to(Finding(FINE, "calibration", "agrees with the images")).code == 0
+    assert load("out").refuted == ""

@@ -8,8 +8,8 @@ import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import predict
-from projservo_cli.monitoring.accuracy import Posture, mean_image, still
-from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
+from projservo_cli.monitoring.accuracy import Posture
+from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing, at_known_markers, mean_image
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
     Explanation,
@@ -18,8 +18,7 @@ from projservo_cli.monitoring.hypotheses import (
     is_possible,
     together,
 )
-from projservo_cli.monitoring.messages import group_of, is_slight, sentence
-from projservo_cli.monitoring.statistics import (
+from projservo_cli.monitoring.innovation_tests import (
     LEAST_ERROR,
     WINDOW,
     Detector,
@@ -30,6 +29,7 @@ from projservo_cli.monitoring.statistics import (
     columns_of_marker,
     is_same_view,
 )
+from projservo_cli.monitoring.messages import group_of, is_slight, sentence
 from projservo_cli.records import CORNERS, VIEWS, BoolArray, Calibration, FloatArray, IntArray
 
 # Markers that are tested, at most.
@@ -122,9 +122,9 @@ class ImageMonitor:
         visible = np.arange(self._all) if visible is None else visible
         self._shown = visible[even_choice(len(visible), _MOST_TESTED)]
         self.calibration = calibration.with_markers(self._shown)
-        known = image_size is not None and bool(np.isfinite(image_size).all())
-        self._centre = 0.5 * (np.asarray(image_size) - 1.0) if known else None
-        self._image_size, self._sigma_px = image_size if known else None, sigma_px
+        has_size = image_size is not None and bool(np.isfinite(image_size).all())
+        self._centre = 0.5 * (np.asarray(image_size) - 1.0) if has_size else None
+        self._image_size, self._sigma_px = image_size if has_size else None, sigma_px
         self._errors = ErrorModel(self.calibration, sigma_px)
         self._detector = Detector(self._errors, max_observations)
         self._pairing = Pairing()
@@ -176,10 +176,10 @@ class ImageMonitor:
         stated : (2, m) standard deviations of the pixels, px, if the finder states them.
         """
         images, stated = images[:, self._shown], None if stated is None else stated[:, self._shown]
-        seen = np.isfinite(images[..., 0])
-        noise = self._errors.noise(seen, stated)
-        if stated is not None and seen.any():
-            images = np.where((noise > _VAGUE * np.median(noise[seen]))[..., None], np.nan, images)
+        detected = np.isfinite(images[..., 0])
+        noise = self._errors.noise(detected, stated)
+        if stated is not None and detected.any():
+            images = np.where((noise > _VAGUE * np.median(noise[detected]))[..., None], np.nan, images)
         self._first = q[0].copy() if self._first is None else self._first
         at_rest = bool(np.abs(q - self._first).max() <= _AT_REST)
         for v in np.flatnonzero(fresh):
@@ -197,12 +197,12 @@ class ImageMonitor:
 
     def fault_at_rest(self) -> str:
         """Return the fault that the mean of the last observations of one posture shows; empty for none."""
-        last = [one.pair for one in self._kept if one.view == self._view]
-        last = [one for one in last if np.abs(one.q - last[-1].q).max() <= _AT_REST]
+        last = [tested.pair for tested in self._kept if tested.view == self._view]
+        last = [pair for pair in last if np.abs(pair.q - last[-1].q).max() <= _AT_REST]
         if not last or self.pending:
             return self.fault
-        mean = mean_image(np.array([one.images for one in last]))
-        q, numbers = np.mean([one.q for one in last], axis=(0, 1)), self.calibration.marker
+        mean = mean_image(np.array([pair.images for pair in last]))
+        q, numbers = np.mean([pair.q for pair in last], axis=(0, 1)), self.calibration.marker
         return detected_fault(self.calibration, q, numbers, mean, self._image_size, self._sigma_px)
 
     def undetected_mm(self, q: FloatArray, used: BoolArray, posture: Posture) -> float:
@@ -213,7 +213,7 @@ class ImageMonitor:
         if not self._kept:
             return 0.0
         used = used[:, self._shown]
-        pair = still(q, np.where(used[..., None], np.zeros(2), np.nan), np.ones(used.shape))
+        pair = FramePair.at_rest(q, np.where(used[..., None], np.zeros(2), np.nan), np.ones(used.shape))
         carry = posture.carry(self.calibration.M, used)
         return self._detector.undetected(carry, self._errors.residual(pair), self._kept[-1].pair.sigma_t)
 
@@ -247,7 +247,7 @@ class ImageMonitor:
             memory.keep(clean, float(pair.t.mean()), not tested.aside.any())
         self._kept = [
             *kept,
-            _Kept(pair=pair, residual=residual, view=self._view, views=memory.views, covered=covered),
+            _Kept(pair=pair, residual=residual, view=self._view, views=memory.state.views, covered=covered),
         ]
         crowd = (tested.aside.sum(axis=1) >= _MOST_FOR_LONG * residual.seen.sum(axis=1)).any()
         self._crowded = (self._crowded + 1) * bool(crowd and not covered)
@@ -267,7 +267,7 @@ class ImageMonitor:
     def _disagree(self, since: Sums | None) -> None:
         """Count an observation that disagrees, and name the fault where that can be done."""
         if since is not None:  # the likeliest onset, as far as observations are remembered
-            after = [one for one in self._kept if one.views > since.views]
+            after = [tested for tested in self._kept if tested.views > since.views]
             self._onset, self._before = self.observations - max(1, len(after)), since
         elif not self._off:
             self._onset, self._before = self.observations - 1, self._detector.memory.total
@@ -280,16 +280,16 @@ class ImageMonitor:
             self._detector.accept()
             self._off = 0
             return
-        found = self._explanations(kept, self._before)
-        best = found[0]
+        fits = self._explanations(kept, self._before)
+        best = fits[0]
         explains, unforgiven = self._explains(best), not set(best.cause.markers) <= set(self._forgiven)
         if explains and unforgiven and self._is_edge(best, self._since_onset()):
             self._forgiven += best.cause.markers
             self._off = 0
             return
-        clear = self._off >= _TWO_AT or len(_rivals(found)) == 1
+        clear = self._off >= _TWO_AT or len(_rivals(fits)) == 1
         if (explains and clear and not self._kept[-1].covered) or self._off == _NAMED_AT[-1]:
-            self.fault = self._message(found)
+            self.fault = self._message(fits)
 
     def _crowd_is_fault(self) -> bool:
         """Whether many detections are aside for long, and these observations together are beyond chance."""
@@ -308,16 +308,18 @@ class ImageMonitor:
         which it came are forgotten, and those in which it goes are not kept.
         """
         count, memory = residual.seen.sum(axis=1), self._detector.memory
-        peak = np.max([count, *(one.residual.seen.sum(axis=1) for one in self._kept[-_REMEMBERED:])], axis=0)
+        peak = np.max(
+            [count, *(past.residual.seen.sum(axis=1) for past in self._kept[-_REMEMBERED:])], axis=0
+        )
         hidden = bool((count < _COVERED * peak).any())
         whole = bool((count >= peak).all() and not aside.any())
         was = bool(self._kept) and self._kept[-1].covered
-        goes = was and not whole and any(one.hidden for one in self._recent)
+        goes = was and not whole and any(past.hidden for past in self._recent)
         if hidden and not was:
-            for one in reversed(self._recent):
-                if one.whole:
+            for past in reversed(self._recent):
+                if past.whole:
                     break
-                memory.return_to(one.state)
+                memory.return_to(past.state)
         self._recent.append(_Recent(whole=whole, hidden=hidden, state=memory.state))
         return hidden or goes
 
@@ -353,43 +355,43 @@ class ImageMonitor:
         causes = causes_of(evidence, self.calibration.marker, self._centre)
         if markers is not None:
             causes = (cause for cause in causes if cause.kind == "marker" and cause.which in markers)
-        found = [self._frozen(one) for one in evidence.explanations(causes) if is_possible(one)]
-        if not found:  # markers that the chosen observations do not show
-            return found
+        fits = [self._frozen(fit) for fit in evidence.explanations(causes) if is_possible(fit)]
+        if not fits:  # markers that the chosen observations do not show
+            return fits
         # Where even the best leaves more than chance does, the unit is what that leaves.
-        minimum = min(found, key=lambda one: one.left)
+        minimum = min(fits, key=lambda fit: fit.left)
         self._unit = max(1.0, minimum.left / max(1.0, evidence.rows - minimum.theta.size))
-        found = [one._replace(gain=one.gain / self._unit, left=one.left / self._unit) for one in found]
-        found.sort(key=lambda one: -one.score)
-        if found[0].cause.kind != "marker":
-            return found
-        moved = [one for one in found if one.cause.kind == "marker" and one.score > _CLEAR] or found[:1]
-        return [together(moved), *(one for one in found if one.cause.kind != "marker")]
+        fits = [fit._replace(gain=fit.gain / self._unit, left=fit.left / self._unit) for fit in fits]
+        fits.sort(key=lambda fit: -fit.score)
+        if fits[0].cause.kind != "marker":
+            return fits
+        moved = [fit for fit in fits if fit.cause.kind == "marker" and fit.score > _CLEAR] or fits[:1]
+        return [together(moved), *(fit for fit in fits if fit.cause.kind != "marker")]
 
-    def _frozen(self, found: Explanation) -> Explanation:
+    def _frozen(self, fit: Explanation) -> Explanation:
         """Turn a slip by as far as the set-point went without the reading into a frozen reading."""
-        cause = found.cause
+        cause = fit.cause
         if cause.kind == "slipped":
-            slip = float(found.theta[0])
+            slip = float(fit.theta[0])
             if self.unanswered[cause.which] * slip > _UNANSWERED * slip**2:
-                return found._replace(cause=cause._replace(kind="frozen"))
-        return found
+                return fit._replace(cause=cause._replace(kind="frozen"))
+        return fit
 
     def _evidence(self, kept: list[_Kept], before: Sums) -> Evidence:
         """Observations to be explained, those of one view with their common weight."""
         memory = self._detector.memory
-        views = np.array([one.view for one in kept])
+        views = np.array([tested.view for tested in kept])
         count = np.array([(views == view).sum() for view in views], dtype=np.float64)
         weights = np.array([memory.worth(c) / c for c in count])
-        pairs, residuals = [one.pair for one in kept], [one.residual for one in kept]
+        pairs, residuals = [tested.pair for tested in kept], [tested.residual for tested in kept]
         return Evidence(self._errors, pairs, residuals, weights, before)
 
-    def _explains(self, found: Explanation) -> bool:
+    def _explains(self, fit: Explanation) -> bool:
         """Whether a cause explains most of the residual, with joints in error, and changes images enough."""
-        left, allowed = self._unit * found.left, self._by_chance(self._evidence_now)
-        minimum = 0.0 if found.cause.markers else _LEAST_PART * self._evidence_now.off_px
-        explains = found.score > 0.0 and left <= allowed + _LEFT * self._unit * found.gain
-        return bool(explains and found.changed_px >= minimum)
+        left, allowed = self._unit * fit.left, self._by_chance(self._evidence_now)
+        minimum = 0.0 if fit.cause.markers else _LEAST_PART * self._evidence_now.off_px
+        explains = fit.score > 0.0 and left <= allowed + _LEFT * self._unit * fit.gain
+        return bool(explains and fit.changed_px >= minimum)
 
     def _has_passed(self, kept: list[_Kept]) -> bool:
         """Whether the last observations agree, alone and together, and no cause explains them better.
@@ -398,8 +400,8 @@ class ImageMonitor:
         """
         if self._sound < WINDOW:
             return False
-        found = self._explanations(kept, self._before)
-        gained = max(self._unit * one.gain - one.cost for one in found)
+        fits = self._explanations(kept, self._before)
+        gained = max(self._unit * fit.gain - fit.cost for fit in fits)
         return gained <= 0.0 and self._evidence_now.before <= self._by_chance(self._evidence_now)
 
     def _by_chance(self, evidence: Evidence) -> float:
@@ -407,56 +409,56 @@ class ImageMonitor:
         rows, lasting = evidence.rows, 1.0 - self._detector.memory.fresh
         return float((1.0 + lasting) * rows + 3.0 * np.sqrt(2.0 * rows) + evidence.bias)
 
-    def _is_edge(self, found: Explanation, kept: list[_Kept]) -> bool:
+    def _is_edge(self, fit: Explanation, kept: list[_Kept]) -> bool:
         """Whether what seems to have moved is perhaps an edge that a finder took for that of a marker.
 
         An edge is off alike as long as the tag is seen from one side.
         kept : observations that showed it.
         """
-        if not found.cause.markers:
+        if not fit.cause.markers:
             return False
-        seen = self._evidence_now.seen[:, :, list(found.cause.markers)]
-        alone = seen.all(axis=1).sum() <= 0.5 * seen.any(axis=1).sum()
-        if alone or found.min_px >= _LEAST_MOVED_PX:
+        detected = self._evidence_now.seen[:, :, list(fit.cause.markers)]
+        alone = detected.all(axis=1).sum() <= 0.5 * detected.any(axis=1).sum()
+        if alone or fit.min_px >= _LEAST_MOVED_PX:
             return bool(alone)
-        return self._errors.slants(np.array([one.pair.q.mean(axis=0) for one in kept])) < WINDOW
+        return self._errors.slants(np.array([tested.pair.q.mean(axis=0) for tested in kept])) < WINDOW
 
     def _judge_markers(self) -> None:
         """Name markers that both views show off by themselves for long."""
-        both, either = self._asides.min(axis=0), self._asides.max(axis=0)
+        in_both, in_either = self._asides.min(axis=0), self._asides.max(axis=0)
         # What hides an edge shows in one view, and passes.
-        if self.pending or not ((both == _NAMED_AT[0]).any() or (either == _TWO_AT).any()):
+        if self.pending or not ((in_both == _NAMED_AT[0]).any() or (in_either == _TWO_AT).any()):
             return
         before, moved = self._detector.memory.total, []
-        for j in np.flatnonzero(either).tolist():
+        for j in np.flatnonzero(in_either).tolist():
             kept = [
-                one._replace(residual=one.residual.without(_all_but(one.residual.seen, j)))
-                for one in self._kept[-max(_NAMED_AT[0], int(either[j])) :]
+                tested._replace(residual=tested.residual.without(_all_but(tested.residual.seen, j)))
+                for tested in self._kept[-max(_NAMED_AT[0], int(in_either[j])) :]
             ]
-            found = self._explanations(kept, before, [j])
-            if not found:
+            fits = self._explanations(kept, before, [j])
+            if not fits:
                 continue
-            best, views = found[0], len({one.view for one in kept})
-            lasts = (both[j] or views >= WINDOW) and not self._is_edge(best, kept)
+            best, views = fits[0], len({tested.view for tested in kept})
+            lasts = (in_both[j] or views >= WINDOW) and not self._is_edge(best, kept)
             if lasts and best.score > _CLEAR and self._explains(best):
                 moved.append(best)
         if moved:
             self.fault = self._message([together(moved)])
 
-    def _message(self, found: list[Explanation]) -> str:
+    def _message(self, fits: list[Explanation]) -> str:
         """Sentence on the fault by the likeliest of causes."""
         residual = self._kept[-1].residual
         rms = np.sqrt(np.square(residual.r).sum() / max(2.0 * residual.seen.sum(), 1.0))
         off = f"images are {rms:.3g} px rms per coordinate off their prediction by the calibration"
-        if not self._explains(found[0]):
+        if not self._explains(fits[0]):
             return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
         # A mirrored reading near zero is a small slip: with backlash, images do not separate them.
         maximum = self._by_chance(self._evidence_now) / self._unit
-        simpler = (one for one in found if not one.theta.size and contains(found[0].cause, one.cause))
-        said = [found[0], *(one for one in simpler if one.left <= maximum), *_rivals(found)[1:]]
-        if len({one.view for one in self._since_onset()}) == 1:
-            said += _as_rigid(found)
-        names = [sentence(one, self.calibration) for one in said[:2]]
+        simpler = (fit for fit in fits if not fit.theta.size and contains(fits[0].cause, fit.cause))
+        said = [fits[0], *(fit for fit in simpler if fit.left <= maximum), *_rivals(fits)[1:]]
+        if len({tested.view for tested in self._since_onset()}) == 1:
+            said += _as_rigid(fits)
+        names = [sentence(fit, self.calibration) for fit in said[:2]]
         return f"{off}: {'; or '.join(names)}"
 
     def _where(self, residual: Residual) -> str:
@@ -486,17 +488,15 @@ def detected_fault(
     """
     if not calibration.usable or not calibration.has_covariance:
         return ""
-    known = np.isin(marker, calibration.marker)
-    pixels = np.full((2, len(calibration.marker), 2), np.nan)
-    pixels[:, calibration.indices_of(marker[known])] = images[:, known]
+    pixels = at_known_markers(calibration, marker, images)
     rest, instants, new = np.zeros((2, len(q))), np.zeros(2), np.ones(2, dtype=np.bool_)
 
     def fault_of(pixels: FloatArray) -> str:
         sigma = max(calibration.sigma_px, sigma_px)
-        monitor, both = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size), np.stack([q, q])
-        monitor.observe(instants, both, rest, instants, pixels, new)
+        monitor, q_views = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size), np.stack([q, q])
+        monitor.observe(instants, q_views, rest, instants, pixels, new)
         for k in range(1, _NAMED_AT[0] * bool(monitor.rejected.any() and not monitor.pending)):
-            monitor.observe(instants + k, both, rest, instants, pixels, new)
+            monitor.observe(instants + k, q_views, rest, instants, pixels, new)
         return monitor.give_up()
 
     expected = predict(calibration, q[None])[0]
@@ -523,7 +523,7 @@ def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> s
     """
     tags = {int(tag): np.flatnonzero(numbers // CORNERS == tag) for tag in np.unique(numbers // CORNERS)}
     tags = {tag: at for tag, at in tags.items() if len(at) == CORNERS and np.isfinite(pixels[:, at]).any()}
-    found: dict[int, tuple[int, int]] = {}
+    moved_to: dict[int, tuple[int, int]] = {}
 
     def rms(tag: int, place: int, turn: int) -> float:
         off = pixels[:, tags[tag]] - np.roll(expected[:, tags[place]], turn, axis=1)
@@ -533,14 +533,14 @@ def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> s
         side = np.linalg.norm(expected[:, at] - np.roll(expected[:, at], 1, axis=1), axis=-1).mean()
         own, best = rms(tag, tag, 0), min(product(tags, range(CORNERS)), key=lambda to: rms(tag, *to))
         if own > _SIDE * side and best != (tag, 0) and rms(tag, *best) < _LEFT * own:
-            found[tag] = best
+            moved_to[tag] = best
     said = []
-    for tag, (place, turn) in found.items():
+    for tag, (place, turn) in moved_to.items():
         if place == tag:
             said.append(f"tag {tag} is {'upside down' if turn == 2 else 'turned by a quarter'}")
-        elif place not in found or tag < place:
+        elif place not in moved_to or tag < place:
             said.append(f"tags {tag} and {place} are exchanged")
-    if not found or 2 * len(found) > len(tags):
+    if not moved_to or 2 * len(moved_to) > len(tags):
         return ""
     return f"{' and '.join(said)} on the tool; put them back as they were, or recalibrate"
 
@@ -550,44 +550,45 @@ def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:
 
     Errors of joints move all of them: a tag is off against the median of the others.
     """
-    seen: BoolArray = np.isfinite(off[..., 0])
+    detected: BoolArray = np.isfinite(off[..., 0])
     tags = numbers // CORNERS
     worst, farthest = np.zeros(len(numbers), dtype=np.bool_), 0.0
     for tag in np.unique(tags):
-        one = np.isin(tags, tag)
-        if (2 * seen[:, one].sum(axis=1) > seen.sum(axis=1)).any() or not seen[:, one].any():
+        of_tag = np.isin(tags, tag)
+        own = detected[:, of_tag]
+        if (2 * own.sum(axis=1) > detected.sum(axis=1)).any() or not own.any():
             continue
-        against = off[:, one] - np.nanmedian(off[:, ~one], axis=1, keepdims=True)
+        against = off[:, of_tag] - np.nanmedian(off[:, ~of_tag], axis=1, keepdims=True)
         rms = float(np.sqrt(np.nanmean(np.square(against).sum(axis=-1))))
         if rms > farthest:
-            worst, farthest = one, rms
+            worst, farthest = of_tag, rms
     return worst if farthest < _LEAST_MOVED_PX else np.zeros_like(worst)
 
 
-def _rivals(found: list[Explanation]) -> list[Explanation]:
+def _rivals(fits: list[Explanation]) -> list[Explanation]:
     """The likeliest cause and those of other names that are nearly as likely."""
     rivals: list[Explanation] = []
-    for one in found:
-        near = found[0].score - one.score < _CLEAR and not contains(one.cause, found[0].cause)
-        if near and group_of(one) not in [group_of(other) for other in rivals]:
-            rivals.append(one)
+    for fit in fits:
+        near = fits[0].score - fit.score < _CLEAR and not contains(fit.cause, fits[0].cause)
+        if near and group_of(fit) not in [group_of(other) for other in rivals]:
+            rivals.append(fit)
     return rivals
 
 
-def _as_rigid(found: list[Explanation]) -> list[Explanation]:
+def _as_rigid(fits: list[Explanation]) -> list[Explanation]:
     """Links that flex by a little, where a rigid motion of both cameras is the likeliest cause.
 
     In one posture deflections of six joints are any rigid motion: their parameters cost more, and show less
     in one posture than in several.
     """
-    if group_of(found[0]) != ("rig", -1):
+    if group_of(fits[0]) != ("rig", -1):
         return []
-    flexible = [one for one in found if one.cause.kind == "flexible" and is_slight(one.theta)]
-    return [one for one in flexible if one.gain >= found[0].gain]
+    flexible = [fit for fit in fits if fit.cause.kind == "flexible" and is_slight(fit.theta)]
+    return [fit for fit in flexible if fit.gain >= fits[0].gain]
 
 
-def _all_but(seen: BoolArray, marker: int) -> BoolArray:
+def _all_but(detections: BoolArray, marker: int) -> BoolArray:
     """Detections (2, m) of all markers but one."""
-    aside = np.ones_like(seen)
+    aside = np.ones_like(detections)
     aside[:, marker] = False
     return aside

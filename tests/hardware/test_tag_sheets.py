@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.detection import TagFinder
-from projservo_cli.hardware import tags
+from projservo_cli.hardware import tag_sheets
 from projservo_cli.settings.markers import GROUND, Markers
 
 pdfium = pytest.importorskip("pypdfium2")
@@ -44,7 +44,7 @@ def test_printed_tags_are_found_at_their_size(projservo, tmp_path, kind, size_mm
     given = ("--kind", kind, "--size-mm", size_mm, "--dictionary", dictionary, "--paper", paper)
     value = projservo("tags", "-o", file, *map(str, given), "--json").json
     image, size = page(file)
-    assert size == pytest.approx(tags.PAPERS[paper], abs=0.01)
+    assert size == pytest.approx(tag_sheets.PAPERS[paper], abs=0.01)
     found, ambiguous = TagFinder(dictionary).find(image)
     assert (len(found), ambiguous) == (count, ())
     assert sorted(found) == sorted(value["tags"])
@@ -75,7 +75,7 @@ def test_a_folded_net_is_the_described_roof(projservo, tmp_path):
 
 def test_triangles_of_the_net_close_the_gaps_of_the_tilted_roof():
     body = Markers.model_validate({"tags": "roof", "tag_size_m": 0.03}).all_tags
-    net = tags.unfolded([tag.number for tag in body], np.array([tag.pose for tag in body]))
+    net = tag_sheets.unfolded([tag.number for tag in body], np.array([tag.pose for tag in body]))
     tilt, width = math.radians(35), 0.03 * GROUND * 1e3
     a = width * np.array([math.cos(tilt), 0, -math.sin(tilt)])
     b = width * np.array([0, math.cos(tilt), -math.sin(tilt)])
@@ -109,7 +109,7 @@ def test_a_sheet_that_cannot_be_is_refused(projservo, tmp_path, given, words):
 
 
 @pytest.mark.parametrize("kind", ["single", "plate", "roof"])
-@pytest.mark.parametrize("paper", tags.PAPERS)
+@pytest.mark.parametrize("paper", tag_sheets.PAPERS)
 def test_the_largest_size_that_a_refusal_names_fits(projservo, tmp_path, kind, paper):
     given = ("tags", "-o", tmp_path / "tags.pdf", "--kind", kind, "--paper", paper, "--size-mm")
     most = re.search(r"take (?:about )?(\d+) mm", projservo(*given, "150").err)

@@ -238,16 +238,16 @@ def pdf(figure: "Figure") -> bytes:
 
 def numbers_of(text: str) -> list[int]:
     """Numbers of tags such as ``0-4,7``; an InputError where they are none, or one stands there twice."""
-    found: list[int] = []
+    numbers: list[int] = []
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
         if not first.isdecimal() or (dash and not (last.isdecimal() and int(last) >= int(first))):
             raise InputError(f"--numbers {text}: expected numbers of tags such as 0-4,7")
-        found += range(int(first), int(last if dash else first) + 1)
-    number, times = Counter(found).most_common(1)[0]
+        numbers += range(int(first), int(last if dash else first) + 1)
+    number, times = Counter(numbers).most_common(1)[0]
     if times > 1:
         raise InputError(
             f"--numbers {text}: tag {number} stands there {times} times: name it once, since detect leaves "
             "out a tag that an image shows twice"
         )
-    return found
+    return numbers

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import recording_inputs, truth_of
-from projservo_cli.hardware import wiggle
+from projservo_cli.hardware import checks_in_motion
 from projservo_cli.records import InputError
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
@@ -130,6 +130,6 @@ def findings(faults, **given):
     foreign = PluginRobot(robot, "arm", len(numbers), bounds_of(config, joints), 30.0, 30.0)
     with at_rest_after(foreign):
         steered = Steered(foreign)
-        moved = [wiggle.strokes(steered, joint) for joint in range(5)]
+        moved = [checks_in_motion.strokes(steered, joint) for joint in range(5)]
     sound = [one for one in moved if not isinstance(one, str)]
-    return [*wiggle.findings_of(sound, numbers)], moved
+    return [*checks_in_motion.findings_of(sound, numbers)], moved

@@ -1,6 +1,6 @@
 """Study of ``doctor --move``: forty set-ups, of which most have one of twelve faults, and what is named.
 
-    python -m tests.studies.preflight
+    python -m tests.studies.doctor
 
 A fault is twice its threshold, a sound set-up has half of each. A fault counts as named if a finding that is
 not fine tells it; a sound set-up as blamed if any finding is not fine.
@@ -14,12 +14,12 @@ import numpy as np
 from projservo_cli.detection import TagFinder
 from projservo_cli.hardware.camera_robot import View
 from projservo_cli.hardware.cameras import Frame
-from projservo_cli.hardware.preflight import Seen, findings_at_rest
+from projservo_cli.hardware.checks_at_rest import RobotAtRest, findings_at_rest
 from projservo_cli.records import JointLimits
 from projservo_cli.settings.cameras import Source
+from tests.hardware.arms_in_motion import Faults, findings
 from tests.hardware.streams import picture
-from tests.hardware.test_preflight import seen_from
-from tests.hardware.wiggled import Faults, findings
+from tests.hardware.test_doctor import seen_from
 
 SEED, SOUND = 20261125, 16
 # Each fault with the words that name it, and for motions what it changes.
@@ -91,7 +91,7 @@ def at_rest(rng, change):
             )
         )
     s = np.stack([view.tags[0].pixels if 0 in view.tags else np.full((4, 2), np.nan) for view in views])
-    seen = Seen(
+    seen = RobotAtRest(
         marker=range(4),
         face=range(4),
         q=np.zeros(5),

@@ -18,11 +18,11 @@ from projservo_cli.calibration.prediction import (
     parameters_from,
 )
 from projservo_cli.geometry.displacements import displacements
-from projservo_cli.monitoring import statistics
+from projservo_cli.monitoring import innovation_tests
 from projservo_cli.monitoring.accuracy import Posture
 from projservo_cli.monitoring.frame_pairs import FramePair
-from projservo_cli.monitoring.monitor import ImageMonitor, detected_fault
-from projservo_cli.monitoring.statistics import WINDOW, Detector, ErrorModel, Memory
+from projservo_cli.monitoring.image_monitor import ImageMonitor, detected_fault
+from projservo_cli.monitoring.innovation_tests import WINDOW, Detector, ErrorModel, Memory
 from tests.calibration.simulated_robot import random_robot, trials
 from tests.configured import calibrate, truth_of
 from tests.known import configured
@@ -54,7 +54,7 @@ class Arm(NamedTuple):
             start, end = self.reference + rng.uniform(-0.7, 0.7, (2, len(self.reference)))
             q = start + share * (end - start)
             s = self.scene.predict(q - self.reference)
-            if ((s > 0.0) & (s < self.image_size)).all():
+            if ((s > 0.0) & (s < self.image_size[:, None])).all():
                 return q, np.gradient(q, axis=0) / PERIOD
 
     def images(self, q, moved=None):
@@ -102,7 +102,7 @@ def test_residuals_of_the_model_itself_set_nothing_off(arm, monkeypatch):
     """Errors of calibration, joints and instants of the first order, at a chance of one run in five."""
     arm = arm.with_joint_noise(1e-3)
     calibration, runs, alarms = arm.calibration, 30, 0
-    monkeypatch.setattr(statistics, "_FALSE_ALARM", 0.2)
+    monkeypatch.setattr(innovation_tests, "_FALSE_ALARM", 0.2)
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         q, q_dot = arm.way(seed % 3)
@@ -315,7 +315,7 @@ def test_a_look_with_sightings_aside_is_not_kept_where_it_moves_the_calibration_
         noise = np.full((2, len(arm.scene.M)), SIGMA)
         look = FramePair(np.full(2, PERIOD * k), q, still, np.zeros(2), s, noise, np.zeros(6))
         memory.keep(errors.residual(look), PERIOD * k, whole)
-        assert memory.views == views
+        assert memory.state.views == views
 
 
 @pytest.mark.parametrize(("backlash", "slip", "sign"), [(0.0, 0, 1), (0.022, 1, 1), (0.05, 1, 0)])
@@ -343,10 +343,10 @@ def test_a_view_of_which_many_sightings_stay_aside_is_off_where_chance_does_not_
         """As play in the joints lets them: some sightings are off, and the view is not."""
         aside = np.zeros_like(residual.seen)
         aside[1, : aside.shape[1] // 3] = True
-        return statistics.Tested(False, aside)
+        return innovation_tests.Tested(False, aside)
 
-    monkeypatch.setattr(statistics.Detector, "tested", some_aside)
-    monkeypatch.setattr(statistics.Detector, "significant", lambda *_: None)
+    monkeypatch.setattr(innovation_tests.Detector, "tested", some_aside)
+    monkeypatch.setattr(innovation_tests.Detector, "significant", lambda *_: None)
     _, said = first_alarm(arm, read, s)
     assert ("right camera" in said) == bool(shift)
     assert bool(said) == bool(shift)
@@ -389,7 +389,7 @@ def test_a_camera_that_moves_by_two_pixels_in_motion_is_named_before_the_end(arm
 def test_errors_of_corners_excuse_only_what_joints_in_error_do_not_cover(arm, way, shift):
     """Both cameras moved alike, where joints are uncertain by 0.003 rad: most of a score is theirs."""
     errors = ErrorModel(arm.with_joint_noise(0.003).calibration, SIGMA)
-    detector, sigma_t = Detector(errors, LOOKS), np.full(2, statistics.LEAST_ERROR)
+    detector, sigma_t = Detector(errors, LOOKS), np.full(2, innovation_tests.LEAST_ERROR)
     q = arm.way(way)[0][[0, STEPS // 2, -1]]
     s = arm.images(at_once(q))
     s[..., 0] += shift
@@ -504,7 +504,7 @@ def test_looks_in_which_a_hand_comes_and_goes_are_not_kept(arm):
     test, new, views = ImageMonitor(arm.calibration, SIGMA, LOOKS), np.ones(2, dtype=bool), []
     for k in range(len(q)):
         test.observe(np.full(2, PERIOD * k), at_once(q)[k], np.zeros((2, 6)), np.zeros(2), s[k], new)
-        views.append(test._detector.memory.views)
+        views.append(test._detector.memory.state.views)
     assert views[7] < views[11]
     assert views[12] == views[17] == views[7]
     assert views[-1] > views[17]

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from projservo_cli.calibration.detections import per_rad
-from projservo_cli.hardware.preflight import FAULT, FINE, WARNING, Finding
+from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding
 from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.pacing import Steered
@@ -165,7 +165,7 @@ def _fit(moved: Strokes, signal: _Signal, passing: float) -> _Fit | None:
     t_q, q = np.array([reading.t_q for reading in moved.readings]), moved.q
     mid = 0.5 * (q.min() + q.max())
     course = PchipInterpolator(t_q, q)  # straight lines would lag behind a joint that slows down
-    found = []
+    rows = []
     for d in _LATENCIES:
         x = course(np.clip(signal.t - d, t_q[0], t_q[-1])) - mid
         up, far = _direction(t_q, q, signal.t - d, passing)
@@ -179,22 +179,22 @@ def _fit(moved: Strokes, signal: _Signal, passing: float) -> _Fit | None:
             return None
         c, *_ = np.linalg.lstsq(A, signal.p[counts])
         r = signal.p[counts] - A @ c
-        found.append(
+        rows.append(
             (float(r @ r) * len(signal.p) / counts.sum(), c[2], (c[1] - c[0]) / c[2] if c[2] else 0.0)
         )
-    return _Fit(*(np.array(column) for column in zip(*found, strict=True)))
+    return _Fit(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def _passed(moved: Strokes, signal: _Signal) -> _Fit | None:
     """Fit without the frames in which the backlash is passed, by the backlash of the fit before."""
-    passing, found = _PASSING, _fit(moved, signal, _PASSING)
-    while found is not None and passing < _MAX_PASSING:
-        wider = 1.2 * float(found.backlash[np.argmin(found.squares)]) + math.radians(0.4)
+    passing, fit = _PASSING, _fit(moved, signal, _PASSING)
+    while fit is not None and passing < _MAX_PASSING:
+        wider = 1.2 * float(fit.backlash[np.argmin(fit.squares)]) + math.radians(0.4)
         if wider <= passing:
             break
         passing = min(max(wider, passing + math.radians(0.3)), _MAX_PASSING)
-        found = _fit(moved, signal, passing) or found
-    return found
+        fit = _fit(moved, signal, passing) or fit
+    return fit
 
 
 def _direction(t_q: FloatArray, q: FloatArray, t: FloatArray, passing: float) -> tuple[BoolArray, BoolArray]:
@@ -216,24 +216,29 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
     """Findings of the strokes of all joints; numbers : of the markers."""
     still, total = [], np.zeros((2, len(_LATENCIES)))
     most = np.zeros(2)  # motion of each image, px
-    for one in moved:
-        signals = [_signal(one, view) for view in range(2)]
-        fits = [_passed(one, signal) for signal in signals]
-        if one.given_up:
+    for trial in moved:
+        signals = [_signal(trial, view) for view in range(2)]
+        fits = [_passed(trial, signal) for signal in signals]
+        if trial.given_up:
             remedy = (
                 "free it, and check the supply; if its sag or backlash is that large, raise "
                 "plant.max_steady_state_error_deg"
             )
-            yield Finding(FAULT, f"joint {one.joint + 1}", f"{one.given_up}: it is held or too weak", remedy)
+            yield Finding(
+                FAULT,
+                f"joint {trial.joint + 1}",
+                f"{trial.given_up}: it is held or too weak",
+                remedy,
+            )
             continue
         spans = [np.ptp(signal.p) if len(signal.p) else 0.0 for signal in signals]
         most, span = np.maximum(most, spans), max(spans)
         if span < _MOVES_PX:
-            still.append(one.joint)
+            still.append(trial.joint)
         else:
             for view, fit in enumerate(fits):
                 total[view] += 0.0 if fit is None else fit.squares
-        yield from _of_servo(one, [fit for fit in fits if fit is not None] if span >= _MOVES_PX else [])
+        yield from _of_servo(trial, [fit for fit in fits if fit is not None] if span >= _MOVES_PX else [])
     yield from _of_still(still, len(moved))
     for name, squares, px in zip(VIEWS, total, most, strict=True):
         if px < _MOVES_PX <= most.max():
@@ -262,24 +267,24 @@ def _minimum(squares: FloatArray) -> float:
     return float(_LATENCIES[k] + 0.005 * np.clip(shift, -1.0, 1.0))
 
 
-def _of_servo(one: Strokes, fits: Sequence[_Fit]) -> Iterator[Finding]:
+def _of_servo(moved: Strokes, fits: Sequence[_Fit]) -> Iterator[Finding]:
     """Hysteresis and sag of a joint, and backlash between its reading and the images."""
-    below, above = (one.rest(stroke) for stroke in (_FROM_BELOW, _FROM_ABOVE))
-    hysteresis = float(one.q[above].mean() - one.q[below].mean())
-    sag = float((one.target - one.q)[below + above].mean())
+    below, above = (moved.rest(stroke) for stroke in (_FROM_BELOW, _FROM_ABOVE))
+    hysteresis = float(moved.q[above].mean() - moved.q[below].mean())
+    sag = float((moved.target - moved.q)[below + above].mean())
     best = [int(np.argmin(fit.squares)) for fit in fits]
     backlash = float(np.mean([fit.backlash[k] for fit, k in zip(fits, best, strict=True)])) if fits else 0.0
-    both = (("hysteresis", hysteresis), ("sag", abs(sag)))
-    parts = [f"{name} {_text(x, one.slides)}" for name, x in both]
+    amounts = (("hysteresis", hysteresis), ("sag", abs(sag)))
+    parts = [f"{name} {_text(x, moved.slides)}" for name, x in amounts]
     if fits:
         hidden = abs(sag) > 2.0 * _NOTABLE and backlash < _NOTABLE
-        size = "hidden by gravity" if hidden else _text(max(backlash, 0.0), one.slides)
+        size = "hidden by gravity" if hidden else _text(max(backlash, 0.0), moved.slides)
         parts.append(f"backlash {size}")
     wide = max(hysteresis, backlash) > _WIDE
     remedy = (
         "teach goals by images, which backlash does not move; look for a loose horn or screw" if wide else ""
     )
-    yield Finding(WARNING if wide else FINE, f"joint {one.joint + 1}", ", ".join(parts), remedy)
+    yield Finding(WARNING if wide else FINE, f"joint {moved.joint + 1}", ", ".join(parts), remedy)
 
 
 def _of_still(still: Sequence[int], n: int) -> Iterator[Finding]:
@@ -307,16 +312,16 @@ def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator
     Hysteresis and backlash leave small motions of the joints, which all tags follow by the images of the
     strokes; the other tags show the motions of the joints, and the rest is motion on the tool.
     """
-    sound = [one for one in moved if not one.given_up]
-    rests = [_at_rest(one, stroke) for one in sound for stroke in (_FROM_BELOW, _FROM_ABOVE)]
-    spans = [_at_rest(one, _UP) - _at_rest(one, _DOWN) for one in sound]
+    sound = [trial for trial in moved if not trial.given_up]
+    rests = [_at_rest(trial, stroke) for trial in sound for stroke in (_FROM_BELOW, _FROM_ABOVE)]
+    spans = [_at_rest(trial, _UP) - _at_rest(trial, _DOWN) for trial in sound]
     tag = np.array(numbers) // CORNERS
     worst: dict[int, float] = {}
     for rest in rests[1:]:
         columns = np.stack([*spans, rest - rests[0]], axis=-1)  # (2, m, 2, j + 1)
-        seen = np.isfinite(columns).all(axis=(2, 3))
+        detected = np.isfinite(columns).all(axis=(2, 3))
         for number in sorted(set(tag.tolist())):
-            own, others = seen & (tag == number), seen & (tag != number)
+            own, others = detected & (tag == number), detected & (tag != number)
             if own.sum() < CORNERS or others.sum() < 2 * len(columns[0, 0, 0]):
                 continue
             A, b = np.split(columns[others].reshape(-1, len(spans) + 1), [-1], axis=1)
@@ -326,13 +331,13 @@ def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator
             if left > max(_LOOSE_PX, _LOOSE * noise):
                 worst[number] = max(worst.get(number, 0.0), float(left))
     if worst:
-        number = max(worst, key=lambda one: worst[one])
+        number = max(worst, key=lambda trial: worst[trial])
         what = f"tag {number} moved by {worst[number]:.1f} px against the others"
         yield Finding(FAULT, "tags", what, "glue it flat on a stiff part, all tags on the same one")
     elif len(rests) > 1 and len(set(tag.tolist())) > 1:
         yield Finding(FINE, "tags", "sit fast on the tool")
 
 
-def _at_rest(one: Strokes, stroke: int) -> FloatArray:
+def _at_rest(moved: Strokes, stroke: int) -> FloatArray:
     """Mean pixels (2, m, 2) at rest at the end of a stroke."""
-    return np.asarray(np.mean([one.readings[k].s for k in one.rest(stroke)], axis=0))
+    return np.asarray(np.mean([moved.readings[k].s for k in moved.rest(stroke)], axis=0))

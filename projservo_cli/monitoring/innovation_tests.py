@@ -50,8 +50,10 @@ _DIFFERENCES, _MEDIAN, _MEDIAN_AT_MOST = 9, 1.386, 5.6
 _OFF_ALONE = 18.4
 # Minimum information on a direction, in units of its deviations: one that no image shows has some.
 _LEAST_INFORMATION = 1e-12
-# Share of the views after which a fault that grows is seen nearly whole; deviations that are told from none.
-_LATE, TOLD = 2.0 / 3.0, 2.0
+# Share of the views after which a fault that grows is seen nearly whole.
+_NEARLY_WHOLE = 2.0 / 3.0
+# Deviations from which a difference is distinguished from none.
+DISTINCT = 2.0
 # Share of the markers of a view that may be off one by one before the view itself is.
 _MOST_ASIDE = 0.5
 
@@ -97,17 +99,6 @@ class Sums(NamedTuple):
             weight_squares=self.weight_squares + factor**2 * other.weight_squares,
             seen=self.seen + factor * other.seen,
             bias=self.bias + factor * other.bias,
-        )
-
-    def times(self, factor: float) -> "Sums":
-        """The same with another weight."""
-        return self._replace(
-            normal=factor * self.normal,
-            by_corner=factor * self.by_corner,
-            weight=factor * self.weight,
-            weight_squares=factor**2 * self.weight_squares,
-            seen=factor * self.seen,
-            bias=factor * self.bias,
         )
 
 
@@ -164,7 +155,7 @@ class ErrorModel:
         predicted = scene.predict(away)[views, views]
         r = pair.images - predicted
         seen = np.isfinite(r[..., 0])
-        noise = pair.noise * np.sqrt(self._excess(away))
+        noise = pair.noise * np.sqrt(self._corner_variance(away))
         at = scene.everywhere(away)
         B = dense_pixel_changes(scene, self.errors, away, at)[views, views]
         D = at.by_point.reshape(n + 1, 2, 2, m, 2, 4)[:, views, views]
@@ -189,7 +180,7 @@ class ErrorModel:
             seen=seen, noise=noise, predicted=predicted, r=r.ravel(), B=B.reshape(rows, -1), F=F, R=R
         )
 
-    def _excess(self, away: FloatArray) -> FloatArray:
+    def _corner_variance(self, away: FloatArray) -> FloatArray:
         """Variance of corners (2, m) over their noise, as detections of the calibration from near them err.
 
         A corner that is seen from another side, or under another slant, errs otherwise.
@@ -274,7 +265,7 @@ class ErrorModel:
         """Root (e, e) of the information on the errors of the calibration."""
         return np.asarray(np.linalg.cholesky(np.eye(self.e) + sums.normal[: self.e, : self.e]))
 
-    def strays(self, sums: Sums) -> bool:
+    def contradicts(self, sums: Sums) -> bool:
         """Whether sums put the calibration where it is not by chance, once in ten thousand."""
         root = self.root(sums)
         off = cho_solve((root, True), sums.normal[: self.e, -1], check_finite=False)
@@ -296,10 +287,15 @@ class ErrorModel:
 class MemoryState(NamedTuple):
     """Observations that agreed up to one time."""
 
-    closed: tuple[Sums, ...]
-    view: Sums
-    length: float  # observations of that view, fading
-    first: FloatArray | None
+    closed: tuple[Sums, ...]  # up to the end of each view, of the older ones fewer
+    view: Sums  # observations of the view that lasts, fading
+    length: float  # how many these are
+    first: FloatArray | None  # (2, m, 2) px predicted at its beginning
+
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return self.closed[-1].views + (self.length > 0.0)
 
 
 class Memory:
@@ -307,11 +303,8 @@ class Memory:
 
     def __init__(self, errors: ErrorModel) -> None:
         self._errors = errors
-        self._closed = [errors.nothing()]
+        self.state = MemoryState((errors.nothing(),), errors.nothing(), 0.0, None)
         self._total: Sums | None = None  # as last asked for
-        self._view = errors.nothing()  # observations of the view that lasts, fading
-        self._count = 0.0
-        self._first: FloatArray | None = None  # (2, m, 2) px predicted at its beginning
         # The last observation, as ``learn`` is given it.
         self._before: tuple[Residual, BoolArray, bool] | None = None
         # Of differences from observation to observation, over σ²: in motion, at rest, and between views.
@@ -355,35 +348,24 @@ class Memory:
         return observations / (self.fresh + observations * (1.0 - self.fresh)) if observations else 0.0
 
     @property
-    def views(self) -> int:
-        """Number of views that agreed."""
-        return self._closed[-1].views + (self._count > 0.0)
-
-    @property
     def total(self) -> Sums:
         """Sums of all observations."""
         if self._total is None:
-            self._total = self._closed[-1]
-            if self._count:
-                worth = self.worth(self._count)
-                view = self._view.times(worth / self._count)
-                self._total = self._total.plus(view._replace(weight_squares=worth**2))
+            self._total = before = self.state.closed[-1]
+            if count := self.state.length:
+                worth = self.worth(count)
+                squares = before.weight_squares + worth**2
+                self._total = before.plus(self.state.view, worth / count)._replace(weight_squares=squares)
         return self._total
-
-    @property
-    def state(self) -> MemoryState:
-        """Observations so far, to return to."""
-        return MemoryState(closed=tuple(self._closed), view=self._view, length=self._count, first=self._first)
 
     def return_to(self, state: MemoryState) -> None:
         """Forget the observations since a state."""
-        self._closed, self._total = list(state.closed), None
-        self._view, self._count, self._first = state.view, state.length, state.first
+        self.state, self._total = state, None
 
     def onsets(self) -> list[Sums]:
         """Sums before each time that something may have begun, the earliest first."""
         seen = self.total.seen.sum()
-        return [sums for sums in self._closed if sums.seen.sum() < seen]
+        return [sums for sums in self.state.closed if sums.seen.sum() < seen]
 
     def keep(self, residual: Residual, t: float, whole: bool) -> None:
         """Add an observation; of earlier views those stay that date an onset to a quarter of its age.
@@ -392,21 +374,14 @@ class Memory:
         not agree where the calibration would have to be off beyond chance.
         """
         new = self._errors.sums(residual, t)
-        if not whole and self._errors.strays(self.total.plus(new)):
+        if not whole and self._errors.contradicts(self.total.plus(new)):
             return
-        if self._first is None or not is_same_view(self._first, residual.predicted):
-            if self._count:
-                self._closed.append(self.total)
-                age = [max(1, (self._closed[-1].views - sums.views) // 4) for sums in self._closed]
-                self._closed = [
-                    sums
-                    for sums, a in zip(self._closed, age, strict=True)
-                    if sums.views % (1 << (a.bit_length() - 1)) == 0
-                ]
-            self._view, self._count, self._first = self._errors.nothing(), 0.0, residual.predicted
-        self._total = None
-        self._view = self._view.times(_FORGET).plus(new)._replace(views=1)
-        self._count = _FORGET * self._count + 1.0
+        state = self.state
+        if state.first is None or not is_same_view(state.first, residual.predicted):
+            closed = _thinned([*state.closed, self.total]) if state.length else state.closed
+            state = MemoryState(closed, self._errors.nothing(), 0.0, residual.predicted)
+        view = new.plus(state.view, _FORGET)._replace(views=1, t=t)
+        self.return_to(state._replace(view=view, length=_FORGET * state.length + 1.0))
 
     def learn(self, now: Residual, aside: BoolArray, disagrees: bool) -> None:
         """Learn the fresh error of each frame from two in a row, free of errors of joints and instants.
@@ -422,8 +397,8 @@ class Memory:
         if last is None or last[2] != disagrees:
             return
         before, n = last[0], len(self._errors.sigma_q)
-        seen = before.seen & now.seen
-        rows = np.repeat((seen & ~aside & ~last[1]).ravel(), 2)
+        in_both = before.seen & now.seen
+        rows = np.repeat((in_both & ~aside & ~last[1]).ravel(), 2)
         weight, columns = 1.0 / np.repeat(now.noise.ravel(), 2)[:, None], [*range(n), 2 * n, 2 * n + 1]
         off, moved = (now.r - before.r) * weight[:, 0], now.F[:, columns] * weight
         if kind == _BETWEEN_VIEWS:
@@ -440,12 +415,19 @@ class Memory:
             square = max(0.0, square - float(np.square(by_errors - basis @ (basis.T @ by_errors)).sum()))
         elif kind == _AT_REST:
             off -= moved @ np.linalg.lstsq(R, along)[0]
-            step = 0.5 * np.square(off / weight[:, 0]).reshape(*seen.shape, 2).sum(axis=2)
-            self._steps.append(np.where(seen, step, np.nan))
+            step = 0.5 * np.square(off / weight[:, 0]).reshape(*in_both.shape, 2).sum(axis=2)
+            self._steps.append(np.where(in_both, step, np.nan))
         # Fading, so that the errors of a finder in one light do not count for ever.
         self._squares[kind] = 0.99 * self._squares[kind] + 0.5 * square
         self._freedom[kind] = 0.99 * self._freedom[kind] + freedom
         self._total = None
+
+
+def _thinned(closed: list[Sums]) -> tuple[Sums, ...]:
+    """Sums up to the end of each view, of the older ones fewer: dates to a quarter of their age."""
+    ages = [max(1, (closed[-1].views - sums.views) // 4) for sums in closed]
+    both = zip(closed, ages, strict=True)
+    return tuple(sums for sums, age in both if sums.views % (1 << (age.bit_length() - 1)) == 0)
 
 
 def is_same_view(before: FloatArray, now: FloatArray) -> bool:
@@ -480,9 +462,9 @@ class _Reduced(NamedTuple):
     def of(self, rows: FloatArray) -> FloatArray:
         """Other right-hand sides (e + f, k) of the equations, (f, k) after the same steps."""
         e = len(self.root)
-        found = self.line @ rows[e:]
-        found -= self.along.T @ solve_triangular(self.root, rows[:e], lower=True, check_finite=False)
-        return np.asarray(found - self.solved.T @ found[self.nuisance])
+        reduced = self.line @ rows[e:]
+        reduced -= self.along.T @ solve_triangular(self.root, rows[:e], lower=True, check_finite=False)
+        return np.asarray(reduced - self.solved.T @ reduced[self.nuisance])
 
 
 class Tested(NamedTuple):
@@ -528,10 +510,10 @@ class Detector:
         """Test χ² of each view and each marker in one observation, without detections off by themselves."""
         errors, (_, m) = self._errors, residual.seen.shape
         total = self.memory.total
-        both = np.concatenate([residual.B.T, total.normal[: errors.e, -1:]], axis=1)
-        both = solve_triangular(errors.root(total), both, lower=True, check_finite=False)
-        W = both[:, :-1]
-        S, r = W.T @ W + residual.R, residual.r - W.T @ both[:, -1]
+        columns = np.concatenate([residual.B.T, total.normal[: errors.e, -1:]], axis=1)
+        columns = solve_triangular(errors.root(total), columns, lower=True, check_finite=False)
+        W = columns[:, :-1]
+        S, r = W.T @ W + residual.R, residual.r - W.T @ columns[:, -1]
         rows = np.arange(4 * m).reshape(2, m, 2)
         single = self._beyond(S, r, rows.reshape(2 * m, 2), residual).reshape(2, m)
         markers = self._beyond(S, r, rows.swapaxes(0, 1).reshape(m, 4), residual)
@@ -553,21 +535,19 @@ class Detector:
         allowed = _MOST_ASIDE * visible.sum(axis=1)
         while ((aside & visible).sum(axis=1) <= allowed).all():
             left = np.flatnonzero(visible.ravel() & ~out)
-            rows = (2 * left[:, None] + np.arange(2)).ravel()
-            if not self._beyond(S, r, rows[None], residual)[0]:
+            if not self._beyond(S, r, coordinate_rows(left)[None], residual)[0]:
                 return False
-            square = relative_to_others(S[np.ix_(rows, rows)], r[rows])
-            if square.max() <= _OFF_ALONE:
+            if (stray := farthest_alone(S, r, left, _OFF_ALONE)) is None:
                 return True
-            out[left[np.argmax(square)]] = True
+            out[stray] = True
         return True
 
     def _beyond(self, S: FloatArray, r: FloatArray, parts: IntArray, residual: Residual) -> BoolArray:
         """Which parts (h,) of residuals, by their rows (h, p), are beyond chance and errors of the model."""
-        seen = np.repeat(residual.seen.ravel(), 2)[parts]
+        detected = np.repeat(residual.seen.ravel(), 2)[parts]
         bias = np.repeat((self._errors.bias_px / residual.noise.ravel()) ** 2, 2)[parts]
         bias = bias + _UNUSUAL**2 * (1.0 - self.memory.fresh)
-        maximum = self._most_once[seen.sum(axis=1)] + np.sqrt((seen * bias).sum(axis=1))
+        maximum = self._most_once[detected.sum(axis=1)] + np.sqrt((detected * bias).sum(axis=1))
         gain = gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
         return np.asarray(gain > maximum**2)
 
@@ -585,7 +565,7 @@ class Detector:
         lengths = _LONGER ** np.arange(1 + int(np.log(total.views) / np.log(_LONGER)))
         tail = self._chance / (count + _SOON) / len(self._sizes)
         by_chance = np.sqrt(chdtri(self._sizes, tail))
-        found: Sums | None = None
+        likeliest: Sums | None = None
         maximum = 0.0
         self._last = np.full(len(self._sizes), -np.inf)
         for length in lengths if thorough else lengths[[count % len(lengths)]]:
@@ -594,8 +574,8 @@ class Detector:
             self._last = np.maximum(self._last, excess)
             most = float((excess - self._accepted).max())
             if most > maximum:
-                found, maximum = since, most
-        return found
+                likeliest, maximum = since, most
+        return likeliest
 
     def _reduced(self, since: Sums, total: Sums, sigma_t: FloatArray, free: list[IntArray]) -> _Reduced:
         """Normal equations of faults since an onset without errors of the calibration and lasting ones."""
@@ -674,7 +654,7 @@ class Detector:
         total, onsets, n = self.memory.total, self.memory.onsets(), len(self._errors.sigma_q)
         if not onsets:
             return 0.0
-        late, greatest = min(onsets, key=lambda sums: abs(sums.views - _LATE * total.views)), 0.0
+        late, greatest = min(onsets, key=lambda sums: abs(sums.views - _NEARLY_WHOLE * total.views)), 0.0
         cameras = 2 * n + 2 + 2 * (CAMERA - 1)
         for since, end in ((onsets[0], self._errors.f), (late, cameras)):
             reduced = self._reduced(since, total, sigma_t, [])
@@ -687,10 +667,10 @@ class Detector:
                 size = np.sqrt(np.maximum(reduced.normal.diagonal(), _LEAST_INFORMATION))[part]
                 unit, block = np.outer(size, size), np.ix_(part, part)
                 inverse = np.linalg.inv(reduced.normal[block] / unit + RIDGE * np.eye(len(part))) / unit
-                found = carry @ at.F[:, part] @ inverse
-                off = np.square(found @ reduced.normal[part, -1]).sum()
-                may = np.trace(found @ spread[block] @ found.T)
-                greatest = max(greatest, float(off + TOLD**2 * may))
+                by_score = carry @ at.F[:, part] @ inverse
+                off = np.square(by_score @ reduced.normal[part, -1]).sum()
+                may = np.trace(by_score @ spread[block] @ by_score.T)
+                greatest = max(greatest, float(off + DISTINCT**2 * may))
         return float(np.sqrt(greatest))
 
     def _root_gains(self, reduced: _Reduced, more: FloatArray | float) -> FloatArray:
@@ -729,14 +709,23 @@ def _greatest(spread: FloatArray, reduced: _Reduced, part: IntArray) -> float:
         return np.inf
 
 
-def relative_to_others(S: FloatArray, r: FloatArray) -> FloatArray:
-    """Return χ² (k,) of each detection given all others, of residuals r (2 k,) with covariance S.
+def farthest_alone(S: FloatArray, r: FloatArray, detections: IntArray, limit: float) -> int | None:
+    """Return the detection, among some (k,), that is the farthest off given all others; None within a limit.
 
     Errors of joints move all of them: one by itself hardly shows its own error.
+
+    S, r : covariance and residuals of all coordinates, px² and px; limit : of χ².
     """
-    P, k = np.linalg.inv(S), np.arange(len(r) // 2)
-    u, blocks = (P @ r).reshape(-1, 2, 1), P.reshape(len(k), 2, len(k), 2)[k, :, k]
-    return np.asarray((u * np.linalg.solve(blocks, u)).sum(axis=(1, 2)))
+    rows, k = coordinate_rows(detections), np.arange(len(detections))
+    P = np.linalg.inv(S[np.ix_(rows, rows)])
+    u, blocks = (P @ r[rows]).reshape(-1, 2, 1), P.reshape(len(k), 2, len(k), 2)[k, :, k]
+    square = (u * np.linalg.solve(blocks, u)).sum(axis=(1, 2))
+    return int(detections[np.argmax(square)]) if square.max() > limit else None
+
+
+def coordinate_rows(detections: IntArray) -> IntArray:
+    """Rows (2 k,) of the coordinates of detections (k,)."""
+    return np.asarray((2 * detections[:, None] + np.arange(2)).ravel())
 
 
 def _rays(scene: Parameters, directions: FloatArray, q: FloatArray) -> FloatArray:
@@ -752,8 +741,8 @@ def _rays(scene: Parameters, directions: FloatArray, q: FloatArray) -> FloatArra
 def rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) -> FloatArray:
     """Basis (d, 4, 4) of rigid motions: translations, and those that the joints generate together."""
     brackets = [A @ B - B @ A for A in H_hat for B in H_hat]
-    known = np.concatenate([H_hat, np.array(brackets), directions[:, :, None] * a_inf])
-    sizes, rows = np.linalg.svd(known.reshape(-1, 16))[1:]
+    motions = np.concatenate([H_hat, np.array(brackets), directions[:, :, None] * a_inf])
+    sizes, rows = np.linalg.svd(motions.reshape(-1, 16))[1:]
     return np.asarray(rows[:6][sizes[:6] > _RANK * sizes[0]].reshape(-1, 4, 4))
 
 
@@ -768,15 +757,15 @@ def _directions_of(n: int, m: int, d: int) -> tuple[list[IntArray], FloatArray, 
     at_camera, free = 2 * n + 2, CAMERA - 1
     at_marker = at_camera + 2 * free
     at_tool = at_marker + 3 * m
-    found = [*((np.array([i]), everything) for i in range(2 * n))]
-    found += [(n + np.arange(n), everything), (np.arange(n), everything)]
+    directions = [*((np.array([i]), everything) for i in range(2 * n))]
+    directions += [(n + np.arange(n), everything), (np.arange(n), everything)]
     for v in (0, 1):
-        found += [(np.array([2 * n + v]), views[v]), (at_camera + v * free + np.arange(free), views[v])]
-    found += [(2 * n + np.arange(2), everything)]
+        directions += [(np.array([2 * n + v]), views[v]), (at_camera + v * free + np.arange(free), views[v])]
+    directions += [(2 * n + np.arange(2), everything)]
     for j in range(m):
-        found += [(at_marker + 3 * j + np.arange(3), everything * (np.arange(m) == j))]
-    found += [(at_tool + np.arange(d), everything), (at_tool + d + np.arange(d), everything)]
-    columns, touches = zip(*found, strict=True)
+        directions += [(at_marker + 3 * j + np.arange(3), everything * (np.arange(m) == j))]
+    directions += [(at_tool + np.arange(d), everything), (at_tool + d + np.arange(d), everything)]
+    columns, touches = zip(*directions, strict=True)
     return list(columns), np.array([part.ravel() for part in touches]), at_tool + 2 * d
 
 

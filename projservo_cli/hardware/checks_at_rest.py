@@ -38,7 +38,7 @@ class Finding(NamedTuple):
 
 
 @dataclass(eq=False)
-class Seen:
+class RobotAtRest:
     """A robot at rest, as its joints and cameras show it."""
 
     marker: Sequence[int]  # numbers of the markers
@@ -57,17 +57,17 @@ class Seen:
 
 
 def findings_at_rest(
-    seen: Seen, finder: TagFinder, dictionary: str, *, moves: bool = False
+    robot: RobotAtRest, finder: TagFinder, dictionary: str, *, moves: bool = False
 ) -> Iterator[Finding]:
     """All findings at rest.
 
     dictionary : name of that of the ``finder``; moves : whether joints are to move next, which need limits.
     """
-    for camera, view in zip(seen.cameras, seen.views, strict=True):
+    for camera, view in zip(robot.cameras, robot.views, strict=True):
         yield from _of_camera(camera)
-        yield from _of_tags(camera.name, view, seen, finder, dictionary)
-    yield from _of_both(seen)
-    yield from _of_joints(seen, FAULT if moves else WARNING)
+        yield from _of_tags(camera.name, view, robot, finder, dictionary)
+    yield from _of_both(robot)
+    yield from _of_joints(robot, FAULT if moves else WARNING)
 
 
 def _of_camera(camera: Camera) -> Iterator[Finding]:
@@ -76,15 +76,15 @@ def _of_camera(camera: Camera) -> Iterator[Finding]:
     rate, asked = camera.rate_hz, camera.settings.rate_hz or _USUAL_HZ
     stamps = "stamped by its driver" if camera.stamped else "stamped when they arrive"
     size = f"{grey.shape[1]} x {grey.shape[0]} px"
-    found = f"{rate:.1f}" if math.isfinite(rate) else "fewer than 3"
+    frames = f"{rate:.1f}" if math.isfinite(rate) else "fewer than 3"
     if not rate >= _SLOW * asked:
         remedy = (
             "webcams expose longer in the dark: add light, or set exposure_ms below "
             f"{1e3 / asked:.0f}; on one hub with another camera, set fourcc: MJPG"
         )
-        yield Finding(WARNING, where, f"{size}, {found} frames a second instead of {asked:g}", remedy)
+        yield Finding(WARNING, where, f"{size}, {frames} frames a second instead of {asked:g}", remedy)
     else:
-        yield Finding(FINE, where, f"{size}, {found} frames a second, {stamps}")
+        yield Finding(FINE, where, f"{size}, {frames} frames a second, {stamps}")
     for remark in camera.remarks:
         what, _, remedy = remark.partition(": ")
         yield Finding(WARNING, where, what, remedy or "take another camera, or keep it from changing")
@@ -100,22 +100,24 @@ def _of_camera(camera: Camera) -> Iterator[Finding]:
     yield Finding(FINE, where, f"{text}, edges blurred by {light.blur_px:.1f} px" if sharp else text)
 
 
-def _of_tags(name: str, view: View, seen: Seen, finder: TagFinder, dictionary: str) -> Iterator[Finding]:
+def _of_tags(
+    name: str, view: View, robot: RobotAtRest, finder: TagFinder, dictionary: str
+) -> Iterator[Finding]:
     """Tags in the image of a camera: which, how large, how certain."""
-    where, known = f"{name} image", {number // CORNERS for number in seen.marker}
+    where, expected = f"{name} image", {number // CORNERS for number in robot.marker}
     for number in view.repeated:
         remedy = "a number must be unique: print another one, or cover the tag that is not on the tool"
         yield Finding(FAULT, where, f"tag {number} is there twice", remedy)
-    there = {number: tag for number, tag in view.tags.items() if number in known}
+    there = {number: tag for number, tag in view.tags.items() if number in expected}
     if not there:
         other, count = other_dictionary(view.frame.grey, dictionary)
         if count > len(view.tags):
             remedy = f"set markers.dictionary: {other}, or print tags of {dictionary}"
             yield Finding(FAULT, where, f"{count} tags are of {other}, none of {dictionary}", remedy)
         elif view.tags:
-            found = ", ".join(map(str, sorted(view.tags)))
+            others = ", ".join(map(str, sorted(view.tags)))
             remedy = "name the corners of the tags on the tool (4 t + k) in markers.numbers"
-            yield Finding(FAULT, where, f"tags {found} are there, and markers has none of them", remedy)
+            yield Finding(FAULT, where, f"tags {others} are there, and markers has none of them", remedy)
         else:
             minimum = math.ceil(MIN_CELL * finder.cells)
             remedy = (
@@ -157,25 +159,25 @@ def other_dictionary(grey: ByteArray, dictionary: str) -> tuple[str, int]:
     return best, counts[best][0]
 
 
-def _of_both(seen: Seen) -> Iterator[Finding]:
+def _of_both(robot: RobotAtRest) -> Iterator[Finding]:
     """Markers that both cameras see, the face among them, and whether the views differ enough for depth."""
-    visible = np.isfinite(seen.s[..., 0])
+    visible = np.isfinite(robot.s[..., 0])
     shared = int(visible.all(axis=0).sum())
     if visible.any(axis=1).all() and shared < MIN_SHARED:
         remedy = "turn the tool towards both cameras, or move them"
-        what = f"share {shared} of {len(seen.marker)} markers ({MIN_SHARED} at least)"
+        what = f"share {shared} of {len(robot.marker)} markers ({MIN_SHARED} at least)"
         yield Finding(FAULT, "both images", what, remedy)
     elif shared:
-        yield Finding(FINE, "both images", f"share {shared} of {len(seen.marker)} markers")
-    both = {number for k, number in enumerate(seen.marker) if visible[:, k].all()}
-    for number in seen.marker:
-        if shared and number in seen.face and number not in both:
+        yield Finding(FINE, "both images", f"share {shared} of {len(robot.marker)} markers")
+    shared_numbers = {number for k, number in enumerate(robot.marker) if visible[:, k].all()}
+    for number in robot.marker:
+        if shared and number in robot.face and number not in shared_numbers:
             what = f"do not both show marker {number} of the face, tag {number // CORNERS}"
             remedy = "turn the tool towards both cameras, or name another markers.face"
             yield Finding(WARNING, "both images", what, remedy)
             break
-    if len(seen.views) == 2:
-        angle = view_angle_deg(seen.views[0].tags, seen.views[1].tags)
+    if len(robot.views) == 2:
+        angle = view_angle_deg(robot.views[0].tags, robot.views[1].tags)
         if angle < _GOOD_ANGLE_DEG:
             what = (
                 f"the cameras see the tags from directions {angle:.1f}° apart ({_GOOD_ANGLE_DEG:g}° at least)"
@@ -186,7 +188,7 @@ def _of_both(seen: Seen) -> Iterator[Finding]:
             yield Finding(FAULT if angle < _MIN_ANGLE_DEG else WARNING, "both cameras", what, remedy)
         elif np.isfinite(angle):
             yield Finding(FINE, "both cameras", f"see the tags from directions {angle:.0f}° apart")
-    noise, stated = np.nanmedian(seen.scatter) if np.isfinite(seen.scatter).any() else 0.0, seen.sigma
+    noise, stated = np.nanmedian(robot.scatter) if np.isfinite(robot.scatter).any() else 0.0, robot.sigma
     if (
         stated is not None
         and np.isfinite(stated).any()
@@ -210,7 +212,7 @@ def view_angle_deg(left: Mapping[int, Corners], right: Mapping[int, Corners]) ->
     for number in left.keys() & right.keys():
         if not np.isfinite([left[number].sigma, right[number].sigma]).all():
             continue
-        towards = [_directions(one[number].pixels, one[number].sigma) for one in (left, right)]
+        towards = [_directions(view[number].pixels, view[number].sigma) for view in (left, right)]
         cosine = max(float(np.clip(a @ b, -1.0, 1.0)) for a, b in product(*towards))
         certain = len(towards[0]) == len(towards[1]) == 1
         (sure if certain else unsure).append(math.degrees(math.acos(cosine)))
@@ -240,15 +242,15 @@ def _directions(pixels: FloatArray, sigma: FloatArray) -> list[FloatArray]:
     return [np.array([*side, z]), np.array([*-side, z])]
 
 
-def _of_joints(seen: Seen, endless: str) -> Iterator[Finding]:
+def _of_joints(robot: RobotAtRest, endless: str) -> Iterator[Finding]:
     """Readings within their limits, and the measurements of the arm itself.
 
     endless : level of a joint without limits.
     """
-    lower, upper = seen.limits.lower, seen.limits.upper
-    readings = ", ".join(in_unit(x, unit, 4) for x, unit in zip(seen.q.tolist(), seen.units, strict=True))
+    lower, upper = robot.limits.lower, robot.limits.upper
+    readings = ", ".join(in_unit(x, unit, 4) for x, unit in zip(robot.q.tolist(), robot.units, strict=True))
     yield Finding(FINE, "joints", f"read {readings}")
-    for i, (x, unit) in enumerate(zip(seen.q.tolist(), seen.units, strict=True)):
+    for i, (x, unit) in enumerate(zip(robot.q.tolist(), robot.units, strict=True)):
         low, high = (in_unit(float(limit[i]), unit, 4) for limit in (lower, upper))
         if not np.isfinite([lower[i], upper[i]]).all():
             yield Finding(
@@ -261,5 +263,5 @@ def _of_joints(seen: Seen, endless: str) -> Iterator[Finding]:
         elif unit != "m" and min(x - lower[i], upper[i] - x) < _ROOM:
             what = f"reads {in_unit(x, unit, 4)}, at its limits {low} to {high}"
             yield Finding(WARNING, f"joint {i + 1}", what, "move it away from there by hand")
-    for name, value in seen.health.items():
+    for name, value in robot.health.items():
         yield Finding(FINE, "arm", f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")

@@ -1,0 +1,166 @@
+"""Doctor: look at robot and cameras before anything is recorded, and move each joint a little."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.detection import DICTIONARY, TagFinder
+from projservo_cli.hardware.camera_robot import CameraRobot, View
+from projservo_cli.hardware.cameras import Camera
+from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding, RobotAtRest, findings_at_rest
+from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
+from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.monitoring.accuracy import resting_error_mm
+from projservo_cli.monitoring.frame_pairs import at_known_markers, mean_image
+from projservo_cli.monitoring.image_monitor import detected_fault
+from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
+from projservo_cli.robots.pacing import Steered
+from projservo_cli.stages import Progress, silent
+from projservo_cli.stages.external_robot import plugin_robot
+from projservo_cli.stages.stage_inputs import OwnRobot, PreflightInputs
+
+# Time of observation of a robot at rest, s, and minimum number of readings.
+_LOOK_S, _MIN_LOOKS = 1.5, 8
+_CALIBRATION = "calibration"  # subject of the finding of a comparison with one
+
+
+class Checked(NamedTuple):
+    """Findings on a robot and its cameras, and what they rest on."""
+
+    findings: tuple[Finding, ...]
+    seen: RobotAtRest | None  # None where robot or cameras did not open
+    moved: tuple[Strokes, ...]  # of the joints that were moved
+
+    @property
+    def works(self) -> bool:
+        """Whether nothing stands against a recording."""
+        return all(finding.level != FAULT for finding in self.findings)
+
+    @property
+    def refuted(self) -> str | None:
+        """Reason why the calibration holds no more, empty where it does; None where it was not compared."""
+        for finding in self.findings:
+            if finding.where == _CALIBRATION and finding.level != WARNING:
+                return finding.text if finding.level == FAULT else ""
+        return None
+
+
+def check(
+    inputs: PreflightInputs,
+    calibration: Calibration | None = None,
+    confirmed: Callable[[str], bool] | None = None,
+    watch: Callable[[PluginRobot], None] | None = None,
+    progress: Progress = silent,
+) -> Checked:
+    """Open robot and cameras, look, and close them.
+
+    calibration : whose images are compared, where there is one, and whose data may give limits.
+    confirmed : asks whether joints may be moved, by so much to either side in words; None moves none.
+    watch : is called with the open robot, for as long as somebody wants to see its images.
+    """
+    joints, dictionary = inputs.joints.joints("", calibration), inputs.dictionary or DICTIONARY
+    assert isinstance(inputs.driven.robot, OwnRobot)
+    bounds = inputs.driven.following.bounds(joints)
+    robot = plugin_robot(inputs.driven.robot, bounds, joints.types, inputs.numbers)
+    findings: list[Finding] = []
+    at_rest, moved = None, list[Strokes]()
+    try:
+        with at_rest_after(robot):
+            if watch is not None:
+                watch(robot)
+            at_rest = _seen(robot, inputs, progress)
+            findings += findings_at_rest(
+                at_rest, TagFinder(dictionary), dictionary, moves=confirmed is not None
+            )
+            if calibration is not None:
+                findings.append(calibration_finding(calibration, at_rest, robot.image_size, inputs.lengths))
+            works = all(finding.level != FAULT for finding in findings)
+            if confirmed is not None and not works:
+                findings.append(
+                    Finding(WARNING, "joints", "were not moved: something above is a fault", "mend it first")
+                )
+            elif confirmed is not None and confirmed(reach_of(joints.types)):
+                findings += _move_joints(robot, moved, progress)
+                findings += findings_of(moved, at_rest.marker)
+    except (InputError, WorkFailed) as error:
+        if isinstance(error, InputError) and at_rest is None:
+            raise
+        what, _, remedy = str(error).partition(": look ")
+        findings.append(Finding(FAULT, "robot and cameras", what, f"look {remedy}" if remedy else ""))
+    return Checked(tuple(findings), at_rest, tuple(moved))
+
+
+def _move_joints(robot: PluginRobot, moved: list[Strokes], progress: Progress) -> Iterator[Finding]:
+    """Move each joint to and fro, and add its strokes; findings on those without room."""
+    steered, joints = Steered(robot), len(robot.bounds.lead)
+    for joint in range(joints):
+        trial = strokes(steered, joint)
+        progress("move", joint + 1, joints)
+        if isinstance(trial, str):
+            what, _, remedy = trial.partition(": ")
+            yield Finding(WARNING, f"joint {joint + 1}", what, remedy)
+        else:
+            moved.append(trial)
+
+
+def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> RobotAtRest:
+    """Look for a while at a robot that stands where it is."""
+    period, readings = robot.bounds.period, [robot.read()]
+    wanted = max(_MIN_LOOKS, round(_LOOK_S / period))
+    while len(readings) < wanted:
+        time.sleep(period)
+        readings.append(robot.read())
+        progress("look", len(readings), wanted)
+    (left, scatter_left), (right, scatter_right) = (_mean(readings, view) for view in range(2))
+    own, cameras, views = robot.robot, list[Camera](), list[View]()
+    if isinstance(own, CameraRobot):
+        cameras, views = own.cameras, [view for view in own.views if view is not None]
+    return RobotAtRest(
+        marker=inputs.numbers,
+        face=inputs.face,
+        q=np.mean([look.q for look in readings], axis=0),
+        s=np.stack([left, right]),
+        sigma=readings[-1].sigma_px,
+        scatter=np.stack([scatter_left, scatter_right]),
+        limits=robot.bounds.limits,
+        units=robot.bounds.units,
+        views=views,
+        cameras=cameras,
+        health=robot.health(),
+    )
+
+
+def _mean(readings: Sequence[Reading], view: int) -> tuple[FloatArray, FloatArray]:
+    """Mean (m, 2) of the new frames of a view, NaN where most show no marker, and scatter (m,), px."""
+    new = [readings[0], *(b for a, b in pairwise(readings) if b.new_views(a)[view])]
+    s = np.array([look.s[view] for look in new])
+    mean, scatter = mean_image(s), np.full(s.shape[1], np.nan)
+    often = np.isfinite(mean[:, 0])
+    if len(s) > 2:
+        scatter[often] = np.sqrt(np.nanvar(s[:, often], axis=0).mean(axis=1))
+    return mean, scatter
+
+
+def calibration_finding(
+    calibration: Calibration, at_rest: RobotAtRest, image_size: ImageSize | None, lengths: FloatArray
+) -> Finding:
+    """Whether images at rest still agree with a calibration, and what changed if they do not.
+
+    lengths : (f, f) between the markers of the face, m, NaN if unknown.
+    """
+    if not calibration.usable or not calibration.has_covariance:
+        return Finding(WARNING, _CALIBRATION, "is not usable", "record and calibrate again")
+    size = image_sizes(image_size or [view.frame.grey.shape[::-1] for view in at_rest.views] or None)
+    marker = np.array(at_rest.marker, dtype=np.int64)
+    if not np.isfinite(at_rest.s[:, np.isin(marker, calibration.marker)]).any():
+        return Finding(WARNING, _CALIBRATION, "was not compared: no marker of it is seen", "show the tags")
+    if fault := detected_fault(calibration, at_rest.q, marker, at_rest.s, size):
+        return Finding(FAULT, _CALIBRATION, fault, "put that back, or record and calibrate again")
+    images = at_known_markers(calibration, marker, at_rest.s)
+    mm = resting_error_mm(calibration, at_rest.q, at_rest.face, lengths, images)
+    within = "" if mm is None else f", which show the tool within {mm:.2g} mm of where its joints put it"
+    return Finding(FINE, _CALIBRATION, f"agrees with the images{within}")
