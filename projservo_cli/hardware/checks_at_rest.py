@@ -45,9 +45,7 @@ class RobotAtRest:
     face: Sequence[int]  # those that must stay visible
     q: FloatArray  # (n,) mean of the joint readings, rad or m
     s: FloatArray  # (2, m, 2) mean of the pixels, NaN where most frames do not show a marker
-    sigma: (
-        FloatArray | None
-    )  # (2, m) standard deviation of a corner of one frame as the detector states it, px
+    sigma: FloatArray | None  # (2, m) deviation of a corner of one frame as the detector states it, px
     scatter: FloatArray  # (2, m) between frames, px
     limits: JointLimits
     units: Sequence[str]  # of the joints, for messages

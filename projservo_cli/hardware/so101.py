@@ -24,7 +24,6 @@ from projservo_cli.records import FloatArray, InputError, JointLimits, WorkFaile
 TURN = 4096  # counts of a servo in a turn
 MIDDLE = 2048  # count that is read as 0 rad
 COUNT = 2.0 * math.pi / TURN  # rad
-BUILT = {"ids": (1, 2, 3, 4, 5), "gripper": 6}  # of an SO-101
 # Addresses of registers.
 _MODEL, _LOWEST, _OFFSET, _TORQUE, _GOAL, _LOCK, _PRESENT = 3, 9, 31, 40, 42, 55, 56
 _STS3215 = 777  # register 3

@@ -131,7 +131,7 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
     rows = coordinate_rows(np.flatnonzero(left))
     P, r, r_joints = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows], by_joints.r[rows]
     F = np.eye(2)[rows % 2] * (rows < len(at.r) // 2)[:, None]
-    covariance: FloatArray = np.linalg.inv(F.T @ P @ F)
+    covariance: FloatArray = np.asarray(np.linalg.inv(F.T @ P @ F), dtype=np.float64)
     shift = covariance @ F.T @ P @ r
     joints = np.linalg.solve(_free(by_joints, by_joints.F[:, :n])[np.ix_(rows, rows)], r_joints)
     # χ² of the shift, of what is left, and of that where joints show it best, over their limits.
