@@ -244,7 +244,7 @@ def invariant_rotations(actions: FloatArray) -> FloatArray:
 
     The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane. If
     few joints leave it open, it is the one nearest to the identity, which serves these joints as well.
-    ``metric.frame.invariant_upgrade`` takes no such joints, but many calibrations at once. The last bits there
+    ``metric.frame.invariant_upgrade`` takes no such joints, but many calibrations at once. Its last bits
     decide signs of what a calibration leaves open, and those here the joint steps near a singularity.
 
     Raises WorkFailed if the joints preserve no metric.
