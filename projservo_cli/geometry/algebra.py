@@ -195,7 +195,7 @@ def as_array(H: Mat4) -> FloatArray:
 
 
 @njit
-def wrapped(theta: float) -> float:
+def wrapped_angle(theta: float) -> float:
     """Equal angle in (−π, π], rad."""
     turns = math.floor((theta + math.pi) / (2.0 * math.pi))
     angle = theta - 2.0 * math.pi * turns
@@ -218,4 +218,4 @@ def incidence_angles(p_0: float, p_s: float, p_c: float) -> tuple[bool, float, f
         return False, 0.0, 0.0
     middle = math.atan2(p_s, p_c)
     spread = math.acos(-p_0 / amplitude)
-    return True, wrapped(middle + spread), wrapped(middle - spread)
+    return True, wrapped_angle(middle + spread), wrapped_angle(middle - spread)

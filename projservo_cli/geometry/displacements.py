@@ -239,34 +239,22 @@ def rigid_inverse(T: FloatArray) -> FloatArray:
     return result
 
 
-def symmetric(coefficients: FloatArray) -> FloatArray:
-    """Symmetric forms (…, 3, 3) by their coefficients (…, 6) in an orthonormal basis."""
-    return np.asarray(np.einsum("...s,sab->...ab", coefficients, _SYMMETRIC))
-
-
-def invariant_forms(actions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Orthonormal coefficients (…, 6, 6) of forms Q, by how much actions L (…, n, 3, 3) change them.
-
-    The change is LᵀQ + QL, of all actions together; its sizes (…, 6) come with them, largest first.
-    """
-    changes = np.einsum("...nba,sbc->...snac", actions, _SYMMETRIC)
-    changes = changes + np.einsum("sab,...nbc->...snac", _SYMMETRIC, actions)
-    changes = changes.reshape(*actions.shape[:-3], 6, -1).swapaxes(-1, -2)
-    _, sizes, rows = np.linalg.svd(changes)
-    return sizes, rows
-
-
 def invariant_rotations(actions: FloatArray) -> FloatArray:
     """Three rotations (3, 3, 3) of the plane at infinity, per rad, in the metric that all joints preserve.
 
     The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane. If
     few joints leave it open, it is the one nearest to the identity, which serves these joints as well.
+    ``metric.frame.invariant_upgrade`` takes no such joints, but many calibrations at once. Its last bits
+    decide signs of what a calibration leaves open, and those here the joint steps near a singularity.
 
     Raises WorkFailed if the joints preserve no metric.
     """
-    sizes, rows = invariant_forms(actions)
+    changes = np.einsum("nba,sbc->nsac", actions, _SYMMETRIC) + np.einsum(
+        "sab,nbc->nsac", _SYMMETRIC, actions
+    )
+    _, sizes, rows = np.linalg.svd(np.swapaxes(changes, 0, 1).reshape(6, -1).T)
     kept = rows[sizes <= _INVARIANT * max(sizes[0], 1.0)]
-    Q = symmetric(kept.T @ (kept @ np.einsum("saa->s", _SYMMETRIC)))
+    Q = np.einsum("s,sab->ab", kept.T @ (kept @ np.einsum("saa->s", _SYMMETRIC)), _SYMMETRIC)
     if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
         raise WorkFailed(
             "the joints preserve no metric of the calibrated frame: calibrate again, or measure point by "

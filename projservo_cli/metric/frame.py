@@ -22,11 +22,9 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.geometry.displacements import (
     carried_screws,
     homogeneous,
-    invariant_forms,
     rigid_inverse,
     screw_displacements,
     screws,
-    symmetric,
     twists,
 )
 from projservo_cli.geometry.lens import TERMS, distort, undistort
@@ -117,10 +115,15 @@ def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
     U = np.linalg.svd(np.concatenate(np.moveaxis(H_hat, -3, 0), axis=-1))[0]
     D, a_inf = U[..., :3].swapaxes(-1, -2), U[..., 3]
     L = (D[..., None, :, :] @ H_hat @ D.swapaxes(-1, -2)[..., None, :, :])[..., turning, :, :]
-    sizes, rows = invariant_forms(np.swapaxes(L, -1, -2))
+    i, j = np.triu_indices(3)
+    basis = np.zeros((6, 3, 3))
+    basis[range(6), i, j] = basis[range(6), j, i] = np.where(i == j, 1.0, np.sqrt(0.5))
+    moved = np.einsum("...nab,sbc->...nacs", L, basis)
+    changes = (moved + np.einsum("...nacs->...ncas", moved)).reshape(*L.shape[:-3], -1, 6)
+    _, sizes, rows = np.linalg.svd(changes)
     if (sizes[..., 4] < _SECOND_FORM * sizes[..., 0]).any():
         raise InputError(_ALL_PARALLEL)
-    S = symmetric(rows[..., 5, :])
+    S = np.einsum("...s,sab->...ab", rows[..., 5, :], basis)
     S *= np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None]
     try:
         A = np.linalg.cholesky(S)

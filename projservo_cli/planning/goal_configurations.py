@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, sub, vec, vec_into, wrapped
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, sub, vec, vec_into, wrapped_angle
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import row_into, solve_normal
 from projservo_cli.geometry.kinematics import forward, image_motion, operators_at
@@ -228,7 +228,7 @@ def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bo
         for i in range(q.shape[0]):
             off = q[i] - base[g, i]
             if not c.model.prismatic[i]:
-                off = wrapped(off)
+                off = wrapped_angle(off)
             maximum = max(maximum, abs(off))
         if maximum <= _DISTINCT:
             return True

@@ -69,7 +69,7 @@ def test_dh_tables_of_both_conventions(convention, rng):
     robot = dh_robot(convention)
     for q in (np.zeros(6), *rng.uniform(-2, 2, (5, 6))):
         assert robot.pose(q) == pytest.approx(chain(q, convention == "modified"), abs=1e-13)
-    assert robot.joint_types.tolist() == [0, 0, 1, 0, 0, 0]
+    assert robot.prismatic.tolist() == [0, 0, 1, 0, 0, 0]
     assert robot.limits.lower == pytest.approx([*np.radians([-3, -3]), -3, *np.radians([-3, -3, -3])])
 
 
