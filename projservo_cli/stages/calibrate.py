@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli.calibration import Nominal, Solution, calibrate, cross_validate
-from projservo_cli.calibration.screening import screened
-from projservo_cli.calibration.undecided import undecided_pairs
+from projservo_cli.calibration.checks.screening import screened
+from projservo_cli.calibration.checks.undecided import undecided_pairs
 from projservo_cli.files import write_whole
 from projservo_cli.image_size import image_sizes
 from projservo_cli.nominal import read_nominal
