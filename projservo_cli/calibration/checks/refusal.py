@@ -14,15 +14,12 @@ from projservo_cli.calibration.checks.validation import cross_validate
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.fit import (
-    OPEN_DIRECTION,
     Expected,
     Solution,
     fit_from,
 )
 from projservo_cli.calibration.initialization import Search, starting_markers, starts
 from projservo_cli.calibration.lens_estimation import undistorted
-from projservo_cli.calibration.prediction import CAMERA
-from projservo_cli.geometry.rigid import cross_matrix
 from projservo_cli.records import VIEWS, BoolArray, FloatArray, WorkFailed
 
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
@@ -38,8 +35,6 @@ _MAX_UNEXPLAINED = 0.02
 _MIN_OF_POSE = 0.25
 # Minimum number of observations of one pose whose agreement on joints is more than chance.
 _AGREEING = 5
-# Maximum number of markers in the estimate of noise at free poses.
-_FREED = 150
 # Share of the poses that show another motion above which the joint readings are wrong.
 _MANY_POSES = 0.4
 # Number of hypotheses about a joint at fault that are fitted completely.
@@ -63,7 +58,7 @@ _NEARLY_ALL, _WRONG_RUN = 0.9, 5
 _MOVED, _WRONG_POSES, _WRONG_SHARE = 0.1, 3, 0.5
 # Maximum share of the other poses that is rejected there, over that of these.
 _OTHERS_SHARE = 0.25
-# Maximum noise of such a fit over that of bodies that move freely, beyond which no error of it is stated.
+# Maximum noise of such a fit over that of the rig, beyond which no error of it is stated.
 _CONTRADICTED_RATIO = 1.5
 # Maximum held-out over predicted error of a fit that rejects much.
 _DOUBTED_ERROR = 1.3
@@ -120,40 +115,6 @@ def describe_other_motion(solution: Solution, found: Outliers, epipolar: Epipola
         f"{count} of {total} observations, at {poses} of {seen} poses, show other joints than those read; "
         "check how poses and images are paired, and the joint readings and types (R or P)"
     )
-
-
-def _noise_at_free_poses(solution: Solution) -> float:
-    """Noise per coordinate, px, of a fit in which the body moves freely to each pose.
-
-    Errors of joints have no part in it: to first order it removes from the residuals everything that
-    cameras, markers and rigid motions of the poses can undo, hence any motion of a robot.
-    """
-    solution = solution.kept().thinned(_FREED)
-    problem, detections, used = solution.problem, solution.problem.detections, solution.used[..., None, None]
-    (K, m), N = (len(problem.q), detections.marker.size), detections.pose_of.size
-    images = solution.params.images(problem.joints(solution.params), detections.pose_of, detections.marker_of)
-    points = images.points[0][:, :3]
-    turned = cross_matrix(np.median(points, axis=0) - points)  # about the middle, negative
-    J, by_place = problem.derivative(solution.params), images.by_point[0][..., :3]
-    by_motion = np.concatenate([by_place @ turned, by_place], axis=3) * detections.weight[..., None, None]
-    X = np.zeros((2, N, 2, 2 * CAMERA + 3 * m + 6 * K))
-    for v in (0, 1):
-        X[v, ..., v * CAMERA : (v + 1) * CAMERA] = J[v, ..., :CAMERA]
-    for block, values, first in (
-        (detections.marker_of, J[..., -3:], 2 * CAMERA),
-        (detections.pose_of, by_motion, 2 * CAMERA + 3 * m),
-    ):
-        width = values.shape[-1]
-        columns = first + width * block[:, None, None] + np.arange(width)
-        np.put_along_axis(X, np.broadcast_to(columns, values.shape), values, axis=3)
-    rows = (X * used).reshape(4 * N, -1)
-    rows /= np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-    left = (solution.residual * used[..., 0]).ravel()
-    squares, basis = np.linalg.eigh(rows.T @ rows)
-    known = squares > OPEN_DIRECTION * squares[-1]
-    explained = (basis[:, known].T @ (rows.T @ left)) ** 2 / squares[known]
-    dof = 2 * int(np.count_nonzero(solution.used)) - int(np.count_nonzero(known))
-    return float(np.sqrt(max(left @ left - explained.sum(), 0.0) / max(dof, 1)))
 
 
 def straight_joints(solution: Solution) -> list[int]:
@@ -331,21 +292,18 @@ def contradiction(
 ) -> str:
     """Describe evidence against a fit that rejects much, and a remedy; empty if there is none.
 
-    The noise is that of the images, whatever was given. A fit that leaves more than the noise of the rig must
-    leave no more than bodies that move freely, as slipping points do, and the rejected detections must agree
-    on no other motion.
+    The noise is that of the images, whatever was given. Of a fit that leaves more than the noise of the rig
+    the rejected detections must agree on no other motion.
     """
     if solution.used.sum() < _KEPT * whole.problem.detections.seen.sum():
         return "that is most of them; remove markers that are not on the robot, and check the joint readings"
-    if solution.sigma_px > DOUBTED_RATIO * epipolar.noise_px:
-        ratio = solution.sigma_px / max(epipolar.noise_px, _noise_at_free_poses(solution))
-        if ratio > _CONTRADICTED_RATIO:
-            return (
-                f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types "
-                "(R or P)"
-            )
-        if other := describe_other_motion(solution, found, epipolar):
-            return other
+    ratio = solution.sigma_px / epipolar.noise_px
+    if ratio > _CONTRADICTED_RATIO:
+        return (
+            f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types (R or P)"
+        )
+    if ratio > DOUBTED_RATIO and (other := describe_other_motion(solution, found, epipolar)):
+        return other
     held_out = cross_validate(solution.kept(), solution.sigma_px, _PARTS, 0, blocks=False)
     rms, predicted = held_out.rms_px, held_out.predicted_rms_px
     if held_out.failed or rms is None or predicted is None:
