@@ -9,13 +9,13 @@ from typing import Any, Literal, NamedTuple, Self, cast, overload
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.calibration.checks.validation import residual_statistics
 from projservo_cli.calibration.prediction import (
     error_factor,
     error_factor_with_model,
     joint_derivative,
     predict,
     prediction_variance,
-    residual_statistics,
 )
 from projservo_cli.display import Displayable, Printed, numbers_in, require_radians, xarray
 from projservo_cli.files import bytes_of

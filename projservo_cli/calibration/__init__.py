@@ -1,21 +1,20 @@
 """Projective kinematics from stereo images of trial motions: [RH00] section 2.
 
-``estimate`` runs the steps: pixels (``detections``), geometry of the rig (``epipolar``), equal numbers in
-both views (``numbering``), initial parameters (``initialization``), robust bundle adjustment (``fit``,
-``adjustment``), outliers (``diagnosis``), frame and covariance (``projective``), deviations from the model
-(``model_error``), assessment (``quality``). ``prediction`` has the forward model, and predicts images and
-their errors from the result. ``screening`` comes before, ``undecided`` after.
+``estimate`` runs the steps: pixels (``detections``), geometry of the rig (``epipolar``), initial parameters
+(``initialization``), robust bundle adjustment (``fit``, ``adjustment``), frame and covariance
+(``projective``), with the ``checks`` of the data before and of the fit after. ``prediction`` has the forward
+model, and predicts images and their errors from the result.
 """
 
+from projservo_cli.calibration.checks.quality import WEAK_NOISE
+from projservo_cli.calibration.checks.validation import cross_validate, residual_statistics
 from projservo_cli.calibration.estimate import calibrate
 from projservo_cli.calibration.fit import Solution, chi2_band
 from projservo_cli.calibration.initialization import Nominal
 from projservo_cli.calibration.prediction import (
     predict,
     prediction_variance,
-    residual_statistics,
 )
-from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate
 
 __all__ = [
     "WEAK_NOISE",

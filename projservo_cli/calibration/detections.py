@@ -52,6 +52,8 @@ _MAX_WRONG = 0.1
 # Probability that noise alone puts the markers of an image farther off their best line.
 _OFF_LINE_TAIL = 0.1
 ON_A_LINE = "the markers lie on one line: a turn about it shows in no image; add a marker off the line"
+# Difference of joint readings, rad or m, below which they are equal: a robot holds a joint with jitter.
+SAME_READING = 2e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,18 +12,28 @@ from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.detections import Detections, require_images, require_motion
-from projservo_cli.calibration.diagnosis import (
+from projservo_cli.calibration.checks.model_error import ModelCheck
+from projservo_cli.calibration.checks.numbering import epipolar_geometry
+from projservo_cli.calibration.checks.outliers import (
     Outliers,
     describe_moved,
-    describe_other_motion,
-    describe_unexplained,
-    joint_at_fault,
-    noise_at_free_poses,
     outlier_rows,
     rejection_reasons,
+)
+from projservo_cli.calibration.checks.quality import WEAK_NOISE, assess
+from projservo_cli.calibration.checks.refusal import (
+    DOUBTED_RATIO,
+    MUCH,
+    contradiction,
+    describe_other_motion,
+    describe_unexplained,
+    deviation,
+    joint_at_fault,
+    refusal,
     straight_joints,
 )
+from projservo_cli.calibration.checks.undecided import require_poses
+from projservo_cli.calibration.detections import Detections, require_images, require_motion
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import (
     CHECK_READINGS,
@@ -36,16 +46,12 @@ from projservo_cli.calibration.fit import (
 )
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
-from projservo_cli.calibration.model_error import ModelCheck, describe, stepped
-from projservo_cli.calibration.numbering import epipolar_geometry
 from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.projective import Projective, closed_form_operators
-from projservo_cli.calibration.quality import WEAK_NOISE, assess, check_model, cross_validate
 from projservo_cli.calibration.time_offset import with_time_offset
-from projservo_cli.calibration.undecided import require_poses
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import ImageSize, border_distance, image_sizes
-from projservo_cli.records import VIEWS, BoolArray, Calibration, Errors, InputError, Observation, letters_of
+from projservo_cli.records import VIEWS, Calibration, Errors, InputError, Observation, letters_of
 
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
@@ -58,25 +64,6 @@ _AS_GOOD = 1.05
 _DECISIVE_SHARE = 0.5
 # Probability that noise alone exceeds the estimated coefficients of a lens without distortion.
 _NO_LENS_TAIL = 0.01
-# Minimum share that a fit keeps of the motion of each joint and, if it rejects much, of the detections.
-_KEPT = 0.5
-# Poses in a row of which this share, and this number, are rejected at least where something changed.
-_NEARLY_ALL, _WRONG_RUN = 0.9, 5
-# Joints that are farther than this share of their range from the median have moved; so many poses in which
-# several did, and this share of them, are rejected at least where readings are in the wrong order.
-_MOVED, _WRONG_POSES, _WRONG_SHARE = 0.1, 3, 0.5
-# Maximum share of the other poses that is rejected there, over that of these.
-_OTHERS_SHARE = 0.25
-# Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
-_DOUBTED_RATIO = 1.15
-# Maximum noise of such a fit over that of bodies that move freely, beyond which no error of it is stated.
-_CONTRADICTED_RATIO = 1.5
-# Maximum held-out over predicted error of a fit that rejects much.
-_DOUBTED_ERROR = 1.3
-# Number of parts in the cross-validation of a fit that rejects much.
-_PARTS = 3
-# Share of rejected detections, explained ones apart, above which a fit rejects much.
-_MUCH = 0.1
 # Share of rejected detections, explained ones included, above which a fit rejects much.
 _MAX_REJECTED = 0.4
 # Maximum share of the pixels of a view outside its image, as outliers may be.
@@ -278,26 +265,21 @@ def _refined(
     share = share_explained(whole, frame)
     solution, kept = whole.determined()
     try:
-        refusal = expected.refusal(solution)
-        if refusal is None:
-            rejected = _rejected_views(solution)
-            refusal = _change(rejected)[1] or _describe_order(solution, rejected)
-            refusal = refusal or _describe_unmoved(solution)
-        if refusal is not None:
-            raise Misfit(refusal)
+        if (why := refusal(solution, expected)) is not None:
+            raise Misfit(why)
         found = Outliers.of(solution)
         doubt = describe_unexplained(solution, found, epipolar)
         kept_by = np.sum([solution.used | found.explained, solution.used], axis=(1, 2))
         out, gone = 1.0 - kept_by / whole.problem.detections.seen.sum()
-        much = bool(doubt) or out > _MUCH or gone > _MAX_REJECTED
+        much = bool(doubt) or out > MUCH or gone > _MAX_REJECTED
         suspicion = "lens" if share else "joint readings"
-        if much and not share and solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:  # not the joints
+        if much and not share and solution.sigma_px > DOUBTED_RATIO * epipolar.noise_px:  # not the joints
             suspicion = "outliers"
         require_poses(solution.kept().problem.detections)
         errors = solution.errors()
         record = _record(Projective.of(solution), solution, expected, errors, found, suspicion, limit_px)
         if much:
-            why = _contradiction(whole, solution, found, epipolar, record.predicted_rms_px or 0.0)
+            why = contradiction(whole, solution, found, epipolar, record.predicted_rms_px or 0.0)
             if why or (doubt and share >= _DECISIVE_SHARE):
                 summary = f"{100.0 * gone:.0f} % of the detections do not fit it, and {why}"
                 summary = describe_other_motion(solution, found, epipolar) or doubt or summary
@@ -305,7 +287,7 @@ def _refined(
     except Misfit as refused:
         if share >= _DECISIVE_SHARE:
             hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
-        elif not (hint := _deviation(solution, expected)):
+        elif not (hint := deviation(solution, expected)):
             raise
         raise Misfit(f"{str(refused).removesuffix(CHECK_READINGS)}; {hint}") from None
     lens = _lens_advice(record, share, frame.known)
@@ -323,110 +305,6 @@ def _refined(
     lost = rejection_reasons(whole, kept)
     lost[:, 0] = detections.marker[lost[:, 0]]
     return dataclasses.replace(record, outlier=outlier, rejected_markers=lost, advice=(*advice, seldom))
-
-
-def _deviation(solution: Solution, expected: Expected) -> str:
-    """Describe the deviation from the model that explains most of a fit that is refused; else empty."""
-    if expected.known or solution.dof <= 0:
-        return ""
-    errors = check_model(solution, solution.errors(), expected.noise_px(solution)).errors
-    onset, prismatic = _change(_rejected_views(solution))[0], solution.params.prismatic
-    if not onset and errors and errors[0].first is not None:
-        onset = int(np.argmax(solution.problem.detections.pose == errors[0].first))
-    found = (stepped(solution, onset) if onset else None) or next(iter(errors), None)
-    return "" if found is None else f"the residuals look as if {describe(found, prismatic)[1]}"
-
-
-def _describe_unmoved(solution: Solution) -> str | None:
-    """Describe a joint whose motion is mostly rejected, as with a wrong type or wrong readings, or None."""
-    detections = solution.problem.detections
-    kept = np.unique(detections.pose_of[solution.used.any(axis=0)])
-    square = (detections.q - detections.q.mean(axis=0)) ** 2
-    short = square[kept].sum(axis=0) < _KEPT * square.sum(axis=0)
-    if not short.any():
-        return None
-    i = int(np.argmax(short))
-    return f"the fit rejects most motion of joint {i + 1}; check its readings and its type (R or P)"
-
-
-def _rejected_views(solution: Solution) -> BoolArray:
-    """Whether a view (2, K) of a pose is mostly rejected."""
-    detections = solution.problem.detections
-    seen, used = np.zeros((2, 2, len(detections.q)))
-    for view in (0, 1):
-        np.add.at(seen[view], detections.pose_of, detections.seen[view])
-        np.add.at(used[view], detections.pose_of, solution.used[view])
-    return np.asarray(used < _KEPT * seen)
-
-
-def _change(rejected: BoolArray) -> tuple[int, str]:
-    """Row from or up to which poses are nearly all rejected, and a sentence on it; 0 and none without.
-
-    rejected : (2, K) views of poses that mostly are.
-    """
-    views = [
-        ("", rejected.all(axis=0)),
-        *((f" in the {name} view", rejected[v]) for v, name in enumerate(VIEWS)),
-    ]
-    for where, gone in views:
-        for which, row in (("first", gone), ("last", gone[::-1])):
-            share = np.cumsum(row) / np.arange(1, len(row) + 1)
-            count = int(np.flatnonzero(row & (share >= _NEARLY_ALL)).max(initial=-1)) + 1
-            if max(_WRONG_RUN, _MUCH * len(row)) <= count < len(row):
-                return count if which == "first" else len(row) - count, (
-                    f"the fit rejects nearly all of the {which} {count} poses{where}: the base, a camera, "
-                    "the tool or the readings of joints changed there; record again, or remove these poses"
-                )
-    return 0, ""
-
-
-def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:
-    """Describe poses of several joints that are rejected where those of one are not, or None.
-
-    One joint at a time moves alike whichever column its readings are in: only together they show the order.
-    rejected : (2, K) views of poses that mostly are.
-    """
-    detections, lost = solution.problem.detections, rejected.all(axis=0)
-    away = np.abs(detections.q - np.median(detections.q, axis=0)) > _MOVED * np.ptp(detections.q, axis=0)
-    several = away.sum(axis=1) > 1
-    wrong, alone = np.count_nonzero(several & lost), np.count_nonzero(~several & lost)
-    count, others = several.sum(), np.count_nonzero(~several)
-    few = wrong < max(_WRONG_POSES, _WRONG_SHARE * count)
-    if few or alone * count > _OTHERS_SHARE * wrong * others:
-        return None
-    return (
-        f"the fit rejects {wrong} of the {count} poses in which several joints move, and {alone} of the "
-        f"{others} others; check the order of the joints (q1, q2, ...) and the readings of these poses"
-    )
-
-
-def _contradiction(
-    whole: Solution, solution: Solution, found: Outliers, epipolar: Epipolar, stated_px: float
-) -> str:
-    """Describe evidence against a fit that rejects much, and a remedy; empty if there is none.
-
-    The noise is that of the images, whatever was given. A fit that leaves more than the noise of the rig must
-    leave no more than bodies that move freely, as slipping points do, and the rejected detections must agree
-    on no other motion.
-    """
-    if solution.used.sum() < _KEPT * whole.problem.detections.seen.sum():
-        return "that is most of them; remove markers that are not on the robot, and check the joint readings"
-    if solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:
-        ratio = solution.sigma_px / max(epipolar.noise_px, noise_at_free_poses(solution))
-        if ratio > _CONTRADICTED_RATIO:
-            return (
-                f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types "
-                "(R or P)"
-            )
-        if other := describe_other_motion(solution, found, epipolar):
-            return other
-    held_out = cross_validate(solution.kept(), solution.sigma_px, _PARTS, 0, blocks=False)
-    rms, predicted = held_out.rms_px, held_out.predicted_rms_px
-    if held_out.failed or rms is None or predicted is None:
-        return "the rest does not predict held-out poses; record more poses and more markers"
-    if rms > _DOUBTED_ERROR * np.hypot(predicted, stated_px):
-        return "the rest does not predict held-out poses; record more poses and more markers"
-    return ""
 
 
 def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tuple[str, ...]:

@@ -4,18 +4,14 @@ It has the equations of the kernels in ``geometry`` for all poses and points tog
 predictions and random tasks.
 """
 
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.detections import Detections, per_rad
-from projservo_cli.calibration.epipolar import Epipolar
-from projservo_cli.calibration.screening import without_placeholders
 from projservo_cli.geometry.displacements import displacements, sine_and_versine
-from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible, undistort
+from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible
 from projservo_cli.records import (
     BoolArray,
     Calibration,
@@ -23,8 +19,6 @@ from projservo_cli.records import (
     FloatArray,
     InputError,
     IntArray,
-    Observation,
-    WorkFailed,
     apart,
 )
 
@@ -32,10 +26,6 @@ from projservo_cli.records import (
 CAMERA = 12
 # Number of parameters of a lens about a given image centre, k1 and k2; two more are its centre.
 LENS = 2
-# Median held-out error, in the stated error and the noise of the images together, from which it contradicts.
-_CONTRADICTED = 3.0
-# Minimum number of correspondences whose epipolar geometry determines their noise within a seventh.
-_NOISE_PAIRS = 32
 
 
 def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
@@ -217,78 +207,6 @@ def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
     """
     params, q = _checked(calibration, q)
     return params.predict(q)
-
-
-def residual_statistics(calibration: Calibration, observation: Observation) -> dict[str, Any]:
-    """Statistics of the distance between predicted and seen pixels, one for each marker and view.
-
-    calibration : projective kinematics.
-    observation : stereo images of the same robot, px; poses in motion do not count.
-    Returns ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``stated_px``, the median
-    error that the covariance states at these readings, ``noise_px`` of these images and readings, and
-    ``limit_px`` of the median by both (None without a covariance); ``skipped``, the numbers of pairs of
-    unknown markers, behind the camera, and missing; ``advice`` about placeholders, which are missing ones.
-    Raises InputError if the readings have another number of joints or are not finite.
-    """
-    observation = observation.at_rest
-    images, advice = without_placeholders(observation.images)
-    observation = replace(observation, images=images)
-    known = np.isin(observation.marker, calibration.marker)
-    numbers = calibration.marker.tolist()
-    order = [numbers.index(number) for number in observation.marker[known].tolist()]
-    pixels = predict(calibration, observation.q)[:, :, order]
-    seen: BoolArray = np.asarray(np.isfinite(images).all(axis=-1))
-    ahead = np.isfinite(pixels[..., 0])
-    compared = seen[:, :, known] & ahead
-    off = (pixels - observation.images[:, :, known])[compared]
-    statistics = distance_statistics(np.linalg.norm(off, axis=1))
-    stated = noise = limit = None
-    if statistics["count"] and np.isfinite(calibration.sqrt_cov_shared).all():
-        of_pairs = prediction_variance(calibration, observation.q).sum(axis=-1)[:, :, order][compared]
-        stated, noise = float(np.sqrt(np.median(of_pairs))), _image_noise(calibration, observation)
-        if sigma_q := calibration.sigma_q:  # these readings have their own noise
-            J = joint_derivative(calibration, observation.q)[:, :, order] * per_rad(calibration.prismatic)
-            noise = float(np.hypot(noise, sigma_q * np.sqrt(np.median((J**2).sum(axis=(-2, -1))[compared]))))
-        limit = _CONTRADICTED * float(np.hypot(stated, noise))
-    return statistics | {
-        "stated_px": stated,
-        "noise_px": noise,
-        "limit_px": limit,
-        "skipped": {
-            "unknown_marker": int(seen[:, :, ~known].sum()),
-            "behind_camera": int((seen[:, :, known] & ~ahead).sum()),
-            "missing": int((~seen).sum()),
-        },
-        "advice": list(advice),
-    }
-
-
-def _image_noise(calibration: Calibration, observation: Observation) -> float:
-    """Euclidean noise of the pixels of an observation, px, by its own epipolar geometry.
-
-    That of the calibration where few markers were seen by both cameras, or without parallax.
-    """
-    detections = Detections.of(observation, calibration.joint_types)
-    if calibration.lens is not None:
-        straight = undistort(calibration.lens, detections.pixels)
-        seen = detections.seen & np.isfinite(straight).all(axis=2)
-        detections = replace(detections, pixels=np.where(seen[..., None], straight, 0.0), seen=seen)
-    sigma = calibration.sigma_px
-    if np.count_nonzero(detections.both) >= _NOISE_PAIRS:
-        with suppress(WorkFailed):
-            sigma = Epipolar.of(detections, np.random.default_rng(0)).sigma_px
-    return float(np.sqrt(2.0)) * sigma
-
-
-def distance_statistics(distance: FloatArray) -> dict[str, Any]:
-    """``count``, ``rms_px``, ``median_px``, ``p95_px`` of distances (L,), the last three None without one."""
-    some = distance.size > 0
-    return {
-        "count": int(distance.size),
-        "rms_px": float(np.sqrt(np.mean(distance**2))) if some else None,
-        "median_px": float(np.median(distance)) if some else None,
-        "p95_px": float(np.percentile(distance, 95)) if some else None,
-    }
 
 
 def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:

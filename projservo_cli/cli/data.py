@@ -297,7 +297,7 @@ def _validate(
         raise click.UsageError("validate needs --data TABLE, or else --metric TABLE")
     if data is not None and metric is not None:
         raise click.UsageError("--data and --metric: validate takes one of them; leave the other out")
-    from projservo_cli.calibration.prediction import residual_statistics
+    from projservo_cli.calibration.checks.validation import residual_statistics
     from projservo_cli.config import load_config
     from projservo_cli.records import WorkFailed
     from projservo_cli.store import load

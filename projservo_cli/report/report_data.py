@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.calibration.model_error import describe
+from projservo_cli.calibration.checks.model_error import describe
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.metric.frame import Metric

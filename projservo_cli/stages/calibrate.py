@@ -6,12 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.calibration.estimate import calibrate
-from projservo_cli.calibration.fit import Solution
-from projservo_cli.calibration.initialization import Nominal
-from projservo_cli.calibration.quality import cross_validate
-from projservo_cli.calibration.screening import screened
-from projservo_cli.calibration.undecided import undecided_pairs
+from projservo_cli.calibration import Nominal, Solution, calibrate, cross_validate
+from projservo_cli.calibration.checks.screening import screened
+from projservo_cli.calibration.checks.undecided import undecided_pairs
 from projservo_cli.files import write_whole
 from projservo_cli.image_size import image_corners, image_sizes
 from projservo_cli.nominal import read_nominal

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate, predict
-from projservo_cli.calibration.model_error import describe
+from projservo_cli.calibration.checks.model_error import describe
 from projservo_cli.records import ModelError, Observation, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -117,7 +117,7 @@ def test_a_large_effect_is_not_usable_until_it_is_accepted():
 
 def test_every_kind_has_words_and_a_code():
     """Sizes are told in per cent, degrees, mm and px, and a code leads back to the record."""
-    from projservo_cli.calibration import model_error
+    from projservo_cli.calibration.checks import model_error
 
     prismatic = np.array([False, True])
     for kind in model_error._SIZES:

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli import Observations, calibrate
 from projservo_cli.calibration import residual_statistics
-from projservo_cli.calibration.screening import screened, without_placeholders
+from projservo_cli.calibration.checks.screening import screened, without_placeholders
 from projservo_cli.records import Observation
 from projservo_cli.report.report_data import findings
 from tests.calibration.simulated_robot import around, random_robot, trials

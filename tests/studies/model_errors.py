@@ -225,7 +225,8 @@ def judged(job):
     # Predictions of the true images, and of what is found in them.
     seen, noise = with_corners(setting.arm, setting.ahead, truth, job.corners, rng)
     scale = 1.0 if sigma is None else np.sqrt(np.mean(sigma[np.isfinite(pixels[..., 0])] ** 2))
-    noise = found.sigma_fitted_px / scale * (np.ones(seen.shape[:3]) if sigma is None else noise)
+    of_images = max(found.sigma_px, found.sigma_fitted_px) / scale
+    noise = of_images * (np.ones(seen.shape[:3]) if sigma is None else noise)
     spread = np.sqrt(variance + noise[:, :, found.marker, None] ** 2)
     each = {"true": error[visible] / np.sqrt(variance[visible])}
     each["seen"] = ((images - seen[:, :, found.marker]) / spread)[visible]

@@ -24,7 +24,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.special import fdtrc
 
 from projservo_cli.calibration.adjustment import LeastSquares, minimize
-from projservo_cli.calibration.detections import Detections, per_rad
+from projservo_cli.calibration.detections import SAME_READING, Detections, per_rad
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.prediction import LENS, Images, Parameters
 from projservo_cli.geometry.displacements import cross_matrix
@@ -48,8 +48,6 @@ _ROUNDS = 2
 _DETECTED = 3.9
 # Standard deviations of a variance ratio above which postures share errors.
 _CORRELATED = 3.9
-# Difference of joint readings, rad or m, below which poses are one posture, as of a joint held with jitter.
-_SAME_POSTURE = 2e-3
 # Deviation of an amplitude, in the units of ``_SIZES``, above which the data leave it open.
 _OPEN = 30.0
 # Minimum number of poses before and after a marker slips, and difference of the shares of rejected images.
@@ -442,7 +440,7 @@ def _postures(q: FloatArray) -> IntArray:
     """Number the posture of each pose (K, n), rad or m: poses that are nearly the same share one."""
     if len(q) < 2:
         return np.zeros(len(q), dtype=np.int64)
-    groups = fcluster(linkage(q, "single", "chebyshev"), _SAME_POSTURE, "distance")
+    groups = fcluster(linkage(q, "single", "chebyshev"), SAME_READING, "distance")
     return np.asarray(groups - 1, dtype=np.int64)
 
 

@@ -12,7 +12,7 @@ from itertools import combinations, product
 import numpy as np
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.detections import MIN_MOTION, Detections
+from projservo_cli.calibration.detections import MIN_MOTION, SAME_READING, Detections
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.records import FloatArray, IntArray, WorkFailed
@@ -21,8 +21,6 @@ from projservo_cli.records import FloatArray, IntArray, WorkFailed
 _DECISIVE = 100.0
 # Maximum number of markers in the comparison, and of joints between two of which every part is tried.
 _MARKERS, _BETWEEN = 24, 8
-# Difference of readings, rad or m, below which two poses are one: a robot holds a joint with jitter.
-_SAME_POSE = 1e-3
 # Numbers of a rigid motion from one pose to another, of a revolute joint and of a prismatic one.
 _OF_MOTION, _OF_REVOLUTE, _OF_PRISMATIC = 6, 4, 2
 # Numbers to spare for each joint, as trials of single joints have them, up to those of a motion.
@@ -94,7 +92,7 @@ def require_poses(detections: Detections) -> None:
     of five poses of a UR5 six predicted images 18 to 40 times worse than stated. With one motion to spare 1
     of 120 was beyond 3 times. Raises WorkFailed with both numbers and the number of poses to record.
     """
-    q, n = np.round(detections.q[np.unique(detections.pose_of)] / _SAME_POSE), detections.prismatic.size
+    q, n = np.round(detections.q[np.unique(detections.pose_of)] / SAME_READING), detections.prismatic.size
     for i, j in sorted(combinations(range(n + 1), 2), key=lambda ends: ends[0] - ends[1]):
         poses, own = len(np.unique(q[:, i:j], axis=0)), _OF_REVOLUTE * (j - i)
         own -= (_OF_REVOLUTE - _OF_PRISMATIC) * int(detections.prismatic[i:j].sum())

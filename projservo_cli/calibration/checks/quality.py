@@ -1,14 +1,13 @@
 """Quality of a calibration: observability of joints, the verdict in words, and cross-validation."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.checks.model_error import ModelCheck, describe, examine
 from projservo_cli.calibration.detections import (
     MAX_JUDGED,
     MAX_REACHES,
@@ -20,23 +19,20 @@ from projservo_cli.calibration.detections import (
     require_motion,
     require_moved,
 )
-from projservo_cli.calibration.fit import WARN_RATIO, Expected, Solution, fit_inliers
+from projservo_cli.calibration.fit import Expected, Solution
 from projservo_cli.calibration.joint_noise import quantile
-from projservo_cli.calibration.model_error import ModelCheck, describe, examine
-from projservo_cli.calibration.prediction import Parameters, distance_statistics
+from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.records import (
     BoolArray,
-    CrossValidation,
     Errors,
     FloatArray,
-    InputError,
     IntArray,
     WorkFailed,
     apart,
 )
 
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is undetermined.
-_UNDETERMINED_NOISE = 1000.0
+UNDETERMINED_NOISE = 1000.0
 # Share of rejected observations above which outliers limit a fit.
 _MAX_OUTLIERS = 0.05
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is poorly observable.
@@ -55,19 +51,8 @@ _FRAMES = 8
 _MIN_REACHES = 0.01
 # Number of bisections of the logarithm of that range, to a twentieth.
 _BISECTIONS = 7
-# Difference of joint readings, rad or m, below which they are equal: a robot holds a joint with jitter.
-_SAME_JOINT = 1e-3
 # Maximum number of deviations from the model that advice names.
 _MAX_NAMED = 3
-# Minimum number of parts in a cross-validation.
-_MIN_FOLDS = 2
-# Divisions of the poses into blocks besides a random one, and the cause of a larger error there.
-_BLOCKS = {"posture": "the model errs between postures", "time": "something changed over the recording"}
-# Held-out over predicted error in blocks, over that of random parts, from which it is named.
-_BLOCK_RATIO = 1.3
-# Minimum number of detections of a marker in the other poses for its prediction.
-_MIN_READINGS = 4
-_OPEN = "the other poses do not determine the robot"
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +245,7 @@ def assess(
             error = (float(np.hypot(factor * error[0], effect)), float(np.hypot(factor * error[1], effect)))
         needed = _needed_spans(uncertainty, spreads)
         i = int(np.argmax(noise))
-        if noise[i] > _UNDETERMINED_NOISE:
+        if noise[i] > UNDETERMINED_NOISE:
             raise WorkFailed(
                 f"joint {i + 1} is not determined: near the reference its predicted images err by "
                 f"{noise[i]:.3g} times the pixel noise; "
@@ -348,193 +333,3 @@ def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
     i = int(np.argmin(motion))
     require_moved(i, float(span[i]), bool(detections.prismatic[i]), float(motion[i]), sigma_px)
     return span
-
-
-def cross_validate(
-    solution: Solution,
-    sigma_px: float,
-    folds: int,
-    seed: int,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    blocks: bool = True,
-) -> CrossValidation:
-    """Predict every pose from a fit to other poses, and the error of the prediction from its covariance.
-
-    Each fit starts from the whole one and converges over its own poses, with its own outliers, so held-out
-    poses influence the start only.
-
-    Parameters
-    ----------
-    solution : fit to all poses.
-    sigma_px : noise per coordinate, px.
-    folds : number of parts to divide the poses into.
-    seed : seed of the division.
-    progress : called after each part with the number done and the total.
-    blocks : whether to divide the poses into blocks of posture and of time too.
-
-    Returns
-    -------
-    Held-out residuals, their statistics and predicted deviations, px.
-
-    Raises
-    ------
-    InputError
-        If there are fewer poses than parts.
-    """
-    detections = solution.problem.detections
-    part, unit = _divide(detections, folds, np.random.default_rng(seed))
-    names = tuple(_BLOCKS) if blocks else ()
-    total, done = folds * (1 + len(names)), 0
-
-    def on_fold() -> None:
-        """Count a part."""
-        nonlocal done
-        done += 1
-        progress(done, total)
-
-    residual, predicted, failed = _of_parts(solution, part, sigma_px, on_fold)
-    distance = np.linalg.norm(residual, axis=3)
-    statistics = distance_statistics(distance[np.isfinite(distance)])
-    expected = _expected_px(predicted)
-    of_blocks: dict[str, Any] = {}
-    for name in names:
-        apart, spread, _ = _of_parts(solution, _blocks(detections, folds, name), sigma_px, on_fold)
-        length = np.linalg.norm(apart, axis=3)
-        of_blocks[f"{name}_rms_px"] = distance_statistics(length[np.isfinite(length)])["rms_px"]
-        of_blocks[f"{name}_predicted_px"] = _expected_px(spread)
-    return CrossValidation(
-        folds=folds,
-        seed=seed,
-        unit=unit,
-        failed=tuple(failed),
-        reason=_describe_held_out(statistics["rms_px"], expected, len(failed), of_blocks),
-        **statistics,
-        predicted_rms_px=expected,
-        pose=detections.pose,
-        fold=part,
-        marker=detections.marker,
-        residual=residual,
-        predicted=predicted,
-        **of_blocks,
-    )
-
-
-def _expected_px(predicted: FloatArray) -> float | None:
-    """Expected distance, px, root mean square, from deviations (…) of coordinates, NaN if there is none."""
-    # Two coordinates a distance.
-    return float(np.sqrt(2.0 * np.nanmean(predicted**2))) if np.isfinite(predicted).any() else None
-
-
-def _blocks(detections: Detections, folds: int, name: str) -> IntArray:
-    """Part (K,) of each pose, -1 without detections: neighbours in time or along the main axis of joints."""
-    present, part = np.unique(detections.pose_of), np.full(len(detections.q), -1, dtype=np.int64)
-    place = np.arange(present.size, dtype=np.float64)
-    if name == "posture":
-        q = detections.q[present] / np.maximum(np.ptp(detections.q[present], axis=0), _SAME_JOINT)
-        place = (q - q.mean(axis=0)) @ np.linalg.svd(q - q.mean(axis=0), full_matrices=False)[2][0]
-    part[present[np.argsort(place, kind="stable")]] = np.arange(present.size) * folds // present.size
-    return part
-
-
-def _of_parts(
-    solution: Solution, part: IntArray, sigma_px: float, on_fold: Callable[[], None]
-) -> tuple[FloatArray, FloatArray, list[str]]:
-    """Residuals of each part (K,) from a fit to the others, their deviations (K, 2, m, 2), and failures."""
-    detections = solution.problem.detections
-    shape = (len(detections.q), 2, detections.marker.size, 2)
-    residual, predicted = np.full(shape, np.nan), np.full(shape, np.nan)
-    failed = []
-    for fold in range(int(part.max()) + 1):
-        try:
-            rows, difference, deviation = _held_out_residuals(solution, part == fold, sigma_px)
-        except WorkFailed as error:
-            failed.append(f"part {fold + 1}: {error}")
-        else:
-            for v in (0, 1):
-                at = np.flatnonzero(rows[v])
-                where = detections.pose_of[at], v, detections.marker_of[at]
-                residual[where], predicted[where] = difference[v, at], deviation[v, at]
-        on_fold()
-    return residual, predicted, failed
-
-
-def _divide(detections: Detections, folds: int, rng: np.random.Generator) -> tuple[IntArray, str]:
-    """Part (K,) of each pose, -1 without detections, and whether poses or configurations were divided.
-
-    Poses that differ in one joint only, as the spins of a tool, share the errors of the others and predict
-    little elsewhere: they stay together unless a part would then be too large, as with trial motions of
-    single joints.
-    """
-    present = np.unique(detections.pose_of)
-    if not _MIN_FOLDS <= folds <= present.size:
-        raise InputError(
-            f"cross-validation in {folds} parts: there are {present.size} poses; "
-            f"choose {_MIN_FOLDS} to {present.size} parts"
-        )
-    q = detections.q[present]
-    changed = (np.abs(q[:, None] - q[None]) > _SAME_JOINT).sum(axis=2)
-    group = np.asarray(connected_components(changed <= 1, directed=False)[1], dtype=np.int64)
-    if np.bincount(group).max() * folds > present.size:
-        group = np.arange(present.size)
-    members = np.bincount(group)
-    size = np.zeros(folds, dtype=np.int64)
-    chosen = np.empty(len(members), dtype=np.int64)
-    for g in rng.permutation(len(members)):
-        chosen[g] = np.argmin(size)
-        size[chosen[g]] += members[g]
-    part = np.full(len(detections.q), -1, dtype=np.int64)
-    part[present] = chosen[group]
-    return part, "poses" if members.max() == 1 else "configurations"
-
-
-def _held_out_residuals(
-    solution: Solution, held_out: BoolArray, sigma_px: float
-) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Residuals of held-out poses (K,) from a fit to the others.
-
-    Returns the detections (2, N) predicted, seen minus predicted (2, N, 2) and its deviation (2, N, 2), px.
-    Raises WorkFailed if the other poses do not determine the robot.
-    """
-    whole, q_reference = solution.problem.detections, solution.problem.q_reference
-    training = whole.of_poses(~held_out)
-    known = training.count_of(training.seen) >= _MIN_READINGS
-    lens = solution.problem.lens_terms
-    tau = solution.problem.tau
-    problem = LeastSquares.of(training.of_markers(known), q_reference, lens).with_noise(tau)
-    require_motion(problem.detections)
-    params = dataclasses.replace(solution.params, M=solution.params.M[known])
-    found = fit_inliers(problem, params, solution.sigma_px)
-    if found is None:
-        raise WorkFailed(_OPEN)
-    found, kept = found.determined()
-    known[known] = kept
-    place = held_out[whole.pose_of] & known[whole.marker_of]
-    test = LeastSquares.of(whole.of_poses(held_out).of_markers(known), q_reference, lens)
-    left, weight = test.residual(found.params), test.detections.weight[..., None]
-    variance = sum((part**2).sum(axis=-1) for part in test.predicted(found.params, found.errors()))
-    # A direction that the other poses leave open keeps its value of the whole fit.
-    if np.sqrt(variance[test.detections.seen].mean()) > _UNDETERMINED_NOISE:
-        raise WorkFailed(_OPEN)
-    if tau is not None:  # joints of a held-out pose have their own noise
-        variance += ((test.joint_derivative(found.params) * tau) ** 2).sum(axis=-1)
-    difference, error = np.zeros((2, *whole.seen.shape, 2))
-    difference[:, place], error[:, place] = -left / weight, sigma_px * np.sqrt(1.0 + variance) / weight
-    return solution.used & place, difference, error
-
-
-def _describe_held_out(
-    rms: float | None, expected: float | None, failed: int, blocks: Mapping[str, Any]
-) -> str:
-    """Describe how the held-out error compares with the predicted one, and where blocks of poses err more."""
-    if rms is None or expected is None:
-        return "no part could be predicted from the others: record more poses"
-    lost = f"; {failed} parts could not be predicted from the others: record more poses" if failed else ""
-    ratio = rms / expected
-    meaning = ""
-    if ratio > WARN_RATIO:
-        meaning = ": the poses disagree by more than noise, as from joint readings or a lens"
-    for name, cause in _BLOCKS.items():
-        apart, predicted = blocks.get(f"{name}_rms_px"), blocks.get(f"{name}_predicted_px")
-        if apart is not None and predicted is not None and apart > _BLOCK_RATIO * max(ratio, 1.0) * predicted:
-            lost += f"; in blocks of {name} {apart / predicted:.3g} times: {cause}"
-    return f"held-out images err {ratio:.3g} times as much as the covariance predicts{meaning}{lost}"

@@ -1,0 +1,220 @@
+"""Diagnosis of outliers: wrong joint readings, exchanged marker numbers, wrong detections, a lens."""
+
+import dataclasses
+import itertools
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
+
+from projservo_cli.calibration.adjustment import LeastSquares, fit_offsets
+from projservo_cli.calibration.checks.model_error import image_motions
+from projservo_cli.calibration.detections import RAYLEIGH, Detections
+from projservo_cli.calibration.epipolar import OUTLIER
+from projservo_cli.calibration.fit import Solution, median_px
+from projservo_cli.calibration.initialization import stationary
+from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray
+
+# Median residual, in σ, below which a corrected joint reading explains a pose.
+_CORRECTED = 3.0
+# Maximum number of observations of a pose in the search for wrong joint readings.
+MAX_OF_POSE = 50
+# Minimum number of detections of a marker to diagnose it.
+_SEEN = 3
+# Minimum share of the detections of an image that are rejected where its camera may have moved.
+_MOSTLY = 0.5
+# Minimum number of detections of such an image: two more than its motion has coordinates, to test it.
+_SEEN_OF_IMAGE = 4
+# Maximum motion of such an image, over the spread of its markers.
+_SMALL_MOTION = 0.1
+# Maximum number of runs of poses that a message names.
+_MAX_RUNS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Outliers:
+    """Explanations of rejected detections."""
+
+    suspect: IntArray  # (S, 2) row of the pose and index of the joint whose reading no image agrees with
+    id_switches: IntArray  # (W, 3) row of the pose, index of the marker as numbered and of the true one
+    poses: IntArray  # (P,) rows of poses whose images show other joints than those read
+    moved: IntArray  # (V, 2) row of the pose and view of images that a motion of the camera explains
+    explained: BoolArray  # (2, N) detections that these explain
+
+    @classmethod
+    def empty(cls, detections: Detections) -> "Outliers":
+        """Return no explanations."""
+        rows = np.zeros((0, 3), dtype=np.int64)
+        return cls(rows[:, :2], rows, rows[:, 0], rows[:, :2], np.zeros_like(detections.seen))
+
+    @classmethod
+    def of(cls, solution: Solution) -> "Outliers":
+        """Explain rejected detections: exchanged marker numbers, moved cameras, then wrong joint readings."""
+        problem, params, used = solution.problem, solution.params, solution.used
+        detections, sigma = problem.detections, solution.sigma_px
+        out = detections.seen & ~used
+        id_switches, explained = _id_switches(problem, params, out, OUTLIER * sigma)
+        moved = _moved_images(solution, out & ~explained)
+        for k, view in moved:
+            here = detections.pose_of == k
+            explained[view, here] |= out[view, here]
+        suspects, poses = list[tuple[int, int]](), list[int]()
+        for k in np.setdiff1d(np.flatnonzero(detections.count_at(used) == 0), moved[:, 0]):
+            here = detections.pose_of == k
+            pose = dataclasses.replace(detections, seen=detections.seen & ~explained).rows(here)
+            rows = np.flatnonzero(pose.seen.any(axis=0))
+            if rows.size < 3:
+                continue
+            some = np.isin(np.arange(len(pose.pose_of)), rows[:: max(1, rows.size // MAX_OF_POSE)])
+            alone = LeastSquares.of(pose.rows(some), problem.q_reference).with_noise(problem.tau)
+            joints = _wrong_joints(alone, params, sigma)
+            suspects += [(int(k), i) for i in joints]
+            if joints or fits_other_joints(alone, params, problem.q, sigma):
+                explained[:, here] |= out[:, here]
+                poses += [] if joints else [int(k)]
+        pairs = np.array(suspects, dtype=np.int64).reshape(-1, 2)
+        return cls(pairs, id_switches, np.array(poses, dtype=np.int64), moved, explained)
+
+
+def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
+    """Images (V, 2), pose and view, mostly rejected by ``out`` (2, N), that fit a camera that moved a little.
+
+    It shifts, turns and scales the image, and is small against the spread of its markers, as the motion by a
+    wrong joint is not.
+    """
+    problem, sigma, found = solution.problem, solution.sigma_px, list[tuple[int, int]]()
+    detections = problem.detections
+    residual = problem.with_noise(None).residual(solution.params)
+    residual /= np.maximum(detections.weight[..., None], 1e-300)
+    for view, k in itertools.product((0, 1), np.unique(detections.pose_of[out.any(axis=0)])):
+        rows = np.flatnonzero(detections.seen[view] & (detections.pose_of == k))
+        if rows.size < _SEEN_OF_IMAGE or np.count_nonzero(out[view, rows]) < _MOSTLY * rows.size:
+            continue
+        x = detections.pixels[view, rows] - detections.pixels[view, rows].mean(axis=0)
+        radius = float(np.sqrt((x**2).sum(axis=1).mean()))
+        A, off = image_motions(x / radius), residual[view, rows]
+
+        def left(b: FloatArray, A: FloatArray = A, off: FloatArray = off) -> FloatArray:
+            """Residuals after a motion of the image by shift, scale and turn b (4,), px."""
+            return np.asarray((off - A @ b).ravel())
+
+        fit = least_squares(left, np.zeros(4), loss="soft_l1", f_scale=sigma)
+        median = float(np.median(np.linalg.norm(fit.fun.reshape(-1, 2), axis=1)))
+        if median <= _CORRECTED * RAYLEIGH * sigma and np.abs(fit.x).max() <= _SMALL_MOTION * radius:
+            found.append((int(k), view))
+    return np.array(found, dtype=np.int64).reshape(-1, 2)
+
+
+def describe_moved(detections: Detections, moved: IntArray) -> str:
+    """Describe images (V, 2) of cameras that moved, by runs of poses in the order of the recording."""
+    present, sentences = np.unique(detections.pose_of), []
+    for view, name in enumerate(VIEWS):
+        at = np.searchsorted(present, np.sort(moved[moved[:, 1] == view, 0]))
+        if not at.size:
+            continue
+        runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
+        words = [" to ".join(map(str, np.unique(detections.pose[present[run[[0, -1]]]]))) for run in runs]
+        settled = f"settled over poses {words.pop(0)}" if at[0] == 0 and runs[0].size > 1 else ""
+        more = f" and {len(words) - _MAX_RUNS} more" if len(words) > _MAX_RUNS else ""
+        later = f"moved at pose{'s' * (at.size > 1)} {', '.join(words[:_MAX_RUNS])}{more}" if words else ""
+        sentences.append(f"the {name} camera {' and '.join(filter(None, (settled, later)))}")
+    return ", ".join(sentences)
+
+
+def _id_switches(
+    problem: LeastSquares, params: Parameters, out: BoolArray, limit: float
+) -> tuple[IntArray, BoolArray]:
+    """Observations (W, 3) that lie where another marker belongs in every view, and their detections (2, N).
+
+    The other marker is unseen or rejected there. A detection that fits its own marker contradicts a switch.
+    """
+    detections = problem.detections
+    joints, rows = (
+        problem.joints(fit_offsets(problem, params)),
+        np.flatnonzero((out == detections.seen).all(axis=0)),
+    )
+    found = set()
+    explained = np.zeros_like(out)
+    for k in np.unique(detections.pose_of[rows]):
+        here = detections.pose_of == k
+        free = np.ones(detections.marker.size, dtype=bool)
+        free[detections.marker_of[here & ~out.any(axis=0)]] = False
+        predicted = np.nan_to_num(params.predict(joints[k : k + 1])[0], nan=-np.inf)
+        others = np.flatnonzero(free & np.isfinite(predicted).all(axis=(0, 2)))
+        trees = [cKDTree(predicted[v, others]) for v in (0, 1)]
+        for row in rows[here[rows]]:
+            # A view that did not see the marker counts for nothing.
+            near = [
+                trees[v].query_ball_point(detections.pixels[v, row], limit / detections.weight[v, row])
+                for v in np.flatnonzero(detections.seen[:, row])
+            ]
+            marker = int(detections.marker_of[row])
+            fits = np.setdiff1d(others[np.array(reduce(np.intersect1d, near), dtype=np.int64)], marker)
+            if fits.size == 1:
+                found.add((int(k), marker, int(fits[0])))
+                explained[:, row] = out[:, row]
+    # A switch of two markers shows in both and counts once.
+    switches = sorted((k, a, b) for k, a, b in found if a < b or (k, b, a) not in found)
+    return np.array(switches, dtype=np.int64).reshape(-1, 3), explained
+
+
+def fits_other_joints(pose: LeastSquares, params: Parameters, q: FloatArray, sigma: float) -> bool:
+    """Whether other joints explain the images of a pose: those of another pose (K, n), or near these."""
+    poses = [dataclasses.replace(pose, q=np.broadcast_to(at, pose.q.shape), tau=None) for at in q]
+    levels = [median_px(one.residual(params), one.detections.seen) for one in poses]
+    nearest = poses[int(np.argmin(levels))]
+    level = min(min(levels), _corrected_level(nearest, params, list(range(q.shape[1])), sigma))
+    return level <= _CORRECTED * RAYLEIGH * sigma
+
+
+def rejection_reasons(solution: Solution, kept: BoolArray) -> IntArray:
+    """Rejected markers (T, 2), those not ``kept`` (m,): index, and reason, an index into ``WHY_LOST``."""
+    detections = solution.problem.detections
+    near = np.linalg.norm(solution.residual, axis=2) <= OUTLIER * solution.sigma_px
+    fits = detections.count_of(detections.seen & near)
+    seen = detections.count_of(detections.seen)
+    why = np.select(
+        [stationary(detections, solution.sigma_px), seen < _SEEN, fits > seen / _SEEN], [0, 3, 2], 1
+    )
+    return np.stack([np.flatnonzero(~kept), why[~kept]], axis=1)
+
+
+def _wrong_joints(pose: LeastSquares, params: Parameters, sigma: float) -> tuple[int, ...]:
+    """Joint, or else pair of joints, whose correction explains the images of a pose; or none."""
+    for size in (1, 2):
+        pairs = list(itertools.combinations(range(pose.q.shape[1]), size))
+        levels = [_corrected_level(pose, params, list(joints), sigma) for joints in pairs]
+        if min(levels, default=np.inf) <= _CORRECTED * RAYLEIGH * sigma:
+            return pairs[int(np.argmin(levels))]
+    return ()
+
+
+def _corrected_level(pose: LeastSquares, params: Parameters, joints: list[int], sigma: float) -> float:
+    """Median residual, px, after a robust fit of some joints of a pose to its images.
+
+    The other joints may be off by their noise.
+    """
+    seen, n = pose.detections.seen, pose.q.shape[1]
+    others = np.setdiff1d(np.arange(n) if pose.tau is not None else joints, joints)
+    moved = np.eye(n)[[*joints, *others]]
+
+    def residual(x: FloatArray) -> FloatArray:
+        images = dataclasses.replace(pose, q=pose.q + x @ moved).residual(params)[seen].ravel()
+        return images if pose.tau is None else np.concatenate([images, x[len(joints) :] / pose.tau[others]])
+
+    found = least_squares(residual, np.zeros(len(moved)), loss="soft_l1", f_scale=sigma)
+    return float(np.median(np.linalg.norm(found.fun[: 2 * int(seen.sum())].reshape(-1, 2), axis=1)))
+
+
+def outlier_rows(detections: Detections, out: BoolArray) -> IntArray:
+    """List the detections of a mask (2, N) as sorted rows (L, 3): pose, marker number, view (2 for both)."""
+    rows = np.flatnonzero(out.any(axis=0))
+    view = np.where(out[:, rows].all(axis=0), 2, np.where(out[0, rows], 0, 1))
+    found = np.stack(
+        [detections.pose[detections.pose_of[rows]], detections.marker[detections.marker_of[rows]], view],
+        axis=1,
+    )
+    return found[np.lexsort(found.T[::-1])].astype(np.int64)
