@@ -148,8 +148,8 @@ def preflight(
     """
     from projservo_cli.config.inputs import preflight_inputs
     from projservo_cli.files import write_whole
-    from projservo_cli.hardware.live_page import page
     from projservo_cli.hardware.preflight import FAULT, WARNING
+    from projservo_cli.report.live_page import preflight_page
     from projservo_cli.stages.preflight import CALIBRATION, check
     from projservo_cli.store import save
 
@@ -167,7 +167,7 @@ def preflight(
             progress=console.progress,
         )
         pictures = [] if checked.seen is None else _pictures(settings, checked.seen)
-        write_whole(output, page(settings.name, checked.findings, pictures))
+        write_whole(output, preflight_page(settings.name, checked.findings, pictures))
     for told in checked.findings:
         refuted = told.text if told.level == FAULT else ""
         compared = told.where == CALIBRATION and told.level != WARNING
@@ -210,7 +210,7 @@ def _goal_pixels(settings: "Config") -> "list[FloatArray]":
 
 
 def _pictures(settings: "Config", seen: "Seen") -> list[bytes]:
-    from projservo_cli.hardware.live_page import annotated
+    from projservo_cli.report.live_page import annotated
 
     both = zip(seen.views, seen.s, _goal_pixels(settings), strict=False)
     return [annotated(view.frame.grey, seen.marker, s, goal) for view, s, goal in both]
@@ -220,8 +220,8 @@ def _watch(console: Console, settings: "Config", robot: "PluginRobot") -> None:
     """Serve both images until Ctrl-C."""
     import time
 
-    from projservo_cli.hardware.live_page import LivePage, annotated
     from projservo_cli.records import VIEWS
+    from projservo_cli.report.live_page import LivePage, annotated
 
     live, goal = LivePage(settings.name), _goal_pixels(settings)
     assert settings.markers is not None

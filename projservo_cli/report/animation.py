@@ -20,7 +20,7 @@ from projservo_cli.report.figures.frames import frames_of, with_halo
 from projservo_cli.report.figures.images import near_pixels
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
 from projservo_cli.report.figures.scene import plant_pyramids, skeleton
-from projservo_cli.report.page import template
+from projservo_cli.report.html import html_page
 from projservo_cli.report.report_data import PAGE_FILE, VIEWS, title
 from projservo_cli.simulation.arm import Arm
 from projservo_cli.simulation.ideal import Plant
@@ -152,7 +152,7 @@ def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
         post_script=_NEARER,
     )
     key = _KEY + (_TREES if motion.trees else ())
-    text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=key)
+    text = html_page("view.html", name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=key)
     write_whole(path, text)
 
 

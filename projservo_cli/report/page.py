@@ -1,19 +1,16 @@
 """A report as one page of HTML that needs nothing else: no network, no scripts, no other file."""
 
-import base64
 import json
 import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from functools import cache
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from markupsafe import Markup
 
 from projservo_cli.calibration import WEAK_NOISE, chi2_band
 from projservo_cli.calibration.detections import REACH_M, REACH_RAD
@@ -23,40 +20,18 @@ from projservo_cli.laws import must_converge, name_of
 from projservo_cli.records import Plan, Report
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows
+from projservo_cli.report.html import embedded, html_page, short
 from projservo_cli.report.report_data import (
     ANIMATION_FILE,
     PAGE_FILE,
     VIEW_FILE,
     VIEWS,
+    FigureSpec,
     stage_object,
     title,
 )
-from projservo_cli.report.style import FORMATS, power_of_ten
+from projservo_cli.report.style import FORMATS
 from projservo_cli.store import Run
-
-if TYPE_CHECKING:
-    from jinja2 import Template
-
-_NONE = "\N{EN DASH}"
-
-
-def _short(value: float | None, digits: int = 3) -> str:
-    """A number with few digits, powers of ten set as such; a dash where there is none."""
-    if value is None or not math.isfinite(value):
-        return _NONE
-    power = math.floor(math.log10(abs(value))) if value else 0
-    whole = value == 0 or isinstance(value, (int, np.integer)) or digits <= power + 1 <= 6
-    mantissa, sign, exponent = (f"{value:.0f}" if whole else f"{value:.{digits}g}").partition("e")
-    text = f"{mantissa} × {power_of_ten(int(exponent))}" if sign else mantissa
-    return text.replace("-", "\N{MINUS SIGN}")
-
-
-def _number(value: Any, digits: int = 3) -> Markup:
-    """A number for the eye that carries all of its digits for programs."""
-    plain = value.item() if isinstance(value, np.generic) else value
-    if plain is None or not math.isfinite(plain):
-        return Markup(_NONE)
-    return Markup('<data value="{}">{}</data>').format(repr(plain), _short(plain, digits))
 
 
 def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> Iterator[str]:
@@ -66,8 +41,8 @@ def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> Iterator
     """
     yield f"{'Usable' if found['usable'] else 'Not usable'}: {found['reason']}."
     if math.isfinite(found["chi2_per_dof"]) and found["dof"] > 0:
-        low, high = (_short(bound) for bound in chi2_band(found["dof"]))
-        chi2, sigma = _short(found["chi2_per_dof"]), _short(found["sigma_px"])
+        low, high = (short(bound) for bound in chi2_band(found["dof"]))
+        chi2, sigma = short(found["chi2_per_dof"]), short(found["sigma_px"])
         yield (
             f"χ² per degree of freedom is {chi2} at {sigma} px of noise per coordinate, with {found['dof']} "
             f"degrees of freedom; where model and noise are true it stays within {low} and {high}."
@@ -84,7 +59,7 @@ def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> Iterator
     if "cross_validation" in found:
         value = found["cross_validation"]
         names = ("rms_px", "predicted_rms_px", "median_px", "p95_px")
-        rms, predicted, median, p95 = (_short(value[name]) for name in names)
+        rms, predicted, median, p95 = (short(value[name]) for name in names)
         yield (
             f"Held out, in {value['folds']} parts of {value['unit']}: rms {rms} px where noise and "
             f"covariance predict {predicted} px, median {median} px, 95th percentile {p95} px. "
@@ -99,7 +74,7 @@ def _worst_joint(found: Mapping[str, Any]) -> str:
     noise, worst = max(known)
     reach = f"{REACH_M:g} m" if found["joints"][worst]["type"] == "P" else f"{REACH_RAD:g} rad"
     return (
-        f"Joint {worst + 1} is known worst: {reach} from the reference it adds {_short(noise)} times the "
+        f"Joint {worst + 1} is known worst: {reach} from the reference it adds {short(noise)} times the "
         f"pixel noise to predicted images; a joint is poorly observable above {WEAK_NOISE:g}, so this one is "
         f"{'poorly observable' if noise > WEAK_NOISE else 'well observable'}."
     )
@@ -108,7 +83,7 @@ def _worst_joint(found: Mapping[str, Any]) -> str:
 def _law_words(trace: Mapping[str, Any]) -> str:
     """Verdict of a law and its reason, in one sentence."""
     steps, reason = trace["steps"], trace["reason"]
-    took = f"{steps} step{'s' * (steps != 1)} ({_short(steps * trace['period'])} s)"
+    took = f"{steps} step{'s' * (steps != 1)} ({short(steps * trace['period'])} s)"
     because = ", because the " if reason.startswith("image error") else ": "
     why = because + reason if reason else ""
     return f"{title(name_of(trace['law'], trace['mode']))}: {trace['verdict']} after {took}{why}."
@@ -124,9 +99,8 @@ class _Picture(NamedTuple):
 
     anchor: str  # its name within the page
     number: str  # as in the names of its files
-    caption: str
-    paper: str  # the figure and section of the paper that it follows
-    drawing: Markup | None
+    spec: FigureSpec
+    drawing: str | None  # its address
     links: tuple[tuple[str, str], ...]
 
 
@@ -138,33 +112,27 @@ def _pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -
         kinds = [kind for kind in FORMATS if own[kind] in files]
         if not kinds:
             continue
-        alt = spec.alt or spec.title
-        images = (_drawing(directory / own[kind], kind, alt) for kind in _TYPES if kind in kinds)
+        images = (_drawing(directory / own[kind], kind) for kind in _TYPES if kind in kinds)
         drawing = next((image for image in images if image is not None), None)
         links = [(kind.upper(), folder + own[kind]) for kind in kinds]
         if (directory / own["csv"]).is_file():
             links.insert(0, ("numbers (CSV)", folder + own["csv"]))
         number = str(int(spec.name[3:5]))
         section = "control" if spec.laws or spec.studies or spec.modes or spec.frames else "plan"
-        picture = _Picture(prefix + spec.name, number, spec.title, spec.paper, drawing, tuple(links))
+        picture = _Picture(prefix + spec.name, number, spec, drawing, tuple(links))
         found["metric" if spec.metric else section if spec.task else "calibration"].append(picture)
     return found
 
 
-def _drawing(path: Path, kind: str, alt: str) -> Markup | None:
-    """A figure as an image within the page; None where there is no file in the folder of the run.
-
-    A browser runs no script of an image and fetches nothing for it, SVG included (HTML, section 4.8.3):
-    files may come from strangers.
-    """
+def _drawing(path: Path, kind: str) -> str | None:
+    """Address of a figure within the page; None where there is no file in the folder of the run."""
     try:
         content = path.read_bytes() if lies_inside(path, path.parents[1]) else None
     except OSError:
         content = None
     if content is None or len(content) > _MOST_BYTES:
         return None
-    data = base64.b64encode(content).decode()
-    return Markup('<img src="data:{};base64,{}" alt="{}">').format(_TYPES[kind], data, alt)
+    return embedded(content, _TYPES[kind])
 
 
 # Files next to the page, and their labels.
@@ -354,23 +322,6 @@ def _side_by_side(columns: Iterable[Iterable[Any]], key: Callable[[Any], Any]) -
     return rows
 
 
-@cache
-def template(name: str) -> "Template":
-    """Template of a page; a value it names and is not given is an error."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {"number": _number, "degrees": math.degrees}
-    return environment.get_template(name)
-
-
 def write_page(run: Run, about: About) -> Path:
     """Write the page of a run into its folder, from the run and the figures that lie there.
 
@@ -408,4 +359,4 @@ def _write(path: Path, views: list[_View], settings: Sequence[Mapping[str, Any]]
         numbered = _side_by_side((v.pictures[section] for v in views), attrgetter("number"))
         pictures[section] = [numbered[number] for number in sorted(numbered, key=int)]
     values = {"views": views, "claims": claims, "differences": _differences(settings), "pictures": pictures}
-    write_whole(path, template("page.html").render(values))
+    write_whole(path, html_page("page.html", **values))

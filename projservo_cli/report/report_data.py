@@ -155,7 +155,7 @@ class ReportData(Fit):
 
 
 @dataclass(frozen=True)
-class _FigureSpec:
+class FigureSpec:
     """One figure and its requirements."""
 
     name: str  # of its files
@@ -217,17 +217,17 @@ class _FigureSpec:
         ]
 
 
-REGISTER: dict[str, _FigureSpec] = {}
+REGISTER: dict[str, FigureSpec] = {}
 _Draw = Callable[[Data, "Figure"], None]
 
 
 def registered(
     name: str, title: str, paper: str, data: Callable[[Any], Data], **needs: Any
 ) -> Callable[[_Draw], _Draw]:
-    """Decorator that registers a drawing function as a figure; arguments are those of ``_FigureSpec``."""
+    """Decorator that registers a drawing function as a figure; arguments are those of ``FigureSpec``."""
 
     def register(draw: _Draw) -> _Draw:
-        REGISTER[name] = _FigureSpec(name, title, paper, data, draw, **needs)
+        REGISTER[name] = FigureSpec(name, title, paper, data, draw, **needs)
         return draw
 
     return register

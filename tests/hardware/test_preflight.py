@@ -20,9 +20,9 @@ from projservo_cli.calibration import predict
 from projservo_cli.config import Override, load_config
 from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.detection import TagFinder
-from projservo_cli.hardware.live_page import LivePage
 from projservo_cli.hardware.preflight import view_angle_deg
 from projservo_cli.records import InputError
+from projservo_cli.report.live_page import LivePage
 from projservo_cli.stages import calibrate, preflight
 from tests.conftest import ROOT
 from tests.hardware.streams import Stream, picture
