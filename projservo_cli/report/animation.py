@@ -16,8 +16,7 @@ from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
-from projservo_cli.report.figures.frames import frames_of, with_halo
-from projservo_cli.report.figures.images import near_pixels
+from projservo_cli.report.figures.images import frames_of, near_pixels, with_halo
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
 from projservo_cli.report.figures.scene import plant_pyramids, skeleton
 from projservo_cli.report.html import html_page
@@ -42,7 +41,7 @@ const far = Math.min(3, Math.max(1, 1050 / plot.clientWidth));
 const {x, y, z} = plot.layout.scene.camera.eye;
 Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}});
 """
-_CAMERAS = (style.BLUE, style.ORANGE)
+_CAMERAS = tuple(line["color"] for line in style.VIEW_LINES)
 _SEEN, _HIDDEN = style.SKY, style.VERMILION
 _KEY = (
     ("robot, face at the start", style.BLACK),
@@ -285,8 +284,7 @@ def _coordinates(points: FloatArray) -> dict[str, list[float]]:
 FRAMES = 60
 _MOST_COLUMNS = 4
 SEEN, HIDDEN = style.GREEN, style.ORANGE
-_PATH: style.LineStyle = {"color": SEEN, "linewidth": 0.9}
-_BEHIND: style.LineStyle = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
+_PATH = style.line(SEEN, width=0.9, label="path of a marker")
 _PANEL, _LEAST_WIDTH = 2.3, 4.0  # inches across one panel, and across the legend
 _COLORS, _NEAR_WHITE = 128, 240  # in addition to greys, which frames need
 _FILM_WIDTH = 320  # px, of which a panel shows most
@@ -348,8 +346,7 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
         axes = figure.subplots(2, len(runs), squeeze=False, sharex=True, sharey=True)
         for column, (name, run) in zip(axes.T, runs.items(), strict=True):
             for view, (panel, camera) in enumerate(zip(column, VIEWS, strict=True)):
-                style.face(panel, run.s[0, view, order], style.START)
-                style.face(panel, run.s_star[view, order], style.GOAL)
+                style.start_and_goal(panel, run.s[0, view, order], run.s_star[view, order], fill=False)
                 style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near, margin)
                 panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
                 panel.set_xlabel("u (px)" if view else "")
@@ -358,9 +355,7 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
             if (film := films[name]) is not None and run.frame_index is not None:
                 for panel, frames in zip(columns[-1], film.swapaxes(0, 1), strict=True):
                     panel.over(frames, run.frame_index, size)
-        line_styles = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
-        line_styles["face hidden from this camera"] = _BEHIND
-        style.legend_below(figure, line_styles, 4 if len(runs) > 2 else 2)
+        style.legend_below(figure, 4 if len(runs) > 2 else 2)
         figure.suptitle("time 00.00 s", fontsize=9)
 
     with style.styled():
@@ -386,7 +381,7 @@ class _Panel:
     def __init__(self, axes: Any, s: FloatArray, hidden: BoolArray) -> None:
         self.axes, self.s, self.hidden = axes, s, hidden
         self.behind, self.paths = (
-            [axes.plot([], [], **line_style)[0] for _ in s[0]] for line_style in (_BEHIND, _PATH)
+            [axes.plot([], [], **line)[0] for _ in s[0]] for line in (style.HIDDEN, _PATH)
         )
         (self.face,) = axes.fill([0.0], [0.0], linewidth=1.2, edgecolor=style.BLACK, alpha=0.9, zorder=3)
         place = {"transform": axes.transAxes, "ha": "center", "va": "bottom"}

@@ -29,6 +29,7 @@ from projservo_cli.records import (
     Plan,
     Trace,
 )
+from projservo_cli.report import style
 from projservo_cli.simulation.arm import Arm
 from projservo_cli.simulation.ideal import Plant
 from projservo_cli.store import Run
@@ -174,6 +175,10 @@ class FigureSpec:
     frames: bool = False  # whether it shows frames; it is not omitted if no robot has any
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
+
+    def drawn(self, data: Data) -> "Figure":
+        """The figure of its data."""
+        return style.drawn(self.draw, data, self.height)
 
     def lacking(self, report_data: Fit) -> str:
         """Return the reason why the figure cannot be drawn; empty if it can."""

@@ -18,8 +18,8 @@ from projservo_cli.report import style
 from projservo_cli.report.animation import motion_of, write_animation, write_view
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.figures.metric import chosen_poses, metric_rows
 from projservo_cli.report.figures.path_deviation import drift_rows, study_numbers
+from projservo_cli.report.figures.scene import chosen_poses, metric_rows
 from projservo_cli.report.page import write_page
 from projservo_cli.report.report_data import (
     ANIMATION_FILE,
@@ -179,7 +179,7 @@ def draw_all(
             if partial := spec.partly(report_data):
                 left_out.append({"what": f"{spec.name}, in part", "reason": partial})
             data = spec.data(report_data)
-            figure = style.drawn(spec.draw, data, spec.height)
+            figure = spec.drawn(data)
             numbers = {name: values for name, values in data.items() if values.dtype != np.uint8}
             contents = {_NUMBERS: to_csv(numbers).encode(), **style.contents(figure, formats)}
         for kind in {*style.FORMATS, _NUMBERS} - {*contents}:

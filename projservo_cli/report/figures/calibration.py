@@ -21,33 +21,20 @@ _BOTH = 2
 _ARROW = 0.04  # length of an arrow of the rms residual, as a fraction of the extent of the observations
 _BAND = (0.025, 0.975)  # shares of χ² between which the residuals of a pose are expected
 _BINS = 40
-_RESIDUAL: style.LineStyle = {"color": style.BLUE}
-_WEAK: style.LineStyle = {
-    "facecolor": style.ORANGE,
-    "edgecolor": style.BLACK,
-    "hatch": "////",
-    "linewidth": 0.6,
-}
-# Reason of a rejected observation: by itself, its number, its pose, or its marker as a whole.
-_KINDS = ("outlier", "id_switch", "pose", "marker")
-_LEFT_OUT: dict[str, style.LineStyle] = {
-    "outlier": {"color": style.VERMILION, "marker": "x"},
-    "id_switch": {"color": style.ORANGE, "marker": "+"},
-    "pose": {"color": style.BLACK, "marker": "1"},
-    "marker": {"color": style.GREEN, "marker": "."},
-}
+_RESIDUAL = style.line(style.BLUE)
+_POSE = style.dots(style.BLUE, "o", "residual of a pose", markersize=2.5)
+_HATCHED: Any = {"edgecolor": style.BLACK, "hatch": "////", "linewidth": 0.6}
+_WEAK = style.patch(style.ORANGE, "weak joint", **_HATCHED)
+_MODEL = style.line(style.BLACK, width=1.2, label="noise model")
+# Rejected observations by the reason: by themselves, their number, their pose, or their marker as a whole.
 _LEFT_OUT = {
-    kind: {**line_style, "linestyle": "none", "markeredgewidth": 0.9}
-    for kind, line_style in _LEFT_OUT.items()
+    "outlier": style.dots(style.VERMILION, "x", "rejected: outlier"),
+    "id_switch": style.dots(style.ORANGE, "+", "rejected: under another number"),
+    "pose": style.dots(style.BLACK, "1", "rejected: of a pose in doubt"),
+    "marker": style.dots(style.GREEN, ".", "rejected: of a rejected marker"),
 }
-_NAMES = {
-    "outlier": "outlier",
-    "id_switch": "under another number",
-    "pose": "of a pose in doubt",
-    "marker": "of a rejected marker",
-}
+_KINDS = tuple(_LEFT_OUT)
 _LARGE, _SMALL, _MANY = 4.0, 1.5, 300  # sizes of these points, pt, and how many are many
-_MODEL: style.LineStyle = {"color": style.BLACK, "linewidth": 1.2}
 
 
 def _data(fit: Fit) -> Data:
@@ -221,32 +208,28 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     _poses(panels[1, 1], data)
     _excitation(panels[2, 0], data)
     _spectrum(panels[2, 1], data)
-    line_styles: dict[str, style.LineStyle] = {
-        f"residual, {data['factor']:,g} times": _RESIDUAL,
-        **{
-            f"rejected: {_NAMES[kind]}": {**line_style, "markersize": _LARGE}
-            for kind, line_style in _LEFT_OUT.items()
-            if any(len(data[f"rejected_{kind}_{view}"]) for view in VIEWS)
-        },
-        "noise model": _MODEL,
-        "residual of a pose": {"color": style.BLUE, "marker": "o", "linestyle": "none"},
-        "95 % of poses in the model": {"color": style.PALE, "linewidth": 6},
-        "weak joint": _WEAK,
-    }
-    style.legend_below(figure, line_styles, 3)
+    notes = [
+        _RESIDUAL | {"label": f"residual, {data['factor']:,g} times"},
+        style.line(style.PALE, width=6, label="95 % of poses in the model"),
+        _WEAK,
+    ]
+    style.legend_below(figure, 3, notes)
 
 
 def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
-    seen, out = data[f"seen_{view}"], {kind: data[f"rejected_{kind}_{view}"] for kind in _KINDS}
+    """Draw residuals as arrows in one image, magnified, and the observations that were rejected."""
+    used, out = data[f"seen_{view}"], {kind: data[f"rejected_{kind}_{view}"] for kind in _KINDS}
     count = sum(map(len, out.values()))
     arrows = float(data["factor"]) * data[f"residual_{view}"]
-    pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
+    pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "color": _RESIDUAL["color"]}
     heads: Any = {"width": 0.0022, "headwidth": 4.0, "headlength": 5.0, "headaxislength": 4.0}
-    axes.quiver(*seen.T, *arrows.T, **pixels, **heads, **_RESIDUAL)
+    axes.quiver(*used.T, *arrows.T, **pixels, **heads)
+    size = _LARGE if count < _MANY else _SMALL
     for kind, positions in out.items():
-        axes.plot(*positions.T, **_LEFT_OUT[kind], markersize=_LARGE if count < _MANY else _SMALL)
-    title = f"{view}: {len(seen):,} observations, {count:,} rejected"
-    style.image_axes(axes, title, np.concatenate([seen, seen + arrows, *out.values()]))
+        if len(positions):
+            axes.plot(*positions.T, **_LEFT_OUT[kind], markersize=size, markeredgewidth=0.9)
+    title = f"{view}: {len(used):,} observations, {count:,} rejected"
+    style.image_axes(axes, title, np.concatenate([used, used + arrows, *out.values()]))
 
 
 def _histogram(axes: "style.Axes", data: Data) -> None:
@@ -282,7 +265,7 @@ def _poses(axes: "style.Axes", data: Data) -> None:
     low, high = np.sqrt(chdtri(coordinates, 1.0 - np.array(_BAND)) / coordinates)
     axes.fill_between(x, low * expected, high * expected, color=style.PALE, linewidth=0)
     axes.plot(x, expected, **_MODEL)
-    axes.plot(predicted, residual, "o", color=style.BLUE, markersize=2.5)
+    axes.plot(predicted, residual, **_POSE)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(0.0, 1.1 * max(float(residual.max(initial=0.0)), high * float(expected.max(initial=sigma))))
 
@@ -299,8 +282,8 @@ def _excitation(axes: "style.Axes", data: Data) -> None:
         (prismatic, other, 1.0, "m", style.SKY),
     ):
         for i in np.flatnonzero(chosen):
-            line_style = _WEAK if weak[i] else {"color": color}
-            kind.bar(i, scale * data["excitation"][i], width=0.6, **line_style)
+            line = _WEAK if weak[i] else {"color": color}
+            kind.bar(i, scale * data["excitation"][i], width=0.6, **line)
         if chosen.any():
             kind.set_ylabel(f"range ({unit})")
     units = [" (m)" if mixed and slides else "" for slides in prismatic]
@@ -316,9 +299,8 @@ def _spectrum(axes: "style.Axes", data: Data) -> None:
     title = f"information, {len(values)} of {int(data['parameters'])} directions free"
     axes.set(title=title, xlabel="direction (best to worst)", ylabel="eigenvalue (1)")
     if values.size:
-        axes.plot(
-            np.arange(1, len(values) + 1), values, "o-", color=style.BLUE, markersize=2.5, linewidth=0.8
-        )
+        line = style.line(style.BLUE, width=0.8, marker="o", markersize=2.5)
+        axes.plot(np.arange(1, len(values) + 1), values, **line)
         style.log_scale(axes)
     else:
         _without_covariance(axes)

@@ -10,16 +10,18 @@ from projservo_cli.report.report_data import VIEWS, Data, ReportData, registered
 from projservo_cli.task.face import cyclic_order
 
 _ARC_POINTS, _SENSE_POINTS = 61, 181
-_SHIFTED: style.LineStyle = {"color": style.VERMILION, "linestyle": (0, (1, 1))}
-_TURNED: style.LineStyle = {"color": style.GREEN, "linestyle": (0, (5, 1.5, 1, 1.5))}
-_PATH: style.LineStyle = {"color": style.GREY, "linewidth": 0.7}
-_AXIS: style.LineStyle = {"color": style.BLACK, "linewidth": 0.8, "linestyle": (0, (8, 3, 1, 3))}
-_SENSES: tuple[style.LineStyle, ...] = (
-    {"color": style.BLUE, "linestyle": "-"},
-    {"color": style.VERMILION, "linestyle": (0, (5, 1.5))},
-)
-_HIDDEN: style.LineStyle = {"color": style.GREY, "linewidth": 4, "alpha": 0.5}
-_ZERO: style.LineStyle = {"color": style.BLACK, "marker": "D", "linestyle": "none", "fillstyle": "none"}
+_START = style.START | {"label": "start $A$"}
+_TARGETS = {
+    "A_star": style.GOAL | {"label": "goal $A_*$"},
+    "A_t": style.line(style.VERMILION, style.DOTTED, label="goal less translation $A_t$"),
+    "A_r": style.line(style.GREEN, style.DASH_DOTTED, label="less rotation onto the plane $A_r$"),
+}
+_PATH = style.line(style.GREY, width=0.7, label="paths of the markers")
+_AXIS = style.line(style.BLACK, (0, (8, 3, 1, 3)), 0.8, label=r"axis of $\hat H_r$")
+_SENSES = (style.line(style.BLUE), style.line(style.VERMILION, style.DASHED))
+_HIDDEN = style.line(style.GREY, width=4, label="hidden from this camera", alpha=0.5, solid_capstyle="butt")
+_ZERO = style.dots(style.BLACK, "D", r"$\theta_0^\pm$, $\tau_0$", fillstyle="none")
+_END = style.dots(style.BLACK, "s", "end of the motion")
 _MARGIN = "margin $a\\cdot O$\n(start = 1)"
 
 
@@ -44,8 +46,8 @@ def _data_partition(report_data: ReportData) -> Data:
         "within_plane": _turned(plan.H_hat[2], share * plan.theta_p, plan.A[order]),
         "axis": _axis(plan.H_hat[1], plan.A_c, plan.A),
     }
-    seen = {name: project(model.P[:1], there, model.lens[:1])[0] for name, there in points.items()}
-    return seen | {"angles_deg": np.degrees([plan.theta_r, plan.theta_p])}
+    pixels = {name: project(model.P[:1], there, model.lens[:1])[0] for name, there in points.items()}
+    return pixels | {"angles_deg": np.degrees([plan.theta_r, plan.theta_p])}
 
 
 def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
@@ -72,7 +74,6 @@ def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
 def _draw_partition(data: Data, figure: "style.Figure") -> None:
     """Three panels, one a part."""
     panels = figure.subplots(1, 3, width_ratios=[1.1, 1, 1])
-    targets = {"A_star": style.GOAL, "A_t": _SHIFTED, "A_r": _TURNED}
     onto, within = (_signed(angle) for angle in data["angles_deg"])
     moved = np.stack([data["A_t"], data["A_star"]])
     parts = (
@@ -80,27 +81,17 @@ def _draw_partition(data: Data, figure: "style.Figure") -> None:
         (rf"onto plane, $\theta_r$ = {onto}°", data["onto_plane"], ("A_r", "A_t")),
         (rf"within plane, $\theta_p$ = {within}°", data["within_plane"], ("A_r",)),
     )
-    for panel, (title, ways, ends) in zip(panels, parts, strict=True):
-        visible = [data["A"], ways.reshape(-1, 2)]
-        if panel is panels[1]:
-            panel.plot(*data["axis"].T, **_AXIS)
-            visible.append(data["axis"])
-        style.paths(panel, ways, _PATH)
-        style.face(panel, data["A"], style.START, fill=True)
+    panels[1].plot(*data["axis"].T, **_AXIS)
+    for panel, (title, paths, ends) in zip(panels, parts, strict=True):
+        axis = [data["axis"]] if panel is panels[1] else []
+        style.paths(panel, paths, _PATH)
+        style.face(panel, data["A"], _START, fill=True)
         for name in ends:
-            style.face(panel, data[name], targets[name])
-        style.image_axes(panel, title, np.concatenate(visible))
+            style.face(panel, data[name], _TARGETS[name])
+        style.image_axes(panel, title, np.concatenate([data["A"], paths.reshape(-1, 2), *axis]))
     arrow = {"arrowstyle": "->", "linewidth": 0.9}
     panels[0].annotate("", data["center"][1], data["center"][0], arrowprops=arrow)
-    line_styles = {
-        "start $A$": style.START,
-        "goal $A_*$": style.GOAL,
-        "goal less translation $A_t$": _SHIFTED,
-        "less rotation onto the plane $A_r$": _TURNED,
-        "paths of the markers": _PATH,
-        r"axis of $\hat H_r$": _AXIS,
-    }
-    style.legend_below(figure, line_styles, 3)
+    style.legend_below(figure, 3)
 
 
 def _data_visibility(report_data: ReportData) -> Data:
@@ -112,12 +103,12 @@ def _data_visibility(report_data: ReportData) -> Data:
     O, face = plan.optical_center, plan.A[cyclic_order(plan.A)]
     start = O @ plan.a
     arcs = [np.linspace(0.0, sense, _SENSE_POINTS) for sense in plan.sense]
-    seen = [project(model.P, _turned(plan.H_hat[1], arc, face), model.lens).swapaxes(0, 1) for arc in arcs]
+    images = [project(model.P, _turned(plan.H_hat[1], arc, face), model.lens).swapaxes(0, 1) for arc in arcs]
     # As the plane is turned, so the optical centre may be turned back.
     margin = [_turned(plan.H_hat[1], -arc, O) @ plan.a / start for arc in arcs]
     tau_0 = plan.tau_0 / plan.tau if plan.tau > 0 else np.full(2, np.nan)
-    used = tau_0[np.isfinite(tau_0)]
-    reach = np.concatenate([[-0.2, 1.2], 1.1 * used[np.abs(used) < 5]])
+    finite = tau_0[np.isfinite(tau_0)]
+    reach = np.concatenate([[-0.2, 1.2], 1.1 * finite[np.abs(finite) < 5]])
     share = np.linspace(reach.min(), reach.max(), 101)
     rate = O @ (plan.H_hat[0].T @ plan.a) / start * plan.tau
     return {
@@ -127,7 +118,7 @@ def _data_visibility(report_data: ReportData) -> Data:
         "theta_deg": np.degrees(arcs),
         "theta_margin": np.stack(margin),
         "theta_0_deg": np.degrees(plan.theta_0),
-        "images": np.stack(seen),
+        "images": np.stack(images),
     }
 
 
@@ -142,54 +133,61 @@ def _data_visibility(report_data: ReportData) -> Data:
 )
 def _draw_visibility(data: Data, figure: "style.Figure") -> None:
     """Per camera: the images along both senses of θ_r, and the margin over θ_r and over τ."""
-    axes = figure.subplots(3, 2, height_ratios=[1.9, 1.0, 0.9])
-    for view, name in enumerate(VIEWS):
-        panel, images = axes[0, view], data["images"][:, :, view]
-        for s, margin, line_style in zip(images, data["theta_margin"][..., view], _SENSES, strict=True):
-            style.hidden_paths(panel, s, margin <= 0.0, _HIDDEN)
-            style.paths(panel, s, line_style | {"linewidth": 0.9})
-            style.face(panel, s[-1], line_style)
-        style.face(panel, images[0, 0], style.START, fill=True)
-        style.image_axes(panel, f"{name} camera", images)
-        _angle(axes[1, view], data, view)
-        _translation(axes[2, view], data, view)
-    line_styles = {"face at the start": style.START}
-    for angle, line_style in zip(data["theta_deg"][:, -1], _SENSES, strict=True):
-        line_styles[rf"sense $\theta_r$ = {_signed(angle)}°"] = line_style
-    line_styles |= {"hidden from this camera": _HIDDEN, r"$\theta_0^\pm$, $\tau_0$": _ZERO}
-    line_styles["end of the motion"] = {"color": style.BLACK, "marker": "s", "linestyle": "none"}
-    style.legend_below(figure, line_styles, 3)
+    panels = figure.subplots(3, 2, height_ratios=[1.9, 1.0, 0.9])
+    senses = [
+        line | {"label": rf"sense $\theta_r$ = {_signed(angle)}°"}
+        for line, angle in zip(_SENSES, data["theta_deg"][:, -1], strict=True)
+    ]
+    for view, (name, (image, turned, moved)) in enumerate(zip(VIEWS, panels.T, strict=True)):
+        images, margins = data["images"][:, :, view], data["theta_margin"][..., view]
+        style.face(image, images[0, 0], style.START | {"label": "face at the start"}, fill=True)
+        for s, margin, line in zip(images, margins, senses, strict=True):
+            style.paths(image, s, _HIDDEN, where=margin <= 0.0)
+            style.paths(image, s, line | {"linewidth": 0.9})
+            style.face(image, s[-1], line)
+        style.image_axes(image, f"{name} camera", images)
+        _angle(turned, data["theta_deg"], margins, senses, data["theta_0_deg"][view])
+        _translation(moved, data["tau_share"], data["tau_margin"][:, view], data["tau_0_share"][view])
+    style.legend_below(figure, 3, [_END])
 
 
-def _angle(axes: "style.Axes", data: Data, view: int) -> None:
-    angles, zeros = data["theta_deg"], data["theta_0_deg"][view]
-    for theta, margin, line_style in zip(angles, data["theta_margin"][..., view], _SENSES, strict=True):
-        _margin(axes, theta, margin, line_style)
-        axes.plot(theta[-1:], margin[-1:], "s", color=line_style["color"])
-    changes = " and ".join(f"{_signed(angle)}°" for angle in zeros)
-    zeros = (zeros[:, None] + np.array([-360.0, 0.0, 360.0])).ravel()
-    zeros = zeros[(zeros >= angles.min()) & (zeros <= angles.max())]
-    axes.plot(zeros, np.zeros_like(zeros), **_ZERO)
-    never = not np.isfinite(data["theta_0_deg"][view]).all()
-    axes.set_title("visibility never changes" if never else rf"$\theta_0^\pm$ = {changes}")
-    axes.set(xlabel=r"$\theta_r$ (deg)", ylabel=_MARGIN)
+def _angle(
+    axes: "style.Axes",
+    angles: FloatArray,
+    margins: FloatArray,
+    senses: list[style.LineStyle],
+    zeros: FloatArray,
+) -> None:
+    """Margins (2, k) over angles (2, k), deg, in both senses, and the angles (2,) of no margin."""
+    for theta, margin, line in zip(angles, margins, senses, strict=True):
+        _margin(axes, theta, margin, line)
+    known = rf"$\theta_0^\pm$ = {' and '.join(f'{_signed(angle)}°' for angle in zeros)}"
+    axes.set_title(known if np.isfinite(zeros).all() else "visibility never changes")
+    periods = (zeros[:, None] + np.array([-360.0, 0.0, 360.0])).ravel()
+    periods = periods[(periods >= angles.min()) & (periods <= angles.max())]
+    axes.plot(periods, np.zeros_like(periods), **_ZERO)
+    axes.set_xlabel(r"$\theta_r$ (deg)")
 
 
-def _translation(axes: "style.Axes", data: Data, view: int) -> None:
-    share, margin, zero = data["tau_share"], data["tau_margin"][:, view], data["tau_0_share"][view]
-    _margin(axes, share, margin, {"color": style.BLACK})
-    axes.plot([1.0], np.interp([1.0], share, margin), "s", color=style.BLACK)
+def _translation(axes: "style.Axes", share: FloatArray, margin: FloatArray, zero: float) -> None:
+    """Margin (k,) over the share (k,) of the translation, and the share of no margin."""
+    _margin(axes, share, margin, style.line(style.BLACK), end=1.0)
     axes.plot([zero], [0.0], **_ZERO)
     known = rf"$\tau_0$ = {_signed(zero, 2)} $\tau$"
     axes.set_title(known if np.isfinite(zero) else "visibility never changes")
-    axes.set(xlim=(share[0], share[-1]), xlabel=r"translation as share of $\tau$ (1)", ylabel=_MARGIN)
+    axes.set(xlim=(share[0], share[-1]), xlabel=r"translation as share of $\tau$ (1)")
 
 
-def _margin(axes: "style.Axes", x: FloatArray, margin: FloatArray, line_style: style.LineStyle) -> None:
-    """A visibility margin over the share of a motion, and where the face is hidden by it."""
+def _margin(
+    axes: "style.Axes", x: FloatArray, margin: FloatArray, line: style.LineStyle, end: float | None = None
+) -> None:
+    """A visibility margin over a motion, where the face is hidden by it, and the end, else the last."""
     axes.plot(x, np.where(margin > 0, np.nan, margin), **_HIDDEN)
-    axes.plot(x, margin, **line_style)
-    axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
+    axes.plot(x, margin, **line)
+    last = (x[-1], margin[-1]) if end is None else (end, np.interp(end, x, margin))
+    axes.plot(*np.array([last]).T, **_END | {"color": line["color"]})
+    style.zero_line(axes)
+    axes.set_ylabel(_MARGIN)
 
 
 def _signed(value: float, decimals: int = 1) -> str:

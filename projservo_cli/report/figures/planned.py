@@ -24,21 +24,23 @@ _TICKS = 11  # points at equal steps of σ on the path
 _WIDE = 4.0  # margins beyond are drawn in powers of ten
 LABEL = 0.05  # room that the number on a contour needs, in shares
 _SIGMA, _SHARE = r"path parameter $\sigma$ (1)", r"share $\mu$ (1)"
-_SHARES: dict[str, style.LineStyle] = {  # equal shares lie on one another: the wider shows beneath
-    r"$\mu_t$": {"color": style.SKY, "linewidth": 3.0},
-    r"$\mu_r$": {"color": style.BLACK, "linewidth": 1.8, "linestyle": (0, (4, 2))},
-    r"$\mu_p$": {"color": style.VERMILION, "linewidth": 1.0, "linestyle": (0, (1, 1))},
+_SHARES = (  # equal shares lie on one another: the wider shows beneath
+    style.line(style.SKY, width=3.0, label=r"$\mu_t$"),
+    style.line(style.BLACK, (0, (4, 2)), 1.8, label=r"$\mu_r$"),
+    style.line(style.VERMILION, style.DOTTED, 1.0, label=r"$\mu_p$"),
+)
+_PATH = style.line(style.VERMILION, width=1.6)
+_HATCHED = {"alpha": 0.6, "edgecolor": style.BLACK, "linewidth": 0.0}
+_REGIONS = {  # hatched, so that they differ in grey too
+    "margin": style.patch(style.GREY, "hidden from this camera", hatch="", **_HATCHED),
+    "border_px": style.patch(style.ORANGE, r"outside this image at every $\mu_p$", hatch="////", **_HATCHED),
 }
-_REGIONS: dict[str, style.LineStyle] = {  # hatched, so that they differ in grey too
-    "margin": {"facecolor": style.GREY, "hatch": ""},
-    "border_px": {"facecolor": style.ORANGE, "hatch": "////"},
-}
-_MARGINS: dict[str, style.LineStyle] = {
-    "visibility": {"color": style.BLUE, "linestyle": "-"},
-    "image": {"color": style.ORANGE, "linestyle": (0, (5, 1.5))},
-    "joints": {"color": style.GREEN, "linestyle": (0, (4, 1, 1, 1))},
-    "conditioning (start = 1)": {"color": style.PURPLE, "linestyle": (0, (1, 1))},
-}
+_MARGINS = (
+    style.line(style.BLUE, label="visibility"),
+    style.line(style.ORANGE, style.DASHED, label="image"),
+    style.line(style.GREEN, (0, (4, 1, 1, 1)), label="joints"),
+    style.line(style.PURPLE, style.DOTTED, label="conditioning (start = 1)"),
+)
 
 
 def _data_linear(report_data: ReportData) -> Data:
@@ -119,45 +121,44 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
 )
 def _draw_planned(data: Data, figure: "style.Figure") -> None:
     """Left the faces from dark to light along the path, right the shares and the margins."""
-    from matplotlib import colormaps
-
     figure.set_figheight(max(4.2 * style.aspect(data["faces"]) + 1.0, 3.0))
     grid = figure.add_gridspec(2, 2, width_ratios=[1.7, 1])
-    faces, sigma, shared = data["faces"], data["sigma"], np.isfinite(data["mu"]).all()
-    image, line_styles = figure.add_subplot(grid[:, 0]), _SHARES if shared else {}
-    if shared:
+    _faces(figure.add_subplot(grid[:, 0]), data)
+    sigma, shares = data["sigma"], None
+    if np.isfinite(data["mu"]).all():
         shares = figure.add_subplot(grid[0, 1])
-        _columns(shares, sigma, data["mu"], line_styles.values())
+        _columns(shares, sigma, data["mu"], _SHARES)
         shares.set_ylabel(_SHARE)
         shares.tick_params(labelbottom=False)
-        margins = figure.add_subplot(grid[1, 1], sharex=shares)
-    else:  # of a path through joint space
-        margins = figure.add_subplot(grid[:, 1])
-    style.paths(image, faces, {"color": style.GREY, "linewidth": 0.6})
+    # A path through joint space has no shares.
+    margins = figure.add_subplot(grid[1, 1] if shares else grid[:, 1], sharex=shares)
+    _columns(margins, sigma, data["margin"], style.VIEW_LINES)
+    style.zero_line(margins)
+    margins.set(xlabel=_SIGMA, ylabel="margin $a\\cdot O$\n(start = 1)")
+    style.legend_below(figure, 6, [style.dots(style.BLACK, "o", "first marker of the face")])
+
+
+def _faces(axes: "style.Axes", data: Data) -> None:
+    """Draw some of the planned faces, from dark to light along the path, and the paths of the markers."""
+    from matplotlib import colormaps
+
+    faces, sigma = data["faces"], data["sigma"]
+    style.paths(axes, faces, style.line(style.GREY, width=0.6))
     visible = np.unique(np.linspace(0, len(sigma) - 1, _FACES).round().astype(int))
     for j in visible:
-        color = colormaps["cividis"](0.82 * sigma[j])
-        ends = j in (visible[0], visible[-1])
-        style.face(image, faces[j], {"color": color, "linewidth": 1.8 if ends else 1.0})
-    style.image_axes(image, f"from the rig's centre, {data['profile']}", faces)
+        width = 1.8 if j in (visible[0], visible[-1]) else 1.0
+        style.face(axes, faces[j], style.line(colormaps["cividis"](0.82 * sigma[j]), width=width))
+    style.image_axes(axes, f"from the rig's centre, {data['profile']}", faces)
     place: Any = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "va": "bottom"}
     paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
-    for j, label in ((0, "start"), (-1, "goal")):
-        image.annotate(label, faces[j][np.argmin(faces[j][:, 1])], bbox=paper, **place)
-    cameras = {f"{name} camera": style.curve(3 - view) for view, name in enumerate(VIEWS)}
-    _columns(margins, sigma, data["margin"], cameras.values())
-    margins.axhline(0.0, color=style.BLACK, linewidth=0.6)
-    margins.set(xlabel=_SIGMA, ylabel="margin $a\\cdot O$\n(start = 1)")
-    first: style.LineStyle = {"color": style.BLACK, "marker": "o", "linestyle": "none"}
-    style.legend_below(figure, {**line_styles, **cameras, "first marker of the face": first}, 6)
+    for corners, label in ((faces[0], "start"), (faces[-1], "goal")):
+        axes.annotate(label, corners[np.argmin(corners[:, 1])], bbox=paper, **place)
 
 
-def _columns(
-    axes: "style.Axes", x: FloatArray, values: FloatArray, line_styles: Iterable[style.LineStyle]
-) -> None:
-    """Each column of values (k, c) over x (k,), in a separate style."""
-    for column, line_style in zip(values.T, line_styles, strict=True):
-        axes.plot(x, column, **line_style)
+def _columns(axes: "style.Axes", x: FloatArray, values: FloatArray, lines: Iterable[style.LineStyle]) -> None:
+    """Draw each column of values (k, c) over x (k,), in its style."""
+    for column, line in zip(values.T, lines, strict=True):
+        axes.plot(x, column, **line)
 
 
 def _data_path(report_data: ReportData) -> Data:
@@ -222,44 +223,38 @@ def _draw_path(data: Data, figure: "style.Figure") -> None:
         _map(axes[0, view], data, view)
         axes[0, view].set_title(f"{name} camera, {data['profile']} profile")
     shares, margins = axes[1]
-    _columns(shares, data["sigma"], data["mu"], _SHARES.values())
-    _columns(margins, data["sigma"], data["along"], _MARGINS.values())
+    _columns(shares, data["sigma"], data["mu"], _SHARES)
+    _columns(margins, data["sigma"], data["along"], _MARGINS)
     shares.set(xlabel=_SIGMA, ylabel=_SHARE)
     margins.set(xlabel=_SIGMA, ylabel="margin (1)")
-    margins.axhline(0.0, color=style.BLACK, linewidth=0.6)
+    style.zero_line(margins)
     if np.nanmax(data["along"]) > _WIDE:  # conditioning may grow a hundredfold
-        margins.set_yscale("symlog", linthresh=1.0)
-        margins.yaxis.set_major_formatter("{x:g}")
+        style.near_zero_scale(margins, 1.0)
     margins.set_ylim(bottom=min(-0.1, 1.1 * float(np.nanmin(data["along"]))))
-    region: style.LineStyle = {"alpha": 0.6, "edgecolor": style.BLACK, "linewidth": 0.0}
-    line_styles: dict[str, style.LineStyle] = {
-        "hidden from this camera": region | _REGIONS["margin"],
-        r"outside this image at every $\mu_p$": region | _REGIONS["border_px"],
-        r"path, at tenths of $\sigma$": {"color": style.VERMILION, "marker": "o"},
-    }
-    style.legend_below(figure, {**line_styles, **_SHARES, **_MARGINS}, 4)
+    path = _PATH | {"marker": "o", "label": r"path, at tenths of $\sigma$"}
+    style.legend_below(figure, 4, [*_REGIONS.values(), path])
 
 
 def _map(axes: "style.Axes", data: Data, view: int) -> None:
+    """Draw the regions in which a camera does not see the face over the shares μ_t and μ_r, and the path."""
     share = data["share"]
-    for name, line_style in _REGIONS.items():
+    for name, line in _REGIONS.items():
         finite = np.maximum(data[name][view], -1e6)
-        region: Any = {"colors": [line_style["facecolor"]], "hatches": [line_style["hatch"]], "alpha": 0.6}
+        region: Any = {"colors": [line["facecolor"]], "hatches": [line["hatch"]], "alpha": line["alpha"]}
         if finite.min() < 0.0:
             axes.contourf(share, share, finite.T, levels=[-1e9, 0.0], **region)
         if finite.min() < 0.0 < finite.max():
             axes.contour(share, share, finite.T, levels=[0.0], colors=[style.BLACK], linewidths=0.6)
     faint: Any = {"colors": [style.BLACK], "linewidths": 0.4, "linestyles": "dotted"}
-    seen = axes.contour(
-        share, share, data["margin"][view].T, levels=[0.25, 0.5, 0.75, 1.0, 1.5, 2.0], **faint
-    )
+    levels = [0.25, 0.5, 0.75, 1.0, 1.5, 2.0]
+    contours = axes.contour(share, share, data["margin"][view].T, levels=levels, **faint)
     lines = np.concatenate([data["mu"][:, :2], np.repeat(share[:, None], 2, axis=1)])
-    axes.clabel(seen, fmt="%g", fontsize=6.5, manual=_clear(seen.allsegs, lines))
+    axes.clabel(contours, fmt="%g", fontsize=6.5, manual=_clear(contours.allsegs, lines))
     axes.plot([0.0, 1.0], [0.0, 1.0], color=style.BLACK, linewidth=0.5)
     t, r = data["mu"][:, :2].T
-    axes.plot(t, r, color=style.VERMILION, linewidth=1.6)
+    axes.plot(t, r, **_PATH)
     tenths, sigma = np.linspace(0.0, 1.0, _TICKS), data["sigma"]
-    axes.plot(np.interp(tenths, sigma, t), np.interp(tenths, sigma, r), "o", color=style.VERMILION)
+    axes.plot(np.interp(tenths, sigma, t), np.interp(tenths, sigma, r), **style.dots(style.VERMILION, "o"))
     labels = {"xlabel": r"translation $\mu_t$ (1)", "ylabel": r"turn onto the plane $\mu_r$ (1)"}
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), **labels)
 
