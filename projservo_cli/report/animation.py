@@ -113,15 +113,15 @@ def _sample_times(q: FloatArray) -> IntArray:
 
 
 def _driven(robot: Arm, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
-    selected, positions = _sample_times(trace.q), []
-    for q in trace.q[selected]:
+    instants, positions = _sample_times(trace.q), []
+    for q in trace.q[instants]:
         H = forward_kinematics(plant.model, q)
         polyline = skeleton(joint_operators(plant.model, q), robot.joint_types, (H @ robot.base_tool)[:3, 3])
         positions.append((polyline, (plant.M[plant.order] @ H.T)[:, :3], (markers @ H.T)[:, :3]))
     moved = (np.stack(kind) for kind in zip(*positions, strict=True))
     verdict, path = f"{trace.verdict}, {trace.steps} steps", _centers(plant, trace.q)
     return _Driven(
-        verdict, trace.period * selected.astype(np.float64), trace.self_occluded[selected], path, *moved
+        verdict, trace.period * instants.astype(np.float64), trace.self_occluded[instants], path, *moved
     )
 
 
@@ -163,20 +163,23 @@ def _figure(motion: _Motion) -> Any:
     still = len(traces)
     for number, (name, run) in enumerate(motion.runs.items()):
         moving = [_moving(go, run, k) for k in range(len(run.seconds))]
-        own = [f"{name}/{k}" for k in range(len(moving))]
-        place = [len(traces) + k for k in range(3)]
-        frames += [go.Frame(name=n, data=data, traces=place) for n, data in zip(own, moving, strict=True)]
+        names = [f"{name}/{k}" for k in range(len(moving))]
+        positions = [len(traces) + k for k in range(3)]
+        frames += [
+            go.Frame(name=frame, data=parts, traces=positions)
+            for frame, parts in zip(names, moving, strict=True)
+        ]
         for trace in (*moving[0], _line(go, run.path, "driven path", style.GREEN, width=5)):
             trace.visible = number == 0  # a list of all runs chooses another
             traces.append(trace)
-        selected = [True] * still + [k // 4 == number for k in range(4 * len(motion.runs))]
+        visible = [True] * still + [k // 4 == number for k in range(4 * len(motion.runs))]
         buttons = [
-            {"label": "▶ play", "method": "animate", "args": [own, _PLAYING]},
+            {"label": "▶ play", "method": "animate", "args": [names, _PLAYING]},
             {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
         ]
-        changed: dict[str, Any] = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": buttons}
+        changed: dict[str, Any] = {"sliders": [_slider(run, names)], "updatemenus[1].buttons": buttons}
         changed |= {f"scene.{axis}axis.range": limits for axis, limits in _extent(motion, run).items()}
-        menu.append({"label": title(name), "method": "update", "args": [{"visible": selected}, changed]})
+        menu.append({"label": title(name), "method": "update", "args": [{"visible": visible}, changed]})
     first: dict[str, Any] = menu[0]["args"][1]
     buttons = first["updatemenus[1].buttons"]
     left = {"x": 0.0, "xanchor": "left"}
@@ -215,21 +218,21 @@ def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
     points = [motion.cameras, motion.start, run.robot, run.markers, run.path, motion.planned]
     points += [] if motion.goal is None else [motion.goal]
     points += [tree[np.isfinite(tree[:, 0])] for tree in motion.trees]
-    selected = np.concatenate([some.reshape(-1, 3) for some in points])
-    low, high = selected.min(axis=0), selected.max(axis=0)
+    corners = np.concatenate([part.reshape(-1, 3) for part in points])
+    low, high = corners.min(axis=0), corners.max(axis=0)
     pad = _PAD * float((high - low).max())
     ranges = np.round(np.stack([low - pad, high + pad], axis=1), _DIGITS)
     return {name: reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
 
 
-def _slider(run: _Driven, own: list[str]) -> dict[str, Any]:
+def _slider(run: _Driven, names: list[str]) -> dict[str, Any]:
     """A step for each instant; its label stands above the slider."""
     steps = []
-    for frame, seconds, hidden in zip(own, run.seconds, run.hidden, strict=True):
-        views = " and ".join(name for name, behind in zip(VIEWS, hidden, strict=True) if behind)
+    for name, seconds, hidden in zip(names, run.seconds, run.hidden, strict=True):
+        views = " and ".join(view for view, behind in zip(VIEWS, hidden, strict=True) if behind)
         label = f"{seconds:.2f} s" + (f", hidden from {views}" if views else "")
-        label += f", {run.verdict}" if frame == own[-1] else ""
-        steps.append({"label": label, "method": "animate", "args": [[frame], _AT_ONCE], "value": frame})
+        label += f", {run.verdict}" if name == names[-1] else ""
+        steps.append({"label": label, "method": "animate", "args": [[name], _AT_ONCE], "value": name})
     return {
         "steps": steps,
         "active": 0,
@@ -307,11 +310,11 @@ def write_animation(
     direct = [name for name in traces if name in BODY_LAWS]
     pair = [*direct[:1], *(name for name in traces if name in POINT_LAWS)]
     columns = {name: traces[name] for name in (pair if len(pair) > 1 else [*traces])[:_MOST_COLUMNS]}
-    shown = image_sizes(size).max(axis=0)
+    extent = image_sizes(size).max(axis=0)
     if size is None:
-        shown = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
+        extent = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
     images = []
-    for pixels in _frames(columns, order, shown):
+    for pixels in _frames(columns, order, extent):
         images.append(Image.fromarray(pixels))
         progress("animation", len(images), FRAMES)
     # The last frame has all colours; one palette for all keeps what does not move the same.
@@ -350,8 +353,8 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
                 style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near, margin)
                 panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
                 panel.set_xlabel("u (px)" if view else "")
-            selected = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
-            columns.append([_Panel(*one) for one in selected])
+            views = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
+            columns.append([_Panel(*view) for view in views])
             if (film := films[name]) is not None and run.frame_index is not None:
                 for panel, frames in zip(columns[-1], film.swapaxes(0, 1), strict=True):
                     panel.over(frames, run.frame_index, size)
@@ -364,10 +367,10 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
             figure.suptitle(f"time {seconds:.2f} s", fontsize=9)
             for column, (name, run) in zip(columns, traces.items(), strict=True):
                 now = min(int((seconds + 1e-9) / run.period), run.steps)
-                values = f"{run.verdict}, {run.steps} steps"
+                verdict = f"{run.verdict}, {run.steps} steps"
                 if now < run.steps:
-                    values = f"later: {values}" if seconds == end else "running"
-                column[0].axes.set_title(f"{title(name)}\n{values}")
+                    verdict = f"later: {verdict}" if seconds == end else "running"
+                column[0].axes.set_title(f"{title(name)}\n{verdict}")
                 for panel in column:
                     panel.show(now)
             canvas: Any = figure.canvas

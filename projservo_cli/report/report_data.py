@@ -49,11 +49,17 @@ NEAREST = tuple(
     CONSTRAINTS[constraint].value for constraint in OF_MOTION
 )  # smallest along the planned motion
 # Lists of what does not fit: observations, and deviations from the model.
-LISTS = ("outliers", "suspect_joint_readings", "id_switches", "moved_images", "model_errors")
+_LISTS = ("outliers", "suspect_joint_readings", "id_switches", "moved_images", "model_errors")
 _COUNTS = ("poses_used", "markers_used")
 _NUMBERS = (
     *("rms_px", "sigma_px", "chi2_per_dof", "seconds", "predicted_rms_px", "predicted_p99_px"),
     *("predicted_recorded_px", "predicted_worst_px"),
+)
+
+# Arrays of a calibration that are few numbers.
+_SHORT_ARRAYS = (
+    *("circular_joints", "undecided_order", "sigma_q_interval", "sigma_scale_interval"),
+    *("time_offset_s", "time_offset_interval_s", "time_offset_jitter_s"),
 )
 
 DIRECT = ("direct_three", "direct_two")
@@ -125,8 +131,8 @@ class ReportData(Fit):
 
     def goal_known(self) -> bool:
         """Whether all runs know the pose of the goal."""
-        own = self.studies.own.values() if self.studies is not None else ()
-        traces = [*self.traces.values(), *own]
+        extra = self.studies.own.values() if self.studies is not None else ()
+        traces = [*self.traces.values(), *extra]
         return bool(traces) and all(np.isfinite(trace.goal_pose).all() for trace in traces)
 
     @property
@@ -175,6 +181,13 @@ class FigureSpec:
     frames: bool = False  # whether it shows frames; it is not omitted if no robot has any
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
+
+    @property
+    def section(self) -> str:
+        """Its section on the page: calibration, metric, plan or control."""
+        if not self.task:
+            return "metric" if self.metric else "calibration"
+        return "control" if self.laws or self.studies or self.modes or self.frames else "plan"
 
     def drawn(self, data: Data) -> "Figure":
         """The figure of its data."""
@@ -280,14 +293,14 @@ def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequen
 
 def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str]) -> dict[str, Any]:
     """Return the JSON object of a stage that failed, or lacks its inputs."""
-    found: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
+    failure: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
     if stage == "calibrate":
-        lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *LISTS)}
+        lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *_LISTS)}
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
-        return found | {"usable": False, "lens": None, "rejected": None, "unshown": None} | numbers | lists
+        return failure | {"usable": False, "lens": None, "rejected": None, "unshown": None} | numbers | lists
     if stage == "servo":
-        found["laws"] = [_scalars(run.traces[law]) for law in laws]
-    return found | {"feasible": False} if stage == "plan" else found
+        return failure | {"laws": [_scalars(run.traces[law]) for law in laws]}
+    return failure | {"feasible": False} if stage == "plan" else failure
 
 
 def _scalars(record: Any) -> dict[str, Any]:
@@ -317,22 +330,15 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
             for view, (u, v, r, k1, k2) in terms
         }
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
-    more = (
-        "circular_joints",
-        "undecided_order",
-        "sigma_q_interval",
-        "sigma_scale_interval",
-        "time_offset_s",
-        "time_offset_interval_s",
-        "time_offset_jitter_s",
-    )
-    own = {name: getattr(calibration, name) for name in more}
-    own |= {"order_determined": None if (order := calibration.undecided_order) is None else not order.size}
-    found = _scalars(calibration)
-    del found["model_error"], found["unshown_error"]
-    own["model_errors"] = [_in_words(one, calibration) for one in calibration.model_errors]
-    own["unshown"] = None if calibration.unshown is None else _in_words(calibration.unshown, calibration)
-    return found | own | {"joints": joints, "lens": lens} | findings(calibration) | held_out
+    values = _scalars(calibration) | {name: getattr(calibration, name) for name in _SHORT_ARRAYS}
+    del values["model_error"], values["unshown_error"]
+    order, unshown = calibration.undecided_order, calibration.unshown
+    values |= {
+        "order_determined": None if order is None else not order.size,
+        "model_errors": [_in_words(error, calibration) for error in calibration.model_errors],
+        "unshown": None if unshown is None else _in_words(unshown, calibration),
+    }
+    return values | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 
 
 def _in_words(error: ModelError, calibration: Calibration) -> dict[str, Any]:
@@ -341,14 +347,18 @@ def _in_words(error: ModelError, calibration: Calibration) -> dict[str, Any]:
 
 
 def _plan(run: Run) -> dict[str, Any]:
-    plan, found = run.plan, _scalars(run.plan)
-    angles = {f"{name}_deg": math.degrees(found.pop(name)) for name in ("theta_r", "theta_p", "theta_s")}
+    """Plain values of a plan, angles in deg, and the smallest margins along it."""
+    plan, values = run.plan, _scalars(run.plan)
+    angles = {f"{name}_deg": math.degrees(values.pop(name)) for name in ("theta_r", "theta_p", "theta_s")}
     nearest = zip(NEAREST, plan.min_margin, plan.min_margin_mu, strict=True)
     return (
-        found
+        values
         | angles
-        | {"tau_0": plan.tau_0, "smallest_margin": plan.margin.min(axis=0)}
-        | {"margins": {name: {"min": low, "mu": mu} for name, low, mu in nearest}}
+        | {
+            "tau_0": plan.tau_0,
+            "smallest_margin": plan.margin.min(axis=0),
+            "margins": {name: {"min": lowest, "mu": mu} for name, lowest, mu in nearest},
+        }
     )
 
 

@@ -117,7 +117,7 @@ def styled() -> Iterator[None]:
         yield
 
 
-HALF_LABEL = 0.16  # in, half the width of a label of four digits
+_HALF_LABEL = 0.16  # in, half the width of a label of four digits
 
 
 def drawn(draw: Callable[[Any, "Figure"], None], data: Any, height: float, width: float = WIDTH) -> "Figure":
@@ -153,7 +153,7 @@ def _arrange(figure: "Figure") -> None:
     if legend:
         figure.subplots_adjust(bottom=1.0 - share * (1.0 - edges.bottom), top=1.0 - share * (1.0 - edges.top))
     if images:  # the last tick of an image, set when its scales are, may stand at the very edge
-        figure.subplots_adjust(right=min(edges.right, 1.0 - HALF_LABEL / figure.get_figwidth()))
+        figure.subplots_adjust(right=min(edges.right, 1.0 - _HALF_LABEL / figure.get_figwidth()))
     for axes in images:
         axes.apply_aspect()
     figure.set_layout_engine()  # with an engine, even one that does nothing, saving draws twice
@@ -175,13 +175,13 @@ def _equal_scales(
 
 def contents(figure: "Figure", formats: Sequence[str]) -> dict[str, bytes]:
     """A figure as files, by format: ``svg``, ``pdf`` or ``png``."""
-    made = {}
+    files = {}
     for kind in formats:
         file = io.BytesIO()
         with styled():
             figure.savefig(file, format=kind, dpi=_PNG_DPI, metadata=_METADATA[kind])
-        made[kind] = file.getvalue()
-    return made
+        files[kind] = file.getvalue()
+    return files
 
 
 def legend_below(figure: "Figure", columns: int, more: Iterable[LineStyle] = ()) -> None:

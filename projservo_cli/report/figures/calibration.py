@@ -158,11 +158,11 @@ def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Dat
     """
     poses = used.any(axis=(1, 2))
     count = 2 * used.sum(axis=(1, 2))[poses]
-    found: Data = {}
+    errors: Data = {}
     for name, squares in (("pose_predicted_px", variance), ("pose_residual_px", residual**2)):
         total = np.where(used[..., None], squares, 0.0).sum(axis=(1, 2, 3))[poses]
-        found[name] = np.sqrt(total / count)
-    return found | {"pose_coordinates": count}
+        errors[name] = np.sqrt(total / count)
+    return errors | {"pose_coordinates": count}
 
 
 def _information(calibration: Calibration) -> FloatArray:

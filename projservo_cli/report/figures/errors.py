@@ -130,11 +130,11 @@ def _rotations(rotation: "style.Axes", difference: "style.Axes", data: Data) -> 
     """Draw θ_r and θ_p with both models, and how far these differ, dotted with true operators."""
     t, t_metric = data["t_s"], data["t_s_metric"]
     t_common = max(t, t_metric, key=len)
-    some = {"fillstyle": "none", "markevery": max(1, len(t_metric) // 25)}
+    markers = {"fillstyle": "none", "markevery": max(1, len(t_metric) // 25)}
     for name, color, marker in (("theta_r", style.BLACK, "o"), ("theta_p", style.VERMILION, "s")):
         angle = rf"$\{name}$"
         rotation.plot(t, data[f"{name}_deg"], color=color, label=f"{angle}, projective model")
-        euclidean = style.dots(color, marker, f"{angle}, Euclidean model", **some)
+        euclidean = style.dots(color, marker, f"{angle}, Euclidean model", **markers)
         rotation.plot(t_metric, data[f"{name}_deg_metric"], **euclidean)
         for kind, dash in (("calibrated", style.SOLID), ("true", style.DOTTED)):
             curve = data[f"{name}_difference_deg_{kind}"]
@@ -167,20 +167,20 @@ def _data_joints(report_data: ReportData) -> Data:
 def _draw_joints(data: Data, figure: "style.Figure") -> None:
     """Left without, right with the limit; joints above, their steps below, per kind of joint."""
     prismatic, limit = data["prismatic"], float(data["step_limit_deg"])
-    both = ((np.flatnonzero(~prismatic), "deg"), (np.flatnonzero(prismatic), "mm"))
-    kinds = [(chosen.tolist(), unit) for chosen, unit in both if len(chosen)]
+    by_kind = ((np.flatnonzero(~prismatic), "deg"), (np.flatnonzero(prismatic), "mm"))
+    kinds = [(chosen.tolist(), unit) for chosen, unit in by_kind if len(chosen)]
     figure.set_figheight(1.2 + 3.6 * len(kinds))
     axes = figure.subplots(2 * len(kinds), 2, sharex=True, squeeze=False)
     for (joints, steps), (chosen, unit) in zip(axes.reshape(-1, 2, 2), kinds, strict=True):
         for panel, panel_below, (name, limited) in zip(joints, steps, _WAYS, strict=True):
             t = data[f"t_s_{name}"]
             for i in chosen:
-                line = style.curve(i, f"$q_{i + 1}$")
+                line = style.curve(i)
                 panel.plot(t, data[f"q_{name}"][:, i], **line)
                 panel_below.plot(t[:-1], data[f"step_{name}"][:, i], **line)
             if limited and unit == "deg":
                 for bound in (-limit, limit):
-                    panel_below.axhline(bound, **_LIMIT, label="limit")
+                    panel_below.axhline(bound, **_LIMIT)
         joints[0].set_ylabel(f"joint ({unit})")
         steps[0].set_ylabel(f"step ({unit} per period)")
         limits = [panel.get_ylim() for panel in joints]  # both sides are to be compared
@@ -189,4 +189,5 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
     for column, heading in zip(axes.T, ("no limit", f"{limit:g}° per step"), strict=True):
         column[0].set_title(f"directTHREE, {heading}")
         column[-1].set_xlabel("time (s)")
-    style.legend_below(figure, min(len(prismatic) + 1, 8))
+    lines = [style.curve(i, f"$q_{i + 1}$") for i in range(len(prismatic))]
+    style.legend_below(figure, min(len(lines) + 1, 8), [*lines, _LIMIT | {"label": "limit"}])

@@ -64,10 +64,10 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
     laws, size = [law for law in POINT_LAWS if f"s_{law}" in data], data["image_size"]
     drawn = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
     near = [[near_pixels(s[:, view], size[view]) for view in range(2)] for s in drawn]
-    heights = [_PANEL_WIDTH * style.aspect(np.concatenate(both)) for both in near]
+    heights = [_PANEL_WIDTH * style.aspect(np.concatenate(pixels)) for pixels in near]
     figure.set_figheight(sum(heights) + 0.62 * len(laws) + 0.45)
     axes = figure.subplots(len(laws), 2, squeeze=False, height_ratios=heights)
-    for row, law, both in zip(axes, laws, near, strict=True):
+    for row, law, pixels in zip(axes, laws, near, strict=True):
         first, last = data[f"plateau_{law}"]
         for view, (panel, name) in enumerate(zip(row, VIEWS, strict=True)):
             s = data[f"s_{law}"][:, view]
@@ -78,8 +78,8 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
             panel.plot(*s[-1].T, **_STOPPED)
             style.start_and_goal(panel, s[0], data[f"s_star_{law}"][view])
             heading = f"{name} camera" if view else f"{title_of(law)}: {data[f'verdict_{law}']}"
-            style.image_axes(panel, heading, both[view])
-            border(panel, size[view], both[view])
+            style.image_axes(panel, heading, pixels[view])
+            border(panel, size[view], pixels[view])
     style.legend_below(figure, 4)
 
 
@@ -155,7 +155,7 @@ _COORDINATES = (
     goal=True,
     alt="For each camera: the errors of u and v of every marker and of the centre over time.",
 )
-def draw_image_errors(data: Data, figure: "style.Figure") -> None:
+def _draw_errors(data: Data, figure: "style.Figure") -> None:
     """One panel a camera; u solid, v dashed, the centre thick, if it is known."""
     axes, t, numbers = figure.subplots(1, 2, sharey=True), data["t_s"], data["marker"]
     for view, (panel, name) in enumerate(zip(axes, VIEWS, strict=True)):
@@ -177,7 +177,7 @@ def _coordinates(axes: "style.Axes", t: FloatArray, pixels: FloatArray, line: st
 
 
 # The overview.
-_SHOWN = ("direct_three", "stacked")
+_OVERVIEW_LAWS = ("direct_three", "stacked")
 _IMAGE_WIDTH, _ERRORS_WIDTH = 3.7, 2.1  # inches, of the panels with images and of those next to them
 _ASPECTS = (0.45, 0.9)  # height over width of an image, within: an error panel has its height
 _PERCENT = (1e-2, 200.0)  # shown of a control error: below, noise of the calibration rules
@@ -200,7 +200,7 @@ def _data_overview(report_data: ReportData) -> Data:
     for name in ("theta_r", "theta_p"):
         if abs(getattr(direct, name)[0]) < _NEAR_ZERO:
             result[f"{name}_percent"] = np.full(len(direct.tau), np.nan)
-    for law in _SHOWN:
+    for law in _OVERVIEW_LAWS:
         trace = report_data.traces[law]
         hidden = trace.self_occluded
         end = f"{trace.verdict} in {trace.steps} steps, face hidden in {hidden.any(axis=1).sum()}"
@@ -218,7 +218,7 @@ def _data_overview(report_data: ReportData) -> Data:
     "One run at a glance: the classical and the direct law in both images, and their errors",
     "not in the paper",
     _data_overview,
-    laws=_SHOWN,
+    laws=_OVERVIEW_LAWS,
     alt="Left: paths of the markers in both camera images, from the face at the start to the goal, "
     "for directTHREE and the stacked law, with the stretches in which the face is hidden. "
     "Right: control errors of directTHREE and image errors of both laws over time.",
@@ -230,7 +230,7 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
             [
                 data["s_star"][view],
                 data["center"][:, view],
-                *(data[f"s_{law}"][:, view].reshape(-1, 2) for law in _SHOWN),
+                *(data[f"s_{law}"][:, view].reshape(-1, 2) for law in _OVERVIEW_LAWS),
             ]
         )
         for view in range(2)
@@ -238,7 +238,7 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
     aspect = style.aspect(np.concatenate(pixels), *_ASPECTS)
     figure.set_figheight(2.0 * _IMAGE_WIDTH * aspect + 1.75 + _LEGEND_ROOM / 72.0)
     axes = figure.subplots(2, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
-    lines = {law: style.LAW_LINES[law] | {"label": str(data[f"verdict_{law}"])} for law in _SHOWN}
+    lines = {law: style.LAW_LINES[law] | {"label": str(data[f"verdict_{law}"])} for law in _OVERVIEW_LAWS}
     for view, (panel, name) in enumerate(zip(axes[:, 0], VIEWS, strict=True)):
         for law, line in reversed(lines.items()):
             s = data[f"s_{law}"][:, view]
@@ -262,8 +262,8 @@ def _control_errors(axes: "style.Axes", data: Data) -> None:
     """Draw the errors of the direct law in % of their start, with a legend above them."""
     for index, (name, label) in enumerate(_ERRORS.items()):
         values = data[f"{name}_percent"]
-        shown = label + " near 0" * bool(np.isnan(values[0]))
-        axes.plot(data["period_s"] * np.arange(len(values)), values, **style.curve(index, shown))
+        legend = label + " near 0" * bool(np.isnan(values[0]))
+        axes.plot(data["period_s"] * np.arange(len(values)), values, **style.curve(index, legend))
     style.log_scale(axes)
     axes.set(ylabel="error (% of its start)", ylim=_PERCENT, xlabel="time (s)")
     axes.set_title(f"control errors, {title_of(DIRECT[0])}", pad=_LEGEND_ROOM)

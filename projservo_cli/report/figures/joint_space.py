@@ -82,16 +82,16 @@ def _data(report_data: ReportData) -> Data:
 def _distances(plan: Plan, border_px: float) -> Data:
     """Return distances in px and their required values; of a joint-space path those of its constraints."""
     if plan.margins is None or plan.required_margins is None:
-        seen = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
-        return {"border_px": seen, "border_px_asked": np.full_like(seen, border_px)}
-    found: Data = {}
+        distance = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
+        return {"border_px": distance, "border_px_asked": np.full_like(distance, border_px)}
+    distances: Data = {}
     for i, count in ((IMAGE, 2), (WIDTH, 2), (CLEAR, 1)):
         name = CONSTRAINTS[i].value
         if np.isfinite(plan.margins[:, i]).all():
-            found[name], found[f"{name}_asked"] = (
+            distances[name], distances[f"{name}_asked"] = (
                 x[:, i : i + count] for x in (plan.margins, plan.required_margins)
             )
-    return found
+    return distances
 
 
 def tree_edges(plan: Plan) -> tuple[FloatArray, FloatArray]:
@@ -110,9 +110,9 @@ def tree_edges(plan: Plan) -> tuple[FloatArray, FloatArray]:
 
 def with_gaps(points: FloatArray) -> FloatArray:
     """Points (k, …) of one edge after the other as one line, with NaN after each edge."""
-    parts = points.reshape(-1, PIECES + 1, *points.shape[1:])
-    gaps = np.full_like(parts[:, :1], np.nan)
-    return np.concatenate([parts, gaps], axis=1).reshape(-1, *points.shape[1:])
+    edges = points.reshape(-1, PIECES + 1, *points.shape[1:])
+    gaps = np.full_like(edges[:, :1], np.nan)
+    return np.concatenate([edges, gaps], axis=1).reshape(-1, *points.shape[1:])
 
 
 @registered(
@@ -137,8 +137,8 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     for view in range(2):
         _image(figure.add_subplot(grid[0, view]), data, view, visible[view])
     cells = (grid[1:, 0],) if len(kinds) == 1 else (grid[1, 0], grid[2, 0])
-    for place, (chosen, unit) in zip(cells, kinds, strict=True):
-        _joints(figure.add_subplot(place), data, chosen.tolist(), unit)
+    for cell, (chosen, unit) in zip(cells, kinds, strict=True):
+        _joints(figure.add_subplot(cell), data, chosen.tolist(), unit)
     shares, distances = figure.add_subplot(grid[1, 1]), figure.add_subplot(grid[2, 1])
     _constraints(shares, data, _SHARES, _NEAR)
     _constraints(distances, data, _DISTANCES, _NEAR_PX)
@@ -151,8 +151,8 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         _REQUIRED,
     ]
     if "nodes" in data and data["nodes"][0] < data["nodes"][1]:
-        shown = "{} of {} joint vectors of trees".format(*data["nodes"])
-        notes.append(style.line(style.GREY, style.NO_LINE, label=shown))
+        stored = "{} of {} joint vectors of trees".format(*data["nodes"])
+        notes.append(style.line(style.GREY, style.NO_LINE, label=stored))
     style.legend_below(figure, 3, notes)
 
 

@@ -46,7 +46,7 @@ def _data_partition(report_data: ReportData) -> Data:
         "within_plane": _turned(plan.H_hat[2], share * plan.theta_p, plan.A[order]),
         "axis": _axis(plan.H_hat[1], plan.A_c, plan.A),
     }
-    pixels = {name: project(model.P[:1], there, model.lens[:1])[0] for name, there in points.items()}
+    pixels = {name: project(model.P[:1], place, model.lens[:1])[0] for name, place in points.items()}
     return pixels | {"angles_deg": np.degrees([plan.theta_r, plan.theta_p])}
 
 
@@ -161,8 +161,8 @@ def _angle(
     """Margins (2, k) over angles (2, k), deg, in both senses, and the angles (2,) of no margin."""
     for theta, margin, line in zip(angles, margins, senses, strict=True):
         _margin(axes, theta, margin, line)
-    known = rf"$\theta_0^\pm$ = {' and '.join(f'{_signed(angle)}°' for angle in zeros)}"
-    axes.set_title(known if np.isfinite(zeros).all() else "visibility never changes")
+    zeros_text = rf"$\theta_0^\pm$ = {' and '.join(f'{_signed(angle)}°' for angle in zeros)}"
+    axes.set_title(zeros_text if np.isfinite(zeros).all() else "visibility never changes")
     periods = (zeros[:, None] + np.array([-360.0, 0.0, 360.0])).ravel()
     periods = periods[(periods >= angles.min()) & (periods <= angles.max())]
     axes.plot(periods, np.zeros_like(periods), **_ZERO)
@@ -173,8 +173,8 @@ def _translation(axes: "style.Axes", share: FloatArray, margin: FloatArray, zero
     """Margin (k,) over the share (k,) of the translation, and the share of no margin."""
     _margin(axes, share, margin, style.line(style.BLACK), end=1.0)
     axes.plot([zero], [0.0], **_ZERO)
-    known = rf"$\tau_0$ = {_signed(zero, 2)} $\tau$"
-    axes.set_title(known if np.isfinite(zero) else "visibility never changes")
+    zero_text = rf"$\tau_0$ = {_signed(zero, 2)} $\tau$"
+    axes.set_title(zero_text if np.isfinite(zero) else "visibility never changes")
     axes.set(xlim=(share[0], share[-1]), xlabel=r"translation as share of $\tau$ (1)")
 
 

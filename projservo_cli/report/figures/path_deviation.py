@@ -23,7 +23,7 @@ _PATH_POINTS = 400
 _WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
 _WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a fraction of the smallest
 _LEAST_OF_MODES = 0.02
-_WAY, _OFF = "way along the straight line (mm)", "distance from it (mm)"
+_ALONG, _OFF = "way along the straight line (mm)", "distance from it (mm)"
 _RESOLUTION = np.radians(1.0)  # longest joint motion, rad or m, between two points of a drawn path
 _OPERATORS = ("true", "calibrated")
 # Largest deviations by operators and limit, both 0 or 1.
@@ -75,10 +75,10 @@ def _data(report_data: ReportData) -> Data:
             trace = studies.sweep[law, "calibrated", limited, gain]
             whirls = np.abs(np.diff(trace.q, axis=0)).max(initial=0.0) > _WHIRL
             points = trace.center if whirls else _center_path(report_data, trace)
-            way, off = along_line(points, trace.center[0], report_data.goal_center(trace))
+            along, off = along_line(points, trace.center[0], report_data.goal_center(trace))
             used = np.unique(np.linspace(0, len(points) - 1, _PATH_POINTS).round().astype(int))
             result[f"whirls_{law}_{i}"] = np.array(whirls)
-            result[f"path_mm_{law}_{i}"] = 1e3 * np.stack([way, off], axis=1)[used]
+            result[f"path_mm_{law}_{i}"] = 1e3 * np.stack([along, off], axis=1)[used]
     return result
 
 
@@ -115,15 +115,15 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         style.line(style.SKY, width=2.4, label=f"{gains.max():g} and {limit}"),
     ]
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
-    for (way_axes, gain_axes), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
+    for (path_axes, gain_axes), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
         paths = [data[f"path_mm_{law}_{i}"] for i in range(len(lines))]
         lower = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
         for path, line in zip(paths, lines, strict=True):
-            way_axes.plot(path[:, 0], np.maximum(path[:, 1], lower), **line)
-        way_axes.set(title=f"{title_of(law)}: path of the centre, calibrated operators")
-        way_axes.set(xlabel=_WAY, ylabel=_OFF)
-        style.log_scale(way_axes)
-        way_axes.set_ylim(bottom=lower)
+            path_axes.plot(path[:, 0], np.maximum(path[:, 1], lower), **line)
+        path_axes.set(title=f"{title_of(law)}: path of the centre, calibrated operators")
+        path_axes.set(xlabel=_ALONG, ylabel=_OFF)
+        style.log_scale(path_axes)
+        path_axes.set_ylim(bottom=lower)
         for (operators, limited), line in _MAXIMA.items():
             label = f"{_OPERATORS[operators]}, {limit if limited else 'no limit'}"
             size = 4.5 if operators else 3.0  # an empty marker shows around a full one
@@ -167,8 +167,8 @@ def _data_modes(report_data: ReportData) -> Data:
     result: Data = {"names": np.array(names)}
     for name in names:
         trace = report_data.traces[name]
-        way, off = along_line(trace.center, trace.center[0], report_data.goal_center(trace))
-        result[f"path_mm_{name}"] = 1e3 * np.stack([way, off], axis=1)
+        along, off = along_line(trace.center, trace.center[0], report_data.goal_center(trace))
+        result[f"path_mm_{name}"] = 1e3 * np.stack([along, off], axis=1)
     return result
 
 
@@ -188,7 +188,7 @@ def _draw_modes(data: Data, figure: "style.Figure") -> None:
     runs = {str(name): data[f"path_mm_{name}"] for name in data["names"]}
     for i, (name, path) in enumerate(runs.items()):
         axes.plot(*path.T, **style.curve(i, title(name)))
-    axes.set(title="path of the centre", xlabel=_WAY, ylabel=_OFF)
+    axes.set(title="path of the centre", xlabel=_ALONG, ylabel=_OFF)
     upper = [float(path[:, 1].max()) for path in runs.values()]
     if min(upper) > 0.0 and max(upper) > _WIDE * min(upper):
         style.log_scale(axes)

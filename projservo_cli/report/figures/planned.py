@@ -197,8 +197,8 @@ def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
     wide, high = (report_data.plant.image_size - 0.5).T[:, :, None, None, None]
     result = np.empty((2, len(mu), len(mu)))
     for i, share in enumerate(mu):
-        there = (M + share * plan.tau * moved).reshape(-1, 4)
-        m = (there @ P.swapaxes(1, 2)).reshape(2, *M.shape[:3], 3)
+        points = (M + share * plan.tau * moved).reshape(-1, 4)
+        m = (points @ P.swapaxes(1, 2)).reshape(2, *M.shape[:3], 3)
         u, v = np.moveaxis(distort_visible(lens[:, None, None, None], m[..., :2] / m[..., 2:]), -1, 0)
         lowest = np.minimum(np.minimum(u + 0.5, wide - u), np.minimum(v + 0.5, high - v)).min(axis=1)
         front = (m[..., 2] * depth > 0.0).all(axis=1)

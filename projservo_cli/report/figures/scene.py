@@ -17,7 +17,7 @@ from projservo_cli.task.face import center_of
 
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
 _ROBOT = style.line(style.BLACK, width=2.0, marker="o", markersize=4)
-_GOAL = style.line(style.VERMILION, (0, (3, 1)), label="face at the goal")  # blue is the left camera
+_GOAL = style.line(style.PURPLE, (0, (3, 1)), label="face at the goal")  # blue is the left camera
 _LINE = style.line(style.GREY, style.DOTTED, label="straight line of the centre")
 
 
@@ -164,7 +164,7 @@ def _fit(axes: Any, figure: "style.Figure", extent: FloatArray) -> None:
 
 
 _POSES, _REGION = 5, 0.95
-_SHOWN = 0.05  # size of the ellipsoids as they are drawn, over the distance of the tools
+_ELLIPSOID_SIZE = 0.05  # size of the ellipsoids as they are drawn, over the distance of the tools
 _ELLIPSOID = style.line(style.VERMILION, width=0.8)
 
 
@@ -228,8 +228,8 @@ def _data_metric(report_data: Fit) -> Data:
     arm = report_data.calibration.model()._replace(
         H_hat_0=twists(metric.axes), q_reference=np.zeros(q.shape[1])
     )
-    seen = report_data.observation.images
-    low, high = np.nanmin(seen, axis=(0, 2)), np.nanmax(seen, axis=(0, 2))
+    pixels = report_data.observation.images
+    low, high = np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))
     spread, axes = np.linalg.eigh(metric.pose_covariance(q)[:, 3:, 3:])
     radius = np.sqrt(chdtri(3, 1.0 - _REGION) * np.maximum(spread, 0.0))
     semi_axes = axes.swapaxes(1, 2) * radius[..., None]
@@ -239,7 +239,7 @@ def _data_metric(report_data: Fit) -> Data:
         "tool": tools,
         "position_std_mm": metric.position_std(q),
         "semi_axes": semi_axes,
-        "factor": np.array(style.magnification(float(radius.max()), _SHOWN * extent)),
+        "factor": np.array(style.magnification(float(radius.max()), _ELLIPSOID_SIZE * extent)),
         "robot": skeleton(joint_operators(arm, q[0]), arm.joint_types, tools[0]),
         "pyramids": _pyramids(metric.body.P, _rectangle(low, high), tools),
     }
