@@ -25,7 +25,6 @@ from projservo_cli.report.figures import (
     errors,
     images,
     joint_space,
-    parts,
     path_deviation,
     planned,
     scene,
@@ -36,21 +35,8 @@ from projservo_cli.task.face import cyclic_order
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "FIGURES",
-    "calibration",
-    "errors",
-    "images",
-    "joint_space",
-    "of_calibration",
-    "of_plan",
-    "of_trace",
-    "parts",
-    "path_deviation",
-    "placed",
-    "planned",
-    "scene",
-]
+# Figures register themselves where their topic is imported.
+_TOPICS = (calibration, errors, images, joint_space, path_deviation, planned, scene)
 FIGURES = tuple(REGISTER[name] for name in sorted(REGISTER))
 
 
