@@ -14,7 +14,7 @@ from projservo_cli.report.style import power_of_ten
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-NONE = "\N{EN DASH}"  # in place of a number that is not there
+_NONE = "\N{EN DASH}"  # in place of a number that is not there
 
 
 def html_page(template: str, **values: Any) -> str:
@@ -50,7 +50,7 @@ def embedded(content: bytes, media_type: str) -> str:
 def short(value: float | None, digits: int = 3) -> str:
     """A number with few digits, powers of ten set as such; a dash where there is none."""
     if value is None or not math.isfinite(value):
-        return NONE
+        return _NONE
     power = math.floor(math.log10(abs(value))) if value else 0
     whole = value == 0 or isinstance(value, (int, np.integer)) or digits <= power + 1 <= 6
     mantissa, sign, exponent = (f"{value:.0f}" if whole else f"{value:.{digits}g}").partition("e")
@@ -62,5 +62,5 @@ def _number(value: Any, digits: int = 3) -> Markup:
     """A number for the eye that carries all of its digits for programs."""
     plain = value.item() if isinstance(value, np.generic) else value
     if plain is None or not math.isfinite(plain):
-        return Markup(NONE)
+        return Markup(_NONE)
     return Markup('<data value="{}">{}</data>').format(repr(plain), short(plain, digits))

@@ -68,7 +68,7 @@ def _calibration_words(values: Mapping[str, Any], *, estimated: bool) -> Iterato
 
 
 def _worst_joint(values: Mapping[str, Any]) -> str:
-    """Which joint adds most to predicted images, and whether it is well observable, in one sentence."""
+    """Name the joint that adds most to predicted images, and whether it is well observable."""
     joints = values["joints"]
     noises = [(joint["noise"], i) for i, joint in enumerate(joints) if math.isfinite(joint["noise"])]
     if not noises:

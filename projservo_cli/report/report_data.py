@@ -371,34 +371,29 @@ def findings(calibration: Calibration) -> dict[str, Any]:
     the ``tracks`` (markers) that are rejected as a whole by reason, of the ``poses`` and of ``unseen_poses``,
     and the count of ``placeholders``.
     """
-    outliers, suspects, swaps = (
-        rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.id_switches)
-    )
-    rejected_tracks, rejected_poses, moved, unseen = (
-        [] if rows is None else rows.tolist()
-        for rows in (
-            calibration.rejected_markers,
-            calibration.rejected_poses,
-            calibration.moved_images,
-            calibration.unseen_poses,
-        )
-    )
-    tracks = {why: [j for j, w in rejected_tracks if w == code] for code, why in enumerate(WHY_LOST)}
-    whole = {j for numbers in tracks.values() for j in numbers}
-    rejected = {
-        "observations": sum(marker not in whole for _, marker, _ in outliers),
-        "id_switches": len(swaps),
-        "tracks": tracks,
-        "poses": sorted({p for p, _ in suspects} | set(rejected_poses)),
-        "unseen_poses": unseen,
-        "placeholders": calibration.placeholders,
-    }
+
+    def rows(name: str) -> list[Any]:
+        """Rows of an array of the calibration; none where it has none."""
+        array = getattr(calibration, name)
+        return [] if array is None else array.tolist()  # type: ignore[no-any-return]
+
+    outliers, suspects, swaps = rows("outlier"), rows("suspect"), rows("id_switches")
+    lost = rows("rejected_markers")
+    tracks = {why: [marker for marker, reason in lost if reason == code] for code, why in enumerate(WHY_LOST)}
+    whole = {marker for marker, _ in lost}
     return {
         "outliers": [{"pose": p, "marker": m, "view": (*VIEWS, "both")[v]} for p, m, v in outliers],
         "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
         "id_switches": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
-        "moved_images": [{"pose": p, "view": VIEWS[v]} for p, v in moved],
+        "moved_images": [{"pose": p, "view": VIEWS[v]} for p, v in rows("moved_images")],
         "poses_used": calibration.poses_used,
         "markers_used": calibration.markers_used,
-        "rejected": rejected,
+        "rejected": {
+            "observations": sum(marker not in whole for _, marker, _ in outliers),
+            "id_switches": len(swaps),
+            "tracks": tracks,
+            "poses": sorted({p for p, _ in suspects} | set(rows("rejected_poses"))),
+            "unseen_poses": rows("unseen_poses"),
+            "placeholders": calibration.placeholders,
+        },
     }

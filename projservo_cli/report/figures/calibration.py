@@ -41,11 +41,11 @@ def _data(fit: Fit) -> Data:
     """Residuals, noise model, predicted error of each pose, excitation and information of a fit."""
     calibration, observation = fit.calibration, fit.observation
     predicted = predict(calibration, observation.q)
-    seen, rejected = _observed(calibration, observation)
-    read: BoolArray = np.all(np.isfinite(seen), axis=-1)
-    out = (rejected > 0) | ~np.isfinite(predicted).all(axis=-1)
-    used = read & ~out
-    residual, variance = seen - predicted, prediction_variance(calibration, observation.q)
+    pixels, rejected = _observed(calibration, observation)
+    measured: BoolArray = np.all(np.isfinite(pixels), axis=-1)
+    excluded = (rejected > 0) | ~np.isfinite(predicted).all(axis=-1)
+    used = measured & ~excluded
+    residual, variance = pixels - predicted, prediction_variance(calibration, observation.q)
     weighed = calibration.sigma_q or observation.sigma is not None
     if weighed:
         residual, variance = _as_tested(fit, residual, used)
@@ -68,16 +68,16 @@ def _data(fit: Fit) -> Data:
         result |= _by_pose(predictable, fit.held_out.residual, fit.held_out.predicted**2)
     unknown = observation.images[:, :, ~np.isin(observation.marker, calibration.marker)]
     for v, view in enumerate(VIEWS):
-        others = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
-        result[f"seen_{view}"] = seen[:, v][used[:, v]]
+        unidentified = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
+        result[f"seen_{view}"] = pixels[:, v][used[:, v]]
         result[f"residual_{view}"] = residual[:, v][used[:, v]]
-        gone = np.maximum(rejected, 1)  # a marker without a prediction counts as an outlier
-        positions = [seen[:, v][(read & out & (gone == i))[:, v]] for i in range(1, len(_KINDS))]
+        reason = np.maximum(rejected, 1)  # a marker without a prediction counts as an outlier
+        positions = [pixels[:, v][(measured & excluded & (reason == i))[:, v]] for i in range(1, len(_KINDS))]
         result |= {
             f"rejected_{kind}_{view}": of_kind
-            for kind, of_kind in zip(_KINDS, (*positions, others), strict=True)
+            for kind, of_kind in zip(_KINDS, (*positions, unidentified), strict=True)
         }
-    extent = max(float(np.ptp(seen[:, v][read[:, v]], axis=0).max()) for v in (0, 1))
+    extent = max(float(np.ptp(pixels[:, v][measured[:, v]], axis=0).max()) for v in (0, 1))
     residual = result["residual"]
     rms = float(np.sqrt(2.0 * np.mean(residual**2))) if residual.size else 0.0
     result["factor"] = np.array(style.magnification(rms, _ARROW * extent))
@@ -128,8 +128,8 @@ def _observed(calibration: Calibration, observation: Observation) -> tuple[Float
 
     Those are outliers (1), markers that were read under another number (2), and poses in doubt (3).
     """
-    seen = observation.images[:, :, _columns(calibration, observation)]
-    out = np.zeros(seen.shape[:3], dtype=np.int64)
+    pixels = observation.images[:, :, _columns(calibration, observation)]
+    reason = np.zeros(pixels.shape[:3], dtype=np.int64)
     row = {number: k for k, number in enumerate(observation.pose.tolist())}
     column = {number: j for j, number in enumerate(calibration.marker.tolist())}
     # The marker that it is was not seen there, or is left out as well: an exchange is listed once.
@@ -137,12 +137,12 @@ def _observed(calibration: Calibration, observation: Observation) -> tuple[Float
     for why, positions in ((2, renamed), (1, calibration.outlier.tolist())):
         for pose, number, view in positions:
             if pose in row and number in column:
-                out[row[pose], slice(None) if view == _BOTH else view, column[number]] = why
+                reason[row[pose], slice(None) if view == _BOTH else view, column[number]] = why
     doubted = calibration.suspect[:, 0]
     if calibration.rejected_poses is not None:
         doubted = np.append(doubted, calibration.rejected_poses)
-    out[np.isin(observation.pose, doubted)] = _KINDS.index("pose") + 1
-    return seen, out
+    reason[np.isin(observation.pose, doubted)] = _KINDS.index("pose") + 1
+    return pixels, reason
 
 
 def _columns(calibration: Calibration, observation: Observation) -> list[int]:
@@ -218,18 +218,18 @@ def _draw(data: Data, figure: "style.Figure") -> None:
 
 def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
     """Draw residuals as arrows in one image, magnified, and the observations that were rejected."""
-    used, out = data[f"seen_{view}"], {kind: data[f"rejected_{kind}_{view}"] for kind in _KINDS}
-    count = sum(map(len, out.values()))
+    used, rejected = data[f"seen_{view}"], {kind: data[f"rejected_{kind}_{view}"] for kind in _KINDS}
+    count = sum(map(len, rejected.values()))
     arrows = float(data["factor"]) * data[f"residual_{view}"]
     pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "color": _RESIDUAL["color"]}
     heads: Any = {"width": 0.0022, "headwidth": 4.0, "headlength": 5.0, "headaxislength": 4.0}
     axes.quiver(*used.T, *arrows.T, **pixels, **heads)
     size = _LARGE if count < _MANY else _SMALL
-    for kind, positions in out.items():
+    for kind, positions in rejected.items():
         if len(positions):
             axes.plot(*positions.T, **_LEFT_OUT[kind], markersize=size, markeredgewidth=0.9)
     title = f"{view}: {len(used):,} observations, {count:,} rejected"
-    style.image_axes(axes, title, np.concatenate([used, used + arrows, *out.values()]))
+    style.image_axes(axes, title, np.concatenate([used, used + arrows, *rejected.values()]))
 
 
 def _histogram(axes: "style.Axes", data: Data) -> None:
