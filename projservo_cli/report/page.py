@@ -209,41 +209,8 @@ def _provenance_text(key: str, provenance: Mapping[str, Any]) -> str:
 
 
 def _calibration(values: dict[str, Any], about: About) -> dict[str, Any]:
-    """Plain values of a calibration with its sentences, and its numbers with their labels and units."""
-    lens = [
-        (f"lens of the {view} camera, {k}", terms[k], "")
-        for view, terms in (values["lens"] or {}).items()
-        for k in ("k1", "k2")
-    ]
-    numbers = [
-        ("method", values["method"], ""),
-        ("source", values["source"], ""),
-        ("residual, rms per marker and view", values["rms_px"], "px"),
-        ("noise per coordinate, as taken", values["sigma_px"], "px"),
-        ("noise per coordinate, from the residuals", values["sigma_fitted_px"], "px"),
-        ("predicted error within the ranges of the joints, rms", values["predicted_rms_px"], "px"),
-        ("the same, in 99 of 100 calibrations below", values["predicted_p99_px"], "px"),
-        ("χ² per degree of freedom", values["chi2_per_dof"], ""),
-        ("degrees of freedom", values["dof"], ""),
-        ("poses", values["poses_used"], ""),
-        ("markers", values["markers_used"], ""),
-        *lens,
-        *_joints_and_time(values),
-        ("time", values["seconds"], "s"),
-    ]
-    words = list(_calibration_words(values, estimated=about.estimates_noise))
-    return values | {"words": words, "numbers": numbers}
-
-
-def _joints_and_time(values: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
-    """Yield the joint noise and the time offsets, if estimated: label, number, unit."""
-    if values["sigma_q"] is not None:
-        yield "joint readings off by, rms", np.degrees(values["sigma_q"]), "°"
-    if values["time_offset_s"] is not None:
-        times = zip(VIEWS, values["time_offset_s"], values["time_offset_jitter_s"], strict=True)
-        for view, delay, jitter in times:
-            yield f"images of the {view} camera late by", 1e3 * delay, "ms"
-            yield f"single images of the {view} camera differ by, rms", 1e3 * jitter, "ms"
+    """Plain values of a calibration with its sentences."""
+    return values | {"words": list(_calibration_words(values, estimated=about.estimates_noise))}
 
 
 def _visibility(plan: Plan) -> dict[str, Any]:

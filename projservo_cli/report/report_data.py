@@ -375,7 +375,7 @@ def findings(calibration: Calibration) -> dict[str, Any]:
     def rows(name: str) -> list[Any]:
         """Rows of an array of the calibration; none where it has none."""
         array = getattr(calibration, name)
-        return [] if array is None else array.tolist()  # type: ignore[no-any-return]
+        return [] if array is None else array.tolist()
 
     outliers, suspects, swaps = rows("outlier"), rows("suspect"), rows("id_switches")
     lost = rows("rejected_markers")
