@@ -19,7 +19,9 @@ from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title
 from projservo_cli.metric.frame import Metric
 from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
+    MM,
     WHY_LOST,
+    BoolArray,
     Calibration,
     CrossValidation,
     FloatArray,
@@ -254,6 +256,17 @@ def registered(
 def percent(values: FloatArray) -> FloatArray:
     """Values normalised to 100 at their start; NaN throughout where they start at 0."""
     return np.asarray(100.0 * values / values[0]) if values[0] != 0 else np.full_like(values, np.nan)
+
+
+def joint_units(prismatic: BoolArray) -> FloatArray:
+    """Factors (n,) from rad or m to the units in which joints are drawn, deg or mm."""
+    return np.where(prismatic, MM, np.degrees(1.0))
+
+
+def joint_kinds(prismatic: BoolArray) -> list[tuple[list[int], str]]:
+    """Numbers of the revolute and of the prismatic joints, where there are some, with their unit."""
+    kinds = [(np.flatnonzero(prismatic == kind).tolist(), "mm" if kind else "deg") for kind in (False, True)]
+    return [(numbers, unit) for numbers, unit in kinds if numbers]
 
 
 def along_line(points: FloatArray, start: FloatArray, goal: FloatArray) -> tuple[FloatArray, FloatArray]:

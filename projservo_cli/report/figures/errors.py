@@ -4,7 +4,15 @@ import numpy as np
 
 from projservo_cli.records import PRISMATIC, FloatArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.report_data import Data, ReportData, curve_difference, percent, registered
+from projservo_cli.report.report_data import (
+    Data,
+    ReportData,
+    curve_difference,
+    joint_kinds,
+    joint_units,
+    percent,
+    registered,
+)
 
 _DECADES = 1e-5  # of its start, down to which an error is drawn on a logarithmic scale
 _FAINT: style.LineStyle = {"linewidth": 0.8, "alpha": 0.55, "label": ""}
@@ -144,7 +152,7 @@ def _rotations(rotation: "style.Axes", difference: "style.Axes", data: Data) -> 
 def _data_joints(report_data: ReportData) -> Data:
     """Joints and their steps under directTHREE with calibrated operators, in deg and in mm."""
     prismatic = report_data.robot.joint_types == PRISMATIC
-    scale = np.where(prismatic, 1e3, np.degrees(1.0))
+    scale = joint_units(prismatic)
     result: Data = {"prismatic": prismatic, "step_limit_deg": np.array(report_data.extra.step_limit_deg)}
     for name, limited in _WAYS:
         trace = report_data.extra.own["direct_three", "calibrated", limited]
@@ -167,8 +175,7 @@ def _data_joints(report_data: ReportData) -> Data:
 def _draw_joints(data: Data, figure: "style.Figure") -> None:
     """Left without, right with the limit; joints above, their steps below, per kind of joint."""
     prismatic, limit = data["prismatic"], float(data["step_limit_deg"])
-    by_kind = ((np.flatnonzero(~prismatic), "deg"), (np.flatnonzero(prismatic), "mm"))
-    kinds = [(chosen.tolist(), unit) for chosen, unit in by_kind if len(chosen)]
+    kinds = joint_kinds(prismatic)
     figure.set_figheight(1.2 + 3.6 * len(kinds))
     axes = figure.subplots(2 * len(kinds), 2, sharex=True, squeeze=False)
     for (joints, steps), (chosen, unit) in zip(axes.reshape(-1, 2, 2), kinds, strict=True):

@@ -6,10 +6,10 @@ import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.planning.margins import BEHIND, CLEAR, CONSTRAINTS, IMAGE, WIDTH
-from projservo_cli.records import PRISMATIC, FloatArray, IntArray, Plan
+from projservo_cli.records import PRISMATIC, FloatArray, Plan
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import border, near_pixels
-from projservo_cli.report.report_data import VIEWS, Data, ReportData, registered
+from projservo_cli.report.report_data import VIEWS, Data, ReportData, joint_kinds, joint_units, registered
 
 PIECES = 4  # of each edge of a tree, which is no straight line in an image
 _IMAGE_WIDTH, _ROW = 2.9, 1.5  # inches: of an image, and the height of a row of curves
@@ -44,7 +44,7 @@ def _data(report_data: ReportData) -> Data:
     """Images, joints and margins along the plan; trees as lines with NaN between their edges."""
     plan, order, model = report_data.plan, report_data.plant.order, report_data.calibrated
     slides = report_data.robot.joint_types == PRISMATIC
-    unit = np.where(slides, 1e3, np.degrees(1.0))
+    unit = joint_units(slides)
     timed = bool(np.isfinite(plan.time).all())
     name = f"{plan.profile.replace('_', ' ')} profile"
     if plan.profile == "joint_space" and not plan.feasible:
@@ -126,10 +126,7 @@ def with_gaps(points: FloatArray) -> FloatArray:
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """Above the images; below left the joints, by kind, right the constraints."""
-    slides = data["prismatic"]
-    kinds: list[tuple[IntArray, str]] = [
-        (np.flatnonzero(slides == kind), "mm" if kind else "deg") for kind in np.unique(slides)
-    ]
+    kinds = joint_kinds(data["prismatic"])
     visible = [_visible(data, view) for view in range(2)]
     image = _IMAGE_WIDTH * style.aspect(np.concatenate(visible), upper=_HIGHEST)
     figure.set_figheight(image + 2.0 * _ROW + 1.9)
@@ -138,7 +135,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         _image(figure.add_subplot(grid[0, view]), data, view, visible[view])
     cells = (grid[1:, 0],) if len(kinds) == 1 else (grid[1, 0], grid[2, 0])
     for cell, (chosen, unit) in zip(cells, kinds, strict=True):
-        _joints(figure.add_subplot(cell), data, chosen.tolist(), unit)
+        _joints(figure.add_subplot(cell), data, chosen, unit)
     shares, distances = figure.add_subplot(grid[1, 1]), figure.add_subplot(grid[2, 1])
     _constraints(shares, data, _SHARES, _NEAR)
     _constraints(distances, data, _DISTANCES, _NEAR_PX)

@@ -1,5 +1,6 @@
 """Fig. 3 of [RH00], robot, rig and face; and arm, cameras and the tool's uncertainty to scale, in metres."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -179,44 +180,41 @@ def chosen_poses(metric: Metric, fit: Fit) -> FloatArray:
     return q[chosen]
 
 
-def metric_rows(metric: Metric, q: FloatArray) -> list[dict[str, Any]]:
-    """Quantities in metres with their standard deviations, plain values; the tool at readings q (k, n)."""
-    rows: list[dict[str, Any]] = []
-
-    def row(quantity: str, value: FloatArray, changes: FloatArray, unit: str) -> None:
-        """Add a row of values (d,), by their changes (c, d) by independent errors."""
-        deviation = np.linalg.norm(np.atleast_2d(changes), axis=0)
-        rows.append(
-            {
-                "quantity": quantity,
-                "value": np.atleast_1d(value).tolist(),
-                "deviation": deviation.tolist(),
-                "unit": unit,
-            }
-        )
-
+def metric_rows(metric: Metric, q: FloatArray) -> Iterator[dict[str, Any]]:
+    """Yield quantities in metres with their standard deviations; the tool at readings q (k, n)."""
     of_K, of_poses, centers = metric.deviations("K"), metric.deviations("poses"), metric.poses[:, :3, 3]
     for v, view in enumerate(VIEWS):
         K = metric.K[v]
-        row(f"{view} camera, focal lengths", K[(0, 1), (0, 1)], of_K[:, v][:, [0, 3]], "px")
-        row(f"{view} camera, principal point", K[:2, 2], of_K[:, v][:, [2, 4]], "px")
-        row(f"{view} camera, position in the base frame", MM * centers[v], MM * of_poses[:, v, 3:], "mm")
+        yield _row(f"{view} camera, focal lengths", K[(0, 1), (0, 1)], of_K[:, v][:, [0, 3]], "px")
+        yield _row(f"{view} camera, principal point", K[:2, 2], of_K[:, v][:, [2, 4]], "px")
+        yield _row(
+            f"{view} camera, position in the base frame", MM * centers[v], MM * of_poses[:, v, 3:], "mm"
+        )
     apart = centers[1] - centers[0]
     distance = np.asarray(np.linalg.norm(apart))
     between = (of_poses[:, 1, 3:] - of_poses[:, 0, 3:]) @ (apart / distance)
-    row("distance of the cameras", MM * distance, MM * between[:, None], "mm")
+    yield _row("distance of the cameras", MM * distance, MM * between[:, None], "mm")
     axes, prismatic = metric.axes, metric.prismatic
     angle, length = links(axes, prismatic, axes)
     changes = metric.changes(lambda body: np.stack(links(body.axes, prismatic, axes), axis=-1))
     for i in range(len(angle)):
         name = f"joint {i + 2}, axis from that of joint {i + 1}"
-        row(f"{name}, angle", np.degrees(angle[i]), np.degrees(changes[:, i, :1]), "°")
+        yield _row(f"{name}, angle", np.degrees(angle[i]), np.degrees(changes[:, i, :1]), "°")
         if np.isfinite(length[i]):
-            row(f"{name}, distance", MM * length[i], MM * changes[:, i, 1:], "mm")
+            yield _row(f"{name}, distance", MM * length[i], MM * changes[:, i, 1:], "mm")
     of_tools = metric.point_changes(q, np.zeros(3))
     for k, T in enumerate(metric.pose(q)):
-        row(f"tool at pose {k + 1}", MM * T[:3, 3], MM * of_tools[:, k], "mm")
-    return rows
+        yield _row(f"tool at pose {k + 1}", MM * T[:3, 3], MM * of_tools[:, k], "mm")
+
+
+def _row(quantity: str, value: FloatArray, changes: FloatArray, unit: str) -> dict[str, Any]:
+    """Plain values of a quantity (d,) and its deviation, by its changes (c, d) by independent errors."""
+    return {
+        "quantity": quantity,
+        "value": np.atleast_1d(value).tolist(),
+        "deviation": np.linalg.norm(np.atleast_2d(changes), axis=0).tolist(),
+        "unit": unit,
+    }
 
 
 def _data_metric(report_data: Fit) -> Data:
