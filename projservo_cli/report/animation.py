@@ -18,7 +18,7 @@ from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, 
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import frames_of, near_pixels, with_halo
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
-from projservo_cli.report.figures.scene import plant_pyramids, skeleton
+from projservo_cli.report.figures.scene import goal_displacement, plant_pyramids, skeleton
 from projservo_cli.report.html import html_page
 from projservo_cli.report.report_data import PAGE_FILE, VIEWS, title
 from projservo_cli.simulation.arm import Arm
@@ -89,8 +89,8 @@ def motion_of(
     """Return the view of runs with at least one step; ``markers`` (p, 4) at the robot's reference, m."""
     face = plant.M[plant.order]
     start = (face @ forward_kinematics(plant.model, plan.q_start).T)[:, :3]
-    goals = [trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all()]
-    goal = (face @ np.linalg.solve(robot.base_tool.T, goals[0].T))[:, :3] if goals else None
+    displacement = goal_displacement(robot, traces)
+    goal = None if displacement is None else (face @ displacement.T)[:, :3]
     planned = _centers(plant, plan.q[np.isfinite(plan.q).all(axis=1)])
     runs = {name: _driven(robot, plant, markers, trace) for name, trace in traces.items()}
     edges = () if plan.tree_q is None else tree_edges(plan)

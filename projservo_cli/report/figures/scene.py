@@ -1,6 +1,6 @@
 """Fig. 3 of [RH00], robot, rig and face; and arm, cameras and the tool's uncertainty to scale, in metres."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -9,10 +9,10 @@ from scipy.special import chdtri
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.geometry.rigid import homogeneous, twists
 from projservo_cli.metric.frame import Metric, links
-from projservo_cli.records import MM, PRISMATIC, VIEWS, FloatArray
+from projservo_cli.records import MM, PRISMATIC, VIEWS, FloatArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, Fit, ReportData, registered
-from projservo_cli.simulation.arm import camera_center
+from projservo_cli.simulation.arm import Arm, camera_center
 from projservo_cli.simulation.ideal import Plant
 from projservo_cli.task.face import center_of
 
@@ -34,13 +34,18 @@ def _data(report_data: ReportData) -> Data:
     }
     visible = plant_pyramids(plant, result["face_start"])
     result |= {"cameras": visible[:, 0], "pyramids": visible}
-    goals = (trace.goal_pose for trace in report_data.traces.values() if np.isfinite(trace.goal_pose).all())
-    if (pose := next(goals, None)) is not None:
-        goal = pose @ np.linalg.inv(robot.base_tool)
+    if (goal := goal_displacement(robot, report_data.traces)) is not None:
         result["face_goal"] = (face @ goal.T)[:, :3]
         centers = [center_of(plant.M @ H.T, plant.center)[:3] for H in (start, goal)]
         result["line"] = np.array(centers)
     return result
+
+
+def goal_displacement(robot: Arm, traces: Mapping[str, Trace]) -> FloatArray | None:
+    """Displacement (4, 4) of the markers from the reference to the goal; None where only images are known."""
+    poses = (trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all())
+    pose = next(poses, None)
+    return None if pose is None else np.asarray(pose @ np.linalg.inv(robot.base_tool))
 
 
 def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArray:
