@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -42,30 +42,19 @@ def annotated(grey: ByteArray, marker: Sequence[int], pixels: FloatArray, goal: 
 
 def preflight_page(name: str, findings: Sequence[Finding], pictures: Sequence[bytes]) -> str:
     """One file of HTML with the findings of a preflight and both pictures, JPEG."""
-    return _page(f"Preflight of {name}", _within(pictures), findings=findings)
+    title = f"Preflight of {name}"
+    return html_page("cameras.html", title=title, images=_within(pictures), findings=findings)
 
 
 def recording_page(name: str, done: str, pictures: Sequence[bytes], *, whole: bool) -> str:
     """One file of HTML that shows how far a recording is, and loads itself again until it is whole."""
-    return _page(f"Recording {name}", _within(pictures), text=done, again=not whole)
+    title = f"Recording {name}"
+    return html_page("cameras.html", title=title, images=_within(pictures), text=done, reloads=not whole)
 
 
 def _within(pictures: Sequence[bytes]) -> dict[str, str]:
     """Addresses of the pictures, JPEG, of both views within a page."""
     return {view: embedded(picture, "image/jpeg") for view, picture in zip(VIEWS, pictures, strict=False)}
-
-
-def _page(
-    title: str,
-    images: Mapping[str, str],
-    *,
-    text: str = "",
-    findings: Sequence[Finding] = (),
-    again: bool = False,
-) -> str:
-    """A page of the images of both views, by their addresses."""
-    values = {"title": title, "images": images.items(), "text": text, "findings": findings, "again": again}
-    return html_page("cameras.html", **values)
 
 
 class LivePage:
@@ -76,7 +65,8 @@ class LivePage:
 
     def __init__(self, name: str, port: int = 0) -> None:
         images = {view: f"/{view}.mjpg" for view in VIEWS}
-        text = _page(f"Live images of {name}", images, text="Ctrl-C in the terminal ends it.")
+        title, note = f"Live images of {name}", "Ctrl-C in the terminal ends it."
+        text = html_page("cameras.html", title=title, images=images, text=note)
         self.pictures: dict[str, bytes] = {}
         live = self
 

@@ -144,7 +144,7 @@ _VERSIONS = ("python", "numpy", "scipy", "numba", "llvmlite", "h5py", "matplotli
 
 
 def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> dict[str, Any]:
-    """Return what the page shows of a run in a ``folder``, relative to it; ``prefix`` precedes its names.
+    """Return the page's data of a run in a ``folder``, relative to the page; ``prefix`` precedes its names.
 
     Parts that are missing are empty or None.
     """

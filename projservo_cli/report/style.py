@@ -296,8 +296,8 @@ def start_and_goal(axes: "Axes", start: FloatArray, goal: FloatArray, *, fill: b
     face(axes, goal, GOAL)
 
 
-def paths(axes: "Axes", points: FloatArray, line_style: LineStyle, *, where: BoolArray | None = None) -> None:
-    """Draw the paths (k, m, 2) of m points, or the stretches at whose instants (k,) something is so."""
-    if where is not None:
-        points = np.where(where[:, None, None], points, np.nan)
+def paths(axes: "Axes", points: FloatArray, line_style: LineStyle, *, mask: BoolArray | None = None) -> None:
+    """Draw the paths (k, m, 2) of m points, of all instants or of those selected by a mask (k,)."""
+    if mask is not None:
+        points = np.where(mask[:, None, None], points, np.nan)
     axes.plot(points[..., 0], points[..., 1], **line_style)

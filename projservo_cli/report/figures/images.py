@@ -71,7 +71,7 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
         first, last = data[f"plateau_{law}"]
         for view, (panel, name) in enumerate(zip(row, VIEWS, strict=True)):
             s = data[f"s_{law}"][:, view]
-            style.paths(panel, s, style.HIDDEN, where=data[f"hidden_{law}"][:, view])
+            style.paths(panel, s, style.HIDDEN, mask=data[f"hidden_{law}"][:, view])
             style.paths(panel, s, _PATH)
             if first >= 0:
                 style.paths(panel, s[first : last + 1], _PLATEAU | {"markevery": [0]})
@@ -171,7 +171,7 @@ def _draw_errors(data: Data, figure: "style.Figure") -> None:
 
 
 def _coordinates(axes: "style.Axes", t: FloatArray, pixels: FloatArray, line: style.LineStyle) -> None:
-    """Draw u and v of pixels (k, 2) over time (k,), told apart by their dashes."""
+    """Draw u and v of pixels (k, 2) over time (k,), distinguished by their dashes."""
     for values, coordinate in zip(pixels.T, _COORDINATES, strict=True):
         axes.plot(t, values, **line | {"linestyle": coordinate["linestyle"]})
 
@@ -242,7 +242,7 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
     for view, (panel, name) in enumerate(zip(axes[:, 0], VIEWS, strict=True)):
         for law, line in reversed(lines.items()):
             s = data[f"s_{law}"][:, view]
-            style.paths(panel, s, style.HIDDEN, where=data[f"hidden_{law}"][:, view])
+            style.paths(panel, s, style.HIDDEN, mask=data[f"hidden_{law}"][:, view])
             style.paths(panel, s, line)
         panel.plot(*data["center"][:, view].T, **_CENTER)
         style.start_and_goal(panel, data[f"s_{DIRECT[0]}"][0, view], data["s_star"][view])

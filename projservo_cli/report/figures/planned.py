@@ -149,7 +149,7 @@ def _draw_visibility(data: Data, figure: "style.Figure") -> None:
         images, margins = data["images"][:, :, view], data["theta_margin"][..., view]
         style.face(image, images[0, 0], style.START | {"label": "face at the start"}, fill=True)
         for s, margin, line in zip(images, margins, senses, strict=True):
-            style.paths(image, s, _HIDDEN, where=margin <= 0.0)
+            style.paths(image, s, _HIDDEN, mask=margin <= 0.0)
             style.paths(image, s, line | {"linewidth": 0.9})
             style.face(image, s[-1], line)
         style.image_axes(image, f"{name} camera", images)
