@@ -18,7 +18,7 @@ from projservo_cli.task.face import center_of
 
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
 _ROBOT = style.line(style.BLACK, width=2.0, marker="o", markersize=4)
-_GOAL = style.line(style.PURPLE, (0, (3, 1)), label="face at the goal")  # blue is the left camera
+_GOAL = style.line(style.PURPLE, (0, (3, 1)), 1.6, label="face at the goal")  # blue is the left camera
 _LINE = style.line(style.GREY, style.DOTTED, label="straight line of the centre")
 
 
