@@ -88,9 +88,9 @@ class ImageModel(Displayable, Calibration):
         """
         if self.observation is None:
             raise InputError("plot: the observations that the calibration was made from are not at hand")
-        from projservo_cli.report import plots  # so that those who draw nothing need not import all figures
+        from projservo_cli.report import figures  # so that those who draw nothing need not import all figures
 
-        return plots.placed(plots.of_calibration(self, self.observation, self.cross_validation), ax)
+        return figures.placed(figures.of_calibration(self, self.observation, self.cross_validation), ax)
 
     @overload
     def predict(self, q: npt.ArrayLike, *, return_std: Literal[False] = False) -> FloatArray: ...
@@ -407,9 +407,9 @@ class MotionPlan(Displayable, Plan):
         """
         if self.scene is None:
             raise InputError("plot: the calibration that the plan was made with is not at hand")
-        from projservo_cli.report import plots
+        from projservo_cli.report import figures
 
-        return plots.placed(plots.of_plan(self, self.scene), ax)
+        return figures.placed(figures.of_plan(self, self.scene), ax)
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""
@@ -442,9 +442,9 @@ class RunTrace(Displayable, Trace):
         ----------
         ax : axes in whose place the figure is shown; by default a separate figure is returned.
         """
-        from projservo_cli.report import plots
+        from projservo_cli.report import figures
 
-        return plots.placed(plots.of_trace(self, self.face), ax)
+        return figures.placed(figures.of_trace(self, self.face), ax)
 
     def coordinates(self) -> dict[str, Any]:
         """Return coordinates of dimensions, by their names; ``time`` in s."""

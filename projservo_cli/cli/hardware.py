@@ -148,7 +148,7 @@ def doctor(
     """
     from projservo_cli.config.inputs import preflight_inputs
     from projservo_cli.files import write_whole
-    from projservo_cli.hardware.live_page import page
+    from projservo_cli.report.live_page import preflight_page
     from projservo_cli.stages.doctor import check
 
     settings = option.configured(config, options, teaching=True)
@@ -165,7 +165,7 @@ def doctor(
             progress=console.progress,
         )
         pictures = [] if checked.seen is None else _pictures(settings, checked.seen)
-        write_whole(output, page(settings.name, checked.findings, pictures))
+        write_whole(output, preflight_page(settings.name, checked.findings, pictures))
     value = {
         "page": output.resolve(),
         "works": checked.works,
@@ -216,7 +216,7 @@ def _goal_pixels(settings: "Config") -> "list[FloatArray]":
 
 
 def _pictures(settings: "Config", seen: "RobotAtRest") -> list[bytes]:
-    from projservo_cli.hardware.live_page import annotated
+    from projservo_cli.report.live_page import annotated
 
     both = zip(seen.views, seen.s, _goal_pixels(settings), strict=False)
     return [annotated(view.frame.grey, seen.marker, s, goal) for view, s, goal in both]
@@ -226,8 +226,8 @@ def _watch(console: Console, settings: "Config", robot: "PluginRobot") -> None:
     """Serve both images until Ctrl-C."""
     import time
 
-    from projservo_cli.hardware.live_page import LivePage, annotated
     from projservo_cli.records import VIEWS
+    from projservo_cli.report.live_page import LivePage, annotated
 
     live, goal = LivePage(settings.name), _goal_pixels(settings)
     assert settings.markers is not None

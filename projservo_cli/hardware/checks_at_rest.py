@@ -108,7 +108,7 @@ def _of_tags(
         yield Finding(FAULT, where, f"tag {number} is there twice", remedy)
     there = {number: tag for number, tag in view.tags.items() if number in expected}
     if not there:
-        other, count = other_dictionary(view.frame.grey, dictionary)
+        other, count = _other_dictionary(view.frame.grey, dictionary)
         if count > len(view.tags):
             remedy = f"set markers.dictionary: {other}, or print tags of {dictionary}"
             yield Finding(FAULT, where, f"{count} tags are of {other}, none of {dictionary}", remedy)
@@ -143,7 +143,7 @@ def _width(tag: Corners) -> float:
     return float(np.linalg.norm(np.roll(tag.pixels, -1, axis=0) - tag.pixels, axis=1).mean())
 
 
-def other_dictionary(grey: ByteArray, dictionary: str) -> tuple[str, int]:
+def _other_dictionary(grey: ByteArray, dictionary: str) -> tuple[str, int]:
     """Return the dictionary with the highest number of tags in an image, among other kinds, and the number.
 
     Of two with as many tags it is the one of the larger and the fewer tags.

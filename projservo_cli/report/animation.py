@@ -16,11 +16,10 @@ from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
-from projservo_cli.report.figures.frames import frames_of, with_halo
-from projservo_cli.report.figures.images import near_pixels
+from projservo_cli.report.figures.images import frames_of, near_pixels, with_halo
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
-from projservo_cli.report.figures.scene import plant_pyramids, skeleton
-from projservo_cli.report.page import template
+from projservo_cli.report.figures.scene import goal_displacement, plant_pyramids, skeleton
+from projservo_cli.report.html import html_page
 from projservo_cli.report.report_data import PAGE_FILE, VIEWS, title
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
@@ -42,7 +41,7 @@ const far = Math.min(3, Math.max(1, 1050 / plot.clientWidth));
 const {x, y, z} = plot.layout.scene.camera.eye;
 Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}});
 """
-_CAMERAS = (style.BLUE, style.ORANGE)
+_CAMERAS = tuple(line["color"] for line in style.VIEW_LINES)
 _SEEN, _HIDDEN = style.SKY, style.VERMILION
 _KEY = (
     ("robot, face at the start", style.BLACK),
@@ -90,8 +89,8 @@ def motion_of(
     """Return the view of runs with at least one step; ``markers`` (p, 4) at the robot's reference, m."""
     face = plant.M[plant.order]
     start = (face @ forward_kinematics(plant.model, plan.q_start).T)[:, :3]
-    goals = [trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all()]
-    goal = (face @ np.linalg.solve(robot.base_tool.T, goals[0].T))[:, :3] if goals else None
+    displacement = goal_displacement(robot, traces)
+    goal = None if displacement is None else (face @ displacement.T)[:, :3]
     planned = _centers(plant, plan.q[np.isfinite(plan.q).all(axis=1)])
     runs = {name: _driven(robot, plant, markers, trace) for name, trace in traces.items()}
     edges = () if plan.tree_q is None else tree_edges(plan)
@@ -114,15 +113,15 @@ def _sample_times(q: FloatArray) -> IntArray:
 
 
 def _driven(robot: SerialArm, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
-    selected, positions = _sample_times(trace.q), []
-    for q in trace.q[selected]:
+    instants, positions = _sample_times(trace.q), []
+    for q in trace.q[instants]:
         H = forward_kinematics(plant.model, q)
         polyline = skeleton(joint_operators(plant.model, q), robot.prismatic, (H @ robot.base_tool)[:3, 3])
         positions.append((polyline, (plant.M[plant.order] @ H.T)[:, :3], (markers @ H.T)[:, :3]))
     moved = (np.stack(kind) for kind in zip(*positions, strict=True))
     verdict, path = f"{trace.verdict}, {trace.steps} steps", _centers(plant, trace.q)
     return _Driven(
-        verdict, trace.period * selected.astype(np.float64), trace.self_occluded[selected], path, *moved
+        verdict, trace.period * instants.astype(np.float64), trace.self_occluded[instants], path, *moved
     )
 
 
@@ -152,7 +151,7 @@ def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
         post_script=_NEARER,
     )
     key = _KEY + (_TREES if motion.trees else ())
-    text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=key)
+    text = html_page("view.html", name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=key)
     write_whole(path, text)
 
 
@@ -164,20 +163,23 @@ def _figure(motion: _Motion) -> Any:
     still = len(traces)
     for number, (name, run) in enumerate(motion.runs.items()):
         moving = [_moving(go, run, k) for k in range(len(run.seconds))]
-        own = [f"{name}/{k}" for k in range(len(moving))]
-        place = [len(traces) + k for k in range(3)]
-        frames += [go.Frame(name=n, data=data, traces=place) for n, data in zip(own, moving, strict=True)]
+        names = [f"{name}/{k}" for k in range(len(moving))]
+        positions = [len(traces) + k for k in range(3)]
+        frames += [
+            go.Frame(name=frame, data=parts, traces=positions)
+            for frame, parts in zip(names, moving, strict=True)
+        ]
         for trace in (*moving[0], _line(go, run.path, "driven path", style.GREEN, width=5)):
             trace.visible = number == 0  # a list of all runs chooses another
             traces.append(trace)
-        selected = [True] * still + [k // 4 == number for k in range(4 * len(motion.runs))]
+        visible = [True] * still + [k // 4 == number for k in range(4 * len(motion.runs))]
         buttons = [
-            {"label": "▶ play", "method": "animate", "args": [own, _PLAYING]},
+            {"label": "▶ play", "method": "animate", "args": [names, _PLAYING]},
             {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
         ]
-        changed: dict[str, Any] = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": buttons}
+        changed: dict[str, Any] = {"sliders": [_slider(run, names)], "updatemenus[1].buttons": buttons}
         changed |= {f"scene.{axis}axis.range": limits for axis, limits in _extent(motion, run).items()}
-        menu.append({"label": title(name), "method": "update", "args": [{"visible": selected}, changed]})
+        menu.append({"label": title(name), "method": "update", "args": [{"visible": visible}, changed]})
     first: dict[str, Any] = menu[0]["args"][1]
     buttons = first["updatemenus[1].buttons"]
     left = {"x": 0.0, "xanchor": "left"}
@@ -216,21 +218,21 @@ def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
     points = [motion.cameras, motion.start, run.robot, run.markers, run.path, motion.planned]
     points += [] if motion.goal is None else [motion.goal]
     points += [tree[np.isfinite(tree[:, 0])] for tree in motion.trees]
-    selected = np.concatenate([some.reshape(-1, 3) for some in points])
-    low, high = selected.min(axis=0), selected.max(axis=0)
+    corners = np.concatenate([part.reshape(-1, 3) for part in points])
+    low, high = corners.min(axis=0), corners.max(axis=0)
     pad = _PAD * float((high - low).max())
     ranges = np.round(np.stack([low - pad, high + pad], axis=1), _DIGITS)
     return {name: reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
 
 
-def _slider(run: _Driven, own: list[str]) -> dict[str, Any]:
+def _slider(run: _Driven, names: list[str]) -> dict[str, Any]:
     """A step for each instant; its label stands above the slider."""
     steps = []
-    for frame, seconds, hidden in zip(own, run.seconds, run.hidden, strict=True):
-        views = " and ".join(name for name, behind in zip(VIEWS, hidden, strict=True) if behind)
+    for name, seconds, hidden in zip(names, run.seconds, run.hidden, strict=True):
+        views = " and ".join(view for view, behind in zip(VIEWS, hidden, strict=True) if behind)
         label = f"{seconds:.2f} s" + (f", hidden from {views}" if views else "")
-        label += f", {run.verdict}" if frame == own[-1] else ""
-        steps.append({"label": label, "method": "animate", "args": [[frame], _AT_ONCE], "value": frame})
+        label += f", {run.verdict}" if name == names[-1] else ""
+        steps.append({"label": label, "method": "animate", "args": [[name], _AT_ONCE], "value": name})
     return {
         "steps": steps,
         "active": 0,
@@ -259,7 +261,7 @@ def _still(go: Any, motion: _Motion) -> Iterator[Any]:
 
 
 def _moving(go: Any, run: _Driven, k: int) -> tuple[Any, Any, Any]:
-    """Arm, face and markers at one of the instants."""
+    """SerialArm, face and markers at one of the instants."""
     robot = _line(go, run.robot[k], "robot", style.BLACK, width=9)
     robot.update(mode="lines+markers", marker={"size": 5, "color": style.BLACK})
     fan = np.arange(1, run.face.shape[1] - 1)
@@ -285,8 +287,7 @@ def _coordinates(points: FloatArray) -> dict[str, list[float]]:
 FRAMES = 60
 _MOST_COLUMNS = 4
 SEEN, HIDDEN = style.GREEN, style.ORANGE
-_PATH: style.LineStyle = {"color": SEEN, "linewidth": 0.9}
-_BEHIND: style.LineStyle = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
+_PATH = style.line(SEEN, width=0.9, label="path of a marker")
 _PANEL, _LEAST_WIDTH = 2.3, 4.0  # inches across one panel, and across the legend
 _COLORS, _NEAR_WHITE = 128, 240  # in addition to greys, which frames need
 _FILM_WIDTH = 320  # px, of which a panel shows most
@@ -309,11 +310,11 @@ def write_animation(
     direct = [name for name in traces if name in BODY_LAWS]
     pair = [*direct[:1], *(name for name in traces if name in POINT_LAWS)]
     columns = {name: traces[name] for name in (pair if len(pair) > 1 else [*traces])[:_MOST_COLUMNS]}
-    shown = image_sizes(size).max(axis=0)
+    extent = image_sizes(size).max(axis=0)
     if size is None:
-        shown = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
+        extent = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
     images = []
-    for pixels in _frames(columns, order, shown):
+    for pixels in _frames(columns, order, extent):
         images.append(Image.fromarray(pixels))
         progress("animation", len(images), FRAMES)
     # The last frame has all colours; one palette for all keeps what does not move the same.
@@ -348,19 +349,16 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
         axes = figure.subplots(2, len(runs), squeeze=False, sharex=True, sharey=True)
         for column, (name, run) in zip(axes.T, runs.items(), strict=True):
             for view, (panel, camera) in enumerate(zip(column, VIEWS, strict=True)):
-                style.face(panel, run.s[0, view, order], style.START)
-                style.face(panel, run.s_star[view, order], style.GOAL)
+                style.start_and_goal(panel, run.s[0, view, order], run.s_star[view, order], fill=False)
                 style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near, margin)
                 panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
                 panel.set_xlabel("u (px)" if view else "")
-            selected = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
-            columns.append([_Panel(*one) for one in selected])
+            views = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
+            columns.append([_Panel(*view) for view in views])
             if (film := films[name]) is not None and run.frame_index is not None:
                 for panel, frames in zip(columns[-1], film.swapaxes(0, 1), strict=True):
                     panel.over(frames, run.frame_index, size)
-        line_styles = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
-        line_styles["face hidden from this camera"] = _BEHIND
-        style.legend_below(figure, line_styles, 4 if len(runs) > 2 else 2)
+        style.legend_below(figure, 4 if len(runs) > 2 else 2)
         figure.suptitle("time 00.00 s", fontsize=9)
 
     with style.styled():
@@ -369,10 +367,10 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
             figure.suptitle(f"time {seconds:.2f} s", fontsize=9)
             for column, (name, run) in zip(columns, traces.items(), strict=True):
                 now = min(int((seconds + 1e-9) / run.period), run.steps)
-                values = f"{run.verdict}, {run.steps} steps"
+                verdict = f"{run.verdict}, {run.steps} steps"
                 if now < run.steps:
-                    values = f"later: {values}" if seconds == end else "running"
-                column[0].axes.set_title(f"{title(name)}\n{values}")
+                    verdict = f"later: {verdict}" if seconds == end else "running"
+                column[0].axes.set_title(f"{title(name)}\n{verdict}")
                 for panel in column:
                     panel.show(now)
             canvas: Any = figure.canvas
@@ -386,7 +384,7 @@ class _Panel:
     def __init__(self, axes: Any, s: FloatArray, hidden: BoolArray) -> None:
         self.axes, self.s, self.hidden = axes, s, hidden
         self.behind, self.paths = (
-            [axes.plot([], [], **line_style)[0] for _ in s[0]] for line_style in (_BEHIND, _PATH)
+            [axes.plot([], [], **line)[0] for _ in s[0]] for line in (style.HIDDEN, _PATH)
         )
         (self.face,) = axes.fill([0.0], [0.0], linewidth=1.2, edgecolor=style.BLACK, alpha=0.9, zorder=3)
         place = {"transform": axes.transAxes, "ha": "center", "va": "bottom"}

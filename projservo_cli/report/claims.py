@@ -59,26 +59,26 @@ def _control_claims(report_data: ReportData, studies: Studies) -> Iterator[_Clai
     metric, twin, calibrated = (
         studies.own[DIRECT[0], kind, False] for kind in ("true", "twin", "calibrated")
     )
-    same, also = _model_difference(twin, metric), _model_difference(calibrated, metric)
+    exact, estimated = _model_difference(twin, metric), _model_difference(calibrated, metric)
     yield _Claim(
         "Projective and Euclidean models give the same θ_r and θ_p",
         "section 6, Fig. 10",
-        f"largest difference {same:.2g}° with true operators, {also:.2g}° with calibrated ones",
+        f"largest difference {exact:.2g}° with true operators, {estimated:.2g}° with calibrated ones",
         f"at most {_MODEL_TOLERANCE_DEG:g}° with true operators",
-        same <= _MODEL_TOLERANCE_DEG,
+        exact <= _MODEL_TOLERANCE_DEG,
     )
     yield from _scale(report_data, calibrated)
     trace = studies.own[DIRECT[1], "calibrated", False]
-    start, task, known = math.degrees(trace.theta_s[0]), math.nan, np.isfinite(trace.goal_pose).all()
-    if known:
+    start, task = math.degrees(trace.theta_s[0]), math.nan
+    if np.isfinite(trace.goal_pose).all():
         R = trace.pose[0, :3, :3].T @ trace.goal_pose[:3, :3]
         task = math.degrees(Rotation.from_matrix(R).magnitude())
     yield _Claim(
         "θ_s starts at the overall rotation of the task, 180° in the paper",
         "section 6, Fig. 9",
-        f"{start:.3f}°; true rotation " + (f"{task:.3f}°" if known else "unknown"),
+        f"{start:.3f}°; true rotation " + ("unknown" if math.isnan(task) else f"{task:.3f}°"),
         f"within {_START_TOLERANCE_DEG:g}° of the true rotation",
-        abs(start - task) <= _START_TOLERANCE_DEG if known else None,
+        None if math.isnan(task) else abs(start - task) <= _START_TOLERANCE_DEG,
     )
     yield from _image_error(calibrated, 1.0 - studies.gains_of_laws.gain_t * calibrated.period)
 
@@ -99,12 +99,12 @@ def _exponential(report_data: ReportData, studies: Studies, law: str) -> Iterato
     )
     measured, holds = "too few settled steps", None
     settled = [late[np.logical_and.accumulate(late > least)] for late, least in curves]
-    if min(len(values) for values in settled) > _LEAST_STEPS:
-        slopes = [np.polyfit(np.arange(len(values)), np.log(values), 1)[0] for values in settled]
+    if min(len(error) for error in settled) > _LEAST_STEPS:
+        slopes = [np.polyfit(np.arange(len(error)), np.log(error), 1)[0] for error in settled]
         rates = [(1.0 - math.exp(slope)) / trace.period for slope in slopes]
         off = max(
-            float(np.abs(values[1:] / values[:-1] / (1.0 - own * trace.period) - 1.0).max())
-            for values, own in zip(settled, gain, strict=True)
+            float(np.abs(error[1:] / error[:-1] / (1.0 - rate * trace.period) - 1.0).max())
+            for error, rate in zip(settled, gain, strict=True)
         )
         measured = (
             f"fitted rates {rates[0]:.3f} (centre) and {rates[1]:.3f} (θ_s) per s for gains {gain[0]:g} and "
@@ -197,13 +197,13 @@ def _drift_claims(report_data: ReportData, studies: Studies) -> Iterator[_Claim]
             "smaller at the highest gain",
             bool((limited <= free * (1 + _SAMPLING)).all() and limited[0] < free[0]),
         )
-    own = [float(studies.own[law, "true", False].center_deviation_mm or 0.0) for law in DIRECT]
+    three, two = (float(studies.own[law, "true", False].center_deviation_mm or 0.0) for law in DIRECT)
     yield _Claim(
         "directTWO is free of the bias of directTHREE: it drifts less",
         "section 5.2",
-        f"at the configured gains without limit directTHREE {own[0]:.3g} mm, directTWO {own[1]:.3g} mm",
+        f"at the configured gains without limit directTHREE {three:.3g} mm, directTWO {two:.3g} mm",
         "smaller largest deviation, true operators",
-        own[1] < own[0],
+        two < three,
     )
     yield from _rate(studies, ~report_data.robot.prismatic)
     yield _joints(report_data, studies.own[DIRECT[0], "true", False])
@@ -212,20 +212,20 @@ def _drift_claims(report_data: ReportData, studies: Studies) -> Iterator[_Claim]
 def _rate(studies: Studies, revolute: BoolArray) -> Iterator[_Claim]:
     """Drift over the period; the longest turn in a step says how far apart the samples can be."""
     periods = np.array(studies.periods)
-    for law, values in zip(DIRECT, study_numbers(studies)["period_path_deviation_mm"], strict=True):
-        if len(periods) < 2 or not (values > 0).all():
+    for law, drift in zip(DIRECT, study_numbers(studies)["period_path_deviation_mm"], strict=True):
+        if len(periods) < 2 or not (drift > 0).all():
             continue
-        order = np.polyfit(np.log(periods), np.log(values), 1)[0]
+        order = np.polyfit(np.log(periods), np.log(drift), 1)[0]
         sweep = ", ".join(f"{1e3 * period:g}" for period in periods)
         steps = np.diff(studies.rate[law, max(studies.periods)].q[:, revolute], axis=0)
         turn = np.degrees(np.abs(steps).max(initial=0.0))
         yield _Claim(
             f"{title_of(law)}: the drift is typical of low control rates",
             "section 7",
-            f"{_listed(values)} mm at periods of {sweep} ms and a fixed gain in 1/s; "
+            f"{_listed(drift)} mm at periods of {sweep} ms and a fixed gain in 1/s; "
             f"drift ∝ period^{order:.2f}; a joint turns by up to {turn:.0f}° in a step of the longest period",
             "falls strictly with the period, true operators and no limit",
-            bool((np.diff(values[np.argsort(periods)]) > 0).all()),
+            bool((np.diff(drift[np.argsort(periods)]) > 0).all()),
         )
 
 
@@ -393,8 +393,8 @@ def _direct(report_data: ReportData) -> Iterator[_Claim]:
 
 def _path_gap(first: FloatArray, second: FloatArray) -> float:
     """Largest distance of a vertex of either path from the other, px, of paths (k, p, 2) and (l, p, 2)."""
-    both = ((first, second), (second, first))
-    return max(float(_to_polyline(a[:, i], b[:, i]).max()) for a, b in both for i in range(a.shape[1]))
+    orders = ((first, second), (second, first))
+    return max(float(_to_polyline(a[:, i], b[:, i]).max()) for a, b in orders for i in range(a.shape[1]))
 
 
 def _to_polyline(points: FloatArray, path: FloatArray) -> FloatArray:
@@ -415,11 +415,8 @@ def claims_of(report_data: ReportData, share: FloatArray, distance: FloatArray) 
     share, distance : (k,) shares λ, and how far apart both sides of (22) put the centre, m; empty where that
         could not be computed.
     """
-    found = [*_classical(report_data), _planned(report_data), *_direct(report_data)]
+    claims = [*_classical(report_data), _planned(report_data), *_direct(report_data)]
     studies = report_data.studies
     if studies is not None and all(trace.steps for trace in studies.own.values()):  # a start off the goal
-        found += [
-            *_drift_claims(report_data, studies),
-            *_control_claims(report_data, studies),
-        ]
-    return [*found, _composition(share, distance)] if len(share) else found
+        claims += [*_drift_claims(report_data, studies), *_control_claims(report_data, studies)]
+    return [*claims, _composition(share, distance)] if len(share) else claims

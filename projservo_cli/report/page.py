@@ -1,19 +1,16 @@
 """A report as one page of HTML that needs nothing else: no network, no scripts, no other file."""
 
-import base64
 import json
 import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from functools import cache
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from markupsafe import Markup
 
 from projservo_cli.calibration.checks.quality import WEAK_NOISE
 from projservo_cli.calibration.detections import REACH_M, REACH_RAD
@@ -24,83 +21,63 @@ from projservo_cli.laws import must_converge, run_name
 from projservo_cli.records import Plan, Report
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows
+from projservo_cli.report.html import embedded, html_page, short
 from projservo_cli.report.report_data import (
     ANIMATION_FILE,
     PAGE_FILE,
     VIEW_FILE,
     VIEWS,
+    FigureSpec,
     stage_object,
     title,
 )
-from projservo_cli.report.style import FORMATS, power_of_ten
+from projservo_cli.report.style import FORMATS
 from projservo_cli.store import Run
 
-if TYPE_CHECKING:
-    from jinja2 import Template
 
-_NONE = "\N{EN DASH}"
-
-
-def _short(value: float | None, digits: int = 3) -> str:
-    """A number with few digits, powers of ten set as such; a dash where there is none."""
-    if value is None or not math.isfinite(value):
-        return _NONE
-    power = math.floor(math.log10(abs(value))) if value else 0
-    whole = value == 0 or isinstance(value, (int, np.integer)) or digits <= power + 1 <= 6
-    mantissa, sign, exponent = (f"{value:.0f}" if whole else f"{value:.{digits}g}").partition("e")
-    text = f"{mantissa} × {power_of_ten(int(exponent))}" if sign else mantissa
-    return text.replace("-", "\N{MINUS SIGN}")
-
-
-def _number(value: Any, digits: int = 3) -> Markup:
-    """A number for the eye that carries all of its digits for programs."""
-    plain = value.item() if isinstance(value, np.generic) else value
-    if plain is None or not math.isfinite(plain):
-        return Markup(_NONE)
-    return Markup('<data value="{}">{}</data>').format(repr(plain), _short(plain, digits))
-
-
-def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> Iterator[str]:
+def _calibration_words(values: Mapping[str, Any], *, estimated: bool) -> Iterator[str]:
     """Whether a calibration is good, why, and which joint is known worst, a sentence each.
 
     ``estimated`` says that the noise was estimated from the same images, so that χ² alone decides nothing.
     """
-    yield f"{'Usable' if found['usable'] else 'Not usable'}: {found['reason']}."
-    if math.isfinite(found["chi2_per_dof"]) and found["dof"] > 0:
-        low, high = (_short(bound) for bound in chi2_band(found["dof"]))
-        chi2, sigma = _short(found["chi2_per_dof"]), _short(found["sigma_px"])
+    yield f"{'Usable' if values['usable'] else 'Not usable'}: {values['reason']}."
+    if math.isfinite(values["chi2_per_dof"]) and values["dof"] > 0:
+        low, high = (short(bound) for bound in chi2_band(values["dof"]))
+        chi2, sigma = short(values["chi2_per_dof"]), short(values["sigma_px"])
         yield (
-            f"χ² per degree of freedom is {chi2} at {sigma} px of noise per coordinate, with {found['dof']} "
+            f"χ² per degree of freedom is {chi2} at {sigma} px of noise per coordinate, with {values['dof']} "
             f"degrees of freedom; where model and noise are true it stays within {low} and {high}."
             + (" The noise is itself an estimate from these images." if estimated else "")
         )
-    yield _worst_joint(found)
-    for name, what, one, many in (
+    yield _worst_joint(values)
+    for name, noun, singular, plural in (
         ("outliers", "observation", "rejected as an outlier", "rejected as outliers"),
         ("suspect_joint_readings", "joint reading", "contradicts the images", "contradict the images"),
         ("id_switches", "marker", "was renumbered", "were renumbered"),
     ):
-        if count := len(found[name]):
-            yield f"{count} {what}{'s' * (count > 1)} {many if count > 1 else one}."
-    if "cross_validation" in found:
-        value = found["cross_validation"]
+        if count := len(values[name]):
+            yield f"{count} {noun}{'s' * (count > 1)} {plural if count > 1 else singular}."
+    if "cross_validation" in values:
+        held_out = values["cross_validation"]
         names = ("rms_px", "predicted_rms_px", "median_px", "p95_px")
-        rms, predicted, median, p95 = (_short(value[name]) for name in names)
+        rms, predicted, median, p95 = (short(held_out[name]) for name in names)
         yield (
-            f"Held out, in {value['folds']} parts of {value['unit']}: rms {rms} px where noise and "
+            f"Held out, in {held_out['folds']} parts of {held_out['unit']}: rms {rms} px where noise and "
             f"covariance predict {predicted} px, median {median} px, 95th percentile {p95} px. "
-            f"{value['reason'][:1].upper()}{value['reason'][1:].rstrip('.')}."
+            f"{held_out['reason'][:1].upper()}{held_out['reason'][1:].rstrip('.')}."
         )
 
 
-def _worst_joint(found: Mapping[str, Any]) -> str:
-    known = [(joint["noise"], i) for i, joint in enumerate(found["joints"]) if math.isfinite(joint["noise"])]
-    if not known:
-        return f"The method {found['method']} states no uncertainty, so no joint can be called the worst."
-    noise, worst = max(known)
-    reach = f"{REACH_M:g} m" if found["joints"][worst]["type"] == "P" else f"{REACH_RAD:g} rad"
+def _worst_joint(values: Mapping[str, Any]) -> str:
+    """Name the joint that adds most to predicted images, and whether it is well observable."""
+    joints = values["joints"]
+    noises = [(joint["noise"], i) for i, joint in enumerate(joints) if math.isfinite(joint["noise"])]
+    if not noises:
+        return f"The method {values['method']} states no uncertainty, so no joint can be called the worst."
+    noise, worst = max(noises)
+    reach = f"{REACH_M:g} m" if joints[worst]["type"] == "P" else f"{REACH_RAD:g} rad"
     return (
-        f"Joint {worst + 1} is known worst: {reach} from the reference it adds {_short(noise)} times the "
+        f"Joint {worst + 1} is known worst: {reach} from the reference it adds {short(noise)} times the "
         f"pixel noise to predicted images; a joint is poorly observable above {WEAK_NOISE:g}, so this one is "
         f"{'poorly observable' if noise > WEAK_NOISE else 'well observable'}."
     )
@@ -109,13 +86,13 @@ def _worst_joint(found: Mapping[str, Any]) -> str:
 def _law_words(trace: Mapping[str, Any]) -> str:
     """Verdict of a law and its reason, in one sentence."""
     steps, reason = trace["steps"], trace["reason"]
-    took = f"{steps} step{'s' * (steps != 1)} ({_short(steps * trace['period'])} s)"
+    took = f"{steps} step{'s' * (steps != 1)} ({short(steps * trace['period'])} s)"
     because = ", because the " if reason.startswith("image error") else ": "
     why = because + reason if reason else ""
     return f"{title(run_name(trace['law'], trace['mode']))}: {trace['verdict']} after {took}{why}."
 
 
-SECTIONS = ("calibration", "metric", "plan", "control")
+_SECTIONS = ("calibration", "metric", "plan", "control")
 _MOST_BYTES = 20_000_000  # of a file; figures have some 100,000
 _TYPES = {"svg": "image/svg+xml", "png": "image/png"}  # that a page can show, the best first
 
@@ -125,47 +102,38 @@ class _Picture(NamedTuple):
 
     anchor: str  # its name within the page
     number: str  # as in the names of its files
-    caption: str
-    paper: str  # the figure and section of the paper that it follows
-    drawing: Markup | None
+    spec: FigureSpec
+    drawing: str | None  # its address
     links: tuple[tuple[str, str], ...]
 
 
 def _pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -> dict[str, list[_Picture]]:
     """Figures by section, of the files that the report wrote; ``prefix`` is of all names within the page."""
-    found: dict[str, list[_Picture]] = {section: [] for section in SECTIONS}
+    by_section: dict[str, list[_Picture]] = {section: [] for section in _SECTIONS}
     for spec in FIGURES:
-        own = {kind: f"figures/{spec.name}.{kind}" for kind in ("csv", *FORMATS)}
-        kinds = [kind for kind in FORMATS if own[kind] in files]
+        paths = {kind: f"figures/{spec.name}.{kind}" for kind in ("csv", *FORMATS)}
+        kinds = [kind for kind in FORMATS if paths[kind] in files]
         if not kinds:
             continue
-        alt = spec.alt or spec.title
-        images = (_drawing(directory / own[kind], kind, alt) for kind in _TYPES if kind in kinds)
+        images = (_drawing(directory / paths[kind], kind) for kind in _TYPES if kind in kinds)
         drawing = next((image for image in images if image is not None), None)
-        links = [(kind.upper(), folder + own[kind]) for kind in kinds]
-        if (directory / own["csv"]).is_file():
-            links.insert(0, ("numbers (CSV)", folder + own["csv"]))
+        links = [(kind.upper(), folder + paths[kind]) for kind in kinds]
+        if (directory / paths["csv"]).is_file():
+            links.insert(0, ("numbers (CSV)", folder + paths["csv"]))
         number = str(int(spec.name[3:5]))
-        section = "control" if spec.laws or spec.studies or spec.modes or spec.frames else "plan"
-        picture = _Picture(prefix + spec.name, number, spec.title, spec.paper, drawing, tuple(links))
-        found["metric" if spec.metric else section if spec.task else "calibration"].append(picture)
-    return found
+        by_section[spec.section].append(_Picture(prefix + spec.name, number, spec, drawing, tuple(links)))
+    return by_section
 
 
-def _drawing(path: Path, kind: str, alt: str) -> Markup | None:
-    """A figure as an image within the page; None where there is no file in the folder of the run.
-
-    A browser runs no script of an image and fetches nothing for it, SVG included (HTML, section 4.8.3):
-    files may come from strangers.
-    """
+def _drawing(path: Path, kind: str) -> str | None:
+    """Address of a figure within the page; None where there is no file in the folder of the run."""
     try:
         content = path.read_bytes() if lies_inside(path, path.parents[1]) else None
     except OSError:
         content = None
     if content is None or len(content) > _MOST_BYTES:
         return None
-    data = base64.b64encode(content).decode()
-    return Markup('<img src="data:{};base64,{}" alt="{}">').format(_TYPES[kind], data, alt)
+    return embedded(content, _TYPES[kind])
 
 
 # Files next to the page, and their labels.
@@ -176,50 +144,36 @@ _MADE |= {"host": "host", "system": "system", "cpu": "processor"}
 _VERSIONS = ("python", "numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
 
 
-class _View(NamedTuple):
-    """One run on the page; missing parts are empty or None."""
+def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> dict[str, Any]:
+    """Return the page's data of a run in a ``folder``, relative to the page; ``prefix`` precedes its names.
 
-    name: str
-    folder: str  # that of the run, relative to the page
-    configuration: str
-    made: list[tuple[str, str]]  # property and value of what made it
-    extras: list[tuple[str, str]]  # label and path of files next to the page
-    calibration: dict[str, Any] | None  # the stages by their plain values, and values for the page alone
-    plan: dict[str, Any] | None
-    laws: list[dict[str, Any]]
-    reported: bool
-    claims: Sequence[dict[str, Any]]
-    metric: Sequence[dict[str, Any]]
-    drift: dict[str, Any] | None
-    left_out: dict[str, list[str]]  # by reason
-    pictures: dict[str, list[_Picture]]
-
-
-def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> _View:
-    """Return the page's data of a run in a ``folder``; ``prefix`` precedes its names."""
+    Parts that are missing are empty or None.
+    """
     run_folder = run.path.parent
     stages = {name.split("/")[0] for name in run.results}
-    found = {stage: stage_object(stage, run, about.joints, list(run.traces)) for stage in stages}
+    values = {stage: stage_object(stage, run, about.joints, list(run.traces)) for stage in stages}
     report: Report | None = run.results["report"].records[""] if "report" in stages else None
     left_out: dict[str, list[str]] = {}
     for entry in report.omitted if report else ():
         left_out.setdefault(entry["reason"], []).append(entry["what"])
-    return _View(
-        about.name,
-        folder,
-        about.configuration,
-        list(_made(run, about)),
-        [(label, folder + name) for name, label in _EXTRAS.items() if (run_folder / name).is_file()],
-        calibration=_calibration(found["calibrate"], about) if "calibrate" in found else None,
-        plan=found["plan"] | _visibility(run.plan) if "plan" in found else None,
-        laws=[_law(trace, about) for trace in found["servo"]["laws"]] if "servo" in found else [],
-        reported=report is not None,
-        claims=report.claims if report else (),
-        metric=report.metric if report else (),
-        drift=_drift(report) if report else None,
-        left_out=left_out,
-        pictures=_pictures(run_folder, report.figures if report else (), folder, prefix),
-    )
+    return {
+        "name": about.name,
+        "folder": folder,
+        "configuration": about.configuration,
+        "made": list(_made(run, about)),
+        "extras": [
+            (label, folder + name) for name, label in _EXTRAS.items() if (run_folder / name).is_file()
+        ],
+        "calibration": _calibration(values["calibrate"], about) if "calibrate" in values else None,
+        "plan": values["plan"] | _visibility(run.plan) if "plan" in values else None,
+        "laws": [_law(trace, about) for trace in values["servo"]["laws"]] if "servo" in values else [],
+        "reported": report is not None,
+        "claims": report.claims if report else (),
+        "metric": report.metric if report else (),
+        "drift": _drift(report) if report else None,
+        "left_out": left_out,
+        "pictures": _pictures(run_folder, report.figures if report else (), folder, prefix),
+    }
 
 
 def _made(run: Run, about: About) -> Iterator[tuple[str, str]]:
@@ -238,82 +192,53 @@ def _made(run: Run, about: About) -> Iterator[tuple[str, str]]:
             yield label, value if len(by_value) == 1 else f"{value} ({', '.join(dict.fromkeys(names))})"
 
 
-def _provenance_text(key: str, made: Mapping[str, Any]) -> str:
-    """One of the things that made a result, in words; the versions where there is no key."""
+def _provenance_text(key: str, provenance: Mapping[str, Any]) -> str:
+    """One property of the origin of a result, in words; the versions where there is no key."""
     if not key:
-        return ", ".join(f"{package} {made[package]}" for package in _VERSIONS if made.get(package))
-    value = made.get(key)
+        return ", ".join(
+            f"{package} {provenance[package]}" for package in _VERSIONS if provenance.get(package)
+        )
+    value = provenance.get(key)
     if key == "argv" and value:
         return " ".join(["projservo", *value[1:]])
     if key == "date" and value:
         moment = datetime.fromisoformat(value)
         return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M} UTC" if moment.tzinfo else str(value)
     if key == "git_commit" and value:
-        return f"{value}{', with changes' if made.get('git_dirty') else ''}"
+        return f"{value}{', with changes' if provenance.get('git_dirty') else ''}"
     return "" if value is None else str(value)
 
 
-def _calibration(found: dict[str, Any], about: About) -> dict[str, Any]:
-    """Plain values of a calibration with its sentences, and its numbers with their labels and units."""
-    lens = [
-        (f"lens of the {view} camera, {k}", terms[k], "")
-        for view, terms in (found["lens"] or {}).items()
-        for k in ("k1", "k2")
-    ]
-    numbers = [
-        ("method", found["method"], ""),
-        ("source", found["source"], ""),
-        ("residual, rms per marker and view", found["rms_px"], "px"),
-        ("noise per coordinate, as taken", found["sigma_px"], "px"),
-        ("noise per coordinate, from the residuals", found["sigma_fitted_px"], "px"),
-        ("predicted error within the ranges of the joints, rms", found["predicted_rms_px"], "px"),
-        ("the same, in 99 of 100 calibrations below", found["predicted_p99_px"], "px"),
-        ("χ² per degree of freedom", found["chi2_per_dof"], ""),
-        ("degrees of freedom", found["dof"], ""),
-        ("poses", found["poses_used"], ""),
-        ("markers", found["markers_used"], ""),
-        *lens,
-        *_joints_and_time(found),
-        ("time", found["seconds"], "s"),
-    ]
-    return found | {
-        "words": list(_calibration_words(found, estimated=about.estimates_noise)),
-        "numbers": numbers,
-    }
-
-
-def _joints_and_time(found: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
-    """Yield the joint noise and the time offsets, if estimated: label, number, unit."""
-    if found["sigma_q"] is not None:
-        yield "joint readings off by, rms", np.degrees(found["sigma_q"]), "°"
-    if found["time_offset_s"] is not None:
-        for view, delay, jitter in zip(
-            VIEWS, found["time_offset_s"], found["time_offset_jitter_s"], strict=True
-        ):
-            yield f"images of the {view} camera late by", 1e3 * delay, "ms"
-            yield f"single images of the {view} camera differ by, rms", 1e3 * jitter, "ms"
+def _calibration(values: dict[str, Any], about: About) -> dict[str, Any]:
+    """Plain values of a calibration with its sentences."""
+    return values | {"words": list(_calibration_words(values, estimated=about.estimates_noise))}
 
 
 def _visibility(plan: Plan) -> dict[str, Any]:
     """Return the minimum visibility of each camera and its changes; both senses of the rotation."""
-    views = []
-    for v, name in enumerate(VIEWS):
-        lowest = int(np.argmin(plan.margin[:, v]))
-        seen = {
+    lowest = plan.margin.argmin(axis=0)
+    views = [
+        {
             "name": name,
-            "margin": float(plan.margin[lowest, v]),
-            "sigma": float(plan.path_parameter[lowest]),
+            "margin": float(plan.margin[lowest[v], v]),
+            "sigma": float(plan.path_parameter[lowest[v]]),
+            "tau_0": float(plan.tau_0[v] / plan.tau) if plan.tau > 0 else None,
+            "theta_0": np.degrees(plan.theta_0[v]).tolist(),
+            "sense_margins": plan.sense_margin[:, v].tolist(),
         }
-        seen["tau_0"] = float(plan.tau_0[v] / plan.tau) if plan.tau > 0 else None
-        seen["theta_0"] = np.degrees(plan.theta_0[v]).tolist()
-        views.append(seen | {"sense_margins": plan.sense_margin[:, v].tolist()})
+        for v, name in enumerate(VIEWS)
+    ]
     return {"views": views, "senses": np.degrees(plan.sense).tolist()}
 
 
 def _law(trace: dict[str, Any], about: About) -> dict[str, Any]:
-    values = {"title": title(run_name(trace["law"], trace["mode"])), "words": _law_words(trace)}
-    must = must_converge(trace["law"], about.required)
-    return trace | values | {"converged": trace["verdict"] == "converged", "must": must}
+    """Plain values of the run of a law, with its title, words on it, and whether it was to converge."""
+    return trace | {
+        "title": title(run_name(trace["law"], trace["mode"])),
+        "words": _law_words(trace),
+        "converged": trace["verdict"] == "converged",
+        "must": must_converge(trace["law"], about.required),
+    }
 
 
 def _drift(report: Report) -> dict[str, Any] | None:
@@ -355,23 +280,6 @@ def _side_by_side(columns: Iterable[Iterable[Any]], key: Callable[[Any], Any]) -
     return rows
 
 
-@cache
-def template(name: str) -> "Template":
-    """Template of a page; a value it names and is not given is an error."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {"number": _number, "degrees": math.degrees}
-    return environment.get_template(name)
-
-
 def write_page(run: Run, about: About) -> Path:
     """Write the page of a run into its folder, from the run and the figures that lie there.
 
@@ -394,19 +302,21 @@ def write_comparison(
     for k, (run, about) in enumerate(runs, 1):
         folder = Path(os.path.relpath(run.path.parent.resolve(), base)).as_posix()
         views.append(_view(run, about, folder=f"{folder}/", prefix=f"run{k}-"))
-    shared = Counter(view.name for view in views)
-    named = [
-        view._replace(name=f"{view.name} ({view.folder[:-1]})") if shared[view.name] > 1 else view
-        for view in views
-    ]
-    _write(path, named, settings)
+    shared = Counter(view["name"] for view in views)
+    for view in views:
+        if shared[view["name"]] > 1:
+            view["name"] += f" ({view['folder'][:-1]})"
+    _write(path, views, settings)
 
 
-def _write(path: Path, views: list[_View], settings: Sequence[Mapping[str, Any]]) -> None:
-    claims = _side_by_side((v.claims for v in views), itemgetter("claim", "source", "criterion"))
+def _write(path: Path, views: list[dict[str, Any]], settings: Sequence[Mapping[str, Any]]) -> None:
+    """Write a page of runs, with their claims and figures side by side."""
+    claims = _side_by_side((view["claims"] for view in views), itemgetter("claim", "source", "criterion"))
     pictures = {}
-    for section in SECTIONS:
-        numbered = _side_by_side((v.pictures[section] for v in views), attrgetter("number"))
+    for section in _SECTIONS:
+        numbered = _side_by_side((view["pictures"][section] for view in views), attrgetter("number"))
         pictures[section] = [numbered[number] for number in sorted(numbered, key=int)]
-    values = {"views": views, "claims": claims, "differences": _differences(settings), "pictures": pictures}
-    write_whole(path, template("page.html").render(values))
+    text = html_page(
+        "page.html", views=views, claims=claims, differences=_differences(settings), pictures=pictures
+    )
+    write_whole(path, text)

@@ -19,7 +19,9 @@ from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title
 from projservo_cli.metric.frame import Metric
 from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
+    MM,
     WHY_LOST,
+    BoolArray,
     Calibration,
     CrossValidation,
     FloatArray,
@@ -29,6 +31,7 @@ from projservo_cli.records import (
     Plan,
     Trace,
 )
+from projservo_cli.report import style
 from projservo_cli.settings.task import Trajectory
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
@@ -48,11 +51,17 @@ NEAREST = tuple(
     CONSTRAINTS[constraint].value for constraint in OF_MOTION
 )  # smallest along the planned motion
 # Lists of what does not fit: observations, and deviations from the model.
-LISTS = ("outliers", "suspect_joint_readings", "id_switches", "moved_images", "model_errors")
+_LISTS = ("outliers", "suspect_joint_readings", "id_switches", "moved_images", "model_errors")
 _COUNTS = ("poses_used", "markers_used")
 _NUMBERS = (
     *("rms_px", "sigma_px", "chi2_per_dof", "seconds", "predicted_rms_px", "predicted_p99_px"),
     *("predicted_recorded_px", "predicted_worst_px"),
+)
+
+# Arrays of a calibration that are few numbers.
+_SHORT_ARRAYS = (
+    *("circular_joints", "undecided_order", "sigma_q_interval", "sigma_scale_interval"),
+    *("time_offset_s", "time_offset_interval_s", "time_offset_jitter_s"),
 )
 
 DIRECT = ("direct_three", "direct_two")
@@ -124,8 +133,8 @@ class ReportData(Fit):
 
     def goal_known(self) -> bool:
         """Whether all runs know the pose of the goal."""
-        own = self.studies.own.values() if self.studies is not None else ()
-        traces = [*self.traces.values(), *own]
+        extra = self.studies.own.values() if self.studies is not None else ()
+        traces = [*self.traces.values(), *extra]
         return bool(traces) and all(np.isfinite(trace.goal_pose).all() for trace in traces)
 
     @property
@@ -155,7 +164,7 @@ class ReportData(Fit):
 
 
 @dataclass(frozen=True)
-class _FigureSpec:
+class FigureSpec:
     """One figure and its requirements."""
 
     name: str  # of its files
@@ -174,6 +183,17 @@ class _FigureSpec:
     frames: bool = False  # whether it shows frames; it is not omitted if no robot has any
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
+
+    @property
+    def section(self) -> str:
+        """Its section on the page: calibration, metric, plan or control."""
+        if not self.task:
+            return "metric" if self.metric else "calibration"
+        return "control" if self.laws or self.studies or self.modes or self.frames else "plan"
+
+    def drawn(self, data: Data) -> "Figure":
+        """The figure of its data."""
+        return style.drawn(self.draw, data, self.height)
 
     def lacking(self, report_data: Fit) -> str:
         """Return the reason why the figure cannot be drawn; empty if it can."""
@@ -217,17 +237,17 @@ class _FigureSpec:
         ]
 
 
-REGISTER: dict[str, _FigureSpec] = {}
+REGISTER: dict[str, FigureSpec] = {}
 _Draw = Callable[[Data, "Figure"], None]
 
 
 def registered(
     name: str, title: str, paper: str, data: Callable[[Any], Data], **needs: Any
 ) -> Callable[[_Draw], _Draw]:
-    """Decorator that registers a drawing function as a figure; arguments are those of ``_FigureSpec``."""
+    """Decorator that registers a drawing function as a figure; arguments are those of ``FigureSpec``."""
 
     def register(draw: _Draw) -> _Draw:
-        REGISTER[name] = _FigureSpec(name, title, paper, data, draw, **needs)
+        REGISTER[name] = FigureSpec(name, title, paper, data, draw, **needs)
         return draw
 
     return register
@@ -236,6 +256,17 @@ def registered(
 def percent(values: FloatArray) -> FloatArray:
     """Values normalised to 100 at their start; NaN throughout where they start at 0."""
     return np.asarray(100.0 * values / values[0]) if values[0] != 0 else np.full_like(values, np.nan)
+
+
+def joint_units(prismatic: BoolArray) -> FloatArray:
+    """Factors (n,) from rad or m to the units in which joints are drawn, deg or mm."""
+    return np.where(prismatic, MM, np.degrees(1.0))
+
+
+def joint_kinds(prismatic: BoolArray) -> list[tuple[list[int], str]]:
+    """Numbers of the revolute and of the prismatic joints, where there are some, with their unit."""
+    kinds = [(np.flatnonzero(prismatic == kind).tolist(), "mm" if kind else "deg") for kind in (False, True)]
+    return [(numbers, unit) for numbers, unit in kinds if numbers]
 
 
 def along_line(points: FloatArray, start: FloatArray, goal: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -275,14 +306,14 @@ def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequen
 
 def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str]) -> dict[str, Any]:
     """Return the JSON object of a stage that failed, or lacks its inputs."""
-    found: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
+    failure: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
     if stage == "calibrate":
-        lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *LISTS)}
+        lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *_LISTS)}
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
-        return found | {"usable": False, "lens": None, "rejected": None, "unshown": None} | numbers | lists
+        return failure | {"usable": False, "lens": None, "rejected": None, "unshown": None} | numbers | lists
     if stage == "servo":
-        found["laws"] = [_scalars(run.traces[law]) for law in laws]
-    return found | {"feasible": False} if stage == "plan" else found
+        return failure | {"laws": [_scalars(run.traces[law]) for law in laws]}
+    return failure | {"feasible": False} if stage == "plan" else failure
 
 
 def _scalars(record: Any) -> dict[str, Any]:
@@ -312,22 +343,15 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
             for view, (u, v, r, k1, k2) in terms
         }
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
-    more = (
-        "circular_joints",
-        "undecided_order",
-        "sigma_q_interval",
-        "sigma_scale_interval",
-        "time_offset_s",
-        "time_offset_interval_s",
-        "time_offset_jitter_s",
-    )
-    own = {name: getattr(calibration, name) for name in more}
-    own |= {"order_determined": None if (order := calibration.undecided_order) is None else not order.size}
-    found = _scalars(calibration)
-    del found["model_error"], found["unshown_error"]
-    own["model_errors"] = [_in_words(one, calibration) for one in calibration.model_errors]
-    own["unshown"] = None if calibration.unshown is None else _in_words(calibration.unshown, calibration)
-    return found | own | {"joints": joints, "lens": lens} | findings(calibration) | held_out
+    values = _scalars(calibration) | {name: getattr(calibration, name) for name in _SHORT_ARRAYS}
+    del values["model_error"], values["unshown_error"]
+    order, unshown = calibration.undecided_order, calibration.unshown
+    values |= {
+        "order_determined": None if order is None else not order.size,
+        "model_errors": [_in_words(error, calibration) for error in calibration.model_errors],
+        "unshown": None if unshown is None else _in_words(unshown, calibration),
+    }
+    return values | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 
 
 def _in_words(error: ModelError, calibration: Calibration) -> dict[str, Any]:
@@ -336,14 +360,18 @@ def _in_words(error: ModelError, calibration: Calibration) -> dict[str, Any]:
 
 
 def _plan(run: Run) -> dict[str, Any]:
-    plan, found = run.plan, _scalars(run.plan)
-    angles = {f"{name}_deg": math.degrees(found.pop(name)) for name in ("theta_r", "theta_p", "theta_s")}
+    """Plain values of a plan, angles in deg, and the smallest margins along it."""
+    plan, values = run.plan, _scalars(run.plan)
+    angles = {f"{name}_deg": math.degrees(values.pop(name)) for name in ("theta_r", "theta_p", "theta_s")}
     nearest = zip(NEAREST, plan.min_margin, plan.min_margin_mu, strict=True)
     return (
-        found
+        values
         | angles
-        | {"tau_0": plan.tau_0, "smallest_margin": plan.margin.min(axis=0)}
-        | {"margins": {name: {"min": low, "mu": mu} for name, low, mu in nearest}}
+        | {
+            "tau_0": plan.tau_0,
+            "smallest_margin": plan.margin.min(axis=0),
+            "margins": {name: {"min": lowest, "mu": mu} for name, lowest, mu in nearest},
+        }
     )
 
 
@@ -356,34 +384,29 @@ def findings(calibration: Calibration) -> dict[str, Any]:
     the ``tracks`` (markers) that are rejected as a whole by reason, of the ``poses`` and of ``unseen_poses``,
     and the count of ``placeholders``.
     """
-    outliers, suspects, swaps = (
-        rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.id_switches)
-    )
-    rejected_tracks, rejected_poses, moved, unseen = (
-        [] if rows is None else rows.tolist()
-        for rows in (
-            calibration.rejected_markers,
-            calibration.rejected_poses,
-            calibration.moved_images,
-            calibration.unseen_poses,
-        )
-    )
-    tracks = {why: [j for j, w in rejected_tracks if w == code] for code, why in enumerate(WHY_LOST)}
-    whole = {j for numbers in tracks.values() for j in numbers}
-    rejected = {
-        "observations": sum(marker not in whole for _, marker, _ in outliers),
-        "id_switches": len(swaps),
-        "tracks": tracks,
-        "poses": sorted({p for p, _ in suspects} | set(rejected_poses)),
-        "unseen_poses": unseen,
-        "placeholders": calibration.placeholders,
-    }
+
+    def rows(name: str) -> list[Any]:
+        """Rows of an array of the calibration; none where it has none."""
+        array = getattr(calibration, name)
+        return [] if array is None else array.tolist()
+
+    outliers, suspects, swaps = rows("outlier"), rows("suspect"), rows("id_switches")
+    lost = rows("rejected_markers")
+    tracks = {why: [marker for marker, reason in lost if reason == code] for code, why in enumerate(WHY_LOST)}
+    whole = {marker for marker, _ in lost}
     return {
         "outliers": [{"pose": p, "marker": m, "view": (*VIEWS, "both")[v]} for p, m, v in outliers],
         "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
         "id_switches": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
-        "moved_images": [{"pose": p, "view": VIEWS[v]} for p, v in moved],
+        "moved_images": [{"pose": p, "view": VIEWS[v]} for p, v in rows("moved_images")],
         "poses_used": calibration.poses_used,
         "markers_used": calibration.markers_used,
-        "rejected": rejected,
+        "rejected": {
+            "observations": sum(marker not in whole for _, marker, _ in outliers),
+            "id_switches": len(swaps),
+            "tracks": tracks,
+            "poses": sorted({p for p, _ in suspects} | set(rows("rejected_poses"))),
+            "unseen_poses": rows("unseen_poses"),
+            "placeholders": calibration.placeholders,
+        },
     }

@@ -1,11 +1,12 @@
-"""One look for all figures: print size, fonts, colours that survive grey print, and saving.
+"""One grammar for all figures: size, fonts, styles of curves, views and laws, legends, and saving.
 
-matplotlib is imported where it is used and always draws without a display; the same data give the
-same bytes in SVG, PDF and PNG.
+A figure draws curves by their line styles, which name them; the legend collects the names. matplotlib is
+imported where it is used and always draws without a display; the same data give the same bytes in SVG, PDF
+and PNG.
 """
 
 import io
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 FORMATS = ("svg", "pdf", "png")
 WIDTH = 6.9  # inches across both columns of a page
 _PNG_DPI = 200
-LineStyle = dict[str, Any]
+LineStyle = dict[str, Any]  # how a curve is drawn, in keywords of matplotlib, and its name in the legend
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 IMAGE = "image"  # label of axes that show pixels
 
@@ -29,20 +30,48 @@ IMAGE = "image"  # label of axes that show pixels
 BLACK, ORANGE, BLUE, SKY = "#000000", "#E69F00", "#0072B2", "#56B4E9"
 VERMILION, GREEN, PURPLE = "#D55E00", "#009E73", "#CC79A7"
 GREY, PALE = "#999999", "#DDDDDD"
+SOLID, NO_LINE = "-", "none"
+DASHED, DOTTED, DASH_DOTTED = (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5))
 # Colour, line style and marker change together, so that a curve is known without its colour.
 _CURVES: tuple[tuple[str, Any, str], ...] = (
-    (BLACK, "-", "o"),
-    (VERMILION, (0, (5, 1.5)), "s"),
-    (BLUE, (0, (1, 1)), "^"),
-    (ORANGE, (0, (5, 1.5, 1, 1.5)), "D"),
+    (BLACK, SOLID, "o"),
+    (VERMILION, DASHED, "s"),
+    (BLUE, DOTTED, "^"),
+    (ORANGE, DASH_DOTTED, "D"),
     (GREEN, (0, (3, 3)), "v"),
     (PURPLE, (0, (3, 1, 1, 1, 1, 1)), "P"),
     (SKY, (0, (8, 2)), "X"),  # of the seventh joint
 )
 
-# How the face at the start and at the goal look in every figure.
-START: LineStyle = {"color": BLACK, "linewidth": 1.4}
-GOAL: LineStyle = {"color": BLUE, "linestyle": (0, (5, 1.5))}
+
+def line(
+    color: str, dash: Any = SOLID, width: float | None = None, marker: str = "", label: str = "", **more: Any
+) -> LineStyle:
+    """Style of a curve: colour, dashes, width in points, marker, and its name in the legend, if any."""
+    chosen = {"linewidth": width, "marker": marker, "label": label}
+    return {"color": color, "linestyle": dash} | {key: value for key, value in chosen.items() if value} | more
+
+
+def dots(color: str, marker: str, label: str = "", **more: Any) -> LineStyle:
+    """Style of points that no line joins."""
+    return line(color, NO_LINE, marker=marker, label=label, **more)
+
+
+def patch(color: str, label: str = "", **more: Any) -> LineStyle:
+    """Style of an area."""
+    return {"facecolor": color, "label": label} | more
+
+
+# The face at the start and at the goal, the views and the laws look the same in every figure.
+START, GOAL = line(BLACK, width=1.4, label="start"), line(BLUE, DASHED, label="goal")
+VIEW_LINES = (line(BLUE, label="left camera"), line(ORANGE, DASHED, label="right camera"))
+LAW_LINES = {
+    "direct_three": line(GREEN, width=1.2),
+    "direct_two": line(PURPLE, DASHED, 1.2),
+    "stacked": line(VERMILION, DASHED, 1.1),
+}
+HIDDEN = line(ORANGE, width=4.0, label="face hidden from this camera", alpha=0.6, solid_capstyle="butt")
+_FIRST_MARKER = 3.0  # size of the dot on the first marker of a face, points
 
 _RC: Any = {
     "font.family": "DejaVu Sans",
@@ -88,7 +117,7 @@ def styled() -> Iterator[None]:
         yield
 
 
-HALF_LABEL = 0.16  # in, half the width of a label of four digits
+_HALF_LABEL = 0.16  # in, half the width of a label of four digits
 
 
 def drawn(draw: Callable[[Any, "Figure"], None], data: Any, height: float, width: float = WIDTH) -> "Figure":
@@ -124,7 +153,7 @@ def _arrange(figure: "Figure") -> None:
     if legend:
         figure.subplots_adjust(bottom=1.0 - share * (1.0 - edges.bottom), top=1.0 - share * (1.0 - edges.top))
     if images:  # the last tick of an image, set when its scales are, may stand at the very edge
-        figure.subplots_adjust(right=min(edges.right, 1.0 - HALF_LABEL / figure.get_figwidth()))
+        figure.subplots_adjust(right=min(edges.right, 1.0 - _HALF_LABEL / figure.get_figwidth()))
     for axes in images:
         axes.apply_aspect()
     figure.set_layout_engine()  # with an engine, even one that does nothing, saving draws twice
@@ -146,40 +175,45 @@ def _equal_scales(
 
 def contents(figure: "Figure", formats: Sequence[str]) -> dict[str, bytes]:
     """A figure as files, by format: ``svg``, ``pdf`` or ``png``."""
-    made = {}
+    files = {}
     for kind in formats:
         file = io.BytesIO()
         with styled():
             figure.savefig(file, format=kind, dpi=_PNG_DPI, metadata=_METADATA[kind])
-        made[kind] = file.getvalue()
-    return made
+        files[kind] = file.getvalue()
+    return files
 
 
-def legend_below(figure: "Figure", line_styles: Mapping[str, LineStyle], columns: int) -> None:
-    """Put one legend for the whole figure below all axes; an entry is a line, or a patch if it has a face."""
+def legend_below(figure: "Figure", columns: int, more: Iterable[LineStyle] = ()) -> None:
+    """Put one legend for the whole figure below all axes: each name once, as first drawn, then more."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles = [
-        Patch(label=label, **line_style)
-        if "facecolor" in line_style
-        else Line2D([], [], label=label, **line_style)
-        for label, line_style in line_styles.items()
-    ]
-    figure.legend(handles=handles, loc="lower center", ncols=columns)
+    handles: dict[str, Any] = {}
+    for axes in figure.axes:
+        if axes.get_legend() is None:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                handles.setdefault(label, handle)
+    for extra in more:
+        handles[extra["label"]] = Patch(**extra) if "facecolor" in extra else Line2D([], [], **extra)
+    figure.legend([*handles.values()], [*handles], loc="lower center", ncols=columns)
 
 
-def curve(index: int, *, marker: bool = False) -> LineStyle:
-    """Look of the curve of a number: colour, line style and, if asked for, marker.
+def curve(index: int, label: str = "", *, marker: bool = False) -> LineStyle:
+    """Style of the curve of a number: colour, line style and, if asked for, marker.
 
     Those of a second round are thin, and their markers hollow.
     """
     again, place = divmod(index, len(_CURVES))
-    color, style, symbol = _CURVES[place]
-    line_style = {"color": color, "linestyle": style} | ({"linewidth": 0.7} if again else {})
-    if not marker:
-        return line_style
-    return line_style | {"marker": symbol} | ({"markerfacecolor": "white"} if again else {})
+    color, dash, symbol = _CURVES[place]
+    thin: LineStyle = {"linewidth": 0.7} if again else {}
+    hollow: LineStyle = {"markerfacecolor": "white"} if again and marker else {}
+    return line(color, dash, marker=symbol if marker else "", label=label, **thin, **hollow)
+
+
+def zero_line(axes: "Axes") -> None:
+    """Draw the line at which a margin is used up."""
+    axes.axhline(0.0, color=BLACK, linewidth=0.6)
 
 
 def image_axes(axes: "Axes", title: str, pixels: FloatArray, margin: float = 0.06) -> None:
@@ -223,6 +257,12 @@ def log_scale(axes: "Axes") -> None:
     axes.yaxis.set_minor_formatter(FuncFormatter(between))
 
 
+def near_zero_scale(axes: "Axes", near: float) -> None:
+    """Vertical scale that is linear up to a value and logarithmic beyond, with plain numbers."""
+    axes.set_yscale("symlog", linthresh=near)
+    axes.yaxis.set_major_formatter("{x:g}")
+
+
 def magnification(size: float, wanted: float) -> float:
     """Factor 1, 2 or 5 times a power of ten that brings a size near to the wanted one; 1 for no size."""
     if size == 0.0:
@@ -245,16 +285,19 @@ def face(axes: "Axes", corners: FloatArray, line_style: LineStyle, *, fill: bool
     """Draw a face from its corners (k, 2) in cyclic order; a dot marks the first."""
     loop = closed(corners)
     if fill:
-        axes.fill(loop[:, 0], loop[:, 1], color=PALE, alpha=0.35, linewidth=0)
-    axes.plot(loop[:, 0], loop[:, 1], **line_style)
-    axes.plot(corners[:1, 0], corners[:1, 1], "o", color=line_style["color"], markersize=3)
+        axes.fill(*loop.T, color=PALE, alpha=0.35, linewidth=0)
+    axes.plot(*loop.T, **line_style)
+    axes.plot(*corners[:1].T, "o", color=line_style["color"], markersize=_FIRST_MARKER)
 
 
-def paths(axes: "Axes", points: FloatArray, line_style: LineStyle) -> None:
-    """Draw the paths (k, m, 2) of m points; NaN is a gap."""
+def start_and_goal(axes: "Axes", start: FloatArray, goal: FloatArray, *, fill: bool = True) -> None:
+    """Draw the face at the start and at the goal from their corners (k, 2) in cyclic order."""
+    face(axes, start, START, fill=fill)
+    face(axes, goal, GOAL)
+
+
+def paths(axes: "Axes", points: FloatArray, line_style: LineStyle, *, mask: BoolArray | None = None) -> None:
+    """Draw the paths (k, m, 2) of m points, of all instants or of those selected by a mask (k,)."""
+    if mask is not None:
+        points = np.where(mask[:, None, None], points, np.nan)
     axes.plot(points[..., 0], points[..., 1], **line_style)
-
-
-def hidden_paths(axes: "Axes", points: FloatArray, hidden: BoolArray, line_style: LineStyle) -> None:
-    """Mark those stretches of the paths (k, m, 2) of m points at whose instants (k,) they are hidden."""
-    paths(axes, np.where(hidden[:, None, None], points, np.nan), {"solid_capstyle": "butt"} | line_style)

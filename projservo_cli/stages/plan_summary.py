@@ -46,26 +46,26 @@ def verdict_of(motion: Motion) -> tuple[bool, str, str]:
 
 def _words(motion: Motion, constraint: int, instant: int) -> str:
     """One constraint at one time, with its margin."""
-    found, demands = motion.along, motion.reaching.demands
+    along, demands = motion.along, motion.reaching.demands
     at = "at mu_t {:.2f}, mu_r {:.2f}, mu_p {:.2f}".format(*motion.mu[instant])
     if constraint == VISIBILITY:
-        view = int(np.argmin(found.visibility[instant]))
-        margin = found.visibility[instant, view]
+        view = int(np.argmin(along.visibility[instant]))
+        margin = along.visibility[instant, view]
         return f"{CONSTRAINTS[VISIBILITY].asked.format(VIEWS[view])} is {margin:.3f} of the start's {at}"
     if constraint == IMAGE:
-        view = int(np.argmin(found.distance[instant]))
-        return f"{_border_words(found.distance[instant, view], VIEWS[view], demands)} {at}"
-    if math.isnan(found.condition[instant]):
+        view = int(np.argmin(along.distance[instant]))
+        return f"{_border_words(along.distance[instant, view], VIEWS[view], demands)} {at}"
+    if math.isnan(along.condition[instant]):
         return f"the joints cannot follow: the operators become dependent {at}"
     if constraint == JOINTS:
-        q = found.q[instant]
+        q = along.q[instant]
         i = min(range(len(q)), key=lambda i: joint_margin(demands, q, i))
         unit = demands.units[i] if demands.units else "rad or m"
         limits = demands.limits
-        here, low, high = (in_unit(values[i], unit, 4) for values in (q, limits.lower, limits.upper))
-        return f"joint {i + 1} is at {here}, its limits are {low} to {high}, {at}"
+        reading, low, high = (in_unit(values[i], unit, 4) for values in (q, limits.lower, limits.upper))
+        return f"joint {i + 1} is at {reading}, its limits are {low} to {high}, {at}"
     return (
-        f"the {CONSTRAINTS[CONDITIONING].asked} is {found.condition[instant]:.2g} "
+        f"the {CONSTRAINTS[CONDITIONING].asked} is {along.condition[instant]:.2g} "
         f"({demands.conditioning:.2g} allowed) {at}"
     )
 
@@ -83,10 +83,10 @@ def _border_words(distance: float, view: str, demands: Demands) -> str:
 
 def minimum_of(motion: Motion) -> tuple[FloatArray, FloatArray]:
     """Smallest value (4,) of each constraint in its own unit, and the shares (4, 3) where it is."""
-    found = motion.along
-    values = [found.visibility.min(axis=1), found.distance.min(axis=1), found.limit, found.condition]
-    where = [0 if np.isnan(column).all() else int(np.nanargmin(column)) for column in values]
-    return np.array([column[i] for column, i in zip(values, where, strict=True)]), motion.mu[where]
+    along = motion.along
+    constraints = [along.visibility.min(axis=1), along.distance.min(axis=1), along.limit, along.condition]
+    instants = [0 if np.isnan(column).all() else int(np.nanargmin(column)) for column in constraints]
+    return np.array([column[i] for column, i in zip(constraints, instants, strict=True)]), motion.mu[instants]
 
 
 def sight_words(profile: str, motion: Motion) -> tuple[bool, str]:
@@ -149,9 +149,9 @@ def _stored(trees: tuple[Tree, Tree]) -> tuple[FloatArray, IntArray]:
 
 def _along(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the margins and their required values, (s, 10), at joints (s, n)."""
-    found = np.zeros((2, len(q), MARGINS))
-    margins_along_into(c, np.ascontiguousarray(q), new_trial(q.shape[1], len(c.M)), found)
-    return found[0], found[1]
+    margins = np.zeros((2, len(q), MARGINS))
+    margins_along_into(c, np.ascontiguousarray(q), new_trial(q.shape[1], len(c.M)), margins)
+    return margins[0], margins[1]
 
 
 def _corners_of(timed: TimedPath) -> FloatArray:

@@ -16,7 +16,6 @@ from projservo_cli.calibration.detections import per_rad
 from projservo_cli.detection import DICTIONARY, MIN_CELL, cells_of
 from projservo_cli.files import write_whole
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
-from projservo_cli.hardware.live_page import annotated, recording_page
 from projservo_cli.records import (
     CORNERS,
     VIEWS,
@@ -28,6 +27,7 @@ from projservo_cli.records import (
     WorkFailed,
     in_unit,
 )
+from projservo_cli.report.live_page import annotated, recording_page
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints

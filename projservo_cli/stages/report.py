@@ -18,8 +18,8 @@ from projservo_cli.report import style
 from projservo_cli.report.animation import motion_of, write_animation, write_view
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.figures.metric import chosen_poses, metric_rows
 from projservo_cli.report.figures.path_deviation import drift_rows, study_numbers
+from projservo_cli.report.figures.scene import chosen_poses, metric_rows
 from projservo_cli.report.page import write_page
 from projservo_cli.report.report_data import (
     ANIMATION_FILE,
@@ -95,8 +95,8 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
     write_whole(directory / CLAIMS_FILE, f"{text}\n")
     for name in (VIEW_FILE, ANIMATION_FILE):  # of other runs than those that are reported on now
         (directory / name).unlink(missing_ok=True)
-    made = Result("", run.configuration, provenance.collect(seed=inputs.about.seed), {}, {"": report})
-    write_page(replace(run, results={**run.results, "report": made}), inputs.about)
+    result = Result("", run.configuration, provenance.collect(seed=inputs.about.seed), {}, {"": report})
+    write_page(replace(run, results={**run.results, "report": result}), inputs.about)
     return report
 
 
@@ -179,9 +179,8 @@ def draw_all(
             if partial := spec.partly(report_data):
                 left_out.append({"what": f"{spec.name}, in part", "reason": partial})
             data = spec.data(report_data)
-            figure = style.drawn(spec.draw, data, spec.height)
-            numbers = {name: values for name, values in data.items() if values.dtype != np.uint8}
-            contents = {_NUMBERS: to_csv(numbers).encode(), **style.contents(figure, formats)}
+            numbers = {name: array for name, array in data.items() if array.dtype != np.uint8}
+            contents = {_NUMBERS: to_csv(numbers).encode(), **style.contents(spec.drawn(data), formats)}
         for kind in {*style.FORMATS, _NUMBERS} - {*contents}:
             (folder / f"{spec.name}.{kind}").unlink(missing_ok=True)
         for kind, content in contents.items():

@@ -22,8 +22,8 @@ from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.detection import TagFinder
 from projservo_cli.files import working_in
 from projservo_cli.hardware.checks_at_rest import FAULT, FINE, Finding, view_angle_deg
-from projservo_cli.hardware.live_page import LivePage
 from projservo_cli.records import InputError
+from projservo_cli.report.live_page import LivePage
 from projservo_cli.stages import calibrate
 from projservo_cli.stages.doctor import Checked, calibration_finding
 from projservo_cli.store import load

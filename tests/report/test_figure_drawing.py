@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
 from projservo_cli.report import style
@@ -104,6 +105,27 @@ def test_a_logarithmic_scale_of_less_than_half_a_decade_has_several_labels():
 @pytest.mark.parametrize("part", ["color", "linestyle", "marker"])
 def test_curves_of_seven_joints_differ_in_each_part_of_their_look(part):
     assert len({str(style.curve(i, marker=True)[part]) for i in range(7)}) == 7
+
+
+def test_a_view_and_a_law_have_one_colour_in_every_figure(figures):
+    drawn = {}
+    for figure in figures.values():
+        for axes in figure.axes:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                if isinstance(handle, Line2D):
+                    drawn.setdefault(label, set()).add(handle.get_color())
+    assert drawn["left camera"] == {style.BLUE}
+    assert drawn["right camera"] == {style.ORANGE}
+    directs = {
+        color for label, colors in drawn.items() if label.startswith("directTHREE") for color in colors
+    }
+    assert directs == {style.LAW_LINES["direct_three"]["color"]}
+
+
+def test_a_legend_names_each_style_once(figures):
+    for name, figure in figures.items():
+        labels = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert len(set(labels)) == len(labels), name
 
 
 def test_importing_figures_does_not_import_matplotlib():

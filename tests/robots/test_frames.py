@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from projservo_cli.records import Trace, WorkFailed
-from projservo_cli.report.figures.frames import frames_of
+from projservo_cli.report.figures.images import frames_of
 from projservo_cli.robots.frame_recorder import MOST_FRAMES, FrameRecorder
 from projservo_cli.store import load
 from tests.fake_records import fake

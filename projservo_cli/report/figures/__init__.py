@@ -1,39 +1,98 @@
 """Figures after those of [RH00]: named arrays from a run, and a drawing of them.
 
 A figure is a pair of functions ``data(material) -> arrays`` and ``draw(data, figure)``, which registers it
-in a file with those of its topic; to add one, write both, and name the file here if it is new.
+in a file with those of its topic; to add one, write both, and name the file here if it is new. Three of them
+are drawn of a single result too, whoever made it.
 """
 
-from projservo_cli.report.figures import (
-    calibration as calibration,
-)
-from projservo_cli.report.figures import (
-    errors as errors,
-)
-from projservo_cli.report.figures import (
-    frames as frames,
-)
-from projservo_cli.report.figures import (
-    images as images,
-)
-from projservo_cli.report.figures import (
-    joint_space as joint_space,
-)
-from projservo_cli.report.figures import (
-    metric as metric,
-)
-from projservo_cli.report.figures import (
-    parts as parts,
-)
-from projservo_cli.report.figures import (
-    path_deviation as path_deviation,
-)
-from projservo_cli.report.figures import (
-    planned as planned,
-)
-from projservo_cli.report.figures import (
-    scene as scene,
-)
-from projservo_cli.report.report_data import REGISTER
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from projservo_cli.image_size import image_sizes
+from projservo_cli.records import (
+    Calibration,
+    CrossValidation,
+    InputError,
+    Observation,
+    Plan,
+    Trace,
+    position_limits,
+)
+from projservo_cli.report.figures import (
+    calibration,
+    errors,
+    images,
+    joint_space,
+    path_deviation,
+    planned,
+    scene,
+)
+from projservo_cli.report.report_data import REGISTER, Fit, title
+from projservo_cli.task.face import cyclic_order
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Figures register themselves where their topic is imported.
+_TOPICS = (calibration, errors, images, joint_space, path_deviation, planned, scene)
 FIGURES = tuple(REGISTER[name] for name in sorted(REGISTER))
+
+
+def of_calibration(
+    calibration: Calibration, observation: Observation, held_out: CrossValidation | None
+) -> "Figure":
+    """Draw figure 13: residuals, errors by pose, excitation and information."""
+    spec = REGISTER["fig13_calibration"]
+    return spec.drawn(spec.data(Fit(calibration, observation.at_rest, held_out=held_out)))
+
+
+def of_plan(plan: Plan, scene: Any) -> "Figure":
+    """Draw figure 16: the motion in both images, its joints and its margins over time.
+
+    scene : has ``model``, ``limits``, ``image_size`` and ``trajectory``.
+    """
+    extent = image_sizes(np.nanmax(plan.s, axis=(0, 2)) if scene.image_size is None else scene.image_size)
+    lowest, highest = plan.q.min(axis=0), plan.q.max(axis=0)
+    robot = SimpleNamespace(
+        prismatic=scene.model.prismatic,
+        limits=position_limits(
+            np.where(np.isfinite(scene.limits.lower), scene.limits.lower, lowest),
+            np.where(np.isfinite(scene.limits.upper), scene.limits.upper, highest),
+        ),
+    )
+    plant = SimpleNamespace(order=cyclic_order(plan.A), image_size=extent)
+    displayed = {"plan": plan, "calibrated": scene.model, "trajectory": scene.trajectory}
+    spec = REGISTER["fig16_way"]
+    return spec.drawn(spec.data(SimpleNamespace(robot=robot, plant=plant, **displayed)))
+
+
+def of_trace(trace: Trace, markers: tuple[int, ...]) -> "Figure":
+    """Draw figure 11, without the centre of the face: errors of its markers in both images over time."""
+    data = {
+        "t_s": trace.period * np.arange(len(trace.s)),
+        "e": trace.s - trace.s_star,
+        "law": np.array(title(trace.law)),
+        "marker": np.array(markers or range(trace.s.shape[2])),
+    }
+    return REGISTER["fig11_image_errors"].drawn(data)
+
+
+def placed(figure: "Figure", axes: Any) -> Any:
+    """Return a figure, or the axes in whose place it is shown as a picture.
+
+    Raises InputError for anything else than axes, such as the array that ``subplots`` gives.
+    """
+    if axes is None:
+        return figure
+    from matplotlib.axes import Axes
+
+    if not isinstance(axes, Axes):
+        raise InputError(f"plot: ax of type {type(axes).__name__}: give one axes of a figure")
+    figure.set_dpi(2.0 * axes.figure.dpi)
+    figure.canvas.draw()
+    canvas: Any = figure.canvas
+    axes.imshow(np.asarray(canvas.buffer_rgba()))
+    axes.set_axis_off()
+    return axes

@@ -22,44 +22,31 @@ _BOTH = 2
 _ARROW = 0.04  # length of an arrow of the rms residual, as a fraction of the extent of the observations
 _BAND = (0.025, 0.975)  # shares of χ² between which the residuals of a pose are expected
 _BINS = 40
-_RESIDUAL: style.LineStyle = {"color": style.BLUE}
-_WEAK: style.LineStyle = {
-    "facecolor": style.ORANGE,
-    "edgecolor": style.BLACK,
-    "hatch": "////",
-    "linewidth": 0.6,
-}
-# Reason of a rejected observation: by itself, its number, its pose, or its marker as a whole.
-_KINDS = ("outlier", "id_switch", "pose", "marker")
-_LEFT_OUT: dict[str, style.LineStyle] = {
-    "outlier": {"color": style.VERMILION, "marker": "x"},
-    "id_switch": {"color": style.ORANGE, "marker": "+"},
-    "pose": {"color": style.BLACK, "marker": "1"},
-    "marker": {"color": style.GREEN, "marker": "."},
-}
+_RESIDUAL = style.line(style.BLUE)
+_POSE = style.dots(style.BLUE, "o", "residual of a pose", markersize=2.5)
+_HATCHED: Any = {"edgecolor": style.BLACK, "hatch": "////", "linewidth": 0.6}
+_WEAK = style.patch(style.ORANGE, "weak joint", **_HATCHED)
+_MODEL = style.line(style.BLACK, width=1.2, label="noise model")
+# Rejected observations by the reason: by themselves, their number, their pose, or their marker as a whole.
 _LEFT_OUT = {
-    kind: {**line_style, "linestyle": "none", "markeredgewidth": 0.9}
-    for kind, line_style in _LEFT_OUT.items()
+    "outlier": style.dots(style.VERMILION, "x", "rejected: outlier"),
+    "id_switch": style.dots(style.ORANGE, "+", "rejected: under another number"),
+    "pose": style.dots(style.BLACK, "1", "rejected: of a pose in doubt"),
+    "marker": style.dots(style.GREEN, ".", "rejected: of a rejected marker"),
 }
-_NAMES = {
-    "outlier": "outlier",
-    "id_switch": "under another number",
-    "pose": "of a pose in doubt",
-    "marker": "of a rejected marker",
-}
+_KINDS = tuple(_LEFT_OUT)
 _LARGE, _SMALL, _MANY = 4.0, 1.5, 300  # sizes of these points, pt, and how many are many
-_MODEL: style.LineStyle = {"color": style.BLACK, "linewidth": 1.2}
 
 
 def _data(fit: Fit) -> Data:
     """Residuals, noise model, predicted error of each pose, excitation and information of a fit."""
     calibration, observation = fit.calibration, fit.observation
     predicted = predict(calibration, observation.q)
-    seen, rejected = _observed(calibration, observation)
-    read: BoolArray = np.all(np.isfinite(seen), axis=-1)
-    out = (rejected > 0) | ~np.isfinite(predicted).all(axis=-1)
-    used = read & ~out
-    residual, variance = seen - predicted, prediction_variance(calibration, observation.q)
+    pixels, rejected = _observed(calibration, observation)
+    measured: BoolArray = np.all(np.isfinite(pixels), axis=-1)
+    excluded = (rejected > 0) | ~np.isfinite(predicted).all(axis=-1)
+    used = measured & ~excluded
+    residual, variance = pixels - predicted, prediction_variance(calibration, observation.q)
     weighed = calibration.sigma_q or observation.sigma is not None
     if weighed:
         residual, variance = _as_tested(fit, residual, used)
@@ -82,16 +69,16 @@ def _data(fit: Fit) -> Data:
         result |= _by_pose(predictable, fit.held_out.residual, fit.held_out.predicted**2)
     unknown = observation.images[:, :, ~np.isin(observation.marker, calibration.marker)]
     for v, view in enumerate(VIEWS):
-        others = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
-        result[f"seen_{view}"] = seen[:, v][used[:, v]]
+        unidentified = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
+        result[f"seen_{view}"] = pixels[:, v][used[:, v]]
         result[f"residual_{view}"] = residual[:, v][used[:, v]]
-        gone = np.maximum(rejected, 1)  # a marker without a prediction counts as an outlier
-        positions = [seen[:, v][(read & out & (gone == i))[:, v]] for i in range(1, len(_KINDS))]
+        reason = np.maximum(rejected, 1)  # a marker without a prediction counts as an outlier
+        positions = [pixels[:, v][(measured & excluded & (reason == i))[:, v]] for i in range(1, len(_KINDS))]
         result |= {
             f"rejected_{kind}_{view}": of_kind
-            for kind, of_kind in zip(_KINDS, (*positions, others), strict=True)
+            for kind, of_kind in zip(_KINDS, (*positions, unidentified), strict=True)
         }
-    extent = max(float(np.ptp(seen[:, v][read[:, v]], axis=0).max()) for v in (0, 1))
+    extent = max(float(np.ptp(pixels[:, v][measured[:, v]], axis=0).max()) for v in (0, 1))
     residual = result["residual"]
     rms = float(np.sqrt(2.0 * np.mean(residual**2))) if residual.size else 0.0
     result["factor"] = np.array(style.magnification(rms, _ARROW * extent))
@@ -142,8 +129,8 @@ def _observed(calibration: Calibration, observation: Observation) -> tuple[Float
 
     Those are outliers (1), markers that were read under another number (2), and poses in doubt (3).
     """
-    seen = observation.images[:, :, _columns(calibration, observation)]
-    out = np.zeros(seen.shape[:3], dtype=np.int64)
+    pixels = observation.images[:, :, _columns(calibration, observation)]
+    reason = np.zeros(pixels.shape[:3], dtype=np.int64)
     row = {number: k for k, number in enumerate(observation.pose.tolist())}
     column = {number: j for j, number in enumerate(calibration.marker.tolist())}
     # The marker that it is was not seen there, or is left out as well: an exchange is listed once.
@@ -151,12 +138,12 @@ def _observed(calibration: Calibration, observation: Observation) -> tuple[Float
     for why, positions in ((2, renamed), (1, calibration.outlier.tolist())):
         for pose, number, view in positions:
             if pose in row and number in column:
-                out[row[pose], slice(None) if view == _BOTH else view, column[number]] = why
+                reason[row[pose], slice(None) if view == _BOTH else view, column[number]] = why
     doubted = calibration.suspect[:, 0]
     if calibration.rejected_poses is not None:
         doubted = np.append(doubted, calibration.rejected_poses)
-    out[np.isin(observation.pose, doubted)] = _KINDS.index("pose") + 1
-    return seen, out
+    reason[np.isin(observation.pose, doubted)] = _KINDS.index("pose") + 1
+    return pixels, reason
 
 
 def _columns(calibration: Calibration, observation: Observation) -> list[int]:
@@ -172,11 +159,11 @@ def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Dat
     """
     poses = used.any(axis=(1, 2))
     count = 2 * used.sum(axis=(1, 2))[poses]
-    found: Data = {}
+    errors: Data = {}
     for name, squares in (("pose_predicted_px", variance), ("pose_residual_px", residual**2)):
         total = np.where(used[..., None], squares, 0.0).sum(axis=(1, 2, 3))[poses]
-        found[name] = np.sqrt(total / count)
-    return found | {"pose_coordinates": count}
+        errors[name] = np.sqrt(total / count)
+    return errors | {"pose_coordinates": count}
 
 
 def _information(calibration: Calibration) -> FloatArray:
@@ -222,32 +209,28 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     _poses(panels[1, 1], data)
     _excitation(panels[2, 0], data)
     _spectrum(panels[2, 1], data)
-    line_styles: dict[str, style.LineStyle] = {
-        f"residual, {data['factor']:,g} times": _RESIDUAL,
-        **{
-            f"rejected: {_NAMES[kind]}": {**line_style, "markersize": _LARGE}
-            for kind, line_style in _LEFT_OUT.items()
-            if any(len(data[f"rejected_{kind}_{view}"]) for view in VIEWS)
-        },
-        "noise model": _MODEL,
-        "residual of a pose": {"color": style.BLUE, "marker": "o", "linestyle": "none"},
-        "95 % of poses in the model": {"color": style.PALE, "linewidth": 6},
-        "weak joint": _WEAK,
-    }
-    style.legend_below(figure, line_styles, 3)
+    notes = [
+        _RESIDUAL | {"label": f"residual, {data['factor']:,g} times"},
+        style.line(style.PALE, width=6, label="95 % of poses in the model"),
+        _WEAK,
+    ]
+    style.legend_below(figure, 3, notes)
 
 
 def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
-    seen, out = data[f"seen_{view}"], {kind: data[f"rejected_{kind}_{view}"] for kind in _KINDS}
-    count = sum(map(len, out.values()))
+    """Draw residuals as arrows in one image, magnified, and the observations that were rejected."""
+    used, rejected = data[f"seen_{view}"], {kind: data[f"rejected_{kind}_{view}"] for kind in _KINDS}
+    count = sum(map(len, rejected.values()))
     arrows = float(data["factor"]) * data[f"residual_{view}"]
-    pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
+    pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "color": _RESIDUAL["color"]}
     heads: Any = {"width": 0.0022, "headwidth": 4.0, "headlength": 5.0, "headaxislength": 4.0}
-    axes.quiver(*seen.T, *arrows.T, **pixels, **heads, **_RESIDUAL)
-    for kind, positions in out.items():
-        axes.plot(*positions.T, **_LEFT_OUT[kind], markersize=_LARGE if count < _MANY else _SMALL)
-    title = f"{view}: {len(seen):,} observations, {count:,} rejected"
-    style.image_axes(axes, title, np.concatenate([seen, seen + arrows, *out.values()]))
+    axes.quiver(*used.T, *arrows.T, **pixels, **heads)
+    size = _LARGE if count < _MANY else _SMALL
+    for kind, positions in rejected.items():
+        if len(positions):
+            axes.plot(*positions.T, **_LEFT_OUT[kind], markersize=size, markeredgewidth=0.9)
+    title = f"{view}: {len(used):,} observations, {count:,} rejected"
+    style.image_axes(axes, title, np.concatenate([used, used + arrows, *rejected.values()]))
 
 
 def _histogram(axes: "style.Axes", data: Data) -> None:
@@ -283,7 +266,7 @@ def _poses(axes: "style.Axes", data: Data) -> None:
     low, high = np.sqrt(chdtri(coordinates, 1.0 - np.array(_BAND)) / coordinates)
     axes.fill_between(x, low * expected, high * expected, color=style.PALE, linewidth=0)
     axes.plot(x, expected, **_MODEL)
-    axes.plot(predicted, residual, "o", color=style.BLUE, markersize=2.5)
+    axes.plot(predicted, residual, **_POSE)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(0.0, 1.1 * max(float(residual.max(initial=0.0)), high * float(expected.max(initial=sigma))))
 
@@ -300,8 +283,8 @@ def _excitation(axes: "style.Axes", data: Data) -> None:
         (prismatic, other, 1.0, "m", style.SKY),
     ):
         for i in np.flatnonzero(chosen):
-            line_style = _WEAK if weak[i] else {"color": color}
-            kind.bar(i, scale * data["excitation"][i], width=0.6, **line_style)
+            line = _WEAK if weak[i] else {"color": color}
+            kind.bar(i, scale * data["excitation"][i], width=0.6, **line)
         if chosen.any():
             kind.set_ylabel(f"range ({unit})")
     units = [" (m)" if mixed and slides else "" for slides in prismatic]
@@ -317,9 +300,8 @@ def _spectrum(axes: "style.Axes", data: Data) -> None:
     title = f"information, {len(values)} of {int(data['parameters'])} directions free"
     axes.set(title=title, xlabel="direction (best to worst)", ylabel="eigenvalue (1)")
     if values.size:
-        axes.plot(
-            np.arange(1, len(values) + 1), values, "o-", color=style.BLUE, markersize=2.5, linewidth=0.8
-        )
+        line = style.line(style.BLUE, width=0.8, marker="o", markersize=2.5)
+        axes.plot(np.arange(1, len(values) + 1), values, **line)
         style.log_scale(axes)
     else:
         _without_covariance(axes)

@@ -4,12 +4,26 @@ import numpy as np
 
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.report_data import Data, ReportData, curve_difference, percent, registered
+from projservo_cli.report.report_data import (
+    Data,
+    ReportData,
+    curve_difference,
+    joint_kinds,
+    joint_units,
+    percent,
+    registered,
+)
 
 _DECADES = 1e-5  # of its start, down to which an error is drawn on a logarithmic scale
-_FAINT: style.LineStyle = {"linewidth": 0.8, "alpha": 0.55}
-_DOTTED = (0, (1, 1.2))
+_FAINT: style.LineStyle = {"linewidth": 0.8, "alpha": 0.55, "label": ""}
 _KERNEL = r"$\tau$, unit-norm kernel (8), "
+_TRANSLATION = {
+    "distance": style.line(style.SKY, width=3.2, label="true distance"),
+    "tau_affine": style.line(style.BLACK, label=r"$\tau$, scale fixed through $a_\infty$"),
+    "tau": style.line(style.VERMILION, style.DASHED, label=_KERNEL + "projective"),
+    "tau_metric": style.line(style.BLACK, style.DOTTED, label=_KERNEL + "Euclidean"),
+}
+_LIMIT = style.line(style.GREY, width=0.8)
 _WAYS = (("free", False), ("limited", True))  # without and with the limit of the joint speed
 
 
@@ -44,27 +58,23 @@ def _time(trace: Trace) -> FloatArray:
 def _draw_two(data: Data, figure: "style.Figure") -> None:
     """Above τ, below θ_s; left as in the paper, right on a logarithmic scale."""
     axes = figure.subplots(2, 2, sharex=True)
-    line_styles: dict[str, style.LineStyle] = {
-        "free": {"color": style.BLACK, "linestyle": "-"},
-        "limited": {"color": style.VERMILION, "linestyle": (0, (4, 1.5))},
+    lines = {
+        "free": style.line(style.BLACK, label="no limit"),
+        "limited": style.line(style.VERMILION, style.DASHED, label=f"{data['step_limit_deg']:g}° per step"),
     }
     for (above, below), scale in zip(axes.T, ("linear", "logarithmic"), strict=True):
-        for name, line_style in line_styles.items():
+        for name, line in lines.items():
             t = data[f"t_s_{name}"]
-            above.plot(t, data[f"tau_affine_{name}"], **line_style)
-            above.plot(t, data[f"tau_{name}"], **line_style, **_FAINT)
-            below.plot(t, data[f"theta_s_deg_{name}"], **line_style)
+            above.plot(t, data[f"tau_affine_{name}"], **line)
+            above.plot(t, data[f"tau_{name}"], **line | _FAINT)
+            below.plot(t, data[f"theta_s_deg_{name}"], **line)
         above.set(title=f"directTWO, {scale} scale", ylabel=r"$\tau$ (% of its start)")
         below.set(xlabel="time (s)", ylabel=r"$\theta_s$ (deg)")
     for panel, start in zip(axes[:, 1], (100.0, float(data["theta_s_deg_free"][0])), strict=True):
         style.log_scale(panel)
         panel.set_ylim(max(start, 1e-3) * _DECADES, max(start, 1e-3) * 3.0)
-    legend: dict[str, style.LineStyle] = {
-        "no limit": line_styles["free"],
-        f"{data['step_limit_deg']:g}° per step": line_styles["limited"],
-        r"thin: $\tau$ of the unit-norm kernel (8)": {"color": style.BLACK, **_FAINT},
-    }
-    style.legend_below(figure, legend, 3)
+    thin = style.line(style.BLACK) | _FAINT | {"label": r"thin: $\tau$ of the unit-norm kernel (8)"}
+    style.legend_below(figure, 3, [thin])
 
 
 def _data_three(report_data: ReportData) -> Data:
@@ -98,7 +108,7 @@ def _data_three(report_data: ReportData) -> Data:
     "Control errors of directTHREE, projective and Euclidean model",
     "Fig. 10, section 6",
     _data_three,
-    height=4.8,
+    height=5.1,
     studies=True,
     goal=True,
     alt="Translation and rotation errors of directTHREE over time with the projective and the "
@@ -106,48 +116,43 @@ def _data_three(report_data: ReportData) -> Data:
 )
 def _draw_three(data: Data, figure: "style.Figure") -> None:
     """Above τ and what separates it from the truth, below the angles and their differences."""
-    axes = figure.subplots(2, 2, sharex=True)
-    (translation, off), (rotation, difference) = axes
+    (translation, off), (rotation, difference) = figure.subplots(2, 2, sharex=True)
     t, t_metric = data["t_s"], data["t_s_metric"]
-    t_common = max(t, t_metric, key=len)
-    line_styles: dict[str, tuple[str, style.LineStyle]] = {
-        "distance": ("true distance", {"color": style.SKY, "linewidth": 3.2}),
-        "tau_affine": (r"$\tau$, scale fixed through $a_\infty$", {"color": style.BLACK}),
-        "tau": (_KERNEL + "projective", {"color": style.VERMILION, "linestyle": (0, (4, 1.5))}),
-        "tau_metric": (_KERNEL + "Euclidean", {"color": style.BLACK, "linestyle": _DOTTED}),
-    }
-    for name, (_, line_style) in line_styles.items():
-        translation.plot(t_metric if name == "tau_metric" else t, data[name], **line_style)
+    for name, line in _TRANSLATION.items():
+        translation.plot(t_metric if name == "tau_metric" else t, data[name], **line)
         if name in ("tau_affine", "tau"):
-            off.plot(t, np.abs(data[name] - data["distance"]), **line_style)
-    some = {"fillstyle": "none", "markevery": max(1, len(t_metric) // 25)}
-    for name, color, marker in (("theta_r", style.BLACK, "o"), ("theta_p", style.VERMILION, "s")):
-        rotation.plot(t, data[f"{name}_deg"], color=color)
-        rotation.plot(t_metric, data[f"{name}_deg_metric"], marker, color=color, **some)
-        for kind, line in (("calibrated", "-"), ("true", _DOTTED)):
-            curve = data[f"{name}_difference_deg_{kind}"]
-            difference.plot(t_common[: len(curve)], curve, color=color, linestyle=line)
-    for panel, least in ((off, 1e-4), (difference, 1e-15)):
+            off.plot(t, np.abs(data[name] - data["distance"]), **line)
+    _rotations(rotation, difference, data)
+    for panel, lowest in ((off, 1e-4), (difference, 1e-15)):
         style.log_scale(panel)
-        panel.set_ylim(bottom=least)
+        panel.set_ylim(bottom=lowest)
     translation.set(title="directTHREE: translation error", ylabel=r"$\tau$ (% of its start)")
     off.set(title="its difference from the true distance", ylabel="difference (% of the start)")
     rotation.set(title="rotation errors", xlabel="time (s)", ylabel="angle (deg)")
     difference.set(title="projective less Euclidean model", xlabel="time (s)", ylabel="difference (deg)")
-    points: style.LineStyle = {"color": style.BLACK, "marker": "o", "linestyle": "none", "fillstyle": "none"}
-    legend = dict(line_styles.values()) | {
-        r"$\theta_r$, projective model": {"color": style.BLACK},
-        r"$\theta_p$, projective model": {"color": style.VERMILION},
-        r"$\theta_r$, $\theta_p$, Euclidean": points,
-        "dotted difference: true operators": {"color": style.BLACK, "linestyle": _DOTTED},
-    }
-    style.legend_below(figure, legend, 2)
+    dotted = style.line(style.BLACK, style.DOTTED, label="dotted difference: true operators")
+    style.legend_below(figure, 2, [dotted])
+
+
+def _rotations(rotation: "style.Axes", difference: "style.Axes", data: Data) -> None:
+    """Draw θ_r and θ_p with both models, and how far these differ, dotted with true operators."""
+    t, t_metric = data["t_s"], data["t_s_metric"]
+    t_common = max(t, t_metric, key=len)
+    markers = {"fillstyle": "none", "markevery": max(1, len(t_metric) // 25)}
+    for name, color, marker in (("theta_r", style.BLACK, "o"), ("theta_p", style.VERMILION, "s")):
+        angle = rf"$\{name}$"
+        rotation.plot(t, data[f"{name}_deg"], color=color, label=f"{angle}, projective model")
+        euclidean = style.dots(color, marker, f"{angle}, Euclidean model", **markers)
+        rotation.plot(t_metric, data[f"{name}_deg_metric"], **euclidean)
+        for kind, dash in (("calibrated", style.SOLID), ("true", style.DOTTED)):
+            curve = data[f"{name}_difference_deg_{kind}"]
+            difference.plot(t_common[: len(curve)], curve, color=color, linestyle=dash)
 
 
 def _data_joints(report_data: ReportData) -> Data:
     """Joints and their steps under directTHREE with calibrated operators, in deg and in mm."""
     prismatic = report_data.robot.prismatic
-    scale = np.where(prismatic, 1e3, np.degrees(1.0))
+    scale = joint_units(prismatic)
     result: Data = {"prismatic": prismatic, "step_limit_deg": np.array(report_data.extra.step_limit_deg)}
     for name, limited in _WAYS:
         trace = report_data.extra.own["direct_three", "calibrated", limited]
@@ -169,30 +174,27 @@ def _data_joints(report_data: ReportData) -> Data:
 )
 def _draw_joints(data: Data, figure: "style.Figure") -> None:
     """Left without, right with the limit; joints above, their steps below, per kind of joint."""
-    prismatic = data["prismatic"]
-    both = ((np.flatnonzero(~prismatic), "deg"), (np.flatnonzero(prismatic), "mm"))
-    kinds = [(chosen.tolist(), unit) for chosen, unit in both if len(chosen)]
+    prismatic, limit = data["prismatic"], float(data["step_limit_deg"])
+    kinds = joint_kinds(prismatic)
     figure.set_figheight(1.2 + 3.6 * len(kinds))
     axes = figure.subplots(2 * len(kinds), 2, sharex=True, squeeze=False)
-    limit = float(data["step_limit_deg"])
-    line: style.LineStyle = {"color": style.GREY, "linewidth": 0.8}
-    for column, (name, limited) in zip(axes.T, _WAYS, strict=True):
-        t = data[f"t_s_{name}"]
-        for joints, steps, (chosen, unit) in zip(column[::2], column[1::2], kinds, strict=True):
+    for (joints, steps), (chosen, unit) in zip(axes.reshape(-1, 2, 2), kinds, strict=True):
+        for panel, panel_below, (name, limited) in zip(joints, steps, _WAYS, strict=True):
+            t = data[f"t_s_{name}"]
             for i in chosen:
-                joints.plot(t, data[f"q_{name}"][:, i], **style.curve(i))
-                steps.plot(t[:-1], data[f"step_{name}"][:, i], **style.curve(i))
+                line = style.curve(i)
+                panel.plot(t, data[f"q_{name}"][:, i], **line)
+                panel_below.plot(t[:-1], data[f"step_{name}"][:, i], **line)
             if limited and unit == "deg":
                 for bound in (-limit, limit):
-                    steps.axhline(bound, **line)
-            if not limited:
-                joints.set_ylabel(f"joint ({unit})")
-                steps.set_ylabel(f"step ({unit} per period)")
-        column[0].set_title(f"directTHREE, {f'{limit:g}° per step' if limited else 'no limit'}")
-        column[-1].set_xlabel("time (s)")
-    for row in axes[::2]:  # both sides are to be compared
-        limits = [panel.get_ylim() for panel in row]
-        for panel in row:
+                    panel_below.axhline(bound, **_LIMIT)
+        joints[0].set_ylabel(f"joint ({unit})")
+        steps[0].set_ylabel(f"step ({unit} per period)")
+        limits = [panel.get_ylim() for panel in joints]  # both sides are to be compared
+        for panel in joints:
             panel.set_ylim(np.min(limits), np.max(limits))
-    line_styles = {f"$q_{i + 1}$": style.curve(i) for i in range(len(prismatic))} | {"limit": line}
-    style.legend_below(figure, line_styles, min(len(line_styles), 8))
+    for column, heading in zip(axes.T, ("no limit", f"{limit:g}° per step"), strict=True):
+        column[0].set_title(f"directTHREE, {heading}")
+        column[-1].set_xlabel("time (s)")
+    lines = [style.curve(i, f"$q_{i + 1}$") for i in range(len(prismatic))]
+    style.legend_below(figure, min(len(lines) + 1, 8), [*lines, _LIMIT | {"label": "limit"}])

@@ -1,41 +1,33 @@
-"""Figs. 4, 7 and 11 of [RH00], and the overview: paths and errors of the markers in both images."""
+"""Figs. 4, 7 and 11 of [RH00], the overview and frames: paths and errors of the markers in both images."""
 
-from typing import Any
+import io
 
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.laws import POINT_LAWS, title_of
+from projservo_cli.laws import BODY_LAWS, POINT_LAWS, title_of
 from projservo_cli.loop.verdicts import plateau_stretch
-from projservo_cli.records import FloatArray
+from projservo_cli.records import ByteArray, FloatArray, IntArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.report_data import DIRECT, VIEWS, Data, ReportData, percent, registered
+from projservo_cli.report.report_data import (
+    DIRECT,
+    VIEWS,
+    Data,
+    Driven,
+    ReportData,
+    percent,
+    registered,
+    title,
+)
+from projservo_cli.task.face import cyclic_order
 
 _OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
-_BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
+_NEAR_BORDER = 0.42  # distance from the middle, as a share of the image, from which its border shows
 _PANEL_WIDTH = 2.9  # inches, of one of two panels side by side
-_BORDER: style.LineStyle = {"color": style.GREY, "linewidth": 0.8}
-_HIDDEN: style.LineStyle = {"color": style.ORANGE, "linewidth": 4.0, "alpha": 0.6}
-_PATH: style.LineStyle = {"color": style.BLACK, "linewidth": 0.9}
-_PLATEAU: style.LineStyle = {"color": style.VERMILION, "linewidth": 2.0, "marker": "s"}
-_MARKER: style.LineStyle = {
-    "linewidth": 0.9,
-    "markersize": 3.0,
-    "linestyle": "-",
-}  # how it is broken says u or v
-# The overview.
-_SHOWN: dict[str, style.LineStyle] = {
-    "direct_three": {"color": style.GREEN, "linewidth": 1.2},
-    "stacked": {"color": style.VERMILION, "linewidth": 1.1, "linestyle": (0, (4, 1.2))},
-}
-_IMAGE_WIDTH, _ERRORS_WIDTH = 3.7, 2.1  # inches, of the panels with images and of those next to them
-_ASPECTS = (0.45, 0.9)  # height over width of an image, within: an error panel has its height
-_PERCENT = (1e-2, 200.0)  # shown of a control error: below, noise of the calibration rules
-_NEAR_ZERO = np.radians(1.0)  # rad; a rotation that starts within it may be noise, which is no whole
-_LEGEND_ROOM = 20.0  # points between a panel and its title
-_BAND: style.LineStyle = {"color": style.ORANGE, "linewidth": 5.0, "alpha": 0.55, "solid_capstyle": "butt"}
-_CENTER: style.LineStyle = {"color": style.GREEN, "linewidth": 3.2}
-_ERRORS = (("tau_affine", r"$\tau$"), ("theta_r", r"$\theta_r$"), ("theta_p", r"$\theta_p$"))
+_PATH = style.line(style.BLACK, width=0.9, label="path of a marker")
+_PLATEAU = style.line(style.VERMILION, width=2.0, marker="s", label="plateau of the image error")
+_STOPPED = style.dots(style.BLACK, "x", "end of the run", markersize=4)
+_BORDER = style.line(style.GREY, style.DOTTED, 0.8, label="border of the image")
 
 
 def _data_classical(report_data: ReportData) -> Data:
@@ -70,51 +62,38 @@ def _data_classical(report_data: ReportData) -> Data:
 def _draw_classical(data: Data, figure: "style.Figure") -> None:
     """One row a law, one column a camera."""
     laws, size = [law for law in POINT_LAWS if f"s_{law}" in data], data["image_size"]
-    panels = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
-    heights = [_PANEL_WIDTH * style.aspect(both_near(s, size)) for s in panels]
+    drawn = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
+    near = [[near_pixels(s[:, view], size[view]) for view in range(2)] for s in drawn]
+    heights = [_PANEL_WIDTH * style.aspect(np.concatenate(pixels)) for pixels in near]
     figure.set_figheight(sum(heights) + 0.62 * len(laws) + 0.45)
     axes = figure.subplots(len(laws), 2, squeeze=False, height_ratios=heights)
-    for row, law in enumerate(laws):
+    for row, law, pixels in zip(axes, laws, near, strict=True):
         first, last = data[f"plateau_{law}"]
-        for view, name in enumerate(VIEWS):
-            panel, s, goal = axes[row, view], data[f"s_{law}"][:, view], data[f"s_star_{law}"][view]
-            style.hidden_paths(panel, s, data[f"hidden_{law}"][:, view], _HIDDEN)
+        for view, (panel, name) in enumerate(zip(row, VIEWS, strict=True)):
+            s = data[f"s_{law}"][:, view]
+            style.paths(panel, s, style.HIDDEN, mask=data[f"hidden_{law}"][:, view])
             style.paths(panel, s, _PATH)
             if first >= 0:
                 style.paths(panel, s[first : last + 1], _PLATEAU | {"markevery": [0]})
-            panel.plot(*s[-1].T, "x", color=style.BLACK, markersize=4)
-            style.face(panel, s[0], style.START, fill=True)
-            style.face(panel, goal, style.GOAL)
-            title = f"{name} camera" if view else f"{title_of(law)}: {data[f'verdict_{law}']}"
-            style.image_axes(panel, title, near_pixels(np.concatenate([s, goal[None]]), size[view]))
-            panel.plot(*style.closed(image_border(size[view])).T, **_BORDER)
-    line_styles: dict[str, style.LineStyle] = {
-        "start": style.START,
-        "goal": style.GOAL,
-        "path of a marker": _PATH,
-    }
-    line_styles |= {"face hidden from this camera": _HIDDEN, "plateau of the image error": _PLATEAU}
-    line_styles["end of the run"] = {"color": style.BLACK, "marker": "x", "linestyle": "none"}
-    every = np.concatenate([near_pixels(s[:, v], size[v]) / size[v] for s in panels for v in (0, 1)])
-    if (np.abs(every - 0.5) > 0.5 - _BORDER_SHOWN).any():
-        line_styles["border of the image"] = _BORDER
-    style.legend_below(figure, line_styles, 4)
+            panel.plot(*s[-1].T, **_STOPPED)
+            style.start_and_goal(panel, s[0], data[f"s_star_{law}"][view])
+            heading = f"{name} camera" if view else f"{title_of(law)}: {data[f'verdict_{law}']}"
+            style.image_axes(panel, heading, pixels[view])
+            border(panel, size[view], pixels[view])
+    style.legend_below(figure, 4)
 
 
-def image_border(size: FloatArray) -> FloatArray:
-    """Corners (4, 2) of an image of a width and height (2,), px."""
-    return np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
-
-
-def both_near(pixels: FloatArray, size: FloatArray) -> FloatArray:
-    """Pixels (k, 2) of both images (…, 2, m, 2) of sizes (2, 2), as ``near_pixels``."""
-    return np.concatenate([near_pixels(pixels[..., view, :, :], size[view]) for view in range(2)])
+def border(axes: "style.Axes", size: FloatArray, pixels: FloatArray) -> None:
+    """Draw the border of an image of a size (2,), px; the legend names it where pixels (k, 2) are near it."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
+    near = (np.abs(pixels / size - 0.5) > _NEAR_BORDER).any()
+    axes.plot(*style.closed(corners).T, **_BORDER | {"label": _BORDER["label"] if near else ""})
 
 
 def near_pixels(pixels: FloatArray, size: FloatArray) -> FloatArray:
     """Of pixels (…, 2) those (k, 2) that were measured, none farther outside the image than is drawn."""
-    seen = pixels[np.isfinite(pixels).all(axis=-1)]
-    return np.clip(seen, -_OUTSIDE * size, (1.0 + _OUTSIDE) * size)
+    measured = pixels[np.isfinite(pixels).all(axis=-1)]
+    return np.clip(measured, -_OUTSIDE * size, (1.0 + _OUTSIDE) * size)
 
 
 def _data_direct(report_data: ReportData) -> Data:
@@ -134,24 +113,15 @@ def _data_direct(report_data: ReportData) -> Data:
 )
 def _draw_direct(data: Data, figure: "style.Figure") -> None:
     """Both laws over one another, one panel a camera."""
-    runs = [data[f"s_{law}"] for law in DIRECT]
-    figure.set_figheight(_PANEL_WIDTH * style.aspect(np.concatenate(runs)) + 1.05)
-    axes = figure.subplots(1, 2)
-    line_styles: tuple[style.LineStyle, ...] = (
-        {"color": style.BLACK, "linewidth": 1.1},
-        {"color": style.VERMILION, "linewidth": 1.1, "linestyle": (0, (4, 1.5))},
-    )
-    for view, (panel, name) in enumerate(zip(axes, VIEWS, strict=True)):
+    runs = np.concatenate([data[f"s_{law}"] for law in DIRECT])
+    figure.set_figheight(_PANEL_WIDTH * style.aspect(runs) + 1.05)
+    for view, (panel, name) in enumerate(zip(figure.subplots(1, 2), VIEWS, strict=True)):
         goal = data["s_star"][view]
-        for s, line_style in zip(runs, line_styles, strict=True):
-            style.paths(panel, s[:, view], line_style)
-        style.face(panel, runs[0][0, view], style.START, fill=True)
-        style.face(panel, goal, style.GOAL)
-        style.image_axes(panel, f"{name} camera", np.concatenate([goal[None], *(s[:, view] for s in runs)]))
-    legend: dict[str, style.LineStyle] = {
-        title_of(law): line_style for law, line_style in zip(DIRECT, line_styles, strict=True)
-    }
-    style.legend_below(figure, legend | {"start": style.START, "goal": style.GOAL}, 4)
+        for law in DIRECT:
+            style.paths(panel, data[f"s_{law}"][:, view], style.LAW_LINES[law] | {"label": title_of(law)})
+        style.start_and_goal(panel, runs[0, view], goal)
+        style.image_axes(panel, f"{name} camera", np.concatenate([goal[None], runs[:, view]]))
+    style.legend_below(figure, 4)
 
 
 def _data_errors(report_data: ReportData) -> Data:
@@ -167,6 +137,14 @@ def _data_errors(report_data: ReportData) -> Data:
     }
 
 
+_MARKER = {"linewidth": 0.9, "markersize": 3.0}
+_CENTER_ERROR = style.line(style.GREY, width=3.0, alpha=0.6)
+_COORDINATES = (
+    style.line(style.BLACK, width=0.9, label="u"),
+    style.line(style.BLACK, (0, (3, 1.2)), 0.9, label="v"),
+)
+
+
 @registered(
     "fig11_image_errors",
     "Image errors of the markers and of the centre",
@@ -177,31 +155,36 @@ def _data_errors(report_data: ReportData) -> Data:
     goal=True,
     alt="For each camera: the errors of u and v of every marker and of the centre over time.",
 )
-def draw_image_errors(data: Data, figure: "style.Figure") -> None:
+def _draw_errors(data: Data, figure: "style.Figure") -> None:
     """One panel a camera; u solid, v dashed, the centre thick, if it is known."""
-    axes = figure.subplots(1, 2, sharey=True)
-    t = data["t_s"]
-    thick: style.LineStyle = {"color": style.GREY, "linewidth": 3.0, "alpha": 0.6}
-    thin: style.LineStyle = {"color": style.BLACK, "linewidth": 0.9}
-    markers = [style.curve(k, marker=True) | _MARKER for k in range(len(data["marker"]))]
+    axes, t, numbers = figure.subplots(1, 2, sharey=True), data["t_s"], data["marker"]
     for view, (panel, name) in enumerate(zip(axes, VIEWS, strict=True)):
-        for k, line_style in enumerate(markers):
-            u, v = data["e"][:, view, k].T
+        for k, number in enumerate(numbers):
             every = {"markevery": (k * len(t) // 60, max(1, len(t) // 12))}
-            panel.plot(t, u, **line_style, **every)
-            panel.plot(t, v, **line_style | every | {"linestyle": (0, (3, 1.2))})
+            line = style.curve(k, f"marker {number}", marker=True) | _MARKER | every
+            _coordinates(panel, t, data["e"][:, view, k], line)
         if "center_e" in data:
-            u, v = data["center_e"][:, view].T
-            panel.plot(t, u, **thick)
-            panel.plot(t, v, linestyle=(0, (2, 1)), **thick)
+            _coordinates(panel, t, data["center_e"][:, view], _CENTER_ERROR | {"label": "centre"})
         panel.set(title=f"{name} camera, {data['law']}", xlabel="time (s)")
     axes[0].set_ylabel("image error $s - s_*$ (px)")
-    line_styles = {
-        f"marker {number}": line_style for number, line_style in zip(data["marker"], markers, strict=True)
-    }
-    line_styles |= {"centre": thick} if "center_e" in data else {}
-    line_styles |= {"u": thin, "v": thin | {"linestyle": (0, (3, 1.2))}}
-    style.legend_below(figure, line_styles, min(len(line_styles), 8))
+    style.legend_below(figure, min(len(numbers) + 3, 8), _COORDINATES)
+
+
+def _coordinates(axes: "style.Axes", t: FloatArray, pixels: FloatArray, line: style.LineStyle) -> None:
+    """Draw u and v of pixels (k, 2) over time (k,), distinguished by their dashes."""
+    for values, coordinate in zip(pixels.T, _COORDINATES, strict=True):
+        axes.plot(t, values, **line | {"linestyle": coordinate["linestyle"]})
+
+
+# The overview.
+_OVERVIEW_LAWS = ("direct_three", "stacked")
+_IMAGE_WIDTH, _ERRORS_WIDTH = 3.7, 2.1  # inches, of the panels with images and of those next to them
+_ASPECTS = (0.45, 0.9)  # height over width of an image, within: an error panel has its height
+_PERCENT = (1e-2, 200.0)  # shown of a control error: below, noise of the calibration rules
+_NEAR_ZERO = np.radians(1.0)  # rad; a rotation that starts within it may be noise, which is no whole
+_LEGEND_ROOM = 20.0  # points between a panel and its title
+_CENTER = style.line(style.GREEN, width=3.2, label=f"centre under {title_of(DIRECT[0])}")
+_ERRORS = {"tau_affine": r"$\tau$", "theta_r": r"$\theta_r$", "theta_p": r"$\theta_p$"}
 
 
 def _data_overview(report_data: ReportData) -> Data:
@@ -212,12 +195,12 @@ def _data_overview(report_data: ReportData) -> Data:
         "s_star": direct.s_star[:, order],
         "center": report_data.center_image(direct),
         "period_s": np.array(direct.period),
-        **{f"{name}_percent": np.abs(percent(getattr(direct, name))) for name, _ in _ERRORS},
+        **{f"{name}_percent": np.abs(percent(getattr(direct, name))) for name in _ERRORS},
     }
     for name in ("theta_r", "theta_p"):
         if abs(getattr(direct, name)[0]) < _NEAR_ZERO:
             result[f"{name}_percent"] = np.full(len(direct.tau), np.nan)
-    for law in _SHOWN:
+    for law in _OVERVIEW_LAWS:
         trace = report_data.traces[law]
         hidden = trace.self_occluded
         end = f"{trace.verdict} in {trace.steps} steps, face hidden in {hidden.any(axis=1).sum()}"
@@ -235,55 +218,147 @@ def _data_overview(report_data: ReportData) -> Data:
     "One run at a glance: the classical and the direct law in both images, and their errors",
     "not in the paper",
     _data_overview,
-    laws=tuple(_SHOWN),
+    laws=_OVERVIEW_LAWS,
     alt="Left: paths of the markers in both camera images, from the face at the start to the goal, "
     "for directTHREE and the stacked law, with the stretches in which the face is hidden. "
     "Right: control errors of directTHREE and image errors of both laws over time.",
 )
 def _draw_overview(data: Data, figure: "style.Figure") -> None:
     """Left the images of both cameras, right the errors."""
-    panels = [
+    pixels = [
         np.concatenate(
             [
                 data["s_star"][view],
                 data["center"][:, view],
-                *(data[f"s_{law}"][:, view].reshape(-1, 2) for law in _SHOWN),
+                *(data[f"s_{law}"][:, view].reshape(-1, 2) for law in _OVERVIEW_LAWS),
             ]
         )
         for view in range(2)
     ]
-    aspect = style.aspect(np.concatenate(panels), *_ASPECTS)
+    aspect = style.aspect(np.concatenate(pixels), *_ASPECTS)
     figure.set_figheight(2.0 * _IMAGE_WIDTH * aspect + 1.75 + _LEGEND_ROOM / 72.0)
     axes = figure.subplots(2, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
-    control, image = axes[:, 1]
+    lines = {law: style.LAW_LINES[law] | {"label": str(data[f"verdict_{law}"])} for law in _OVERVIEW_LAWS}
     for view, (panel, name) in enumerate(zip(axes[:, 0], VIEWS, strict=True)):
-        for law, line_style in reversed(_SHOWN.items()):
+        for law, line in reversed(lines.items()):
             s = data[f"s_{law}"][:, view]
-            style.hidden_paths(panel, s, data[f"hidden_{law}"][:, view], _BAND)
-            style.paths(panel, s, line_style)
+            style.paths(panel, s, style.HIDDEN, mask=data[f"hidden_{law}"][:, view])
+            style.paths(panel, s, line)
         panel.plot(*data["center"][:, view].T, **_CENTER)
-        style.face(panel, data[f"s_{DIRECT[0]}"][0, view], style.START, fill=True)
-        style.face(panel, data["s_star"][view], style.GOAL)
-        style.image_axes(panel, f"{name} camera", panels[view])
-    for index, (name, label) in enumerate(_ERRORS):
-        values = data[f"{name}_percent"]
-        t, shown = data["period_s"] * np.arange(len(values)), label + " near 0" * bool(np.isnan(values[0]))
-        control.plot(t, values, label=shown, **style.curve(index))
-    style.log_scale(control)
-    control.set(ylabel="error (% of its start)", ylim=_PERCENT)
-    control.set_title(f"control errors, {title_of(DIRECT[0])}", pad=_LEGEND_ROOM)
-    above: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": len(_ERRORS)}
-    control.legend(handlelength=1.5, columnspacing=1.0, **above)
-    for law, line_style in _SHOWN.items():
+        style.start_and_goal(panel, data[f"s_{DIRECT[0]}"][0, view], data["s_star"][view])
+        style.image_axes(panel, f"{name} camera", pixels[view])
+    _control_errors(axes[0, 1], data)
+    for law, line in lines.items():
         e, hidden = data[f"image_error_{law}"], data[f"hidden_{law}"].any(axis=1)
         t = data["period_s"] * np.arange(len(e))
-        image.plot(t, np.where(hidden, e, np.nan), **_BAND)
-        image.plot(t, e, **line_style)
-    style.log_scale(image)
-    image.set(title="image errors, both laws", ylabel="rms (px)")
-    for panel in (control, image):
-        panel.set_xlabel("time (s)")
-    line_styles = {str(data[f"verdict_{law}"]): line_style for law, line_style in _SHOWN.items()}
-    line_styles |= {f"centre under {title_of(DIRECT[0])}": _CENTER, "face at the start": style.START}
-    line_styles |= {"face at the goal": style.GOAL, "face hidden from the camera": _BAND}
-    style.legend_below(figure, line_styles, 2)
+        axes[1, 1].plot(t, np.where(hidden, e, np.nan), **style.HIDDEN)
+        axes[1, 1].plot(t, e, **line)
+    style.log_scale(axes[1, 1])
+    axes[1, 1].set(title="image errors, both laws", ylabel="rms (px)", xlabel="time (s)")
+    style.legend_below(figure, 2)
+
+
+def _control_errors(axes: "style.Axes", data: Data) -> None:
+    """Draw the errors of the direct law in % of their start, with a legend above them."""
+    for index, (name, label) in enumerate(_ERRORS.items()):
+        values = data[f"{name}_percent"]
+        legend = label + " near 0" * bool(np.isnan(values[0]))
+        axes.plot(data["period_s"] * np.arange(len(values)), values, **style.curve(index, legend))
+    style.log_scale(axes)
+    axes.set(ylabel="error (% of its start)", ylim=_PERCENT, xlabel="time (s)")
+    axes.set_title(f"control errors, {title_of(DIRECT[0])}", pad=_LEGEND_ROOM)
+    axes.legend(
+        handlelength=1.5, columnspacing=1.0, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(_ERRORS)
+    )
+
+
+# Frames.
+_MOMENTS = ("start", "in the middle", "end")
+_HALO = 1.2  # points, by which lines over a frame are wider in white
+_FOUND = style.dots(style.ORANGE, "+", "markers found", markersize=4.0)
+_FACE = style.line(style.GREEN, width=1.2, label="face")
+_DRIVEN = style.line(style.VERMILION, width=0.9, label="path of a marker")
+
+
+def frames_of(trace: Trace, selected: IntArray | None = None, width: int | None = None) -> ByteArray | None:
+    """Frames (k, 2, height, width) of a run, of those kept the ones shown (k,); None where none are kept.
+
+    width : px that they need not exceed, at which they are read faster and smaller.
+    """
+    from PIL import Image
+
+    if trace.frame_jpeg is None or trace.frame_size is None:
+        return None
+    ends = np.cumsum(trace.frame_size).reshape(-1, 2)
+    pairs = []
+    for k in np.arange(len(ends)) if selected is None else selected:
+        pair = []
+        for end, size in zip(ends[k], trace.frame_size[k], strict=True):
+            image = Image.open(io.BytesIO(trace.frame_jpeg[end - size : end].tobytes()), formats=["JPEG"])
+            if width is not None and image.width > width:
+                image.draft("L", (width, width * image.height // image.width))
+            pair.append(np.asarray(image.convert("L")))
+        pairs.append(pair)
+    return np.array(pairs)
+
+
+def _data_frames(report_data: Driven | ReportData) -> Data:
+    """Frames of three moments, all that was found in them, the path of the face and its goal.
+
+    Of the runs with frames it is that of the first direct law, else the first.
+    """
+    order = cyclic_order(report_data.plan.A)
+    filmed = [name for name, trace in report_data.traces.items() if trace.frame_index is not None]
+    name = next((name for name in filmed if name in BODY_LAWS), filmed[0])
+    trace = report_data.traces[name]
+    assert trace.frame_index is not None
+    assert trace.frame_s is not None
+    half = np.abs(trace.image_error[trace.frame_index] - 0.5 * trace.image_error[0])
+    selected = np.array([0, int(np.nanargmin(half)), len(half) - 1])
+    frames = frames_of(trace, selected)
+    assert frames is not None
+    return {
+        "run": np.array(f"{title(name)}, {trace.verdict}"),
+        "instant": trace.frame_index[selected],
+        "period_s": np.array(trace.period),
+        "found": trace.frame_s[selected],
+        "s": trace.s[:, :, order],
+        "s_star": trace.s_star[:, order],
+        "frames": frames,
+    }
+
+
+def with_halo(axes: "style.Axes") -> None:
+    """Draw all lines over a frame with a white margin, so that they show on any ground."""
+    from matplotlib.patheffects import withStroke
+
+    for line in axes.lines:
+        line.set_path_effects([withStroke(linewidth=line.get_linewidth() + _HALO, foreground="white")])
+
+
+@registered(
+    "fig17_frames",
+    "Images of both cameras at the start, in the middle and at the end",
+    "not in the paper",
+    _data_frames,
+    frames=True,
+    alt="A row for each camera, with its image at the start, in the middle and at the end. Drawn over "
+    "them are the markers that were found, the face with the paths of its markers so far, and the goal.",
+)
+def _draw_frames(data: Data, figure: "style.Figure") -> None:
+    """A row a camera, a column a moment."""
+    height, width = data["frames"].shape[2:]
+    figure.set_figheight(2.0 * style.WIDTH / 3.0 * height / width + 1.1)
+    for (view, i), panel in np.ndenumerate(figure.subplots(2, 3)):
+        panel.imshow(data["frames"][i, view], cmap="gray", vmin=0, vmax=255)
+        s = data["s"][: data["instant"][i] + 1, view]
+        style.paths(panel, s, _DRIVEN)
+        style.face(panel, s[-1], _FACE)
+        style.face(panel, data["s_star"][view], style.GOAL)
+        panel.plot(*data["found"][i, view].T, **_FOUND)
+        with_halo(panel)
+        panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+        seconds = data["instant"][i] * float(data["period_s"])
+        run = f"{data['run']}\n" if not (view or i) else ""
+        panel.set_title(f"{run}{VIEWS[view]} camera, {_MOMENTS[i]}, {seconds:.2f} s")
+    style.legend_below(figure, 4)

@@ -7,43 +7,37 @@ import numpy as np
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.image_size import BEHIND
 from projservo_cli.planning.margins import CLEAR, CONSTRAINTS, IMAGE, WIDTH
-from projservo_cli.records import FloatArray, IntArray, Plan
+from projservo_cli.records import FloatArray, Plan
 from projservo_cli.report import style
-from projservo_cli.report.figures.images import image_border, near_pixels
-from projservo_cli.report.report_data import VIEWS, Data, ReportData, registered
+from projservo_cli.report.figures.images import border, near_pixels
+from projservo_cli.report.report_data import VIEWS, Data, ReportData, joint_kinds, joint_units, registered
 
 PIECES = 4  # of each edge of a tree, which is no straight line in an image
 _IMAGE_WIDTH, _ROW = 2.9, 1.5  # inches: of an image, and the height of a row of curves
 _HIGHEST = 0.8  # height of an image over its width, at most
-_NEAR_EDGE = 0.42  # distance from the middle of an image, as a share of it, from which its border shows
 _STRIP = 0.085  # of the time, that the range of a joint takes next to the curves
 _NEAR, _NEAR_PX = 1.0, 10.0  # margins and distances up to which a scale to ten times as much is linear
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")  # as text, which takes a tenth of formulas
-_SIDES: tuple[Any, Any] = ("-", (0, (4, 1.5)))  # of what both cameras have
-_PATH: style.LineStyle = {"color": style.GREY, "linewidth": 0.8}
-_CENTER: style.LineStyle = {"color": style.GREEN, "linewidth": 1.6}
-_CORNER: style.LineStyle = {"color": style.VERMILION, "marker": "|", "markersize": 8.0, "linestyle": "none"}
-_EDGE: style.LineStyle = {"color": style.GREY, "linewidth": 0.8, "linestyle": (0, (1, 1))}
-_TREES: dict[str, style.LineStyle] = {
-    "start": {"color": style.SKY, "linewidth": 0.5, "alpha": 0.7},
-    "goals": {"color": style.PURPLE, "linewidth": 0.5, "alpha": 0.7},
+_SIDES = (style.SOLID, (0, (4, 1.5)))  # of what both cameras have
+_PATH = style.line(style.GREY, width=0.8, label="path of a marker")
+_CENTER = style.line(style.GREEN, width=1.6, label="path of the centre")
+_CORNER = style.dots(style.VERMILION, "|", "a rounded corner begins, ends", markersize=8.0)
+_TREES = {
+    "start": style.line(style.SKY, width=0.5, label="tree from the start", alpha=0.7),
+    "goals": style.line(style.PURPLE, width=0.5, label="tree from the goals", alpha=0.7),
 }
-_KEPT_OUT: style.LineStyle = {
-    "facecolor": "none",
-    "edgecolor": style.VERMILION,
-    "hatch": "////",
-    "linewidth": 0.6,
-}
-_ASKED: style.LineStyle = {"linewidth": 0.8, "linestyle": (0, (1, 1))}
+_HATCHED: Any = {"edgecolor": style.VERMILION, "hatch": "////", "linewidth": 0.6}
+_KEPT_OUT = style.patch("none", "kept-out region", **_HATCHED)
+_REQUIRED = style.line(style.GREY, style.DOTTED, 0.8, label="asked for")
 _SHARES = {
-    "visibility": ("visibility a·O (start = 1)", style.BLUE),
-    "joints": ("nearest joint limit (middle = 1)", style.GREEN),
-    "conditioning": ("conditioning (start = 1)", style.PURPLE),
+    "visibility": style.line(style.BLUE, label="visibility a·O (start = 1)"),
+    "joints": style.line(style.GREEN, label="nearest joint limit (middle = 1)"),
+    "conditioning": style.line(style.PURPLE, label="conditioning (start = 1)"),
 }
 _DISTANCES = {
-    "border_px": ("face from the border", style.ORANGE),
-    "width_px": ("width of the face", style.BLACK),
-    "clear_px": ("body from kept-out regions", style.VERMILION),
+    "border_px": style.line(style.ORANGE, label="face from the border"),
+    "width_px": style.line(style.BLACK, label="width of the face"),
+    "clear_px": style.line(style.VERMILION, label="body from kept-out regions"),
 }
 
 
@@ -51,7 +45,7 @@ def _data(report_data: ReportData) -> Data:
     """Images, joints and margins along the plan; trees as lines with NaN between their edges."""
     plan, order, model = report_data.plan, report_data.plant.order, report_data.calibrated
     slides = report_data.robot.prismatic
-    unit = np.where(slides, 1e3, np.degrees(1.0))
+    unit = joint_units(slides)
     timed = bool(np.isfinite(plan.time).all())
     name = f"{plan.profile.replace('_', ' ')} profile"
     if plan.profile == "joint_space" and not plan.feasible:
@@ -89,16 +83,16 @@ def _data(report_data: ReportData) -> Data:
 def _distances(plan: Plan, border_px: float) -> Data:
     """Return distances in px and their required values; of a joint-space path those of its constraints."""
     if plan.margins is None or plan.required_margins is None:
-        seen = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
-        return {"border_px": seen, "border_px_asked": np.full_like(seen, border_px)}
-    found: Data = {}
+        distance = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
+        return {"border_px": distance, "border_px_asked": np.full_like(distance, border_px)}
+    distances: Data = {}
     for i, count in ((IMAGE, 2), (WIDTH, 2), (CLEAR, 1)):
         name = CONSTRAINTS[i].value
         if np.isfinite(plan.margins[:, i]).all():
-            found[name], found[f"{name}_asked"] = (
+            distances[name], distances[f"{name}_asked"] = (
                 x[:, i : i + count] for x in (plan.margins, plan.required_margins)
             )
-    return found
+    return distances
 
 
 def tree_edges(plan: Plan) -> tuple[FloatArray, FloatArray]:
@@ -117,9 +111,9 @@ def tree_edges(plan: Plan) -> tuple[FloatArray, FloatArray]:
 
 def with_gaps(points: FloatArray) -> FloatArray:
     """Points (k, …) of one edge after the other as one line, with NaN after each edge."""
-    parts = points.reshape(-1, PIECES + 1, *points.shape[1:])
-    gaps = np.full_like(parts[:, :1], np.nan)
-    return np.concatenate([parts, gaps], axis=1).reshape(-1, *points.shape[1:])
+    edges = points.reshape(-1, PIECES + 1, *points.shape[1:])
+    gaps = np.full_like(edges[:, :1], np.nan)
+    return np.concatenate([edges, gaps], axis=1).reshape(-1, *points.shape[1:])
 
 
 @registered(
@@ -133,10 +127,7 @@ def with_gaps(points: FloatArray) -> FloatArray:
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """Above the images; below left the joints, by kind, right the constraints."""
-    slides = data["prismatic"]
-    kinds: list[tuple[IntArray, str]] = [
-        (np.flatnonzero(slides == kind), "mm" if kind else "deg") for kind in np.unique(slides)
-    ]
+    kinds = joint_kinds(data["prismatic"])
     visible = [_visible(data, view) for view in range(2)]
     image = _IMAGE_WIDTH * style.aspect(np.concatenate(visible), upper=_HIGHEST)
     figure.set_figheight(image + 2.0 * _ROW + 1.9)
@@ -144,45 +135,53 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     for view in range(2):
         _image(figure.add_subplot(grid[0, view]), data, view, visible[view])
     cells = (grid[1:, 0],) if len(kinds) == 1 else (grid[1, 0], grid[2, 0])
-    for place, (chosen, unit) in zip(cells, kinds, strict=True):
-        _joints(figure.add_subplot(place), data, chosen.tolist(), unit)
+    for cell, (chosen, unit) in zip(cells, kinds, strict=True):
+        _joints(figure.add_subplot(cell), data, chosen, unit)
     shares, distances = figure.add_subplot(grid[1, 1]), figure.add_subplot(grid[2, 1])
-    _curves(shares, data, {name: color for name, (_, color) in _SHARES.items()})
-    _curves(distances, data, {name: color for name, (_, color) in _DISTANCES.items()})
+    _constraints(shares, data, _SHARES, _NEAR)
+    _constraints(distances, data, _DISTANCES, _NEAR_PX)
     shares.set(ylabel="margin (1)", xlabel="")
     shares.tick_params(labelbottom=False)
     distances.set_ylabel("distance (px)")
-    for axes, near in ((shares, _NEAR), (distances, _NEAR_PX)):
-        if np.abs(axes.dataLim.intervaly).max() > 10.0 * near:
-            axes.set_yscale("symlog", linthresh=near)
-            axes.yaxis.set_major_formatter("{x:g}")
-    style.legend_below(figure, _legend(data), 3)
+    notes = [
+        style.line(style.GREY, _SIDES[0], label="left camera, or both"),
+        style.line(style.GREY, _SIDES[1], label="right camera"),
+        _REQUIRED,
+    ]
+    if "nodes" in data and data["nodes"][0] < data["nodes"][1]:
+        stored = "{} of {} joint vectors of trees".format(*data["nodes"])
+        notes.append(style.line(style.GREY, style.NO_LINE, label=stored))
+    style.legend_below(figure, 3, notes)
+
+
+def _kept_out(data: Data, view: int) -> list[FloatArray]:
+    """Regions (k, 2) of one image that are kept out of."""
+    return [data[name] for name in data if name.startswith(f"kept_out_{VIEWS[view]}")]
 
 
 def _visible(data: Data, view: int) -> FloatArray:
     """All pixels (k, 2) that are drawn of one image."""
-    names = ["s", "s_star", "center", *(f"tree_{name}" for name in _TREES if f"tree_{name}" in data)]
-    drawn = [data[name][..., view, :, :] if name[0] == "s" else data[name][:, view] for name in names]
-    drawn += [data[name] for name in data if name.startswith(f"kept_out_{VIEWS[view]}")]
+    lines = ["center", *(f"tree_{name}" for name in _TREES if f"tree_{name}" in data)]
+    drawn = [data[name][..., view, :, :] for name in ("s", "s_star")]
+    drawn += [*(data[name][:, view] for name in lines), *_kept_out(data, view)]
     return near_pixels(np.concatenate([pixels.reshape(-1, 2) for pixels in drawn]), data["image_size"][view])
 
 
 def _image(axes: "style.Axes", data: Data, view: int, visible: FloatArray) -> None:
-    for name in (name for name in data if name.startswith(f"kept_out_{VIEWS[view]}")):
-        axes.fill(*data[name].T, **_KEPT_OUT)
-    for name, line_style in _TREES.items():
+    """Draw trees, paths, faces and kept-out regions in the image of one camera."""
+    for region in _kept_out(data, view):
+        axes.fill(*region.T, **_KEPT_OUT)
+    for name, line in _TREES.items():
         if f"tree_{name}" in data:
-            axes.plot(*data[f"tree_{name}"][:, view].T, **line_style)
+            axes.plot(*data[f"tree_{name}"][:, view].T, **line)
     s, center = data["s"][:, view], data["center"][:, view]
     style.paths(axes, s, _PATH)
     axes.plot(*center.T, **_CENTER)
-    t = _time(data)[0]
-    at = data["corner_s"].ravel()
-    axes.plot(*(np.interp(at, t, column) for column in center.T), **_CORNER)
-    style.face(axes, s[0], style.START, fill=True)
-    style.face(axes, data["s_star"][view], style.GOAL)
+    if (ends := data["corner_s"].ravel()).size:
+        axes.plot(*(np.interp(ends, _time(data)[0], column) for column in center.T), **_CORNER)
+    style.start_and_goal(axes, s[0], data["s_star"][view])
     style.image_axes(axes, f"{VIEWS[view]} camera, {data['name']}", visible)
-    axes.plot(*style.closed(image_border(data["image_size"][view])).T, **_EDGE)
+    border(axes, data["image_size"][view], visible)
 
 
 def _time(data: Data) -> tuple[FloatArray, str]:
@@ -199,24 +198,16 @@ def _joints(axes: "style.Axes", data: Data, chosen: list[int], unit: str) -> Non
     values = values[np.isfinite(values)]
     low, high = (float(values.min()), float(values.max())) if len(values) else (-1.0, 1.0)
     pad = 0.06 * max(high - low, 1e-3)
+    bar: Any = {"linewidth": 3.0, "solid_capstyle": "butt"}  # a projecting cap would lengthen the range
+    named: Any = {"ha": "center", "va": "bottom", "fontsize": 6.5}
     for begin, until in data["corner_s"]:
         axes.axvspan(begin, until, color=style.PALE, linewidth=0)
     axes.axvline(end, color=style.GREY, linewidth=0.6)
     for place, i in enumerate(chosen):
-        line_style = style.curve(i)
-        axes.plot(t, q[:, i], **line_style)
-        x = end * (1.0 + _STRIP * (place + 0.7))
-        axes.plot(
-            [x, x], np.clip(limits[:, i], low - pad, high + pad), color=line_style["color"], linewidth=3.0
-        )
-        axes.text(
-            x,
-            high + 1.5 * pad,
-            "q" + str(i + 1).translate(_SUBSCRIPTS),
-            ha="center",
-            va="bottom",
-            fontsize=6.5,
-        )
+        line, x = style.curve(i), end * (1.0 + _STRIP * (place + 0.7))
+        axes.plot(t, q[:, i], **line)
+        axes.plot([x, x], np.clip(limits[:, i], low - pad, high + pad), color=line["color"], **bar)
+        axes.text(x, high + 1.5 * pad, "q" + str(i + 1).translate(_SUBSCRIPTS), **named)
     colors = [style.curve(i)["color"] for i in chosen]
     axes.scatter(np.zeros(len(chosen)), data["q_start_deg_or_mm"][chosen], 9.0, colors)
     axes.set(xlabel=name, ylabel=f"joint ({unit})", ylim=(low - pad, high + 4.0 * pad))
@@ -224,46 +215,19 @@ def _joints(axes: "style.Axes", data: Data, chosen: list[int], unit: str) -> Non
     axes.set_xticks([x for x in axes.get_xticks() if 0.0 <= x <= end])
 
 
-def _curves(axes: "style.Axes", data: Data, colors: dict[str, str]) -> None:
-    """Draw the constraints over time, solid for the left camera or both, and their required values."""
+def _constraints(axes: "style.Axes", data: Data, lines: dict[str, style.LineStyle], near: float) -> None:
+    """Draw constraints over time, solid for the left camera or both, and their required values, dotted.
+
+    near : value up to which the scale is linear if they grow beyond ten times as much.
+    """
     t, name = _time(data)
-    axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
-    for key, color in colors.items():
-        for suffix, line_styles in (("", _SIDES), ("_asked", (_ASKED["linestyle"],) * 2)):
-            width = 0.8 if suffix else 1.2
-            for column, line_style in zip(
-                data.get(key + suffix, np.zeros((len(t), 0))).T, line_styles, strict=False
-            ):
-                axes.plot(t, column, color=color, linestyle=line_style, linewidth=width)
-    axes.set(xlabel=name)
-
-
-def _legend(data: Data) -> dict[str, style.LineStyle]:
-    grey: style.LineStyle = {"color": style.GREY}
-    line_styles: dict[str, style.LineStyle] = {
-        "start": style.START,
-        "goal": style.GOAL,
-        "path of a marker": _PATH,
-    }
-    line_styles["path of the centre"] = _CENTER
-    if len(data["corner_s"]):
-        line_styles["a rounded corner begins, ends"] = _CORNER
-    for name, line_style in _TREES.items():
-        if f"tree_{name}" in data:
-            line_styles[f"tree from the {name}"] = line_style | {"linewidth": 1.2}
-    if "nodes" in data and data["nodes"][0] < data["nodes"][1]:
-        line_styles["{} of {} joint vectors of trees".format(*data["nodes"])] = {"linewidth": 0}
-    if any(name.startswith("kept_out") for name in data):
-        line_styles["kept-out region"] = _KEPT_OUT
-    for key, (label, color) in (_SHARES | _DISTANCES).items():
+    style.zero_line(axes)
+    for key, line in lines.items():
         if key in data:
-            line_styles[label] = {"color": color}
-    line_styles |= {
-        "left camera, or both": grey | {"linestyle": _SIDES[0]},
-        "right camera": grey | {"linestyle": _SIDES[1]},
-    }
-    line_styles["asked for"] = grey | _ASKED
-    visible = np.concatenate([_visible(data, view) / data["image_size"][view] for view in range(2)])
-    return line_styles | (
-        {"border of the image": _EDGE} if (np.abs(visible - 0.5) > _NEAR_EDGE).any() else {}
-    )
+            for column, dash in zip(data[key].T, _SIDES, strict=False):
+                axes.plot(t, column, **line | {"linestyle": dash})
+        if f"{key}_asked" in data:
+            axes.plot(t, data[f"{key}_asked"], **_REQUIRED | {"color": line["color"], "label": ""})
+    axes.set_xlabel(name)
+    if np.abs(axes.dataLim.intervaly).max() > 10.0 * near:
+        style.near_zero_scale(axes, near)

@@ -23,16 +23,15 @@ _PATH_POINTS = 400
 _WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
 _WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a fraction of the smallest
 _LEAST_OF_MODES = 0.02
-_WAY, _OFF = "way along the straight line (mm)", "distance from it (mm)"
+_ALONG, _OFF = "way along the straight line (mm)", "distance from it (mm)"
 _RESOLUTION = np.radians(1.0)  # longest joint motion, rad or m, between two points of a drawn path
 _OPERATORS = ("true", "calibrated")
-_LIMITED: style.LineStyle = {"color": style.SKY, "linewidth": 2.4}
 # Largest deviations by operators and limit, both 0 or 1.
-_MAXIMA: dict[tuple[int, int], style.LineStyle] = {
-    (0, 0): {"color": style.BLACK, "marker": "o"},
-    (0, 1): {"color": style.BLACK, "marker": "^", "linestyle": (0, (4, 1.5))},
-    (1, 0): {"color": style.VERMILION, "marker": "s", "fillstyle": "none"},
-    (1, 1): {"color": style.VERMILION, "marker": "v", "fillstyle": "none", "linestyle": (0, (4, 1.5))},
+_MAXIMA = {
+    (0, 0): style.line(style.BLACK, marker="o"),
+    (0, 1): style.line(style.BLACK, style.DASHED, marker="^"),
+    (1, 0): style.line(style.VERMILION, marker="s", fillstyle="none"),
+    (1, 1): style.line(style.VERMILION, style.DASHED, marker="v", fillstyle="none"),
 }
 
 
@@ -76,10 +75,10 @@ def _data(report_data: ReportData) -> Data:
             trace = studies.sweep[law, "calibrated", limited, gain]
             whirls = np.abs(np.diff(trace.q, axis=0)).max(initial=0.0) > _WHIRL
             points = trace.center if whirls else _center_path(report_data, trace)
-            way, off = along_line(points, trace.center[0], report_data.goal_center(trace))
+            along, off = along_line(points, trace.center[0], report_data.goal_center(trace))
             used = np.unique(np.linspace(0, len(points) - 1, _PATH_POINTS).round().astype(int))
             result[f"whirls_{law}_{i}"] = np.array(whirls)
-            result[f"path_mm_{law}_{i}"] = 1e3 * np.stack([way, off], axis=1)[used]
+            result[f"path_mm_{law}_{i}"] = 1e3 * np.stack([along, off], axis=1)[used]
     return result
 
 
@@ -110,46 +109,43 @@ def _center_path(report_data: ReportData, trace: Trace) -> FloatArray:
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """One row a law: left the paths, right the largest deviation over the gain."""
+    gains, limit = data["gain"], f"{float(data['step_limit_deg']):g}° per step"
+    lines = [
+        *(style.curve(i, f"gain {gain:g} per step") for i, gain in enumerate(gains)),
+        style.line(style.SKY, width=2.4, label=f"{gains.max():g} and {limit}"),
+    ]
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
-    gains = data["gain"]
-    line_styles = [*(style.curve(i) for i in range(len(gains))), _LIMITED]
-    for (path_axes, upper), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
-        paths = [data[f"path_mm_{law}_{i}"] for i in range(len(gains) + 1)]
+    for (path_axes, gain_axes), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
+        paths = [data[f"path_mm_{law}_{i}"] for i in range(len(lines))]
         lower = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
-        for path, line_style in zip(paths, line_styles, strict=True):
-            path_axes.plot(path[:, 0], np.maximum(path[:, 1], lower), **line_style)
+        for path, line in zip(paths, lines, strict=True):
+            path_axes.plot(path[:, 0], np.maximum(path[:, 1], lower), **line)
         path_axes.set(title=f"{title_of(law)}: path of the centre, calibrated operators")
-        path_axes.set(xlabel=_WAY, ylabel=_OFF)
+        path_axes.set(xlabel=_ALONG, ylabel=_OFF)
         style.log_scale(path_axes)
         path_axes.set_ylim(bottom=lower)
-        for (operators, limited), line_style in _MAXIMA.items():
+        for (operators, limited), line in _MAXIMA.items():
+            label = f"{_OPERATORS[operators]}, {limit if limited else 'no limit'}"
             size = 4.5 if operators else 3.0  # an empty marker shows around a full one
-            upper.plot(gains, deviation[operators, limited], markersize=size, **line_style)
-        upper.set(title=f"{title_of(law)}: largest distance", xscale="log")
-        upper.set(xlabel="gain per step (1)", ylabel="largest distance (mm)")
-        upper.set_xticks(gains, [f"{gain:g}" for gain in gains])
-        upper.minorticks_off()
-        style.log_scale(upper)
-    limit = f"{float(data['step_limit_deg']):g}° per step"
-    legend = {
-        f"gain {gain:g} per step": line_style for gain, line_style in zip(gains, line_styles, strict=False)
-    }
-    legend[f"{gains.max():g} and {limit}"] = _LIMITED
-    for (operators, limited), line_style in _MAXIMA.items():
-        legend[f"{_OPERATORS[operators]}, {limit if limited else 'no limit'}"] = line_style
-    if any(data[f"whirls_{law}_{i}"] for law in DIRECT for i in range(len(gains) + 1)):
-        legend["chords: steps over 180°"] = {"color": style.BLACK, "linewidth": 0}
-    style.legend_below(figure, legend, 4)
+            gain_axes.plot(gains, deviation[operators, limited], **line, markersize=size, label=label)
+        gain_axes.set(title=f"{title_of(law)}: largest distance", xscale="log")
+        gain_axes.set(xlabel="gain per step (1)", ylabel="largest distance (mm)")
+        gain_axes.set_xticks(gains, [f"{gain:g}" for gain in gains])
+        gain_axes.minorticks_off()
+        style.log_scale(gain_axes)
+    whirls = any(data[f"whirls_{law}_{i}"] for law in DIRECT for i in range(len(lines)))
+    note = style.line(style.BLACK, style.NO_LINE, label="chords: steps over 180°")
+    style.legend_below(figure, 4, [note] * whirls)
 
 
 def drift_rows(report: Report) -> list[dict[str, Any]]:
     """The drift table as rows: law, operators, limit in deg per step or None, gain, mm, converged."""
     rows = []
-    for index in np.ndindex(report.path_deviation_mm.shape):
-        law, operators, limited, gain = index
+    for law, operators, limited, gain in np.ndindex(report.path_deviation_mm.shape):
+        index = law, operators, limited, gain
         drift, at_samples = (
-            float(report.path_deviation_mm[index]),
-            float(report.path_deviation_at_samples_mm[index]),
+            float(values[index]) if np.isfinite(values[index]) else None
+            for values in (report.path_deviation_mm, report.path_deviation_at_samples_mm)
         )
         rows.append(
             {
@@ -157,8 +153,8 @@ def drift_rows(report: Report) -> list[dict[str, Any]]:
                 "operators": _OPERATORS[operators],
                 "limit_deg_per_step": report.step_limit_deg if limited else None,
                 "gain_per_step": float(report.gain_per_step[gain]),
-                "path_deviation_mm": drift if np.isfinite(drift) else None,
-                "path_deviation_at_samples_mm": at_samples if np.isfinite(at_samples) else None,
+                "path_deviation_mm": drift,
+                "path_deviation_at_samples_mm": at_samples,
                 "converged": bool(report.path_deviation_converged[index]),
             }
         )
@@ -171,8 +167,8 @@ def _data_modes(report_data: ReportData) -> Data:
     result: Data = {"names": np.array(names)}
     for name in names:
         trace = report_data.traces[name]
-        way, off = along_line(trace.center, trace.center[0], report_data.goal_center(trace))
-        result[f"path_mm_{name}"] = 1e3 * np.stack([way, off], axis=1)
+        along, off = along_line(trace.center, trace.center[0], report_data.goal_center(trace))
+        result[f"path_mm_{name}"] = 1e3 * np.stack([along, off], axis=1)
     return result
 
 
@@ -188,13 +184,13 @@ def _data_modes(report_data: ReportData) -> Data:
 )
 def _draw_modes(data: Data, figure: "style.Figure") -> None:
     """Draw the distance of the centre from its line over the distance along it, one curve per run."""
-    axes, names = figure.subplots(), [str(name) for name in data["names"]]
-    for i, name in enumerate(names):
-        way, off = data[f"path_mm_{name}"].T
-        axes.plot(way, off, **style.curve(i))
-    axes.set(title="path of the centre", xlabel=_WAY, ylabel=_OFF)
-    style.legend_below(figure, {title(name): style.curve(i) for i, name in enumerate(names)}, 2)
-    upper = [float(data[f"path_mm_{name}"][:, 1].max()) for name in names]
+    axes = figure.subplots()
+    runs = {str(name): data[f"path_mm_{name}"] for name in data["names"]}
+    for i, (name, path) in enumerate(runs.items()):
+        axes.plot(*path.T, **style.curve(i, title(name)))
+    axes.set(title="path of the centre", xlabel=_ALONG, ylabel=_OFF)
+    upper = [float(path[:, 1].max()) for path in runs.values()]
     if min(upper) > 0.0 and max(upper) > _WIDE * min(upper):
         style.log_scale(axes)
         axes.set_ylim(bottom=_LEAST_OF_MODES * min(upper))
+    style.legend_below(figure, 2)

@@ -1,4 +1,4 @@
-"""Figs. 5 and 6 of [RH00]: planned motions seen from between the cameras; and the path among all motions."""
+"""Figs. 1, 2, 5 and 6 of [RH00]: the parts of the task and the planned motions, with their visibility."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -17,6 +17,192 @@ from projservo_cli.simulation.arm import METRIC_A_INF, roll_axis
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.trajectory import trajectory_displacement
 
+_ARC_POINTS, _SENSE_POINTS = 61, 181
+_START = style.START | {"label": "start $A$"}
+_TARGETS = {
+    "A_star": style.GOAL | {"label": "goal $A_*$"},
+    "A_t": style.line(style.VERMILION, style.DOTTED, label="goal less translation $A_t$"),
+    "A_r": style.line(style.GREEN, style.DASH_DOTTED, label="less rotation onto the plane $A_r$"),
+}
+_PART_PATH = style.line(style.GREY, width=0.7, label="paths of the markers")
+_AXIS = style.line(style.BLACK, (0, (8, 3, 1, 3)), 0.8, label=r"axis of $\hat H_r$")
+_SENSES = (style.line(style.BLUE), style.line(style.VERMILION, style.DASHED))
+_HIDDEN = style.line(style.GREY, width=4, label="hidden from this camera", alpha=0.5, solid_capstyle="butt")
+_ZERO = style.dots(style.BLACK, "D", r"$\theta_0^\pm$, $\tau_0$", fillstyle="none")
+_END = style.dots(style.BLACK, "s", "end of the motion")
+_MARGIN = "margin $a\\cdot O$\n(start = 1)"
+
+
+def _turned(H_hat: FloatArray, angles: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (k, m, 4) turned about one axis by each of the angles (k,), rad."""
+    return np.stack([points @ exp_rotation(H_hat, theta).T for theta in angles])
+
+
+def _data_partition(report_data: ReportData) -> Data:
+    """Images in the left camera of the face, its targets and the paths of the three parts.
+
+    A_t is the goal less the translation, A_r the goal less both translation and rotation onto the
+    plane, [RH00] eqs. (12), (16); all come from the calibration and the images.
+    """
+    plan, model = report_data.plan, report_data.calibrated
+    order = cyclic_order(plan.A)
+    share = np.linspace(0.0, 1.0, _ARC_POINTS)
+    points = {
+        **{name: getattr(plan, name)[order] for name in ("A", "A_t", "A_r", "A_star")},
+        "center": np.stack([plan.A_c, plan.A_c_star]),
+        "onto_plane": _turned(plan.H_hat[1], share * plan.theta_r, plan.A_r[order]),
+        "within_plane": _turned(plan.H_hat[2], share * plan.theta_p, plan.A[order]),
+        "axis": _axis(plan.H_hat[1], plan.A_c, plan.A),
+    }
+    pixels = {name: project(model.P[:1], place, model.lens[:1])[0] for name, place in points.items()}
+    return pixels | {"angles_deg": np.degrees([plan.theta_r, plan.theta_p])}
+
+
+def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
+    """Two points (2, 4) on the axis of a rotation through the centre, as far out as the face.
+
+    (I + Ĥ²) X is the foot of X on the axis.
+    """
+    offset = A + A @ (H_hat @ H_hat).T - A_c
+    longest = offset[np.argmax(np.linalg.norm(offset, axis=1))]
+    reach = np.linalg.norm(A - A_c, axis=1).max()
+    half = 1.4 * reach * longest / max(float(np.linalg.norm(longest)), np.finfo(float).tiny)
+    return np.stack([A_c - half, A_c + half])
+
+
+@registered(
+    "fig01_partition",
+    "The task as a translation, a rotation onto the target plane and one within it",
+    "Fig. 1, section 4.1",
+    _data_partition,
+    height=3.0,
+    alt="Three panels in the left image: the face moved along a straight line, turned onto the "
+    "target plane, and turned within it.",
+)
+def _draw_partition(data: Data, figure: "style.Figure") -> None:
+    """Three panels, one a part."""
+    panels = figure.subplots(1, 3, width_ratios=[1.1, 1, 1])
+    onto, within = (_signed(angle) for angle in data["angles_deg"])
+    moved = np.stack([data["A_t"], data["A_star"]])
+    parts = (
+        ("translation of the centre", moved, ("A_t", "A_star")),
+        (rf"onto plane, $\theta_r$ = {onto}°", data["onto_plane"], ("A_r", "A_t")),
+        (rf"within plane, $\theta_p$ = {within}°", data["within_plane"], ("A_r",)),
+    )
+    panels[1].plot(*data["axis"].T, **_AXIS)
+    for panel, (title, paths, ends) in zip(panels, parts, strict=True):
+        axis = [data["axis"]] if panel is panels[1] else []
+        style.paths(panel, paths, _PART_PATH)
+        style.face(panel, data["A"], _START, fill=True)
+        for name in ends:
+            style.face(panel, data[name], _TARGETS[name])
+        style.image_axes(panel, title, np.concatenate([data["A"], paths.reshape(-1, 2), *axis]))
+    arrow = {"arrowstyle": "->", "linewidth": 0.9}
+    panels[0].annotate("", data["center"][1], data["center"][0], arrowprops=arrow)
+    style.legend_below(figure, 3)
+
+
+def _data_visibility(report_data: ReportData) -> Data:
+    """Margins a·O of both cameras over τ and θ_r, their zeros, and the images along both senses.
+
+    Margins are relative to the start, so 1 is the face as first seen and 0 a face seen edge-on.
+    """
+    plan, model = report_data.plan, report_data.calibrated
+    O, face = plan.optical_center, plan.A[cyclic_order(plan.A)]
+    start = O @ plan.a
+    arcs = [np.linspace(0.0, sense, _SENSE_POINTS) for sense in plan.sense]
+    images = [project(model.P, _turned(plan.H_hat[1], arc, face), model.lens).swapaxes(0, 1) for arc in arcs]
+    # As the plane is turned, so the optical centre may be turned back.
+    margin = [_turned(plan.H_hat[1], -arc, O) @ plan.a / start for arc in arcs]
+    tau_0 = plan.tau_0 / plan.tau if plan.tau > 0 else np.full(2, np.nan)
+    finite = tau_0[np.isfinite(tau_0)]
+    reach = np.concatenate([[-0.2, 1.2], 1.1 * finite[np.abs(finite) < 5]])
+    share = np.linspace(reach.min(), reach.max(), 101)
+    rate = O @ (plan.H_hat[0].T @ plan.a) / start * plan.tau
+    return {
+        "tau_share": share,
+        "tau_margin": 1.0 - share[:, None] * rate,
+        "tau_0_share": tau_0,
+        "theta_deg": np.degrees(arcs),
+        "theta_margin": np.stack(margin),
+        "theta_0_deg": np.degrees(plan.theta_0),
+        "images": np.stack(images),
+    }
+
+
+@registered(
+    "fig02_visibility",
+    "Where the face changes visibility, and both senses of the rotation onto the plane",
+    "Fig. 2, section 4.2",
+    _data_visibility,
+    height=7.4,
+    alt="For each camera: the face turned onto the target plane in both senses, and its visibility "
+    "margin over the angle and over the translation, with the values at which it is zero.",
+)
+def _draw_visibility(data: Data, figure: "style.Figure") -> None:
+    """Per camera: the images along both senses of θ_r, and the margin over θ_r and over τ."""
+    panels = figure.subplots(3, 2, height_ratios=[1.9, 1.0, 0.9])
+    senses = [
+        line | {"label": rf"sense $\theta_r$ = {_signed(angle)}°"}
+        for line, angle in zip(_SENSES, data["theta_deg"][:, -1], strict=True)
+    ]
+    for view, (name, (image, turned, moved)) in enumerate(zip(VIEWS, panels.T, strict=True)):
+        images, margins = data["images"][:, :, view], data["theta_margin"][..., view]
+        style.face(image, images[0, 0], style.START | {"label": "face at the start"}, fill=True)
+        for s, margin, line in zip(images, margins, senses, strict=True):
+            style.paths(image, s, _HIDDEN, mask=margin <= 0.0)
+            style.paths(image, s, line | {"linewidth": 0.9})
+            style.face(image, s[-1], line)
+        style.image_axes(image, f"{name} camera", images)
+        _angle(turned, data["theta_deg"], margins, senses, data["theta_0_deg"][view])
+        _translation(moved, data["tau_share"], data["tau_margin"][:, view], data["tau_0_share"][view])
+    style.legend_below(figure, 3, [_END])
+
+
+def _angle(
+    axes: "style.Axes",
+    angles: FloatArray,
+    margins: FloatArray,
+    senses: list[style.LineStyle],
+    zeros: FloatArray,
+) -> None:
+    """Margins (2, k) over angles (2, k), deg, in both senses, and the angles (2,) of no margin."""
+    for theta, margin, line in zip(angles, margins, senses, strict=True):
+        _margin(axes, theta, margin, line)
+    zeros_text = rf"$\theta_0^\pm$ = {' and '.join(f'{_signed(angle)}°' for angle in zeros)}"
+    axes.set_title(zeros_text if np.isfinite(zeros).all() else "visibility never changes")
+    periods = (zeros[:, None] + np.array([-360.0, 0.0, 360.0])).ravel()
+    periods = periods[(periods >= angles.min()) & (periods <= angles.max())]
+    axes.plot(periods, np.zeros_like(periods), **_ZERO)
+    axes.set_xlabel(r"$\theta_r$ (deg)")
+
+
+def _translation(axes: "style.Axes", share: FloatArray, margin: FloatArray, zero: float) -> None:
+    """Margin (k,) over the share (k,) of the translation, and the share of no margin."""
+    _margin(axes, share, margin, style.line(style.BLACK), end=1.0)
+    axes.plot([zero], [0.0], **_ZERO)
+    zero_text = rf"$\tau_0$ = {_signed(zero, 2)} $\tau$"
+    axes.set_title(zero_text if np.isfinite(zero) else "visibility never changes")
+    axes.set(xlim=(share[0], share[-1]), xlabel=r"translation as share of $\tau$ (1)")
+
+
+def _margin(
+    axes: "style.Axes", x: FloatArray, margin: FloatArray, line: style.LineStyle, end: float | None = None
+) -> None:
+    """A visibility margin over a motion, where the face is hidden by it, and the end, else the last."""
+    axes.plot(x, np.where(margin > 0, np.nan, margin), **_HIDDEN)
+    axes.plot(x, margin, **line)
+    last = (x[-1], margin[-1]) if end is None else (end, np.interp(end, x, margin))
+    axes.plot(*np.array([last]).T, **_END | {"color": line["color"]})
+    style.zero_line(axes)
+    axes.set_ylabel(_MARGIN)
+
+
+def _signed(value: float, decimals: int = 1) -> str:
+    """Number with a typographic minus."""
+    return f"{value:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
+
+
 STEEP = 0.35  # share of the path at which the steep profile has done the translation
 _FACES = 9
 _NODES = 81
@@ -25,21 +211,23 @@ _TICKS = 11  # points at equal steps of σ on the path
 _WIDE = 4.0  # margins beyond are drawn in powers of ten
 LABEL = 0.05  # room that the number on a contour needs, in shares
 _SIGMA, _SHARE = r"path parameter $\sigma$ (1)", r"share $\mu$ (1)"
-_SHARES: dict[str, style.LineStyle] = {  # equal shares lie on one another: the wider shows beneath
-    r"$\mu_t$": {"color": style.SKY, "linewidth": 3.0},
-    r"$\mu_r$": {"color": style.BLACK, "linewidth": 1.8, "linestyle": (0, (4, 2))},
-    r"$\mu_p$": {"color": style.VERMILION, "linewidth": 1.0, "linestyle": (0, (1, 1))},
+_SHARES = (  # equal shares lie on one another: the wider shows beneath
+    style.line(style.SKY, width=3.0, label=r"$\mu_t$"),
+    style.line(style.BLACK, (0, (4, 2)), 1.8, label=r"$\mu_r$"),
+    style.line(style.VERMILION, style.DOTTED, 1.0, label=r"$\mu_p$"),
+)
+_PATH = style.line(style.VERMILION, width=1.6)
+_HATCHED = {"alpha": 0.6, "edgecolor": style.BLACK, "linewidth": 0.0}
+_REGIONS = {  # hatched, so that they differ in grey too
+    "margin": style.patch(style.GREY, "hidden from this camera", hatch="", **_HATCHED),
+    "border_px": style.patch(style.ORANGE, r"outside this image at every $\mu_p$", hatch="////", **_HATCHED),
 }
-_REGIONS: dict[str, style.LineStyle] = {  # hatched, so that they differ in grey too
-    "margin": {"facecolor": style.GREY, "hatch": ""},
-    "border_px": {"facecolor": style.ORANGE, "hatch": "////"},
-}
-_MARGINS: dict[str, style.LineStyle] = {
-    "visibility": {"color": style.BLUE, "linestyle": "-"},
-    "image": {"color": style.ORANGE, "linestyle": (0, (5, 1.5))},
-    "joints": {"color": style.GREEN, "linestyle": (0, (4, 1, 1, 1))},
-    "conditioning (start = 1)": {"color": style.PURPLE, "linestyle": (0, (1, 1))},
-}
+_MARGINS = (
+    style.line(style.BLUE, label="visibility"),
+    style.line(style.ORANGE, style.DASHED, label="image"),
+    style.line(style.GREEN, (0, (4, 1, 1, 1)), label="joints"),
+    style.line(style.PURPLE, style.DOTTED, label="conditioning (start = 1)"),
+)
 
 
 def _data_linear(report_data: ReportData) -> Data:
@@ -120,45 +308,44 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
 )
 def _draw_planned(data: Data, figure: "style.Figure") -> None:
     """Left the faces from dark to light along the path, right the shares and the margins."""
-    from matplotlib import colormaps
-
     figure.set_figheight(max(4.2 * style.aspect(data["faces"]) + 1.0, 3.0))
     grid = figure.add_gridspec(2, 2, width_ratios=[1.7, 1])
-    faces, sigma, shared = data["faces"], data["sigma"], np.isfinite(data["mu"]).all()
-    image, line_styles = figure.add_subplot(grid[:, 0]), _SHARES if shared else {}
-    if shared:
+    _faces(figure.add_subplot(grid[:, 0]), data)
+    sigma, shares = data["sigma"], None
+    if np.isfinite(data["mu"]).all():
         shares = figure.add_subplot(grid[0, 1])
-        _columns(shares, sigma, data["mu"], line_styles.values())
+        _columns(shares, sigma, data["mu"], _SHARES)
         shares.set_ylabel(_SHARE)
         shares.tick_params(labelbottom=False)
-        margins = figure.add_subplot(grid[1, 1], sharex=shares)
-    else:  # of a path through joint space
-        margins = figure.add_subplot(grid[:, 1])
-    style.paths(image, faces, {"color": style.GREY, "linewidth": 0.6})
+    # A path through joint space has no shares.
+    margins = figure.add_subplot(grid[1, 1] if shares else grid[:, 1], sharex=shares)
+    _columns(margins, sigma, data["margin"], style.VIEW_LINES)
+    style.zero_line(margins)
+    margins.set(xlabel=_SIGMA, ylabel=_MARGIN)
+    style.legend_below(figure, 6, [style.dots(style.BLACK, "o", "first marker of the face")])
+
+
+def _faces(axes: "style.Axes", data: Data) -> None:
+    """Draw some of the planned faces, from dark to light along the path, and the paths of the markers."""
+    from matplotlib import colormaps
+
+    faces, sigma = data["faces"], data["sigma"]
+    style.paths(axes, faces, style.line(style.GREY, width=0.6))
     visible = np.unique(np.linspace(0, len(sigma) - 1, _FACES).round().astype(int))
     for j in visible:
-        color = colormaps["cividis"](0.82 * sigma[j])
-        ends = j in (visible[0], visible[-1])
-        style.face(image, faces[j], {"color": color, "linewidth": 1.8 if ends else 1.0})
-    style.image_axes(image, f"from the rig's centre, {data['profile']}", faces)
+        width = 1.8 if j in (visible[0], visible[-1]) else 1.0
+        style.face(axes, faces[j], style.line(colormaps["cividis"](0.82 * sigma[j]), width=width))
+    style.image_axes(axes, f"from the rig's centre, {data['profile']}", faces)
     place: Any = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "va": "bottom"}
     paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
-    for j, label in ((0, "start"), (-1, "goal")):
-        image.annotate(label, faces[j][np.argmin(faces[j][:, 1])], bbox=paper, **place)
-    cameras = {f"{name} camera": style.curve(3 - view) for view, name in enumerate(VIEWS)}
-    _columns(margins, sigma, data["margin"], cameras.values())
-    margins.axhline(0.0, color=style.BLACK, linewidth=0.6)
-    margins.set(xlabel=_SIGMA, ylabel="margin $a\\cdot O$\n(start = 1)")
-    first: style.LineStyle = {"color": style.BLACK, "marker": "o", "linestyle": "none"}
-    style.legend_below(figure, {**line_styles, **cameras, "first marker of the face": first}, 6)
+    for corners, label in ((faces[0], "start"), (faces[-1], "goal")):
+        axes.annotate(label, corners[np.argmin(corners[:, 1])], bbox=paper, **place)
 
 
-def _columns(
-    axes: "style.Axes", x: FloatArray, values: FloatArray, line_styles: Iterable[style.LineStyle]
-) -> None:
-    """Each column of values (k, c) over x (k,), in a separate style."""
-    for column, line_style in zip(values.T, line_styles, strict=True):
-        axes.plot(x, column, **line_style)
+def _columns(axes: "style.Axes", x: FloatArray, values: FloatArray, lines: Iterable[style.LineStyle]) -> None:
+    """Draw each column of values (k, c) over x (k,), in its style."""
+    for column, line in zip(values.T, lines, strict=True):
+        axes.plot(x, column, **line)
 
 
 def _data_path(report_data: ReportData) -> Data:
@@ -197,8 +384,8 @@ def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
     size = report_data.plant.image_size[:, None, None, None]
     result = np.empty((2, len(mu), len(mu)))
     for i, share in enumerate(mu):
-        there = (M + share * plan.tau * moved).reshape(-1, 4)
-        m = (there @ P.swapaxes(1, 2)).reshape(2, *M.shape[:3], 3)
+        points = (M + share * plan.tau * moved).reshape(-1, 4)
+        m = (points @ P.swapaxes(1, 2)).reshape(2, *M.shape[:3], 3)
         pixels = distort_visible(lens[:, None, None, None], m[..., :2] / m[..., 2:])
         lowest = border_distance(pixels, size).min(axis=1)
         front = (m[..., 2] * depth > 0.0).all(axis=1)
@@ -223,44 +410,38 @@ def _draw_path(data: Data, figure: "style.Figure") -> None:
         _map(axes[0, view], data, view)
         axes[0, view].set_title(f"{name} camera, {data['profile']} profile")
     shares, margins = axes[1]
-    _columns(shares, data["sigma"], data["mu"], _SHARES.values())
-    _columns(margins, data["sigma"], data["along"], _MARGINS.values())
+    _columns(shares, data["sigma"], data["mu"], _SHARES)
+    _columns(margins, data["sigma"], data["along"], _MARGINS)
     shares.set(xlabel=_SIGMA, ylabel=_SHARE)
     margins.set(xlabel=_SIGMA, ylabel="margin (1)")
-    margins.axhline(0.0, color=style.BLACK, linewidth=0.6)
+    style.zero_line(margins)
     if np.nanmax(data["along"]) > _WIDE:  # conditioning may grow a hundredfold
-        margins.set_yscale("symlog", linthresh=1.0)
-        margins.yaxis.set_major_formatter("{x:g}")
+        style.near_zero_scale(margins, 1.0)
     margins.set_ylim(bottom=min(-0.1, 1.1 * float(np.nanmin(data["along"]))))
-    region: style.LineStyle = {"alpha": 0.6, "edgecolor": style.BLACK, "linewidth": 0.0}
-    line_styles: dict[str, style.LineStyle] = {
-        "hidden from this camera": region | _REGIONS["margin"],
-        r"outside this image at every $\mu_p$": region | _REGIONS["border_px"],
-        r"path, at tenths of $\sigma$": {"color": style.VERMILION, "marker": "o"},
-    }
-    style.legend_below(figure, {**line_styles, **_SHARES, **_MARGINS}, 4)
+    path = _PATH | {"marker": "o", "label": r"path, at tenths of $\sigma$"}
+    style.legend_below(figure, 4, [*_REGIONS.values(), path])
 
 
 def _map(axes: "style.Axes", data: Data, view: int) -> None:
+    """Draw the regions in which a camera does not see the face over the shares μ_t and μ_r, and the path."""
     share = data["share"]
-    for name, line_style in _REGIONS.items():
+    for name, line in _REGIONS.items():
         finite = np.maximum(data[name][view], -1e6)
-        region: Any = {"colors": [line_style["facecolor"]], "hatches": [line_style["hatch"]], "alpha": 0.6}
+        region: Any = {"colors": [line["facecolor"]], "hatches": [line["hatch"]], "alpha": line["alpha"]}
         if finite.min() < 0.0:
             axes.contourf(share, share, finite.T, levels=[-1e9, 0.0], **region)
         if finite.min() < 0.0 < finite.max():
             axes.contour(share, share, finite.T, levels=[0.0], colors=[style.BLACK], linewidths=0.6)
     faint: Any = {"colors": [style.BLACK], "linewidths": 0.4, "linestyles": "dotted"}
-    seen = axes.contour(
-        share, share, data["margin"][view].T, levels=[0.25, 0.5, 0.75, 1.0, 1.5, 2.0], **faint
-    )
+    levels = [0.25, 0.5, 0.75, 1.0, 1.5, 2.0]
+    contours = axes.contour(share, share, data["margin"][view].T, levels=levels, **faint)
     lines = np.concatenate([data["mu"][:, :2], np.repeat(share[:, None], 2, axis=1)])
-    axes.clabel(seen, fmt="%g", fontsize=6.5, manual=_clear(seen.allsegs, lines))
+    axes.clabel(contours, fmt="%g", fontsize=6.5, manual=_clear(contours.allsegs, lines))
     axes.plot([0.0, 1.0], [0.0, 1.0], color=style.BLACK, linewidth=0.5)
     t, r = data["mu"][:, :2].T
-    axes.plot(t, r, color=style.VERMILION, linewidth=1.6)
+    axes.plot(t, r, **_PATH)
     tenths, sigma = np.linspace(0.0, 1.0, _TICKS), data["sigma"]
-    axes.plot(np.interp(tenths, sigma, t), np.interp(tenths, sigma, r), "o", color=style.VERMILION)
+    axes.plot(np.interp(tenths, sigma, t), np.interp(tenths, sigma, r), **style.dots(style.VERMILION, "o"))
     labels = {"xlabel": r"translation $\mu_t$ (1)", "ylabel": r"turn onto the plane $\mu_r$ (1)"}
     axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), **labels)
 

@@ -1,25 +1,26 @@
-"""Fig. 3 of [RH00]: robot, stereo rig and face at the start and at the goal."""
+"""Fig. 3 of [RH00], robot, rig and face; and arm, cameras and the tool's uncertainty to scale, in metres."""
 
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
-from projservo_cli.geometry.displacements import homogeneous
+from projservo_cli.geometry.displacements import homogeneous, twists
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.image_size import image_corners
-from projservo_cli.records import BoolArray, FloatArray
+from projservo_cli.metric.frame import Metric, links
+from projservo_cli.records import MM, VIEWS, BoolArray, FloatArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.report_data import Data, ReportData, registered
+from projservo_cli.report.report_data import Data, Fit, ReportData, registered
 from projservo_cli.simulation.analytic_plant import Plant
-from projservo_cli.simulation.arm import camera_center
+from projservo_cli.simulation.arm import SerialArm, camera_center
 from projservo_cli.task.face import center_of
 
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
-ROBOT: style.LineStyle = {"color": style.BLACK, "linewidth": 2.0, "marker": "o", "markersize": 4}
-_CAMERAS: dict[str, style.LineStyle] = {
-    "left camera": {"color": style.BLUE, "linewidth": 1.0},
-    "right camera": {"color": style.ORANGE, "linewidth": 1.0},
-}
+_ROBOT = style.line(style.BLACK, width=2.0, marker="o", markersize=4)
+_GOAL = style.line(style.PURPLE, (0, (3, 1)), 1.6, label="face at the goal")  # blue is the left camera
+_LINE = style.line(style.GREY, style.DOTTED, label="straight line of the centre")
 
 
 def _data(report_data: ReportData) -> Data:
@@ -34,13 +35,18 @@ def _data(report_data: ReportData) -> Data:
     }
     visible = plant_pyramids(plant, result["face_start"])
     result |= {"cameras": visible[:, 0], "pyramids": visible}
-    goals = (trace.goal_pose for trace in report_data.traces.values() if np.isfinite(trace.goal_pose).all())
-    if (pose := next(goals, None)) is not None:
-        goal = pose @ np.linalg.inv(robot.base_tool)
+    if (goal := goal_displacement(robot, report_data.traces)) is not None:
         result["face_goal"] = (face @ goal.T)[:, :3]
         centers = [center_of(plant.M @ H.T, plant.center)[:3] for H in (start, goal)]
         result["line"] = np.array(centers)
     return result
+
+
+def goal_displacement(robot: SerialArm, traces: Mapping[str, Trace]) -> FloatArray | None:
+    """Displacement (4, 4) of the markers from the reference to the goal; None where only images are known."""
+    poses = (trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all())
+    pose = next(poses, None)
+    return None if pose is None else np.asarray(pose @ np.linalg.inv(robot.base_tool))
 
 
 def skeleton(H_hat: FloatArray, prismatic: BoolArray, tool: FloatArray) -> FloatArray:
@@ -60,11 +66,11 @@ def skeleton(H_hat: FloatArray, prismatic: BoolArray, tool: FloatArray) -> Float
 
 
 def plant_pyramids(plant: Plant, face: FloatArray) -> FloatArray:
-    """Pyramids (2, 5, 3) of the whole images of a plant, by ``pyramids``."""
-    return pyramids(plant.model.P, rectangle(*np.moveaxis(image_corners(plant.image_size), -2, 0)), face)
+    """Pyramids (2, 5, 3) of the whole images of a plant, by ``_pyramids``."""
+    return _pyramids(plant.model.P, _rectangle(*np.moveaxis(image_corners(plant.image_size), -2, 0)), face)
 
 
-def pyramids(P: FloatArray, corners: FloatArray, face: FloatArray) -> FloatArray:
+def _pyramids(P: FloatArray, corners: FloatArray, face: FloatArray) -> FloatArray:
     """Optical centre and image corners (2, 5, 3) of metric cameras P (2, 3, 4), m.
 
     corners : (2, 4, 2) pixels. They are drawn at a depth in front of the camera that goes by the distance of
@@ -77,7 +83,7 @@ def pyramids(P: FloatArray, corners: FloatArray, face: FloatArray) -> FloatArray
     return np.concatenate([centers, centers + depth * rays * scale[:, None, None]], axis=1)
 
 
-def rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
+def _rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
     """Corners (2, 4, 2) of the images of both views between pixels low and high (2, 2) or (2,)."""
     share = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     low, high = (np.broadcast_to(end, (2, 2))[:, None] for end in (low, high))
@@ -95,40 +101,31 @@ def rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """One view in perspective with equal scales."""
-    axes = space(figure, data["pyramids"])
-    axes.plot(*data["robot"].T, **ROBOT)
-    axes.plot(*style.closed(data["face_start"]).T, **style.START)
-    line_styles = {"robot at the start": ROBOT, "face at the start": style.START}
+    axes = _space(figure, data["pyramids"])
+    axes.plot(*data["robot"].T, **_ROBOT, label="robot at the start")
+    axes.plot(*style.closed(data["face_start"]).T, **style.START | {"label": "face at the start"})
     visible = [data["robot"], data["face_start"]]
     if "face_goal" in data:
-        goal: style.LineStyle = {"color": style.VERMILION, "linestyle": (0, (3, 1))}
-        axes.plot(*style.closed(data["face_goal"]).T, **goal)
-        line: style.LineStyle = {"color": style.GREY, "linestyle": (0, (1, 1))}
-        axes.plot(*data["line"].T, **line)
-        line_styles |= {"face at the goal": goal, "straight line of the centre": line}
+        axes.plot(*style.closed(data["face_goal"]).T, **_GOAL)
+        axes.plot(*data["line"].T, **_LINE)
         visible.append(data["face_goal"])
-    show(axes, figure, data["pyramids"], np.concatenate(visible), line_styles)
+    _show(axes, figure, data["pyramids"], np.concatenate(visible))
 
 
-def space(figure: "style.Figure", rig: FloatArray) -> Any:
+def _space(figure: "style.Figure", rig: FloatArray) -> Any:
     """Axes in three dimensions with the pyramids (2, 5, 3) of both cameras."""
     axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
     axes.patch.set_visible(False)
     axes.computed_zorder = False
-    for (center, *corners), line_style in zip(rig, _CAMERAS.values(), strict=True):
-        axes.plot(*style.closed(np.stack(corners)).T, **line_style)
+    for (center, *corners), line in zip(rig, style.VIEW_LINES, strict=True):
+        edges = line | {"linestyle": style.SOLID, "linewidth": 1.0}
+        axes.plot(*style.closed(np.stack(corners)).T, **edges)
         for corner in corners:
-            axes.plot(*np.stack([center, corner]).T, **line_style)
+            axes.plot(*np.stack([center, corner]).T, **edges)
     return axes
 
 
-def show(
-    axes: Any,
-    figure: "style.Figure",
-    rig: FloatArray,
-    points: FloatArray,
-    line_styles: dict[str, style.LineStyle],
-) -> None:
+def _show(axes: Any, figure: "style.Figure", rig: FloatArray, points: FloatArray) -> None:
     """Show a rig and points (k, 3) with equal scales, seen from the side of the rig, above a legend."""
     from matplotlib.ticker import MultipleLocator
 
@@ -146,7 +143,7 @@ def show(
     towards = rig[:, 0].mean(axis=0) - points.mean(axis=0)
     axes.view_init(elev=22, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62)
     figure.set_layout_engine()
-    style.legend_below(figure, line_styles | _CAMERAS, 3)
+    style.legend_below(figure, 3)
     _fit(axes, figure, extent)
 
 
@@ -171,3 +168,109 @@ def _fit(axes: Any, figure: "style.Figure", extent: FloatArray) -> None:
         middle += off / figure.bbox.size
     axes.set_box_aspect(size, zoom=zoom)
     axes.set_position((*(middle - 0.5 * side), *side))
+
+
+_POSES, _REGION = 5, 0.95
+_ELLIPSOID_SIZE = 0.05  # size of the ellipsoids as they are drawn, over the distance of the tools
+_ELLIPSOID = style.line(style.VERMILION, width=0.8)
+
+
+def chosen_poses(metric: Metric, fit: Fit) -> FloatArray:
+    """Five readings (5, n) of those in the data: nearest to the reference, then the farthest tools."""
+    q = fit.observation.q
+    positions = metric.pose(q)[:, :3, 3]
+    chosen = [int(np.argmin(np.abs(q - fit.calibration.q_reference).sum(axis=1)))]
+    while len(chosen) < min(_POSES, len(q)):
+        away = np.linalg.norm(positions[:, None] - positions[chosen], axis=2).min(axis=1)
+        chosen.append(int(np.argmax(away)))
+    return q[chosen]
+
+
+def metric_rows(metric: Metric, q: FloatArray) -> Iterator[dict[str, Any]]:
+    """Yield quantities in metres with their standard deviations; the tool at readings q (k, n)."""
+    of_K, of_poses, centers = metric.deviations("K"), metric.deviations("poses"), metric.poses[:, :3, 3]
+    for v, view in enumerate(VIEWS):
+        K = metric.K[v]
+        yield _row(f"{view} camera, focal lengths", K[(0, 1), (0, 1)], of_K[:, v][:, [0, 3]], "px")
+        yield _row(f"{view} camera, principal point", K[:2, 2], of_K[:, v][:, [2, 4]], "px")
+        yield _row(
+            f"{view} camera, position in the base frame", MM * centers[v], MM * of_poses[:, v, 3:], "mm"
+        )
+    apart = centers[1] - centers[0]
+    distance = np.asarray(np.linalg.norm(apart))
+    between = (of_poses[:, 1, 3:] - of_poses[:, 0, 3:]) @ (apart / distance)
+    yield _row("distance of the cameras", MM * distance, MM * between[:, None], "mm")
+    axes, prismatic = metric.axes, metric.prismatic
+    angle, length = links(axes, prismatic, axes)
+    changes = metric.changes(lambda body: np.stack(links(body.axes, prismatic, axes), axis=-1))
+    for i in range(len(angle)):
+        name = f"joint {i + 2}, axis from that of joint {i + 1}"
+        yield _row(f"{name}, angle", np.degrees(angle[i]), np.degrees(changes[:, i, :1]), "°")
+        if np.isfinite(length[i]):
+            yield _row(f"{name}, distance", MM * length[i], MM * changes[:, i, 1:], "mm")
+    of_tools = metric.point_changes(q, np.zeros(3))
+    for k, T in enumerate(metric.pose(q)):
+        yield _row(f"tool at pose {k + 1}", MM * T[:3, 3], MM * of_tools[:, k], "mm")
+
+
+def _row(quantity: str, value: FloatArray, changes: FloatArray, unit: str) -> dict[str, Any]:
+    """Plain values of a quantity (d,) and its deviation, by its changes (c, d) by independent errors."""
+    return {
+        "quantity": quantity,
+        "value": np.atleast_1d(value).tolist(),
+        "deviation": np.linalg.norm(np.atleast_2d(changes), axis=0).tolist(),
+        "unit": unit,
+    }
+
+
+def _data_metric(report_data: Fit) -> Data:
+    """Arm at the first of five poses, cameras, and 95 % regions of the tool at all of them, m."""
+    metric = report_data.metric
+    assert metric is not None
+    q = chosen_poses(metric, report_data)
+    tools = metric.pose(q)[:, :3, 3]
+    arm = report_data.calibration.model()._replace(
+        H_hat_0=twists(metric.axes), q_reference=np.zeros(q.shape[1])
+    )
+    pixels = report_data.observation.images
+    low, high = np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))
+    spread, axes = np.linalg.eigh(metric.pose_covariance(q)[:, 3:, 3:])
+    radius = np.sqrt(chdtri(3, 1.0 - _REGION) * np.maximum(spread, 0.0))
+    semi_axes = axes.swapaxes(1, 2) * radius[..., None]
+    extent = float(np.ptp(tools, axis=0).max()) + float(np.linalg.norm(tools.mean(axis=0)))
+    return {
+        "q": q,
+        "tool": tools,
+        "position_std_mm": metric.position_std(q),
+        "semi_axes": semi_axes,
+        "factor": np.array(style.magnification(float(radius.max()), _ELLIPSOID_SIZE * extent)),
+        "robot": skeleton(joint_operators(arm, q[0]), arm.prismatic, tools[0]),
+        "pyramids": _pyramids(metric.body.P, _rectangle(low, high), tools),
+    }
+
+
+@registered(
+    "fig18_metric",
+    "SerialArm, cameras and the tool's uncertainty, to scale",
+    "not in the paper",
+    _data_metric,
+    height=4.4,
+    task=False,
+    metric=True,
+    alt="The arm at one pose in three dimensions, both cameras with pyramids over the pixels in which "
+    "markers were seen, and ellipsoids of the tool's position at five poses, magnified.",
+)
+def _draw_metric(data: Data, figure: "style.Figure") -> None:
+    """One view in perspective; regions as three ellipses each."""
+    axes = _space(figure, data["pyramids"])
+    axes.plot(*data["robot"].T, **_ROBOT, label="arm at one pose")
+    largest = MM * float(np.linalg.norm(data["semi_axes"], axis=2).max())
+    region = f"95 % region of the tool, {float(data['factor']):,g} times (at most {largest:.3g} mm)"
+    angle = np.linspace(0.0, 2.0 * np.pi, 61)[:, None]
+    visible = [data["robot"]]
+    for center, semi in zip(data["tool"], float(data["factor"]) * data["semi_axes"], strict=True):
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            ring = center + np.cos(angle) * semi[a] + np.sin(angle) * semi[b]
+            axes.plot(*ring.T, **_ELLIPSOID, label=region)
+            visible.append(ring)
+    _show(axes, figure, data["pyramids"], np.concatenate(visible))

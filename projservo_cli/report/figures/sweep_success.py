@@ -14,15 +14,15 @@ def draw_success(data: Data, figure: Figure) -> None:
     """Success of each law, ``<law>.rate``, from ``.low`` to ``.high``, over ``.x``, which is a ``label``."""
     axes = figure.add_subplot()
     laws = _laws(data, ".rate")
-    line_styles = {law: style.curve(i, marker=True) for i, law in enumerate(laws)}
     span = max(float(np.ptp(data[f"{law}.x"])) for law in laws) or 1.0
     for i, law in enumerate(laws):
         x, rate = data[f"{law}.x"], data[f"{law}.rate"]
         offset = 0.006 * span * (i - 0.5 * (len(laws) - 1))  # so that bars of laws do not hide each other
         reach = np.maximum(0.0, [rate - data[f"{law}.low"], data[f"{law}.high"] - rate])
-        axes.errorbar(x + offset, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **line_styles[law])
+        line = style.curve(i, law, marker=True)
+        axes.errorbar(x + offset, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **line)
     axes.set(xlabel=str(data["label"]), ylabel="success (%), bars: 95 %", ylim=(-3, 103))
-    style.legend_below(figure, line_styles, min(3, len(laws)))
+    style.legend_below(figure, min(3, len(laws)))
 
 
 def draw_basin(data: Data, figure: Figure) -> None:
@@ -57,12 +57,13 @@ def draw_final_errors(data: Data, figure: Figure) -> None:
     ``data`` has for each law ``<law>.error`` (k,), mm, sorted, and ``<law>.share`` (k,) of all its runs.
     """
     axes = figure.add_subplot()
-    line_styles = {law: style.curve(i) for i, law in enumerate(_laws(data, ".error"))}
-    for law, line_style in line_styles.items():
-        axes.plot(data[f"{law}.error"], 100.0 * data[f"{law}.share"], drawstyle="steps-post", **line_style)
+    laws = _laws(data, ".error")
+    for i, law in enumerate(laws):
+        line = style.curve(i, law)
+        axes.plot(data[f"{law}.error"], 100.0 * data[f"{law}.share"], drawstyle="steps-post", **line)
     label = "distance of the centre from the goal at the end (mm)"
     axes.set(xlabel=label, ylabel="runs within it (%)", xscale="log", ylim=(-3, 103))
-    style.legend_below(figure, line_styles, min(3, len(line_styles)))
+    style.legend_below(figure, min(3, len(laws)))
 
 
 def _laws(data: Data, ending: str) -> list[str]:

@@ -1,7 +1,5 @@
-"""The page of a preflight, and both images live in a browser of this machine."""
+"""Pages of both images: of a preflight, of a recording, and live in a browser of this machine."""
 
-import base64
-import html
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -13,12 +11,8 @@ import numpy as np
 from projservo_cli.detection import opencv
 from projservo_cli.hardware.checks_at_rest import Finding
 from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray
+from projservo_cli.report.html import embedded, html_page
 
-_STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:80rem;margin:1.5rem auto;padding:0 1rem}
-img{width:49%;min-width:20rem}td,th{padding:.2rem .6rem;text-align:left;vertical-align:top}
-.fault td:first-child{color:#b00020;font-weight:700}.warning td:first-child{color:#a05a00;font-weight:700}
-@media(prefers-color-scheme:dark){body{background:#111;color:#eee}.fault td:first-child{color:#ff8a80}
-.warning td:first-child{color:#ffc46b}}"""
 # Grey values are drawn over in BGR: found tags, and the goal.
 _TAG, _GOAL = (60, 200, 0), (255, 140, 0)
 # Longest pause between two images of a live page, s.
@@ -46,39 +40,21 @@ def annotated(grey: ByteArray, marker: Sequence[int], pixels: FloatArray, goal: 
     return bytes(cv.imencode(".jpg", image, [cv.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
 
 
-def page(name: str, findings: Sequence[Finding], pictures: Sequence[bytes]) -> str:
+def preflight_page(name: str, findings: Sequence[Finding], pictures: Sequence[bytes]) -> str:
     """One file of HTML with the findings of a preflight and both pictures, JPEG."""
-    rows = "".join(
-        f'<tr class="{one.level}"><td>{one.level}</td>'
-        + "".join(f"<td>{html.escape(text)}</td>" for text in (one.where, one.text, one.remedy))
-        + "</tr>"
-        for one in findings
-    )
-    head = "<tr><th></th><th>part</th><th>found</th><th>remedy</th></tr>"
-    return _document(f"Preflight of {name}", f"<p>{_images(pictures)}</p><table>{head}{rows}</table>")
+    title = f"Preflight of {name}"
+    return html_page("cameras.html", title=title, images=_within(pictures), findings=findings)
 
 
 def recording_page(name: str, done: str, pictures: Sequence[bytes], *, whole: bool) -> str:
     """One file of HTML that shows how far a recording is, and loads itself again until it is whole."""
-    again = "" if whole else '<meta http-equiv="refresh" content="2">'
-    return _document(f"Recording {name}", f"<p>{html.escape(done)}</p><p>{_images(pictures)}</p>", again)
+    title = f"Recording {name}"
+    return html_page("cameras.html", title=title, images=_within(pictures), text=done, reloads=not whole)
 
 
-def _images(pictures: Sequence[bytes]) -> str:
-    """Elements of both pictures, JPEG, inside the page itself."""
-    both = zip(VIEWS, map(base64.b64encode, pictures), strict=False)
-    return " ".join(
-        f'<img alt="{view} image with the tags found" src="data:image/jpeg;base64,{data.decode()}">'
-        for view, data in both
-    )
-
-
-def _document(title: str, body: str, head: str = "") -> str:
-    title = html.escape(title)
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8">{head}<title>{title}</title>'
-        f"<style>{_STYLE}</style><h1>{title}</h1>{body}</html>\n"
-    )
+def _within(pictures: Sequence[bytes]) -> dict[str, str]:
+    """Addresses of the pictures, JPEG, of both views within a page."""
+    return {view: embedded(picture, "image/jpeg") for view, picture in zip(VIEWS, pictures, strict=False)}
 
 
 class LivePage:
@@ -88,8 +64,9 @@ class LivePage:
     """
 
     def __init__(self, name: str, port: int = 0) -> None:
-        images = "".join(f'<img alt="{view} image" src="/{view}.mjpg"> ' for view in VIEWS)
-        text = _document(f"Live images of {name}", f"<p>{images}</p><p>Ctrl-C in the terminal ends it.</p>")
+        images = {view: f"/{view}.mjpg" for view in VIEWS}
+        title, note = f"Live images of {name}", "Ctrl-C in the terminal ends it."
+        text = html_page("cameras.html", title=title, images=images, text=note)
         self.pictures: dict[str, bytes] = {}
         live = self
 
