@@ -13,10 +13,10 @@ from projservo_cli.simulation import faults
 from projservo_cli.simulation.cameras import Frames
 from projservo_cli.simulation.scene import rendered_model
 from projservo_cli.stages import calibrate as calibrating
-from projservo_cli.stages import external_robot, scenario, studies
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import report as reporting
+from projservo_cli.stages import scenario
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages import teach as teaching
 
@@ -84,11 +84,6 @@ def bounds_of(config, joints):
     return given._following(config, config.plant.speed_scale).bounds(joints)
 
 
-def plugin_robot(config, joints, markers):
-    robot = given.recording_inputs(config).own
-    return external_robot.plugin_robot(robot, bounds_of(config, joints), joints.types, range(markers))
-
-
 def robot_by_itself(config, truth, q, sigma_px, seed, stream):
     robot = given._simulated(config, truth, None)
     return faults.robot_by_itself(robot, q, sigma_px, (seed, stream))
@@ -124,10 +119,6 @@ def teach(config, frames, at=None, *more):
 
 def require_face(config, taught):
     teaching.require_face(config.face_numbers, taught)
-
-
-def comparison_of(config, calibration, plan):
-    return studies.comparison_of(given.report_inputs(config).extra, calibration, plan)
 
 
 def report_on(run, directory, **options):

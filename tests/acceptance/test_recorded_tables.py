@@ -94,36 +94,6 @@ def test_noise_free_tables_are_explained_to_their_rounding(held_out, robot, meth
     assert store.load("out").calibration.method == method
 
 
-def test_noise_that_was_given_judges_the_fit(answer, shared_data):
-    table = shared_data / "ur5" / "trials_0.5px.csv"
-
-    def calibrate(noise):
-        return answer("calibrate", "--data", table, "--noise-px", noise, "-o", f"at {noise}", "--json", "-q")
-
-    code, value, _ = calibrate(0.5)
-    assert (code, value["sigma_px"]) == (0, 0.5)
-    assert value["chi2_per_dof"] == pytest.approx(1.0, abs=4 * np.sqrt(2 / 2851))
-    assert not any("pixel noise" in text for text in (value["reason"], *value["advice"]))
-    code, value, _ = calibrate(0.4)  # fitted over given: 1.25, between 1.15 and 3
-    assert (code, value["usable"]) == (0, True)
-    assert "more than pixel noise" in value["reason"]
-    code, value, err = calibrate(0.1)  # fitted over given: 5
-    assert (code, value["usable"]) == (1, False)
-    assert "0.1" in value["reason"]
-    assert err.count("\n") == 1
-    assert "Traceback" not in err
-
-
-def test_wrong_joint_types_of_a_table_are_refused(answer, shared_data):
-    table = shared_data / "stanford" / "trials_0.5px.csv"
-    code, value, err = answer("calibrate", "--data", table, "-o", "out", "--json", "-q")  # all R
-    assert (code, value["usable"]) == (1, False)
-    assert "type" in value["reason"]
-    assert err.count("\n") == 1
-    for joints in ("RRPRR", "RRPRRX"):
-        assert answer("calibrate", "--data", table, "--joints", joints, "-o", "out")[0] == 2
-
-
 def rewritten(source, target, rng, columns, marker, pose):
     """The table with columns in another order, a further one, rows shuffled, markers and poses renumbered."""
     with source.open(newline="", encoding="utf-8") as file:
@@ -185,17 +155,3 @@ def test_a_tag_whose_corners_begin_further_in_one_view_is_named(answer, shared_d
     code, value, err = answer("calibrate", "--data", table, "-o", "out", "--json")
     assert (code, value["failed"]) == (1, "calibrate")
     assert "tag 1: its corners begin 1 further in the right view" in " ".join(err.split())
-
-
-@pytest.mark.parametrize("noise", ["0.0", "1.0"])
-def test_types_that_are_not_given_are_told_and_tried(answer, shared_data, noise):
-    table = shared_data / "stanford" / f"trials_{noise}px.csv"
-    code, _, err = answer("calibrate", "--data", table, "-o", "out", "--json")
-    told = " ".join(err.split())
-    assert code == 1
-    assert "joint 3 is prismatic, not revolute: check --joints (RRPRRR would fit)" in told
-    table = shared_data / "ur5" / f"trials_{noise}px.csv"
-    for types, assumed in ((), True), (("--joints", "RRRRRR"), False):
-        code, value, err = answer("calibrate", "--data", table, *types, "-o", "other", "--json", "--force")
-        assert (code, value["joint_types_assumed"]) == (0, assumed)
-        assert ("joint types are not given: all are taken as revolute" in err) == assumed

@@ -49,14 +49,6 @@ def test_the_direct_law_stands_beside_the_classical_ones(frames):
         assert abs(pixels.shape[1] - width) <= 1
 
 
-def test_the_film_lasts_as_long_as_the_longest_run_that_converged(frames):
-    slow, ends = run(80, verdict="no progress"), []
-    for verdict in ("converged", "diverged"):
-        end = frames(2, slow=slow, quick=run(9, verdict=verdict))[-1]
-        ends.append(count(end[:, : end.shape[1] // 2], animation.SEEN))
-    assert ends[0] < 0.6 * ends[1]  # of the way of the first run, 9 s and 80 s
-
-
 def test_the_face_moves_and_hidden_instants_are_marked(frames):
     first, hidden, last = frames(3, one=run())
     assert abs(first.shape[1] - 400) <= 1  # room for the legend
@@ -69,23 +61,3 @@ def test_the_face_moves_and_hidden_instants_are_marked(frames):
     legend = first[-60:]  # is whole
     assert (legend[:, [0, 1, 2, -3, -2, -1]] > 250).all()
     assert (legend < 128).any()
-
-
-def test_markers_that_were_not_seen_are_told_and_leave_the_rest(frames):
-    lost, whole = run(hidden=()), run(hidden=())
-    lost.s[3, 1] = np.nan
-    first, last = zip(*(frames(5, one=one)[3:] for one in (lost, whole)), strict=True)
-    upper, lower = np.array_split(np.abs(first[0].astype(int) - first[1]).max(axis=2) > 60, 2)
-    assert lower.sum() > 200  # the word, and the face that is gone, in the image of the right camera alone
-    assert not upper.any()
-    assert count(last[0], animation.SEEN) > 0.9 * count(last[1], animation.SEEN)
-
-
-def test_frames_are_the_ground_and_the_drawing_of_today_lies_over_them(frames):
-    traces = case()[2].traces
-    filmed, bare = traces["direct_three"], traces["direct_two"]
-    (shown,) = frames(1, filmed=filmed, bare=bare)
-    left, right = np.array_split(shown, 2, axis=1)
-    assert (left < 12).all(axis=2).mean() > 0.4  # frames are black
-    assert (right < 12).all(axis=2).mean() < 0.1
-    assert count(left, animation.SEEN) > 20

@@ -119,29 +119,3 @@ def test_a_camera_that_stands_still_while_joints_move_is_named():
         look(40 * PERIOD, motion(40 * PERIOD))
     for k in range(41, 100):  # at rest it may
         look(k * PERIOD, np.zeros(2))
-
-
-def test_a_clock_of_a_camera_that_jumps_is_named():
-    delays, history, s = (
-        Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT),
-        History(),
-        predicted(np.zeros((1, 2)))[0],
-    )
-    for k in range(10):
-        history.add(k * PERIOD, np.zeros(2))
-        delays.update(np.full(2, k * PERIOD), s + k, history)
-    history.add(10 * PERIOD, np.zeros(2))
-    with pytest.raises(WorkFailed, match="stamp of a left image"):
-        delays.update(np.array([5.0, 10 * PERIOD]), s + 10, history)
-
-
-def test_joints_of_the_past_are_those_read_to_the_bit_and_straight_between():
-    history, q = History(), np.random.default_rng(0).standard_normal((5, 3))
-    t = np.array([0.0, 0.1, 0.25, 0.3, 0.7])
-    for pair in zip(t, q, strict=True):
-        history.add(*pair)
-    np.testing.assert_array_equal(history.at(t), q)
-    np.testing.assert_array_equal(history.at(np.array([-5.0])), q[:1])
-    between = np.array([0.05, 0.2, 0.29, 0.5])
-    straight = np.stack([np.interp(between, t, joint) for joint in q.T], axis=1)
-    np.testing.assert_allclose(history.at(between), straight)

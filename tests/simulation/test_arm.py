@@ -73,14 +73,6 @@ def test_dh_tables_of_both_conventions(convention, rng):
     assert robot.limits.lower == pytest.approx([*np.radians([-3, -3]), -3, *np.radians([-3, -3, -3])])
 
 
-def test_puma_at_its_ready_pose():
-    """Corke's toolbox: joints (0, 90, −90, 0, 0, 0)° stretch the arm up; the wrist is at a3, −d3, a2 + d4."""
-    pose = truth_of(configured("paper")).robot.pose(np.radians([0, 90, -90, 0, 0, 0]))
-    # The tool is 0.05625 + 0.05 m beyond the wrist.
-    assert pose[:3, 3] == pytest.approx([0.0203, -0.15005, 0.8636 + 0.10625], abs=1e-12)
-    assert pose[:3, :3] == pytest.approx(np.eye(3), abs=1e-12)
-
-
 def test_a_camera_looks_at_its_target():
     position, target = np.array([2.0, -0.3, 0.8]), np.array([0.5, 0.1, 0.6])
     P = camera(position, target)
@@ -104,12 +96,6 @@ def test_a_camera_looks_at_its_target():
     assert across == pytest.approx([-1.2 / distance, 0], abs=1e-9)
     with pytest.raises(InputError, match="along the line of sight"):
         camera(position, np.add(position, [0, 0, 4]))
-
-
-def test_roll_axis_lies_between_the_cameras():
-    point, direction = roll_axis(np.array([camera([2, y, 0.5], [0.5, 0, 0.5]) for y in (-0.2, 0.2)]))
-    assert point == pytest.approx([2, 0, 0.5], abs=1e-12)
-    assert direction == pytest.approx([-1, 0, 0], abs=1e-12)
 
 
 @pytest.mark.parametrize("roll_deg", [10, 165, 180])

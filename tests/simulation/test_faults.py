@@ -59,14 +59,6 @@ def driven(plant, targets):
 WAY = [[0.02 * k, -0.01 * k] for k in range(1, 26)]
 
 
-def test_an_ideal_robot_is_where_it_was_sent_and_shows_it():
-    plant = robot()
-    q, s = driven(plant, WAY)
-    assert q == pytest.approx(np.array(WAY), abs=1e-14)
-    assert s == pytest.approx(np.array([images(row) for row in WAY]), abs=1e-9)
-    assert (plant.now(), plant.truth()) == (pytest.approx(25 * PERIOD), pytest.approx(WAY[-1]))
-
-
 def test_a_servo_lags_as_a_system_of_first_order_does():
     plant, lag, pace = robot(servo_time_constant_s=0.05), 0.05, np.array([0.02, -0.01]) / PERIOD
     q, _ = driven(plant, [*WAY, *[WAY[-1]] * 5])
@@ -172,23 +164,3 @@ def test_events_befall_the_robot_in_their_period():
         expected[:, 2] = math.nan if 2 <= k < 4 else expected[:, 2]
         assert q == pytest.approx(struck, abs=1e-12)
         assert s == pytest.approx(expected, abs=1e-8, nan_ok=True)
-
-
-def test_a_slip_and_a_frozen_reading_are_not_read():
-    plant = robot(joint_moved={"at_step": 5, "joint": 1, "by_deg": math.degrees(0.05), "encoder_slip": True})
-    q, _ = driven(plant, WAY[:8])
-    assert plant.truth() - q[-1] == pytest.approx([0.05, 0.0], abs=1e-12)
-    q, _ = driven(robot(stuck_encoder={"joint": 1, "from_step": 3, "steps": 4}), WAY[:10])
-    assert np.array(q)[:, 0] / 0.02 == pytest.approx([1, 2, 3, 3, 3, 3, 7, 8, 9, 10])
-    assert np.array(q)[:, 1] / -0.01 == pytest.approx(np.arange(1, 11))
-
-
-def test_runs_are_the_same_to_the_bit_and_other_seeds_are_others():
-    late = {"camera_latency_s": {"left": 0.05, "right": 0.06}, "exposure_s": 0.01, "jitter_s": 0.003}
-    faults = late | {"servo_time_constant_s": 0.05, "gravity_sag_deg": 0.5, "backlash_deg": 0.5} | WARPED
-    one, two, other = (driven(robot(0.5, seed, **faults), WAY) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one[1], two[1])
-    assert np.isfinite(one[1][0]).all()
-    assert (np.array(one[1])[0] != np.array(other[1])[0]).all()
-    noise = np.array([s - images(q) for q, s in zip(*driven(robot(sigma_px=0.5), WAY), strict=True)])
-    assert noise.std() == pytest.approx(0.5, rel=0.15)
