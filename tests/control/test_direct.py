@@ -1,5 +1,6 @@
 """Direct control: each error at its own rate, one rotation for two, and the limit of the translation."""
 
+import inspect
 import math
 import runpy
 
@@ -8,6 +9,7 @@ import pytest
 from scipy.linalg import expm
 
 from projservo_cli import laws
+from projservo_cli.control import classical, direct, exact
 from projservo_cli.control.law import TAU, TAU_AFFINE, THETA_P, THETA_R, THETA_S
 from projservo_cli.laws import LAWS
 from tests.samples import frame, pixels, poe, revolute
@@ -100,6 +102,15 @@ def test_a_marker_as_center(center):
 
     assert deviation(run.center) < 2e-3
     assert deviation((run.log.H @ sc.plant.M.mean(axis=0))[:, :3]) > 5e-3
+
+
+def test_laws_are_given_images_joints_and_a_model_and_nothing_else():
+    """Each is the function of its name in one of the files of laws."""
+    found = {**vars(classical), **vars(direct), **vars(exact)}
+    for law in LAWS:
+        parameters = inspect.signature(getattr(found[law], "py_func", found[law])).parameters
+        assert list(parameters) == ["model", "task", "gains", "s", "q", "state"]
+    assert [*CODES.items()] == [(law, code) for code, law in enumerate(LAWS)]
 
 
 def test_a_law_that_the_if_chain_does_not_know_is_refused(monkeypatch):

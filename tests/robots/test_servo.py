@@ -193,6 +193,24 @@ def test_without_an_image_nothing_moves_unless_that_is_asked_for(servo, fault, d
     assert dark in told["untested"]
 
 
+def test_joint_limits_end_a_run_whatever_is_configured(calibrated):
+    use = f"plant={{use: '{HERE}:Sound', joint_limits: report}}"
+    config = load_config(UR5, [use, "noise.servo_px=0.1"])
+    calibration = load(calibrated).calibration
+    scenario = scenario_of(config, calibration)
+    gains, limits = scenario.gains, scenario.limits
+    assert limits.stop_at_joint_limit
+    assert limits.image_error_px == 0.01 + 2.0 * calibration.sigma_fitted_px
+    np.testing.assert_array_equal(gains.limits.speed, np.full(6, np.radians(125.0)))
+
+
+def test_a_robot_without_speed_limit_is_refused(servo):
+    answer = servo(*SOUND, "--set", "control.joint_speed_limit_deg_s=null")
+    assert answer.code == 2
+    assert "set control.joint_speed_limit_deg_s" in answer.err
+    assert commands() == []
+
+
 TALKING = """
 import threading
 from tests.robots.robots import ByImage, Sound
@@ -253,6 +271,14 @@ def test_a_law_that_fails(servo, law, code, message):
     assert "Traceback" not in answer.err
 
 
+def test_confirm_needs_a_terminal(servo, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
+    answer = servo(*SOUND, "--confirm")
+    assert answer.code == 2
+    assert "--confirm: standard input is no terminal" in answer.err
+    assert commands() == []
+
+
 @pytest.mark.parametrize(("answered", "code"), [("y", 0), ("n", 130), ("", 130)])
 def test_confirm_asks_before_the_first_motion(servo, monkeypatch, answered, code):
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
@@ -270,6 +296,14 @@ def test_confirm_asks_before_the_first_motion(servo, monkeypatch, answered, code
     assert moved == 0
     assert ("servo will move tests.robots.robots:Sound, speeds times 0.5" in answer.err) or asked[0][0]
     assert bool(commands()) == (code == 0)
+
+
+def test_a_report_never_moves_a_robot(servo, projservo):
+    CALLS.clear()
+    answer = projservo("report", "-c", UR5, "-o", "run", *SOUND)
+    assert answer.code == 2
+    assert "which moves tests.robots.robots:Sound: run projservo servo first" in answer.err
+    assert CALLS == []
 
 
 def test_a_real_robot_moves_whenever_it_is_asked_to_and_a_report_shows_what_is_stored(servo, projservo):
