@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from projservo_cli import laws
 from projservo_cli.control import classical, direct, exact
 from projservo_cli.control.law import TAU, TAU_AFFINE, THETA_P, THETA_R, THETA_S
-from projservo_cli.laws import LAWS
+from projservo_cli.laws import CODES, LAWS
 from tests.samples import frame, pixels, poe, revolute
 from tests.scene import GAINS, STEP, Run, limits, scene
 

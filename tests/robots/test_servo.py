@@ -1,5 +1,6 @@
 """Servo and record with robots and laws of others, on the command line."""
 
+import io
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import projservo_cli as ps
 from projservo_cli.config import Override, load_config
 from projservo_cli.store import load
+from tests.configured import scenario_of
 from tests.robots import robots
 from tests.robots.robots import CALLS
 
