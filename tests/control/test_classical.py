@@ -61,21 +61,6 @@ def test_euclidean_points_is_the_pseudo_inverse_in_metres(case):
     assert np.abs(commanded("euclidean_points", sc, s, q, frame(1))[1] - q_dot).max() > 1e-4
 
 
-@pytest.mark.parametrize("law", ["direct_three", "direct_two", "stacked", "blockwise"])
-@pytest.mark.parametrize("types", ["RRRRRR", "RRPRRR"])
-def test_laws_need_no_metric_frame(law, types):
-    """The same command from the model in any projective frame, and from cameras of any scale."""
-    sc, q, s, _ = instant(types, 4, 5)
-    wanted = commanded(law, sc, s, q)[1]
-    for seed in (1, 2):
-        status, q_dot = commanded(law, sc, s, q, frame(seed, mirrored=seed == 2))
-        assert status == OK
-        assert q_dot == pytest.approx(wanted, abs=1e-8 * np.abs(wanted).max())
-    scaled = sc.model._replace(P=sc.model.P * np.array([-3.0, 1e-3])[:, None, None])
-    _, q_dot = BuiltInLaw(CODES[law], scaled, sc.task(), GAINS)(s, q)
-    assert q_dot == pytest.approx(wanted, abs=1e-8 * np.abs(wanted).max())
-
-
 @pytest.mark.parametrize("law", list(CODES))
 def test_unseen_markers_are_lost(law):
     sc, q, s, _ = instant("RRRRRR", 4, 5)
