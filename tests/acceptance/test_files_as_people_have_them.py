@@ -11,23 +11,7 @@ from projservo_cli.config import load_config
 from projservo_cli.masking import masked
 from projservo_cli.records import InputError
 from projservo_cli.store.tables import read_table
-from tests.conftest import ROOT, SHARED
-
-
-@pytest.fixture
-def case(tmp_path, monkeypatch):
-    """Function that enters a copy of a case by name, or skips where it is absent."""
-
-    def enter(name):
-        folder = SHARED.parent / "cases" / name
-        if not folder.is_dir():
-            pytest.skip(f"case not found at {folder}")
-        for file in folder.iterdir():
-            (tmp_path / file.name).write_bytes(file.read_bytes())
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.syspath_prepend(str(tmp_path))
-
-    return enter
+from tests.conftest import ROOT
 
 
 @pytest.fixture
@@ -79,8 +63,8 @@ def config_of(folder, content):
     return load_config(folder / "arm.yaml")
 
 
-def test_case_03_urdf_two_parents(case, told):
-    case("03_urdf_two_parents")
+def test_case_03_urdf_two_parents(entered, told):
+    entered("03_urdf_two_parents")
     code, _, err = told("calibrate", "-c", "arm.yaml", "-o", "out")
     assert code == 2
     assert "link fore has two parent joints, j3 and rod_joint" in err
@@ -112,14 +96,14 @@ def test_a_urdf_that_is_no_tree_or_leaves_something_open_is_refused_by_its_cause
     assert "\n" not in str(refused.value)
 
 
-def test_case_07_xacro_comment(case, told):
-    case("07_xacro_comment")
+def test_case_07_xacro_comment(entered, told):
+    entered("07_xacro_comment")
     code, out, _ = told("calibrate", "-c", "arm.yaml", "-n")
     assert (code, out) == (0, "calibrate: would be made (none yet)")
 
 
-def test_case_08_unequal_image_sizes(case, told):
-    case("08_unequal_image_sizes")
+def test_case_08_unequal_image_sizes(entered, told):
+    entered("08_unequal_image_sizes")
     code, out, _ = told("plan", "-c", "unequal.yaml", "-o", "out", "--json")
     assert code == 0
     assert json.loads(out)["profile"] == "joint_space"  # the linear one leaves both images
@@ -152,8 +136,8 @@ def test_passwords_and_tokens_of_urls_are_masked(text, wanted):
     assert masked(text) == wanted == masked(wanted) == str(InputError(text))
 
 
-def test_case_10_password_in_page(case, told, tmp_path):
-    case("10_password_in_page")
+def test_case_10_password_in_page(entered, told, tmp_path):
+    entered("10_password_in_page")
     for command in (["doctor"], ["doctor", "--json"], ["record", "--output", "t.csv"], ["record", "-v"]):
         code, out, err = told(*command, "-c", "arm.yaml")
         assert code == 1

@@ -1,12 +1,11 @@
 """Recorded tables of two arms, through the command line: held-out prediction, noise, methods, order."""
 
 import csv
-import json
 
 import numpy as np
 import pytest
 
-from projservo_cli import cli, store
+from projservo_cli import store
 from projservo_cli.calibration import predict
 from projservo_cli.store.tables import read_table
 
@@ -25,24 +24,6 @@ HELD_OUT = {
 NOISE_FREE = {"bundle_adjustment": 2e-6, "closed_form": 5e-5}
 
 
-@pytest.fixture(autouse=True)
-def elsewhere(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def answer(capsys):
-    """Exit code, JSON and messages of a call."""
-
-    def call(*arguments):
-        capsys.readouterr()
-        code = cli.run([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return code, json.loads(captured.out) if captured.out else None, captured.err
-
-    return call
-
-
 @pytest.fixture
 def held_out(answer, shared_data):
     """Calibrate from a table, predict the validation poses: both JSON objects."""
@@ -50,13 +31,11 @@ def held_out(answer, shared_data):
     def run(robot, noise, *options):
         table = shared_data / robot / f"trials_{noise}px.csv"
         code, calibration, err = answer(
-            "calibrate", "--data", table, "--joints", JOINTS[robot], *options, "-o", "out", "--json"
+            "calibrate", "--data", table, "--joints", JOINTS[robot], *options, "-o", "out"
         )
         # A calibration that is not usable is a failure, and yet stored for comparison.
         assert code == (0 if calibration["usable"] else 1), err
-        code, value, err = answer(
-            "validate", "out", "--data", shared_data / robot / "validation.csv", "--json"
-        )
+        code, value, err = answer("validate", "out", "--data", shared_data / robot / "validation.csv")
         assert code == 0, err
         assert value["count"] == 4000  # 200 poses, 10 markers, 2 views: nothing was dropped
         assert value["skipped"] == {"unknown_marker": 0, "behind_camera": 0, "missing": 0}
@@ -117,14 +96,14 @@ def test_a_table_says_the_same_in_any_order(held_out, answer, shared_data, rng, 
     rewritten(
         shared_data / "ur5" / "trials_0.5px.csv", table, rng, columns, lambda m: 90 - 7 * m, lambda p: 500 - p
     )
-    code, value, err = answer("calibrate", "--data", table, "-o", "other", "--json")
+    code, value, err = answer("calibrate", "--data", table, "-o", "other")
     assert (code, value["usable"]) == (0, True), err
     second = store.load("other").calibration
     assert sorted(second.marker) == [90 - 7 * m for m in reversed(range(10))]
     q = read_table(shared_data / "ur5" / "validation.csv").q
     order = [list(second.marker).index(90 - 7 * m) for m in first.marker]
     assert np.abs(predict(second, q)[:, :, order] - predict(first, q)).max() <= 1e-6
-    code, value, _ = answer("validate", "other", "--data", shared_data / "ur5" / "validation.csv", "--json")
+    code, value, _ = answer("validate", "other", "--data", shared_data / "ur5" / "validation.csv")
     # None of the numbers 27 … 90 is one of 0 … 9.
     assert (value["count"], value["skipped"]["unknown_marker"], value["rms_px"]) == (0, 4000, None)
 
@@ -140,9 +119,9 @@ def test_validate_fails_where_the_rig_is_another(answer, shared_data, tmp_path):
         writer.writerows(
             row | {side: float(row[side]) + 2.0 for side in ("u_left", "u_right")} for row in rows
         )
-    answer("calibrate", "--data", shared_data / "ur5" / "trials_0.5px.csv", "-o", "out", "--json")
-    assert answer("validate", "out", "--data", table, "--json")[0] == 0
-    code, value, err = answer("validate", "out", "--data", tmp_path / "turned.csv", "--json")
+    answer("calibrate", "--data", shared_data / "ur5" / "trials_0.5px.csv", "-o", "out")
+    assert answer("validate", "out", "--data", table)[0] == 0
+    code, value, err = answer("validate", "out", "--data", tmp_path / "turned.csv")
     assert (code, value["median_px"] > value["limit_px"]) == (1, True)
     assert "contradict the calibration" in err
 
@@ -152,6 +131,6 @@ def test_a_tag_whose_corners_begin_further_in_one_view_is_named(answer, shared_d
     table = shared_data.parent / "cases/23_tag_turned_in_one_view/tag_corner_order_turned_0.csv"
     if not table.exists():
         pytest.skip(f"{table} is absent")
-    code, value, err = answer("calibrate", "--data", table, "-o", "out", "--json")
+    code, value, err = answer("calibrate", "--data", table, "-o", "out")
     assert (code, value["failed"]) == (1, "calibrate")
     assert "tag 1: its corners begin 1 further in the right view" in " ".join(err.split())
