@@ -68,19 +68,6 @@ def test_a_calibration_from_python_is_that_of_the_chain(name):
     alike(ps.calibrate(observations, lens=config.calibration.lens), chained, Calibration)
 
 
-def test_poses_have_noise_of_their_own_and_may_have_none(config, made):
-    q = made[0].q
-    first, second = ps.simulate(config, q), ps.simulate(config, q, seed=7)
-    exact = ps.simulate(config, q, noise_px=0.0)
-    assert not np.array_equal(first.images, made[0].images)
-    for seen in (first, second):
-        noise = (seen.images - exact.images)[np.isfinite(seen.images)]
-        assert noise.std() == pytest.approx(0.5, rel=0.1)  # 1,960 of them: 1.6 %
-    np.testing.assert_array_equal(ps.simulate(config, q, seed=7).images, second.images)
-    noises = [(seen.images - exact.images).ravel() for seen in (first, second)]
-    assert abs(np.corrcoef(noises)[0, 1]) < 0.1
-
-
 def test_a_score_is_that_of_validate(config, made, tmp_path, capsys):
     observations, calibration, _ = made
     held_out = ps.simulate(config, observations.q[:9] + 0.05)
@@ -132,33 +119,6 @@ def test_a_plan_takes_joints_pixels_and_what_was_taught(config, made, tmp_path):
         np.testing.assert_array_equal(ps.plan(config, calibration, goal=goal).s, by_images.s)
     joints = calibration.q_reference + 0.05
     assert ps.plan(config, calibration, goal=joints).feasible
-
-
-@pytest.mark.parametrize(
-    ("changed", "what"),
-    [
-        (
-            lambda q, s: (q[:, [0, 1, 2, 3, 5, 4]], s),
-            r"rejects \d of the 9 poses in which several joints move",
-        ),
-        (
-            lambda q, s: (q, s + 12.0 * bumped(s, 20)),
-            "rejects nearly all of the first 20 poses in the right view",
-        ),
-    ],
-    ids=["exchanged joints", "a camera that was bumped"],
-)
-def test_what_agrees_in_parts_alone_is_not_usable(changed, what):
-    recorded = ps.simulate(ps.Config.load("ur5").replace({"calibration.random_poses": 10}))
-    with pytest.raises(ps.WorkFailed, match=what):
-        ps.calibrate(ps.Observations.from_arrays(*changed(recorded.q, recorded.images)))
-
-
-def bumped(images, count):
-    """Where v of the right view is, in the first poses."""
-    where = np.zeros_like(images)
-    where[:count, 1, :, 1] = 1.0
-    return where
 
 
 def test_a_run_has_the_start_and_goal_of_its_plan(config, made):

@@ -5,7 +5,6 @@ import pytest
 from scipy.optimize import least_squares
 
 from projservo_cli.calibration import calibrate, chi2_band, predict, prediction_variance
-from projservo_cli.calibration.joint_noise import tick_noise
 from tests.calibration.bound import derivative, images, parameters, spread
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -97,13 +96,3 @@ def test_a_wrong_reading_is_found_among_small_errors_and_these_are_not_suspected
     found = calibrate(seen, TYPES, source="recorded", joint_noise=None)
     assert found.suspect.tolist() == [[seen.pose[20], 3]]
     assert found.sigma_q == pytest.approx(SIGMA_Q, rel=0.35)
-
-
-def test_ticks_are_counted():
-    tick = 2.0 * np.pi / 4096
-    _robot, q, seen = recorded(7, lambda q, rng: np.round(q / (tick * UNIT)) * (tick * UNIT) - q)
-    assert tick_noise(seen.q, np.array([False, True, False, False])) == pytest.approx(tick / np.sqrt(12.0))
-    found = calibrate(seen, TYPES, source="recorded", joint_noise=None)
-    assert found.sigma_q == pytest.approx(tick / np.sqrt(12.0))
-    assert "ticks" in found.reason
-    assert tick_noise(q, np.zeros(4, dtype=bool)) == 0.0

@@ -115,19 +115,6 @@ def test_every_kind_has_words_and_a_code():
     assert "mm" in describe(ModelError("joint_step", (2,), "", 0.02, 0.001, 0.5, 3), prismatic)[1]
 
 
-def test_a_tag_that_slips_amid_the_recording_is_named_with_its_pose():
-    """Each corner stays at the place that most of its images show; some of them are off at the end."""
-    robot = random_robot(TYPES, np.random.default_rng(8), markers=12)
-    seen = dataclasses.replace(table(robot, still, 0, 0.0, 8), marker=np.arange(12))
-    moved_robot = dataclasses.replace(robot, markers=robot.markers + np.array([0.005, 0.0, 0.003, 0.0]))
-    images = seen.images.copy()
-    images[K // 2 :, :, 4:8] += (moved_robot.images(seen.q) - robot.images(seen.q))[K // 2 :, :, 4:8]
-    found = calibrate(dataclasses.replace(seen, images=images), TYPES, source="recorded", joint_noise=None)
-    assert [one.kind for one in found.model_errors] == ["tool"]
-    assert found.model_errors[0].first == pytest.approx(seen.pose[K // 2], abs=4)
-    assert "the markers moved on the tool at pose" in found.advice[0]
-
-
 @pytest.mark.parametrize(("moved", "at"), [((0, 1), 22), ((1,), 30)])
 def test_a_table_that_is_bumped_amid_the_recording_is_named_and_no_readings_are(moved, at):
     """Both cameras see the base move alike; one camera that moves is told from that."""

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import Nominal, calibrate, predict
-from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.detections import Detections
 from projservo_cli.nominal import read_nominal as fields_of
 from projservo_cli.records import InputError
 from tests.calibration.simulated_robot import around, random_robot, trials
@@ -79,20 +77,6 @@ def test_the_same_optimum_as_from_the_images_alone(robot, observation, alone, wr
     found = calibrate(observation, "RPRR", sigma_px=SIGMA, init=read_nominal(written(values)))
     assert found.advice == alone.advice
     agree(found, alone, around(robot, 20, rng))
-
-
-def test_the_reference_of_the_file_may_be_any_pose(robot, observation, written):
-    """The truth about another reference predicts the images of all poses without any fit."""
-    values = described(robot, observation)
-    readings = Detections.of(observation, "RPRR")
-    nominal = read_nominal(written(values))
-    home = readings.reference()
-    for q_reference in (home, home + np.array([0.3, 0.1, -0.5, 0.8])):
-        scene = nominal.start(readings, q_reference)
-        pixels, depth = LeastSquares.of(readings, q_reference).pixels(scene)
-        truth = robot.images(observation.q).transpose(1, 0, 2, 3)[:, readings.pose_of, readings.marker_of]
-        np.testing.assert_allclose(pixels, truth, atol=1e-9)
-        assert (depth > 0.0).all()
 
 
 def wrong_robot(values):

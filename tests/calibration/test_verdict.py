@@ -70,20 +70,6 @@ def test_what_limits_is_said(robot, weak):
     assert "limited by noise" in calibrated(robot, trials(robot, 6)).reason
 
 
-def test_a_joint_that_never_moves_apart_is_limited_by_geometry():
-    robot = random_robot("RRR", np.random.default_rng(3), markers=6)
-    q = trials(robot, 6)
-    # The second joint follows the first, but for a trace; the third not at all apart from it.
-    q[:, 1] = robot.q_reference[1] + q[:, 0] - robot.q_reference[0]
-    q[3, 1] += 0.002
-    q = q[:9]
-    q[6:, 2] = robot.q_reference[2] + [0.3, 0.4, 0.5]
-    found = calibrated(robot, q)
-    assert "limited by geometry" in found.reason
-    told = "hardly apart from the other joints: move (it|each) alone, by"
-    assert any(re.search(told, text) for text in found.advice)
-
-
 @pytest.mark.parametrize(
     ("span", "prismatic", "needed", "text"),
     [

@@ -7,12 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config import load_config
-from projservo_cli.records import WorkFailed
-from projservo_cli.stages import teach as teaching
 from projservo_cli.store import load
 
 ROOT = Path(__file__).parents[2]
@@ -106,37 +103,6 @@ def test_a_goal_is_taught_and_told(projservo, tmp_path, monkeypatch):
         assert (refused.code, refused.out, refused.err.count("\n")) == (2, "", 1)
         assert told in refused.err
     assert not (tmp_path / "other.yaml").exists()
-
-
-def test_what_names_its_goal_and_start_before_they_are_taught_teaches_them(projservo, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    text = (ROOT / "configs" / "hobby.yaml").read_text(encoding="utf-8")
-    own = yaml.safe_load(text)
-    own["calibration"] = own.get("calibration", {}) | {"reference": own["task"]["start"]}
-    own["task"] = {"start": "start.yaml", "goal": "goal.yaml"}
-    (tmp_path / "own.yaml").write_text(yaml.safe_dump(own), encoding="utf-8")
-    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "1")
-    lacking = projservo("plan", "-c", "own.yaml", "-n")
-    assert (lacking.code, "start.yaml" in lacking.err) == (2, True)
-    for start in (("--start",), ()):
-        answer = projservo("teach", "-c", "own.yaml", *at, *start)
-        assert answer.code == 0, answer.err
-        assert answer.out.endswith(f"set task.{'start: start' if start else 'goal: goal'}.yaml\n")
-    task = load_config("own.yaml").task
-    assert task.start == task.goal.images.joints
-
-
-def test_what_cannot_be_taught_is_an_object_with_exit_code_1(projservo, tmp_path, monkeypatch):
-    def fail(*_):
-        raise WorkFailed("teach: joint 3\nmoved")
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(teaching, "teach", fail)
-    answer = projservo("teach", "-c", ROOT / "configs" / "hobby.yaml", "--json")
-    assert (answer.code, answer.err) == (1, "projservo: teach: joint 3 moved\n")
-    told = {"file": str(tmp_path / "goal.yaml"), "failed": "teach", "reason": "joint 3 moved"}
-    assert answer.json == told
-    assert not (tmp_path / "goal.yaml").exists()
 
 
 PICK = """\

@@ -56,17 +56,3 @@ def test_what_somebody_recorded_is_not_replaced(projservo, stages):
     answer = projservo(*CHAIN, "--set", "seed=1")
     assert (answer.code, answer.err.count("\n")) == (2, 1)
     assert "lab:Arm" in TABLE.read_text()
-
-
-def test_a_recording_that_fails_is_an_object_and_nothing_else_is_made(projservo, stages, monkeypatch):
-    from projservo_cli.records import WorkFailed
-    from projservo_cli.stages import record
-
-    def fail(config, recording, progress):
-        raise WorkFailed("record: joint 1 stands still")
-
-    monkeypatch.setattr(record, "record", fail)
-    answer = projservo(*CHAIN, "--json")
-    assert (answer.code, stages.made) == (1, [])
-    assert answer.err.splitlines()[-1] == "projservo: record: joint 1 stands still"
-    assert answer.json["record"]["failed"] == answer.json["plan"]["failed"] == "record"

@@ -83,24 +83,6 @@ def test_force_makes_the_named_stages_anew_and_drops_what_hung_on_them(projservo
     assert reported.made == ["plan", "direct_three", "stacked"]
 
 
-def test_a_table_that_changes_outdates_and_one_that_moved_away_does_not(projservo, stages, tmp_path):
-    given = ("--joints", "rp", "--noise-px", "2e-1", "--json")
-    answer = projservo("calibrate", "--data", "t.csv", *given)
-    assert answer.json["run"] == str(tmp_path / "results/t/run.h5")
-    assert [joint["type"] for joint in answer.json["joints"]] == ["R", "P"]
-    stored = load("results/t").configuration
-    assert "joints: RP" in stored
-    assert "noise_px: 0.2" in stored
-    moved = (tmp_path / "t.csv").rename(tmp_path / "u.csv")
-    assert projservo("calibrate", "-o", "results/t").code == 0
-    assert projservo("calibrate", "-o", "results/t", "--data", "u.csv").code == 0
-    assert stages.made == ["calibrate"]
-    moved.write_text(moved.read_text().replace("0,0,0.1,0.2,1,", "0,0,0.1,0.2,9,"))
-    assert projservo("calibrate", "-o", "results/t").code == 0
-    assert stages.made == ["calibrate"] * 2
-    assert projservo("calibrate", "-o", "results/t", "--data", "none.csv").code == 2
-
-
 def test_laws_are_those_asked_for_in_their_order_and_others_stay(projservo, reported):
     laws = ["--law", "blockwise", "--law", "direct_three", "--law", "blockwise"]
     answer = projservo(*laws, "servo", "-o", "out", "--json")
@@ -111,18 +93,6 @@ def test_laws_are_those_asked_for_in_their_order_and_others_stay(projservo, repo
     projservo("servo", "-o", "out", "--law", "blockwise", "--set", "control.gain=1")
     assert reported.made == ["blockwise"]
     assert list(load("out").traces) == ["direct_three", "stacked", "blockwise"]
-
-
-def test_of_claims_those_that_do_not_hold_are_named_and_all_of_them_in_detail(projservo, reported):
-    answer = projservo("report", "-o", "out")
-    assert (
-        "1 of 2 claims hold; it does not hold that\n  - it is large\n  1 omitted: no run\nrun: " in answer.out
-    )
-    detailed = projservo("report", "-o", "out", "-v").out
-    assert "  holds: c: 3 mm\n  does not hold: it is large: 1 mm\n  omitted: fig_9: no run\n" in detailed
-    value = projservo("report", "-o", "out", "--json").json
-    assert value["figures"] == ["figures/fig_1.svg"]
-    assert [claim["holds"] for claim in value["claims"]] == [True, False]
 
 
 CALIBRATE_KEYS = {

@@ -171,29 +171,6 @@ def test_inconsistencies_are_refused_with_path_and_flag(good, override, path, me
 
 
 @pytest.mark.parametrize(
-    ("region", "path", "message"),
-    [
-        ("{occludes: false}", "0", "give left, right or both"),
-        ("{left: [[0, 0], [9, 9]]}", "0.left", "needs 3 or more entries"),
-        ("{left: [[0, 0], [9, 9], [9, 0], [0, 9]]}", "0.left", "from corners 1 and 3 meet"),
-        ("{right: [[0, 0], [4, 4], [9, 9]]}", "0.right", "no area"),
-        ("{right: [[0, 0], [9, 0], [9, 9], [4, 0]]}", "0.right", "from corners 1 and 3 meet"),  # touches
-        ("{left: [[0, 0], [9, 0], [4, 2], [9, 9]], right: [[0, 0], [9, 0], [9, 9]]}", "", ""),
-    ],
-)
-def test_polygons_of_a_region_are_simple(good, region, path, message):
-    overrides = (f"trajectory.keep_out=[{region}]", "control.mode=track", "trajectory.duration_s=3")
-    if not path:
-        assert load_config(good, overrides).trajectory.keep_out[0].occludes
-        (found,) = errors(good, overrides[0])
-        assert "control.mode: regulate follows no plan" in found
-        return
-    (found,) = errors(good, *overrides)
-    assert f" trajectory.keep_out.{path}: " in found
-    assert message in found
-
-
-@pytest.mark.parametrize(
     ("override", "message"),
     [
         ("control.gain_t", "expected KEY=VALUE"),

@@ -116,40 +116,6 @@ def test_a_camera_that_another_program_has_is_named_with_that_program(tmp_path):
     assert f"(process {other.pid}): close that" in told
 
 
-class _Driver:
-    """A device of which the driver has autofocus that it does not switch off."""
-
-    def __init__(self, deaf):
-        self.deaf, self.told = deaf, {}
-
-    def getBackendName(self):
-        return "V4L2"
-
-    def set(self, key, value):
-        self.told[key] = value
-        return key not in self.deaf
-
-    def get(self, key):
-        return 1.0 if key in self.deaf else self.told.get(key, -1.0)
-
-
-def test_autofocus_and_exposure_that_a_driver_does_not_fix_are_said():
-    cv = cameras._cv()
-    settings = CameraSettings(0, (640, 480), 30.0, exposure_ms=8.0, focus=20.0)
-    sound = _Driver(set())
-    assert list(cameras._set_up(sound, settings)) == []
-    assert sound.told[cv.CAP_PROP_EXPOSURE] == 80.0  # V4L2 counts 100 µs
-    assert (sound.told[cv.CAP_PROP_AUTO_EXPOSURE], sound.told[cv.CAP_PROP_AUTOFOCUS]) == (1, 0)
-    assert sound.told[cv.CAP_PROP_FOURCC] == cv.VideoWriter.fourcc(*"MJPG")
-    deaf = _Driver({cv.CAP_PROP_AUTOFOCUS, cv.CAP_PROP_FOCUS, cv.CAP_PROP_EXPOSURE})
-    autofocus, focus, exposure = cameras._set_up(deaf, settings)
-    assert "autofocus is on" in autofocus
-    assert "does not set the focus to 20" in focus
-    assert "does not fix the exposure at 8 ms" in exposure
-    (automatic,) = cameras._set_up(sound, CameraSettings(0))
-    assert "its exposure is automatic" in automatic
-
-
 class Arm:
     """An arm that reads joints alone."""
 

@@ -1,11 +1,8 @@
 """The command tags: true scale for the detector of the project, and a net that folds to the roof."""
 
-import math
-
 import numpy as np
 import pytest
 
-from projservo_cli.config.markers import GROUND, Markers
 from projservo_cli.detection import TagFinder
 from projservo_cli.hardware import tags
 
@@ -50,26 +47,6 @@ def test_printed_tags_are_found_at_their_size(projservo, tmp_path, kind, size_mm
     for tag in found.values():
         assert tag.clean.all()
         assert sides(tag.pixels) == pytest.approx(size_mm, rel=2e-3)
-
-
-def test_a_folded_net_is_the_described_roof(projservo, tmp_path):
-    file, size = tmp_path / "tags.pdf", 30.0
-    projservo("tags", "--kind", "roof", "-o", file)
-    found, _ = TagFinder("4X4_50").find(page(file)[0])
-    flat = {n: np.c_[t.pixels[:, 0], -t.pixels[:, 1]] / PX_MM for n, t in found.items()}
-    origin, half, tilt = flat[0].mean(axis=0), 0.5 * GROUND * size, math.radians(35)
-    body = Markers.model_validate({"tags": "roof", "tag_size_m": 1e-3 * size}).all_tags
-    for tag in body:
-        corners = flat[tag.number] - origin
-        out = corners.mean(axis=0)
-        folded = np.c_[corners, np.zeros(4)]
-        if tag.number:
-            out /= np.linalg.norm(out)
-            beyond = corners @ out - half
-            folded[:, :2] += np.outer(beyond * (math.cos(tilt) - 1.0), out)
-            folded[:, 2] = -beyond * math.sin(tilt)
-        folded[:, 2] += 1.5 * half
-        assert folded == pytest.approx(1e3 * tag.corners, abs=0.06)  # mm
 
 
 @pytest.mark.parametrize(

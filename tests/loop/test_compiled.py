@@ -11,7 +11,7 @@ from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import SUBSAMPLES, Ended, path_deviation, summarize
 from projservo_cli.loop.step import CONVERGED, MAX_STEPS
 from projservo_cli.simulation.ideal import Ends
-from tests.samples import displacement, pixels, poe
+from tests.samples import poe
 from tests.scene import GAINS, STEP, Run, limits, scene
 
 
@@ -66,32 +66,6 @@ def test_at_the_goal_and_next_to_it_a_run_converges(law):
     run = Run(scene(1e-7 * STEP), law, bounds=limits(image_error_px=1e-8))
     assert run.verdict == "converged"
     assert run.steps < 120
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_speed_limit_scales_commands_uniformly(law):
-    """The same first command, all joints by one factor; no joint ever faster than its limit."""
-    sc = scene()
-    free = Run(sc, law, bounds=limits(max_steps=1)).log.q_dot[0]
-    speed = np.full(6, 0.2 * np.abs(free).max())
-    run = Run(sc, law, bounds=limits(speed=speed, max_steps=50))
-    assert run.log.factor[0] == pytest.approx(0.2, rel=0.1 if law == "exact" else 1e-12)
-    if law == "exact":  # the limit bounds its first-order step; the path it solves for is not bent
-        assert (np.abs(run.log.q_dot) <= 1.1 * speed).all()
-        return
-    assert run.log.q_dot[0] == pytest.approx(0.2 * free, rel=1e-12)
-    assert (np.abs(run.log.q_dot) <= speed * (1 + 1e-14)).all()
-
-
-def test_an_opaque_face_hides_its_markers():
-    """It looks away at the start although the plant remembers its front: occluded in both views."""
-    for opaque, ends in ((True, ("markers lost", 0)), (False, ("converged", -1))):
-        sc = scene(opaque=opaque)
-        sc = sc._replace(plant=sc.plant._replace(visible=-sc.plant.visible))
-        run = Run(sc, "direct_three", task=scene().task())
-        assert (run.verdict, run.steps if opaque else -1) == ends
-        assert np.isnan(run.log.s).all() == opaque
-        assert run.log.hidden.all()
 
 
 def test_occlusion_begins_where_the_plane_passes_the_optical_center():
@@ -168,23 +142,3 @@ def test_success_is_told_of_the_truth(rng):
     hidden = run.log.hidden.copy()
     hidden[run.steps // 2, 1] = 1.0
     assert success(log=run.log._replace(hidden=hidden)) == 0.0
-
-
-def test_memory_decides_the_sense_of_a_half_turn():
-    """Exactly 180° within the plane: the run turns the way its memory tells, and arrives either way."""
-    sc = scene(np.zeros(6))
-    M = sc.plant.M[:, :3]
-    center = M.mean(axis=0)
-    normal = np.cross(M[1] - M[0], M[2] - M[0])
-    R = displacement(np.pi * normal / np.linalg.norm(normal), np.zeros(3))[:3, :3]
-    goal = np.c_[(M - center) @ R.T + center, np.ones(4)]
-    sc = sc._replace(s_star=pixels(sc.model.P, goal))
-    bounds = limits(max_steps=3)
-    first = Run(sc, "direct_two", bounds=bounds)
-    driven = first.log.q_dot[0]
-    for sign in (1.0, -1.0):
-        memory = np.zeros((2, 6))
-        memory[1] = sign * driven
-        run = Run(sc, "direct_two", bounds=bounds, memory=memory)
-        assert np.sign(run.log.q_dot[0] @ driven) == sign
-        assert (run.log.q_dot[1] @ run.log.q_dot[0]) > 0

@@ -79,24 +79,6 @@ def test_closed_form_of_an_arm(frame):
     np.testing.assert_allclose(np.trace(between), np.trace(np.linalg.multi_dot(turned)), atol=1e-9)
 
 
-def test_points_are_triangulated_where_the_arm_puts_them(frame):
-    arm = robot(ELBOW, "RRRR")
-    m = calibrated(arm, frame).metric(0.3, "cameras")
-    q = np.array([[0.2, 0.1, -0.3, 0.4], [-0.1, 0.2, 0.1, -0.5]])
-    s = arm.images(q)
-    T = m.pose(q)
-    expected = np.einsum("kij,mj->kmi", T[:, :3, :3], m.markers) + T[:, None, :3, 3]
-    np.testing.assert_allclose(m.triangulate(s), expected, atol=1e-9)
-    np.testing.assert_allclose(m.triangulate(s[1]), expected[1], atol=1e-9)
-    assert m.triangulation_covariance(s).shape == (2, 4, 3, 3)
-    s[0, 1, 2] = np.nan  # unseen on the right
-    expected[0, 2] = np.nan
-    np.testing.assert_allclose(m.triangulate(s), expected, atol=1e-9)
-    assert np.isnan(m.triangulation_covariance(s)).all(axis=(2, 3)).sum() == 1
-    with pytest.raises(InputError, match="left and right view"):
-        m.triangulate(s[:, :1])
-
-
 def test_the_frame_is_right_handed(frame):
     """A reflection of the projective frame changes nothing."""
     arm = robot(ELBOW, "RRRR")

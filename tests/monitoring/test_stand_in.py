@@ -6,7 +6,6 @@ import pytest
 from scipy.linalg import expm
 
 from projservo_cli.monitoring.monitor import detected_fault
-from tests.monitoring.corners import CornerMap, pose_of
 from tests.monitoring.stand_in import (
     ARMS,
     CAMERAS,
@@ -54,24 +53,6 @@ def test_pixels_are_those_of_twists_and_of_opencv(name):
         np.testing.assert_allclose(seen(tool_pose(arm, q), view).pixels, expected, atol=1e-6)
         np.testing.assert_allclose(R @ place + t, 0.0, atol=1e-12)
         assert np.allclose((R @ target + t)[:2], 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("finder", ["finder", "subpix", "jpeg"])
-def test_the_same_view_errs_alike_and_one_beside_it_nearly(finder):
-    found, rng, jumps, sizes = CornerMap(finder), np.random.default_rng(3), [], []
-    for _ in range(40):
-        side, view = np.array([rng.uniform(30.0, 80.0)]), rng.uniform([0.1, -3.1, -3.1], [1.0, 3.1, 3.1])
-        s, small = rng.uniform(100.0, 500.0, (1, 4, 2)), 0.02 * rng.standard_normal((1, 4, 2))
-        here, beside = (
-            found.at(*(part[None] for part in pose_of(side[0], *(view + step))), side, s + step * small, 0)[0]
-            for step in (0.0, 0.002)
-        )
-        again = found.at(*(part[None] for part in pose_of(side[0], *view)), side, s, 0)[0]
-        assert np.array_equal(here, again)
-        jumps.append(np.abs(beside - here).max())
-        sizes.append(np.sqrt(np.mean(here**2)))
-    assert 0.002 < np.median(sizes) < 1.0
-    assert max(jumps) < 0.05 * max(sizes)
 
 
 @pytest.mark.parametrize(

@@ -32,18 +32,3 @@ def test_the_robot_ends_at_the_tool_and_carries_the_face(shown):
         )
         face = [truth.face[k] for k in material.plant.order]
         np.testing.assert_array_equal(run.face, run.markers[:, face])
-
-
-def test_the_ends_of_the_task_and_the_planned_path_between_them(shown):
-    _, material, scene = shown
-    trace = material.traces["direct_three"]
-    run = scene.runs["direct_three"]
-    np.testing.assert_allclose(scene.start, run.face[0], atol=1e-12)
-    middle = scene.goal.mean(axis=0)
-    np.testing.assert_allclose(middle, material.goal_center(trace), atol=1e-12)
-    # The model of the case is the true one, so the joints of the plan lead along the straight line.
-    way = middle - trace.center[0]
-    off = scene.planned - trace.center[0]
-    off -= np.outer(off @ way / (way @ way), way)
-    np.testing.assert_allclose(off, 0.0, atol=1e-6)
-    np.testing.assert_allclose(scene.planned[[0, -1]], [trace.center[0], middle], atol=1e-6)

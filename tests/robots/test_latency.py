@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior, Delays, History
+from projservo_cli.robots.latency import NOTHING_KNOWN, Delays, History
 
 PERIOD, NOISE = 0.04, 0.5
 EXACT, PLAY = np.zeros(2), 0.04  # of readings; rad
@@ -66,16 +66,6 @@ def test_play_in_the_joints_is_no_delay(late):
         )
     assert np.abs(np.array(off)[10:] + late).max() < 0.15
     assert np.abs(np.array(off)[30:] + late).max() < 0.06
-
-
-def test_a_given_delay_is_kept_and_a_wrong_one_is_not_hidden():
-    for given, wrong in ((0.1, False), (0.3, True)):
-        prior = DelayPrior(np.full(2, given), np.zeros(2), np.full(2, 0.005))
-        delays = Delays(predicted, prior, NOISE, 1.0, EXACT)
-        off = looks(delays, (0.1, 0.1))
-        np.testing.assert_array_equal(delays.mean, [given, given])
-        moving = np.abs(off[25:40])
-        assert (moving > 0.1).mean() > 0.9 if wrong else moving.max() < 0.005
 
 
 def test_a_delay_that_changes_is_followed():

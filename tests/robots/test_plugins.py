@@ -1,12 +1,11 @@
 """From names to classes: what is found, what is refused and how, what is never imported."""
 
 import sys
-from importlib import metadata
 from pathlib import Path
 
 import pytest
 
-from projservo_cli.config import load_config, to_yaml
+from projservo_cli.config import load_config
 from projservo_cli.records import InputError
 from projservo_cli.robots import plugins
 from projservo_cli.robots.source import source_hash
@@ -67,22 +66,6 @@ MADE = {
     "by delegation": "def __getattr__(self, name):\n        return getattr(Bare, name)",
     "too few": "def __init__(self):\n        self.open = self.close = print\n        self.stop = None",
 }
-
-
-def test_registered_names_stand_for_their_class(monkeypatch):
-    points = {
-        "projservo.plants": [metadata.EntryPoint("arm", f"{HERE}:Sound", "projservo.plants")],
-        "projservo.laws": [metadata.EntryPoint("by_image", f"{HERE}:ByImage", "projservo.laws")],
-    }
-    monkeypatch.setattr(metadata, "entry_points", lambda group: points[group])
-    config = load_config(UR5, ["plant=arm", "control.laws=[exact, by_image]"])
-    assert config.plant.use == f"{HERE}:Sound"
-    assert config.control.laws == ("exact", f"{HERE}:ByImage")
-    text = to_yaml(config)
-    points.update({"projservo.plants": [], "projservo.laws": []})
-    assert load_config("stored", text=text) == config  # read where nothing is registered
-    with pytest.raises(InputError, match="'arm'"):
-        load_config(UR5, ["plant=arm"])
 
 
 @pytest.mark.parametrize(

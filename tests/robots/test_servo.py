@@ -1,7 +1,6 @@
 """Servo and record with robots and laws of others, on the command line."""
 
 import io
-import sys
 from pathlib import Path
 
 import click
@@ -213,46 +212,6 @@ def test_a_robot_without_speed_limit_is_refused(servo):
     assert commands() == []
 
 
-TALKING = """
-import threading
-from tests.robots.robots import ByImage, Sound
-print("a module says")
-
-class Robot(Sound):
-    def __init__(self, config):
-        super().__init__(config)
-        print("a robot is made")
-    def read(self):
-        threading.Thread(target=print, args=("a camera says",)).start()
-        print("a robot sees")
-        return super().read()
-    def stop(self):
-        print("a robot stops")
-        super().stop()
-
-class Law(ByImage):
-    def __init__(self, setup):
-        super().__init__(setup)
-        print("a law is made")
-    def __call__(self, s, q):
-        print("a law is asked")
-        return super().__call__(s, q)
-"""
-SAID = ("a module says", "a robot is made", "a robot sees", "a camera says", "a robot stops", "a law is made")
-
-
-def test_a_law_and_a_robot_of_others_and_what_they_print(servo, monkeypatch):
-    """Standard output is for results: what others print, from whatever thread, goes to standard error."""
-    Path("mine_talks.py").write_text(TALKING)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    plant = ["--set", f"plant={{use: 'mine_talks:Robot', {OPTIONS}}}}}"]
-    answer = servo(*plant, "--set", "law=mine_talks:Law", *NEAR, "--json", law=None)
-    assert answer.code == 0, answer.err
-    assert answer.json["laws"][0]["verdict"] == "converged"
-    assert [text for text in (*SAID, "a law is asked") if text in answer.out] == []
-    assert [text for text in (*SAID, "a law is asked") if text not in answer.err] == []
-
-
 @pytest.mark.parametrize(
     ("law", "code", "message"),
     [
@@ -331,33 +290,3 @@ def test_a_real_robot_moves_whenever_it_is_asked_to_and_a_report_shows_what_is_s
     config = load_config(UR5, [Override.parse(SOUND[1])])
     ps.Experiment(config, "run", progress=False).make("servo", laws=["direct_three"])
     assert CALLS.count("open") == 1  # of a new object
-
-
-def test_a_robot_is_calibrated_from_what_it_showed(projservo, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    CALLS.clear()
-    alone = projservo("calibrate", "-c", UR5, *SOUND, "-o", "run")
-    assert (alone.code, CALLS) == (2, [])
-    assert "is calibrated from a table: record it" in alone.err
-    chain = ("record", "calibrate", "-o", "run", "--set", "calibration.frames_per_joint=4")
-    answer = projservo(*chain, "-c", UR5, *SOUND, "--json")
-    assert answer.code == 0, answer.err
-    assert (answer.json["record"]["recorded"], answer.json["calibrate"]["source"]) == (37, "recorded")
-    assert CALLS[-2:] == ["stop", "close"]
-    CALLS.clear()
-    refused = projservo(*chain, "--set", "seed=5")
-    assert (refused.code, CALLS) == (2, [])
-    assert "is named by the stored run alone, which starts no code" in refused.err
-    assert projservo("calibrate", "-o", "run", "--json").json["usable"] == answer.json["calibrate"]["usable"]
-    again = projservo(*chain, "-c", UR5, *SOUND)
-    assert (again.code, CALLS) == (0, [])
-    assert "record: up to date, and the robot is not moved: --force records all poses again" in again.err
-    # A fault that advises to recalibrate leads somewhere: what it contradicts is recorded again, once.
-    few = ["--set", "calibration.frames_per_joint=4", "--law", "exact"]
-    moved = projservo("servo", "-c", UR5, "-o", "run", *few, *faulty("bumped camera"), "--json")
-    assert moved.code == 1
-    assert "the left camera was moved" in moved.json["reason"]
-    for recorded, why in ((37, "what is there was contradicted"), (0, "up to date")):
-        answer = projservo(*chain, "-c", UR5, *SOUND, "--json")
-        assert answer.json["record"]["recorded"] == recorded, answer.err
-        assert f"record: {'making (' * bool(recorded)}{why}" in answer.err

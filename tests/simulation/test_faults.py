@@ -59,15 +59,6 @@ def driven(plant, targets):
 WAY = [[0.02 * k, -0.01 * k] for k in range(1, 26)]
 
 
-def test_a_servo_lags_as_a_system_of_first_order_does():
-    plant, lag, pace = robot(servo_time_constant_s=0.05), 0.05, np.array([0.02, -0.01]) / PERIOD
-    q, _ = driven(plant, [*WAY, *[WAY[-1]] * 5])
-    for k, row in enumerate(q, 1):
-        t, end = k * PERIOD, 25 * PERIOD
-        behind = lag * (1.0 - math.exp(-min(t, end) / lag)) * math.exp(-max(0.0, t - end) / lag)
-        assert row == pytest.approx(pace * (min(t, end) - behind), abs=1e-12)
-
-
 def test_sag_is_read_and_flexing_is_not_in_proportion_to_the_load():
     assert full_reach(arm()) == pytest.approx(0.7, rel=0.01)
     reach, sag = full_reach(arm()), math.radians(0.5)
@@ -82,28 +73,6 @@ def test_sag_is_read_and_flexing_is_not_in_proportion_to_the_load():
             told, _ = driven(plant, [q] * 10)
             assert told[-1] - q == pytest.approx(sag * read, abs=2e-4 * sag + sag**2)
             assert plant.truth() - q == pytest.approx(sag * true, abs=2e-4 * sag + sag**2)
-
-
-def test_play_leaves_the_link_behind_where_the_way_turns():
-    play, plant = math.radians(0.5), robot(backlash_deg=0.5)
-    there, back = WAY, [*WAY[::-1], [0.0, 0.0]]
-    q, _ = driven(plant, there)
-    assert plant.truth() - q[-1] == pytest.approx(0.5 * play * np.array([-1, 1]), abs=1e-12)
-    q, _ = driven(plant, [*back, [0.2 * play, 0.0]])
-    assert q[-1] == pytest.approx([0.2 * play, 0.0])
-    assert plant.truth() == pytest.approx(0.5 * play * np.array([1, -1]), abs=1e-12)
-
-
-def test_encoders_count_ticks_and_servos_may_do_so_too():
-    tick = 2 * math.pi / 4096
-    for coarse in (False, True):
-        plant = robot(encoder_counts_per_turn=4096, quantize_setpoints=coarse)
-        for target, q in zip(WAY, driven(plant, WAY)[0], strict=True):
-            assert q / tick == pytest.approx(np.round(q / tick), abs=1e-9)
-            assert abs(q - target).max() <= 0.5 * tick + 1e-12
-        gap = abs(plant.truth() - WAY[-1]).max()
-        assert (gap > 1e-6) == coarse
-        assert gap <= 0.5 * tick
 
 
 def along(t):

@@ -113,19 +113,6 @@ def test_servos_of_ours_follow_lag_and_sag_as_they_are_told(tmp_path, servo):
 
 
 @pytest.mark.usefixtures("needs_mujoco")
-def test_what_an_arm_touches_is_told(tmp_path):
-    config = described(tmp_path, "position")
-    path = tmp_path / "arm.xml"
-    post = '<worldbody><body name="post" pos="0 0.5 0.4"><geom size="0.04"/></body>'
-    path.write_text(path.read_text(encoding="utf-8").replace("<worldbody>", post), encoding="utf-8")
-    physics = driven(config, np.array([0.4, 0.0]))
-    assert physics.obstruction == ""
-    physics.follow(np.array([1.7, 0.0]), 2.0)
-    assert physics.motor[0] < 1.5
-    assert physics.obstruction == "the arm touches: post and boom"
-
-
-@pytest.mark.usefixtures("needs_mujoco")
 def test_a_real_arm_with_its_meshes(shared_data, small, drawn):
     """Its own servos hold it with an error of their stiffness; drawn, it does not hide its tags."""
     file = shared_data / "robots" / "ur5e" / "ur5e.xml"

@@ -48,19 +48,6 @@ def test_noise_and_blur_are_as_they_were_asked_for(small, drawn):
     assert steepest[1] < 0.6 * steepest[0]
 
 
-def test_an_exposure_is_the_mean_of_the_frames_in_it(small, drawn):
-    truth, eyes = drawn(small())
-    q, way = POSTURES[7], np.array([[0.0, 0.01 * k] for k in range(-2, 3)])
-    rng = np.random.default_rng(0)
-    single = []
-    for step in way:
-        eyes.capture(1, (q + step)[None], None, rng)
-        single.append(eyes.last[1].astype(float))
-    seen, _ = eyes.capture(1, q + way, None, rng)
-    assert np.abs(eyes.last[1] - np.mean(single, axis=0)).max() <= 1.0
-    assert np.nanmean(np.abs(seen - truth.images(q, truth.M)[1])) < 0.1
-
-
 HASHED = """
 import hashlib, sys
 import numpy as np

@@ -158,8 +158,8 @@ def pairs(count):
 
 @pytest.mark.volume
 def test_what_keeps_its_key_is_the_same_to_the_bit():
-    drawn = pairs(40)
-    assert len(drawn) == 40
+    drawn = pairs(20)
+    assert len(drawn) == 20
     for name, key, stage, other in drawn:
         _, results = chain(name)
         assert same(made(stage, GIVEN[stage](other), results), results[stage]), (name, key, stage)

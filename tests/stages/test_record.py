@@ -279,39 +279,6 @@ def test_a_robot_that_does_not_arrive_is_reported_and_the_rest_kept(kind, messag
         assert read_table("t.csv").at_rest.pose.tolist() == list(range(len(recording.done)))
 
 
-def test_a_robot_with_faults_is_recorded_at_rest_and_on_the_way_as_calibrate_sees_it(tmp_path):
-    """At rest within noise of what its true joints show; on the way 120 ms late, by the frames' own times."""
-    faults = (
-        "disturbance.camera_latency_s=0.12",
-        "disturbance.encoder_counts_per_turn=4096",
-        "disturbance.gravity_sag_deg=0.5",
-    )
-    config = load_config(
-        CONFIGS / "hobby.yaml",
-        [*faults, "calibration.frames_per_joint=2", "calibration.random_poses=2"],
-    )
-    seen, sigma_px = stage.observed(config)
-    tick, truth = 2 * np.pi / 4096, truth_of(config)
-    assert sigma_px == 0.5
-    rest, targets = seen.at_rest, trial_motions(config)
-    assert rest.q / tick == pytest.approx(np.round(rest.q / tick), abs=1e-9)
-    assert np.abs(rest.q - targets).max() < np.radians(0.5) + tick
-    off = rest.images - np.array([truth.images(q, truth.M) for q in rest.q])
-    assert off.std() == pytest.approx(0.5, rel=0.2)  # half a tick is 0.4 px here
-    moving = seen.rows(seen.moving > 0)
-    assert 10 < len(moving.q) <= 200
-    first = moving.rows(moving.moving == moving.moving[0])
-    shown = np.array([[np.interp(t - 0.12, first.t_q, q) for q in first.q.T] for t in first.t_q])
-    late = np.array([truth.images(q, truth.M) for q in shown])[first.t_q > first.t_q[0] + 0.12]
-    behind = first.images[first.t_q > first.t_q[0] + 0.12] - late
-    assert len(behind) > 2
-    assert np.nanstd(behind) < 2.0
-    stage.record(config, stage.new_recording(config, tmp_path / "trials.csv"))
-    table = read_table(tmp_path / "trials.csv", "RRRRR")
-    np.testing.assert_array_equal(table.images, seen.images)
-    np.testing.assert_array_equal(table.t_q, seen.t_q)
-
-
 ROOF = (
     "markers={tags: roof, tag_size_m: 0.3}",  # of ten
     "task.goal={roll_deg: 10}",

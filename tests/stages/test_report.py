@@ -120,18 +120,6 @@ def test_both_sides_of_eq_22_agree_to_first_order_only():
     assert "λ^2.0" in differs.measured
 
 
-def test_projective_twin_is_well_conditioned_and_sees_the_same():
-    _, bench, material = case()
-    assert np.linalg.cond(studies.H_PE) < 2.5
-    twin, true = bench.models["twin"], bench.models["true"]
-    M = np.append([0.5, 0.1, 0.6], 1.0)
-    M_twin = np.linalg.solve(studies.H_PE, M)
-    np.testing.assert_allclose(twin.P @ M_twin, true.P @ M, rtol=1e-12)
-    assert twin.a_inf @ M_twin == pytest.approx(true.a_inf @ M, rel=1e-13)
-    np.testing.assert_allclose(twin.a_inf @ twin.H_hat_0, 0.0, atol=1e-13)
-    assert material.calibrated.P.shape == (2, 3, 4)
-
-
 @pytest.mark.volume
 @pytest.mark.parametrize("name", ["paper", "ur5"])
 def test_claims_of_a_whole_run_with_exact_operators(name):

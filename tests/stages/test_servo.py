@@ -38,18 +38,3 @@ def test_direct_laws_do_the_task_in_sight_of_both_cameras(name, law):
     assert trace.position_error_mm < 0.1
     assert trace.rotation_error_deg < 0.05
     assert (trace.first_beyond_limit, trace.first_outside_image) == (-1, -1)
-
-
-@pytest.mark.parametrize("steps", [10, 25])
-def test_the_size_of_the_face_tells_about_how_far_it_is_off(steps):
-    """The error in the images holds the rotation that is left too: it is compared once that is small."""
-    trace = case("stanford").servo("direct_three", max_steps=steps)
-    assert trace.image_error_px == trace.image_error[-1]
-    moved = np.linalg.norm(_corners(trace, trace.pose[-1]) - _corners(trace, trace.goal_pose), axis=1)
-    assert trace.estimated_position_error_mm == pytest.approx(1e3 * np.sqrt(np.mean(moved**2)), rel=0.4)
-
-
-def _corners(trace, pose):
-    """Corners (k, 3) of the face of the case at a pose of the tool."""
-    truth = case("stanford").truth
-    return (truth.M_face @ np.linalg.inv(truth.robot.base_tool).T @ pose.T)[:, :3]

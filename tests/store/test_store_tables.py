@@ -20,30 +20,6 @@ def written(tmp_path, *lines, end="\n", prefix=b""):
     return path
 
 
-def test_rows_become_arrays(tmp_path):
-    table = read_table(written(tmp_path, HEADER, *ROWS))
-    assert table.pose.tolist() == [0, 7]
-    assert table.marker.tolist() == [0, 1]
-    assert table.q.tolist() == [[0.5, -1.0], [0.25, 0.2]]
-    assert table.images[0].tolist() == [[[11, 21], [10, 20]], [[31, 41], [30, 40]]]
-    assert np.isnan(table.images[1, :, 0]).all()  # no row for marker 0 at pose 7
-    assert table.images[1, 0, 1].tolist() == [12.5, 22]
-    assert np.isnan(table.images[1, 1, 1]).all()  # empty cells
-
-
-def test_order_of_columns_extra_columns_line_ends_and_mark_do_not_matter(tmp_path):
-    plain = read_table(written(tmp_path, HEADER, *ROWS))
-    columns = HEADER.split(",")
-    order = [7, 2, 0, 5, 3, 1, 4, 6]
-    lines = [",".join(["note", *(columns[i] for i in order)])]
-    for row in ROWS:
-        cells = row.split(",")
-        lines.append(",".join(['"a,b"', *(f" {cells[i]} " for i in order)]))
-    odd = read_table(written(tmp_path, *lines, "", "", end="\r\n", prefix=b"\xef\xbb\xbf"))
-    for name in ("pose", "marker", "q", "images"):
-        np.testing.assert_array_equal(getattr(plain, name), getattr(odd, name))
-
-
 BAD = {
     "empty file": ([""], "the table is empty"),
     "header only": ([HEADER], "no rows"),
@@ -90,17 +66,6 @@ def test_readings_that_look_like_degrees_are_refused_with_the_remedy(tmp_path, t
     with pytest.raises(InputError, match=message) as caught:
         read_table(written(tmp_path, HEADER, *TURNS), types)
     assert "\n" not in str(caught.value)
-
-
-def test_radians_are_never_mistaken_for_degrees(tmp_path):
-    path = written(tmp_path, HEADER, *TURNS)
-    with pytest.raises(InputError, match=r"q2 of pose 0 is 370, of a prismatic joint in m \(2 such readings"):
-        read_table(path, "RP")
-    assert read_table(path, "RP", "rad").q[0].tolist() == [0.5, 370]  # metres, or whatever a slide reads
-    assert read_table(path, "RR", "rad").q[0].tolist() == [0.5, 370]  # as the user says
-    widest = 2 * 2 * np.pi  # twice the range of a joint that turns fully to both sides
-    path = written(tmp_path, HEADER, f"0,1,{widest},{-widest},1,2,3,4")
-    assert read_table(path).q.tolist() == [[widest, -widest]]
 
 
 LIST = ["pose,q1,q2,left,right", "7,1,90,a.png,b.png", "3,2,-90,c.png,d.png"]

@@ -7,7 +7,6 @@ import pytest
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.sweeps.design import name_of_run
-from projservo_cli.sweeps.folder import in_kernel
 from projservo_cli.sweeps.runs import Part, run_part
 from tests.configured import calibrate, plan, servo, truth_of
 from tests.sweeps.cases import design
@@ -121,13 +120,3 @@ def test_runs_that_cannot_begin_have_a_verdict_and_no_numbers():
     assert np.isnan(made.columns["position_error_mm"]).all()
     assert made.columns["steps"].tolist() == [-1] * 4
     assert made.columns["success"].tolist() == [0] * 4
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("plant.speed_scale", 0.5), ("trajectory.profile", "constrained"), ("control.mode", "track")],
-)
-def test_runs_that_need_more_than_their_images_are_made_elsewhere(key, value):
-    plain, other = (design(grid={"law": ["exact"]}, set=given) for given in ({}, {key: value}))
-    assert in_kernel(plain, 0)
-    assert not in_kernel(other, 0)
