@@ -9,8 +9,7 @@ from projservo_cli.calibration import calibrate
 from projservo_cli.records import WorkFailed
 from projservo_cli.report.report_data import findings
 from tests.calibration.bound import errors_of_the_best
-from tests.calibration.mistakes import KINDS, MISTAKES, table
-from tests.studies.calibration_mistakes import median_error, shares_left_out
+from tests.calibration.mistakes import KINDS, MISTAKES, median_error, shares_left_out, table
 
 
 def calibrated(mistaken, **given):

@@ -5,8 +5,8 @@
 
 Operators are those of Cosmic Ray that leave Python that runs: a sum for a difference, ``<`` for ``<=``, a
 number one higher or lower, a loop that is passed over. Lines are drawn from functions of the mathematics.
-Each mutant stands in a copy of the tree; there run the tests of the package's folder that import the mutated
-module, without the compiler, until the first fails. A mutant that takes longer than the limit is killed too.
+Each mutant stands in a copy of the tree; there run the tests nearest to the mutated module, without the
+compiler, until the first fails. A mutant that takes longer than the limit is killed too.
 """
 
 import argparse
@@ -67,15 +67,17 @@ def places(module: Path) -> list[Mutant]:
     return found
 
 
-def nearest(module: str) -> list[str]:
-    """Test files of the folder of a module that import it; all of the folder where none does."""
+def nearest(tree: Path, module: str) -> list[str]:
+    """Test file of the name of a module; where there is none, those of its folder that import it, or all."""
     package = Path(module).with_suffix("")
-    folder = ROOT / "tests" / package.parent.name
+    folder = tree / "tests" / package.parent.name
     files = [path for path in sorted(folder.glob("test_*.py")) if path.stem != "test_jit"]
     name = ".".join(package.parts)
-    pairs = (name, f"from {name.rpartition('.')[0]} import {package.name}")
-    chosen = [path for path in files if any(text in path.read_text(encoding="utf-8") for text in pairs)]
-    return [str(path.relative_to(ROOT)) for path in chosen or files]
+    words = (name, f"from {name.rpartition('.')[0]} import {package.name}")
+    chosen = [path for path in files if path.stem == f"test_{package.name}"] or [
+        path for path in files if any(text in path.read_text(encoding="utf-8") for text in words)
+    ]
+    return [str(path.relative_to(tree)) for path in chosen or files]
 
 
 def tested(tree: Path, module: str, limit: float) -> tuple[str, str, float]:
@@ -85,7 +87,7 @@ def tested(tree: Path, module: str, limit: float) -> tuple[str, str, float]:
     seconds = (int(limit), int(limit) + 1)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
-        [*command, *nearest(module)],
+        [*command, *nearest(tree, module)],
         cwd=tree,
         env=os.environ | environment,
         capture_output=True,
@@ -132,7 +134,7 @@ def main() -> None:
             if mutant.module not in limits:
                 outcome, by, seconds = tested(tree, mutant.module, 10 * LIMIT_S)
                 if outcome != "survived":
-                    sys.exit(f"unchanged, {mutant.module}: {outcome} {by}; the tests must pass first")
+                    sys.exit(f"unchanged, {mutant.module}: {outcome} {by}; the tests must pass in time first")
                 limits[mutant.module] = max(LIMIT_S, 2 * seconds)
             source = (ROOT / mutant.module).read_text(encoding="utf-8")
             changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
