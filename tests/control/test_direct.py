@@ -34,6 +34,12 @@ def test_each_error_decays_at_its_own_rate(types):
         assert rates(run, column) == pytest.approx(gain, rel=0.02)
 
 
+def test_one_rotation_decays_at_the_rate_of_its_gain():
+    run = Run(scene(), "direct_two", FINE._replace(gain_t=1.3, gain_s=0.8), limits(max_steps=100))
+    assert rates(run, TAU_AFFINE) == pytest.approx(1.3, rel=0.02)
+    assert rates(run, THETA_S) == pytest.approx(0.8, rel=0.02)
+
+
 def test_error_of_both_rotations_is_the_true_angle():
     """θ_s, and τ in metres with the metric model, against the true poses of the face at every instant."""
     sc = scene()

@@ -80,6 +80,15 @@ def test_one_rotation_equals_two(theta_r, theta_p, seed):
     assert math.cos(theta_s / 2) == pytest.approx(math.cos(theta_r / 2) * math.cos(theta_p / 2), abs=1e-14)
 
 
+def test_the_printed_factor_two_is_wrong():
+    """Erratum of (25): c = 2 sin sin leaves an error of order one."""
+    H_r, H_p = perpendicular_pair(2)
+    theta_r, theta_p = 1.0, 1.4
+    theta_s, a, b, c = composed_angle(theta_r, theta_p)
+    printed = (a * H_r + b * H_p + 2 * c * (H_r @ H_p - H_p @ H_r)) / math.sin(theta_s / 2)
+    assert np.abs(expm(theta_s * printed) - expm(theta_r * H_r) @ expm(theta_p * H_p)).max() > 0.1
+
+
 @pytest.mark.parametrize("theta_p", [0.0, 0.7, math.pi])
 def test_half_a_turn(theta_p):
     """Exactly 180° onto the plane: θ_s is π and the operator still gives the product."""

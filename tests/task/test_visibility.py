@@ -87,6 +87,14 @@ def test_neutral_parallel_to_the_face_and_within_its_plane(point, theta, shift, 
         assert carried(a, G @ H @ np.linalg.inv(G)) @ O.T == pytest.approx(a @ O.T, rel=1e-9)
 
 
+def test_the_optical_axis_itself_is_not_neutral():
+    """Erratum of section 4.2: along the optical axis an oblique face off that axis does turn its back."""
+    normal, point, O = np.array([-0.9, 0, 0.43]), np.array([1.0, 0, 1.4]), np.array([-0.15, 0, 0, 1.0])
+    a = np.append(normal, -normal @ point)
+    margins = [carried(a, displacement([0, 0, 0], [0, 0, z])) @ O for z in (0.0, 2.0)]
+    assert margins[0] > 0 > margins[1]
+
+
 @pytest.mark.parametrize("direction", [[0, 0, 1], [1, 0.2, 0.5], [-0.3, 1, -1]])
 def test_translation_changes_visibility_at_tau_0(G, direction):
     H_hat = G @ prismatic(direction) @ np.linalg.inv(G)
