@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from projservo_cli import files
 from projservo_cli.cli.output import Console
 from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
@@ -22,7 +21,6 @@ FEW = ["--set", "calibration.frames_per_joint=2"]
 @pytest.fixture(autouse=True)
 def elsewhere(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
 
 
 def same(table, observation):

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from projservo_cli import files
 from projservo_cli.store.tables import read_joint_list, read_table
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -16,7 +15,6 @@ STANFORD = ("-c", CONFIGS / "stanford.yaml", "--set", "calibration.frames_per_jo
 @pytest.fixture(autouse=True)
 def elsewhere(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(files, "_synchronise", lambda path: None)
 
 
 def test_suggest_record_calibrate_again(projservo):
