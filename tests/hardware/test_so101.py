@@ -337,3 +337,27 @@ def test_two_processes_do_not_drive_one_arm(opened):
     bus, _ = opened()
     with pytest.raises(InputError, match=r"another program has it|another projservo drives this arm"):
         SO101(bus.port).open()
+
+
+def test_an_overload_of_before_ends_with_the_first_set_point(opened):
+    bus, arm = opened()
+    arm.hold()
+    arm.close()
+    bus.servos[2].overload = True
+    again = opened(bus)[1]
+    again.joints()
+    again.hold()
+    assert not bus.servos[2].overload
+    bus.servos[2].overload = True
+    with pytest.raises(WorkFailed, match=r"joint 2 .* is overloaded"):
+        again.joints()
+
+
+def test_a_gripper_that_holds_keeps_its_grip(opened, rig):
+    bus = rig()
+    bus.servos[6].write(GOAL, (1000).to_bytes(2, "little"))
+    arm = opened(bus)[1]
+    before = len(bus.servos[6].moments)
+    arm.hold()
+    assert len(bus.servos[6].moments) == before
+    assert len(bus.servos[5].moments) == 1

@@ -242,6 +242,27 @@ def test_a_late_answer_ends_the_waiting_and_stop_is_called_meanwhile(capsys):
     robot.released.set()
 
 
+def test_opening_has_time_of_its_own_and_is_closed_where_it_fails():
+    robot = Scripted()
+    robot.open = lambda: time.sleep(0.2)
+    foreign = PluginRobot(robot, "plant m:C", 3, BOUNDS, 0.05, 5.0)
+    with at_rest_after(foreign):
+        pass
+    assert len(robot.closed) == 1
+
+    def fails():
+        raise OSError("no arm")
+
+    robot = Scripted()
+    robot.open = robot.stop = fails
+    with (
+        pytest.raises(WorkFailed, match=r"^plant m:C: open\(\) failed: OSError: no arm \(\S+\)$"),
+        opened(robot),
+    ):
+        pass
+    assert len(robot.closed) == 1
+
+
 def interrupt():
     raise KeyboardInterrupt
 

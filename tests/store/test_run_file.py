@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -12,7 +13,7 @@ from projservo_cli.records import InputError, Plan
 from projservo_cli.store import save_record
 from tests.fake_records import fake
 from tests.store.deceit import EDITS, HEADS, edited, head, resealed
-from tests.store.sound import result, sound_run
+from tests.store.sound import result, sound_file, sound_run
 
 SEAL_SIZE = 83  # bytes of the line behind the data
 LONG = "name: ä\n" * 30_000  # 240 kB: beyond what an HDF5 object header holds
@@ -120,6 +121,15 @@ def test_what_is_added_to_and_what_is_written_as_a_whole_hold_the_same(tmp_path,
         for name, one in results.items():
             for label, record in one.records.items():
                 assert_same(back[name].records[label], record)
+
+
+def test_a_failing_save_leaves_the_old_file_and_no_debris(path, monkeypatch):
+    run = store.load(path)
+    monkeypatch.setattr(Path, "replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.raises(InputError, match="No space left"):
+        store.save(run)
+    assert path.read_bytes() == sound_file()
+    assert [found.name for found in path.parent.iterdir()] == ["run.h5"]
 
 
 def test_a_change_anywhere_is_noticed_before_it_is_read(path, monkeypatch):

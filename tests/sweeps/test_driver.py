@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import threading
 
 import pytest
 
@@ -96,6 +97,29 @@ def test_what_is_not_of_this_sweep_is_refused(tmp_path):
     folder.manifest.unlink()
     with pytest.raises(InputError, match="is missing; choose another folder"):
         folder.status(second)
+
+
+def test_threads_give_the_same_and_are_left_in_order(tmp_path):
+    """Runs that differ in their seeds alone are threads; an interrupt waits for those at work."""
+
+    def threads():
+        return [thread for thread in threading.enumerate() if "ThreadPool" in thread.name]
+
+    def interrupt(what, done, total):
+        if what == "runs" and done >= 10:
+            assert threads()
+            raise KeyboardInterrupt
+
+    found = design(runs=30, chunk=5, calibrations=2)
+    assert make(found, tmp_path / "one").complete
+    reference = columns(tmp_path / "one")
+    with pytest.raises(KeyboardInterrupt):
+        make(found, tmp_path / "two", workers=2, progress=interrupt)
+    assert not threads()
+    assert 10 <= len(columns(tmp_path / "two")["run"]) < 60
+    assert make(found, tmp_path / "two", workers=2).complete
+    for name, values in columns(tmp_path / "two").items():
+        assert values.tobytes() == reference[name].tobytes(), name
 
 
 def dead_once(job):
