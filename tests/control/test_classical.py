@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.control.law import LOST, OK
+from projservo_cli.control.law import LOST, OK, new_state, reset
 from projservo_cli.geometry.kinematics import image_jacobian
 from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw
@@ -69,3 +69,13 @@ def test_unseen_markers_are_lost(law):
             broken = s.copy()
             broken[place] = value
             assert commanded(law, sc, broken, q)[0] == LOST
+
+
+@pytest.mark.parametrize(
+    "name", ["driven", "q_dot", "q_ahead", "errors", "fit", "face_px", "limited", "share", "parts", "clock"]
+)
+def test_a_state_that_is_reset_is_a_new_one(name):
+    used, new = new_state(6, 4), new_state(6, 4)
+    getattr(used, name)[:] = 7
+    reset(used)
+    np.testing.assert_array_equal(getattr(used, name), getattr(new, name))

@@ -10,7 +10,7 @@ def system_of(A, b=0.0):
     """The columns of A as the kernels want them, with rubbish beside them."""
     m, n = A.shape
     system = new_system(n, m)
-    system.B[:] = system.rhs[:] = 7.0
+    system.B[:] = system.rhs[:] = np.nan
     system.B[:, :m], system.rhs[:m] = A.T, b
     return system
 
