@@ -283,6 +283,16 @@ def test_a_view_of_which_many_sightings_stay_aside_is_off_where_chance_does_not_
     assert bool(said) == bool(shift)
 
 
+def test_a_marker_that_was_off_and_is_gone_is_not_judged(arm):
+    """By no two looks alike, so that nothing is named while it is seen; the looks since do not show it."""
+    q, _ = arm.way(1)
+    q = q[:1].repeat(40, axis=0)
+    s = noisy(arm.images(at_once(q)), 1)
+    s[5:10, :, 4] += 30.0 * np.random.default_rng(2).standard_normal((5, 2, 2))
+    s[10:, :, 4] = np.nan
+    assert first_alarm(arm, q, s) == (None, "")
+
+
 @pytest.mark.parametrize(("stride", "way"), [(3, 4), (4, 7)])
 def test_a_camera_that_moves_by_two_pixels_in_motion_is_named_before_the_end(arm, stride, way):
     """No two looks in motion are of one view: all differences count that tell how long corners err alike."""
