@@ -73,7 +73,7 @@ class Experiment(Printed):
 
         Parameters
         ----------
-        stages : of ``calibrate``, ``plan``, ``servo`` and ``report``, in their order.
+        *stages : of ``calibrate``, ``plan``, ``servo`` and ``report``, in their order.
         laws : instead of ``control.laws``: names or ``module:Class``.
         force : whether named stages are made even if they are up to date.
         blind : whether a robot may move although cameras show no marker of the calibration.

@@ -1,6 +1,7 @@
 """Every check of the project, or those that are named: `python -m tests.check [NAME ...]`."""
 
 import os
+import shlex
 import subprocess
 import sys
 import time
@@ -25,30 +26,33 @@ SPHINX = [
     "docs",
     "build/docs",
 ]
-# Modules whose functions are compiled, tested once more without the compiler: the same bits, and indices
-# that are looked at.
-MATHEMATICS = [f"tests/{folder}" for folder in ("geometry", "task", "control", "loop", "simulation")]
-NOT_COMPILED = ("--ignore-glob=*_rendered_*", "--ignore-glob=*_mujoco_*")
-UNCOMPILED = ["-m", "not volume", *NOT_COMPILED, *MATHEMATICS]
+PACKAGE = ROOT / "projservo_cli"
+DOCSTRINGS = [PYTHON, "-m", "numpydoc", "lint", *sorted(map(str, PACKAGE.rglob("*.py")))]
+# Tests of compiled functions, once more without the compiler: the same bits, and indices that are looked at.
+MATHEMATICS = [
+    f"tests/{name}" for name in ("geometry", "task", "control", "loop", "simulation/test_ideal.py")
+]
+UNCOMPILED = ["-m", "not volume", *MATHEMATICS]
 WITHOUT_COMPILER = {"NUMBA_DISABLE_JIT": "1"}
 
 # The emulator runs in real time, on a machine that others may use: it is tried again.
 ATTEMPTS = {"tutorial": 2}
 
 Check = tuple[Sequence[str | Path], dict[str, str]]
-# Each on one processor: two at a time.
+# Two at a time, in this order: the tutorial, whose emulator runs in real time, and the others behind it.
 SINGLE: dict[str, Check] = {
+    "tutorial": ([PYTHON, "-m", "pytest", "-q", "tests/studies/so101_tutorial.py"], {}),
     "types": ([BIN / "mypy"], {}),
     "documentation": (SPHINX, WITHOUT_COMPILER),
     "lint": ([BIN / "ruff", "check", "."], {}),
     "format": ([BIN / "ruff", "format", "--check", "."], {}),
     "imports": ([BIN / "lint-imports"], {}),
+    "docstrings": (DOCSTRINGS, {}),
 }
-# Each on both processors, or timed; the emulator of the tutorial takes one, and half of another.
+# Each on both processors, or timed.
 WHOLE: dict[str, Check] = {
     "mathematics without the compiler": ([*PYTEST, *UNCOMPILED], WITHOUT_COMPILER),
     "tests": ([*PYTEST, "--ignore=tests/benchmarks"], {}),
-    "tutorial": ([PYTHON, "-m", "pytest", "-q", "tests/studies/so101_tutorial.py"], {}),
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
 # Only by name. Coverage doubles the time of the first pass and adds a fifth to the second; lines of both add
@@ -69,10 +73,11 @@ BY_NAME: dict[str, Check] = {
 def run(name: str, check: Check) -> bool:
     """Run a check, print what it says once it is over, and return whether it passed."""
     command, environment = check
+    behind = ["nice", "-n", "10"] if name in SINGLE and name != "tutorial" else []
     start = time.monotonic()
     for _ in range(ATTEMPTS.get(name, 1)):
         done = subprocess.run(
-            command,
+            [*behind, *command],
             cwd=ROOT,
             env={"OPENBLAS_NUM_THREADS": "1", **os.environ, **environment},
             stdout=subprocess.PIPE,
@@ -83,7 +88,7 @@ def run(name: str, check: Check) -> bool:
         if done.returncode == 0:
             break
     outcome = "passed" if done.returncode == 0 else "FAILED"
-    words = " ".join(str(Path(part).name) for part in command)
+    words = shlex.join(Path(part).name for part in command[:9])
     print(
         f"── {name}: {words}\n{done.stdout}── {name}: {outcome} in {time.monotonic() - start:.0f} s\n",
         flush=True,

@@ -12,10 +12,10 @@ from projservo_cli.settings.sections import JointVector
 from projservo_cli.simulation import faults, streams, workspace
 from projservo_cli.simulation.rendering import Frames, rendered_model
 from projservo_cli.stages import calibrate as calibrating
-from projservo_cli.stages import external_robot, scenario, studies
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import report as reporting
+from projservo_cli.stages import scenario
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages import teach as teaching
 
@@ -83,11 +83,6 @@ def bounds_of(config, joints):
     return given._drive(config, None).following.bounds(joints)
 
 
-def plugin_robot(config, joints, markers):
-    robot = given.recording_inputs(config).own
-    return external_robot.plugin_robot(robot, bounds_of(config, joints), joints.types, range(markers))
-
-
 def robot_by_itself(config, truth, q, sigma_px, seed, stream):
     robot = given._drive(config, truth).robot
     return faults.robot_by_itself(robot, q, sigma_px, (seed, stream))
@@ -123,10 +118,6 @@ def teach(config, frames, at=None, *more):
 
 def require_face(config, taught):
     teaching.require_face(config.face_numbers, taught)
-
-
-def comparison_of(config, calibration, plan):
-    return studies.comparison_of(given.report_inputs(config).extra, calibration, plan)
 
 
 def report_on(run, directory, **options):

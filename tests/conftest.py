@@ -5,7 +5,9 @@ import io
 import json
 import os
 import signal
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,10 +57,49 @@ def reference_truth(shared_data):
     return read
 
 
+@pytest.fixture(scope="session", autouse=True)
+def quick_disk():
+    """Nothing is forced onto the disk, which may take its time."""
+    from projservo_cli import files
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(files, "_synchronise", lambda path: None)
+        yield
+
+
 @pytest.fixture
 def rng():
     """Random numbers that are the same in every run."""
     return np.random.default_rng(20000626)
+
+
+@dataclass
+class Answer:
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        def refuse(constant: str) -> None:
+            raise AssertionError(f"{constant} is not strict JSON")
+
+        return json.loads(self.out, parse_constant=refuse)
+
+
+@pytest.fixture
+def projservo(capsys):
+    """Function that calls the command line in this process."""
+
+    def call(*arguments: Any) -> Answer:
+        from projservo_cli import cli
+
+        capsys.readouterr()
+        code = cli.run([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Answer(code, captured.out, captured.err)
+
+    return call
 
 
 @pytest.fixture(scope="session")

@@ -87,7 +87,7 @@ def markdown(docstring: str) -> list[str]:
     text = re.sub(r"``(.+?)``", lambda code: f"`{' '.join(code[1].split())}`", docstring, flags=re.DOTALL)
     text = re.sub(r"\n +(?=\S)", " ", text)  # what goes on in the next line
     text = re.sub(r"^(\w[\w ]*)\n-{3,}\n", r"\n**\1**\n\n", text, flags=re.MULTILINE)
-    text = re.sub(r"^(\w+(?:, \w+)*) : ", lambda name: f"- `{name[1]}`: ", text, flags=re.MULTILINE)
+    text = re.sub(r"^(\*?\w+(?:, \w+)*) : ", lambda name: f"- `{name[1]}`: ", text, flags=re.MULTILINE)
     text = re.sub(
         r"^(\w+(?:Error|Failed)|ImageModel|Observations) (?=\w)", r"- `\1`: ", text, flags=re.MULTILINE
     )

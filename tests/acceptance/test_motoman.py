@@ -78,20 +78,6 @@ def test_held_out_images_are_predicted(tables, fitted, lens, rms, median):
     assert fitted[lens].outlier.size == 0
 
 
-def test_the_lens_is_suspected_before_it_is_sought(fitted):
-    without, with_lens = fitted[False], fitted[True]
-    assert without.lens is None
-    assert "limited by lens" in without.reason
-    assert "limited by joint readings" in with_lens.reason
-    assert not any("lens" in text for text in with_lens.advice)
-    # What the score test promises is what the fit then gains, 31 % of the squares; the lens of the first
-    # is centred on what was seen, which costs two of them.
-    (promised,) = (text for text in without.advice if "try --lens" in text)
-    gained = 100.0 * (1.0 - (with_lens.sigma_fitted_px / without.sigma_fitted_px) ** 2)
-    assert gained == pytest.approx(31.0, abs=0.5)
-    assert "28 %" in promised
-
-
 def consecutive_angles(calibration):
     """Angles between consecutive axes, deg, through the gauge in which all operators are twists.
 
@@ -115,13 +101,6 @@ def consecutive_angles(calibration):
 @pytest.mark.parametrize("lens", [False, True])
 def test_axes_stand_as_the_maker_built_them(fitted, lens):
     assert consecutive_angles(fitted[lens]) == pytest.approx([90.0, 180.0, 90.0, 90.0, 90.0], abs=1.0)
-
-
-def test_thirty_poses_are_enough_from_every_start(tables):
-    values = [held_out(fit(few(tables[0], 8), seed), tables) for seed in (0, 1)]
-    assert values[0]["median_px"] <= 1.15
-    for name in ("rms_px", "median_px", "p95_px"):
-        assert values[1][name] == pytest.approx(values[0][name], abs=1e-3)
 
 
 @pytest.fixture(scope="module")

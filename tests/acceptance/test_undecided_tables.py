@@ -1,40 +1,11 @@
 """Tables as people have them, of which the data leave something open: said by its cause."""
 
-import json
-
 import numpy as np
 import pytest
 
-from projservo_cli import cli, store
-from tests.conftest import ROOT, SHARED
+from projservo_cli import store
+from tests.conftest import ROOT
 from tests.robots.robots import CALLS
-
-
-@pytest.fixture
-def case(tmp_path, monkeypatch):
-    """Function that gives the folder of a case by name; skips where it is absent."""
-    monkeypatch.chdir(tmp_path)
-
-    def folder(name):
-        path = SHARED.parent / "cases" / name
-        if not path.is_dir():
-            pytest.skip(f"case not found at {path}")
-        return path
-
-    return folder
-
-
-@pytest.fixture
-def answer(capsys):
-    """Exit code, JSON and messages of a call."""
-
-    def call(*arguments):
-        capsys.readouterr()
-        code = cli.run([str(argument) for argument in (*arguments, "--json")])
-        captured = capsys.readouterr()
-        return code, json.loads(captured.out) if captured.out else None, captured.err
-
-    return call
 
 
 def test_case_05_wrap_360(case, answer):

@@ -14,8 +14,6 @@ import pytest
 import projservo_cli as ps
 from projservo_cli import cli
 from projservo_cli.calibration import prediction_variance
-from projservo_cli.config.inputs import calibration_inputs
-from projservo_cli.keys import key_of
 from projservo_cli.records import Calibration, Observation, Trace
 from projservo_cli.store.tables import read_table, write_table
 from tests.configured import calibrate
@@ -70,33 +68,6 @@ def test_a_calibration_from_python_is_that_of_the_chain(name):
     alike(ps.calibrate(observations, lens=config.calibration.lens), chained, Calibration)
 
 
-def test_joint_noise_is_estimated_where_the_chain_estimates_it():
-    config = ps.Config.load("ur5").replace({"disturbance.backlash_deg": 0.1})
-    seen = ps.simulate(config)
-    assert seen.joint_noise is None
-    assert not seen.exact
-    # half of the play, evenly spread: 0.05/√3 deg rms at most, and never none
-    assert 0.005 < np.degrees(ps.calibrate(seen).sigma_q) < 0.05
-
-
-def test_joint_noise_that_readings_have_not_is_named(made):
-    with pytest.raises(ps.WorkFailed, match="px of noise and 5° rms of joint noise, expected"):
-        ps.calibrate(made[0], joint_noise_deg=5)
-
-
-def test_poses_have_noise_of_their_own_and_may_have_none(config, made):
-    q = made[0].q
-    first, second = ps.simulate(config, q), ps.simulate(config, q, seed=7)
-    exact = ps.simulate(config, q, noise_px=0.0)
-    assert not np.array_equal(first.images, made[0].images)
-    for seen in (first, second):
-        noise = (seen.images - exact.images)[np.isfinite(seen.images)]
-        assert noise.std() == pytest.approx(0.5, rel=0.1)  # 1,960 of them: 1.6 %
-    np.testing.assert_array_equal(ps.simulate(config, q, seed=7).images, second.images)
-    noises = [(seen.images - exact.images).ravel() for seen in (first, second)]
-    assert abs(np.corrcoef(noises)[0, 1]) < 0.1
-
-
 def test_a_score_is_that_of_validate(config, made, tmp_path, capsys):
     observations, calibration, _ = made
     held_out = ps.simulate(config, observations.q[:9] + 0.05)
@@ -135,29 +106,6 @@ def test_deviations_are_those_of_the_covariance(made):
     np.testing.assert_allclose(np.sqrt(((J @ C) * J).sum(axis=1)), sigma, rtol=1e-3)
 
 
-def test_what_is_behind_a_camera_has_no_pixels_and_no_derivative(made):
-    calibration = made[1]
-    turned = dataclasses.replace(calibration, P=calibration.P * np.array([1.0, -1.0])[:, None, None])
-    q = made[0].q[:3]
-    np.testing.assert_array_equal(turned.predict(q)[:, 0], calibration.predict(q)[:, 0])
-    np.testing.assert_array_equal(turned.jacobian(q)[:, 0], calibration.jacobian(q)[:, 0])
-    assert np.isnan(turned.predict(q)[:, 1]).all()
-    assert np.isnan(turned.jacobian(q)[:, 1]).all()
-
-
-@pytest.mark.parametrize("progress", [True, False])
-def test_a_bar_in_a_terminal_can_be_switched_off(config, monkeypatch, capsys, progress):
-    observations = ps.simulate(config)
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    ps.calibrate(observations, progress=progress)
-    assert ("calibration" in capsys.readouterr().err) == progress
-
-
-def test_no_poses_have_no_derivatives(made):
-    calibration, none = made[1], np.zeros((0, 6))
-    assert calibration.jacobian(none).shape == (*calibration.predict(none).shape, 6)
-
-
 def test_a_plan_takes_joints_pixels_and_what_was_taught(config, made, tmp_path):
     _, calibration, plan = made
     same = ps.plan(config, calibration, q_start=plan.q_start)
@@ -171,33 +119,6 @@ def test_a_plan_takes_joints_pixels_and_what_was_taught(config, made, tmp_path):
         np.testing.assert_array_equal(ps.plan(config, calibration, goal=goal).s, by_images.s)
     joints = calibration.q_reference + 0.05
     assert ps.plan(config, calibration, goal=joints).feasible
-
-
-@pytest.mark.parametrize(
-    ("changed", "what"),
-    [
-        (
-            lambda q, s: (q[:, [0, 1, 2, 3, 5, 4]], s),
-            r"rejects \d of the 9 poses in which several joints move",
-        ),
-        (
-            lambda q, s: (q, s + 12.0 * bumped(s, 20)),
-            "rejects nearly all of the first 20 poses in the right view",
-        ),
-    ],
-    ids=["exchanged joints", "a camera that was bumped"],
-)
-def test_what_agrees_in_parts_alone_is_not_usable(changed, what):
-    recorded = ps.simulate(ps.Config.load("ur5").replace({"calibration.random_poses": 10}))
-    with pytest.raises(ps.WorkFailed, match=what):
-        ps.calibrate(ps.Observations.from_arrays(*changed(recorded.q, recorded.images)))
-
-
-def bumped(images, count):
-    """Where v of the right view is, in the first poses."""
-    where = np.zeros_like(images)
-    where[:count, 1, :, 1] = 1.0
-    return where
 
 
 def test_a_run_has_the_start_and_goal_of_its_plan(config, made):
@@ -401,16 +322,6 @@ def test_a_law_of_a_notebook_is_never_up_to_date(config, tmp_path, monkeypatch):
     assert run.make("servo", laws=["__main__:Resolved"]).traces["__main__:Resolved"].steps > 1.5 * steps
 
 
-def test_what_was_finished_is_kept_where_a_stage_fails(config, tmp_path):
-    goal = {"roll_deg": None, "perturbation": None, "joints": {"joints": [9] * 6}}
-    far = config.replace({"task": {"goal": goal}})
-    run = ps.Experiment(far, tmp_path / "run")
-    with pytest.raises(ps.WorkFailed, match=r"plan: task.goal: joint 1 would be at 9 rad, beyond its limits"):
-        run.make("servo")
-    assert list(run.results) == ["calibrate"]
-    assert list(ps.load(tmp_path / "run").results) == ["calibrate"]
-
-
 def test_a_stored_run_starts_no_code_that_it_names(config, tmp_path):
     named = config.replace({"control.laws": [f"{__name__}:Resolved"]})
     ps.Experiment(named, tmp_path / "run").make("plan")
@@ -609,16 +520,6 @@ def test_what_is_masked_is_unseen(made):
     np.testing.assert_array_equal(metric.triangulate(masked(seen)), metric.triangulate(seen))
 
 
-def test_results_print_themselves_in_few_lines(config, made):
-    _, calibration, plan = made
-    study = ps.sweep(config, laws=["exact"], runs=2, grid={"noise.servo_px": [k / 10 for k in range(15)]})
-    trace = ps.servo(config, calibration, plan)
-    for one in (*made, trace, study, config, ps.Experiment(config)):
-        assert len(repr(one).splitlines()) <= 12
-        assert max(map(len, repr(one).splitlines())) <= 200
-        assert one._repr_html_().startswith("<table>")
-
-
 def test_labelled_arrays_are_the_group_of_the_run_file(config, made, tmp_path):
     xarray = pytest.importorskip("xarray")
     run = ps.Experiment(config, tmp_path / "run").make("servo")
@@ -659,29 +560,3 @@ def test_no_public_name_is_hidden_by_a_module():
         importlib.import_module(f"projservo_cli.{module.name}")
     assert {name: getattr(ps, name) for name in names} == before
     assert set(dir(ps)) >= set(names)
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "same"),
-    [
-        ("hobby", {"control.period_s": 0.1}, False),
-        ("hobby", {"control.joint_speed_limit_deg_s": 30.0}, False),
-        ("hobby", {"plant.speed_scale": 0.5}, True),
-        ("hobby", {"plant.timeout_s": 3.0}, True),
-        ("ur5", {"control.period_s": 0.02}, True),
-        ("ur5", {"plant.settle_s": 1.0}, True),
-        ("ur5", {"noise.calibration_px": 0.4}, False),
-    ],
-)
-def test_a_calibration_stands_where_nothing_changed_that_it_is_made_from(name, change, same):
-    before = ps.Config.load(name).replace(LATE if name == "hobby" else {})
-    after = before.replace(change)
-    assert (key_of(calibration_inputs(before)) == key_of(calibration_inputs(after))) is same
-
-
-@pytest.mark.parametrize("change", [{"control.period_s": 0.08}, {"plant.speed_scale": 0.5}])
-def test_what_is_in_no_key_changes_nothing_and_what_changes_something_is_in_one(change):
-    before = ps.Config.load("hobby").replace(FEW | LATE)
-    after = before.replace(change)
-    same = np.array_equal(ps.simulate(before).images, ps.simulate(after).images, equal_nan=True)
-    assert (key_of(calibration_inputs(before)) == key_of(calibration_inputs(after))) is same

@@ -1,8 +1,8 @@
 """Tables of tracked points with mistakes of every kind, and the truth of which sightings are wrong.
 
-A body is seen by two cameras at poses of an arm, or of a turntable; each point is seen at a few poses, as
-a tracker sees it. Whole tracks may belong to something else, single sightings may be wrong, and so may the
-joint readings of whole poses.
+A body is seen by two cameras at poses of an arm; each point is seen at a few poses, as a tracker sees it.
+Whole tracks may belong to something else, single sightings may be wrong, and so may the joint readings of
+whole poses.
 """
 
 import dataclasses
@@ -10,8 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from projservo_cli.calibration import predict
 from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation
-from tests.calibration.simulated_robot import IMAGE_SIZE, Robot, around, random_robot, revolute, rig
+from tests.calibration.simulated_robot import IMAGE_SIZE, Robot, around, random_robot, rig
 
 SIGMA = 0.5  # noise a coordinate, px
 # What may be wrong with a sighting, and how a mixture is made of it; 0 stands for nothing.
@@ -51,22 +52,6 @@ class Mistaken:
         return np.flatnonzero((self.kind == KINDS.index("readings")).any(axis=1))
 
 
-def arm(points, poses, joint_types, rng):
-    """A random robot with a body of so many points, and random poses of it."""
-    robot = random_robot(joint_types, rng, points)
-    return robot, around(robot, poses, rng)
-
-
-def turntable(points, poses, rng):
-    """A body on a table that turns once, the points on its side; and the poses."""
-    turn, height = rng.uniform(0.0, 2.0 * np.pi, points), rng.uniform(-0.15, 0.15, points)
-    radius = rng.uniform(0.06, 0.14, points)
-    body = np.stack([radius * np.sin(turn), height, -radius * np.cos(turn), np.ones(points)], axis=1)
-    axis = revolute([0.05, 1.0, -0.1], np.zeros(3))
-    robot = Robot("R", axis[None], rig(), body, np.zeros(1))
-    return robot, np.linspace(0.0, 2.0 * np.pi, poses, endpoint=False)[:, None]
-
-
 def table(
     mistake: str,
     seed: int,
@@ -81,12 +66,12 @@ def table(
 ) -> Mistaken:
     """A table with a share of its sightings wrong; of its poses for readings, half of it.
 
-    ``joint_types`` may be "turntable"; its tracks are of consecutive poses. Every sighting may ``slip`` a
-    little on the body, by so many px a coordinate, in both views alike: the epipolar geometry shows none.
+    Every sighting may ``slip`` a little on the body, by so many px a coordinate, in both views alike: the
+    epipolar geometry shows none.
     """
     rng = np.random.default_rng([seed, MISTAKES.index(mistake) + 1 if mistake != "right" else 0])
-    table_turns = joint_types == "turntable"
-    robot, q = turntable(points, poses, rng) if table_turns else arm(points, poses, joint_types, rng)
+    robot = random_robot(joint_types, rng, points)
+    q = around(robot, poses, rng)
     kinds = KINDS[1:] if mistake == "mixture" else () if mistake == "right" else (mistake,)
     part = share / max(len(kinds), 1)
     images = robot.images(q)
@@ -96,7 +81,7 @@ def table(
         tracks, left = np.split(left, [round(part * points)])
         images[:, :, tracks] = _elsewhere(name, len(q), len(tracks), rng)
         kind[:, tracks] = KINDS.index(name)
-    shown = _shown(images, robot.markers if table_turns else None, q, length, rng)
+    shown = _shown(images, length, rng)
     kind[~shown] = -1
     for name in (name for name in kinds if name.startswith("drift")):
         left = _drift(robot, q, images, kind, left, (name, part), rng)
@@ -136,18 +121,10 @@ def _elsewhere(name, poses, count, rng):
     return m[..., :2] / m[..., 2:]
 
 
-def _shown(images, side, q, length, rng):
-    """Which points (K, m) are seen at which poses: a few that lie in both images, or consecutive ones.
-
-    Points at the side of a turning body (m, 4) are seen while they face the cameras.
-    """
+def _shown(images, length, rng):
+    """Which points (K, m) are seen at which poses: a few that lie in both images."""
     inside = ((images >= 0.0) & (images <= np.array(IMAGE_SIZE) - 1.0)).all(axis=(1, 3))
-    if side is None:
-        rank = np.where(inside, rng.random(inside.shape), np.inf)
-    else:
-        turn = np.arctan2(side[:, 0], -side[:, 2])
-        away = np.abs(np.angle(np.exp(1j * (turn - q + rng.uniform(-0.3, 0.3, len(turn))))))
-        rank = np.where(inside, away, np.inf)
+    rank = np.where(inside, rng.random(inside.shape), np.inf)
     return inside & (np.argsort(np.argsort(rank, axis=0), axis=0) < length)
 
 
@@ -214,3 +191,33 @@ def _misread(q, wrong, rng):
         else:
             read[row] = q[rng.choice(np.delete(np.arange(len(q)), k))]
     return read
+
+
+def left_out(mistaken, calibration):
+    """Sightings (K, m) of which a view was left out, or whose pose or marker was."""
+    out = np.zeros(mistaken.kind.shape, dtype=bool)
+    out[calibration.outlier[:, 0], calibration.outlier[:, 1]] = True
+    for pose, *numbers in calibration.id_switches:
+        out[pose, numbers[0]] = True
+        # An exchange of two shows in both and is told once.
+        out[pose, numbers[1]] |= mistaken.kind[pose, numbers[1]] == 1
+    out[calibration.suspect[:, 0]] = True
+    out[calibration.rejected_poses] = True
+    gone = np.setdiff1d(mistaken.observation.marker, calibration.marker)
+    out[:, gone] = True
+    return out & (mistaken.kind >= 0)
+
+
+def shares_left_out(mistaken, calibration):
+    """Shares of the wrong sightings off by more than 4 σ and of the right ones, as counted."""
+    out = left_out(mistaken, calibration)[:, mistaken.counted]
+    kind, off = mistaken.kind[:, mistaken.counted], mistaken.off[:, mistaken.counted]
+    wrong, right = (kind > 0) & (off > 4.0 * SIGMA), kind == 0
+    return out[wrong].mean() if wrong.any() else np.nan, out[right].mean()
+
+
+def median_error(mistaken, calibration, markers):
+    """Median error of held-out images of markers, px."""
+    truth = mistaken.robot.images(mistaken.ahead)[:, :, markers]
+    images = predict(calibration, mistaken.ahead)[:, :, np.searchsorted(calibration.marker, markers)]
+    return float(np.nanmedian(np.linalg.norm(images - truth, axis=3)))

@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import predict
 from projservo_cli.config import load_config
 from projservo_cli.stages import calibrate as calibrating
-from projservo_cli.store.tables import write_table
 from tests.configured import calibrate as stage
 from tests.configured import truth_of
 
@@ -58,21 +56,3 @@ def test_a_simulated_run_with_garbage_for_truth_is_the_same(monkeypatch, method,
     assert np.nanmedian(np.abs(images - observation.images[0])) > 100.0
     monkeypatch.setattr(calibrating, "observed", lambda *asked, progress: (observation, noise))
     same(stage.run(config)[1], calibration)
-
-
-@pytest.fixture(scope="module")
-def table(honest, tmp_path_factory):
-    path = tmp_path_factory.mktemp("table") / "trials.csv"
-    write_table(honest[0], path)
-    return path
-
-
-def test_a_recorded_run_needs_neither_robot_nor_rig(honest, table, tmp_path):
-    bare = tmp_path / "bare.yaml"
-    bare.write_text(f"name: bare\nseed: 5\ndata: {{table: {table}}}\n", encoding="utf-8")
-    observation, calibration, _ = stage.run(load_config(bare, ()))
-    np.testing.assert_array_equal(observation.images, honest[0].images)
-    # Another seed, another guess of the image centre, σ estimated: the same optimum. The search ends
-    # when a step moves the images by 1e-7 of the residual, 1e-7 · 0.5 px · √2000 over all images.
-    assert np.abs(predict(calibration, observation.q) - predict(honest[1], observation.q)).max() <= 1e-6
-    assert calibration.sigma_px != honest[1].sigma_px

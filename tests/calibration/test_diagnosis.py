@@ -46,15 +46,6 @@ def test_a_joint_of_the_wrong_type(types, joint, motions):
     )
 
 
-def test_a_joint_of_the_wrong_type_whose_fit_passes():
-    """The innermost slide, taken for a turn about a far axis, leaves less than is refused for its size."""
-    robot = robot_of("RPRP")
-    message = refusal(seen(robot, poses(robot, "all at once")), "RPRR")
-    assert message.startswith(
-        "by the images joint 4 is prismatic, not revolute: check the types of joints (RPRP would fit)"
-    )
-
-
 @pytest.mark.parametrize(("types", "joint", "motions"), [("RRRRRR", 3, "trials"), ("RPRP", 1, "all at once")])
 def test_a_joint_that_stands_still_while_its_readings_move(types, joint, motions):
     robot = robot_of(types)

@@ -4,10 +4,16 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration.detections import Detections
-from projservo_cli.calibration.epipolar import Epipolar
+from projservo_cli.calibration.epipolar import (
+    Epipolar,
+    ImageFrame,
+    log_distances,
+    marker_pairs,
+    metric_guesses,
+)
 from projservo_cli.geometry.stereo import fundamental_matrix
 from projservo_cli.records import Observation, WorkFailed
-from tests.calibration.simulated_robot import rig
+from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, rig
 
 
 def sightings(count, sigma, rng):
@@ -62,3 +68,20 @@ def test_too_few_and_flat_sightings_are_refused():
     again = left + 0.3 * np.random.default_rng(6).standard_normal(left.shape)
     with pytest.raises(WorkFailed, match="without a baseline"):
         geometry(left, again, 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_first_guess_is_a_rigid_body_before_cameras_of_the_true_focal_length(seed):
+    """Of exact images of a body at random poses, whose principal points are the middles of the images."""
+    rng = np.random.default_rng(seed)
+    robot = random_robot("RRR", rng, markers=8)
+    seen = Detections.of(robot.observe(around(robot, 12, rng), 0.0, rng), robot.joint_types)
+    frame = ImageFrame.of(seen, IMAGE_SIZE)
+    (P, points), *_ = metric_guesses(Epipolar.of(seen, rng), seen, frame, 1.0)
+    deviation, twice = log_distances(points, marker_pairs(seen.pose_of[seen.both], seen.marker_of[seen.both]))
+    assert twice.all()
+    assert deviation.max() < 1e-3
+    M = np.c_[points, np.ones(len(points))]
+    assert (M @ P[:, 2].T > 0.0).all()
+    assert np.median(M @ P[0, 2]) == pytest.approx(1.0, rel=1e-6)
+    assert P[0, 0, 0] / P[0, 2, 2] == pytest.approx(1200.0, rel=1e-2)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from projservo_cli.calibration import calibrate, chi2_band, cross_validate, predict, prediction_variance
-from projservo_cli.calibration.joint_noise import tick_noise
+from projservo_cli.calibration import calibrate, chi2_band, predict, prediction_variance
 from tests.calibration.bound import derivative, images, parameters, spread
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -91,56 +90,9 @@ def test_the_fit_is_that_of_least_squares_over_robot_and_joints_at_once():
     assert variance.ravel() == pytest.approx((T**2).sum(axis=1), rel=0.1)
 
 
-def test_exact_readings_and_loud_pixels_show_no_noise_of_joints():
-    _robot, _q, seen = recorded(5, exact)
-    plain, asked = (calibrate(seen, TYPES, source="recorded", joint_noise=given) for given in (0.0, None))
-    assert (plain.sigma_q, asked.sigma_q) == (None, 0.0)
-    assert asked.sigma_q_interval[0] == 0.0 < asked.sigma_q_interval[1] < SIGMA_Q
-    for name in ("P", "H_hat_0", "M", "sqrt_cov_shared", "sqrt_cov_own"):
-        np.testing.assert_array_equal(getattr(asked, name), getattr(plain, name))
-    quiet = calibrate(seen, TYPES, source="recorded", sigma_px=0.7 * SIGMA, joint_noise=None)
-    assert quiet.sigma_q == 0.0
-    assert "more than pixel noise is left" in quiet.reason
-    assert quiet.model_px == pytest.approx(SIGMA * np.sqrt(1.0 - 0.49), rel=0.1)
-
-
 def test_a_wrong_reading_is_found_among_small_errors_and_these_are_not_suspected():
     _robot, _q, seen = recorded(6, normal)
     seen.q[20, 2] += 0.05
     found = calibrate(seen, TYPES, source="recorded", joint_noise=None)
     assert found.suspect.tolist() == [[seen.pose[20], 3]]
     assert found.sigma_q == pytest.approx(SIGMA_Q, rel=0.35)
-
-
-def test_ticks_are_counted():
-    tick = 2.0 * np.pi / 4096
-    _robot, q, seen = recorded(7, lambda q, rng: np.round(q / (tick * UNIT)) * (tick * UNIT) - q)
-    assert tick_noise(seen.q, np.array([False, True, False, False])) == pytest.approx(tick / np.sqrt(12.0))
-    found = calibrate(seen, TYPES, source="recorded", joint_noise=None)
-    assert found.sigma_q == pytest.approx(tick / np.sqrt(12.0))
-    assert "ticks" in found.reason
-    assert tick_noise(q, np.zeros(4, dtype=bool)) == 0.0
-
-
-def test_poses_held_out_err_as_predicted():
-    _, _, seen = recorded(8, normal)
-    held_out = []
-    calibrate(
-        seen,
-        TYPES,
-        source="recorded",
-        joint_noise=None,
-        fitted=lambda *fit: held_out.append(cross_validate(*fit, folds=4, seed=0)),
-    )
-    assert held_out[0].rms_px == pytest.approx(held_out[0].predicted_rms_px, rel=0.15)
-    assert held_out[0].predicted_rms_px > 1.3 * np.sqrt(2.0) * SIGMA
-
-
-def test_what_a_robot_of_one_joint_leaves_open_does_no_harm():
-    rng = np.random.default_rng(1)
-    robot = random_robot("R", rng, 6)
-    seen = robot.observe(trials(robot, frames=16), SIGMA, rng)
-    assert calibrate(seen, "R", source="recorded", joint_noise=None).sigma_q == 0.0
-    seen.q[:] += SIGMA_Q * rng.standard_normal(seen.q.shape)
-    low, high = calibrate(seen, "R", source="recorded", joint_noise=None).sigma_q_interval
-    assert 0.0 < low < SIGMA_Q < high

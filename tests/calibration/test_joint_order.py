@@ -48,25 +48,6 @@ def test_single_joint_trials_show_no_order_and_combined_poses_all_of_it(types):
     assert len(undecided(Observations.of(exchanged, joint_types=types[::-1]))[0]) == len(pairs(types))
 
 
-def test_pairs_that_moved_together_are_decided_and_the_others_named():
-    robot = random_robot("RRRR", np.random.default_rng(4), markers=8)
-    two = np.tile(robot.q_reference, (4, 1))
-    two[:, [0, 2]] += np.radians([[20, 15], [-20, 15], [15, -25], [-10, -20]])
-    found, _ = undecided(seen(robot, np.vstack([trials(robot, 8), two])))
-    assert found == [[1, 2], [1, 4], [2, 3], [2, 4], [3, 4]]
-    two[:, 3] += np.radians([30, -20, 10, 25])
-    found, _ = undecided(seen(robot, np.vstack([trials(robot, 8), two])))
-    assert found == [[1, 2], [2, 3], [2, 4]]
-
-
-def test_a_hardly_combined_pose_decides_nothing():
-    """Joints at rest jitter by less than would move the images."""
-    robot = random_robot("RRRR", np.random.default_rng(4), markers=8)
-    q = trials(robot, 8)
-    jitter = np.random.default_rng(1).normal(0.0, 1e-5, q.shape)
-    assert undecided(seen(robot, q + jitter))[0] == pairs("RRRR")
-
-
 def test_a_stated_order_and_that_of_a_simulation_need_no_poses():
     robot = random_robot("RRR", np.random.default_rng(4), markers=8)
     observations = seen(robot, trials(robot, 8))

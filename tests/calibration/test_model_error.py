@@ -86,24 +86,6 @@ def test_a_sound_arm_is_not_blamed(types):
         assert "limited by noise" in found.reason
 
 
-def test_near_identical_frames_count_once():
-    """Ten frames of a posture with the same errors of detection tell no more than one."""
-    robot = random_robot(TYPES, np.random.default_rng(5))
-    once = table(robot, still, 0, 0.0, 5)
-    images = np.repeat(once.images, 10, axis=0)
-    images = images + 0.02 * np.random.default_rng(6).standard_normal(images.shape)
-    again = dataclasses.replace(once, pose=np.arange(10 * K), q=np.repeat(once.q, 10, axis=0), images=images)
-    one, ten = (calibrate(seen, TYPES, source="recorded", joint_noise=None) for seen in (once, again))
-    # The variance by 50 postures is known to a quarter.
-    assert ten.predicted_rms_px == pytest.approx(one.predicted_rms_px, rel=0.35)
-
-
-def test_a_refused_fit_names_the_deviation():
-    robot = random_robot(TYPES, np.random.default_rng(0))
-    with pytest.raises(WorkFailed, match=r"joint 2 turns 5 %.* less than it reads"):
-        calibrate(table(robot, gear, 1, -0.05, 0), TYPES, source="recorded")
-
-
 def test_a_large_effect_is_not_usable_until_it_is_accepted():
     robot = random_robot(TYPES, np.random.default_rng(7))
     seen = table(robot, gear, 2, -0.02, 7)
@@ -131,33 +113,6 @@ def test_every_kind_has_words_and_a_code():
         )
         assert any(unit in sentence for unit in ("%", "°", "px", "mm"))
     assert "mm" in describe(ModelError("joint_step", (2,), "", 0.02, 0.001, 0.5, 3), prismatic)[1]
-
-
-def test_a_tag_that_slips_amid_the_recording_is_named_with_its_pose():
-    """Each corner stays at the place that most of its images show; some of them are off at the end."""
-    robot = random_robot(TYPES, np.random.default_rng(8), markers=12)
-    seen = dataclasses.replace(table(robot, still, 0, 0.0, 8), marker=np.arange(12))
-    moved_robot = dataclasses.replace(robot, markers=robot.markers + np.array([0.005, 0.0, 0.003, 0.0]))
-    images = seen.images.copy()
-    images[K // 2 :, :, 4:8] += (moved_robot.images(seen.q) - robot.images(seen.q))[K // 2 :, :, 4:8]
-    found = calibrate(dataclasses.replace(seen, images=images), TYPES, source="recorded", joint_noise=None)
-    assert [one.kind for one in found.model_errors] == ["tool"]
-    assert found.model_errors[0].first == pytest.approx(seen.pose[K // 2], abs=4)
-    assert "the markers moved on the tool at pose" in found.advice[0]
-
-
-def test_deviations_that_images_hardly_tell_apart_are_all_named():
-    """Of a step as small as noise the true joint is named, first or beside what explains images as well."""
-    others = 0
-    for seed in range(6):
-        robot = random_robot(TYPES, np.random.default_rng(seed))
-        seen = table(robot, stepped, seed % len(TYPES), 0.0006, seed)
-        errors = calibrate(seen, TYPES, source="recorded", joint_noise=None).model_errors
-        for first in errors[:1]:
-            named = [code.split("|")[1] for code in first.code.split("/")]
-            assert str(seed % len(TYPES) + 1) in named
-            others += len(first.others)
-    assert others
 
 
 @pytest.mark.parametrize(("moved", "at"), [((0, 1), 22), ((1,), 30)])

@@ -7,7 +7,6 @@ import pytest
 
 from projservo_cli import Observations, calibrate
 from projservo_cli.calibration import residual_statistics
-from projservo_cli.calibration.checks.screening import screened, without_placeholders
 from projservo_cli.records import Observation
 from projservo_cli.report.report_data import findings
 from tests.calibration.simulated_robot import around, random_robot, trials
@@ -57,33 +56,6 @@ def test_a_placeholder_counts_as_an_empty_cell(u, v, words):
     assert f"in {GAPS.any(axis=1).sum()} rows of several markers and poses" in found.advice[-1]
 
 
-def test_placeholders_of_one_marker_or_of_several_kinds_and_those_of_held_out_images():
-    one = GAPS & (np.arange(8) == 3)
-    images = filled(-1.0, -1.0)
-    images[one] = 9999.0
-    emptied, (line,) = without_placeholders(images)
-    np.testing.assert_array_equal(np.isnan(emptied[..., 0]), GAPS)
-    assert "u = -1, v = -1 stands" in line
-    assert "u = 9999, v = 9999 stands" in line
-    calibration = calibrated(EMPTY)
-    score, expected = (
-        residual_statistics(calibration, one) for one in (dataclasses.replace(SEEN, images=images), EMPTY)
-    )
-    assert score.pop("advice") == [line]
-    assert expected.pop("advice") == []
-    assert score == expected
-
-
-@pytest.mark.parametrize("step", [1e-9, 0.5, 1.0, 4.0])
-def test_images_on_a_grid_hold_no_placeholders(step):
-    images = step * np.rint(ROBOT.observe(Q, 0.5, np.random.default_rng(7)).images / step)
-    still = images.copy()
-    still[:, :, 2] = [[100.0, 2000.0], [50.0, 2100.0]]  # a marker that stands still is rejected as such
-    copies = np.concatenate([images, images, images, images])  # as are near-identical frames
-    for each in (images, still, copies):
-        assert without_placeholders(each)[0] is each
-
-
 def test_poses_that_no_camera_saw_change_nothing_but_the_advice():
     q = np.insert(SEEN.q, [0, 9], [[9.0, -8.0, 7.0], [2.0, 2.0, -9.0]], axis=0)
     images = np.insert(EMPTY.images, [0, 9], np.nan, axis=0)
@@ -116,19 +88,3 @@ def test_readings_on_a_circle_are_cut_at_the_widest_gap(low):
     ]
     assert max(score["rms_px"] for score in scores) == pytest.approx(scores[0]["rms_px"], rel=1e-6)
     assert scores[0]["rms_px"] < 1.0
-
-
-@pytest.mark.parametrize("kind", ["P", "R"])
-def test_readings_that_turned_that_far_stay(kind):
-    rng = np.random.default_rng(4)
-    columns = {
-        "even": np.linspace(-170.0, 170.0, 20),
-        "random": rng.uniform(-170.0, 170.0, 20),
-        "two turns": rng.uniform(-360.0, 360.0, 20),
-        "two postures": np.r_[rng.normal(-100.0, 5.0, 10), rng.normal(100.0, 5.0, 10)],
-        "half a turn to each side": np.r_[-180.0, np.zeros(18), 180.0],
-    }
-    columns |= {"a slide": np.r_[np.full(10, 1.0), np.full(10, 359.0)]} if kind == "P" else {}
-    q = np.radians(np.stack([*columns.values()], axis=1))
-    seen = Observation(np.arange(20), np.arange(3), q, np.random.default_rng(0).random((20, 2, 3, 2)))
-    assert screened(seen, kind * q.shape[1]).circular.size == 0

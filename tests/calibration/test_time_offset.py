@@ -94,33 +94,6 @@ def test_delay_of_each_view_is_within_5_ms_and_its_interval(known, late, free, s
     assert found.time_offset_jitter_s == pytest.approx(deviation, abs=2.5e-3)
 
 
-def test_ticks_wrong_frames_and_lost_markers_do_no_harm(known):
-    robot, calibration = known
-    rng = np.random.default_rng(3)
-    seen, truth = on_the_way(robot, Cameras(0.1, None, 0.0, rng), rng, tick=2.0 * np.pi / 4096)
-    wrong = rng.choice(len(seen.q), len(seen.q) // 20, replace=False)
-    seen.images[wrong] = seen.images[rng.permutation(wrong)] + 30.0
-    seen.images[rng.random(seen.images.shape[:3]) < 0.3] = np.nan
-    found = with_time_offset(dataclasses.replace(calibration, sigma_q=4.4e-4), seen)
-    assert found.time_offset_s == pytest.approx(truth, abs=2e-3)
-
-
-def test_deviations_count_times_their_factor(known):
-    robot, calibration = known
-    rng = np.random.default_rng(5)
-    seen, _ = on_the_way(robot, Cameras(0.1, None, 5e-3, rng), rng)
-    right = dataclasses.replace(seen, sigma=np.full(seen.images.shape[:3], calibration.sigma_px))
-    third = dataclasses.replace(right, sigma=right.sigma / 3.0)
-    told, found = (
-        with_time_offset(calibration, right),
-        with_time_offset(dataclasses.replace(calibration, sigma_scale=3.0), third),
-    )
-    assert found.time_offset_interval_s == pytest.approx(told.time_offset_interval_s, rel=1e-9)
-    assert with_time_offset(calibration, third).time_offset_interval_s != pytest.approx(
-        told.time_offset_interval_s, rel=1e-6
-    )
-
-
 def test_without_frames_that_tell_it_there_is_no_delay(known):
     robot, calibration = known
     rng = np.random.default_rng(4)

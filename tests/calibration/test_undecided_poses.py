@@ -25,15 +25,6 @@ def test_as_few_numbers_as_the_joints_have_are_refused(types, count, enough):
     calibrate(seen(types, enough + 2), types, source="recorded")
 
 
-def test_joints_in_a_row_need_as_many_postures():
-    robot = random_robot("RRRRR", np.random.default_rng(3), markers=10)
-    q = around(robot, 24, np.random.default_rng(3))
-    q[:, 3:] = q[np.arange(24) % 2, 3:]
-    observation = robot.observe(q, 0.5, np.random.default_rng(3))
-    with pytest.raises(WorkFailed, match=r"^2 postures of joints 4 to 5 show 6 numbers .* record 3 or more"):
-        calibrate(observation, "RRRRR", source="recorded")
-
-
 def test_one_trial_of_each_joint_is_enough():
     for types in ("RP", "RRR", "RRRRRR"):
         robot = random_robot(types, np.random.default_rng(3), markers=10)

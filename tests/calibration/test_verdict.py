@@ -70,41 +70,6 @@ def test_what_limits_is_said(robot, weak):
     assert "limited by noise" in calibrated(robot, trials(robot, 6)).reason
 
 
-def test_a_joint_that_never_moves_apart_is_limited_by_geometry():
-    robot = random_robot("RRR", np.random.default_rng(3), markers=6)
-    q = trials(robot, 6)
-    # The second joint follows the first, but for a trace; the third not at all apart from it.
-    q[:, 1] = robot.q_reference[1] + q[:, 0] - robot.q_reference[0]
-    q[3, 1] += 0.002
-    q = q[:9]
-    q[6:, 2] = robot.q_reference[2] + [0.3, 0.4, 0.5]
-    found = calibrated(robot, q)
-    assert "limited by geometry" in found.reason
-    told = "hardly apart from the other joints: move (it|each) alone, by"
-    assert any(re.search(told, text) for text in found.advice)
-
-
-def test_many_outliers_limit():
-    robot = random_robot("RRR", np.random.default_rng(3), markers=6)
-    q = trials(robot, 8)
-    rng = np.random.default_rng(8)
-    found = robot.observe(q, SIGMA, rng)
-    hit = rng.random(found.images.shape[:3]) < 0.05
-    found.images[hit] += rng.uniform(20.0, 60.0, (int(hit.sum()), 2))
-    assert "limited by outliers" in calibrate(found, "RRR", source="recorded").reason
-
-
-def test_what_is_wrong_once_is_told_of_one():
-    robot = random_robot("RRR", np.random.default_rng(3), markers=6)
-    q = trials(robot, 8)
-    found = robot.observe(q, SIGMA, np.random.default_rng(2))
-    found.images[5, 0, 2] += 40.0
-    found.q[11, 0] += 0.1
-    told = " ".join(calibrate(found, "RRR", source="recorded").advice)
-    assert "1 observation was rejected as an outlier: " in told
-    assert "1 joint reading disagrees with the images: " in told
-
-
 @pytest.mark.parametrize(
     ("span", "prismatic", "needed", "text"),
     [
@@ -124,35 +89,6 @@ def test_advice_in_words(span, prismatic, needed, text):
     spans[3], ranges[3] = span, needed
     which = np.array([3])
     assert describe_joints(which, spans, np.array([False] * 3 + [prismatic]), ranges) == (text,)
-
-
-def test_joints_alike_share_a_line():
-    span, needed = np.array([0.1, 2.0, 0.2, 0.1, 0.3]), np.full(5, np.radians(50.0))
-    weak, revolute = np.array([1, 2, 3, 4]), np.zeros(5, dtype=bool)
-    apart, little = describe_joints(weak, span, revolute, needed)
-    assert apart == "joint 2 moved 115° but hardly apart from the other joints: move it alone, by 50° or more"
-    assert (
-        little == "joints 3, 4 and 5 moved only 11.5°, 5.73° and 17.2°: move each at least 50°, 50° and 50°"
-    )
-
-
-@pytest.mark.parametrize("needed", [np.nan, 0.2, 2.0])
-def test_a_single_joint_asks_for_no_other(needed):
-    (text,) = describe_joints(np.array([0]), np.array([1.0]), np.array([False]), np.array([needed]))
-    assert text.startswith("joint 1 moved")
-    assert "alone" not in text
-    assert "other joints" not in text
-    assert "every joint" not in text
-
-
-def test_a_joint_that_moved_alone_is_not_told_to():
-    needed, alike = np.array([0.03, 0.03]), np.array([False, False])
-    told = describe_joints(np.arange(2), np.ones(2), alike, needed, np.array([0.9, 0.01]))
-    assert told == (
-        "joint 2 moved 57.3° but hardly apart from the other joints: move it alone, by 1.72° or more",
-        "joint 1 moved 57.3°, in too few poses: record further ones in which it moves alone, by 1.72° or "
-        "more",
-    )
 
 
 def test_joints_that_are_off_are_told_in_px_and_no_joint_is_to_move_for_them():

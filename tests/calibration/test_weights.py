@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.calibration import calibrate, cross_validate, predict, prediction_variance
 from projservo_cli.calibration.detections import Detections
-from projservo_cli.calibration.epipolar import Core, Epipolar
+from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.store.tables import read_table, write_table
 from tests.calibration.bound import Bound
@@ -60,25 +60,6 @@ def test_the_bound_is_reached_and_chi2_is_one(draws):
         assert np.sqrt(np.nanmean(each**2)) == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_reading_far_off_by_its_own_deviation_is_an_outlier(draws):
-    robot, _, _, seen = draws
-    observation = seen[0]
-    images, (k, v, j) = observation.images.copy(), np.argwhere(observation.sigma == SHARP)[40]
-    images[k, v, j] += 1.5  # half of what the blurred ones are off
-    found = calibrate(dataclasses.replace(observation, images=images), robot.joint_types)
-    assert found.outlier.tolist() == [[observation.pose[k], observation.marker[j], v]]
-
-
-def test_one_deviation_for_all_changes_nothing(draws):
-    robot, q, _, _ = draws
-    plain = robot.observe(q, 0.5, np.random.default_rng(3))
-    alike = dataclasses.replace(plain, sigma=np.full(plain.images.shape[:3], 0.5))
-    known, told = (calibrate(o, robot.joint_types, sigma_px=0.5) for o in (plain, alike))
-    for field in dataclasses.fields(known):
-        if field.name != "seconds":
-            np.testing.assert_array_equal(getattr(known, field.name), getattr(told, field.name))
-
-
 def test_tables_keep_deviations_to_the_bit_and_refuse_what_is_none(draws, tmp_path):
     observation, path = draws[3][0], tmp_path / "table.csv"
     images = observation.images.copy()
@@ -124,16 +105,6 @@ def test_a_common_factor_of_stated_deviations_is_found_and_changes_no_verdict(pl
     np.testing.assert_allclose(predict(found, held_out), predict(right, held_out), atol=1e-5)
 
 
-def test_a_factor_of_one_is_one(plenty):
-    robot, _, observation, found = plenty
-    assert found.sigma_scale == 1.0
-    assert "times" not in found.reason
-    assert found.sigma_px == pytest.approx(np.sqrt(np.mean(observation.sigma**2)), rel=1e-12)
-    given = calibrate(observation, robot.joint_types, source="recorded", sigma_px=0.9)
-    assert given.sigma_scale is given.sigma_scale_interval is None
-    assert calibrate(observation, robot.joint_types).sigma_scale is None
-
-
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_deviations_that_are_wrong_are_told_before_anything_is_accused(plenty, factor):
     robot, _, observation, _ = plenty
@@ -159,27 +130,3 @@ def test_the_factor_is_right_where_a_third_of_the_sightings_are_wrong(plenty):
         scales.append(core.sigma_px / readings.stated_px)
         assert core.interval[0] < core.sigma_px < core.interval[1]
     assert np.mean(scales) == pytest.approx(1.0, abs=0.12)
-
-
-def test_the_interval_of_the_factor_holds_it_as_often_as_it_says():
-    rng = np.random.default_rng(11)
-    poses = np.repeat(np.arange(30), 20)
-    held = [low < 0.5 < high for low, high in (Core.of(0.5 * rng.standard_normal(600), poses).interval
-            for _ in range(400))]  # fmt: skip
-    assert np.mean(held) == pytest.approx(0.95, abs=0.04)
-
-
-def test_a_wrong_joint_type_is_not_taken_for_noise_of_pixels(plenty):
-    _, _, observation, _ = plenty
-    with pytest.raises(WorkFailed, match="joint"):
-        calibrate(misstated(observation, 0.5), "RRR", source="recorded")
-
-
-def test_noise_of_joints_is_not_taken_for_noise_of_pixels(plenty):
-    robot, _, observation, _ = plenty
-    q = observation.q + np.random.default_rng(0).normal(0.0, 0.005, observation.q.shape) * [1.0, 0.3, 1.0]
-    wrong = misstated(dataclasses.replace(observation, q=q), 0.5)
-    found = calibrate(wrong, robot.joint_types, source="recorded", joint_noise=None)
-    assert found.sigma_scale == pytest.approx(2.0, rel=0.15)
-    assert found.sigma_q_interval[0] < 0.005 < found.sigma_q_interval[1]
-    assert found.chi2_per_dof == pytest.approx(1.0, abs=0.3)

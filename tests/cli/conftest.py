@@ -1,6 +1,5 @@
 """The command line called in this process, with stages that only pretend to work."""
 
-import json
 import shutil
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from projservo_cli import calibration, cli, files, steps
+from projservo_cli import calibration, cli, steps
 from projservo_cli.laws import law_and_mode
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
 from projservo_cli.stages import calibrate, plan, report, servo
@@ -97,20 +96,6 @@ class Stages:
         return fake(Report, 9, figures=("figures/fig_1.svg",), claims=claims, omitted=(left_out,))
 
 
-@dataclass
-class Answer:
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:
-        def refuse(constant: str) -> None:
-            raise AssertionError(f"{constant} is not strict JSON")
-
-        return json.loads(self.out, parse_constant=refuse)
-
-
 def pretend(patch, folder):
     """Pretended stages, in a folder with a configuration and a table."""
     pretended = Stages()
@@ -119,7 +104,6 @@ def pretend(patch, folder):
     patch.setattr(servo, "run", lambda *given, **brought: pretended.servo(*given))
     patch.setattr(report, "run", lambda *given, **named: pretended.report(*given, **named))
     patch.setattr(steps, "missing", lambda run: pretended.gone)
-    patch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
     patch.chdir(folder)
     (folder / "tiny.yaml").write_text(CONFIGURATION, encoding="utf-8")
     (folder / "t.csv").write_text(TABLE, encoding="utf-8")
@@ -163,19 +147,6 @@ def statistics(monkeypatch):
     }
     monkeypatch.setattr(calibration, "residual_statistics", lambda *_: value)
     return value
-
-
-@pytest.fixture
-def projservo(capsys):
-    """Function that calls the command line in this process."""
-
-    def call(*arguments: Any) -> Answer:
-        capsys.readouterr()
-        code = cli.run([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return Answer(code, captured.out, captured.err)
-
-    return call
 
 
 @pytest.fixture

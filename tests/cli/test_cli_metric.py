@@ -1,26 +1,19 @@
 """Files in metres, read by other people's code, and positions against a table: from the command line."""
 
-import dataclasses
 import json
 import subprocess
 import sys
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
 
 from projservo_cli import store
-from projservo_cli.calibration import calibrate
 from projservo_cli.cli import run
-from projservo_cli.metric.kinematic_errors import kinematic_errors
 from projservo_cli.metric.opencv import opencv_cameras
-from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.records import InputError
 from projservo_cli.results import ImageModel
-from projservo_cli.simulation.urdf import urdf_chain
-from projservo_cli.store.tables import read_table
 
 KNOWN = ["--metric", "0.2492990172463582", "--between", "2,8"]
 
@@ -94,63 +87,6 @@ def test_mujoco_reads_the_arm_and_predicts_the_same_pixels(ur5, metric, tmp_path
     np.testing.assert_allclose(camera.xmat.reshape(3, 3), metric.poses[0, :3, :3], atol=1e-12)
 
 
-def test_yourdfpy_reads_the_arm_and_predicts_the_same_pixels(ur5, metric, tmp_path):
-    yourdfpy = pytest.importorskip("yourdfpy")
-    robot = yourdfpy.URDF.load(str(export(ur5, tmp_path, "urdf")))
-    for q in Q:
-        robot.update_cfg(q)
-        tool = robot.get_transform("tool", "base_link")
-        np.testing.assert_allclose(pixels_at(metric, tool), pixels_at(metric, metric.pose(q)), atol=1e-6)
-    assert robot.joint_map["joint_2"].limit.lower == pytest.approx(metric.range[1, 0])
-
-
-def test_the_own_reader_finds_the_same_axes(ur5, metric, tmp_path):
-    file = export(ur5, tmp_path, "urdf")
-    axes = urdf_chain(str(file), "tool", file.read_bytes()).axes
-    np.testing.assert_allclose(axes, metric.axes, atol=1e-12)
-
-
-def test_limits_of_the_configuration_are_those_of_the_urdf(tmp_path, capsys):
-    """A prismatic joint among them, whose readings set the scale; without limits, those of the trials."""
-    table, out = tmp_path / "trials.csv", tmp_path / "out"
-    stanford = str(Path(__file__).parents[2] / "configs" / "stanford.yaml")
-    assert run(["record", "-c", stanford, "--output", str(table)]) == 0
-    config = ["-c", stanford, "--data", str(table)]
-    for name, more in (("known", config), ("unknown", ["--data", str(table), "--joints", "RRPRRR"])):
-        assert run(["calibrate", *more, "-o", str(tmp_path / name)]) == 0
-        capsys.readouterr()
-        assert run(["export", str(tmp_path / name), "--to", "urdf", "-o", str(out), "--force"]) == 0
-        assert ("readings of the trial motions" in capsys.readouterr().out) == (name == "unknown")
-        chain = ET.fromstring((out / "robot.urdf").read_text()).findall("joint")
-        limits = np.array(
-            [[float(joint.find("limit").get(end)) for end in ("lower", "upper")] for joint in chain[:6]]
-        )
-        axis = np.array(chain[2].find("axis").get("xyz").split(), dtype=float)
-        assert np.linalg.norm(axis) == pytest.approx(1.0, abs=1e-12)
-        wide = np.ptp(limits, axis=1)
-        assert (wide[0] > 5.0) == (name == "known")
-    assert (
-        run(["export", str(tmp_path / "known"), "--to", "urdf", "--metric", "0.3", "-o", str(out), "--force"])
-        == 2
-    )
-    assert "without its ends" in capsys.readouterr().err
-
-
-def test_ros_gets_the_poses_of_the_cameras(ur5, metric, tmp_path):
-    words = export(ur5, tmp_path, "ros").read_text().split("args=")[1].split()
-    value = {name: float(words[words.index(f"--{name}" if name != "x" else '"--x') + 1]) for name in "xyz"}
-    np.testing.assert_allclose(list(value.values()), metric.poses[0, :3, 3], atol=1e-12)
-    turn = [float(words[words.index(f"--q{name}") + 1]) for name in "xyzw"]
-    np.testing.assert_allclose(Rotation.from_quat(turn).as_matrix(), metric.poses[0, :3, :3], atol=1e-12)
-
-
-def test_json_has_all_numbers_with_covariances(ur5, metric, tmp_path):
-    found = json.loads(export(ur5, tmp_path, "json").read_text())
-    for name in ("K", "lens", "poses", "axes", "markers"):
-        np.testing.assert_array_equal(found[name], getattr(metric, name))
-        np.testing.assert_allclose(found[f"{name}_covariance"], metric.covariance(name))
-
-
 def matrix(screw):
     H = np.zeros((4, 4))
     H[:3, :3], H[:3, 3] = np.cross(np.eye(3), screw[:3]), screw[3:]
@@ -217,25 +153,6 @@ def test_a_model_with_other_senses_or_zeros_is_refused(ur5, reference_truth, tmp
     assert run(["export", str(ur5), "--to", "ros", "-o", str(out), *KNOWN, *words_of_model]) == 1
     assert words in " ".join(capsys.readouterr().err.split())
     assert not out.exists()
-
-
-def in_metres(shared_data, order):
-    """Metric of a table with its columns in another order."""
-    table = read_table(shared_data / "ur5" / "trials_0.5px.csv")
-    found = ImageModel.of(
-        calibrate(dataclasses.replace(table, q=table.q[:, order]), "RRRRRR", source="recorded")
-    )
-    return found.metric(float(KNOWN[1]), (2, 8))
-
-
-def test_joints_of_a_table_in_another_order_than_those_of_the_model(shared_data):
-    """Motions of single joints do not show the order, so that the table itself is usable."""
-    axes = in_metres(shared_data, [0, 1, 2, 3, 4, 5]).axes  # of the true order, as a model
-    for order in ([2, 1, 0, 3, 4, 5], [0, 1, 2, 4, 3, 5]):
-        i, j = (k + 1 for k in range(6) if order[k] != k)
-        exchanged = in_metres(shared_data, order)
-        with pytest.raises(WorkFailed, match=f"joints {i} and {j} have each other's place in the model"):
-            kinematic_errors(exchanged, axes)
 
 
 @pytest.mark.parametrize("joint", range(7))
@@ -308,31 +225,3 @@ def test_links_of_a_model_contradict_a_length_that_is_wrong(
     if not word:
         value = json.loads((out / "metric.json").read_text())
         assert abs(value["length_error"]) < 4.0 * value["length_error_std"]
-
-
-def test_a_length_without_its_deviation_is_told_and_one_that_cannot_be_is_refused(ur5, tmp_path, capsys):
-    for std in (None, 0.0001):
-        more = [] if std is None else ["--metric-std", str(std)]
-        found = json.loads(export(ur5, tmp_path, "json", *more, "--force").read_text())
-        assert found["length_std_m"] == std
-        assert ("m ± ? (--metric-std)" in capsys.readouterr().out) == (std is None)
-    out = tmp_path / "mm"
-    assert (
-        run(["export", str(ur5), "--to", "ros", "-o", str(out), "--metric", "249.3", "--between", "2,8"]) == 1
-    )
-    assert "the left camera is" in capsys.readouterr().err
-    assert not out.exists()
-
-
-@pytest.mark.parametrize("factor", [1.0, 1.03])
-def test_readings_of_a_rail_contradict_a_length_that_is_wrong(shared_data, tmp_path, capsys, factor):
-    table, folder, out = shared_data / "stanford" / "trials_0.1px.csv", tmp_path / "run", tmp_path / "out"
-    assert run(["calibrate", "--data", str(table), "--joints", "RRPRRR", "-o", str(folder)]) == 0
-    m = ImageModel.of(store.load(folder).calibration).metric()  # by the rail
-    length = factor * float(np.linalg.norm(m.markers[2] - m.markers[8]))
-    capsys.readouterr()
-    code = run(
-        ["export", str(folder), "--to", "ros", "-o", str(out), "--metric", str(length), "--between", "2,8"]
-    )
-    assert (code, out.exists()) == ((0, True) if factor == 1.0 else (1, False))
-    assert ("joint 3 moves 1.03 ± " in capsys.readouterr().err) == (factor != 1.0)

@@ -5,10 +5,8 @@ import shlex
 import subprocess
 import sys
 
-import click
 import pytest
 
-from projservo_cli import __version__
 from projservo_cli.cli import main
 
 PIECES = [("servo",), ("plan",), ("-c", "tiny.yaml"), ("-o", "out"), ("--json",)]
@@ -21,22 +19,6 @@ def test_options_stand_anywhere_in_a_chain(projservo, stages):
         assert [step["stage"] for step in answer.json["steps"]] == ["calibrate", "plan", "servo"]
         assert answer.json["run"].endswith("/out/run.h5")
     assert stages.made == []
-
-
-def test_options_stand_anywhere_around_arguments(projservo, reported, statistics):
-    for order in itertools.permutations(["validate", "out", "--data=t.csv", "--json"]):
-        if order.index("validate") < order.index("out"):
-            answer = projservo(*order)
-            assert answer.code == 0, answer.err
-            assert answer.json["count"] == 2
-    assert projservo("--json", "validate", "-qo", "out", "--data", "t.csv").json["count"] == 2
-    assert projservo("--json", "--data", "t.csv", "validate", "--", "out").json["count"] == 2
-
-
-def test_stages_run_in_their_order_each_once(projservo, stages):
-    answer = projservo("servo", "calibrate", "servo", "plan", "-c", "tiny.yaml", "--json")
-    assert list(answer.json) == ["calibrate", "plan", "servo"]
-    assert stages.made == ["calibrate", "plan", "direct_three", "stacked"]
 
 
 @pytest.mark.parametrize("name", main.commands)
@@ -56,36 +38,6 @@ def test_help_has_an_example_that_the_command_line_takes(projservo, name):
         assert name in context.obj
         _, command, rest = main.resolve_command(context, [*context.obj[:1], *context.args])
         command.make_context(name, rest, parent=context)
-
-
-def test_a_flag_takes_a_value_in_all_commands_or_in_none():
-    takes = {}
-    for command in main.commands.values():
-        for option in command.params:
-            if isinstance(option, click.Option):
-                assert takes.setdefault(option.opts[-1], option.is_flag) == option.is_flag
-
-
-@pytest.mark.parametrize("given", ["nan", "inf"])
-def test_options_of_numbers_take_finite_ones_alone(given):
-    options = {option.opts[-1]: option for command in main.commands.values() for option in command.params}
-    numbers = [option for option in options.values() if isinstance(option.type, click.types.FloatParamType)]
-    assert len(numbers) > 5
-    for option in numbers:
-        with pytest.raises(click.BadParameter, match=given):
-            option.type.convert(given, option, None)
-
-
-def test_help_names_all_commands_and_version_is_printed(projservo):
-    text = projservo("--help").out
-    assert all(f"  {name} " in text for name in main.commands)
-    assert max(map(len, text.splitlines())) <= 80
-    assert projservo().out == text
-    for words in (["--version"], ["--version", "show", "x"]):
-        assert projservo(*words).out == f"projservo {__version__}\n"
-    both = projservo("servo", "calibrate", "-h").out
-    assert "--law" in both
-    assert "--suggest" in both
 
 
 def test_help_imports_neither_numbers_nor_files():
@@ -210,21 +162,3 @@ def test_what_makes_no_sense_is_refused_in_one_line_before_any_work(projservo, s
     assert answer.err.startswith("projservo: ")
     assert answer.err.count("\n") == 1
     assert (stages.made, set(tmp_path.iterdir())) == ([], there)
-
-
-def test_several_errors_are_several_lines(projservo, stages):
-    answer = projservo("calibrate", "-c", "tiny.yaml", "--set", "seed=-1", "--set", "noise.calibration_px=a")
-    assert "projservo: --set seed=-1: seed: must be at least 0" in answer.err
-    assert answer.err.count("\nprojservo: ") == 1
-
-
-def test_runs_that_are_none(projservo, reported, tmp_path):
-    whole = (tmp_path / "out/run.h5").read_bytes()
-    (tmp_path / "out/run.h5").write_bytes(whole[: len(whole) // 2])
-    for words in (["show"], ["validate", "--data", "t.csv"], ["calibrate", "-c", "tiny.yaml", "-o"]):
-        answer = projservo(*words, "out")
-        assert (answer.code, answer.out) == (2, "")
-        assert "cut short" in answer.err
-    assert "there is no run file" in projservo("show", "nowhere").err
-    (tmp_path / "out/run.h5").rename(tmp_path / "out/sweep.h5")
-    assert "out: holds a sweep and no run; see projservo report out" in projservo("show", "out").err

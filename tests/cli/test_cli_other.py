@@ -7,14 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
-import projservo_cli.calibration
 from projservo_cli.cli.equations import REGISTER
-from projservo_cli.config import load_config, to_yaml
-from projservo_cli.records import WorkFailed
-from projservo_cli.stages import teach as teaching
-from projservo_cli.store import Run, load, save
+from projservo_cli.config import load_config
+from projservo_cli.store import load
 
 ROOT = Path(__file__).parents[2]
 
@@ -42,33 +38,6 @@ def test_validate_prints_the_statistics_of_a_table(projservo, reported, statisti
     assert "1 joint columns" in answer.err
 
 
-def test_validate_takes_the_unit_of_the_run_unless_told(projservo, stages, monkeypatch, tmp_path):
-    monkeypatch.setattr(
-        projservo_cli.calibration,
-        "residual_statistics",
-        lambda calibration, observation: {
-            "count": 0,
-            "skipped": {},
-            "q": observation.q,
-            "limit_px": None,
-        },
-    )
-    rows = (tmp_path / "t.csv").read_text()
-    (tmp_path / "deg.csv").write_text(rows.replace("0.2", "20").replace("0.3", "30"))
-    projservo("calibrate", "--data", "t.csv", "-o", "out")
-    refused = projservo("validate", "out", "--data", "deg.csv")
-    assert refused.code == 2
-    assert "q2 of pose 0 is 20" in refused.err
-    assert "--joint-unit deg" in refused.err
-    given = projservo("validate", "out", "--data", "deg.csv", "--joint-unit", "deg", "--json").json["q"]
-    assert given[0][1] == pytest.approx(0.3490658503988659, rel=1e-15)  # 20 degrees
-    projservo("calibrate", "--data", "deg.csv", "--joint-unit", "deg", "-o", "deg")
-    assert "joint_unit: deg" in load("deg").configuration
-    assert projservo("validate", "deg", "--data", "deg.csv", "--json").json["q"] == given
-    same = projservo("validate", "deg", "--data", "deg.csv", "--joint-unit", "rad", "--json").json["q"]
-    assert same == [[0.1, 20], [0.1, 30]]
-
-
 def test_show_tells_what_a_run_holds(projservo, reported, tmp_path):
     (tmp_path / "out").rename(tmp_path / "paper")
     (tmp_path / "results").mkdir()
@@ -84,15 +53,6 @@ def test_show_tells_what_a_run_holds(projservo, reported, tmp_path):
     assert "tiny, simulated" in text
     assert [line for line in text.splitlines() if len(line) > 80] == []
     assert "gain_t: 2.5" in projservo("show", "results/paper", "-v").out
-
-
-def test_equations_are_listed(projservo):
-    entries = projservo("equations", "--json").json["equations"]
-    assert [entry["number"] for entry in entries[:25]] == [str(i) for i in range(1, 26)]
-    assert set(entries[0]) == {"number", "title", "functions", "tests", "erratum"}
-    text = projservo("equations").out
-    assert "(25) Coefficients of the composed rotation" in text
-    assert "without the factor 2" in " ".join(text.split())
 
 
 CONSEQUENCES = {"21", "22"}  # statements on what the laws integrate to; no function computes them by itself
@@ -143,85 +103,6 @@ def test_a_goal_is_taught_and_told(projservo, tmp_path, monkeypatch):
         assert (refused.code, refused.out, refused.err.count("\n")) == (2, "", 1)
         assert told in refused.err
     assert not (tmp_path / "other.yaml").exists()
-
-
-def test_what_names_its_goal_and_start_before_they_are_taught_teaches_them(projservo, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    text = (ROOT / "configs" / "hobby.yaml").read_text(encoding="utf-8")
-    own = yaml.safe_load(text)
-    own["calibration"] = own.get("calibration", {}) | {"reference": own["task"]["start"]}
-    own["task"] = {"start": "start.yaml", "goal": "goal.yaml"}
-    (tmp_path / "own.yaml").write_text(yaml.safe_dump(own), encoding="utf-8")
-    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "1")
-    lacking = projservo("plan", "-c", "own.yaml", "-n")
-    assert (lacking.code, "start.yaml" in lacking.err) == (2, True)
-    for start in (("--start",), ()):
-        answer = projservo("teach", "-c", "own.yaml", *at, *start)
-        assert answer.code == 0, answer.err
-        assert answer.out.endswith(f"set task.{'start: start' if start else 'goal: goal'}.yaml\n")
-    task = load_config("own.yaml").task
-    assert task.start == task.goal.images.joints
-
-
-@pytest.mark.parametrize("key", ["goal", "start"])
-def test_what_is_taught_elsewhere_is_told_as_the_configuration_takes_it(
-    projservo, tmp_path, monkeypatch, key
-):
-    monkeypatch.chdir(tmp_path)
-    hobby, flags = ("-c", ROOT / "configs" / "hobby.yaml"), ("--start",) * (key == "start")
-    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "1")
-    told = projservo("teach", *hobby, *at, *flags).out.splitlines()[-1]
-    value = told.removeprefix("set ").replace(": ", "=")
-    assert value == f"task.{key}={tmp_path / key}.yaml"
-    assert projservo("plan", *hobby, "--set", value, "-n").code == 0
-
-
-def test_what_cannot_be_taught_is_an_object_with_exit_code_1(projservo, tmp_path, monkeypatch):
-    def fail(*_):
-        raise WorkFailed("teach: joint 3\nmoved")
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(teaching, "teach", fail)
-    answer = projservo("teach", "-c", ROOT / "configs" / "hobby.yaml", "--json")
-    assert (answer.code, answer.err) == (1, "projservo: teach: joint 3 moved\n")
-    told = {"file": str(tmp_path / "goal.yaml"), "failed": "teach", "reason": "joint 3 moved"}
-    assert answer.json == told
-    assert not (tmp_path / "goal.yaml").exists()
-
-
-def test_a_start_that_cameras_do_not_see_is_refused_and_one_in_part_named(projservo, tmp_path, monkeypatch):
-    def teach(*given):
-        taught = original(*given)
-        taught.s[0, : -seen or None] = np.nan
-        return taught
-
-    monkeypatch.chdir(tmp_path)
-    original = teaching.teach
-    monkeypatch.setattr(teaching, "teach", teach)
-    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "1")
-    asked = ("teach", "--start", "-c", ROOT / "configs" / "hobby.yaml", *at)
-    for seen in (0, 2):
-        refused = projservo(*asked)
-        words = f"both cameras see {seen} of 8 markers (3 at least; left {seen}, right 8): turn the tool"
-        assert (refused.code, words in refused.err) == (1, True)
-        assert not (tmp_path / "start.yaml").exists()
-    seen = 6
-    answer = projservo(*asked)
-    assert answer.code == 0
-    assert answer.out.startswith("teach: 6 of 8 markers in both views, from 1 images left and 1 right")
-    assert "until both cameras see all tags, and teach again" in " ".join(answer.err.split())
-
-
-def test_what_is_taught_beside_a_run_is_of_its_configuration(projservo, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    config = load_config(ROOT / "configs" / "hobby.yaml", ["plant.averaged_frames=2"])
-    save(Run(tmp_path / "run.h5", to_yaml(config), {}))
-    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "3")
-    answer = projservo("teach", tmp_path, *at, "--json")
-    assert (answer.code, len(answer.json["joints"])) == (0, 5)
-    save(Run(tmp_path / "run.h5", to_yaml(config).replace("plant:", "plant:\n  use: nowhere:Robot"), {}))
-    refused = projservo("teach", tmp_path, "--force")
-    assert (refused.code, "named by the stored run alone" in refused.err) == (2, True)
 
 
 PICK = """\

@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-from projservo_cli.cli.output import Console
 from projservo_cli.store import load
-from projservo_cli.store.tables import read_table
 
 CHAIN = ("record", "calibrate", "plan", "-c", "tiny.yaml", "-o", "out")
 TABLE = Path("out/trials.csv")
@@ -43,38 +41,6 @@ def test_an_outdated_recording_is_made_anew_and_what_rests_on_it(projservo, stag
     assert stages.made == ["calibrate", "plan"] * 3
 
 
-def test_an_interrupted_recording_goes_on_in_the_chain(projservo, stages, monkeypatch):
-    def lose_patience(console, what, done, total, note=""):
-        if (what, done) == ("record", 5):
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Console, "progress", lose_patience)
-        answer = projservo(*CHAIN)
-    assert (answer.code, stages.made) == (130, [])
-    assert "trials.csv: 5 of 17 poses; run again to continue" in " ".join(answer.err.split())
-    answer = projservo(*CHAIN, "--json")
-    assert "record: making (interrupted)" in answer.err
-    assert (answer.json["record"]["found"], answer.json["record"]["recorded"]) == (5, 12)
-    assert read_table(TABLE).pose.tolist() == list(range(17))
-
-
-def test_a_table_that_the_configuration_names_is_recorded_there(projservo, stages):
-    assert projservo(*CHAIN, "--data", "mine.csv", "-q").code == 0
-    assert not TABLE.exists()
-    assert len(read_table("mine.csv").pose) == 17
-    degrees = projservo(*CHAIN, "--data", "mine.csv", "--set", "data.joint_unit=deg")
-    assert (degrees.code, "record writes rad" in degrees.err) == (2, True)
-
-
-def test_record_alone_writes_the_table_of_the_configuration(projservo, stages):
-    alone = projservo("record", "-c", "tiny.yaml", "--set", "data.table=mine.csv", "-q")
-    assert alone.code == 0, alone.err
-    assert len(read_table("mine.csv").pose) == 17
-    again = projservo(*CHAIN, "--data", "mine.csv", "--json")
-    assert (again.json["record"]["recorded"], again.json["record"]["found"]) == (0, 17)
-
-
 def test_what_somebody_recorded_is_not_replaced(projservo, stages):
     own = Path("t.csv").read_bytes()
     answer = projservo(*CHAIN, "--data", "t.csv")
@@ -90,17 +56,3 @@ def test_what_somebody_recorded_is_not_replaced(projservo, stages):
     answer = projservo(*CHAIN, "--set", "seed=1")
     assert (answer.code, answer.err.count("\n")) == (2, 1)
     assert "lab:Arm" in TABLE.read_text()
-
-
-def test_a_recording_that_fails_is_an_object_and_nothing_else_is_made(projservo, stages, monkeypatch):
-    from projservo_cli.records import WorkFailed
-    from projservo_cli.stages import record
-
-    def fail(config, recording, progress):
-        raise WorkFailed("record: joint 1 stands still")
-
-    monkeypatch.setattr(record, "record_poses", fail)
-    answer = projservo(*CHAIN, "--json")
-    assert (answer.code, stages.made) == (1, [])
-    assert answer.err.splitlines()[-1] == "projservo: record: joint 1 stands still"
-    assert answer.json["record"]["failed"] == answer.json["plan"]["failed"] == "record"

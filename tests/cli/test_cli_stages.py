@@ -9,7 +9,6 @@ from tqdm import tqdm
 
 from projservo_cli import progress
 from projservo_cli.cli.output import Console
-from projservo_cli.records import InputError
 from projservo_cli.report import animation as film
 from projservo_cli.report import page
 from projservo_cli.stages import report as reporting
@@ -42,25 +41,6 @@ def test_up_to_date_is_skipped_and_prints_the_same(projservo, stages):
     assert load("out").path.read_bytes() == stored
 
 
-def test_each_law_runs_in_those_of_the_modes_that_it_has(projservo, stages):
-    modes = "control.mode=[regulate, track, image_track]"
-    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--set", modes, "--json")
-    assert answer.code == 0
-    names = ["direct_three", "direct_three_track", "stacked", "stacked_image_track"]
-    assert stages.made == ["calibrate", "plan", *names]
-    assert list(load("out").traces) == names
-    told = [f"{row['law']} {row['mode']}" for row in answer.json["laws"]]
-    assert told == ["direct_three regulate", "direct_three track", "stacked regulate", "stacked image_track"]
-
-
-def test_a_mode_that_cannot_be_is_refused_before_anything_is_made(projservo, stages):
-    track = ("-c", "tiny.yaml", "-o", "out", "--set", "control.mode=track")
-    answer = projservo("servo", *track, "--law", "stacked")
-    assert (answer.code, stages.made) == (2, [])
-    assert "control.mode track: stacked has no such mode, only regulate and image_track" in answer.err
-    assert projservo("calibrate", *track).code == 0  # which does not care
-
-
 @pytest.mark.parametrize(
     ("change", "remade"),
     [
@@ -84,19 +64,6 @@ def test_only_what_depends_on_a_change_is_redone(projservo, reported, change, re
     assert reported.made == []
 
 
-def test_a_plan_that_fails_its_constraints_ends_in_1_with_the_reason(projservo, stages):
-    stages.verdicts = {"plan": "infeasible"}
-    wanted = ("--set", "trajectory.profile=constrained")
-    answer = projservo("plan", "-c", "tiny.yaml", "-o", "out", *wanted, "--json")
-    assert answer.code == 1
-    assert answer.err.strip().endswith("plan: too near")
-    assert answer.json["feasible"] is False
-    assert set(answer.json["margins"]) == {"visibility", "border_px", "joints", "condition"}
-    # What only measures the profile of the paper, or was made before, does not end the call.
-    assert projservo("servo", "-o", "out").code == 0
-    assert projservo("plan", "-c", "tiny.yaml", "-o", "linear").code == 0
-
-
 def test_an_interrupted_chain_goes_on_where_it_stopped(projservo, stages, refused):
     stages.fails["stacked"] = KeyboardInterrupt()
     answer = projservo("servo", "-c", "tiny.yaml", "-o", "out")
@@ -116,35 +83,6 @@ def test_force_makes_the_named_stages_anew_and_drops_what_hung_on_them(projservo
     assert reported.made == ["plan", "direct_three", "stacked"]
 
 
-def test_a_table_that_changes_outdates_and_one_that_moved_away_does_not(projservo, stages, tmp_path):
-    given = ("--joints", "rp", "--noise-px", "2e-1", "--json")
-    answer = projservo("calibrate", "--data", "t.csv", *given)
-    assert answer.json["run"] == str(tmp_path / "results/t/run.h5")
-    assert [joint["type"] for joint in answer.json["joints"]] == ["R", "P"]
-    stored = load("results/t").configuration
-    assert "joints: RP" in stored
-    assert "noise_px: 0.2" in stored
-    moved = (tmp_path / "t.csv").rename(tmp_path / "u.csv")
-    assert projservo("calibrate", "-o", "results/t").code == 0
-    assert projservo("calibrate", "-o", "results/t", "--data", "u.csv").code == 0
-    assert stages.made == ["calibrate"]
-    moved.write_text(moved.read_text().replace("0,0,0.1,0.2,1,", "0,0,0.1,0.2,9,"))
-    assert projservo("calibrate", "-o", "results/t").code == 0
-    assert stages.made == ["calibrate"] * 2
-    assert projservo("calibrate", "-o", "results/t", "--data", "none.csv").code == 2
-
-
-def test_a_recorded_calibration_is_not_replaced_by_a_simulated_one(projservo, stages):
-    simulated = ("calibrate", "-c", "tiny.yaml", "-o", "out")
-    projservo("calibrate", "--data", "t.csv", "-o", "out")
-    answer = projservo(*simulated)
-    assert answer.code == 2
-    assert "recorded data" in answer.err
-    for given, source in (([], "recorded"), (["--force"], "simulated"), (["--data", "t.csv"], "recorded")):
-        assert projservo(*simulated, *given).code == (0 if given else 2)
-        assert load("out").calibration.source == source
-
-
 def test_laws_are_those_asked_for_in_their_order_and_others_stay(projservo, reported):
     laws = ["--law", "blockwise", "--law", "direct_three", "--law", "blockwise"]
     answer = projservo(*laws, "servo", "-o", "out", "--json")
@@ -155,27 +93,6 @@ def test_laws_are_those_asked_for_in_their_order_and_others_stay(projservo, repo
     projservo("servo", "-o", "out", "--law", "blockwise", "--set", "control.gain=1")
     assert reported.made == ["blockwise"]
     assert list(load("out").traces) == ["direct_three", "stacked", "blockwise"]
-
-
-def test_a_report_is_about_the_laws_and_the_configuration_of_its_call(projservo, stages):
-    projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", "blockwise")
-    projservo("report", "-o", "out")
-    projservo("report", "-o", "out", "--set", "report.formats=[png]")
-    (first, _), (second, configuration) = stages.reported
-    assert first == second == ["direct_three", "stacked"]
-    assert "formats: [png]" in configuration
-
-
-def test_of_claims_those_that_do_not_hold_are_named_and_all_of_them_in_detail(projservo, reported):
-    answer = projservo("report", "-o", "out")
-    assert (
-        "1 of 2 claims hold; it does not hold that\n  - it is large\n  1 omitted: no run\nrun: " in answer.out
-    )
-    detailed = projservo("report", "-o", "out", "-v").out
-    assert "  holds: c: 3 mm\n  does not hold: it is large: 1 mm\n  omitted: fig_9: no run\n" in detailed
-    value = projservo("report", "-o", "out", "--json").json
-    assert value["figures"] == ["figures/fig_1.svg"]
-    assert [claim["holds"] for claim in value["claims"]] == [True, False]
 
 
 CALIBRATE_KEYS = {
@@ -299,35 +216,6 @@ def test_each_run_that_did_not_converge_or_missed_periods_has_a_line_with_its_re
     assert said == [second, "projservo: servo/direct_two: text ä"]
 
 
-def test_without_a_truth_the_table_tells_errors_in_the_images(projservo, stages, monkeypatch):
-    drive = stages.servo
-    told = {"image_error_px": 0.25, "estimated_position_error_mm": 0.5}
-    monkeypatch.setattr(stages, "servo", lambda *given: replace(drive(*given), **told))
-    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", "exact")
-    head, words, columns, row = answer.out.splitlines()[:4]
-    assert head == "servo: image errors at the end, self-occluded steps left/right"
-    assert columns.split() == ["law", "verdict", "steps", "px", "mm", "occluded"]
-    assert words.split() == ["image", "within"]
-    assert row.split() == ["exact", "converged", "3", "0.25", "0.5", "3/3"]
-    told |= {"position_error_mm": 2.0, "estimated_position_error_mm": None}
-    answer = projservo("servo", "-o", "out", "--law", "exact", "--force")
-    assert answer.out.startswith("servo: true errors at the end")
-    assert answer.out.splitlines()[3].split() == ["exact", "converged", "3", "2", "-", "3/3", "-"]
-
-
-def test_what_a_robot_or_law_prints_is_no_data(projservo, stages, monkeypatch):
-    drive = stages.servo
-
-    def chatty(*arguments, **settings):
-        print("at rest")
-        return drive(*arguments, **settings)
-
-    monkeypatch.setattr(stages, "servo", chatty)
-    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--json")
-    assert len(answer.json["laws"]) == 2
-    assert answer.err.count("at rest") == 2
-
-
 def test_a_dry_run_does_nothing_and_says_what_would_be_done(projservo, stages, tmp_path):
     answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "-n")
     assert answer.code == 0
@@ -344,26 +232,12 @@ def test_a_dry_run_does_nothing_and_says_what_would_be_done(projservo, stages, t
     assert "gain: 1" not in load("out").configuration
 
 
-def test_quiet_says_nothing_but_json_and_errors(projservo, stages, refused):
-    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "-q")
-    assert (answer.code, answer.out, answer.err) == (0, "", "")
-    assert projservo("servo", "-o", "out", "-q", "--json").json["laws"]
-    stages.fails["calibrate"] = refused
-    assert str(refused) in projservo("calibrate", "-o", "out", "-q", "--force").err
-
-
 def test_a_failure_of_the_program_itself_is_one_line_and_verbose_shows_where(projservo, stages):
     stages.fails["plan"] = ZeroDivisionError("by\nzero")
     answer = projservo("plan", "-c", "tiny.yaml", "-o", "out")
     assert answer.code == 1
     assert answer.err.splitlines()[-1].startswith("projservo: internal error, ZeroDivisionError: by zero")
     assert "Traceback" in projservo("plan", "-o", "out", "-v").err
-
-
-def test_a_report_whose_files_are_gone_is_made_again(projservo, reported):
-    reported.gone = True
-    assert "report: making (a file of it is missing)" in projservo("report", "-o", "out").err
-    assert reported.made == ["report"]
 
 
 def test_progress_shows_only_to_someone_who_watches_and_its_clock_goes_on(capsys, monkeypatch):
@@ -418,18 +292,3 @@ def test_a_view_and_an_animation_are_made_beside_a_report_that_is_up_to_date(
     assert answer.json["animation"].endswith("/animation.gif")
     assert "view: " in projservo("report", "-o", "out", "--view").out
     assert reported.made == []
-
-
-def test_a_view_that_cannot_be_made_is_refused_before_any_work(projservo, stages, monkeypatch):
-    def lacks():
-        raise InputError("the 3D view needs plotly: pip install '.[view]'")
-
-    monkeypatch.setattr(film, "plotly", lacks)
-    answer = projservo("report", "-c", "tiny.yaml", "-o", "out", "--view")
-    assert answer.code == 2
-    assert answer.err == "projservo: the 3D view needs plotly: pip install '.[view]'\n"
-    assert projservo("calibrate", "-c", "tiny.yaml", "--view").code == 2
-    answer = projservo("calibrate", "report", "--data", "t.csv", "--joints", "RR", "-o", "new", "--animation")
-    assert answer.code == 2
-    assert "--animation: shows runs of laws, which need a task" in answer.err
-    assert stages.made == []

@@ -40,14 +40,6 @@ def test_texts_of_a_run_command_no_terminal_and_become_no_part_of_the_page(projs
     assert "&lt;img src=x" in text
 
 
-def test_messages_about_files_do_not_command_the_terminal(projservo, stages, tmp_path):
-    (tmp_path / "bad.yaml").write_text('"\\e[2J": 1\nname: "\\e[31m"\n', encoding="utf-8")
-    answer = projservo("calibrate", "-c", "bad.yaml")
-    assert answer.code == 2
-    assert plain(answer.err)
-    assert "\\u001b[2J" in answer.err
-
-
 @pytest.mark.parametrize("name", ["../out", "/tmp/out", "a/b", "..", ".", "a\\b", "", "x\n", "~/x:y"])
 def test_a_name_is_that_of_one_folder(projservo, stages, tmp_path, name):
     before = sorted(tmp_path.rglob("*"))

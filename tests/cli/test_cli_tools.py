@@ -1,7 +1,6 @@
 """The commands compare, export, init, schema and doctor."""
 
 import csv
-import importlib.metadata
 import json
 from html.parser import HTMLParser
 from pathlib import Path
@@ -91,12 +90,6 @@ def test_init_writes_what_loads_and_its_schema(projservo, stages, tmp_path):
     assert (tmp_path / "projservo.yaml").is_file()
 
 
-def test_schema_is_printed_or_written(projservo, stages, tmp_path):
-    assert projservo("schema").json == json_schema()
-    assert projservo("schema", "-o", "s.json").out == ""
-    assert json.loads((tmp_path / "s.json").read_text(encoding="utf-8")) == json_schema()
-
-
 def test_doctor_tells_versions_extras_kernels_and_results(projservo, stages, tmp_path):
     value = projservo("doctor", "--json").json
     assert value["missing"] == []
@@ -106,13 +99,3 @@ def test_doctor_tells_versions_extras_kernels_and_results(projservo, stages, tmp
     assert max(map(len, text.splitlines())) <= 80 or str(tmp_path) in text
     for word in ("python", "packages", "kernels", "results"):
         assert word in text
-
-
-def test_doctor_names_what_is_missing(projservo, stages, monkeypatch):
-    needed = ["numpy>=2", "not-there-at-all>=1", "neither; extra == 'other'"]
-    monkeypatch.setattr(importlib.metadata, "requires", lambda name: needed)
-    answer = projservo("doctor")
-    assert answer.code == 1
-    assert "not-there-at-all MISSING" in answer.out
-    assert "extra other: lacks neither: pip install '.[other]'" in answer.out
-    assert projservo("doctor", "--json").json["missing"] == ["not-there-at-all"]

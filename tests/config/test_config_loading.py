@@ -3,14 +3,13 @@
 import math
 
 import pytest
-import yaml
 
-from projservo_cli.config import Config, Override, load_config, shipped, to_yaml
+from projservo_cli.config import load_config, to_yaml
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.keys import encoded
 from projservo_cli.laws import LAWS
 from projservo_cli.records import InputError
-from tests.conftest import ROOT, SHIPPED
+from tests.conftest import SHIPPED
 
 GOOD = """\
 seed: 1
@@ -171,68 +170,6 @@ def test_inconsistencies_are_refused_with_path_and_flag(good, override, path, me
     assert message in found
 
 
-def test_a_contradiction_hides_no_other(good):
-    """Neither within its section nor between that and others, malformed values or not."""
-    told = errors(
-        good,
-        f"robot.dh.tool={POSE.replace('1, 0]', '-1, 0]')}",
-        "robot.dh.joints.1.limits_m=[2, 1]",
-        "task.goal.roll_deg=null",
-        "task.start.joints=[1, 1, 2]",
-        "disturbance.stuck_encoder={joint: 3, from_step: 1}",
-        "control.gian=1",
-    )
-    paths = ["task.goal", "robot.dh.joints.1.limits_m", "robot.dh.tool", "task.start.joints",
-             "disturbance.stuck_encoder.joint", "control.gian"]  # fmt: skip
-    assert [path for path in paths for line in told if f": {path}: " in line] == paths
-    assert len(told) == len(paths)
-
-
-def test_a_start_for_the_joints_of_the_table_is_not_held_against_those_of_another_robot(good):
-    (line,) = errors(good, "data={table: t.csv, joints: RRR}", "task.start.joints=[1, 0.5, 1]")
-    assert line.endswith("data.joints: RRR are not the joints of the robot, RP")
-
-
-def test_screws_are_checked(good):
-    joints = (
-        "[{type: R, w: [0, 0, 2], v: [0, 0, 0]}, {type: R, w: [0, 0, 1], v: [0, 0, 1]}, "
-        "{type: P, w: [0, 0, 1], v: [0, 0.5, 0]}]"
-    )
-    screws = f"{{reference: {{joints: [0, 0, 0], unit: rad}}, base_tool: {POSE}, joints: {joints}}}"
-    start, *told = errors(good, f"robot={{screws: {screws}}}")
-    assert start.endswith("task.start.joints: 2 values for 3 joints (RRP)")
-    found = [line.split(": robot")[1] for line in told]
-    assert found == [
-        ".screws.joints.0.w: must be of unit length for a joint of type R, it is 2",
-        ".screws.joints.1.v: must be orthogonal to w: a revolute joint has no pitch",
-        ".screws.joints.2.v: must be of unit length for a joint of type P, it is 0.5",
-        ".screws.joints.2.w: must be zero for a joint of type P",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("region", "path", "message"),
-    [
-        ("{occludes: false}", "0", "give left, right or both"),
-        ("{left: [[0, 0], [9, 9]]}", "0.left", "needs 3 or more entries"),
-        ("{left: [[0, 0], [9, 9], [9, 0], [0, 9]]}", "0.left", "from corners 1 and 3 meet"),
-        ("{right: [[0, 0], [4, 4], [9, 9]]}", "0.right", "no area"),
-        ("{right: [[0, 0], [9, 0], [9, 9], [4, 0]]}", "0.right", "from corners 1 and 3 meet"),  # touches
-        ("{left: [[0, 0], [9, 0], [4, 2], [9, 9]], right: [[0, 0], [9, 0], [9, 9]]}", "", ""),
-    ],
-)
-def test_polygons_of_a_region_are_simple(good, region, path, message):
-    overrides = (f"trajectory.keep_out=[{region}]", "control.mode=track", "trajectory.duration_s=3")
-    if not path:
-        assert load_config(good, overrides).trajectory.keep_out[0].occludes
-        (found,) = errors(good, overrides[0])
-        assert "control.mode: regulate follows no plan" in found
-        return
-    (found,) = errors(good, *overrides)
-    assert f" trajectory.keep_out.{path}: " in found
-    assert message in found
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -269,15 +206,6 @@ def test_a_blank_recorded_configuration_needs_only_a_table(tmp_path, monkeypatch
     assert line.endswith("data.joint_unit: 'degree' is not one of them; did you mean deg?")
 
 
-def test_a_table_is_sought_beside_the_configuration(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "sub").mkdir()
-    (tmp_path / "sub/c.yaml").write_text("data: {table: t.csv, joint_unit: deg}", encoding="utf-8")
-    config = load_config("sub/c.yaml")
-    assert config.data.table == str(tmp_path / "sub/t.csv")
-    assert load_config("elsewhere.yaml", text=to_yaml(config)).data == config.data
-
-
 UNREADABLE = {
     "nothing": "",
     "no yaml": "name: [1",
@@ -301,39 +229,3 @@ def test_unreadable_text_is_refused(case):
 def test_duplicate_keys_are_refused_with_both_places(good):
     (line,) = errors(good, text=GOOD.replace("  face:", "  face: [0, 1, 3]\n  face:"))
     assert line == f"{good}:14:3: markers.face: the key stands here a second time (first at 13:3); keep one"
-
-
-def test_files_that_are_none(tmp_path):
-    assert "cannot be read" in errors(tmp_path / "none.yaml")[0]
-    assert "cannot be read" in errors(tmp_path)[0]
-    (tmp_path / "c.yaml").write_bytes(b"name: \xff")
-    assert "not UTF-8" in errors(tmp_path / "c.yaml")[0]
-
-
-def test_a_folder_does_not_stand_for_the_shipped_configuration_of_its_name(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "ur5").mkdir()
-    assert shipped("ur5") == ROOT / "configs" / "ur5.yaml"
-
-
-def test_plain_text_means_what_the_core_schema_says():
-    text = "[1e-3, .5, 5., -7, on, 12:30, 0x10, 1_000, '5', ~, Null, TRUE, -.inf, !!str a]"
-    meant = [0.001, 0.5, 5.0, -7, "on", "12:30", "0x10", "1_000", "5", None, None, True, -math.inf, "a"]
-    assert Override.parse(f"x={text}").value == meant
-
-
-def test_a_configuration_made_in_python_is_checked_as_well(good):
-    values = yaml.safe_load(to_yaml(load_config(good)))
-    values["control"]["gain_t"] = 25.0
-    with pytest.raises(ValueError, match="gain_t"):
-        Config.model_validate(values)
-
-
-def test_limits_of_a_robot_of_yours_that_look_like_degrees_are_refused(good):
-    limits = "robot={{limits: {{joints: [[{}, {}], [-100, 100]], unit: {}}}}}"
-    task = ("task.goal.roll_deg=null", "task.goal.joints={joints: [1, 0.5], unit: deg}")
-    data = ("data={table: t.csv, joints: RP}", *task)
-    (found,) = errors(good, *data, limits.format(-110, 110, "rad"))
-    assert "robot.limits.joints.0: -110 to 110 rad is more than two turns to a side: degrees? set" in found
-    for low, high, unit in ((-110, 110, "deg"), (-6.3, 12.5, "rad")):  # of a prismatic joint 100 m are right
-        load_config(good, [*data, limits.format(low, high, unit)])

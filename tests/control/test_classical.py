@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.control.law import LOST, OK
+from projservo_cli.control.law import LOST, OK, new_state, reset
 from projservo_cli.geometry.kinematics import image_jacobian
 from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw
@@ -61,21 +61,6 @@ def test_euclidean_points_is_the_pseudo_inverse_in_metres(case):
     assert np.abs(commanded("euclidean_points", sc, s, q, frame(1))[1] - q_dot).max() > 1e-4
 
 
-@pytest.mark.parametrize("law", ["direct_three", "direct_two", "stacked", "blockwise"])
-@pytest.mark.parametrize("types", ["RRRRRR", "RRPRRR"])
-def test_laws_need_no_metric_frame(law, types):
-    """The same command from the model in any projective frame, and from cameras of any scale."""
-    sc, q, s, _ = instant(types, 4, 5)
-    wanted = commanded(law, sc, s, q)[1]
-    for seed in (1, 2):
-        status, q_dot = commanded(law, sc, s, q, frame(seed, mirrored=seed == 2))
-        assert status == OK
-        assert q_dot == pytest.approx(wanted, abs=1e-8 * np.abs(wanted).max())
-    scaled = sc.model._replace(P=sc.model.P * np.array([-3.0, 1e-3])[:, None, None])
-    _, q_dot = BuiltInLaw(CODES[law], scaled, sc.task(), GAINS)(s, q)
-    assert q_dot == pytest.approx(wanted, abs=1e-8 * np.abs(wanted).max())
-
-
 @pytest.mark.parametrize("law", list(CODES))
 def test_unseen_markers_are_lost(law):
     sc, q, s, _ = instant("RRRRRR", 4, 5)
@@ -84,3 +69,13 @@ def test_unseen_markers_are_lost(law):
             broken = s.copy()
             broken[place] = value
             assert commanded(law, sc, broken, q)[0] == LOST
+
+
+@pytest.mark.parametrize(
+    "name", ["driven", "q_dot", "q_ahead", "errors", "fit", "face_px", "limited", "share", "parts", "clock"]
+)
+def test_a_state_that_is_reset_is_a_new_one(name):
+    used, new = new_state(6, 4), new_state(6, 4)
+    getattr(used, name)[:] = 7
+    reset(used)
+    np.testing.assert_array_equal(getattr(used, name), getattr(new, name))

@@ -37,20 +37,6 @@ def test_a_scaled_command_keeps_to_the_line(scale):
     assert np.abs(trace.q[1] - trace.q[0]).max() > 0.04
 
 
-def test_what_hardly_moves_is_called_slow_and_no_minimum():
-    trace = exact_run("paper", 0.1, "null", "plant.speed_scale=0.0005", "stop.max_steps=40")
-    assert trace.verdict == "no progress"
-    assert "commands are too slow, 5e-05 of the way in a period; raise plant.speed_scale" in trace.reason
-
-
-def test_joints_that_a_law_drives_at_their_limits_are_not_slow():
-    scenario = known_scenario(configured("paper"))
-    model = scenario.truth.model
-    trace = driven(scenario, planned(scenario, model, samples=3), "blockwise", model)
-    assert trace.verdict == "no progress"
-    assert trace.reason.endswith("a local minimum")
-
-
 def test_the_limit_shortens_the_way_and_never_bends_it():
     # Fewer steps than to the goal: only the deviation from the line is looked at.
     trace = exact_run("paper", 0.5, "125", "stop.max_steps=6")

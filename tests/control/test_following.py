@@ -7,8 +7,6 @@ import pytest
 
 from projservo_cli.control.law import TAU_AFFINE, THETA_S
 from projservo_cli.laws import LAW_SPECS, TRACK
-from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.task.target import followed
 from projservo_cli.task.trajectory import (
     NO_REFERENCE,
     following,
@@ -18,7 +16,7 @@ from projservo_cli.task.trajectory import (
 from projservo_cli.task.trajectory import planned as planned_at
 from tests.control.following import SPEED, Followed, planned, tracked
 from tests.samples import frame
-from tests.scene import GAINS, Run, limits, scene, with_pins
+from tests.scene import GAINS, Run, limits, scene
 
 TRACKING = [law for law, spec in LAW_SPECS.items() if TRACK in spec.modes]
 
@@ -129,58 +127,6 @@ def test_image_track_keeps_to_the_planned_images():
     plain = Run(sc, "stacked", G=frame(1))
     planned_at = reference.s[np.minimum(np.arange(plain.steps + 1), len(reference.s) - 1)]
     assert np.linalg.norm(plain.log.s - planned_at, axis=-1).max() > 30.0
-
-
-def test_while_markers_are_lost_the_plan_waits():
-    sc = with_pins(scene())
-    noise = np.zeros((401, 2, 9, 2))
-    noise[5:12] = np.nan
-    bounds = limits(speed=np.full(6, SPEED), max_lost_periods=10)
-    whole = Followed(sc, "exact", bounds=bounds, task=sc.body_task())
-    waited = Followed(sc, "exact", bounds=bounds, task=sc.body_task(), noise=noise)
-    assert (whole.verdict, waited.verdict) == ("converged", "converged")
-    assert waited.steps == whole.steps + 7
-    np.testing.assert_array_equal(waited.log.q[12:], whole.log.q[5:])
-
-
-def test_commands_that_are_scaled_follow_a_slower_plan():
-    """The reference goes on by half a period in each; that commands are halved is up to the loop."""
-    sc = scene()
-    run = Run(sc, "exact", task=tracked(sc, rate=0.5), bounds=limits(max_steps=3))
-    assert run.state.clock[0] == 4 * 0.5  # the law is asked at the last instant, too
-
-
-def test_a_task_that_is_done_is_followed_at_rest():
-    sc = scene(step=np.zeros(6))
-    run = Followed(sc, "exact", plan=planned(sc))
-    assert (run.verdict, run.steps) == ("converged", 0)
-    run = Followed(sc, "exact", plan=planned(sc), bounds=limits(max_steps=3, image_error_px=0.0))
-    assert run.log.q == pytest.approx(np.tile(sc.q_start, (4, 1)), abs=1e-9)
-
-
-def test_a_plan_without_time_or_joints_is_refused():
-    sc = scene()
-    with pytest.raises(InputError, match=r"set trajectory\.duration_s"):
-        followed(sc.model, sc.task(), planned(sc, speed=math.inf), GAINS.period, 1.0)
-    plan = planned(sc)
-    plan.q[50:] = np.nan
-    with pytest.raises(WorkFailed, match="cannot follow"):
-        followed(sc.model, sc.task(), plan, GAINS.period, 1.0)
-    with pytest.raises(WorkFailed, match=r"duration_s 0\.1: the minimum within the joint-speed limit"):
-        planned(sc, duration=0.1)
-
-
-def test_a_given_duration_is_kept():
-    sc = scene()
-    shortest, longer = planned(sc), planned(sc, duration=4.0)
-    assert longer.duration == 4.0
-    assert longer.time == pytest.approx(shortest.time * 4.0 / shortest.duration, abs=1e-12)
-    assert planned(sc, duration=4.0, speed=math.inf).time == pytest.approx(
-        4.0 * longer.path_parameter, abs=1e-12
-    )
-    # At its shortest one joint is always at the limit.
-    rate = np.abs(np.diff(shortest.q, axis=0)).max(axis=1) / np.diff(shortest.time)
-    assert rate == pytest.approx(np.full(100, SPEED), rel=1e-9)
 
 
 @pytest.mark.parametrize("duration", [None, 6.0])

@@ -68,56 +68,6 @@ def test_corners_err_as_they_say():
     assert all(0.7 < ratio < 1.3 for _, _, ratio in decades), decades
 
 
-def test_a_corner_without_room_for_edges_is_kept_with_a_deviation_of_its_own(rng):
-    """Tags that are thin or at the border of the image."""
-    off = []
-    for k in range(12):
-        corners = square((70, 60), 60, 0.3 * k, (1.0, 0.15))
-        image = render(cv2, TAGS, (140, 120), [(3, corners)], blur=0.6, noise=2, rng=rng)
-        tag = TagFinder("4X4_50").find(image.astype(float))[0].get(3)
-        if tag is not None:
-            assert not tag.clean.any()
-            off.append((tag.pixels - corners) / tag.sigma[:, None])
-    kept = np.isfinite(off)  # where an edge passes far from a corner, it is left out
-    assert len(off) > 3
-    assert kept.mean() > 0.7
-    assert 0.4 < np.sqrt(np.mean(np.square(off)[kept])) < 1.6
-
-
-@pytest.mark.parametrize(
-    ("name", "number"), [("APRILTAG_36H11", 17), ("dict_5x5_100", 5), ("aruco_original", 0)]
-)
-def test_dictionaries_by_their_names(rng, name, number):
-    code = {17: cv2.aruco.DICT_APRILTAG_36H11, 5: cv2.aruco.DICT_5X5_100, 0: cv2.aruco.DICT_ARUCO_ORIGINAL}
-    dictionary = cv2.aruco.getPredefinedDictionary(code[number])
-    corners = square((150, 110), 90, 0.4, (1.0, 0.9))
-    image = render(cv2, dictionary, SIZE, [(number, corners)], blur=0.8, noise=2, rng=rng)
-    found, _ = TagFinder(name).find(image.astype(float))
-    np.testing.assert_allclose(found[number].pixels, corners, atol=0.1)
-
-
-def test_a_tag_that_is_hidden_in_part_gives_no_wrong_corner(rng):
-    corners = square((160, 120), 100, 0.0)
-    finder, missing, kept = TagFinder("4X4_50"), 0, 0
-    for u, v in rng.integers((95, 55), (220, 175), (24, 2)):
-        image = render(
-            cv2, TAGS, SIZE, [(3, corners)], blur=0.8, noise=2, rng=rng, cover=[(int(u), int(v), 14, 14)]
-        )
-        found, _ = finder.find(image.astype(float))
-        error = (found[3].pixels if 3 in found else np.full((4, 2), np.nan)) - corners
-        missing += int(np.isnan(error[:, 0]).sum())
-        kept += int(np.isfinite(error[:, 0]).sum())
-        assert not (np.abs(error) > 0.3).any()
-    assert missing > 8
-    assert kept > 8
-
-
-def test_a_tag_that_is_there_twice_is_left_out(rng):
-    quads = [(4, square((80, 120), 60, 0.1)), (4, square((230, 120), 60, 0.3)), (7, square((155, 40), 50, 0))]
-    found, ambiguous = TagFinder("4X4_50").find(render(cv2, TAGS, SIZE, quads).astype(float))
-    assert (list(found), ambiguous) == ([7], (4,))
-
-
 FACES = {0: (-0.05, 0.0), 5: (0.05, 0.0), 9: (0.0, 0.09)}  # centres of three tags on the tool, m
 SIDE = 0.06
 
@@ -262,14 +212,6 @@ def test_images_that_make_no_table(projservo, name):
     assert (answer.code, answer.err.count("\n")) == (code, 1), answer.err
     assert message in answer.err
     assert not Path("t.csv").exists()
-
-
-def test_folders_and_dictionaries_that_are_none(projservo):
-    joints("q1", "1")
-    answer = projservo("detect", "nowhere", "r", "--joints-csv", "q.csv", "-o", "t.csv")
-    assert (answer.code, "nowhere: no images there" in answer.err) == (2, True)
-    answer = projservo("detect", "l", "r", "--joints-csv", "q.csv", "-o", "t.csv", "--dictionary", "9X9")
-    assert (answer.code, "valid: 4X4_100" in answer.err) == (2, True)
 
 
 @pytest.mark.parametrize(

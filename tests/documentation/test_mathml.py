@@ -42,13 +42,3 @@ def test_matrices_are_whole_and_accents_stand_over_their_letter_alone(mathml):
         for over in root.iter("mover"):
             if over[1].text in ACCENTS:
                 assert len("".join(over[0].itertext()).strip()) == 1, tex
-
-
-def test_a_matrix_of_bold_letters_and_hats(mathml):
-    """What docutils alone makes one cell of, with the bracket inside."""
-    matrix = r"\begin{bmatrix}\hat{\mathbf H}_1\boldsymbol M&\boldsymbol b\end{bmatrix}"
-    tex = rf"\dot{{\boldsymbol M}}={matrix}\boldsymbol q"
-    root = tree(mathml, tex)
-    cells = ["".join("".join(cell.itertext()).split()) for cell in root.iter("mtd")]
-    assert cells == ["𝐇ˆ1𝑴", "𝒃"]
-    assert next(root.iter("mover"))[0].text == "𝑴"

@@ -1,9 +1,12 @@
 """Values of projective space: products against NumPy, incidences of points, lines and planes."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from projservo_cli.geometry.algebra import (
     apply,
@@ -23,6 +26,9 @@ from projservo_cli.geometry.algebra import (
     vec,
     vec_into,
 )
+from projservo_cli.geometry.displacements import invariant_rotations, twist_exponential
+from projservo_cli.records import WorkFailed
+from tests.samples import hat
 
 EPS = np.finfo(float).eps
 # Zeros and ones make special positions (axes, planes through the origin) common.
@@ -86,3 +92,29 @@ def test_dual_pencil_is_orthonormal_and_incident(A, D, exponent):
         assert abs(a @ A) <= 1e-14 * sizes[0]
         # Removing the part of D along A leaves an error of 1000 EPS at the angle allowed above.
         assert abs(a @ D) <= 1e-12 * sizes[1]
+
+
+@settings(max_examples=100)
+@given(st.sampled_from([0.0, 1e-9, 0.99e-4, 1.01e-4, 1e-2, 1.0, math.pi, 6.0]), st.integers(0, 10**6))
+def test_exponential_of_any_twist_is_that_of_scipy(size, seed):
+    """Both branches at the switch from series to closed form; rotation and translation together."""
+    w, v = np.random.default_rng(seed).normal(size=(2, 3))
+    X = size * hat(w / np.linalg.norm(w), v)
+    # Round-off of the entries, which grow with the translation.
+    assert as_array(twist_exponential(mat(X))) == pytest.approx(expm(X), abs=1e-13 * (1.0 + size * 5.0))
+
+
+@settings(max_examples=50)
+@given(st.integers(2, 6), st.integers(0, 10**6))
+def test_rotations_are_those_of_the_metric_that_all_joints_keep(joints, seed):
+    """Of joints that turn about random directions, in a random affine frame; some keep none."""
+    rng = np.random.default_rng(seed)
+    C = np.linalg.qr(rng.normal(size=(3, 3)))[0] * rng.uniform(0.5, 2.0, 3)
+    Q = C.T @ C
+    w = rng.normal(size=(joints, 3))
+    actions = np.array([np.linalg.solve(C, np.cross(np.eye(3), one) @ C) for one in w])
+    for R in invariant_rotations(actions):
+        assert pytest.approx(0.0, abs=1e-9) == R.T @ Q + Q @ R
+        assert np.sort(np.linalg.eigvals(R).imag) == pytest.approx([-1.0, 0.0, 1.0], abs=1e-9)
+    with pytest.raises(WorkFailed, match="preserve no metric"):
+        invariant_rotations(rng.normal(size=(5, 3, 3)))

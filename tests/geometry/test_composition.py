@@ -43,13 +43,6 @@ def test_the_printed_second_solution_holds_only_without_a_cosine():
     assert abs(0.4 + math.sin(printed) + 0.5 * math.cos(printed)) > 0.5
 
 
-def test_no_angle_where_the_plane_is_never_met():
-    assert not incidence_angles(1.0, 0.3, 0.4)[0]
-    assert not incidence_angles(0.0, 0.0, 0.0)[0]
-    assert not incidence_angles(math.nan, 1.0, 0.0)[0]
-    assert incidence_angles(-0.5, 0.3, 0.4)[0]  # it only touches
-
-
 def perpendicular_pair(seed):
     """Two revolute operators about perpendicular axes through one point, in a projective frame."""
     generator = np.random.default_rng(seed)
@@ -98,8 +91,3 @@ def test_half_a_turn(theta_p):
     theta_s, H_s = composed(H_r, H_p, math.pi, theta_p)
     assert theta_s == pytest.approx(math.pi, abs=1e-15)
     assert expm(theta_s * H_s) == pytest.approx(expm(math.pi * H_r) @ expm(theta_p * H_p), abs=1e-12)
-
-
-def test_the_identity_has_no_axis():
-    H_r, H_p = perpendicular_pair(1)
-    assert not composed_operator(mat(H_r), mat(H_p), *composed_angle(0.0, 0.0)[1:])[0]

@@ -11,10 +11,9 @@ from projservo_cli.geometry.displacements import (
     exp_rotation,
     normalize_displacement,
     translation,
-    twist_exponential,
 )
 from projservo_cli.records import WorkFailed
-from tests.samples import displacement, frame, hat, prismatic, revolute
+from tests.samples import displacement, frame, prismatic, revolute
 
 ANGLES = [0.0, 1e-12, 1e-4, 0.3, math.pi / 2, 3.0, math.pi, 4.0, 2 * math.pi, -0.7, -math.pi, 17.0]
 
@@ -56,12 +55,3 @@ def test_a_homography_that_reflects_or_is_singular_is_refused():
     for H in (np.diag([1.0, 1, -1, 1]), np.diag([1.0, 1, 0, 1]), np.zeros((4, 4))):
         with pytest.raises(WorkFailed, match="no displacement"):
             normalize_displacement(H, np.ones((1, 4)), np.array([0, 0, 0, 1.0]))
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-9, 0.99e-4, 1.01e-4, 1e-2, 1.0, math.pi, 6.0])
-def test_exponential_of_any_twist(size):
-    """Both branches at the switch from series to closed form; rotation and translation together."""
-    for w, v in [([1, 2, -2], [0.3, -0.5, 0.2]), ([0, 0, 3], [1, 0, 5]), ([0, 0, 0], [1, 2, 3])]:
-        X = size * hat(np.array(w) / 3.0, v)
-        # Round-off of the entries, which grow with the translation of size·5.
-        assert as_array(twist_exponential(mat(X))) == pytest.approx(expm(X), abs=1e-13)

@@ -1,10 +1,7 @@
 """Where machine code is cached: keyed by every source it depends on, or not at all."""
 
 import importlib
-import json
-import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -72,62 +69,3 @@ def test_no_cache_where_nothing_can_be_written(copy, tmp_path, monkeypatch):
     (tmp_path / "occupied").write_text("a file, not a folder", encoding="utf-8")
     monkeypatch.setenv("PROJSERVO_CACHE_DIR", str(tmp_path / "occupied"))
     assert cache_folder(copy) is None
-
-
-CALL = """
-import json
-import numpy as np
-from projservo_cli.geometry.jit import CACHE_FOLDER
-from projservo_cli.geometry.kernels import least_squares, new_system
-from projservo_cli.task.visibility import margin_coefficients
-values = margin_coefficients((1.0, 2.0, 3.0, 4.0), (0.5,) * 16, (1.0, 1.0, 0.0, 2.0))
-# One that only compiled functions call is called from Python by way of another, and cached as well.
-system, x = new_system(2, 3), np.zeros(2)
-system.B[:, :3], system.rhs[:3] = [[1.0, 2.0, 3.0], [4.0, 0.0, 6.0]], [9.0, 2.0, 15.0]
-assert least_squares(system, 3, x)
-assert np.allclose(x, [1.0, 2.0])
-hits = [sum(function.stats.cache_hits.values()) for function in (margin_coefficients, least_squares)]
-print(json.dumps([values, CACHE_FOLDER is not None, *hits]))
-"""
-
-
-def called(root, **environment):
-    """What the script says of a kernel and its cache, in a fresh interpreter."""
-    kept = {k: v for k, v in os.environ.items() if k not in ("PROJSERVO_CACHE_DIR", "XDG_CACHE_HOME")}
-    environment = {**kept, "PYTHONPATH": str(root.parent), "PYTHONDONTWRITEBYTECODE": "1", **environment}
-    done = subprocess.run(
-        [sys.executable, "-c", CALL],
-        env=environment,
-        cwd=root.parent,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return json.loads(done.stdout)
-
-
-@pytest.mark.volume
-def test_installed_read_only_with_an_edit_and_without_a_home(copy):
-    """Cached from a read-only install for all; an edit in another file is never missed; no home, no cache."""
-    root = copy.rename(copy.parent / "projservo_cli")
-    writable = {path: path.stat().st_mode for path in [root, *root.rglob("*")]}
-    for path, mode in writable.items():
-        path.chmod(mode & ~0o222)
-    home = root.parent / "home"
-    try:
-        first = called(root, HOME=str(home))
-        assert first == [[51.0, -20.0, -40.0], True, 0, 0]
-        elsewhere = shutil.copytree(root, root.parent / "elsewhere" / root.name)
-        assert called(elsewhere, HOME=str(home)) == [first[0], True, 1, 1]
-    finally:
-        for path, mode in writable.items():
-            path.chmod(mode)
-    algebra = root / "geometry" / "algebra.py"
-    text = algebra.read_text(encoding="utf-8")
-    edited = text.replace("return (a[0] * A[0] + a[1] * A[1])", "return 7.0 + (a[0] * A[0] + a[1] * A[1])")
-    assert edited != text
-    algebra.write_text(edited, encoding="utf-8")
-    values, _, *hits = called(root, HOME=str(home))
-    assert values != first[0]
-    assert hits[0] == 0
-    assert called(root, HOME=os.devnull) == [values, False, 0, 0]

@@ -2,33 +2,27 @@
 
 import html
 import json
-import os
 import re
-import signal
-import socket
-import subprocess
 import sys
 import urllib.request
 from types import SimpleNamespace
 
-import click
 import cv2
 import numpy as np
 import pytest
 
 from projservo_cli.calibration import predict
-from projservo_cli.config import Override, load_config
+from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs
 from projservo_cli.detection import TagFinder
 from projservo_cli.files import working_in
-from projservo_cli.hardware.checks_at_rest import FAULT, FINE, Finding, view_angle_deg
-from projservo_cli.records import InputError
+from projservo_cli.hardware.checks_at_rest import FAULT, FINE, Finding
 from projservo_cli.report.live_page import LivePage
 from projservo_cli.stages import calibrate
 from projservo_cli.stages.doctor import Checked, calibration_finding
 from projservo_cli.store import load
 from tests.conftest import ROOT
-from tests.hardware.arms_in_motion import Faults, Rail, findings
+from tests.hardware.arms_in_motion import Faults, findings
 from tests.hardware.streams import Stream, picture
 
 LEFT = picture(at=(60.0, 80.0), numbers=(0, 1, 2), side=50.0, step=75.0)
@@ -154,45 +148,6 @@ def test_a_mistake_with_tags_or_light_is_named_with_its_remedy(doctor, left, rig
         assert [one for one in found[level] if text in one], found
 
 
-def test_a_camera_that_slows_down_in_the_dark_is_named(doctor):
-    _, found = doctor(LEFT, LEFT, rate_hz=15.0, asked_hz=30)
-    slow = [one for one in found["warning"] if "frames a second instead of 30" in one]
-    assert len(slow) == 2
-    assert "webcams expose longer in the dark: add light, or set exposure_ms below 33" in slow[0]
-
-
-def test_cameras_close_together_are_named_and_apart_are_not(doctor):
-    _, found = doctor(seen_from(-0.01), seen_from(0.01))
-    (close,) = (one for one in found["fault"] if "directions" in one)
-    assert "apart (10° at least): move them apart, by a third of their distance" in close
-    assert float(close.split("directions ")[1].split("°")[0]) == pytest.approx(2.3, abs=1.5)
-    finder = TagFinder("4X4_50")
-    for baseline in (0.1, 0.2):
-        views = [finder.find(seen_from(x).astype(float))[0] for x in (-baseline / 2, baseline / 2)]
-        expected = 2.0 * np.degrees(np.arctan(baseline))
-        assert view_angle_deg(*views) == pytest.approx(expected, rel=0.15)
-
-
-def test_an_arm_at_a_stop_and_one_beyond_its_limits_are_named(doctor):
-    _, found = doctor(LEFT, LEFT, options=", options: {q_deg: [0, 99.5, -120, 0, 0]}")
-    assert any(
-        "joint 2: reads 99.5 deg, at its limits -100 deg to 100 deg" in one for one in found["warning"]
-    )
-    assert any("joint 3: reads -120 deg, beyond its limits -97 deg" in one for one in found["fault"])
-
-
-def test_a_camera_that_does_not_open_ends_in_a_fault_with_its_name(doctor, projservo):
-    answer, found = doctor(LEFT, LEFT, sets=("--set", "cameras.left.source=nowhere.mp4"))
-    assert answer.code == 1
-    (fault,) = found["fault"]
-    assert "the left camera (cameras.left.source: nowhere.mp4): cannot be opened" in fault
-    assert "look at its name" in fault
-    answer = projservo("doctor", "--move")
-    assert (answer.code, "doctor checks a robot with -c alone" in answer.err) == (2, True)
-    answer = projservo("doctor", "-c", "arm.yaml", "--move")
-    assert (answer.code, "nobody can be asked" in answer.err) == (2, True)
-
-
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="device nodes of Linux")
 @pytest.mark.parametrize(
     ("left", "right", "words"),
@@ -214,64 +169,6 @@ def test_a_source_that_is_taken_or_no_camera_is_refused(projservo, tmp_path, mon
     (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
     answer = projservo("doctor", "-c", "arm.yaml")
     assert (answer.code, answer.err.count("\n"), words in answer.err) == (2, 1, True), answer.err
-
-
-def test_an_exposure_in_seconds_is_refused_and_a_format_in_small_letters_is_not(tmp_path):
-    path = tmp_path / "arm.yaml"
-    path.write_text(CONFIGURATION.format(left="l", right="r", rate=30, options=""), encoding="utf-8")
-    for exposure, words in (("0.008", "must be at least 0.1"), ("8000", "must be at most 1000")):
-        with pytest.raises(InputError, match=rf"cameras.left.exposure_ms: {words}"):
-            load_config(path, [Override.parse(f"cameras.left.exposure_ms={exposure}")])
-    found = load_config(path, [Override.parse("cameras.left.fourcc=mjpg")])
-    assert found.cameras.left.fourcc == "MJPG"
-
-
-@pytest.fixture
-def process(tmp_path):
-    """Function that starts doctor before two cameras in a process of its own, as people do."""
-    images = seen_from(-0.12), seen_from(0.12)
-    left, right = (Stream(lambda image=image: image, 10.0) for image in images)
-    started = []
-
-    def start(right_source=right.url):
-        text = CONFIGURATION.format(left=left.url, right=right_source, rate=10, options="")
-        (tmp_path / "arm.yaml").write_text(text, encoding="utf-8")
-        command = "from projservo_cli.cli import main; main()"
-        started.append(
-            subprocess.Popen(
-                [sys.executable, "-c", command, "doctor", "-c", "arm.yaml"],
-                cwd=tmp_path,
-                env=os.environ | {"PYTHONPATH": str(ROOT)},
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-        )
-        return started[-1]
-
-    yield start
-    for one in started:
-        one.kill()
-        one.communicate()
-    left.close()
-    right.close()
-
-
-def test_a_command_with_cameras_ends_with_its_own_exit_code(process):
-    out, err = (sound := process()).communicate(timeout=60)
-    assert (sound.returncode, "ready to record" in out, err) == (0, True, "")
-    out, err = (alone := process("nowhere.mp4")).communicate(timeout=60)
-    assert (alone.returncode, "the right camera" in out, err) == (1, True, "")
-
-
-def test_an_interrupt_before_a_silent_camera_ends_in_its_own_exit_code(process):
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        waiting = process(f"http://127.0.0.1:{silent.getsockname()[1]}/right.mjpg")
-        silent.settimeout(60.0)
-        with silent.accept()[0]:
-            waiting.send_signal(signal.SIGINT)
-            _, err = waiting.communicate(timeout=60)
-    assert (waiting.returncode, err.splitlines()[-1]) == (130, "projservo: interrupted")
 
 
 @pytest.fixture(scope="module")
@@ -368,57 +265,6 @@ def test_motions_name_what_a_recording_would_fail_at(faults, where, words):
     assert words in f"{fault.text}: {fault.remedy}"
 
 
-RAIL = """\
-name: rail
-plant: {{use: "tests.hardware.arms_in_motion:Rail"{options}}}
-data: {{table: rail.csv, joints: RP}}
-markers: {{numbers: [0, 1, 2, 3, 4, 5, 6, 7], face: [0, 1, 2, 3]}}
-robot: {{limits: {limits}}}
-control: {{joint_speed_limit_deg_s: 40, prismatic_speed_limit_m_s: 0.5}}
-"""
-
-
-@pytest.fixture
-def rail(projservo, tmp_path, monkeypatch):
-    """Function that checks and moves a joint that turns and one that slides; answer, findings, questions."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
-    asked = []
-    monkeypatch.setattr(click, "confirm", lambda question, **_: asked.append(question) or True)
-
-    def check(limits="{joints: [[-90, 90], [-0.5, 0.5]], unit: deg}", options=""):
-        (tmp_path / "rail.yaml").write_text(RAIL.format(limits=limits, options=options), encoding="utf-8")
-        answer = projservo("doctor", "-c", "rail.yaml", "--move", "--json")
-        assert answer.code < 2, answer.err
-        return answer, answer.json["findings"], asked
-
-    return check
-
-
-def test_a_joint_that_slides_moves_by_millimetres_and_reports_them(rail):
-    answer, found, asked = rail()
-    assert answer.code == 0
-    assert "move each joint by 3°, prismatic ones by 15.7 mm, to either side" in asked[0]
-    t, turned, slid = np.array(Rail.last.sent).T
-    assert np.degrees([turned.min(), turned.max()]) == pytest.approx([-3.0, 3.0])
-    assert [slid.min(), slid.max()] == pytest.approx([-0.0157, 0.0157], abs=1e-4)
-    assert np.abs(np.diff(slid) / np.diff(t)).max() == pytest.approx(0.3 * np.radians(20.0), rel=0.01)
-    text = {one["where"]: one["text"] for one in found}
-    assert text["joint 1"] == "hysteresis 0°, sag 0°, backlash 0°"
-    assert text["joint 2"] == "hysteresis 0 mm, sag 0 mm, backlash 0 mm"
-
-
-def test_a_joint_without_limits_is_a_fault_and_nothing_moves(rail, tmp_path):
-    answer, found, asked = rail(limits="{from_data: 0.1}")
-    assert (answer.code, asked, Rail.last.sent) == (1, [], [])
-    assert (tmp_path / "preflight.html").exists()
-    assert [one["where"] for one in found if (one["level"], one["text"]) == ("fault", "has no limits")] == [
-        "joint 1",
-        "joint 2",
-    ]
-    assert found[-1]["text"] == "were not moved: something above is a fault"
-
-
 @pytest.mark.parametrize(
     ("frozen", "where", "words"),
     [
@@ -433,12 +279,6 @@ def test_a_camera_that_repeats_one_frame_is_named(rail, tmp_path, frozen, where,
     assert words in f"{fault['text']}: {fault['remedy']}"
     assert (frozen == "[1]") == any(one["where"] == "tags" for one in found)
     assert (tmp_path / "preflight.html").exists()
-
-
-def test_a_robot_that_refuses_to_move_leaves_the_findings_at_rest(rail, tmp_path):
-    answer, found, _ = rail(options=", options: {refuses: true}")
-    assert (answer.code, found[-1]["text"]) == (1, "nothing was moved")
-    assert "share 8 of 8 markers" in (tmp_path / "preflight.html").read_text(encoding="utf-8")
 
 
 def test_a_live_page_serves_both_images_to_this_machine_alone():

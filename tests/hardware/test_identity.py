@@ -26,24 +26,9 @@ def test_an_arm_that_was_homed_since_is_named_by_what_changed():
             robot.require_identity("1:0/4095/12/0/0;2:0/4095/12/7/0")
 
 
-def test_a_robot_without_identity_has_none():
-    robot = robot_with()
-    with at_rest_after(robot):
-        assert robot.identity() == ""
-
-
 @pytest.mark.parametrize("identity", ["", "1:0/4095/12/0/0;2:0/4095/12/-85/0"])
 def test_a_table_keeps_recording_and_identity(tmp_path, identity):
     seen = Observation(np.arange(2), np.arange(3), np.zeros((2, 1)), np.ones((2, 2, 3, 2)))
     write_table(seen, tmp_path / "t.csv", recording="my:Robot 0123", identity=identity)
     assert recording_of(tmp_path / "t.csv") == "my:Robot 0123"
     assert identity_in(tmp_path / "t.csv") == identity
-
-
-def test_words_of_a_class_are_passed_on():
-    def read():
-        raise WorkFailed("joint 3 is too hot")
-
-    robot = robot_with(read=read)
-    with at_rest_after(robot), pytest.raises(WorkFailed, match=r"^arm: joint 3 is too hot$"):
-        robot.read()

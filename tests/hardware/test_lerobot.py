@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from projservo_cli import plugins
-from projservo_cli.records import WorkFailed
 from tests.documentation.blocks import PAGES, blocks_of
 
 NAMES = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
@@ -77,9 +76,3 @@ def test_a_robot_of_lerobot_is_driven_in_radians(made):
     arm.hold()
     assert robot.on
     assert len(made.lines) <= 20
-
-
-@pytest.mark.parametrize("config", [{"use_degrees": False}, {"disable_torque_on_disconnect": True}])
-def test_percentages_and_an_arm_that_falls_are_refused(made, config):
-    with pytest.raises(WorkFailed, match="set use_degrees=True and disable_torque_on_disconnect=False"):
-        made(**config)

@@ -12,7 +12,6 @@ from projservo_cli.cli import run
 from projservo_cli.config import load_config
 from projservo_cli.config.editing import with_limits
 from projservo_cli.hardware import so101
-from projservo_cli.records import InputError
 from tests.emulated.arm import Arm, Clock
 from tests.emulated.servos import Bus
 
@@ -104,23 +103,6 @@ def test_a_range_over_the_end_of_a_turn_is_refused_or_shifted(arm, capsys):
     assert abs(high - low - 148.0) < 1.5
 
 
-def test_an_arm_without_limits_is_not_released_to_be_taught(arm, capsys):
-    assert run(["teach", "--start", "-c", "arm.yaml"]) == 2
-    error = capsys.readouterr().err
-    assert "joint 1 has no limits, without which the arm would not hold again: nothing was released" in error
-    assert "run projservo limits -c FILE first" in error
-    assert error.count("\n") == 1
-
-
-def test_release_lets_go_and_says_so(arm, capsys):
-    for servo in arm.bus.servos.values():
-        servo.write(40, b"\1")
-    arm.script += [lambda: "\n"]
-    assert run(["release", "-c", "arm.yaml"]) == 0
-    assert "torque is off: nothing holds the arm" in capsys.readouterr().err
-    assert not any(servo.on for servo in arm.bus.servos.values())
-
-
 def test_all_that_answer_are_released_and_the_others_named(arm, capsys):
     """With limits the wrong way round in the file, which nothing else takes."""
     text = arm.file.read_text()
@@ -158,26 +140,6 @@ def test_nobody_at_the_terminal_lets_go_of_no_arm(arm, capsys, command):
     assert all(servo.on for servo in arm.bus.servos.values())
 
 
-def test_a_slip_in_the_options_is_one_line(arm, capsys):
-    arm.file.write_text("plant: {use: so101, options: {prot: auto}}\n")
-    assert run(["release", "-c", "arm.yaml"]) == 2
-    assert "plant.options" in capsys.readouterr().err
-
-
-def test_limits_that_the_file_would_not_hold_are_printed(arm, capsys):
-    """A comment on the line of the key would take them in."""
-    text = arm.file.read_text()
-    arm.file.write_text(text + "\nrobot:\n  limits: # of May\n    joints: [[1, 2]]\n    unit: deg\n")
-    arm.script += [lambda: "\n", moved(arm.bus, [(-15.0, 15.0)] * 5)]
-    assert run(["limits", "-c", "arm.yaml"]) == 2
-    assert "put them under robot yourself" in " ".join(capsys.readouterr().err.split())
-
-
-def test_only_an_arm_of_bus_servos_is_released(tmp_path, capsys):
-    assert run(["release", "-c", "configs/hobby.yaml"]) == 2
-    assert "plant simulated: is no arm of bus servos: set plant: so101" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -198,8 +160,3 @@ def test_limits_take_their_place_in_a_file_and_all_else_stays(text):
     assert after == before | {"robot": before.get("robot") or {}}
     comments = [line.partition("#")[2] for line in text.splitlines() if "#" in line]
     assert all(f"#{comment}" in edited for comment in comments)
-
-
-def test_a_text_that_is_no_configuration_is_refused():
-    with pytest.raises(InputError, match=r"f.yaml: expected keys and values"):
-        with_limits("- 1\n", PAIRS, "f.yaml")

@@ -1,14 +1,10 @@
 """The command tags: true scale for the detector of the project, and a net that folds to the roof."""
 
-import math
-import re
-
 import numpy as np
 import pytest
 
 from projservo_cli.detection import TagFinder
 from projservo_cli.hardware import tag_sheets
-from projservo_cli.settings.markers import GROUND, Markers
 
 pdfium = pytest.importorskip("pypdfium2")
 pytest.importorskip("cv2")
@@ -53,37 +49,6 @@ def test_printed_tags_are_found_at_their_size(projservo, tmp_path, kind, size_mm
         assert sides(tag.pixels) == pytest.approx(size_mm, rel=2e-3)
 
 
-def test_a_folded_net_is_the_described_roof(projservo, tmp_path):
-    file, size = tmp_path / "tags.pdf", 30.0
-    projservo("tags", "--kind", "roof", "-o", file)
-    found, _ = TagFinder("4X4_50").find(page(file)[0])
-    flat = {n: np.c_[t.pixels[:, 0], -t.pixels[:, 1]] / PX_MM for n, t in found.items()}
-    origin, half, tilt = flat[0].mean(axis=0), 0.5 * GROUND * size, math.radians(35)
-    body = Markers.model_validate({"tags": "roof", "tag_size_m": 1e-3 * size}).all_tags
-    for tag in body:
-        corners = flat[tag.number] - origin
-        out = corners.mean(axis=0)
-        folded = np.c_[corners, np.zeros(4)]
-        if tag.number:
-            out /= np.linalg.norm(out)
-            beyond = corners @ out - half
-            folded[:, :2] += np.outer(beyond * (math.cos(tilt) - 1.0), out)
-            folded[:, 2] = -beyond * math.sin(tilt)
-        folded[:, 2] += 1.5 * half
-        assert folded == pytest.approx(1e3 * tag.corners, abs=0.06)  # mm
-
-
-def test_triangles_of_the_net_close_the_gaps_of_the_tilted_roof():
-    body = Markers.model_validate({"tags": "roof", "tag_size_m": 0.03}).all_tags
-    net = tag_sheets.unfolded([tag.number for tag in body], np.array([tag.pose for tag in body]))
-    tilt, width = math.radians(35), 0.03 * GROUND * 1e3
-    a = width * np.array([math.cos(tilt), 0, -math.sin(tilt)])
-    b = width * np.array([0, math.cos(tilt), -math.sin(tilt)])
-    (_, flap, brim, end) = next(line.points for line in net.lines if len(line.points) == 4 and not line.fold)
-    assert np.linalg.norm(brim - end) == pytest.approx(np.linalg.norm(a - b))
-    assert np.linalg.norm(brim - flap) > 5.0  # mm, wide enough to take glue
-
-
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -106,18 +71,3 @@ def test_a_sheet_that_cannot_be_is_refused(projservo, tmp_path, given, words):
     assert answer.code == 2
     assert words in answer.err
     assert not (tmp_path / "tags.pdf").exists()
-
-
-@pytest.mark.parametrize("kind", ["single", "plate", "roof"])
-@pytest.mark.parametrize("paper", tag_sheets.PAPERS)
-def test_the_largest_size_that_a_refusal_names_fits(projservo, tmp_path, kind, paper):
-    given = ("tags", "-o", tmp_path / "tags.pdf", "--kind", kind, "--paper", paper, "--size-mm")
-    most = re.search(r"take (?:about )?(\d+) mm", projservo(*given, "150").err)
-    assert projservo(*given, most[1]).code == 0
-    assert projservo(*given, int(most[1]) + 1, "--force").code == 2
-
-
-def test_a_sheet_is_a_pdf_by_its_name(projservo, tmp_path):
-    answer = projservo("tags", "-o", tmp_path / "sheet.png")
-    assert (answer.code, "such as sheet.pdf" in answer.err) == (2, True)
-    assert list(tmp_path.iterdir()) == []

@@ -54,35 +54,3 @@ def test_an_opaque_face_is_measured_by_the_pins(shown):
     true = sc.images(run.log.q[-1]) - sc.s_star
     assert run.log.judged[-1] == pytest.approx(np.sqrt((true**2).sum() / 8), rel=1e-3)
     assert run.log.q[-1] == pytest.approx(sc.q_goal, abs=1e-5)
-
-
-def test_views_that_the_goal_did_not_show_are_left_out():
-    sc = with_pins(scene())
-    task = sc.body_task()
-    task.body.in_goal[0, 4:] = task.body.in_goal[1, 7:] = False
-    run = Run(sc, "exact", task=task)
-    assert run.verdict == "converged"
-    assert (run.log.fit[:, 2] == 4 + 7).all()
-
-
-def test_markers_lost_one_after_the_other(rng):
-    """The run goes on with what is left and ends where two markers are."""
-    sc = with_pins(scene())
-    noise = np.zeros((41, 2, 9, 2))
-    for k in range(8):
-        noise[3 * k :, :, k] = np.nan
-    run = body_run(sc, "direct_three", bounds=limits(max_steps=40), noise=noise)
-    assert run.log.fit[:, 2].tolist() == [2 * (8 - k // 3) for k in range(run.steps + 1)]
-    assert (run.verdict, run.steps) == ("markers lost", 18)
-    assert np.isnan(run.log.errors[-1]).all()
-
-
-def test_a_marker_beyond_the_image_is_unseen_if_it_is_a_pin():
-    sc = with_pins(scene())
-    low = sc.plant._replace(image_size=np.full((2, 2), [1280.0, 500.0]))
-    run = body_run(sc._replace(plant=low), "direct_three", bounds=limits(stop_at_border=False))
-    free = body_run(sc, "direct_three")
-    v = free.log.s[: run.steps + 1, :, :, 1]
-    assert (v[:, :, 4:] > 499.5).any()
-    assert (np.isnan(run.log.s[0, :, 4:, 1]) == (v[0, :, 4:] > 499.5)).all()
-    assert np.isfinite(run.log.s[:, :, :4]).all()

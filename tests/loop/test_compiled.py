@@ -9,12 +9,10 @@ from projservo_cli.control.law import Law, reset
 from projservo_cli.laws import CODES, LAWS
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.run_metrics import SUBSAMPLES, Ended, path_deviation, summarize
-from projservo_cli.loop.verdicts import CONVERGED, MAX_STEPS, RUNNING
+from projservo_cli.loop.verdicts import CONVERGED, MAX_STEPS
 from projservo_cli.simulation.analytic_plant import Ends
-from tests.samples import displacement, pixels, poe
+from tests.samples import poe
 from tests.scene import GAINS, STEP, Run, limits, scene
-
-DIRECT = ("direct_three", "direct_two")
 
 
 def test_log_describes_the_run_it_belongs_to():
@@ -59,17 +57,6 @@ def test_arrays_that_another_run_left_are_as_good_as_new(law, rng):
     assert used.state.limited[0] == fresh.state.limited[0]
 
 
-def test_a_run_that_lasts_longer_than_its_noise_says_so():
-    """Noise for fewer instants gives the same instants, and no verdict."""
-    whole = Run(scene(), "direct_two", bounds=limits(max_steps=30, image_error_px=1e-9))
-    cut = Run(
-        scene(), "direct_two", bounds=limits(max_steps=30, image_error_px=1e-9), noise=np.zeros((12, 2, 4, 2))
-    )
-    assert (cut.code, cut.steps) == (RUNNING, 11)
-    assert whole.steps == 30
-    assert np.array_equal(cut.log.error[:12], whole.log.error[:12])
-
-
 @pytest.mark.parametrize("law", LAWS)
 def test_at_the_goal_and_next_to_it_a_run_converges(law):
     """Without a command, and after steps of 1e-9 rad: errors of 1e-6 px, directions next to nothing."""
@@ -79,108 +66,6 @@ def test_at_the_goal_and_next_to_it_a_run_converges(law):
     run = Run(scene(1e-7 * STEP), law, bounds=limits(image_error_px=1e-8))
     assert run.verdict == "converged"
     assert run.steps < 120
-
-
-def test_noise_is_added_to_what_the_law_sees(rng):
-    law = "direct_two"
-    sc = scene()
-    bounds = limits(max_steps=30)
-    noise = 0.5 * rng.normal(size=(31, 2, 4, 2))
-    run = Run(sc, law, bounds=bounds, noise=noise)
-    assert run.steps == 30
-    for k in (0, 7, 30):
-        assert run.log.s[k] - sc.images(run.log.q[k]) == pytest.approx(noise[k], abs=1e-9)
-    assert np.abs(run.log.q - Run(sc, law, bounds=bounds).log.q).max() > 1e-4
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_speed_limit_scales_commands_uniformly(law):
-    """The same first command, all joints by one factor; no joint ever faster than its limit."""
-    sc = scene()
-    free = Run(sc, law, bounds=limits(max_steps=1)).log.q_dot[0]
-    speed = np.full(6, 0.2 * np.abs(free).max())
-    run = Run(sc, law, bounds=limits(speed=speed, max_steps=50))
-    assert run.log.factor[0] == pytest.approx(0.2, rel=0.1 if law == "exact" else 1e-12)
-    if law == "exact":  # the limit bounds its first-order step; the path it solves for is not bent
-        assert (np.abs(run.log.q_dot) <= 1.1 * speed).all()
-        return
-    assert run.log.q_dot[0] == pytest.approx(0.2 * free, rel=1e-12)
-    assert (np.abs(run.log.q_dot) <= speed * (1 + 1e-14)).all()
-
-
-def test_left_image():
-    """An image cut just beyond the start ends the run there, or is only recorded."""
-    sc = scene()
-    low = Run(sc, "direct_three").log.s[:, 0, :, 0].min(axis=1)
-    shift = 0.5 * (low[0] + low.min())
-    first = int(np.argmax(low - shift < -0.5))
-    assert first > 0
-    camera = sc.plant.model.P.copy()
-    camera[0, 0] -= shift * camera[0, 2]
-    sc = sc._replace(plant=sc.plant._replace(model=sc.model._replace(P=camera)))
-    s_start, s_star = (sc.images(q) for q in (sc.q_start, sc.q_goal))
-    sc = sc._replace(s_start=s_start, s_star=s_star)
-    run = Run(sc, "direct_three", bounds=limits(stop_at_border=True))
-    assert (run.verdict, run.steps) == ("out of view", first)
-    assert run.log.events[0] == first
-    told = Run(sc, "direct_three", bounds=limits(stop_at_border=False))
-    assert told.verdict == "converged"
-    assert told.log.events[0] == first
-
-
-def test_joint_limit():
-    """Stopped at it, the last step shortened, or only recorded with the joint that passed."""
-    sc = scene()
-    upper = sc.plant.limits.upper.copy()
-    upper[2] = sc.q_start[2] + 0.5 * STEP[2]
-    sc = sc._replace(plant=sc.plant._replace(limits=sc.plant.limits._replace(upper=upper)))
-    told = Run(sc, "direct_three")
-    assert told.verdict == "converged"
-    first = int(np.argmax(told.log.q[:, 2] > upper[2]))
-    assert told.log.events[1:3].tolist() == [first, 2]
-    stopped = Run(sc, "direct_three", bounds=limits(stop_at_joint_limit=True))
-    assert (stopped.verdict, stopped.steps) == ("joint limit", first)
-    assert stopped.log.events[1:3].tolist() == [-1, 2]
-    assert (stopped.log.q[:, 2] <= upper[2]).all()
-    assert stopped.log.q[-1, 2] == pytest.approx(upper[2], abs=1e-11)
-    # The last step keeps its direction.
-    last, whole = np.diff(stopped.log.q, axis=0)[-1], np.diff(told.log.q, axis=0)[first - 1]
-    assert last / last[2] == pytest.approx(whole / whole[2], rel=1e-9)
-
-
-def test_behind_camera():
-    """The goal is in view, but the rig's frame puts a marker of the start behind the left camera."""
-    sc = scene()
-    M = sc.plant.M.copy()
-    M[0, 2] = -0.2
-    hidden = sc._replace(plant=sc.plant._replace(M=M))
-    run = Run(hidden, "direct_three", task=sc.task())
-    assert (run.verdict, run.steps) == ("behind camera", 0)
-    assert np.isnan(run.log.s[0, 0, 0]).all()
-
-
-def test_singular():
-    """Two joints on one axis at the start: no joint motion of the law is unique."""
-    sc = scene()
-    H_hat_0 = sc.model.H_hat_0.copy()
-    H_hat_0[3] = H_hat_0[2]
-    model = sc.model._replace(H_hat_0=H_hat_0)
-    wrist = sc._replace(plant=sc.plant._replace(model=model))
-    for law in LAWS:
-        run = Run(wrist, law, task=sc.task())
-        assert (run.verdict, run.steps) == ("singular", 0)
-        assert np.isnan(run.log.errors).all()
-
-
-def test_an_opaque_face_hides_its_markers():
-    """It looks away at the start although the plant remembers its front: occluded in both views."""
-    for opaque, ends in ((True, ("markers lost", 0)), (False, ("converged", -1))):
-        sc = scene(opaque=opaque)
-        sc = sc._replace(plant=sc.plant._replace(visible=-sc.plant.visible))
-        run = Run(sc, "direct_three", task=scene().task())
-        assert (run.verdict, run.steps if opaque else -1) == ends
-        assert np.isnan(run.log.s).all() == opaque
-        assert run.log.hidden.all()
 
 
 def test_occlusion_begins_where_the_plane_passes_the_optical_center():
@@ -199,26 +84,6 @@ def test_occlusion_begins_where_the_plane_passes_the_optical_center():
     opaque = Run(scene(opaque=True), "stacked")
     assert opaque.verdict == "markers lost"
     assert opaque.steps == int(np.argmax(run.log.hidden.any(axis=1)))
-
-
-def test_visibility_limits_the_translation():
-    """Towards the cameras, τ_0 ahead: with a vanishing share δ of it the first step does not translate."""
-    sc = scene()
-    nearer = sc.plant.M - np.array([0, 0, 0.4, 0])
-    sc = sc._replace(s_star=pixels(sc.model.P, nearer))
-    free, held = (
-        Run(
-            sc,
-            "direct_three",
-            GAINS._replace(visibility_fraction=delta, gain_r=1e-9, gain_p=1e-9),
-            limits(max_steps=1),
-        )
-        for delta in (0.9, 1e-9)
-    )
-    assert free.state.limited[0] == 0
-    assert held.state.limited[0] > 0
-    moved = [np.linalg.norm(run.center[-1] - run.center[0]) for run in (free, held)]
-    assert moved[1] < 1e-6 * moved[0]
 
 
 def test_deviation_from_the_line():
@@ -277,35 +142,3 @@ def test_success_is_told_of_the_truth(rng):
     hidden = run.log.hidden.copy()
     hidden[run.steps // 2, 1] = 1.0
     assert success(log=run.log._replace(hidden=hidden)) == 0.0
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, math.pi - 1e-7, math.pi])
-def test_rotation_that_is_left(angle):
-    """Accurate at both ends, where an arc cosine would lose half its digits."""
-    sc, tool = scene(), displacement([0.3, 0.2, -0.5], [0, 0, 0])
-    log = Run(sc, "stacked", bounds=limits(max_steps=0)).log
-    log.H[0] = np.eye(4)
-    ends = Ends(tool, displacement([0, angle, 0], [1, 2, 3]) @ tool, np.full(4, np.nan))
-    told = summarize(sc.plant, log, Ended(MAX_STEPS, 0, 0.0), GAINS.period, ends)
-    assert math.radians(told.rotation_error_deg) == pytest.approx(angle, abs=1e-14)
-    assert math.isnan(told.position_error_mm)
-
-
-def test_memory_decides_the_sense_of_a_half_turn():
-    """Exactly 180° within the plane: the run turns the way its memory tells, and arrives either way."""
-    sc = scene(np.zeros(6))
-    M = sc.plant.M[:, :3]
-    center = M.mean(axis=0)
-    normal = np.cross(M[1] - M[0], M[2] - M[0])
-    R = displacement(np.pi * normal / np.linalg.norm(normal), np.zeros(3))[:3, :3]
-    goal = np.c_[(M - center) @ R.T + center, np.ones(4)]
-    sc = sc._replace(s_star=pixels(sc.model.P, goal))
-    bounds = limits(max_steps=3)
-    first = Run(sc, "direct_two", bounds=bounds)
-    driven = first.log.q_dot[0]
-    for sign in (1.0, -1.0):
-        memory = np.zeros((2, 6))
-        memory[1] = sign * driven
-        run = Run(sc, "direct_two", bounds=bounds, memory=memory)
-        assert np.sign(run.log.q_dot[0] @ driven) == sign
-        assert (run.log.q_dot[1] @ run.log.q_dot[0]) > 0

@@ -3,10 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.laws import CODES
-from projservo_cli.loop.python import BuiltInLaw, run_in_python
 from projservo_cli.loop.verdicts import VERDICTS
-from projservo_cli.simulation.analytic_plant import AnalyticPlant
 from tests.loop.test_python_loop import in_python, same_logs
 from tests.scene import GAINS, STEP, Run, limits, scene
 
@@ -59,25 +56,3 @@ def test_both_loops_end_at_the_limit_alike(law, sigma, rng):
     assert compiled.verdict == "joint limit"
     assert (log.q[: steps + 1] <= sc.plant.limits.upper).all()
     same_logs(log, compiled.full, steps)
-
-
-def test_a_scaled_run_stops_at_the_limit_too():
-    sc, gains = narrowed()
-    built_in = BuiltInLaw(CODES["exact"], sc.model, sc.task(), gains)
-    plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((401, 2, 4, 2)))
-    code, _, _ = run_in_python(built_in, plant, sc.s_star, GAINS.period, limits(**STOP), 0.25)
-    assert VERDICTS[code] == "joint limit"
-    assert 0 <= sc.plant.limits.upper[2] - plant.q[2] < 1e-5
-
-
-def test_limits_beside_the_path_change_nothing():
-    free = Run(scene(), "exact")
-    sc, gains = narrowed(1.5)
-    beside = Run(sc, "exact", gains, limits(**STOP))
-    assert (beside.verdict, beside.steps) == ("converged", free.steps)
-    np.testing.assert_array_equal(beside.log.q, free.log.q)
-    # Nor does the limit that a joint begins beyond and returns from.
-    lower = sc.plant.limits.lower.copy()
-    lower[2] = sc.q_start[2] + 0.1 * STEP[2]
-    returning = Run(sc, "exact", gains._replace(limits=gains.limits._replace(lower=lower)), limits(**STOP))
-    np.testing.assert_array_equal(returning.log.q, free.log.q)

@@ -1,7 +1,5 @@
 """The loop in Python equals the compiled loop to the bit, and takes laws of others."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,6 @@ from projservo_cli.control.law import ERRORS, OK
 from projservo_cli.laws import CODES, LAWS
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
 from projservo_cli.loop.verdicts import VERDICTS
-from projservo_cli.records import InputError
 from projservo_cli.simulation.analytic_plant import AnalyticPlant
 from tests.control.following import Followed, tracked
 from tests.loop.bits import FOLLOWING
@@ -116,18 +113,6 @@ def test_both_loops_end_alike(bounds):
     assert same(log.events, compiled.log.events)
 
 
-def test_a_bound_law_keeps_its_arrays_alive_and_sees_their_changes():
-    sc, task = scene(), scene().task()
-    s_star = task.s_star
-    law = BuiltInLaw(CODES["stacked"], sc.model, task, GAINS)
-    del task
-    _, before = law(sc.s_start, sc.q_start)
-    s_star += 5.0
-    _, after = law(sc.s_start, sc.q_start)
-    assert before.any()
-    assert not np.array_equal(before, after)
-
-
 class Towards:
     """A law of somebody else: straight to given joints."""
 
@@ -177,12 +162,3 @@ def test_a_command_that_is_no_number_diverges():
         Towards(np.full(6, np.nan)), plant, sc.s_star, 0.04, limits(max_steps=3)
     )
     assert (VERDICTS[verdict], steps) == ("diverged", 0)
-
-
-def test_an_attribute_that_is_misspelt_is_named():
-    """It would count as one that the law does not have."""
-    sc = scene()
-    law = SimpleNamespace(errors=np.full(5, np.nan), facepx=np.ones(1))
-    plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((2, 2, 4, 2)))
-    with pytest.raises(InputError, match=r"law SimpleNamespace: has facepx.* did you mean face_px"):
-        run_in_python(law, plant, sc.s_star, GAINS.period, limits(max_steps=1))

@@ -86,14 +86,6 @@ def test_what_stops_the_law_at_the_goal_has_it_shunned():
     assert watch.attempts[-1] == "at step 32 (a joint limit at the goal) in vain"
 
 
-def test_no_more_ways_are_searched_than_asked_for():
-    ways = PathReplanner(count=9)
-    watch, _, log = watched(ways, clock=20.0, searches=1)
-    assert watch.ruled(log, 5, JOINT_LIMIT, np.zeros(2)) == WAITING
-    assert watch.ruled(log, 6, JOINT_LIMIT, np.zeros(2)) == JOINT_LIMIT
-    assert len(ways.asked) == 1
-
-
 def test_a_law_that_comes_no_nearer_at_the_goal_is_given_another_way():
     ways = PathReplanner()
     watch, _, log = watched(ways, clock=20.0, stall_periods=4)
@@ -101,19 +93,6 @@ def test_a_law_that_comes_no_nearer_at_the_goal_is_given_another_way():
     verdicts = [watch.ruled(log, k, RUNNING, np.zeros(2)) for k in range(40, 46)]
     assert verdicts == [RUNNING] * 4 + [WAITING, RUNNING]
     assert watch.attempts == ["at step 44 (no progress at the goal)"]
-
-
-def test_a_way_may_lead_away_from_the_goal():
-    watch, _, log = watched(PathReplanner(), clock=4.0)
-    assert watch.ruled(log, 7, DIVERGED, np.zeros(2)) == RUNNING
-
-
-def test_a_command_that_is_no_number_is_never_let_through():
-    ways = PathReplanner()
-    watch, _, log = watched(ways, clock=4.0)
-    assert watch.ruled(log, 7, DIVERGED, np.array([0.0, np.nan])) == WAITING
-    assert watch.attempts == ["at step 7 (growing errors on the path)"]
-    assert watch.ruled(log, 8, DIVERGED, np.array([np.inf, 0.0])) == DIVERGED
 
 
 def test_what_is_ahead_is_looked_at_with_what_images_are_off():

@@ -65,19 +65,6 @@ def test_beside_the_goal_the_joints_hide_what_is_left():
     assert "coarse readings hide the rest" in stall.reason
 
 
-def test_instants_at_which_the_arm_was_held_count_for_nothing():
-    robot, log = Robot(), new_log(2, 4, 1000, 5)
-    stall = StallMonitor(robot, LIMITS)
-    robot.steered = SimpleNamespace(
-        reading=SimpleNamespace(q=np.zeros(2)),
-        target=np.zeros(2),
-        set_point=SimpleNamespace(short=np.zeros(2, bool)),
-    )
-    for k in [*range(5), *range(200, 205), *range(400, 405)]:
-        log.judged[k] = 50.0 * (0.9 if k > 200 else 1.0)
-        assert stall.ruled(log, k, RUNNING, np.zeros(2)) == RUNNING
-
-
 def test_a_joint_that_stays_at_the_end_of_its_lead_is_not_following():
     ruled, stall, k = judged(
         lambda k: 50.0, lambda k: (0.5, 0.1), lambda k: (0.9, min(0.1 + 0.01 * k, 0.4)), short=(True, False)

@@ -8,12 +8,10 @@ from scipy.linalg import expm
 from scipy.stats import chi2
 
 import projservo_cli as projservo
-from projservo_cli.calibration import calibrate
 from projservo_cli.config.inputs import truth_of
 from projservo_cli.metric.frame import Metric
 from projservo_cli.records import Calibration, InputError, WorkFailed
 from projservo_cli.results import ImageModel
-from projservo_cli.store.tables import read_table
 from tests.calibration.simulated_robot import Robot, prismatic, revolute, rig
 from tests.known import configured
 
@@ -81,30 +79,6 @@ def test_closed_form_of_an_arm(frame):
     np.testing.assert_allclose(np.trace(between), np.trace(np.linalg.multi_dot(turned)), atol=1e-9)
 
 
-def test_points_are_triangulated_where_the_arm_puts_them(frame):
-    arm = robot(ELBOW, "RRRR")
-    m = calibrated(arm, frame).metric(0.3, "cameras")
-    q = np.array([[0.2, 0.1, -0.3, 0.4], [-0.1, 0.2, 0.1, -0.5]])
-    s = arm.images(q)
-    T = m.pose(q)
-    expected = np.einsum("kij,mj->kmi", T[:, :3, :3], m.markers) + T[:, None, :3, 3]
-    np.testing.assert_allclose(m.triangulate(s), expected, atol=1e-9)
-    np.testing.assert_allclose(m.triangulate(s[1]), expected[1], atol=1e-9)
-    assert m.triangulation_covariance(s).shape == (2, 4, 3, 3)
-    s[0, 1, 2] = np.nan  # unseen on the right
-    expected[0, 2] = np.nan
-    np.testing.assert_allclose(m.triangulate(s), expected, atol=1e-9)
-    assert np.isnan(m.triangulation_covariance(s)).all(axis=(2, 3)).sum() == 1
-    with pytest.raises(InputError, match="left and right view"):
-        m.triangulate(s[:, :1])
-
-
-def test_a_prismatic_joint_has_the_scale(frame):
-    arm = robot((prismatic(Z), *ELBOW[1:]), "PRRR")
-    m = calibrated(arm, frame).metric()
-    np.testing.assert_allclose(np.linalg.norm(m.poses[1, :3, 3] - m.poses[0, :3, 3]), 0.3, rtol=1e-9)
-
-
 def test_the_frame_is_right_handed(frame):
     """A reflection of the projective frame changes nothing."""
     arm = robot(ELBOW, "RRRR")
@@ -139,50 +113,12 @@ def test_what_has_no_metric_says_so(arm, known, said, frame):
     assert "\n" not in str(error.value)
 
 
-def test_markers_that_are_numbered_like_a_tag_are_none(frame):
-    c = dataclasses.replace(calibrated(robot(ELBOW, "RRRR"), frame), marker=np.arange(4))
-    with pytest.raises(InputError, match="markers 0 to 3 are no tag: their sides differ by"):
-        c.metric(0.06, "tags")
-
-
-def test_an_unknown_marker_of_the_face_is_named(frame):
-    with pytest.raises(InputError, match="marker 99 is not in the calibration"):
-        calibrated(robot(ELBOW, "RRRR"), frame).metric(0.3, "cameras", face=[0, 10, 20, 99])
-
-
-def test_two_axes_that_noise_alone_makes_skew_have_no_metric():
-    config = configured("ur5")
-    c = projservo.calibrate(projservo.simulate(config, seed=5))
-    q = c.q_reference[[1, 2]]
-    part = dataclasses.replace(
-        c, joint_types="RR", H_hat_0=c.H_hat_0[[1, 2]], q_reference=q, joint_min=q, excitation=q,
-        sqrt_cov_shared=np.delete(c.sqrt_cov_shared, np.r_[24:40, 72:120], axis=0),
-    )  # fmt: skip
-    with pytest.raises(InputError, match="all revolute axes are parallel"):
-        part.metric(0.3, "cameras")
-
-
 @pytest.fixture(scope="module")
 def draws():
     """Calibrations of a UR5 at 0.5 px, and its truth."""
     config = configured("ur5")
     noisy = [projservo.calibrate(projservo.simulate(config, seed=900 + k, noise_px=0.5)) for k in range(5)]
     return truth_of(config), noisy
-
-
-def test_distances_of_markers_from_a_known_one(shared_data, reference_truth):
-    """All 45 distances on the body of another simulator's UR5, from each that is 150 mm or more."""
-    M = np.array(reference_truth("ur5")["markers_tool"])
-    observation = read_table(shared_data / "ur5" / "trials_0.5px.csv")
-    c = ImageModel.of(calibrate(observation, "RRRRRR", sigma_px=0.5))
-    apart = np.linalg.norm(M[:, None] - M, axis=-1)
-    i, j = np.triu_indices(len(M), 1)
-    long = [(a, b) for a, b in zip(i.tolist(), j.tolist(), strict=True) if apart[a, b] >= 0.15]
-    assert len(i) == 45
-    assert len(long) > 20
-    found = [c.metric(apart[ends], ends).markers for ends in long]
-    errors = [np.linalg.norm(m[i] - m[j], axis=1) - apart[i, j] for m in found]
-    assert np.sqrt(np.mean(np.square(errors))) <= 0.25e-3
 
 
 def test_errors_are_as_large_as_their_covariance_says(draws):
@@ -201,13 +137,6 @@ def test_errors_are_as_large_as_their_covariance_says(draws):
     low, high = chi2.ppf([5e-4, 1.0 - 5e-4], 5 * 2 * len(noisy))
     # both cameras of a draw share its errors, so the sum scatters up to twice as far
     assert 0.5 * low < total < 2.0 * high
-
-
-def test_deviation_of_the_length_is_in_all_lengths(draws):
-    c = draws[1][0]
-    exact, rough = (c.metric(0.38, "cameras", length_std_m=std) for std in (0.0, 0.0038))
-    more = rough.position_std(c.q_reference) ** 2 - exact.position_std(c.q_reference) ** 2
-    np.testing.assert_allclose(np.sqrt(more), 10.0 * np.abs(exact.pose(c.q_reference)[:3, 3]), rtol=1e-3)
 
 
 def test_position_std_is_that_of_many_draws_of_the_errors(draws):

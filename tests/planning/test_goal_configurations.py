@@ -38,45 +38,12 @@ def test_every_goal_shows_the_goal_within_the_limits(name, k):
     assert apart.min() > np.radians(1.0)
 
 
-@pytest.mark.parametrize("name", ["paper", "ur5", "stanford"])
-def test_the_joints_at_which_the_goal_was_drawn_are_among_them(name):
-    for k in range(6):
-        found = case(name, k)
-        goals, *_ = goals_in(found)
-        assert np.abs(goals - found.q_goal).max(axis=1).min() < 1e-6
-
-
 def test_an_arm_with_a_spherical_wrist_has_eight_solutions():
     # D. Pieper, "The kinematics of manipulators under computer control", 1968: four places of the wrist, and
     # two turns of it each, wherever limits let them.
     counts = [goals_in(case("paper", k))[2][0] for k in range(6)]
     assert max(counts) == 8
     assert all(count % 2 == 0 for count in counts)
-
-
-def test_turns_are_goals_of_their_own():
-    # The UR5 turns five of its joints twice around: 2⁵ goals of each solution.
-    goals, _, (solutions, hidden, _) = goals_in(case("ur5", 1))
-    assert len(goals) == 32 * (solutions - hidden)
-
-
-def test_joints_that_turn_often_have_no_more_goals_than_are_near():
-    found = case("ur5", 1)
-    often = found.c._replace(limits=found.c.limits._replace(lower=np.full(6, -1e4), upper=np.full(6, 1e4)))
-    starts = np.vstack([found.q_start, found.q_goal])
-    goals, rank, (solutions, *_) = goals_of(often, found.aim, found.q_start, NONE[:, :6], starts)
-    assert len(goals) == 5**6 * solutions
-    assert np.abs(goals - found.q_start).max() < 5.0 * np.pi + 1e-6
-    assert (np.diff(rank) >= 0.0).all()
-
-
-def test_few_are_the_nearest_of_many():
-    found = case("ur5", 2)
-    many, times, _ = goals_in(found)
-    way = find_path(found.c, found.aim, found.q_start, NONE[:, :6], SearchLimits(max_goals=5))
-    assert way.n_goals == len(many)
-    fastest = np.abs(way.goals - found.q_start) / found.c.limits.speed
-    np.testing.assert_allclose(times[:5], fastest.max(axis=1))
 
 
 def test_a_goal_beyond_the_limits_is_told():

@@ -1,6 +1,5 @@
 """Plans of the profiles joint_space and auto, and runs that follow them to the goal."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from functools import lru_cache
 
@@ -9,14 +8,13 @@ import pytest
 
 from projservo_cli.calibration import predict
 from projservo_cli.geometry.kinematics import forward_kinematics
-from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import followed
 from projservo_cli.task.trajectory import planned
 from tests.configured import calibrate, scenario_of, servo, truth_of
 from tests.configured import plan as planning
-from tests.known import asked, configured
+from tests.known import configured
 
 pytestmark = pytest.mark.volume
 COUNT = 6
@@ -68,20 +66,6 @@ def test_a_random_task_is_planned_and_followed_to_its_goal(name, k):
         assert trace.first_beyond_limit == trace.first_outside_image == -1
 
 
-@pytest.mark.parametrize("law", ["exact_track", "direct_three_track", "direct_two_track"])
-def test_a_way_is_followed_where_and_when_it_was_planned(law):
-    """By a law that is given what the plan was made with, without noise."""
-    config, calibration, _ = guided("ur5", 1)
-    quiet = config.model_copy(update={"noise": config.noise.model_copy(update={"servo_px": 0.0})})
-    plan = planning.run(quiet, calibration)
-    trace = servo.run(quiet, calibration, plan, law)
-    there = int(plan.duration / trace.period)
-    assert trace.speed_factor[:there] == pytest.approx(1.0, abs=0.01)
-    times = np.r_[0.0, np.cumsum(trace.speed_factor)] * trace.period
-    wanted = np.stack([np.interp(times, plan.time, column) for column in plan.q.T], axis=1)
-    assert trace.q[:there] == pytest.approx(wanted[:there], abs=np.radians(1.0) + 1e-9)
-
-
 def test_the_displacement_planned_at_a_time_is_that_of_the_joints():
     config, calibration, plan = guided("paper", 1)
     model, period = calibration.model(), config.control.period_s
@@ -96,22 +80,6 @@ def test_the_displacement_planned_at_a_time_is_that_of_the_joints():
         wanted = forward_kinematics(model, q) @ np.linalg.inv(forward_kinematics(model, rows[0]))
         found = np.array(planned(model, task.reference, clock)).reshape(4, 4)
         assert found == pytest.approx(wanted, abs=1e-9)
-
-
-def test_what_is_stored_tells_the_images_between_its_samples():
-    """Half a pixel's tenth, by the true model: of joints halfway between two that are stored."""
-    _, _, plan = guided("paper", 2)
-    finer = guided("paper", 2)[0].trajectory.model_copy(update={"samples": 4 * len(plan.time) - 3})
-    config = guided("paper", 2)[0].model_copy(update={"trajectory": finer})
-    dense = planning.run(config, guided("paper", 2)[1])
-    times = dense.time
-    q = np.stack([np.interp(times, plan.time, column) for column in plan.q.T], axis=1)
-    truth = truth_of(config)
-    off = [
-        truth.images(a, truth.M_face) - truth.images(b, truth.M_face) for a, b in zip(q, dense.q, strict=True)
-    ]
-    assert np.abs(off).max() < 0.1
-    assert dense.duration == plan.duration
 
 
 def test_auto_is_linear_to_the_bit_where_that_keeps_every_constraint():
@@ -135,56 +103,6 @@ def test_auto_says_which_way_it_took_and_why_not_the_ones_before():
             assert [text.split(": ")[0] for text in plan.rejected_profiles] == before[plan.profile]
             assert (plan.n_goal_configurations is None) == (plan.profile != "joint_space")
     assert {"linear", "joint_space"} <= taken
-
-
-def test_the_duration_is_stretched_but_never_cut():
-    config, calibration, plan = guided("ur5", 0)
-    slow = config.trajectory.model_copy(update={"duration_s": 2.0 * plan.duration})
-    longer = planning.run(config.model_copy(update={"trajectory": slow}), calibration)
-    assert longer.duration == 2.0 * plan.duration
-    np.testing.assert_array_equal(longer.q, plan.q)
-    fast = config.trajectory.model_copy(update={"duration_s": 0.5 * plan.duration})
-    with pytest.raises(WorkFailed, match=r"trajectory\.duration_s.*the minimum within"):
-        planning.run(config.model_copy(update={"trajectory": fast}), calibration)
-
-
-def test_a_joint_without_a_speed_limit_is_refused_by_its_key():
-    with pytest.raises(InputError, match=r"control\.prismatic_speed_limit_m_s.*as fast as joints can"):
-        configured("stanford", "trajectory.profile=joint_space", "control.prismatic_speed_limit_m_s=null")
-    scenario = scenario_of(configured("stanford", "control.prismatic_speed_limit_m_s=null"))
-    plan = planning.plan_task(
-        scenario.model, scenario.ends, asked("auto"), scenario.demands._replace(border_px=480.0)
-    )
-    assert not plan.feasible
-    assert (
-        plan.rejected_profiles[-1]
-        == "joint_space: joint 3 has no speed limit: set control.prismatic_speed_limit_m_s"
-    )
-
-
-def test_no_way_is_told_and_the_law_goes_alone():
-    config, calibration, _ = guided("paper", 0)
-    scenario = scenario_of(config, calibration)
-    shut = scenario.ends.q_start - 1e-3, scenario.ends.q_start + 1e-3
-    demands = scenario.demands._replace(limits=scenario.demands.limits._replace(lower=shut[0], upper=shut[1]))
-    search = planning.JointSearch(scenario.goal_joints, 0.5)
-    plan = planning.plan_task(scenario.model, scenario.ends, scenario.inputs.trajectory, demands, search)
-    assert not plan.feasible
-    assert plan.profile == "joint_space"
-    assert plan.duration is None
-    assert "lie beyond the joint limits" in plan.reason
-    trace = servo.run(config, calibration, plan, "exact_track")
-    assert plan.reason in trace.unplanned
-
-
-def test_plans_in_threads_are_equal_to_the_bit():
-    names = [("paper", k) for k in range(COUNT)]
-    alone = [guided(*name)[2] for name in names]
-    with ThreadPoolExecutor(4) as pool:
-        made = list(pool.map(lambda name: planning.run(*guided(*name)[:2]), names * 2))
-    for here, there in zip(alone * 2, made, strict=True):
-        for field in fields(here):
-            np.testing.assert_array_equal(getattr(here, field.name), getattr(there, field.name))
 
 
 def test_a_face_that_is_lost_for_long_is_found_on_the_way_back():

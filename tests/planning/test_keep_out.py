@@ -1,10 +1,7 @@
 """Regions that are kept out of: distances by another library, and a box in space."""
 
-import json
-
 import numpy as np
 import pytest
-import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
@@ -14,11 +11,7 @@ from projservo_cli.planning.keep_out import keep_out_of, outside_polygon
 from projservo_cli.planning.margins import CLEAR
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at
 from projservo_cli.planning.time_parameterization import joints_at
-from projservo_cli.records import Spread, WorkFailed
-from projservo_cli.stages.plan_summary import reason_of
-from tests.configured import calibrate, plan, servo
-from tests.conftest import ROOT
-from tests.known import configured
+from projservo_cli.records import Spread
 from tests.planning.joint_space_cases import COUNT, case
 
 
@@ -123,52 +116,3 @@ def test_no_marker_enters_a_box_that_stands_on_the_straight_way():
             assert (np.abs(segments - middle).max(axis=-1) > 0.02).all()
     assert tried >= 4
     assert around >= 0.7 * tried
-
-
-def test_a_region_of_one_image_bars_that_image():
-    found = case("paper", 0)
-    nothing = np.empty((0, 6))
-    everywhere = np.array([[-1e4, -1e4], [1e4, -1e4], [1e4, 1e4], [-1e4, 1e4]])
-    c = found.c._replace(keep_out=keep_out_of([(everywhere, None, True)]))
-    way = find_path(c, found.aim, found.q_start, nothing, SearchLimits(max_samples=200))
-    assert len(way.corners) == 0
-    assert reason_of(way) == "the start is already within region 1"
-    around = found.aim.s_star[0, 1] + [[-3.0, -3.0], [3.0, -3.0], [0.0, 5.0]]
-    c = found.c._replace(keep_out=keep_out_of([(around, None, True)]))
-    way = find_path(c, found.aim, found.q_start, nothing, SearchLimits(max_samples=200))
-    assert way.solutions == way.hidden + way.blocked
-    assert f"and {way.blocked} within a region that is kept out of" in reason_of(way)
-
-
-@pytest.fixture(scope="module")
-def drawn():
-    """The paper's task with the region of the page on obstacles, in a profile, and its plan."""
-    page = (ROOT / "docs" / "how-to" / "keep-out-of-obstacles.md").read_text(encoding="utf-8")
-    block = next(block for block in page.split("```text\n") if block.startswith("trajectory:"))
-    region = yaml.safe_load(block.split("```")[0])["trajectory"]["keep_out"]
-    calibration = calibrate.run(configured("paper"))[1]
-
-    def plan_of(profile):
-        keep_out = f"trajectory.keep_out={json.dumps(region)}"
-        config = configured("paper", f"trajectory.profile={profile}", keep_out, "control.mode=track")
-        return config, calibration, plan.run(config, calibration)
-
-    return plan_of
-
-
-@pytest.mark.volume
-def test_a_region_in_the_way_closes_the_motions_of_the_paper_and_leaves_a_way_around(drawn):
-    config, calibration, linear = drawn("linear")
-    assert not linear.feasible
-    assert "the body enters region 1 of trajectory.keep_out at path parameter 0." in linear.reason
-    with pytest.raises(WorkFailed, match="no law runs without one"):
-        servo.run(config, calibration, linear, "exact_track")
-    config, calibration, found = drawn("auto")
-    assert (found.profile, found.feasible) == ("joint_space", True)
-    assert ["enters region 1" in text for text in found.rejected_profiles] == [True, True]
-    trace = servo.run(config, calibration, found, "exact_track")
-    assert trace.verdict == "converged"
-    # The face is never within the outlines in either image, as the cameras see it.
-    region = config.trajectory.keep_out[0]
-    for view, corners in enumerate((region.left, region.right)):
-        assert not Outline(corners).contains_points(trace.s[:, view].reshape(-1, 2)).any()

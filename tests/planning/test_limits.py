@@ -9,7 +9,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
 from projservo_cli.store.tables import read_table
-from tests.configured import calibrate, plan, record, scenario_of, servo
+from tests.configured import calibrate, plan, record, scenario_of
 
 ROOT = Path(__file__).parents[2]
 # The arm's trials turn each joint by 30° to both sides of this reference.
@@ -54,52 +54,10 @@ def test_limits_from_data_are_what_they_cover_widened_by_a_share_of_it(mine):
     np.testing.assert_array_equal(
         read_table(config.data.table, "RRRRRR", "rad").q.min(axis=0), calibration.joint_min
     )
-    found = plan.run(load_joint(config), calibration)
+    through_joints = config.trajectory.model_copy(update={"profile": "joint_space"})
+    found = plan.run(config.model_copy(update={"trajectory": through_joints}), calibration)
     assert found.feasible, found.reason
     assert ((found.q > scenario.joints.limits.lower) & (found.q < scenario.joints.limits.upper)).all()
-
-
-def load_joint(config):
-    """The same with the profile joint_space."""
-    return config.model_copy(
-        update={"trajectory": config.trajectory.model_copy(update={"profile": "joint_space"})}
-    )
-
-
-def test_limits_from_a_list(mine):
-    pairs = "[[0, 360], [-180, 0], [-180, 0], [-90, 90], [0, 180], [0, 360]]"
-    config, calibration = mine(
-        f"robot.limits={{joints: {pairs}, unit: deg}}",
-        "trajectory.profile=joint_space",
-        "data.joint_order=stated",
-    )
-    lower = scenario_of(config, calibration).joints.limits.lower
-    np.testing.assert_allclose(lower, np.radians([0, -180, -180, -90, 0, 0]))
-    found = plan.run(config, calibration)
-    assert found.feasible
-    trace = servo.run(config, calibration, found, "exact_track")  # a robot of somebody else, on its way
-    assert trace.verdict == "converged"
-    assert trace.planned_s == found.duration
-    assert trace.steps * trace.period > 0.9 * found.duration
-    assert (trace.q >= lower).all()
-
-
-def test_without_limits_the_way_through_joint_space_is_closed(mine):
-    with pytest.raises(
-        InputError, match=r": robot: the profile joint_space needs the limits .* set robot\.limits"
-    ):
-        mine("trajectory.profile=joint_space")
-    # A region at the goal keeps the other profiles from it.
-    config, calibration = mine("trajectory.profile=auto")
-    u, v = scenario_of(config, calibration).ends.s_star[0, 0]
-    around = f"[[{u - 9}, {v - 9}], [{u + 9}, {v - 9}], [{u}, {v + 9}]]"
-    config, _ = mine("trajectory.profile=auto", f"trajectory.keep_out=[{{left: {around}}}]")
-    found = plan.run(config, calibration)
-    assert not found.feasible
-    assert "the goal is within region 1" in found.reason
-    assert found.rejected_profiles[-1].startswith(
-        "joint_space: the limits of some joints are unknown: set robot.limits"
-    )
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,14 @@
 """Suggested poses: the promised variance is the one found, less than by chance, within the region."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import calibrate, predict, prediction_variance
+from projservo_cli.calibration import calibrate, prediction_variance
 from projservo_cli.planning.pose_selection import suggest
 from projservo_cli.planning.prediction_covariance import Region
-from projservo_cli.records import InputError, Observation, WorkFailed
+from projservo_cli.records import InputError, WorkFailed
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials
 
 SIGMA = 0.5
@@ -58,26 +57,6 @@ def visible(robot, q):
     return q[inside.all(axis=1).sum(axis=1) >= 3]
 
 
-def test_poses_lie_in_the_region_and_are_told_from_the_nearest_recorded_one(robot, few, region, suggested):
-    observation = observed(robot, few, 0)
-    q = np.array([one.q for one in suggested])
-    assert ((q >= region.low) & (q <= region.high)).all()
-    assert len(visible(robot, q)) == COUNT
-    assert len(np.unique(q, axis=0)) == COUNT
-    for one in suggested:
-        row = int(np.flatnonzero(observation.pose == one.from_pose)[0])
-        np.testing.assert_allclose(few[row] + one.delta, one.q, atol=1e-15)
-        assert np.linalg.norm(one.delta) == pytest.approx(np.linalg.norm(few - one.q, axis=1).min())
-
-
-def test_each_pose_makes_the_rest_less_uncertain(suggested):
-    for one, following in itertools.pairwise(suggested):
-        assert one.variance_after < one.variance_before
-        assert following.variance_before == pytest.approx(one.variance_after, rel=1e-9)
-    # The first gains most: a greedy choice has falling returns.
-    assert suggested[0].variance_before > 2.0 * suggested[0].variance_after
-
-
 def test_what_is_promised_is_what_the_covariance_with_the_poses_says(robot, few, suggested):
     """An oracle that knows nothing of designs: calibrate with the poses added, look at the variance."""
     targets = visible(robot, around(robot, 150, np.random.default_rng(8)))
@@ -117,25 +96,3 @@ def test_what_cannot_be_suggested_says_why(robot, few, region):
     bare = dataclasses.replace(calibration, sqrt_cov_shared=np.full((2, 2), np.nan), method="closed_form")
     with pytest.raises(InputError, match="the method closed_form has not"):
         suggest(bare, observation, region, region, 1, np.random.default_rng(0))
-
-
-def test_a_recorded_table_gives_poses_near_its_own(shared_data, tmp_path):
-    from projservo_cli.config import load_config
-    from projservo_cli.store.tables import read_table
-    from tests.configured import calibrate as stage
-
-    path = shared_data / "ur5" / "trials_0.5px.csv"
-    table = read_table(path, "RRRRRR")
-    some = np.arange(len(table.pose)) % 2 == 0
-    table = Observation(table.pose[some], table.marker, table.q[some], table.images[some])
-    calibration = calibrate(table, "RRRRRR", source="recorded")
-    config = load_config(None, [f"data.table={path}"])
-    found = stage.suggest_motions(config, table, calibration, 3, tmp_path / "suggestions.csv")
-    span = np.ptp(table.q, axis=0)
-    for one in found:
-        assert (one.q >= table.q.min(axis=0) - 0.15 * span).all()
-        assert (one.q <= table.q.max(axis=0) + 0.15 * span).all()
-        images = predict(calibration, one.q[None])[0]
-        low, high = np.nanmin(table.images, axis=(0, 2)), np.nanmax(table.images, axis=(0, 2))
-        inside = ((images >= low[:, None]) & (images <= high[:, None])).all(axis=-1)
-        assert inside.all(axis=0).sum() >= 3

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from projservo_cli.planning.product_space import plan_path
 from projservo_cli.records import InputError, position_limits
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.studies import projective_twin
@@ -14,7 +13,7 @@ from projservo_cli.sweeps.design import STRATA, random_tasks
 from projservo_cli.task.target import TaskImages
 from tests.configured import truth_of
 from tests.known import asked, configured, known_scenario
-from tests.planning.cases import constrained, reaching_of
+from tests.planning.cases import constrained
 from tests.planning.oracle import TrueTask
 from tests.samples import frame, in_frame, pixels, poe
 from tests.stages.cases import case
@@ -112,19 +111,6 @@ def test_the_shipped_task_needs_coupled_parts():
     assert 0 < np.nanmin(plan.tau_0[plan.tau_0 > 0]) < plan.tau
 
 
-def test_the_shipped_task_that_even_shares_hide_from_both_cameras():
-    """Shares that grow evenly lose sight of the face by true geometry; the planned ones never do."""
-    example, found = shipped("apart")
-    even = np.repeat(np.linspace(0.0, 1.0, 1001)[:, None], 3, axis=1)
-    assert min(side.min() for side in found.true.along(even, *found.true.senses()[0])) < 0.0
-    assert found.kept
-    assert found.plan.feasible, found.plan.reason
-    assert found.sight > 0.02
-    linear = example.planned(example.truth.model, samples=101)
-    assert not linear.feasible
-    assert (linear.margin.min(axis=0) < -0.3).all()
-
-
 def test_what_makes_a_task_infeasible_is_named():
     example = case("paper")
     plan = constrained("paper", border_px=470.0)
@@ -154,16 +140,6 @@ def test_a_start_that_is_the_goal_is_planned_as_no_motion():
     assert plan.feasible
     assert plan.duration == pytest.approx(0.0, abs=1e-6)
     assert np.abs(plan.H_d - np.eye(4)).max() < 1e-7
-
-
-@pytest.mark.parametrize("arm", ["paper", "ur5"])
-def test_the_sense_of_the_turn_is_the_one_a_grid_search_finds(arm):
-    """Offered the rest of a whole turn as θ_r, the planner comes back to the sense that stays in sight."""
-    reaching = reaching_of(arm)
-    tau, theta, theta_p = reaching.amplitudes
-    other = reaching._replace(amplitudes=np.array([tau, theta - math.copysign(2 * math.pi, theta), theta_p]))
-    senses = [plan_path(asked).reaching.amplitudes[1] for asked in (reaching, other)]
-    assert senses[1] == pytest.approx(senses[0])
 
 
 @pytest.mark.parametrize("arm", ["paper", "ur5"])

@@ -1,14 +1,12 @@
 """Paths from start to goal: valid, timed within the limits, the same whoever searches beside."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 
 from projservo_cli.planning.constraints import new_trial
 from projservo_cli.planning.margins import JOINTS, VISIBILITY, WIDTH
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at
-from projservo_cli.planning.time_parameterization import ROOM, joints_at, minimum_time, time_parameterized
+from projservo_cli.planning.time_parameterization import ROOM, joints_at, time_parameterized
 from tests.planning.joint_space_cases import COUNT, case
 
 SEARCH = SearchLimits()
@@ -75,17 +73,6 @@ def test_the_pace_is_nearly_the_quickest_there_is():
     assert timed.time[-1] <= 1.05 * quickest
 
 
-def test_a_way_is_the_same_to_the_bit_in_threads():
-    found = case("stanford", next(k for k in range(COUNT) if len(way_of(case("stanford", k)).corners) > 2))
-    alone = way_of(found)
-    with ThreadPoolExecutor(4) as pool:
-        for path in pool.map(lambda _: way_of(found), range(8)):
-            np.testing.assert_array_equal(path.corners, alone.corners)
-            np.testing.assert_array_equal(path.timing.time, alone.timing.time)
-            assert path.draws == alone.draws
-    assert not np.array_equal(way_of(found, SearchLimits(seed=1)).corners, alone.corners)
-
-
 def test_no_way_is_told_with_what_stands_in_it():
     # A width that the face keeps nowhere but at its ends: the trees end at it.
     found = case("paper", 0)
@@ -97,10 +84,3 @@ def test_no_way_is_told_with_what_stands_in_it():
     assert path.timing is None
     assert path.draws == 500
     assert path.failures.argmax() in (WIDTH, WIDTH + 1)
-
-
-def test_a_shortened_way_is_no_longer_than_what_the_trees_found():
-    found = case("stanford", next(k for k in range(COUNT) if len(way_of(case("stanford", k)).corners) > 2))
-    path = way_of(found)
-    took = minimum_time(found.c.limits.speed, path.corners)[-1]
-    assert took >= (np.abs(path.goals[0] - found.q_start) / found.c.limits.speed).max() - 1e-12

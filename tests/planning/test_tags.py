@@ -82,20 +82,6 @@ def limited(made):
     return made.demands._replace(limits=limits)
 
 
-def test_a_motion_of_the_paper_is_judged_by_the_best_tag():
-    made = scenario("trajectory.profile=linear")
-    truth, demands = made.truth, made.demands
-    plan = plan_task(made.model, made.ends, made.inputs.trajectory, demands)
-    found = np.array([in_truth(truth, q) for q in plan.q])
-    side, border = found[:, :, :2] / found[0, 0, :2], found[:, :, 4:]
-    half, px = 0.5 * truth.image_size.min(), demands.border_px
-    worst = np.minimum(side.min(axis=2), (border.min(axis=2) - px) / (half - px))
-    best = np.arange(len(worst)), worst.argmax(axis=1)
-    assert len(set(best[1])) > 1
-    np.testing.assert_allclose(plan.margin, side[best], rtol=1e-6)
-    np.testing.assert_allclose(plan.border_distance, border[best], rtol=1e-6)
-
-
 @pytest.mark.parametrize("profile", ["joint_space", "auto"])
 def test_the_middle_tag_may_turn_away_where_another_stays_in_sight(profile):
     made = scenario(f"trajectory.profile={profile}")

@@ -9,10 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projservo_cli.control.law import OK
-from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.loop.verdicts import NO_PROGRESS, Instant, new_log, plateau_stretch, verdict_at
 from projservo_cli.report.claims import claims_of
-from projservo_cli.report.report_data import curve_difference
 from tests.report.cases import SPECS, case
 from tests.scene import limits
 
@@ -93,34 +91,6 @@ def test_image_errors_are_held_against_an_exponential_and_the_least_before():
         assert (int(many), int(most), holds) == monotone
 
 
-def test_contributions_of_the_joints_add_up_to_the_deviation_of_a_step():
-    _, bench, material = case()
-    model, q = material.plant.model, bench.scenario.ends.q_start
-    velocity = np.random.default_rng(1).normal(size=len(q))
-    center = forward_kinematics(model, q) @ material.middle
-    line = np.einsum("i,ijk,k->j", velocity, joint_operators(model, q), center)[:3]
-    pose = forward_kinematics(model, q) @ material.robot.base_tool
-    pose[:3, 3] += line / np.linalg.norm(line)
-    for size in (0.05, 0.1):  # the third order is left out
-        moved = forward_kinematics(model, q + size * velocity) @ material.middle
-        trace = dataclasses.replace(
-            material.traces["direct_three"],
-            q=np.stack([q, q + size * velocity]),
-            center=np.stack([center, moved])[:, :3],
-            goal_pose=pose,
-        )
-        text, _ = measured("velocities of q1 and q3", own={("direct_three", "true", False): trace})
-        first = float(re.search(r"deviation of ([\d.]+) mm", text)[1])
-        parts = [float(value) for value in re.findall(r"q\d ([+-][\d.]+)", text)]
-        assert len(parts) == len(q)
-        assert first > 1.0
-        assert sum(parts) == pytest.approx(first, rel=2.0 * size, abs=0.005 * 7)  # two decimals are told
-
-
-def test_rotation_of_the_task_is_the_half_turn_of_its_configuration():
-    assert measured("overall rotation of the task")[0].endswith("true rotation 180.000°")
-
-
 def on_plateau(error, k, window):
     """Whether a run whose last instant is k ends so."""
     log = new_log(6, 4, len(error), 5)
@@ -157,18 +127,3 @@ def test_the_plateau_that_is_drawn_and_claimed_is_that_of_the_verdict():
     (claim,) = [c for c in claims_of(shown, np.zeros(0), np.zeros(0)) if "local minimum" in c.claim]
     assert claim.measured.startswith("19 steps from step 10 at 30 px")
     assert claim.criterion.startswith("image error falls < 1 % in 5 steps")
-
-
-def test_curves_that_differ_by_the_sense_of_a_half_turn_are_compared_by_size():
-    curve = np.pi * 0.9 ** np.arange(20)
-    np.testing.assert_allclose(curve_difference(curve, -curve[:15] + 1e-3), np.full(15, 1e-3), rtol=1e-9)
-    assert curve_difference(curve, curve).max() == 0
-
-
-def test_runs_that_start_at_the_goal_say_nothing_of_drift_and_decay():
-    material = case()[2]
-    still = {key: dataclasses.replace(run, steps=0, q=run.q[:1]) for key, run in material.studies.own.items()}
-    studies = dataclasses.replace(material.studies, own=still)
-    found = claims_of(dataclasses.replace(material, studies=studies), np.zeros(0), np.zeros(0))
-    assert found
-    assert not any("drift" in claim.claim or "decay" in claim.claim for claim in found)

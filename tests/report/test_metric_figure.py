@@ -6,13 +6,11 @@ from scipy.stats import chi2
 
 from projservo_cli.config.inputs import report_inputs
 from projservo_cli.metric.frame import links
-from projservo_cli.report import style
 from projservo_cli.report.figures.scene import chosen_poses, metric_rows
 from projservo_cli.report.report_data import Fit
 from projservo_cli.stages.report import in_metres
 from tests.configured import calibrate, truth_of
 from tests.known import configured
-from tests.report.cases import SPECS
 
 
 @pytest.fixture(scope="module")
@@ -43,18 +41,6 @@ def test_rows_agree_with_the_data_sheet_within_their_deviations(calibrated):
     assert np.square(off).sum() < chi2.ppf(0.999, len(off))
 
 
-def test_without_a_length_or_a_covariance_the_reason_is_said(calibrated):
-    _, _, calibration, lengths = calibrated
-    unknown = lengths._replace(apart=np.full_like(lengths.apart, np.nan))
-    assert in_metres(calibration, unknown) == (
-        None,
-        "no length on the tool is known: set markers.positions_m or markers.tag_size_m",
-    )
-    closed = calibrate.run(configured("paper", "calibration.method=closed_form", "noise.calibration_px=0"))[1]
-    paper = report_inputs(configured("paper")).lengths
-    assert "has no covariance: use bundle_adjustment" in in_metres(closed, paper)[1]
-
-
 def test_links_are_angles_and_common_normals_with_signs_nearby():
     """Screws whose links are known by construction, and changes of first order through zero."""
     #                 along z        parallel, 0.3 off      across, crossing 0.2 above
@@ -69,14 +55,3 @@ def test_links_are_angles_and_common_normals_with_signs_nearby():
     moved = axes.copy()
     moved[2, 5] = 0.1  # to the other side of the second axis
     assert links(moved, prismatic, axes)[1][1] == pytest.approx(-0.1)
-
-
-def test_a_far_camera_has_few_ticks(calibrated, caplog):
-    """As readings of a prismatic joint in mm put it."""
-    _, observation, calibration, lengths = calibrated
-    fit = Fit(calibration, observation, metric=in_metres(calibration, lengths)[0])
-    data = SPECS["fig18_metric"].data(fit)
-    data["pyramids"] = data["pyramids"] + 2000.0
-    (axes,) = style.drawn(SPECS["fig18_metric"].draw, data, 4.4).axes
-    assert not caplog.messages
-    assert 2 <= len(axes.get_xticks()) <= 10

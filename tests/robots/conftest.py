@@ -5,16 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from projservo_cli import cli, files
-from tests.cli.conftest import projservo  # noqa: F401 - the command line as in its own tests
+from projservo_cli import cli
 from tests.robots.robots import CALLS
 
 UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
-
-
-@pytest.fixture(autouse=True)
-def no_disk(monkeypatch):
-    monkeypatch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +20,7 @@ def calibrated(tmp_path_factory):
 
 
 @pytest.fixture
-def servo(projservo, calibrated, monkeypatch, tmp_path):  # noqa: F811
+def servo(projservo, calibrated, monkeypatch, tmp_path):
     """Servo with the calibration, the configuration given anew."""
     monkeypatch.chdir(tmp_path)
     CALLS.clear()

@@ -6,9 +6,6 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.config import load_config
-from projservo_cli.loop.python import BuiltInLaw
-from projservo_cli.task.face import MIDPOINT
-from projservo_cli.task.target import TaskImages
 from tests.configured import truth_of
 
 CALLS = []
@@ -104,19 +101,6 @@ class Faulty(Sound):
             raise RuntimeError("protective stop")
 
 
-class Stamped(Sound):
-    """Stamps joints and images in a unit of its own: so many a second, in whole numbers if it says so."""
-
-    def __init__(self, config, unit=1.0, images_only=False, whole=False):
-        super().__init__(config)
-        self.unit, self.images_only, self.whole = unit, images_only, whole
-
-    def read(self):
-        stamp = self.unit * (1000.25 + self.time)
-        stamp = float(round(stamp)) if self.whole else stamp
-        return *super().read(), None if self.images_only else stamp, stamp, stamp
-
-
 class NoStop:
     def open(self): ...
     def read(self): ...
@@ -146,11 +130,6 @@ class Now(NoStop):
     def stop(self): ...
 
 
-class Unmakeable(Sound):
-    def __init__(self):
-        raise ConnectionError("no route to 10.0.0.7")
-
-
 NOT_A_CLASS = 3
 
 
@@ -162,19 +141,6 @@ class Sent(NamedTuple):
     due: float
     step: np.ndarray
     period: float
-
-
-class DirectThree:
-    """The law direct_three, made from what a law of others is given."""
-
-    def __init__(self, setup):
-        model = setup.calibration.model()
-        task = TaskImages(setup.plan.q_start, setup.s_start, setup.s_star, MIDPOINT).task(model)
-        self.law = BuiltInLaw(0, model, task, setup.gains)
-        self.law.state.driven[:] = setup.plan.rotation_sense()
-
-    def __call__(self, s, q):
-        return self.law(s, q)[1]
 
 
 class ByImage:
@@ -194,10 +160,6 @@ class Wrong(ByImage):
 
     def __call__(self, s, q):
         return self.answer
-
-
-class Silent(Wrong):
-    answer = None
 
 
 class Raising(ByImage):

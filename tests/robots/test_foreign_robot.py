@@ -5,7 +5,6 @@ import signal
 import threading
 import time
 from contextlib import contextmanager
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -223,16 +222,6 @@ def test_clocks_that_jump_or_stand_still_are_named():
             foreign.read()
 
 
-def test_a_robot_without_a_clock_is_paced_by_that_of_the_machine():
-    nothing = dict.fromkeys(("open", "command", "stop", "close"), lambda *arguments: None)
-    with opened(SimpleNamespace(**nothing, read=lambda: ((0.1, 0.2), S))) as foreign:
-        assert abs(foreign.read().t_q - time.monotonic()) < 0.5
-        start = time.monotonic()
-        assert not foreign.wait_until(foreign.now() + 0.05)
-        assert 0.05 <= time.monotonic() - start < 0.5
-        assert foreign.wait_until(start)
-
-
 def test_a_late_answer_ends_the_waiting_and_stop_is_called_meanwhile(capsys):
     robot = Scripted(lambda: robot.released.wait(20.0))
     start = time.monotonic()
@@ -274,19 +263,6 @@ def test_opening_has_time_of_its_own_and_is_closed_where_it_fails():
     assert len(robot.closed) == 1
 
 
-def test_a_failure_says_where_it_was_raised():
-    def fails():
-        raise OSError("bus\nerror")
-
-    with (
-        pytest.raises(
-            WorkFailed, match=r"read\(\) failed: OSError: bus error \(test_foreign_robot.py:\d+\)$"
-        ),
-        opened(Scripted(fails)) as foreign,
-    ):
-        foreign.read()
-
-
 def interrupt():
     raise KeyboardInterrupt
 
@@ -309,16 +285,6 @@ def test_stop_and_close_are_called_once_on_every_way_out(leave):
     plant.stop()
     assert len(robot.stopped) == len(robot.closed) == 1
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-def test_signals_that_are_ignored_stay_ignored():
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with at_rest_after(guarded(Scripted())):
-            os.kill(os.getpid(), signal.SIGHUP)
-            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_robot_that_does_not_come_to_rest_is_said_beside_the_failure(monkeypatch):

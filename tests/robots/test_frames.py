@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from projservo_cli.records import Trace, WorkFailed
+from projservo_cli.records import Trace
 from projservo_cli.report.figures.images import frames_of
 from projservo_cli.robots.frame_recorder import MOST_FRAMES, FrameRecorder
 from projservo_cli.store import load
 from tests.fake_records import fake
 from tests.robots.robots import Sound
-from tests.robots.test_foreign_robot import Scripted, opened
 from tests.robots.test_servo import NEAR, OPTIONS
 
 
@@ -33,29 +32,6 @@ def test_frames_are_thinned_evenly_and_the_first_and_last_are_kept(looks):
     assert shown.shape == (len(instant), 2, 8, 16)
     assert shown[:, 0].mean(axis=(1, 2)) == pytest.approx(instant % 251, abs=1.0)
     assert shown[:, 1].mean(axis=(1, 2)) == pytest.approx(255 - instant % 251, abs=1.0)
-
-
-def test_frames_of_another_size_than_the_configuration_are_refused_at_once():
-    robot = Scripted(lambda: ([0, 0], robot.s))
-    robot.frames = np.zeros((2, 4, 6), np.uint8)
-    said = "the image size of its frames is 6 x 4 px, not the 8 x 4 of the configuration"
-    with opened(robot) as foreign:
-        foreign.image_size = (8, 4)
-        with pytest.raises(WorkFailed, match=said):
-            foreign.read()
-
-
-@pytest.mark.parametrize(
-    "frames", [np.zeros((2, 4, 4)), np.zeros((4, 4), np.uint8), np.zeros((3, 4, 4), np.uint8), "none"]
-)
-def test_other_frames_than_the_contract_has_are_refused(frames):
-    robot = Scripted(lambda: ([0, 0], robot.s))
-    robot.frames = frames
-    with (
-        pytest.raises(WorkFailed, match=r"plant m:C: frames must be an array \(2, height, width\) of uint8"),
-        opened(robot) as foreign,
-    ):
-        foreign.read()
 
 
 class Seeing(Sound):

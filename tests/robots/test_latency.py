@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior, Delays, History
+from projservo_cli.robots.latency import NOTHING_KNOWN, Delays, History
 
 PERIOD, NOISE = 0.04, 0.5
 EXACT, PLAY = np.zeros(2), 0.04  # of readings; rad
@@ -68,16 +68,6 @@ def test_play_in_the_joints_is_no_delay(late):
     assert np.abs(np.array(off)[30:] + late).max() < 0.06
 
 
-def test_a_given_delay_is_kept_and_a_wrong_one_is_not_hidden():
-    for given, wrong in ((0.1, False), (0.3, True)):
-        prior = DelayPrior(np.full(2, given), np.zeros(2), np.full(2, 0.005))
-        delays = Delays(predicted, prior, NOISE, 1.0, EXACT)
-        off = looks(delays, (0.1, 0.1))
-        np.testing.assert_array_equal(delays.mean, [given, given])
-        moving = np.abs(off[25:40])
-        assert (moving > 0.1).mean() > 0.9 if wrong else moving.max() < 0.005
-
-
 def test_a_delay_that_changes_is_followed():
     delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT)
     history, rng = History(), np.random.default_rng(3)
@@ -119,29 +109,3 @@ def test_a_camera_that_stands_still_while_joints_move_is_named():
         look(40 * PERIOD, motion(40 * PERIOD))
     for k in range(41, 100):  # at rest it may
         look(k * PERIOD, np.zeros(2))
-
-
-def test_a_clock_of_a_camera_that_jumps_is_named():
-    delays, history, s = (
-        Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT),
-        History(),
-        predicted(np.zeros((1, 2)))[0],
-    )
-    for k in range(10):
-        history.add(k * PERIOD, np.zeros(2))
-        delays.update(np.full(2, k * PERIOD), s + k, history)
-    history.add(10 * PERIOD, np.zeros(2))
-    with pytest.raises(WorkFailed, match="stamp of a left image"):
-        delays.update(np.array([5.0, 10 * PERIOD]), s + 10, history)
-
-
-def test_joints_of_the_past_are_those_read_to_the_bit_and_straight_between():
-    history, q = History(), np.random.default_rng(0).standard_normal((5, 3))
-    t = np.array([0.0, 0.1, 0.25, 0.3, 0.7])
-    for pair in zip(t, q, strict=True):
-        history.add(*pair)
-    np.testing.assert_array_equal(history.at(t), q)
-    np.testing.assert_array_equal(history.at(np.array([-5.0])), q[:1])
-    between = np.array([0.05, 0.2, 0.29, 0.5])
-    straight = np.stack([np.interp(between, t, joint) for joint in q.T], axis=1)
-    np.testing.assert_allclose(history.at(between), straight)

@@ -1,14 +1,13 @@
 """From names to classes: what is found, what is refused and how, what is never imported."""
 
 import sys
-from importlib import metadata
 from pathlib import Path
 
 import pytest
 
 from projservo_cli import plugins
-from projservo_cli.config import load_config, to_yaml
-from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.config import load_config
+from projservo_cli.records import InputError
 from projservo_cli.robots.source import source_hash
 
 UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
@@ -61,84 +60,12 @@ def test_what_cannot_be_used_is_said_in_one_line(target, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_class_that_cannot_be_made_is_a_failure_of_the_work():
-    with pytest.raises(
-        WorkFailed, match=r"Unmakeable: cannot be made: ConnectionError: no route .* \(robots.py:"
-    ):
-        plugins.make("plant", f"{HERE}:Unmakeable", (), {})
-
-
-def test_a_function_may_make_the_robot():
-    written(
-        "mine_made", "from tests.robots.robots import Sound\n\ndef robot(path):\n    return Sound(path)\n"
-    )
-    made = plugins.make("plant", "mine_made:robot", (), {"path": str(UR5)})
-    assert made.read()[0].shape == (6,)
-
-
 MADE = {
     "in __init__": "def __init__(self):\n        self.open = self.close = self.stop = print",
     "by a loop": "def __init__(self):\n        [setattr(self, n, print) for n in ('open', 'close', 'stop')]",
     "by delegation": "def __getattr__(self, name):\n        return getattr(Bare, name)",
     "too few": "def __init__(self):\n        self.open = self.close = print\n        self.stop = None",
 }
-
-
-@pytest.mark.parametrize("way", MADE)
-def test_methods_that_objects_are_given_as_they_are_made_count(way):
-    text = "class Bare:\n    open = close = stop = print\n\n\nclass Arm:\n    def joints(self): ...\n"
-    text += "    def command(self, target, speed, due): ...\n    "
-    written(f"mine_arm_{len(way)}", text + MADE[way] + "\n")
-    found = plugins.find("plant", f"mine_arm_{len(way)}:Arm")
-    if way == "too few":
-        with pytest.raises(InputError, match=r"lacks stop\(\); needed: open, joints"):
-            plugins.called("plant", "mine:Arm", found, (), {})
-    else:
-        assert plugins.brings_no_pixels(plugins.called("plant", "mine:Arm", found, (), {}))
-
-
-def test_the_working_directory_comes_last():
-    written("colorsys", "raise AssertionError('a file here must not stand in for an installed module')\n")
-    sys.modules.pop("colorsys", None)
-    assert plugins.find("law", "colorsys:rgb_to_hsv")(0.0, 0.0, 0.0) == (0.0, 0.0, 0.0)
-
-
-def test_registered_names_stand_for_their_class(monkeypatch):
-    points = {
-        "projservo.plants": [metadata.EntryPoint("arm", f"{HERE}:Sound", "projservo.plants")],
-        "projservo.laws": [metadata.EntryPoint("by_image", f"{HERE}:ByImage", "projservo.laws")],
-    }
-    monkeypatch.setattr(metadata, "entry_points", lambda group: points[group])
-    config = load_config(UR5, ["plant=arm", "control.laws=[exact, by_image]"])
-    assert config.plant.use == f"{HERE}:Sound"
-    assert config.control.laws == ("exact", f"{HERE}:ByImage")
-    text = to_yaml(config)
-    points.update({"projservo.plants": [], "projservo.laws": []})
-    assert load_config("stored", text=text) == config  # read where nothing is registered
-    with pytest.raises(InputError, match="'arm'"):
-        load_config(UR5, ["plant=arm"])
-
-
-def test_reading_a_configuration_imports_nothing():
-    written("mine_touches", "import pathlib\npathlib.Path('imported').touch()\n")
-    config = load_config(UR5, ["plant=mine_touches:A", "law=mine_touches:B"])
-    assert load_config("stored", text=to_yaml(config)) == config
-    assert not Path("imported").exists()
-    with pytest.raises(InputError, match="has no A"):
-        plugins.find("plant", "mine_touches:A")
-    assert Path("imported").exists()
-
-
-def test_the_short_and_the_long_form_are_one():
-    short = load_config(UR5, ["plant=a.b:C", "plant.timeout_s=2", "law=a:L"])
-    long = load_config(UR5, ["plant={use: 'a.b:C', timeout_s: 2}", "control.laws=['a:L']"])
-    assert short == long
-    Path("both.yaml").write_text("law: exact\ncontrol: {laws: [exact]}\ndata: {table: t.csv}\n")
-    with pytest.raises(InputError, match=r"both.yaml:1:1: law: control.laws is set as well"):
-        load_config("both.yaml")
-    Path("one.yaml").write_text("law: exact\nplant: a:B\ndata: {table: t.csv}\n")
-    assert load_config("one.yaml").control.laws == ("exact",)
-    assert load_config("one.yaml").plant.use == "a:B"
 
 
 @pytest.mark.parametrize(
@@ -215,17 +142,3 @@ def test_a_law_that_is_edited_is_run_anew_and_one_that_is_gone_stands(projservo)
     projservo(*command)
     Path("mine_edited.py").unlink()
     assert "servo/mine_edited:Law: up to date, though the source of its law is gone" in said()
-
-
-def test_a_sweep_is_not_continued_with_another_source(projservo):
-    written("mine_swept", LAW)
-    Path("sweep.yaml").write_text(
-        f"base: {UR5}\nseed: 1\nruns: 1\ngrid: {{law: ['mine_swept:Law']}}\nset: {{stop.max_steps: 3}}\n"
-    )
-    command = ("sweep", "-c", "sweep.yaml", "-o", "swept")
-    assert projservo(*command).code == 0
-    assert projservo(*command).code == 0
-    written("mine_swept", LAW + "# edited\n")
-    again = projservo(*command)
-    assert again.code == 2
-    assert "the source of mine_swept:Law changed since; choose another folder" in again.err

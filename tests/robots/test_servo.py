@@ -1,9 +1,7 @@
 """Servo and record with robots and laws of others, on the command line."""
 
 import io
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import click
 import numpy as np
@@ -12,12 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import projservo_cli as ps
 from projservo_cli.config import Override, load_config
-from projservo_cli.records import Calibration
-from projservo_cli.stages.scenario import Scenario
 from projservo_cli.store import load
-from projservo_cli.store.tables import read_table
 from tests.configured import scenario_of
-from tests.fake_records import fake
 from tests.robots import robots
 from tests.robots.robots import CALLS
 
@@ -131,24 +125,6 @@ def test_a_robot_that_fails_ends_the_run_in_one_line(servo, fault, after, messag
     assert np.isfinite(trace.s[-1]).all() == fault.startswith("command")
 
 
-def test_a_camera_that_shows_nothing_any_more_is_named(servo):
-    answer = servo(*faulty("blind", 80), "--set", "stop.max_steps=60", "--json", law="exact")
-    (told,) = answer.json["laws"]
-    assert told["verdict"] != "converged"
-    assert "the left camera has shown no marker of the face since step" in told["reason"]
-
-
-def test_a_joint_that_is_blocked_is_named_while_the_run_goes_on(servo):
-    answer = servo(*faulty("blocked", 80), "--json", law="exact")
-    (told,) = answer.json["laws"]
-    assert told["verdict"] == "following error"
-    assert told["overruns"] == 0
-    trace = load("run").traces["exact"]
-    assert trace.reason.startswith("joint 3 stands at ")
-    assert trace.steps < 300
-    assert np.ptp(trace.q[-40:, 2]) == 0.0
-
-
 def test_after_a_failure_no_other_law_drives_the_robot(servo):
     answer = servo(*faulty("raises", 100), "--law", "exact", "--json")
     assert answer.code == 1
@@ -218,35 +194,6 @@ def test_without_an_image_nothing_moves_unless_that_is_asked_for(servo, fault, d
     assert dark in told["untested"]
 
 
-def test_a_camera_that_is_lost_under_way_is_said_of_a_run_that_converges(servo):
-    answer = servo(*faulty("blind", 75), *NEAR, law="exact")
-    assert answer.code == 0, answer.err
-    assert "converged" in answer.out
-    assert "the left camera has shown no marker" in " ".join(answer.out.split())
-
-
-def test_a_calibration_without_covariance_tests_nothing_and_says_so():
-    inputs = SimpleNamespace(tests_images=True)
-    bare = fake(Calibration, sqrt_cov_shared=np.full((3, 3), np.nan))
-    assert "has no covariance" in Scenario.untested.fget(SimpleNamespace(inputs=inputs, calibration=bare))
-    sound = fake(Calibration, sqrt_cov_shared=np.eye(3))
-    assert Scenario.untested.fget(SimpleNamespace(inputs=inputs, calibration=sound)) == ""
-
-
-def test_lost_markers_are_waited_for(servo):
-    answer = servo(*faulty("lost for a while", 80), "--json")
-    assert answer.json["laws"][0]["verdict"] == "converged"
-    trace = load("run").traces["direct_three"]
-    unseen = np.isnan(trace.s).any(axis=(1, 2, 3))
-    assert unseen.sum() == 9
-    np.testing.assert_array_equal(trace.q_dot[unseen[:-1]], 0.0)
-    answer = servo(*faulty("lost", 80), "--set", "stop.max_lost_periods=7", "--json")
-    (told,) = answer.json["laws"]
-    assert (answer.code, told["verdict"]) == (1, "markers lost")
-    assert "7 periods after the last that was" in told["reason"]
-    assert np.isnan(load("run").traces["direct_three"].s).any(axis=(1, 2, 3)).sum() == 8
-
-
 def test_joint_limits_end_a_run_whatever_is_configured(calibrated):
     use = f"plant={{use: '{HERE}:Sound', joint_limits: report}}"
     config = load_config(UR5, [use, "noise.servo_px=0.1"])
@@ -263,58 +210,6 @@ def test_a_robot_without_speed_limit_is_refused(servo):
     assert answer.code == 2
     assert "set control.joint_speed_limit_deg_s" in answer.err
     assert commands() == []
-
-
-def test_a_law_of_others_equals_the_built_in_one_it_calls(servo):
-    points = ["--set", "control.features=points"]
-    assert servo("-q", *points).code == 0
-    built_in = load("run").traces["direct_three"]
-    assert servo("-q", *points, law=f"{HERE}:DirectThree").code == 0
-    theirs = load("run").traces[f"{HERE}:DirectThree"]
-    assert theirs.verdict == "converged"
-    for name in ("q", "s", "q_dot", "pose"):
-        np.testing.assert_array_equal(getattr(theirs, name), getattr(built_in, name), err_msg=name)
-    assert np.isnan(theirs.tau).all()
-
-
-TALKING = """
-import threading
-from tests.robots.robots import ByImage, Sound
-print("a module says")
-
-class Robot(Sound):
-    def __init__(self, config):
-        super().__init__(config)
-        print("a robot is made")
-    def read(self):
-        threading.Thread(target=print, args=("a camera says",)).start()
-        print("a robot sees")
-        return super().read()
-    def stop(self):
-        print("a robot stops")
-        super().stop()
-
-class Law(ByImage):
-    def __init__(self, setup):
-        super().__init__(setup)
-        print("a law is made")
-    def __call__(self, s, q):
-        print("a law is asked")
-        return super().__call__(s, q)
-"""
-SAID = ("a module says", "a robot is made", "a robot sees", "a camera says", "a robot stops", "a law is made")
-
-
-def test_a_law_and_a_robot_of_others_and_what_they_print(servo, monkeypatch):
-    """Standard output is for results: what others print, from whatever thread, goes to standard error."""
-    Path("mine_talks.py").write_text(TALKING)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    plant = ["--set", f"plant={{use: 'mine_talks:Robot', {OPTIONS}}}}}"]
-    answer = servo(*plant, "--set", "law=mine_talks:Law", *NEAR, "--json", law=None)
-    assert answer.code == 0, answer.err
-    assert answer.json["laws"][0]["verdict"] == "converged"
-    assert [text for text in (*SAID, "a law is asked") if text in answer.out] == []
-    assert [text for text in (*SAID, "a law is asked") if text not in answer.err] == []
 
 
 @pytest.mark.parametrize(
@@ -335,13 +230,6 @@ def test_a_law_that_fails(servo, law, code, message):
     assert answer.code == code
     assert message in answer.err
     assert "Traceback" not in answer.err
-
-
-def test_a_law_that_waits_is_waited_for(servo):
-    answer = servo("--set", "stop.max_lost_periods=3", "--json", law=f"{HERE}:Silent")
-    assert answer.code == 1  # a law that is named must converge
-    assert "Silent must converge, but ended in markers lost: " in answer.err
-    assert (answer.json["laws"][0]["verdict"], answer.json["laws"][0]["steps"]) == ("markers lost", 3)
 
 
 def test_confirm_needs_a_terminal(servo, monkeypatch):
@@ -369,33 +257,6 @@ def test_confirm_asks_before_the_first_motion(servo, monkeypatch, answered, code
     assert moved == 0
     assert ("servo will move tests.robots.robots:Sound, speeds times 0.5" in answer.err) or asked[0][0]
     assert bool(commands()) == (code == 0)
-
-
-def test_a_stored_run_starts_no_code(servo, projservo, monkeypatch):
-    Path("mine_marks.py").write_text(
-        "import pathlib\npathlib.Path('imported').touch()\nfrom tests.robots.robots import *\n"
-    )
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    robot = ["--set", f"plant={{use: 'mine_marks:Sound', {OPTIONS}}}}}"]
-    law = ["--set", "control.laws=['mine_marks:ByImage', direct_three]"]
-    assert servo(*robot, *law, *NEAR, "-q", law=None).code == 0
-    Path("imported").unlink()
-    sys.modules.pop("mine_marks")
-    for words in (
-        ("show", "run"), ("servo", "-o", "run"), ("servo", "-o", "run", "-n", "--force"),
-        ("calibrate", "-o", "run", "--set", "seed=9", "-n"), ("validate", "run", "--data", "t.csv"),
-    ):  # fmt: skip
-        projservo(*words)
-    refused = projservo("servo", "-o", "run", "--force")
-    assert refused.code == 2
-    assert "law mine_marks:ByImage is named by the stored run alone, which starts no code" in refused.err
-    refused = projservo("servo", "-o", "run", "--force", "--law", "mine_marks:ByImage")
-    assert "plant mine_marks:Sound is named by the stored run alone" in refused.err
-    assert not Path("imported").exists()
-    assert "mine_marks" not in sys.modules
-    asked = projservo("servo", "-o", "run", "--force", "--law", "direct_three", *robot)
-    assert asked.code == 0, asked.err
-    assert Path("imported").exists()
 
 
 def test_a_report_never_moves_a_robot(servo, projservo):
@@ -429,52 +290,3 @@ def test_a_real_robot_moves_whenever_it_is_asked_to_and_a_report_shows_what_is_s
     config = load_config(UR5, [Override.parse(SOUND[1])])
     ps.Experiment(config, "run", progress=False).make("servo", laws=["direct_three"])
     assert CALLS.count("open") == 1  # of a new object
-
-
-def test_a_robot_is_calibrated_from_what_it_showed(projservo, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    CALLS.clear()
-    alone = projservo("calibrate", "-c", UR5, *SOUND, "-o", "run")
-    assert (alone.code, CALLS) == (2, [])
-    assert "is calibrated from a table: record it" in alone.err
-    chain = ("record", "calibrate", "-o", "run", "--set", "calibration.frames_per_joint=4")
-    answer = projservo(*chain, "-c", UR5, *SOUND, "--json")
-    assert answer.code == 0, answer.err
-    assert (answer.json["record"]["recorded"], answer.json["calibrate"]["source"]) == (37, "recorded")
-    assert CALLS[-2:] == ["stop", "close"]
-    CALLS.clear()
-    refused = projservo(*chain, "--set", "seed=5")
-    assert (refused.code, CALLS) == (2, [])
-    assert "is named by the stored run alone, which starts no code" in refused.err
-    assert projservo("calibrate", "-o", "run", "--json").json["usable"] == answer.json["calibrate"]["usable"]
-    again = projservo(*chain, "-c", UR5, *SOUND)
-    assert (again.code, CALLS) == (0, [])
-    assert "record: up to date, and the robot is not moved: --force records all poses again" in again.err
-    # A fault that advises to recalibrate leads somewhere: what it contradicts is recorded again, once.
-    few = ["--set", "calibration.frames_per_joint=4", "--law", "exact"]
-    moved = projservo("servo", "-c", UR5, "-o", "run", *few, *faulty("bumped camera"), "--json")
-    assert moved.code == 1
-    assert "the left camera was moved" in moved.json["reason"]
-    for recorded, why in ((37, "what is there was contradicted"), (0, "up to date")):
-        answer = projservo(*chain, "-c", UR5, *SOUND, "--json")
-        assert answer.json["record"]["recorded"] == recorded, answer.err
-        assert f"record: {'making (' * bool(recorded)}{why}" in answer.err
-
-
-def test_record_drives_the_same_robot(projservo, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    few = ["--set", "calibration.frames_per_joint=2"]
-    answer = projservo("record", "-c", UR5, *SOUND, *few, "-o", "t.csv", "--speed-scale", "0.5", "--json")
-    assert answer.code == 0, answer.err
-    assert (answer.json["recorded"], answer.json["markers"]) == (25, 10)
-    assert max(np.abs(sent.step).max() for sent in commands()) <= 0.5 * np.radians(125.0) * 0.04 * (1 + 1e-12)
-    assert CALLS[-2:] == ["stop", "close"]
-    answer = projservo("record", "-c", UR5, *few, "-o", "t.csv")
-    assert answer.code == 2  # those poses are of another robot
-    answer = projservo("record", "-c", UR5, *faulty("raises", 115), *few, "-o", "u.csv")
-    assert answer.code == 1
-    assert "camera 2 is unplugged" in answer.err
-    assert CALLS[-2:] == ["stop", "close"]
-    table = read_table("u.csv")  # what was seen until then is kept, on the way too
-    assert table.at_rest.pose.tolist() == [0, 1, 2, 3, 4]
-    assert table.moving.max() == 5

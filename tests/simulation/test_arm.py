@@ -5,12 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.records import InputError
-from projservo_cli.simulation.arm import camera_center, roll_axis
+from projservo_cli.simulation.arm import roll_axis
 from projservo_cli.simulation.workspace import turned
 from tests.configured import truth_of
 from tests.known import configured
-from tests.samples import displacement, pixels
+from tests.samples import displacement
 
 # θ, α (deg), d, a (m) of six joints, the third prismatic.
 TABLE = [
@@ -71,45 +70,6 @@ def test_dh_tables_of_both_conventions(convention, rng):
         assert robot.pose(q) == pytest.approx(chain(q, convention == "modified"), abs=1e-13)
     assert robot.prismatic.tolist() == [0, 0, 1, 0, 0, 0]
     assert robot.limits.lower == pytest.approx([*np.radians([-3, -3]), -3, *np.radians([-3, -3, -3])])
-
-
-def test_puma_at_its_ready_pose():
-    """Corke's toolbox: joints (0, 90, −90, 0, 0, 0)° stretch the arm up; the wrist is at a3, −d3, a2 + d4."""
-    pose = truth_of(configured("paper")).robot.pose(np.radians([0, 90, -90, 0, 0, 0]))
-    # The tool is 0.05625 + 0.05 m beyond the wrist.
-    assert pose[:3, 3] == pytest.approx([0.0203, -0.15005, 0.8636 + 0.10625], abs=1e-12)
-    assert pose[:3, :3] == pytest.approx(np.eye(3), abs=1e-12)
-
-
-def test_a_camera_looks_at_its_target():
-    position, target = np.array([2.0, -0.3, 0.8]), np.array([0.5, 0.1, 0.6])
-    P = camera(position, target)
-
-    def seen(point):
-        return pixels(np.array([P, P]), np.append(point, 1.0)[None])[0, 0]
-
-    assert seen(target) == pytest.approx([640, 500], abs=1e-9)
-    assert seen(target + np.array([0, 0, 0.1]))[1] < 500  # up is towards smaller v
-    left = np.cross([0, 0, 1.0], target - position)
-    assert seen(target + 0.1 * left)[0] < 640
-    distance = np.linalg.norm(target - position)
-    assert P[2] @ [*target, 1] == pytest.approx(distance)
-    assert camera_center(P) == pytest.approx(position, abs=1e-12)
-    for cameras in (np.stack([P, P]), np.stack([P, -3 * P])):
-        point, direction = roll_axis(cameras)
-        assert point == pytest.approx(position)
-        assert direction == pytest.approx((target - position) / distance)
-    # One metre across at the target's distance is the focal length over that distance, in both axes.
-    across = seen(target + 1e-3 * left / np.linalg.norm(left)) - [640, 500]
-    assert across == pytest.approx([-1.2 / distance, 0], abs=1e-9)
-    with pytest.raises(InputError, match="along the line of sight"):
-        camera(position, np.add(position, [0, 0, 4]))
-
-
-def test_roll_axis_lies_between_the_cameras():
-    point, direction = roll_axis(np.array([camera([2, y, 0.5], [0.5, 0, 0.5]) for y in (-0.2, 0.2)]))
-    assert point == pytest.approx([2, 0, 0.5], abs=1e-12)
-    assert direction == pytest.approx([-1, 0, 0], abs=1e-12)
 
 
 @pytest.mark.parametrize("roll_deg", [10, 165, 180])

@@ -58,23 +58,6 @@ def driven(plant, targets):
 WAY = [[0.02 * k, -0.01 * k] for k in range(1, 26)]
 
 
-def test_an_ideal_robot_is_where_it_was_sent_and_shows_it():
-    plant = robot()
-    q, s = driven(plant, WAY)
-    assert q == pytest.approx(np.array(WAY), abs=1e-14)
-    assert s == pytest.approx(np.array([images(row) for row in WAY]), abs=1e-9)
-    assert (plant.now(), plant.truth()) == (pytest.approx(25 * PERIOD), pytest.approx(WAY[-1]))
-
-
-def test_a_servo_lags_as_a_system_of_first_order_does():
-    plant, lag, pace = robot(servo_time_constant_s=0.05), 0.05, np.array([0.02, -0.01]) / PERIOD
-    q, _ = driven(plant, [*WAY, *[WAY[-1]] * 5])
-    for k, row in enumerate(q, 1):
-        t, end = k * PERIOD, 25 * PERIOD
-        behind = lag * (1.0 - math.exp(-min(t, end) / lag)) * math.exp(-max(0.0, t - end) / lag)
-        assert row == pytest.approx(pace * (min(t, end) - behind), abs=1e-12)
-
-
 def test_sag_is_read_and_flexing_is_not_in_proportion_to_the_load():
     assert full_reach(arm()) == pytest.approx(0.7, rel=0.01)
     reach, sag = full_reach(arm()), math.radians(0.5)
@@ -89,28 +72,6 @@ def test_sag_is_read_and_flexing_is_not_in_proportion_to_the_load():
             told, _ = driven(plant, [q] * 10)
             assert told[-1] - q == pytest.approx(sag * read, abs=2e-4 * sag + sag**2)
             assert plant.truth() - q == pytest.approx(sag * true, abs=2e-4 * sag + sag**2)
-
-
-def test_play_leaves_the_link_behind_where_the_way_turns():
-    play, plant = math.radians(0.5), robot(backlash_deg=0.5)
-    there, back = WAY, [*WAY[::-1], [0.0, 0.0]]
-    q, _ = driven(plant, there)
-    assert plant.truth() - q[-1] == pytest.approx(0.5 * play * np.array([-1, 1]), abs=1e-12)
-    q, _ = driven(plant, [*back, [0.2 * play, 0.0]])
-    assert q[-1] == pytest.approx([0.2 * play, 0.0])
-    assert plant.truth() == pytest.approx(0.5 * play * np.array([1, -1]), abs=1e-12)
-
-
-def test_encoders_count_ticks_and_servos_may_do_so_too():
-    tick = 2 * math.pi / 4096
-    for coarse in (False, True):
-        plant = robot(encoder_counts_per_turn=4096, quantize_setpoints=coarse)
-        for target, q in zip(WAY, driven(plant, WAY)[0], strict=True):
-            assert q / tick == pytest.approx(np.round(q / tick), abs=1e-9)
-            assert abs(q - target).max() <= 0.5 * tick + 1e-12
-        gap = abs(plant.truth() - WAY[-1]).max()
-        assert (gap > 1e-6) == coarse
-        assert gap <= 0.5 * tick
 
 
 def along(t):
@@ -171,23 +132,3 @@ def test_events_befall_the_robot_in_their_period():
         expected[:, 2] = math.nan if 2 <= k < 4 else expected[:, 2]
         assert q == pytest.approx(struck, abs=1e-12)
         assert s == pytest.approx(expected, abs=1e-8, nan_ok=True)
-
-
-def test_a_slip_and_a_frozen_reading_are_not_read():
-    plant = robot(joint_moved={"at_step": 5, "joint": 1, "by_deg": math.degrees(0.05), "encoder_slip": True})
-    q, _ = driven(plant, WAY[:8])
-    assert plant.truth() - q[-1] == pytest.approx([0.05, 0.0], abs=1e-12)
-    q, _ = driven(robot(stuck_encoder={"joint": 1, "from_step": 3, "steps": 4}), WAY[:10])
-    assert np.array(q)[:, 0] / 0.02 == pytest.approx([1, 2, 3, 3, 3, 3, 7, 8, 9, 10])
-    assert np.array(q)[:, 1] / -0.01 == pytest.approx(np.arange(1, 11))
-
-
-def test_runs_are_the_same_to_the_bit_and_other_seeds_are_others():
-    late = {"camera_latency_s": {"left": 0.05, "right": 0.06}, "exposure_s": 0.01, "jitter_s": 0.003}
-    faults = late | {"servo_time_constant_s": 0.05, "gravity_sag_deg": 0.5, "backlash_deg": 0.5} | WARPED
-    one, two, other = (driven(robot(0.5, seed, **faults), WAY) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one[1], two[1])
-    assert np.isfinite(one[1][0]).all()
-    assert (np.array(one[1])[0] != np.array(other[1])[0]).all()
-    noise = np.array([s - images(q) for q, s in zip(*driven(robot(sigma_px=0.5), WAY), strict=True)])
-    assert noise.std() == pytest.approx(0.5, rel=0.15)

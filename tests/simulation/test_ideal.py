@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.geometry.algebra import mat
-from projservo_cli.simulation.analytic_plant import AnalyticPlant, observe
+from projservo_cli.simulation.analytic_plant import observe
 from tests.samples import displacement, poe
 from tests.scene import STEP, scene
 
@@ -54,17 +54,3 @@ def test_a_marker_behind_a_camera_has_no_pixel():
     in_front, _, s, _ = observed(plant, displacement([0, 0, 0], [0, 0, -1.4]))
     assert not in_front
     assert np.isnan(s).any()
-
-
-def test_the_plant_as_an_object():
-    sc = scene()
-    noise = np.arange(2 * 16, dtype=float).reshape(2, 2, 4, 2)
-    plant = AnalyticPlant(sc.plant, sc.q_start, noise)
-    assert plant.observe() == pytest.approx(sc.s_start + noise[0], abs=1e-9)
-    plant.command(0.5 * STEP, 0.04)
-    assert plant.joints() == pytest.approx(sc.q_start + 0.5 * STEP, abs=1e-15)
-    plant.joints()[:] = 7.0  # a reading is a copy
-    assert plant.observe() == pytest.approx(sc.images(sc.q_start + 0.5 * STEP) + noise[1], abs=1e-9)
-    # From the middle between the cameras, which is the origin.
-    assert plant.distance() == pytest.approx(np.linalg.norm(plant.M.mean(axis=0)[:3]))
-    assert sc.q_start.tolist() == sc.model.q_reference.tolist()

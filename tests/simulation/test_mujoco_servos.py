@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.records import InputError
 from projservo_cli.simulation.physics import Physics
 from tests.configured import truth_of
 from tests.simulation.conftest import eyes_of
@@ -111,70 +110,6 @@ def test_servos_of_ours_follow_lag_and_sag_as_they_are_told(tmp_path, servo):
     assert physics.motor[0] == pytest.approx(0.1, abs=1e-6)
     physics.follow(physics.setpoint, 1.0)
     assert physics.motor[0] == pytest.approx(0.1, abs=1e-4)
-
-
-@pytest.mark.usefixtures("needs_mujoco")
-def test_motors_hold_a_joint_that_has_to_turn_little(tmp_path):
-    """Upright, the arm weighs on its first joint a hundredth of what it does when it is stretched out."""
-    config = described(tmp_path, "motor")
-    path = tmp_path / "arm.xml"
-    path.write_text(path.read_text(encoding="utf-8").replace('"tilt" axis', '"tilt" range="-1.6 1.6" axis'))
-    physics = driven(config, np.array([0.4, -0.3]))
-    upright = np.array([0.9, -1.5])
-    physics.follow(upright, 0.5)
-    physics.follow(upright, 1.0)
-    sent = []
-    for _ in range(5):
-        physics.follow(upright, 0.002)
-        sent.append(physics._data.ctrl.copy())
-    assert physics.motor == pytest.approx(upright, abs=1e-6)
-    assert np.ptp(sent, axis=0) == pytest.approx(0.0, abs=1e-3)
-
-
-@pytest.mark.usefixtures("needs_mujoco")
-def test_what_an_arm_touches_is_told(tmp_path):
-    config = described(tmp_path, "position")
-    path = tmp_path / "arm.xml"
-    post = '<worldbody><body name="post" pos="0 0.5 0.4"><geom size="0.04"/></body>'
-    path.write_text(path.read_text(encoding="utf-8").replace("<worldbody>", post), encoding="utf-8")
-    physics = driven(config, np.array([0.4, 0.0]))
-    assert physics.obstruction == ""
-    physics.follow(np.array([1.7, 0.0]), 2.0)
-    assert physics.motor[0] < 1.5
-    assert physics.obstruction == "the arm touches: post and boom"
-
-
-@pytest.mark.usefixtures("needs_mujoco")
-@pytest.mark.parametrize(
-    "limit", ['gear="-20" ctrlrange="-0.4 0.4"', 'forcerange="-8 8"', 'actuatorfrcrange="-8 8"']
-)
-def test_a_servo_too_weak_for_what_it_holds_is_told(tmp_path, limit):
-    config = described(tmp_path, "motor")
-    path, text = tmp_path / "arm.xml", (tmp_path / "arm.xml").read_text(encoding="utf-8")
-    if "actuatorfrcrange" in limit:
-        text = text.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-8 8"')
-    else:
-        text = text.replace('gear="-20"', limit)
-    path.write_text(text, encoding="utf-8")
-    physics = driven(config, np.array([0.4, math.pi / 2.0]))  # it hangs
-    physics.follow(physics.setpoint, 0.1)
-    assert physics.obstruction == ""
-    physics.follow(np.array([0.4, 0.0]), 2.0)
-    assert physics.obstruction == "at the end of what their servos can do: joint 2"
-
-
-@pytest.mark.usefixtures("needs_mujoco")
-def test_what_cannot_drive_a_joint_is_named(tmp_path):
-    with pytest.raises(
-        InputError, match=r"disturbance.gravity_sag_deg: servos of robot.mjcf sag by their own gains"
-    ):
-        driven(described(tmp_path, "position"), Q, sag=0.01)
-    SERVOS["muscle"] = '<muscle name="t" joint="tilt" lengthrange="0 1"/>'
-    try:
-        with pytest.raises(InputError, match="actuator t is no motor, position"):
-            driven(described(tmp_path, "muscle"), Q)
-    finally:
-        del SERVOS["muscle"]
 
 
 @pytest.mark.usefixtures("needs_mujoco")

@@ -48,41 +48,6 @@ def test_noise_and_blur_are_as_they_were_asked_for(small, drawn):
     assert steepest[1] < 0.6 * steepest[0]
 
 
-def test_an_exposure_is_the_mean_of_the_frames_in_it(small, drawn):
-    truth, eyes = drawn(small())
-    q, way = POSTURES[7], np.array([[0.0, 0.01 * k] for k in range(-2, 3)])
-    rng = np.random.default_rng(0)
-    single = []
-    for step in way:
-        eyes.capture(1, (q + step)[None], None, rng)
-        single.append(eyes.last[1].astype(float))
-    seen, _ = eyes.capture(1, q + way, None, rng)
-    assert np.abs(eyes.last[1] - np.mean(single, axis=0)).max() <= 1.0
-    assert np.nanmean(np.abs(seen - truth.images(q, truth.M)[1])) < 0.1
-
-
-def test_a_tag_that_is_moved_is_seen_to_be_moved(small, drawn):
-    truth, eyes = drawn(small())
-    q, by = POSTURES[7], np.array([0.01, 0.0, 0.005])
-    moved = truth.M.copy()
-    moved[4:8, :3] += truth.robot.base_tool[:3, :3] @ by
-    seen, _ = eyes.capture(1, q[None], (6, by), np.random.default_rng(0))
-    assert seen == pytest.approx(truth.images(q, moved)[1], abs=0.15, nan_ok=True)
-    assert np.isfinite(seen[4:8]).all()
-
-
-def test_plates_lists_and_hard_light_are_seen(small, drawn):
-    turned = (
-        "{number: 7, size_m: 0.1, pose: [[0, -1, 0, 0.05], [1, 0, 0, 0.02], [0, 0, 1, 0.03], [0, 0, 0, 1]]}"
-    )
-    for markers in ("{tags: plate, tag_size_m: 0.07}", f"{{tags: [{turned}], dictionary: APRILTAG_36H11}}"):
-        for light in ("soft", "side"):
-            truth, eyes = drawn(small(f"markers={markers}", f"plant.options.light={light}"))
-            off = misses(truth, eyes, POSTURES[[6, 7, 8]])
-            assert np.isfinite(off).all()
-            assert np.abs(off).max() < 0.15
-
-
 HASHED = """
 import hashlib, sys
 import numpy as np
@@ -148,19 +113,3 @@ def test_a_scene_that_cannot_be_is_said_in_a_line(small, overrides, message):
     config = small(*(text.replace("TAG", tag) for text in overrides))
     with pytest.raises(InputError, match=message):
         eyes_of(config)
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("plant.options.blur=1", "plant.options.blur: unknown key; did you mean blur_px"),
-        ("plant.options.light=dark", "plant.options.light: 'dark' is not one of them; valid: soft, side"),
-        ("noise.servo_px=0.5", "noise.servo_px: is that of projected points"),
-        ("markers={positions_m: [[0, 0, 0]]}", "markers: plant mujoco shows tags: set markers.tags"),
-        ("markers.numbers=[1, 2]", "markers.numbers: tags is set as well"),
-        ("markers.face=[0, 1, 99]", "markers.face.2: there is no marker 99"),
-    ],
-)
-def test_what_contradicts_a_rendered_plant_is_named(small, override, message):
-    with pytest.raises(InputError, match=message):
-        small(override)

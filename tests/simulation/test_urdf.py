@@ -133,12 +133,3 @@ def test_what_cannot_be_taken_is_said_in_a_line(tmp_path, kind, text, tip, messa
         configured(tmp_path, kind, text, tip)
     assert str(told.value).startswith(f"{tmp_path}/its.yaml:1:")
     assert "\n" not in str(told.value)
-
-
-def test_a_stored_configuration_needs_the_file_no_more(tmp_path):
-    from projservo_cli.config import to_yaml
-
-    for kind, text, tip in (("urdf", URDF, "tool"), ("mjcf", MJCF, "hand")):
-        config = configured(tmp_path, kind, text, tip)
-        (tmp_path / "robot.xml").unlink()
-        assert load_config(tmp_path / "stored.yaml", text=to_yaml(config)) == config

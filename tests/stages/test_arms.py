@@ -4,15 +4,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
 from projservo_cli import Experiment
 from projservo_cli.config import load_config
-from projservo_cli.geometry.kinematics import joint_operators, project
+from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import WorkFailed
-from tests.configured import calibrate, plan, scenario_of, servo, truth_of
+from tests.configured import calibrate, plan, servo
 from tests.conftest import ROOT
-from tests.samples import revolute
 
 LAWS = ("exact", "direct_two", "direct_three", "stacked")
 # Four joints: two vertical axes, a lift and a vertical axis again; it turns the face about one direction.
@@ -109,22 +107,6 @@ def test_the_redundant_arm_makes_the_least_motion(points):
         H_hat = joint_operators(model, trace.q[k]).reshape(7, 16)
         spent = np.linalg.svd(H_hat.T)[2][6] @ trace.q_dot[k]
         assert abs(spent) < 1e-6 * np.linalg.norm(trace.q_dot[k])
-
-
-@pytest.mark.volume
-@pytest.mark.parametrize(("name", "axis"), [("lift", [0, 1, 0]), ("five", [1, 0, 0])])
-def test_a_task_beyond_the_joints_is_refused_with_what_is_left(name, axis):
-    """The face turned where it is by 20°, about an axis that these joints do not turn it about."""
-    truth = truth_of(planned(name)[0])
-    q = scenario_of(planned(name)[0]).exact.q_start
-    M = truth.M_face @ (truth.robot.pose(q) @ np.linalg.inv(truth.robot.base_tool)).T
-    M = M @ expm(np.radians(20.0) * revolute(M[:, :3].mean(axis=0), axis)).T
-    images = {side: s.tolist() for side, s in zip(("left", "right"), project(truth.P, M), strict=True)}
-    with pytest.raises(WorkFailed, match=r"(?:lie in what|a pose that) \d joints .* px rms") as refusal:
-        planned(name, f"task.goal={{images: {images}}}")
-    left = float(str(refusal.value).split(" px rms")[0].split()[-1])
-    whole = np.sqrt(np.mean(np.sum((project(truth.P, M) - truth.images(q, truth.M_face)) ** 2, axis=-1)))
-    assert 3.0 < left <= whole
 
 
 def test_one_joint_is_calibrated_and_has_a_page_and_reaches_no_pose(tmp_path):

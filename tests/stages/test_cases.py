@@ -5,7 +5,6 @@ import pytest
 from scipy.linalg import expm
 
 from projservo_cli.config import load_config
-from projservo_cli.records import WorkFailed
 from tests.configured import calibrate, plan, servo
 from tests.conftest import ROOT
 from tests.samples import revolute
@@ -92,34 +91,6 @@ def test_a_task_that_can_be_done_is_done(driven, name):
         assert np.sum(q_dot[1:] * q_dot[:-1], axis=1).min() > 0.5
 
 
-def test_faces_opposite_are_refused_in_words(driven):
-    with pytest.raises(WorkFailed, match="sees one side of the face"):
-        driven(moved(180, (0.0, 1.0, 0.0), shift=(0.0, 0.0, -0.3)))
-
-
-def test_the_limit_ends_the_run_at_it(driven):
-    trace = driven(turn(90, "robot.dh.joints.3.limits_deg=[20, 400]", "plant.joint_limits=stop"))
-    assert (trace.verdict, trace.limit_joint) == ("joint limit", 3)
-    assert np.degrees(trace.q[-1, 3]) == pytest.approx(20.0, abs=1e-4)
-    assert trace.reason.startswith("joint 4 stands at its limit, 20 deg, and the task would take it beyond; ")
-    assert trace.reason.endswith(" px are left")
-    assert 0 < trace.remaining_translation < 1
-    assert 0 < trace.remaining_rotation_deg < 90
-
-
-def test_lost_markers_are_waited_for_and_no_longer(driven):
-    whole = driven(turn(180))
-    for steps in (1, 20, "null"):
-        trace = driven(turn(180, f"disturbance.lost_markers={{from_step: 10, steps: {steps}}}"))
-        if steps == "null":
-            assert (trace.verdict, trace.steps) == ("markers lost", 10 + 25)
-            np.testing.assert_array_equal(trace.q[-1], trace.q[10])
-        else:
-            assert abs(trace.steps - whole.steps - steps) <= 1
-            assert not trace.q_dot[10 : 10 + steps].any()
-            np.testing.assert_allclose(trace.q[-1], whole.q[-1], atol=1e-4)
-
-
 def test_what_befalls_the_readings_is_in_the_trace(driven):
     slip = driven(turn(180, SLIP, UNTESTED))
     assert slip.verdict == "converged"
@@ -128,18 +99,3 @@ def test_what_befalls_the_readings_is_in_the_trace(driven):
     frozen = driven(turn(180, "disturbance.stuck_encoder={joint: 4, from_step: 10, steps: null}", UNTESTED))
     assert (frozen.verdict, "joint 4 stands at" in frozen.reason) == ("following error", True)
     assert (frozen.q_read[10:, 3] == frozen.q[10, 3]).all()
-
-
-def test_images_that_a_disturbance_sets_off_the_calibration_are_noticed(driven):
-    slip = driven(turn(180, SLIP))
-    assert (slip.verdict, slip.success) == ("fault detected", False)
-    assert 10 < slip.steps < 30  # without noise a held arm shows the same image, for half a second
-    moved = driven(turn(180, "disturbance.camera_moved={at_step: 12, view: right, by_px: [1.5, -1]}"))
-    assert (moved.verdict, "right camera" in moved.reason) == ("fault detected", True)
-    untested = driven(turn(180, "disturbance.camera_moved={at_step: 12, view: right, by_px: 3}", UNTESTED))
-    assert (untested.verdict, untested.untested) == ("converged", "stop.innovation_threshold is 0")
-    assert (slip.untested, driven(turn(180)).untested) == ("", "")
-    assert untested.position_error_mm > 0.05  # where the shifted camera says that the goal is
-    # A knock that the readings follow, and markers that nobody sees, take nothing from the calibration.
-    lost = driven(turn(180, "disturbance.lost_markers={from_step: 10, steps: 2}"))
-    assert lost.verdict == driven(DONE["joint_moved"]).verdict == "converged"

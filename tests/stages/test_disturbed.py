@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.records import InputError
 from tests.configured import calibrate, plan, servo, truth_of
 from tests.conftest import ROOT
 
@@ -55,8 +54,3 @@ def test_the_trace_holds_the_truth(driven):
     loose = driven("disturbance.backlash_deg=0.5", "disturbance.link_deflection_deg=0.2", UNTESTED)
     off = np.degrees(np.abs(loose.q - loose.q_read))
     assert 0.2 < off.max() <= 0.25 + 0.2 + 1e-9
-
-
-def test_a_robot_of_somebody_else_is_not_disturbed():
-    with pytest.raises(InputError, match="disturbs the simulated robot"):
-        config("disturbance.camera_latency_s=0.1", "plant=my_robot:Robot")

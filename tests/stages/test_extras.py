@@ -1,22 +1,16 @@
 """The 3D view and the animation beside a report, without a browser."""
 
 import dataclasses
-import json
 import re
-import sys
 
-import numpy as np
 import pytest
 from PIL import Image
 
-from projservo_cli.cli.stages import require_optional
-from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report import animation as film
 from projservo_cli.report.report_data import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
 from projservo_cli.stages import report
 from projservo_cli.store import Result
 from tests.configured import animation_of, page_of, report_on, view_of
-from tests.known import configured
 from tests.report.cases import case
 from tests.report.conftest import MADE, read, stored
 
@@ -48,37 +42,6 @@ def test_the_view_is_one_file_that_loads_nothing(view):
     assert not re.search(r"https?:|\*|'self'", policy.attributes["content"])
 
 
-def test_the_view_holds_every_instant_of_every_law(run, view):
-    text = view.read_text(encoding="utf-8")
-    frames = json.loads(re.search(r"Plotly\.addFrames\('scene',\s*(\[.*?\])\s*\);", text, re.S)[1])
-    named = {frame["name"]: frame for frame in frames}
-    assert list(named) == [
-        f"{name}/{k}" for name, trace in run.traces.items() for k in range(trace.steps + 1)
-    ]
-    for name, trace in run.traces.items():
-        places = np.transpose([named[f"{name}/{trace.steps}"]["data"][0][axis] for axis in "xyz"])
-        # A tenth of a millimetre is what the file keeps.
-        np.testing.assert_allclose(places[-1], trace.pose[-1, :3, 3], atol=1e-4)
-
-
-def test_without_plotly_the_view_says_what_to_install(run, monkeypatch):
-    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
-    with pytest.raises(InputError, match=r"pip install '\.\[view\]'"):
-        require_optional(configured("paper"), ["view"])
-    require_optional(configured("paper"), ["animation"])
-
-
-def test_what_has_no_metres_or_no_task_is_refused_with_the_remedy():
-    pytest.importorskip("plotly", reason="plotly is not installed: pip install '.[view]'")
-    config = configured("paper")
-    projective = config.model_copy(update={"robot": None})
-    with pytest.raises(InputError, match=r"--view: .*no metres.*robot\.dh or robot\.screws.*--animation"):
-        require_optional(projective, ["view"])
-    require_optional(projective, ["animation"])
-    with pytest.raises(InputError, match=r"--animation: .*task"):
-        require_optional(config.model_copy(update={"task": None}), ["animation"])
-
-
 def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):
     monkeypatch.setattr(film, "FRAMES", 6)  # a tenth of them, each of which takes its time
     told = []
@@ -98,14 +61,6 @@ def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):
     before = path.read_bytes()
     animation_of(run)
     assert path.read_bytes() == before
-
-
-@pytest.mark.parametrize("make", [view_of, animation_of])
-def test_runs_without_a_step_have_nothing_to_show(run, make):
-    pytest.importorskip("plotly", reason="plotly is not installed: pip install '.[view]'")
-    kept = {name: result for name, result in run.results.items() if not name.startswith("servo/")}
-    with pytest.raises(WorkFailed, match="projservo servo"):
-        make(dataclasses.replace(run, results=kept))
 
 
 def test_the_page_links_to_what_there_is_and_a_new_report_removes_it(tmp_path, monkeypatch):

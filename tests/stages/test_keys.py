@@ -4,7 +4,6 @@ import dataclasses
 import json
 import random
 import shutil
-import subprocess
 import sys
 from functools import cache
 
@@ -158,8 +157,8 @@ def pairs(count):
 
 @pytest.mark.volume
 def test_what_keeps_its_key_is_the_same_to_the_bit():
-    drawn = pairs(40)
-    assert len(drawn) == 40
+    drawn = pairs(20)
+    assert len(drawn) == 20
     for name, key, stage, other in drawn:
         _, results = chain(name)
         assert same(made(stage, GIVEN[stage](other), results), results[stage]), (name, key, stage)
@@ -271,25 +270,6 @@ def test_a_model_of_mujoco_counts_with_the_files_that_it_names(tmp_path):
         assert not {*other.values()} & {*first.values()}
 
 
-URDF = """<robot name="r"><link name="base"/><link name="tool"/>
-<joint name="a" type="revolute"><parent link="base"/><child link="tool"/><axis xyz="0 0 1"/>
-<limit lower="-2" upper="{}" effort="1" velocity="1"/></joint></robot>"""
-
-
-def test_of_a_urdf_the_screws_count_and_not_its_place_or_text(tmp_path):
-    def key(name, upper=2.0, comment=""):
-        path = tmp_path / name
-        path.write_text(URDF.format(upper) + comment, encoding="utf-8")
-        vectors = "task={start: {joints: [0], unit: rad}, goal: {joints: {joints: [0.2], unit: rad}}}"
-        config = configured(
-            "paper", f"robot={{urdf: {path}, tip: tool}}", vectors, "calibration.reference=null"
-        )
-        return key_of(calibration_inputs(config))
-
-    assert key("a.urdf") == key("b.urdf", comment="<!-- moved -->")
-    assert key("a.urdf") != key("a.urdf", upper=1.5)
-
-
 def test_canonical_bytes_tell_values_apart():
     values = [1, 1.0, True, "1", None, (1,), [1], {"a": 1}, np.ones(1), np.ones(1, np.int64), np.ones((1, 1))]
     assert len({encoded(value) for value in values}) == len(values)
@@ -297,14 +277,3 @@ def test_canonical_bytes_tell_values_apart():
         assert encoded(decoded(encoded(value), {})) == encoded(value)
     with pytest.raises(TypeError, match="object has no canonical bytes"):
         encoded(object())
-
-
-def test_no_function_below_the_experiment_takes_a_configuration():
-    """The layers say so too; this names what an import inside a function would hide."""
-    found = subprocess.run(
-        ["grep", "-rlE", r"projservo_cli\.config|: Config\b", str(ROOT / "projservo_cli")],
-        capture_output=True, text=True, check=True,
-    ).stdout.split()  # fmt: skip
-    below = {path.removeprefix(f"{ROOT}/projservo_cli/") for path in found if path.endswith(".py")}
-    above = ("cli/", "sweeps/", "config/", "api.py", "chain.py", "experiment.py", "steps.py", "__init__.py")
-    assert not {path for path in below if not path.startswith(above)}

@@ -5,15 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from projservo_cli import files
 from projservo_cli.cli.output import Console
 from projservo_cli.config import load_config
-from projservo_cli.detection import cells_of
-from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.records import WorkFailed
 from projservo_cli.robots.contract import PluginRobot
-from projservo_cli.store import load
 from projservo_cli.store.tables import read_joint_list, read_table
-from tests.configured import bounds_of, joints_of, plugin_robot, simulate, trial_motions, truth_of
+from tests.configured import bounds_of, joints_of, simulate, trial_motions, truth_of
 from tests.configured import record as stage
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -24,7 +21,6 @@ FEW = ["--set", "calibration.frames_per_joint=2"]
 @pytest.fixture(autouse=True)
 def elsewhere(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
 
 
 def same(table, observation):
@@ -39,33 +35,6 @@ def test_the_table_is_what_calibrate_simulates_to_the_bit(projservo, config):
     assert (answer.json["poses"], answer.json["recorded"], answer.json["pending"]) == (49, 49, 0)
     settings = load_config(config)
     same(read_table("new/t.csv"), simulate(settings, truth_of(settings)))
-
-
-def test_markers_that_leave_an_image_are_counted(projservo):
-    wide = ["--set", "calibration.amplitude_deg=60", "--set", "rig.image_size_px=[800, 600]"]
-    answer = projservo("record", "-c", UR5, *wide, "-o", "t.csv", "--json")
-    images = read_table("t.csv").images
-    assert 0 < answer.json["unseen"] == np.isnan(images[..., 0]).sum()
-
-
-def test_recording_then_calibrating_is_calibrating(projservo):
-    assert projservo("record", "-c", UR5, "-o", "t.csv", "-q").code == 0
-    assert projservo("calibrate", "-c", UR5, "-o", "one", "-q").code == 0
-    recorded = ["--data", "t.csv", "--noise-px", "0.5"]
-    assert projservo("calibrate", "-c", UR5, *recorded, "-o", "two", "-q").code == 0
-    one, two = load("one").calibration, load("two").calibration
-    assert (one.source, two.source) == ("simulated", "recorded")
-    for name in (
-        "P",
-        "H_hat_0",
-        "M",
-        "a_inf",
-        "q_reference",
-        "sqrt_cov_shared",
-        "sqrt_cov_marker",
-        "sqrt_cov_own",
-    ):
-        np.testing.assert_array_equal(getattr(two, name), getattr(one, name), err_msg=name)
 
 
 def lose_patience(console, what, done, total, note=""):
@@ -91,18 +60,6 @@ def test_an_interrupted_recording_goes_on_where_it_was(projservo, monkeypatch, g
     assert Path("t.csv").read_bytes() == Path("whole.csv").read_bytes()
     again = projservo("record", "-c", UR5, *FEW, "-o", "t.csv", "--json").json
     assert (again["recorded"], again["commands"]) == (0, 0)
-
-
-def test_the_table_grows_while_the_robot_moves(monkeypatch):
-    monkeypatch.setattr("projservo_cli.stages.record.SAVE_EVERY", 0.0)
-    config = load_config(UR5, ["calibration.frames_per_joint=2"])
-    path, sizes = Path("t.csv"), []
-    recording = stage.new_recording(config, path)
-    monkeypatch.setattr(recording, "save", lambda: sizes.append(len(recording.done)))
-    stage.record(config, recording)
-    assert sizes[0] < 13
-    assert sizes == sorted(set(sizes))
-    assert sizes[-1] == 13
 
 
 def test_a_table_of_another_configuration_is_refused_unless_forced(projservo):
@@ -132,13 +89,6 @@ def test_a_table_of_another_configuration_is_refused_unless_forced(projservo):
     assert Path("t.csv").read_bytes() != before
     again = projservo("record", "-c", UR5, *FEW, "--set", "seed=2", "-o", "t.csv", "--json")
     assert again.json["found"] == 13
-
-
-def test_what_does_not_change_the_pixels_does_not_matter(projservo):
-    assert projservo("record", "-c", UR5, *FEW, "-o", "t.csv", "-q").code == 0
-    for change in ("calibration.method=closed_form", "control.period_s=0.02", "markers.face=[0, 1, 2]"):
-        answer = projservo("record", "-c", UR5, *FEW, "--set", change, "-o", "t.csv", "--json")
-        assert (answer.code, answer.json["recorded"]) == (0, 0), change
 
 
 def test_further_motions_follow_the_trials_and_continue_their_table(projservo):
@@ -327,70 +277,6 @@ def test_a_robot_that_does_not_arrive_is_reported_and_the_rest_kept(kind, messag
         assert read_table("t.csv").at_rest.pose.tolist() == list(range(len(recording.done)))
 
 
-class Leaving(Arm):
-    """An arm that is gone after some time."""
-
-    def moved(self):
-        if self.time > 8.0:
-            raise ConnectionError("no route to the arm")
-
-
-def test_a_recording_that_failed_goes_on_with_what_is_missing():
-    config = load_config(UR5, TEN)
-    begun = stage.new_recording(config, Path("t.csv"))
-    with pytest.raises(WorkFailed, match="no route to the arm"):
-        stage.record(config, begun, driven(config, Leaving(config, lag=0.05)))
-    assert 3 < len(begun.done) < 10
-    before = read_table("t.csv")
-    recording = stage.new_recording(config, Path("t.csv"))
-    assert recording.found == len(begun.done)
-    stage.record(config, recording, driven(config, Arm(config, lag=0.05)))
-    table = read_table("t.csv")
-    assert table.at_rest.pose.tolist() == list(range(13))
-    np.testing.assert_array_equal(table.images[: recording.found], before.at_rest.images)
-    assert {*before.moving} < {*table.moving}
-
-
-def test_a_recorded_configuration_without_robot_says_which_key_to_set(projservo):
-    Path("mine.yaml").write_text("data: {table: t.csv}\n")
-    answer = projservo("record", "-c", "mine.yaml", "-o", "u.csv")
-    assert answer.code == 2
-    assert "set robot.dh or robot.screws" in answer.err
-
-
-def test_a_robot_with_faults_is_recorded_at_rest_and_on_the_way_as_calibrate_sees_it(tmp_path):
-    """At rest within noise of what its true joints show; on the way 120 ms late, by the frames' own times."""
-    faults = (
-        "disturbance.camera_latency_s=0.12",
-        "disturbance.encoder_counts_per_turn=4096",
-        "disturbance.gravity_sag_deg=0.5",
-    )
-    config = load_config(
-        CONFIGS / "hobby.yaml",
-        [*faults, "calibration.frames_per_joint=2", "calibration.random_poses=2"],
-    )
-    seen, sigma_px = stage.observed(config)
-    tick, truth = 2 * np.pi / 4096, truth_of(config)
-    assert sigma_px == 0.5
-    rest, targets = seen.at_rest, trial_motions(config)
-    assert rest.q / tick == pytest.approx(np.round(rest.q / tick), abs=1e-9)
-    assert np.abs(rest.q - targets).max() < np.radians(0.5) + tick
-    off = rest.images - np.array([truth.images(q, truth.M) for q in rest.q])
-    assert off.std() == pytest.approx(0.5, rel=0.2)  # half a tick is 0.4 px here
-    moving = seen.rows(seen.moving > 0)
-    assert 10 < len(moving.q) <= 200
-    first = moving.rows(moving.moving == moving.moving[0])
-    shown = np.array([[np.interp(t - 0.12, first.t_q, q) for q in first.q.T] for t in first.t_q])
-    late = np.array([truth.images(q, truth.M) for q in shown])[first.t_q > first.t_q[0] + 0.12]
-    behind = first.images[first.t_q > first.t_q[0] + 0.12] - late
-    assert len(behind) > 2
-    assert np.nanstd(behind) < 2.0
-    stage.record(config, stage.new_recording(config, tmp_path / "trials.csv"))
-    table = read_table(tmp_path / "trials.csv", "RRRRR")
-    np.testing.assert_array_equal(table.images, seen.images)
-    np.testing.assert_array_equal(table.t_q, seen.t_q)
-
-
 ROOF = (
     "markers={tags: roof, tag_size_m: 0.3}",  # of ten
     "task.goal={roll_deg: 10}",
@@ -457,14 +343,6 @@ def test_what_cannot_be_used_is_named_before_anything_moves(seen, message):
     assert not Path("t.csv").exists()
 
 
-def test_a_camera_may_need_a_moment_for_its_first_image():
-    config = load_config(UR5, [*TEN, *ROOF])
-    recording = stage.new_recording(config, Path("t.csv"))
-    robot = Masked(config, lambda q, s: s if robot.looks > 3 else s * np.nan)
-    stage.record(config, recording, driven(config, robot))
-    assert not recording.pending
-
-
 def test_after_each_joint_what_it_showed_must_be_of_use_and_is_kept():
     config = load_config(UR5, [*TEN, *ROOF])
     recording = stage.new_recording(config, Path("t.csv"))
@@ -488,70 +366,3 @@ def test_after_each_joint_what_it_showed_must_be_of_use_and_is_kept():
     assert sound.sent == []
     stage.record(config, stage.new_recording(config, Path("t.csv"), force=True), driven(config, sound))
     assert len(np.unique(read_table("t.csv").at_rest.pose)) == 13
-
-
-def test_the_face_must_be_seen_by_both_cameras_once():
-    config = load_config(UR5, [*TEN, *ROOF, "markers.face=[0, 1, 2]"])
-    recording = stage.new_recording(config, Path("t.csv"))
-    robot = Masked(config, without(1, 2))
-    with pytest.raises(
-        WorkFailed, match=r"marker 2 of the face, markers.face \[0, 1, 2\], at none of 3 poses"
-    ):
-        stage.record(config, recording, driven(config, robot))
-    assert len(recording.done) == 3
-
-
-def test_markers_that_are_no_tags_have_no_cells():
-    """Shrunk as much, ten points are recorded: nothing is known of their size."""
-    config = load_config(UR5, TEN)
-    recording = stage.new_recording(config, Path("t.csv"))
-    stage.record(config, recording, driven(config, Masked(config, shrunk)))
-    assert not recording.pending
-
-
-@pytest.mark.parametrize(
-    ("name", "cells"),
-    [("4X4_50", 6), ("DICT_7X7_1000", 9), ("apriltag_36h11", 8), ("APRILTAG_16H5", 6), ("ARUCO_ORIGINAL", 7)],
-)
-def test_a_dictionary_tells_how_many_cells_its_tags_have(name, cells):
-    assert cells_of(name) == cells
-    cv2 = pytest.importorskip("cv2")
-    known = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
-    name = known["DICT_" + name.upper().removeprefix("DICT_")]
-    assert cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).markerSize + 2 == cells
-
-
-class Named(Arm):
-    def __init__(self, dictionary="4X4_50", **options):
-        self.given = {"dictionary": dictionary, **options}
-
-
-class Unnamed(Arm):
-    def __init__(self, **options):
-        self.given = options
-
-
-def made(kind, *settings):
-    config = load_config(UR5, [f"plant.use='tests.stages.test_record:{kind}'", *settings])
-    return plugin_robot(config, joints_of(config), 10).robot.given
-
-
-def test_a_dictionary_reaches_the_class_or_is_refused():
-    other = "markers.dictionary=APRILTAG_36H11"
-    assert made("Named") == {"dictionary": "4X4_50"}
-    assert made("Named", other, "plant.options={more: 1}") == {"dictionary": "APRILTAG_36H11", "more": 1}
-    assert made("Unnamed", "plant.options={dictionary: A}") == {"dictionary": "A"}
-    with pytest.raises(
-        InputError, match=r"^markers\.dictionary: .*without effect: plant\.use .*:Unnamed takes"
-    ):
-        made("Unnamed", other)
-    with pytest.raises(InputError, match=r"markers\.dictionary: plant\.options gives .* as well; keep one"):
-        made("Named", other, "plant.options={dictionary: A}")
-
-
-def test_joints_are_told_in_the_unit_of_the_configuration():
-    for path, told in ((CONFIGS / "hobby.yaml", "90 deg"), (UR5, "1.57 rad")):
-        config = load_config(path)
-        assert bounds_of(config, joints_of(config)).text(1, np.pi / 2, 3) == told
-    config = load_config(STANFORD)
-    assert bounds_of(config, joints_of(config)).text(2, 0.5) == "0.5 m"

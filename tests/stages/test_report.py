@@ -4,15 +4,11 @@ import json
 import numpy as np
 import pytest
 
-from projservo_cli import steps
-from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures.path_deviation import study_numbers
-from projservo_cli.report.report_data import DIRECT
 from projservo_cli.stages import report, studies
-from projservo_cli.store import Result, Run, load, save
+from projservo_cli.store import Result, load, save
 from tests.configured import report_on
-from tests.known import configured
 from tests.report.cases import GAINS, PERIODS_S, SPECS, case
 from tests.report.conftest import stored
 
@@ -73,34 +69,6 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
     np.testing.assert_array_equal(again.path_deviation_mm, record.path_deviation_mm)
 
 
-def test_a_figure_names_the_law_that_it_lacks():
-    """Both direct laws where it compares them; of the classical ones it draws what there is."""
-    material = case()[2]
-    for law in DIRECT:
-        without = changed(material, **{law: None})
-        assert law in SPECS["fig07_three_two"].lacking(without)
-        assert SPECS["fig01_partition"].lacking(without) == ""
-    classical = SPECS["fig04_classical"]
-    assert classical.lacking(changed(material, blockwise=None)) == ""
-    assert "blockwise" in classical.partly(changed(material, blockwise=None))
-    still = changed(material, direct_three=short(material.traces["direct_three"], 0))
-    assert "direct_three" in SPECS["fig11_image_errors"].lacking(still)
-
-
-def test_a_run_that_ended_after_three_steps_is_drawn(tmp_path, monkeypatch):
-    of_traces = tuple(spec for spec in SPECS.values() if spec.laws)
-    monkeypatch.setattr(report, "FIGURES", of_traces)
-    material = case()[2]
-    cut = {law: short(trace, 3) for law, trace in material.traces.items()}
-    material = changed(material, **cut)
-    left_out = []
-    written = report.draw_all(material, tmp_path, ("svg",), left_out)
-    assert len(written) == len(of_traces) >= 3
-    assert left_out == []
-    claims = claims_of(material, NONE, NONE)
-    assert any(claim.claim.startswith("No self-occlusion") for claim in claims)
-
-
 def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, monkeypatch):
     material = case()[2]
 
@@ -136,41 +104,6 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
     assert all(row["path_deviation_mm"] is None for row in content["drift"])
 
 
-def test_what_fails_is_named_and_its_figures_left_out(tmp_path, monkeypatch):
-    """Studies, and the comparison of both sides of equation (22)."""
-
-    def fail(*_, **__):
-        raise WorkFailed("the task\ncannot be partitioned")
-
-    reason = "the task cannot be partitioned"
-    monkeypatch.setattr(report, "run_studies", fail)
-    monkeypatch.setattr(report, "metric_plan", fail)
-    monkeypatch.setattr(report, "FIGURES", (SPECS["fig12_joints"],))
-    record = report_on(stored(tmp_path), tmp_path)
-    assert [entry["what"] for entry in record.omitted] == ["studies", "equation (22)", "fig12_joints"]
-    assert all(entry["reason"].endswith(reason) for entry in record.omitted)
-    assert (record.figures, record.path_deviation_mm.size, record.share.size) == ((), 0, 0)
-    made = dataclasses.replace(case()[2], studies=None, no_studies=reason)
-    for spec in SPECS.values():
-        assert (reason in spec.lacking(made)) == spec.studies
-
-
-def test_which_laws_must_converge_outdates_the_page_that_says_so_and_no_run(tmp_path):
-    def keys(*overrides):
-        found = steps.steps_for(configured("paper", *overrides), Run(tmp_path / "run.h5"), ["report"])
-        return {step.name: step.key for step in found}
-
-    before, after = keys(), keys("control.must_converge=[exact]")
-    assert {name for name in before if before[name] != after[name]} == {"report"}
-
-
-def test_a_report_needs_a_plan(tmp_path):
-    run = stored(tmp_path)
-    run = dataclasses.replace(run, results={"calibrate": run.results["calibrate"]})
-    with pytest.raises(InputError, match="holds no plan"):
-        report_on(run, tmp_path)
-
-
 def test_both_sides_of_eq_22_agree_to_first_order_only():
     _, bench, material = case()
     plan = studies.metric_plan(bench)
@@ -185,46 +118,6 @@ def test_both_sides_of_eq_22_agree_to_first_order_only():
     *_, same = claims_of(material, lambdas, np.zeros(3))
     assert (differs.holds, same.holds) == (False, True)
     assert "λ^2.0" in differs.measured
-
-
-def test_projective_twin_is_well_conditioned_and_sees_the_same():
-    _, bench, material = case()
-    assert np.linalg.cond(studies.H_PE) < 2.5
-    twin, true = bench.models["twin"], bench.models["true"]
-    M = np.append([0.5, 0.1, 0.6], 1.0)
-    M_twin = np.linalg.solve(studies.H_PE, M)
-    np.testing.assert_allclose(twin.P @ M_twin, true.P @ M, rtol=1e-12)
-    assert twin.a_inf @ M_twin == pytest.approx(true.a_inf @ M, rel=1e-13)
-    np.testing.assert_allclose(twin.a_inf @ twin.H_hat_0, 0.0, atol=1e-13)
-    assert material.calibrated.P.shape == (2, 3, 4)
-
-
-def test_limited_runs_keep_the_limit_and_free_ones_do_not():
-    extra = case()[2].studies
-    for (_, _, limited, gain), trace in extra.sweep.items():
-        most = np.degrees(np.abs(np.diff(trace.q, axis=0)).max())
-        assert (most <= extra.step_limit_deg * (1 + 1e-12)) == limited or gain < 0.5
-
-
-def test_periods_at_which_no_loop_survives_are_left_out():
-    _, bench, _ = case()
-    short = bench.scenario.termination._replace(max_steps=1)
-    few = dataclasses.replace(
-        bench,
-        scenario=dataclasses.replace(bench.scenario, termination=short),
-    )
-    extra = studies.run_studies(few, (0.1,), (0.4, 0.04))  # gain 2.5 1/s
-    assert extra.periods == (0.04,)
-
-
-def test_a_claim_follows_its_number():
-    material = case()[2]
-    trace = material.traces["direct_three"]
-    hidden = dataclasses.replace(trace, self_occluded_steps_left=3)
-    found = [claims_of(changed(material, direct_three=run), NONE, NONE) for run in (trace, hidden)]
-    verdicts = [next(c for c in claims if c.claim.startswith("No self")) for claims in found]
-    assert [claim.holds for claim in verdicts] == [True, False]
-    assert "3 left" in verdicts[1].measured
 
 
 @pytest.mark.volume
@@ -257,11 +150,3 @@ def test_claims_of_a_whole_run_with_exact_operators(name):
         *(of_paper if name == "paper" else ()),
     } <= {claim.claim for claim in claims if claim.holds}
     assert study_numbers(material.studies)["path_deviation_converged"].all()  # converged
-
-
-@pytest.mark.volume
-def test_all_figures_are_drawn_from_a_whole_run(tmp_path):
-    left_out = []
-    written = report.draw_all(case("paper", 2000, whole=True)[2], tmp_path, ("svg",), left_out)
-    assert left_out == []
-    assert len(written) == len(SPECS)

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.records import WorkFailed
-from projservo_cli.task.body import NO_BODY
 from tests.configured import calibrate, plan, scenario_of, servo, under
 from tests.known import driven
 from tests.stages.cases import Case, case
@@ -74,24 +72,13 @@ def test_noise_in_the_loop_reaches_its_bound(law):
     """Each step corrects a share λ of the difference between two fits: B_target² + λ/(2−λ) B_current²."""
     bound = np.array(bounds_at_goal(calibrated()[0], 0.5)) * math.sqrt(1 + GAIN / (2 - GAIN))
     body, verdicts = steady(law, 0.5, "body", 100)
-    points, _ = steady(law, 0.5, "points", 100)
-    print(f"{law}: steady state {body[0]:.3f} mm, {body[1]:.3f}°; bound {bound[0]:.3f} mm, {bound[1]:.3f}°; "
-          f"points {points[0]:.3f} mm, {points[1]:.3f}°: {points[0] / body[0]:.1f} and "
-          f"{points[1] / body[1]:.1f} times the body's")  # fmt: skip
+    points, _ = steady(law, 0.5, "points", 25)
     assert set(verdicts) <= {"max steps", "no progress"}
     assert (body <= 1.1 * bound).all()
     # Averaging 20 views instead of 8 is worth 1.6 in position; a body 0.3 m across instead of a face of
     # 0.08 m much more in rotation.
     assert points[0] > 1.5 * body[0]
     assert points[1] > 3 * body[1]
-
-
-@pytest.mark.volume
-@pytest.mark.parametrize("law", ["exact", "direct_three", "direct_two"])
-def test_no_run_diverges_at_two_pixels(law):
-    _, verdicts = steady(law, 2.0, "body", 50)
-    assert verdicts.total() == 50
-    assert set(verdicts) <= {"max steps", "no progress"}
 
 
 def noisy(*overrides):
@@ -116,29 +103,6 @@ def test_the_body_is_the_default_but_for_the_laws_that_need_points():
     assert (body.s[0] == stacked.s[0]).all()  # the same noise for every law
 
 
-def test_a_calibration_that_is_not_usable_has_no_body_unless_one_is_asked_for():
-    example, calibration, _ = calibrated()
-    points = Case("paper", ["control.features=points"])
-    assert scenario_of(points.config, calibration).exact.body is NO_BODY
-    poor = replace(calibration, usable=False)
-    assert scenario_of(example.config, poor).exact.body is NO_BODY
-    asked = Case("paper", ["control.features=body"])
-    assert scenario_of(asked.config, poor).exact.body is not NO_BODY
-
-
-def test_only_markers_that_the_calibration_knows_are_used():
-    example, calibration, _ = calibrated()
-    keep = np.array([9, 3, 1, 0, 2, 5])
-    fewer = replace(calibration, marker=calibration.marker[keep], M=calibration.M[keep])
-    some = scenario_of(example.config, fewer)
-    full = scenario_of(example.config, calibration)
-    assert some.numbers[4:] == (5, 9)
-    order = [0, 1, 2, 3, 5, 9]
-    assert np.abs(some.exact.body.M - full.exact.body.M[order]).max() < 1e-15
-    assert (some.plant_of("exact").pins == example.truth.M[[5, 9]]).all()
-    assert (some.ends.s_star == full.ends.s_star[:, order]).all()
-
-
 def test_a_goal_known_by_images_of_the_face_is_reached_with_the_body():
     example, calibration, _ = calibrated()
     images = {view: example.ends.s_star[i].tolist() for i, view in enumerate(("left", "right"))}
@@ -150,31 +114,3 @@ def test_a_goal_known_by_images_of_the_face_is_reached_with_the_body():
     assert (trace.views_used == 8).all()
     gap = np.linalg.norm(trace.center[-1] - example.goal_center)
     assert gap < 1e-4
-
-
-def test_a_body_that_cannot_be_known_says_what_to_set():
-    example, calibration, _ = calibrated()
-    across = np.linalg.svd(calibration.a_inf[None])[2][1]
-    stretch = np.repeat(np.outer(across, across)[None], 6, axis=0)
-    with pytest.raises(WorkFailed, match=r"control\.features: points"):
-        scenario_of(example.config, replace(calibration, H_hat_0=stretch))
-
-
-class Careless:
-    """A law that writes to all it is given."""
-
-    def __init__(self, setup):
-        for values in (setup.s_start, setup.s_star, setup.plan.q, setup.plan.H_hat):
-            values[:] = 0.0
-
-    def __call__(self, s, q):
-        return np.zeros_like(q)
-
-
-def test_what_a_law_writes_to_is_not_what_other_laws_are_given():
-    example, calibration, planned = noisy("stop.max_steps=1", "noise.servo_px=0")
-    before = scenario_of(example.config, calibration).ends.s_star.copy(), planned.q.copy()
-    servo.run(example.config, calibration, planned, f"{__name__}:Careless")
-    assert np.array_equal(scenario_of(example.config, calibration).ends.s_star, before[0])
-    assert np.array_equal(planned.q, before[1])
-    assert before[0].all()

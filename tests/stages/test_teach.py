@@ -25,19 +25,6 @@ def calibration():
     return calibrate.run(config())[1]
 
 
-def test_frames_are_averaged_and_their_scatter_is_told():
-    given = config("noise.servo_px=0.5")
-    taught, truth = teach(given, 40, AT), truth_of(given)
-    off = taught.s - truth.images(AT, truth.M)
-    assert taught.frames.tolist() == [40, 40]
-    assert taught.q == pytest.approx(AT)
-    assert off.std() == pytest.approx(0.5 / np.sqrt(40), rel=0.35)
-    assert np.sqrt(np.mean(taught.sigma**2)) == pytest.approx(0.5 / np.sqrt(40), rel=0.15)
-    once = teach(given, 1, AT)
-    assert np.isnan(once.sigma).all()
-    assert "sigma_left_px" not in once.as_goal()["images"]
-
-
 @pytest.mark.parametrize("lasting", [0.0, 0.3])
 def test_frames_are_averaged_by_what_they_tell_of_themselves(rng, lasting):
     """One sharp and two blurred frames a round, part of whose errors lasts and does not average away."""
@@ -93,38 +80,6 @@ def test_what_does_not_fit_the_calibration_is_told(calibration):
         require_face(config(), taught)
 
 
-def test_a_goal_is_taught_where_limits_of_joints_are_not_known(calibration):
-    # A robot of which the configuration gives no limits; no path is searched, but the images are tested.
-    taught, plain = teach(config(), 10, AT), ("robot=null", "rig=null", "plant.use=tests.robots.robots:Sound")
-    numbers = f"markers={{numbers: {calibration.marker.tolist()}, face: [0, 1, 2, 3]}}"
-    ends = ("task.goal={joints: {joints: [0, 0, 0, 0, 0], unit: deg}}",)
-    given = config(*plain, numbers, *ends, "data={table: none.csv, joints: RRRRR}")
-    assert checked(given, calibration, taught).reached
-    taught.s[1] += [0.0, 8.0]
-    assert "the right camera was moved" in checked(given, calibration, taught).reason
-
-
-@pytest.mark.volume
-def test_a_goal_taught_after_a_camera_was_moved_names_the_camera(calibration):
-    taught = teach(config(), 10, AT)
-    taught.s[1] += [0.0, 8.0]
-    check = checked(config(), calibration, taught)
-    assert not check.reached
-    assert "the goal was taught after a change since the calibration: images are" in check.reason
-    assert "the right camera was moved, by 8" in check.reason
-
-
-def test_a_file_that_was_not_taught_is_refused(tmp_path):
-    with pytest.raises(InputError, match=r"task\.goal: .*ur5\.yaml: is no file that projservo teach wrote"):
-        config("task.goal=ur5.yaml")
-    path = tmp_path / "goal.yaml"
-    path.write_text("images: {markers: [0, 1, 2, 3], left: [[1, 2]], right: [[1, 2]]}", encoding="utf-8")
-    with pytest.raises(InputError, match=r"task\.goal\.images\.left: 1 entries for 4 markers"):
-        config(f"task.goal={path}")
-    with pytest.raises(InputError, match=r"task\.start: .*has no joints"):
-        config(f"task.start={path}")
-
-
 def test_a_robot_that_can_let_go_is_held_again_before_it_is_looked_at(tmp_path, monkeypatch):
     (tmp_path / "by_hand.py").write_text(
         "import numpy as np\n"
@@ -170,16 +125,3 @@ def test_a_robot_that_can_let_go_is_held_again_before_it_is_looked_at(tmp_path, 
         plant = f"plant={{use: 'by_hand:Arm', settle_s: 0.02, options: {{falls_at: {look}}}}}"
         with pytest.raises(WorkFailed, match=rf"joint 3 moved by 49 deg {since} \(1\.06 deg at most\)"):
             teach(config(plant, "control.period_s=0.001", "control.gain=1"), 100, None, words)
-
-
-def test_what_is_unseen_has_no_deviation():
-    """A camera that sees no marker of three, with and without a deviation of its own."""
-    s = np.full((2, 3, 2), 100.0)
-    s[1, 2] = np.nan
-    for told in (None, np.full((2, 3), 0.1)):
-        stamps = iter(range(1, 99))
-        look = lambda told=told, stamps=stamps: Reading(AT, s, 0.0, np.full(2, float(next(stamps))), told)  # noqa: E731
-        mean, *_ = averaged(look(), look, 3)
-        assert np.isnan(mean.s[1, 2]).all()
-        if told is not None:
-            assert np.isfinite(mean.sigma_px).sum() == 5

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from projservo_cli.files import lies_inside, replacing, require_inside, working_in
+from projservo_cli.files import lies_inside, require_inside, working_in
 from projservo_cli.records import InputError
 from projservo_cli.store import save
 from projservo_cli.store.tables import write_table
@@ -88,23 +88,6 @@ def test_a_folder_is_worked_in_by_one_process_and_free_when_that_is_killed(tmp_p
     assert [*tmp_path.iterdir()] == []
 
 
-def test_a_folder_nothing_was_written_into_goes_again(tmp_path):
-    with working_in(tmp_path / "new"):
-        assert (tmp_path / "new").is_dir()
-    assert not (tmp_path / "new").exists()
-    with working_in(tmp_path / "new"):
-        (tmp_path / "new" / "file").touch()
-    assert (tmp_path / "new" / "file").exists()
-
-
-def test_a_folder_that_cannot_be_made_is_told(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="cannot be written"), working_in(tmp_path / "file" / "folder"):
-        pass
-    with pytest.raises(InputError, match="cannot be written"), replacing(tmp_path / "file" / "run.h5"):
-        pass
-
-
 @pytest.fixture
 def little_disk(tmp_path):
     """A disk of 256 kB."""
@@ -138,16 +121,3 @@ def test_a_full_disk_is_told_and_the_old_file_stays(little_disk):
             write()
     assert path.read_bytes() == b"old"
     assert {found.name for found in little_disk.iterdir()} <= {"file", "filling"}
-
-
-def test_a_file_system_that_takes_nothing_back_is_told_in_one_line(tmp_path, monkeypatch):
-    def refuse(path, **options):
-        raise OSError(30, "Read-only file system")
-
-    monkeypatch.setattr(Path, "touch", refuse)
-    monkeypatch.setattr(Path, "unlink", refuse)
-    with (
-        pytest.raises(InputError, match=r"a.txt: cannot be written: Read-only file system$"),
-        replacing(tmp_path / "a.txt"),
-    ):
-        pass

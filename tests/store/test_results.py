@@ -1,6 +1,5 @@
 """A run as an object: what its calibration predicts, against the run's own data and differences."""
 
-import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -11,10 +10,7 @@ import pytest
 import projservo_cli
 from projservo_cli import cli
 from projservo_cli.config import load_config
-from projservo_cli.records import InputError
-from projservo_cli.store import save
 from tests.configured import truth_of
-from tests.store.sound import sound_run
 
 STANFORD = Path(__file__).parents[2] / "configs" / "stanford.yaml"
 
@@ -52,16 +48,6 @@ def test_the_jacobian_is_the_derivative_of_the_prediction(run):
     np.testing.assert_array_equal(calibration.jacobian(np.array([q, q]))[1], J)
 
 
-def test_points_of_any_scale_and_sign_project_alike(run):
-    calibration = run.calibration
-    at_reference = calibration.predict(calibration.q_reference)
-    np.testing.assert_allclose(calibration.project(calibration.M), at_reference, atol=1e-9)
-    np.testing.assert_allclose(calibration.project(-3.0 * calibration.M), at_reference, atol=1e-9)
-    assert calibration.project(calibration.M[0]).shape == (2, 2)
-    grid = np.broadcast_to(calibration.M, (3, 10, 4))
-    assert calibration.project(grid).shape == (2, 3, 10, 2)
-
-
 def test_points_behind_a_camera_have_no_pixels_and_those_at_infinity_vanishing_points(run):
     calibration = run.calibration
     centers = np.array([np.linalg.svd(P)[2][-1] for P in calibration.P])
@@ -74,31 +60,6 @@ def test_points_behind_a_camera_have_no_pixels_and_those_at_infinity_vanishing_p
     limit = np.where(np.isnan(far[0]), far[1], far[0])
     for point in (way, -way):
         np.testing.assert_allclose(calibration.project(point), limit, rtol=1e-6)
-
-
-def test_other_numbers_of_joints_or_coordinates_are_refused(run):
-    for q in (np.zeros(5), np.zeros((2, 7)), np.zeros((1, 1, 6)), np.full(6, np.nan), 1.0):
-        for function in (run.calibration.predict, run.calibration.jacobian):
-            with pytest.raises(InputError, match="expected 6 finite numbers"):
-                function(q)
-    for points in (np.zeros(3), np.zeros((4, 3)), 1.0):
-        with pytest.raises(InputError, match="four homogeneous coordinates"):
-            run.calibration.project(points)
-
-
-def test_a_run_says_what_it_lacks_and_how_to_make_it(run, tmp_path):
-    assert run.observation.images.shape == (49, 2, 10, 2)
-    assert run.traces == {}
-    with pytest.raises(InputError, match=r"make it first: make\('plan'\)"):
-        _ = run.plan
-    full = dataclasses.replace(sound_run(tmp_path / "run.h5"), configuration="name: x")
-    save(full)
-    again = projservo_cli.load(tmp_path)
-    assert again.configuration == "name: x"
-    assert (again.plan.profile, list(again.traces)) == (full.plan.profile, ["stacked", "direct_three"])
-    np.testing.assert_array_equal(again.calibration.P, full.calibration.P)
-    with pytest.raises(InputError, match="there is no run file"):
-        projservo_cli.load(tmp_path / "none")
 
 
 def test_importing_the_package_stays_light():

@@ -1,7 +1,6 @@
 """Observation tables: what is read, what is refused and where, and round trips."""
 
 import dataclasses
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.records import InputError, Observation
-from projservo_cli.store.tables import read_joint_list, read_positions, read_table, recording_of, write_table
+from projservo_cli.store.tables import read_joint_list, read_table, write_table
 
 HEADER = "pose,marker,q1,q2,u_left,v_left,u_right,v_right"
 ROWS = ["0,1,0.5,-1,10,20,30,40", "0,0,0.5,-1,11,21,31,41", "7,1,0.25,2e-1,12.5,22,,"]
@@ -19,30 +18,6 @@ def written(tmp_path, *lines, end="\n", prefix=b""):
     path = tmp_path / "table.csv"
     path.write_bytes(prefix + end.join(lines).encode())
     return path
-
-
-def test_rows_become_arrays(tmp_path):
-    table = read_table(written(tmp_path, HEADER, *ROWS))
-    assert table.pose.tolist() == [0, 7]
-    assert table.marker.tolist() == [0, 1]
-    assert table.q.tolist() == [[0.5, -1.0], [0.25, 0.2]]
-    assert table.images[0].tolist() == [[[11, 21], [10, 20]], [[31, 41], [30, 40]]]
-    assert np.isnan(table.images[1, :, 0]).all()  # no row for marker 0 at pose 7
-    assert table.images[1, 0, 1].tolist() == [12.5, 22]
-    assert np.isnan(table.images[1, 1, 1]).all()  # empty cells
-
-
-def test_order_of_columns_extra_columns_line_ends_and_mark_do_not_matter(tmp_path):
-    plain = read_table(written(tmp_path, HEADER, *ROWS))
-    columns = HEADER.split(",")
-    order = [7, 2, 0, 5, 3, 1, 4, 6]
-    lines = [",".join(["note", *(columns[i] for i in order)])]
-    for row in ROWS:
-        cells = row.split(",")
-        lines.append(",".join(['"a,b"', *(f" {cells[i]} " for i in order)]))
-    odd = read_table(written(tmp_path, *lines, "", "", end="\r\n", prefix=b"\xef\xbb\xbf"))
-    for name in ("pose", "marker", "q", "images"):
-        np.testing.assert_array_equal(getattr(plain, name), getattr(odd, name))
 
 
 BAD = {
@@ -82,33 +57,7 @@ def test_bad_tables_are_refused_with_the_line(tmp_path, case):
     assert "\n" not in str(caught.value)
 
 
-def test_bytes_that_are_no_text_a_folder_and_nothing_are_refused(tmp_path):
-    path = written(tmp_path, HEADER)
-    path.write_bytes(HEADER.encode() + b"\n0,1,\xff\xfe")
-    for where, what in (
-        (path, ":2: not UTF-8"),
-        (tmp_path, "cannot be read"),
-        (tmp_path / "no", "cannot be"),
-    ):
-        with pytest.raises(InputError, match=what):
-            read_table(where)
-
-
-def test_a_joint_string_must_fit_the_columns(tmp_path):
-    path = written(tmp_path, HEADER, *ROWS)
-    assert read_table(path, "RP").q.shape == (2, 2)
-    with pytest.raises(InputError, match=r"2 joint columns.*'RRP' has 3 letters"):
-        read_table(path, "RRP")
-
-
 TURNS = ["0,1,0.5,370,1,2,3,4", "3,1,0.5,-90,1,2,3,4"]
-
-
-def test_revolute_readings_in_degrees_become_radians(tmp_path):
-    path = written(tmp_path, HEADER, *TURNS)
-    q = read_table(path, "PR", "deg").q
-    np.testing.assert_allclose(q, [[0.5, 37 * np.pi / 18], [0.5, -np.pi / 2]], rtol=1e-15)
-    np.testing.assert_array_equal(read_table(path, "RR", "deg").q, np.radians([[0.5, 370], [0.5, -90]]))
 
 
 @pytest.mark.parametrize("types", [None, "RR", "PR"])
@@ -117,17 +66,6 @@ def test_readings_that_look_like_degrees_are_refused_with_the_remedy(tmp_path, t
     with pytest.raises(InputError, match=message) as caught:
         read_table(written(tmp_path, HEADER, *TURNS), types)
     assert "\n" not in str(caught.value)
-
-
-def test_radians_are_never_mistaken_for_degrees(tmp_path):
-    path = written(tmp_path, HEADER, *TURNS)
-    with pytest.raises(InputError, match=r"q2 of pose 0 is 370, of a prismatic joint in m \(2 such readings"):
-        read_table(path, "RP")
-    assert read_table(path, "RP", "rad").q[0].tolist() == [0.5, 370]  # metres, or whatever a slide reads
-    assert read_table(path, "RR", "rad").q[0].tolist() == [0.5, 370]  # as the user says
-    widest = 2 * 2 * np.pi  # twice the range of a joint that turns fully to both sides
-    path = written(tmp_path, HEADER, f"0,1,{widest},{-widest},1,2,3,4")
-    assert read_table(path).q.tolist() == [[widest, -widest]]
 
 
 LIST = ["pose,q1,q2,left,right", "7,1,90,a.png,b.png", "3,2,-90,c.png,d.png"]
@@ -140,39 +78,6 @@ def test_a_list_of_joints_has_numbers_and_images_or_not(tmp_path):
     plain = read_joint_list(written(tmp_path, "q2,q1", "90,1", "", "-90,2"), "PR", "deg")
     assert (plain.pose.tolist(), plain.numbered, plain.left) == ([0, 1], False, None)
     np.testing.assert_allclose(plain.q, [[1, np.pi / 2], [2, -np.pi / 2]], rtol=1e-15)
-
-
-BAD_LISTS = {
-    "degrees": (LIST, "q2 of pose 7 is 90, .*look like degrees"),
-    "twice": ([*LIST, "7,1,1,e,f"], ":4: pose 7 is already in line 2"),
-    "one side": (["q1,left", "1,a"], ":1: give the columns left and right both"),
-    "no name": (["q1,left,right", "1,a,"], ":2: an image has no name"),
-    "no rows": (["q1"], "add a pose a row"),
-    "no joints": (["pose", "1"], ":1: .*lacks.*q1"),
-}
-
-
-def test_bad_lists_of_joints_are_refused_with_the_line(tmp_path):
-    for lines, message in BAD_LISTS.values():
-        with pytest.raises(InputError, match=message):
-            read_joint_list(written(tmp_path, *lines))
-
-
-def test_positions_in_millimetres_are_refused(tmp_path):
-    lines = ["pose,q1,x,y,z", "0,0.1,100,200,300", "1,0.2,150,200,280"]
-    with pytest.raises(InputError, match="positions are 50 m apart: they look like millimetres"):
-        read_positions(written(tmp_path, *lines), "R")
-
-
-def test_a_recording_is_told_by_a_column_of_its_own(tmp_path):
-    path = written(tmp_path, HEADER, *ROWS)
-    table = read_table(path)
-    assert recording_of(path) is None
-    write_table(table, path, recording="abc")
-    assert recording_of(path) == "abc"
-    np.testing.assert_array_equal(read_table(path).images, table.images)
-    path.write_text(path.read_text().replace("abc", "xyz", 1))
-    assert recording_of(path) is None
 
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -212,15 +117,3 @@ def test_poses_in_motion_and_times_come_back_and_stay_out_of_what_is_at_rest(tmp
     assert found.at_rest.pose.tolist() == [0]
     write_table(found.at_rest, path)
     assert read_table(path).moving is None
-
-
-def test_a_long_table_is_read_line_by_line(tmp_path):
-    """What is held besides the images is little: far less than a table of strings would be."""
-    sightings = ",".join(["0.123456789", "0.987654321", *["123.456789"] * 4])
-    path = written(tmp_path, HEADER, *(f"{row % 10},{row // 10},{sightings}" for row in range(20_000)))
-    tracemalloc.start()
-    table = read_table(path)
-    _, most = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert table.images.shape == (10, 2, 2000, 2)
-    assert most - table.images.nbytes < 250 * 20_000  # bytes a row

@@ -1,13 +1,10 @@
 """The table of a sweep: parts put together, texts that open as texts, traces, what is refused."""
 
-import shutil
-from collections import namedtuple
-
 import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, Trace
-from projservo_cli.store.sweep_table import Failure, SweepTable, assemble, merge_failures, write_part
+from projservo_cli.store.sweep_table import Failure, SweepTable, assemble, write_part
 from tests.fake_records import fake
 
 HEADINGS = [("run", "i8", "1", "number"), ("law", "S7", "1", "text"), ("error", "f8", "px", "of the image")]
@@ -45,15 +42,6 @@ def test_what_was_in_the_parts_is_in_the_table(table):
         found.trace(7)
 
 
-def test_failures_of_all_parts_are_counted_and_the_reason_is_that_of_the_first_run(table):
-    assert SweepTable(table).failures == {"exact": (4, 3, "reason 0")}
-    found = {}
-    merge_failures(
-        found, [("a", Failure(1, 7, "later")), ("b", Failure(1, 0, "b")), ("a", Failure(2, 5, "a"))]
-    )
-    assert found == {"a": (3, 5, "a"), "b": (1, 0, "b")}
-
-
 def test_a_part_that_changed_costs_no_table(table, parts):
     before = table.read_bytes()
     parts[1].write_bytes(parts[1].read_bytes()[:-1])
@@ -65,11 +53,3 @@ def test_a_part_that_changed_costs_no_table(table, parts):
         SweepTable(table)
     with pytest.raises(InputError, match="not the table of a sweep"):
         SweepTable(parts[0])
-
-
-def test_a_table_larger_than_the_disk_is_not_begun(parts, tmp_path, monkeypatch):
-    little = namedtuple("usage", "free")(1000)
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: little)
-    with pytest.raises(InputError, match="cannot be written: No space left"):
-        assemble(tmp_path / "sweep.h5", parts, HEADINGS, {})
-    assert {path.suffixes[0] for path in tmp_path.iterdir()} == {".part"}

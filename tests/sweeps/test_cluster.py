@@ -7,8 +7,6 @@ import time
 
 import pytest
 
-from projservo_cli.records import WorkFailed
-from projservo_cli.sweeps import engine
 from tests.sweeps import processes
 
 pytest.importorskip("distributed", reason="distributed is not installed: the extra cluster")
@@ -83,16 +81,3 @@ def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(clu
     assert code == 0, err
     assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in err
     assert not processes.differences(out, reference)
-
-
-def test_no_scheduler_at_the_address(monkeypatch):
-    monkeypatch.setattr(engine, "PATIENCE_S", 0.5)
-    with pytest.raises(WorkFailed, match=r"--scheduler tcp://127\.0\.0\.1:9: no answer within 0\.5 s"):
-        engine.Cluster("tcp://127.0.0.1:9")
-
-
-def test_a_cluster_of_other_versions_is_refused(cluster, monkeypatch):
-    address = cluster().address
-    monkeypatch.setattr(engine.provenance, "collect", lambda **_: dict.fromkeys(engine.DECISIVE, "0.1"))
-    with pytest.raises(engine.InputError, match=r"a worker has projservo [0-9.]+ instead of 0\.1"):
-        engine.Cluster(address)

@@ -10,7 +10,6 @@ from projservo_cli.config import load_sweep, to_yaml
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.records import InputError
 from projservo_cli.sweeps.design import Design, read_design
-from tests.configured import truth_of
 from tests.conftest import ROOT
 from tests.known import configured
 from tests.sweeps.cases import design
@@ -35,13 +34,6 @@ def test_the_grid_is_the_product_of_its_axes_and_the_last_runs_fastest():
         assert config.control.gain_t == gain
         assert config.control.laws == (law,)
         assert found.values(cell) == {"base": base, "noise": noise, "control.gain_t": gain, "law": law}
-
-
-def test_a_value_may_take_other_keys_with_it():
-    found = design(grid={"law": {"exact": {}, "exact_track": {"trajectory.profile": "auto"}}})
-    profiles = [(cell.control.mode, cell.trajectory.profile) for cell in map(found.cell, range(found.cells))]
-    assert profiles == [(("regulate",), "linear"), (("track",), "auto")]
-    assert Design.made_of(found.recipe).cell(1) == found.cell(1)
 
 
 def test_a_run_depends_on_its_number_alone_and_cells_share_their_draws():
@@ -95,19 +87,6 @@ def test_distributions_keep_to_their_bounds_and_moments():
     assert abs(draws["normal"].mean() - 2) < 4 * 0.5 / math.sqrt(4000)
     assert abs(draws["normal"].std() / 0.5 - 1) < 4 / math.sqrt(2 * 4000)
     assert abs((draws["choice"] == "a").sum() - 2000) < 4 * math.sqrt(1000)
-
-
-def test_random_tasks_come_one_of_each_stratum_in_turn():
-    found = design(tasks={"random": 8})
-    robot = truth_of(found.cell(0)).robot
-    strata = []
-    for run in range(8):
-        config = found.config(run)
-        start, goal = (np.array(q.joints) for q in (config.task.start, config.task.goal.joints))
-        R = robot.pose(start)[:3, :3].T @ robot.pose(goal)[:3, :3]
-        strata.append(int(6 * math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)) / math.pi))
-    # Runs have as many tasks as they are, of 4 a cell the tasks 0 to 3.
-    assert strata == [0, 1, 2, 3, 0, 1, 2, 3]
 
 
 @pytest.mark.parametrize(

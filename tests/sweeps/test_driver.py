@@ -3,23 +3,15 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import threading
 
-import numpy as np
 import pytest
 
-from projservo_cli.cli import run
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.store import load
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweeps import engine
-from projservo_cli.sweeps import folder as driver
 from projservo_cli.sweeps.engine import Engine
 from projservo_cli.sweeps.folder import Folder
-from projservo_cli.sweeps.runs import run_part
-from tests.conftest import ROOT
 from tests.sweeps import processes
 from tests.sweeps.cases import columns, design, make
 
@@ -130,42 +122,6 @@ def test_threads_give_the_same_and_are_left_in_order(tmp_path):
         assert values.tobytes() == reference[name].tobytes(), name
 
 
-MEMORY = """
-import re, sys
-from projservo_cli.cli import run
-run(["sweep", "-c", sys.argv[1], "--set", "runs=3000", "-o", sys.argv[2], "-j", "2", "-q"])
-print(re.search(r"VmHWM:\\s*([0-9]+) kB", open("/proc/self/status").read()).group(1))
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory is read from /proc")
-def test_memory_is_bounded(tmp_path):
-    """Machine code that is not there yet is made by a process of its own."""
-    command = [sys.executable, "-c", MEMORY, str(ROOT / "configs" / "sweep_speed.yaml"), str(tmp_path)]
-    ended = subprocess.run(command, env=processes.ENVIRONMENT, capture_output=True, text=True, check=True)
-    assert int(ended.stdout.splitlines()[-1]) <= 300_000
-
-
-def test_killed_before_its_parts_were_put_together_or_removed(tmp_path, monkeypatch):
-    """All runs are done, but there is no table; or there is, and its parts still are."""
-
-    def killed(*_):
-        raise SystemExit
-
-    found, folder = design(runs=2, chunk=2), Folder(tmp_path)
-    for name in ("Folder.assemble", "shutil.rmtree"):
-        with monkeypatch.context() as patched:
-            patched.setattr(f"projservo_cli.sweeps.folder.{name}", killed)
-            with pytest.raises(SystemExit):
-                make(found, tmp_path)
-        status = folder.status(found)
-        assert (status.done, status.total, status.complete) == (4, 4, False)
-    assert make(found, tmp_path).complete
-    assert folder.status(found).complete
-    assert not processes.parts(tmp_path)
-    assert columns(tmp_path)["run"].tolist() == [0, 1, 2, 3]
-
-
 def dead_once(job):
     """A job that ends its process the first time it is made."""
     number, marker = job
@@ -187,78 +143,3 @@ def test_jobs_of_a_lost_process_are_made_again_until_processes_die_again_and_aga
     monkeypatch.setattr(engine, "MOST_LOSSES", 1)
     with pytest.raises(WorkFailed, match="lost 2 times in a row"):
         list(Engine(2).completed(always_dead, [1]))
-
-
-class Recorded(Engine):
-    """An engine of two that works here, and how many jobs of what it was given, one time after the other."""
-
-    def __init__(self, workers=2):
-        super().__init__(workers)
-        self.given = []
-
-    def completed(self, function, jobs, **_):
-        """Results of jobs in their order."""
-        jobs = list(jobs)
-        self.given.append(len(jobs))
-        yield from map(function, jobs)
-
-
-def test_an_empty_cache_is_filled_by_one_job_before_there_are_more(tmp_path, monkeypatch):
-    """With a run of each law, also where a run of its own left a part; a filled one is left alone."""
-    cache = tmp_path / "cache" / "loop_0123"
-    cache.mkdir(parents=True)
-    monkeypatch.setattr(driver, "CACHE_FOLDER", cache.parent)
-    (cache / "compiled.run_compiled-108.py311.nbi").touch()
-    said = []
-    made = []
-    monkeypatch.setattr(driver, "run_part", lambda part: made.append(part) or run_part(part))
-
-    def given(workers=2):
-        found, recorded = design(runs=1, chunk=1), Recorded(workers)
-        made.clear()
-        folder = Folder(tmp_path / f"sweep{len(said)}{workers}")
-        driver.run_sweep(found, folder, recorded, lambda *_: None, said.append, force=True)
-        return recorded.given, [(part.first, part.last) for part in made]
-
-    every = [(0, 1), (1, 2)]
-    assert given(workers=1) == ([1, 2], every)
-    assert not said
-    assert given() == ([1, 1, 2], [(1, 2), (0, 1), *every])
-    assert said == ["compiling kernels, once, before the processes start"]
-    (cache / "batch._until_rehearsal-108.py311.nbi").touch()
-    assert given() == ([1, 2], every)
-    monkeypatch.undo()
-    assert all(any(driver.CACHE_FOLDER.rglob(loop)) for loop in driver.LOOPS)
-
-
-def test_guided_runs_are_the_same_in_processes_and_made_anew(tmp_path):
-    """Their plans take the covariance of the calibration, which those of other sweeps go without."""
-    guided = {"exact": {}, "exact_track": {"trajectory.profile": "joint_space"}}
-    found = design(runs=3, chunk=1, calibrations=2, tasks={"random": 3}, grid={"law": guided})
-    make(found, tmp_path / "one")
-    make(found, tmp_path / "two", workers=2)
-    rows, others = columns(tmp_path / "one"), columns(tmp_path / "two")
-    for name, values in rows.items():
-        assert values.tobytes() == others[name].tobytes(), name
-    number = 3 + int(np.flatnonzero(rows["steps"][3:] > 0)[0])
-    assert run(["servo", "--from", f"{tmp_path / 'one'}:{number}", "-o", str(tmp_path / "run"), "-q"]) == 0
-    (trace,) = load(tmp_path / "run").traces.values()
-    for name in ("verdict", "steps", "success", "effort", "position_error_mm"):
-        assert getattr(trace, name) == rows[name][number]
-    assert {
-        made.sqrt_cov_shared.size > 0 for made in Folder(tmp_path / "one").calibrations(found).values()
-    } == {True}
-    plain = design(runs=3, calibrations=2)
-    kept = Folder(tmp_path / "one").calibrations(plain).values()
-    assert {made.sqrt_cov_shared.size for made in kept} == {0}
-
-
-def test_a_run_made_anew_has_the_numbers_of_its_row(whole, tmp_path):
-    _, folder = whole
-    for number in (3, processes.RUNS + 4):
-        row = {name: values[number] for name, values in columns(folder).items()}
-        assert run(["servo", "--from", f"{folder}:{number}", "-o", str(tmp_path / str(number)), "-q"]) == 0
-        (trace,) = load(tmp_path / str(number)).traces.values()
-        assert (trace.law, trace.verdict, trace.steps) == (row["law"], row["verdict"], row["steps"])
-        assert trace.position_error_mm == row["position_error_mm"]
-        assert trace.effort == row["effort"]

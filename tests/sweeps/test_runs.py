@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import plan as planning
-from projservo_cli.sweeps import runs
 from projservo_cli.sweeps.design import name_of_run
-from projservo_cli.sweeps.folder import in_kernel
 from projservo_cli.sweeps.runs import Part, run_part
-from tests.configured import calibrate, plan, scenario_of, servo, truth_of
-from tests.known import configured
+from tests.configured import calibrate, plan, servo, truth_of
 from tests.sweeps.cases import design
 
 # Of each case every run is redone.
@@ -124,53 +120,3 @@ def test_runs_that_cannot_begin_have_a_verdict_and_no_numbers():
     assert np.isnan(made.columns["position_error_mm"]).all()
     assert made.columns["steps"].tolist() == [-1] * 4
     assert made.columns["success"].tolist() == [0] * 4
-
-
-@pytest.mark.volume
-def test_the_deviation_is_unknown_where_images_alone_show_the_goal():
-    s_star = scenario_of(configured("ur5")).exact.s_star.tolist()
-    goal = {"images": dict(zip(("left", "right"), s_star, strict=True))}
-    made = run_part(part_of(design(runs=1, set={"task.goal": goal}, between_samples=True))).columns
-    assert (made["steps"] > 0).all()
-    assert np.isnan(made["center_deviation_mm"]).all()
-
-
-@pytest.mark.volume
-def test_laws_on_the_same_images_share_the_plan(monkeypatch):
-    planned, plan_of = [], planning.run
-    monkeypatch.setattr(planning, "run", lambda *given: planned.append(given) or plan_of(*given))
-    run_part(part_of(design(**CASES["constrained"] | {"runs": 2, "seed": 7})))
-    assert len(planned) == 2
-
-
-@pytest.mark.volume
-def test_noise_for_fewer_instants_changes_nothing(monkeypatch):
-    """A run that outlasts its noise is made anew with more of it."""
-    part = part_of(design(runs=2))
-    whole = run_part(part).columns
-    assert whole["steps"].min() > 8
-    monkeypatch.setattr(runs, "INSTANTS", 2)
-    for name, values in run_part(part).columns.items():
-        assert values.tobytes() == whole[name].tobytes(), name
-
-
-@pytest.mark.volume
-def test_a_run_whose_images_show_nothing_has_a_verdict_and_no_numbers():
-    """Images so noisy that markers have no place leave nothing to count."""
-    part = run_part(part_of(design(runs=3, set={"noise.servo_px": 3000.0})))
-    made = part.columns
-    lost = made["verdict"] == b"not started"
-    assert lost.any()
-    assert sum(failure.runs for failure in part.failures.values()) == lost.sum()
-    assert (made["steps"][lost] == -1).all()
-    assert np.isnan(made["effort"][lost]).all()
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("plant.speed_scale", 0.5), ("trajectory.profile", "constrained"), ("control.mode", "track")],
-)
-def test_runs_that_need_more_than_their_images_are_made_elsewhere(key, value):
-    plain, other = (design(grid={"law": ["exact"]}, set=given) for given in ({}, {key: value}))
-    assert in_kernel(plain, 0)
-    assert not in_kernel(other, 0)

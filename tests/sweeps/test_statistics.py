@@ -7,8 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.cli.output import words_of
-from projservo_cli.records import InputError
 from projservo_cli.store.sweep_table import assemble, write_part
 from projservo_cli.sweeps.folder import Folder
 from projservo_cli.sweeps.runs import MEASURED, NUMBERED
@@ -121,14 +119,6 @@ def test_success_over_a_value_and_within_edges(made):
     assert (np.array(edges["stacked.low"]) < edges["stacked.rate"]).all()
 
 
-@pytest.mark.volume
-def test_columns_of_tiny_numbers_stay_apart(made):
-    told = made[0]
-    quantiles = {key: {"0.5": 1.23e-10} for key in ("steps", "position_error_mm", "path_length_ratio")}
-    words = [*words_of("sweep", told | {"cells": [told["cells"][0] | {"quantiles": quantiles}]})]
-    assert words[2].split()[-3:] == 3 * ["1.23e-10"]
-
-
 def test_the_report_of_a_sweep(tmp_path):
     """Over two start offsets, with one drawn: every figure there is but noise."""
     offset = "task.start_offset"
@@ -155,8 +145,3 @@ def test_the_report_of_a_sweep(tmp_path):
     assert len(share) == 6
     done = columns(tmp_path)
     assert np.nanmean(share) == pytest.approx(done["success"][done["law"] == "direct_two"].mean())
-
-
-def test_a_report_of_nothing(tmp_path):
-    with pytest.raises(InputError, match="no table of a sweep"):
-        report(Folder(tmp_path).assembled(), ["png"], lambda *_: None)

@@ -8,7 +8,6 @@ from scipy.linalg import expm
 
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.records import WorkFailed
 from projservo_cli.task.body import ALL_VIEWS, SETTLED, fit_body, make_body
 from tests.samples import arm, displacement, frame, in_frame, pixels, poe, revolute
 
@@ -69,18 +68,6 @@ def test_a_robot_that_turns_about_one_direction_has_a_body_all_the_same():
     wanted = parallel[0, :3, :3].ravel()
     assert np.linalg.lstsq(L.T, wanted, rcond=None)[0] @ L == pytest.approx(wanted, abs=1e-12)
     assert np.linalg.matrix_rank(np.r_[L, [wanted]]) == 3
-
-
-def test_joints_that_keep_no_metric_have_no_body(rng):
-    with pytest.raises(WorkFailed, match="preserve no metric"):
-        make_body(arm()._replace(H_hat_0=rng.normal(size=(6, 4, 4))), markers())
-
-
-def test_two_directions_of_turning_imply_the_third():
-    axes = [[0, 0, 1.0], [0, 1.0, 0]] * 3
-    twists = np.array([revolute([0.1 * i, 0.2, 0.3 * i], axis) for i, axis in enumerate(axes)])
-    body = make_body(arm()._replace(H_hat_0=twists), markers())
-    assert body.H_hat[:, :3, :3] == pytest.approx(-np.swapaxes(body.H_hat[:, :3, :3], 1, 2), abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", FRAMES)

@@ -74,13 +74,6 @@ def test_plane_is_oriented_and_carried_along(seed):
         assert plane(A @ T.T, order) == pytest.approx(carried / np.linalg.norm(carried), abs=1e-13)
 
 
-def test_plane_of_a_bent_face_is_a_compromise():
-    """Bent by ±1 mm at the corners of a square the plane stays in the middle, through the centre."""
-    A = SQUARE + 1e-3 * np.outer([1, -1, 1, -1], [0, 0, 1, 0])
-    a = plane(A)
-    assert a / a[2] == pytest.approx(np.array([0, 0, 1, -1.4]), abs=1e-14)
-
-
 def images_for(model, s_start, s_star):
     return TaskImages(model.q_reference, s_start, s_star, MIDPOINT).task(model)
 
@@ -112,13 +105,6 @@ def test_a_goal_that_shows_the_back_is_refused():
     # Turned by 88° about the vertical the face is seen from the left only.
     model, s_start, s_star = images(SQUARE, turned(SQUARE_CENTER, [0, math.radians(88), 0]))
     with pytest.raises(WorkFailed, match=r"(left|right) camera sees one side of the face"):
-        images_for(model, s_start, s_star)
-
-
-def test_a_marker_without_a_point_is_named():
-    model, s_start, s_star = images(face(), np.eye(4))
-    s_star[1, 2, 0] = np.nan
-    with pytest.raises(WorkFailed, match="marker 2"):
         images_for(model, s_start, s_star)
 
 

@@ -119,12 +119,6 @@ def test_rotation_changes_visibility_at_both_theta_0(G, axis):
         assert sides[0] * sides[1] < 0
 
 
-def test_a_rotation_that_never_turns_the_face_away():
-    """About the viewing direction, of a face seen from far: |p_0| exceeds the amplitude."""
-    a = np.array([0.05, 0, -1.0, 1.4])
-    assert visibility_angles(a, revolute([0, 0, 0], [0, 0, 1]), np.array([-0.15, 0, 0, 1])) is None
-
-
 def test_margin_coefficients_describe_the_carried_plane(G, rng):
     H_hat = G @ revolute([0.1, 0.2, 1.3], [1, 2, 3]) @ np.linalg.inv(G)
     a, O = rng.normal(size=(2, 4))
