@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.records import InputError, masked
+from projservo_cli.masking import masked
+from projservo_cli.records import InputError
 
 
 class File(NamedTuple):

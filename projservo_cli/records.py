@@ -6,13 +6,14 @@ knows how it is stored.
 """
 
 import math
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from projservo_cli.masking import masked
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -67,27 +68,6 @@ def _array(dims: str, units: str = "1", about: str = "", **default: Any) -> Any:
 def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
     """Declare a scalar or text field with its unit and meaning."""
     return field(metadata={"units": units, "about": about}, **default)
-
-
-MASK = "***"
-"""Stands for a password in what is shown or stored."""
-# Passwords of URLs (RFC 3986, section 3.2.1), which users write with slashes and @ too, unlike ports; and
-# values of parameters.
-_USERINFO = re.compile(r"://(?:([^\s/?#:@]*:)(?!\d*(?:[/?#\s]|$))\S*|[^\s/?#:@]*)@")
-_PARAMETER = re.compile(
-    r"""(?i)([?&](?:key|pass|pw|sig)=|(?<![^\s?&;#/"'=])[\w.-]*(?:token|passw|pwd|loginpas|user-pw|secret|api_?key"""
-    r"""|signature|credential|auth)[\w.-]*=)[^\s&"']+?(?=[)\]:,.;']*(?:[\s&"]|$))"""
-)
-
-
-def masked(value: Any) -> Any:
-    """A text without passwords and tokens of URLs; of mappings and lists, each value so."""
-    if isinstance(value, str):
-        value = _USERINFO.sub(lambda match: f"://{match[1] or ''}{MASK}@", value) if "://" in value else value
-        return _PARAMETER.sub(rf"\1{MASK}", value) if "=" in value else value
-    if isinstance(value, dict):
-        return {key: masked(inner) for key, inner in value.items()}
-    return type(value)(map(masked, value)) if type(value) in (list, tuple) else value
 
 
 class InputError(ValueError):

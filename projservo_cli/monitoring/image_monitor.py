@@ -197,7 +197,8 @@ class ImageMonitor:
 
     def fault_at_rest(self) -> str:
         """Return the fault that the mean of the last observations of one posture shows; empty for none."""
-        last = [tested.pair for tested in self._kept if tested.view == self._view]
+        # A hand that covers a part of a view may pull the corners next to it.
+        last = [tested.pair for tested in self._kept if tested.view == self._view and not tested.covered]
         last = [pair for pair in last if np.abs(pair.q - last[-1].q).max() <= _AT_REST]
         if not last or self.pending:
             return self.fault

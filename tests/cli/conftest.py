@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from projservo_cli import calibration, cli, steps
+from projservo_cli import cli, steps
+from projservo_cli.calibration.checks import validation
 from projservo_cli.laws import law_and_mode
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
 from projservo_cli.stages import calibrate, plan, report, servo
@@ -145,7 +146,7 @@ def statistics(monkeypatch):
         "limit_px": 1.5,
         "skipped": {"unknown_marker": 1, "behind_camera": 0, "missing": 3},
     }
-    monkeypatch.setattr(calibration, "residual_statistics", lambda *_: value)
+    monkeypatch.setattr(validation, "residual_statistics", lambda *_: value)
     return value
 
 

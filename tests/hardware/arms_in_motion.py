@@ -7,6 +7,7 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import recording_inputs, truth_of
 from projservo_cli.hardware import checks_in_motion
+from projservo_cli.records import InputError
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from tests.configured import bounds_of, joints_of
@@ -79,6 +80,40 @@ class Wiggled:
             stamps.append(taken + faults.latency_s[view])
         q = np.round(self.q / COUNT) * COUNT
         return q, np.stack(views), self.time, *stamps, np.full((2, len(self.tag)), faults.noise_px)
+
+    def stop(self):
+        pass
+
+    def close(self):
+        pass
+
+
+class Rail:
+    """A joint that turns and one that slides, at once where they are sent, and two tags that both move."""
+
+    def __init__(self, frozen=(), refuses=False):
+        self.refuses = refuses
+        self.q, self.time, self.sent = np.zeros(2), 0.0, []
+        self.frozen = [*frozen]  # views, 0 or 1, of which one frame is repeated
+        type(self).last = self
+
+    def now(self):
+        return self.time
+
+    def open(self):
+        pass
+
+    def command(self, target, speed, due):
+        if self.refuses:
+            raise InputError("nothing was moved: look at its key")
+        self.q, self.time = target.copy(), due
+        self.sent.append((due, *target))
+
+    def read(self):
+        s = 100.0 + 10.0 * np.arange(32.0).reshape(2, 8, 2) + [600.0 * self.q[0], 2000.0 * self.q[1]]
+        stamps, still = np.full(2, self.time), s - s[0, 0] + 100.0
+        s[self.frozen], stamps[self.frozen] = still[self.frozen], 0.0
+        return self.q, s, self.time, *stamps
 
     def stop(self):
         pass

@@ -7,6 +7,7 @@ import sys
 import urllib.request
 from types import SimpleNamespace
 
+import click
 import cv2
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from projservo_cli.stages import calibrate
 from projservo_cli.stages.doctor import Checked, calibration_finding
 from projservo_cli.store import load
 from tests.conftest import ROOT
-from tests.hardware.arms_in_motion import Faults, findings
+from tests.hardware.arms_in_motion import Faults, Rail, findings
 from tests.hardware.streams import Stream, picture
 
 LEFT = picture(at=(60.0, 80.0), numbers=(0, 1, 2), side=50.0, step=75.0)
@@ -263,6 +264,57 @@ def test_motions_name_what_a_recording_would_fail_at(faults, where, words):
     (fault,) = (one for one in found if one.level == "fault")
     assert fault.where == where
     assert words in f"{fault.text}: {fault.remedy}"
+
+
+RAIL = """\
+name: rail
+plant: {{use: "tests.hardware.arms_in_motion:Rail"{options}}}
+data: {{table: rail.csv, joints: RP}}
+markers: {{numbers: [0, 1, 2, 3, 4, 5, 6, 7], face: [0, 1, 2, 3]}}
+robot: {{limits: {limits}}}
+control: {{joint_speed_limit_deg_s: 40, prismatic_speed_limit_m_s: 0.5}}
+"""
+
+
+@pytest.fixture
+def rail(projservo, tmp_path, monkeypatch):
+    """Function that checks and moves a joint that turns and one that slides; answer, findings, questions."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
+    asked = []
+    monkeypatch.setattr(click, "confirm", lambda question, **_: asked.append(question) or True)
+
+    def check(limits="{joints: [[-90, 90], [-0.5, 0.5]], unit: deg}", options=""):
+        (tmp_path / "rail.yaml").write_text(RAIL.format(limits=limits, options=options), encoding="utf-8")
+        answer = projservo("doctor", "-c", "rail.yaml", "--move", "--json")
+        assert answer.code < 2, answer.err
+        return answer, answer.json["findings"], asked
+
+    return check
+
+
+def test_a_joint_that_slides_moves_by_millimetres_and_reports_them(rail):
+    answer, found, asked = rail()
+    assert answer.code == 0
+    assert "move each joint by 3°, prismatic ones by 15.7 mm, to either side" in asked[0]
+    t, turned, slid = np.array(Rail.last.sent).T
+    assert np.degrees([turned.min(), turned.max()]) == pytest.approx([-3.0, 3.0])
+    assert [slid.min(), slid.max()] == pytest.approx([-0.0157, 0.0157], abs=1e-4)
+    assert np.abs(np.diff(slid) / np.diff(t)).max() == pytest.approx(0.3 * np.radians(20.0), rel=0.01)
+    text = {one["where"]: one["text"] for one in found}
+    assert text["joint 1"] == "hysteresis 0°, sag 0°, backlash 0°"
+    assert text["joint 2"] == "hysteresis 0 mm, sag 0 mm, backlash 0 mm"
+
+
+def test_a_joint_without_limits_is_a_fault_and_nothing_moves(rail, tmp_path):
+    answer, found, asked = rail(limits="{from_data: 0.1}")
+    assert (answer.code, asked, Rail.last.sent) == (1, [], [])
+    assert (tmp_path / "preflight.html").exists()
+    assert [one["where"] for one in found if (one["level"], one["text"]) == ("fault", "has no limits")] == [
+        "joint 1",
+        "joint 2",
+    ]
+    assert found[-1]["text"] == "were not moved: something above is a fault"
 
 
 @pytest.mark.parametrize(
