@@ -25,9 +25,9 @@ from projservo_cli.calibration.checks.refusal import (
     DOUBTED_RATIO,
     MUCH,
     contradiction,
+    describe_deviation,
     describe_other_motion,
     describe_unexplained,
-    deviation,
     joint_at_fault,
     refusal,
     straight_joints,
@@ -287,7 +287,7 @@ def _refined(
     except Misfit as refused:
         if share >= _DECISIVE_SHARE:
             hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
-        elif not (hint := deviation(solution, expected)):
+        elif not (hint := describe_deviation(solution, expected)):
             raise
         raise Misfit(f"{str(refused).removesuffix(CHECK_READINGS)}; {hint}") from None
     lens = _lens_advice(record, share, frame.known)

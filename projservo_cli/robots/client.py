@@ -31,6 +31,8 @@ _REJECTED = 1e-3
 _STALE_S = 0.5
 # Looks before the first motion, until enough agree or a fault is named.
 _MOST_LOOKS = 120
+# Looks over which what is wrong with images must last while the arm is held: a hand passes in less.
+_LASTS = 60
 
 
 class Known(NamedTuple):
@@ -187,18 +189,35 @@ class DrivenRobot:
             self.give_up()
         return self.disturbance
 
-    def unseen(self, least: int) -> str:
-        """Return which cameras show no marker of the calibration, if so many or more do not; else empty."""
+    def unseen(self, least: int, *, held: bool = False) -> str:
+        """Return which cameras show no marker of the calibration, if so many or more do not; else empty.
+
+        held : whether the arm may be held meanwhile, to see whether that lasts.
+        """
+        for _ in range(_LASTS):
+            if not held or max(self._dark) < WINDOW or self.disturbance:
+                break
+            self.steered.hold()
+            self.observe()
         dark = [view for view, looks in zip(VIEWS, self._dark, strict=True) if looks >= WINDOW]
         if len(dark) < least:
             return ""
         which = f"the {dark[0]} camera shows no" if len(dark) == 1 else "neither camera shows a"
         return f"{which} marker of the calibration"
 
-    def at_rest(self) -> str:
-        """Return the fault that images show by the test of one posture, that of ``doctor``; else empty."""
-        if self.monitor is not None:
-            self.disturbance = self.disturbance or self.monitor.fault_at_rest()
+    def at_rest(self, *, held: bool = False) -> str:
+        """Return the fault that images show by the test of one posture, that of ``doctor``; else empty.
+
+        held : whether the arm may be held meanwhile, to see whether that lasts.
+        """
+        wrong = "" if self.monitor is None else self.monitor.fault_at_rest()
+        for _ in range(_LASTS):
+            if not held or self.monitor is None or not wrong or self.disturbance:
+                break
+            self.steered.hold()
+            self.observe()
+            wrong = self.monitor.fault_at_rest()
+        self.disturbance = self.disturbance or wrong
         return self.disturbance
 
     def _agreed(self, observations: int) -> bool:

@@ -141,7 +141,7 @@ class LawRun:
                 for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
                         raise WorkFailed(f"stopped on the path to the start, since {wrong}", refutes=True)
-                if wrong := driven.at_rest():
+                if wrong := driven.at_rest(held=True):
                     raise WorkFailed(f"stopped at the start, since {wrong}", refutes=True)
                 at_start = self._require_images(driven, "stopped at the start of the task, since", 1)
                 self.unseen = at_start or unseen
@@ -150,7 +150,7 @@ class LawRun:
 
     def _require_images(self, driven: DrivenRobot, what: str, least: int) -> str:
         """Refuse to move a robot of which so many cameras or more show nothing, unless that was asked for."""
-        unseen = driven.unseen(least)
+        unseen = driven.unseen(least, held=least == 1)
         if unseen and not self.blind:
             remarks = "; ".join([unseen, *driven.robot.remarks()])
             raise WorkFailed(

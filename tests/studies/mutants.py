@@ -27,7 +27,12 @@ import numpy as np
 ROOT = Path(__file__).parents[2]
 MODULES = (
     *("geometry/*", "task/*", "control/*", "planning/margins", "planning/constraints"),
-    *("calibration/adjustment", "calibration/triangulation", "calibration/epipolar", "monitoring/statistics"),
+    *(
+        "calibration/adjustment",
+        "calibration/triangulation",
+        "calibration/epipolar",
+        "monitoring/innovation_tests",
+    ),
 )
 BINARY = ("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "Pow_Mul")
 ORDER = ("Lt_LtE", "LtE_Lt", "Gt_GtE", "GtE_Gt", "Lt_Gt", "Gt_Lt", "LtE_Gt", "GtE_Lt", "Eq_NotEq", "NotEq_Eq")

@@ -205,7 +205,7 @@ def _hypotheses(detections: Detections, q_reference: FloatArray) -> list[tuple[s
     return found
 
 
-def deviation(solution: Solution, expected: Expected) -> str:
+def describe_deviation(solution: Solution, expected: Expected) -> str:
     """Describe the deviation from the model that explains most of a fit that is refused; else empty."""
     if expected.known or solution.dof <= 0:
         return ""
