@@ -194,11 +194,8 @@ class DrivenRobot:
 
         held : whether the arm may be held meanwhile, to see whether that lasts.
         """
-        for _ in range(_LASTS):
-            if not held or max(self._dark) < WINDOW or self.disturbance:
-                break
-            self.steered.hold()
-            self.observe()
+        if held:
+            self._held_while(lambda: bool(max(self._dark) >= WINDOW), _LASTS)
         dark = [view for view, looks in zip(VIEWS, self._dark, strict=True) if looks >= WINDOW]
         if len(dark) < least:
             return ""
@@ -210,15 +207,20 @@ class DrivenRobot:
 
         held : whether the arm may be held meanwhile, to see whether that lasts.
         """
-        wrong = "" if self.monitor is None else self.monitor.fault_at_rest()
-        for _ in range(_LASTS):
-            if not held or self.monitor is None or not wrong or self.disturbance:
-                break
+        if (monitor := self.monitor) is not None:
+            if held:
+                self._held_while(lambda: bool(monitor.fault_at_rest()), _LASTS)
+            self.disturbance = self.disturbance or monitor.fault_at_rest()
+        return self.disturbance
+
+    def _held_while(self, wrong: Callable[[], bool], looks: int) -> bool:
+        """Hold the arm while something is wrong with images; whether it lasted for all of some looks."""
+        for _ in range(looks):
+            if self.disturbance or not wrong():
+                return False
             self.steered.hold()
             self.observe()
-            wrong = self.monitor.fault_at_rest()
-        self.disturbance = self.disturbance or wrong
-        return self.disturbance
+        return True
 
     def _agreed(self, observations: int) -> bool:
         """Whether enough of a number of observations agree."""
@@ -228,12 +230,8 @@ class DrivenRobot:
     def agrees(self) -> str:
         """Test the last images, holding the arm while they disagree; return the fault."""
         self.observe()
-        for _ in range(_MOST_LOOKS):
-            if self.disturbance or not self.holds:
-                return self.disturbance
-            self.steered.hold()
-            self.observe()
-        self.give_up()
+        if self._held_while(lambda: self.holds, _MOST_LOOKS):
+            self.give_up()
         return self.disturbance
 
     @property
