@@ -259,31 +259,25 @@ class Observation:
         return self if self.moving is None else self.rows(self.moving == 0)
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """Projective kinematics of a robot seen by a stereo rig of unknown calibration.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ProjectiveKinematics:
+    """Robot and cameras in one projective frame, with the errors of all their numbers.
 
     Points are scaled to ``a_inf @ M = 1``, so that the mean of points is their midpoint.
     """
 
-    method: str = _scalar(about="bundle_adjustment or closed_form")
-    source: str = _scalar(about="simulated or recorded")
     joint_types: str = _scalar(about="one letter a joint, R or P")
-    usable: bool = _scalar(about="whether the calibration is usable for control")
-    reason: str = _scalar(about="reason why it is usable or not")
-    advice: tuple[str, ...] = _scalar(about="remedies, one sentence each")
-    rms_px: float = _scalar("px", "reprojection residual, rms per marker and view (Euclidean)")
-    sigma_px: float = _scalar("px", "noise per image coordinate: configured, given or estimated")
-    sigma_fitted_px: float = _scalar("px", "noise per coordinate from the residuals of the fit")
-    chi2_per_dof: float = _scalar(about="squared residuals over sigma_px squared, per degree of freedom")
-    dof: int = _scalar(about="degrees of freedom of the fit")
-    seconds: float = _scalar("s", "computing time")
     P: FloatArray = _array("view image_row coordinate", "px", "cameras, projective frame")
     H_hat_0: FloatArray = _array("joint row coordinate", about="joint operators at the reference")
     q_reference: FloatArray = _array("joint", "rad or m", "joint reading at the reference")
     a_inf: FloatArray = _array("coordinate", about="common plane at infinity")
     marker: IntArray = _array("marker", about="number of the marker")
     M: FloatArray = _array("marker coordinate", about="markers at the reference, a_inf @ M = 1")
+    lens: FloatArray | None = _array(
+        "view lens_term",
+        about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2",
+        default=None,
+    )
     # The covariance of all these, as ``Errors`` says; of a method without one they are not finite.
     sqrt_cov_shared: FloatArray = _array(
         "parameter error",
@@ -297,6 +291,81 @@ class Calibration:
         "marker coordinate own",
         about="square root of the covariance of each marker by three separate errors",
     )
+
+    @property
+    def prismatic(self) -> BoolArray:
+        """Whether each joint (n,) is prismatic."""
+        return prismatic_of(self.joint_types)
+
+    def model(self) -> Model:
+        """The kernels' view of the calibration."""
+        lens = NO_LENS if self.lens is None else self.lens
+        return Model(
+            P=self.P,
+            H_hat_0=self.H_hat_0,
+            prismatic=self.prismatic,
+            q_reference=self.q_reference,
+            a_inf=self.a_inf,
+            lens=lens,
+        )
+
+    @property
+    def errors(self) -> Errors:
+        """Errors of P, H_hat_0, lenses and M, in this order."""
+        return Errors(self.sqrt_cov_shared, self.sqrt_cov_marker, self.sqrt_cov_own)
+
+    @property
+    def lens_terms(self) -> int:
+        """Number of estimated terms of each lens: 0, k1 and k2, or those and the image centre u, v."""
+        if self.lens is None:
+            return 0
+        return (len(self.sqrt_cov_shared) - self.P.size - self.H_hat_0.size) // 2
+
+    @property
+    def has_covariance(self) -> bool:
+        """Whether the method says how far it is off."""
+        return bool(np.isfinite(self.sqrt_cov_shared).all())
+
+    def indices_of(self, numbers: Iterable[int]) -> list[int]:
+        """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""
+        known = self.marker.tolist()
+        return [known.index(number) for number in numbers]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FitQuality:
+    """Evidence of a calibration: its residuals, their noise, and how well each joint is determined."""
+
+    rms_px: float = _scalar("px", "reprojection residual, rms per marker and view (Euclidean)")
+    sigma_px: float = _scalar("px", "noise per image coordinate: configured, given or estimated")
+    sigma_fitted_px: float = _scalar("px", "noise per coordinate from the residuals of the fit")
+    chi2_per_dof: float = _scalar(about="squared residuals over sigma_px squared, per degree of freedom")
+    dof: int = _scalar(about="degrees of freedom of the fit")
+    sigma_scale: float | None = _scalar(
+        about="true standard deviation of pixels over the stated one, if the images determine it",
+        default=None,
+    )
+    sigma_scale_interval: FloatArray | None = _array(
+        "limit", about="95 % interval of sigma_scale", default=None
+    )
+    model_px: float = _scalar("px", "model error per coordinate, 0 if it is within the noise", default=0.0)
+    corner_squares: FloatArray | None = _array(
+        "corner_pose view marker",
+        about="squared residuals over their variance, mean of both coordinates, NaN if unseen",
+        default=None,
+    )
+    corner_q: FloatArray | None = _array(
+        "corner_pose joint", "rad or m", "joint readings of corner_squares", default=None
+    )
+    sigma_q: float | None = _scalar(
+        "rad",
+        "standard deviation of joint readings, prismatic × 0.3 m/rad; 0 if none is significant",
+        default=None,
+    )
+    sigma_q_interval: FloatArray | None = _array(
+        "limit", "rad", "95 % interval of sigma_q, if estimated", default=None
+    )
+    encoder_counts: bool = _scalar(about="whether sigma_q is that of encoder counts", default=False)
     excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
     joint_min: FloatArray = _array("joint", "rad or m", "minimum joint reading in the data")
     poorly_observable: BoolArray = _array("joint", about="joints whose operator the data hardly determine")
@@ -308,6 +377,12 @@ class Calibration:
     )
     poses_used: int = _scalar(about="number of poses in the fit")
     markers_used: int = _scalar(about="number of markers in the fit")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rejections:
+    """Data that a calibration left out or read otherwise than they were written, or that decide nothing."""
+
     outlier: IntArray = _array(
         "outlier_row outlier_column",
         about="rejected observations: pose, marker, view (0 left, 1 right, 2 both)",
@@ -340,6 +415,21 @@ class Calibration:
     undecided_order: IntArray | None = _array(
         "undecided_pair pair_end", about="pairs of joints, from 1, whose order no pose shows", default=None
     )
+
+    @property
+    def order_advice(self) -> str:
+        """Advice about joints whose order nothing shows; empty if there are none, or it was not tested."""
+        if self.undecided_order is None or not self.undecided_order.size:
+            return ""
+        *joints, last = np.unique(self.undecided_order).tolist()
+        names = f"the order of joints {', '.join(map(str, joints))} and {last}"
+        return f"{names} is taken from the table; no pose shows it: add poses in which several move"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StatedErrors:
+    """Errors of predicted images, with the deviations from the model that limit them."""
+
     predicted_rms_px: float | None = _scalar(
         "px",
         "expected error of images within the joint ranges, rms per marker and view",
@@ -348,46 +438,14 @@ class Calibration:
     predicted_p99_px: float | None = _scalar(
         "px", "99th percentile of that rms over draws of the noise", default=None
     )
-    lens: FloatArray | None = _array(
-        "view lens_term",
-        about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2",
+    predicted_recorded_px: float | None = _scalar(
+        "px", "expected error of images at the recorded poses, rms per marker and view", default=None
+    )
+    predicted_worst_px: float | None = _scalar(
+        "px",
+        "expected error within the joint ranges if the deviation is there that these data do not show",
         default=None,
     )
-    sigma_q: float | None = _scalar(
-        "rad",
-        "standard deviation of joint readings, prismatic × 0.3 m/rad; 0 if none is significant",
-        default=None,
-    )
-    sigma_q_interval: FloatArray | None = _array(
-        "limit", "rad", "95 % interval of sigma_q, if estimated", default=None
-    )
-    encoder_counts: bool = _scalar(about="whether sigma_q is that of encoder counts", default=False)
-    time_offset_s: FloatArray | None = _array(
-        "view", "s", "time of a joint reading less the time of its image", default=None
-    )
-    time_offset_interval_s: FloatArray | None = _array(
-        "view limit", "s", "95 % interval of the time offset", default=None
-    )
-    time_offset_jitter_s: FloatArray | None = _array(
-        "view", "s", "standard deviation of the time offset of single images", default=None
-    )
-    model_px: float = _scalar("px", "model error per coordinate, 0 if it is within the noise", default=0.0)
-    corner_squares: FloatArray | None = _array(
-        "corner_pose view marker",
-        about="squared residuals over their variance, mean of both coordinates, NaN if unseen",
-        default=None,
-    )
-    corner_q: FloatArray | None = _array(
-        "corner_pose joint", "rad or m", "joint readings of corner_squares", default=None
-    )
-    sigma_scale: float | None = _scalar(
-        about="true standard deviation of pixels over the stated one, if the images determine it",
-        default=None,
-    )
-    sigma_scale_interval: FloatArray | None = _array(
-        "limit", about="95 % interval of sigma_scale", default=None
-    )
-
     model_error: tuple[str, ...] = _scalar(
         about="deviations from the model that limit predictions: kind, joints and view of each", default=()
     )
@@ -409,14 +467,6 @@ class Calibration:
         about="its usual or smallest detectable size, 0, and its effect in px",
         default=None,
     )
-    predicted_recorded_px: float | None = _scalar(
-        "px", "expected error of images at the recorded poses, rms per marker and view", default=None
-    )
-    predicted_worst_px: float | None = _scalar(
-        "px",
-        "expected error within the joint ranges if the deviation is there that these data do not show",
-        default=None,
-    )
 
     @property
     def model_errors(self) -> tuple[ModelError, ...]:
@@ -431,36 +481,29 @@ class Calibration:
             return None
         return ModelError.of(self.unshown_error[0], self.unshown_numbers.tolist())
 
-    def indices_of(self, numbers: Iterable[int]) -> list[int]:
-        """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""
-        known = self.marker.tolist()
-        return [known.index(number) for number in numbers]
 
-    @property
-    def order_advice(self) -> str:
-        """Advice about joints whose order nothing shows; empty if there are none, or it was not tested."""
-        if self.undecided_order is None or not self.undecided_order.size:
-            return ""
-        *joints, last = np.unique(self.undecided_order).tolist()
-        names = f"the order of joints {', '.join(map(str, joints))} and {last}"
-        return f"{names} is taken from the table; no pose shows it: add poses in which several move"
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
+    """Projective kinematics of a robot seen by a stereo rig of unknown calibration.
 
-    @property
-    def errors(self) -> Errors:
-        """Errors of P, H_hat_0, lenses and M, in this order."""
-        return Errors(self.sqrt_cov_shared, self.sqrt_cov_marker, self.sqrt_cov_own)
+    Points are scaled to ``a_inf @ M = 1``, so that the mean of points is their midpoint.
+    """
 
-    @property
-    def lens_terms(self) -> int:
-        """Number of estimated terms of each lens: 0, k1 and k2, or those and the image centre u, v."""
-        if self.lens is None:
-            return 0
-        return (len(self.sqrt_cov_shared) - self.P.size - self.H_hat_0.size) // 2
-
-    @property
-    def has_covariance(self) -> bool:
-        """Whether the method says how far it is off."""
-        return bool(np.isfinite(self.sqrt_cov_shared).all())
+    method: str = _scalar(about="bundle_adjustment or closed_form")
+    source: str = _scalar(about="simulated or recorded")
+    usable: bool = _scalar(about="whether the calibration is usable for control")
+    reason: str = _scalar(about="reason why it is usable or not")
+    advice: tuple[str, ...] = _scalar(about="remedies, one sentence each")
+    seconds: float = _scalar("s", "computing time")
+    time_offset_s: FloatArray | None = _array(
+        "view", "s", "time of a joint reading less the time of its image", default=None
+    )
+    time_offset_interval_s: FloatArray | None = _array(
+        "view limit", "s", "95 % interval of the time offset", default=None
+    )
+    time_offset_jitter_s: FloatArray | None = _array(
+        "view", "s", "standard deviation of the time offset of single images", default=None
+    )
 
     def without_covariance(self) -> "Calibration":
         """The same, which takes little memory, for those who do not ask how far it is off."""
@@ -486,23 +529,6 @@ class Calibration:
             sqrt_cov_own=few.own,
             corner_squares=None if self.corner_squares is None else self.corner_squares[..., indices],
         )
-
-    def model(self) -> Model:
-        """The kernels' view of the calibration."""
-        lens = NO_LENS if self.lens is None else self.lens
-        return Model(
-            P=self.P,
-            H_hat_0=self.H_hat_0,
-            prismatic=self.prismatic,
-            q_reference=self.q_reference,
-            a_inf=self.a_inf,
-            lens=lens,
-        )
-
-    @property
-    def prismatic(self) -> BoolArray:
-        """Whether each joint (n,) is prismatic."""
-        return prismatic_of(self.joint_types)
 
 
 @dataclass(frozen=True, eq=False)
@@ -549,34 +575,10 @@ def in_sense(theta_r: float, theta_p: float, q_hat: FloatArray) -> FloatArray:
     return np.asarray(signs[:, None] * q_hat)
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """A reaching task as a translation and two rotations, and the motion planned for it.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlannedMotion:
+    """Samples of a planned motion, and their margins."""
 
-    Everything comes from the calibration and the start and goal images. Amplitudes are per view
-    where they concern visibility: None is stored as NaN where a motion never changes it.
-    """
-
-    profile: str = _scalar(about="profile of the motion")
-    feasible: bool = _scalar(
-        about="whether both cameras see the face all along; in the profile constrained, whether all "
-        "constraints hold; in the profile joint_space, whether a path was found"
-    )
-    reason: str = _scalar(about="reason why the plan is feasible or not")
-    tau: float = _scalar(about="amplitude of the translation, unit-norm kernel of (8)")
-    theta_r: float = _scalar("rad", "angle onto the target plane, in the sense chosen")
-    theta_p: float = _scalar("rad", "angle within the plane")
-    theta_s: float = _scalar("rad", "angle of both rotations together")
-    constraint: str = _scalar(
-        about="constraint with the smallest margin, as a fraction of its margin at the ends"
-    )
-    duration: float | None = _scalar(
-        "s",
-        "duration, as configured or at the joint-speed limit; none without a limit, or if no joints follow",
-    )
-    tau_limit: float = _scalar(
-        about="minimum visibility_fraction·tau_0 ahead of the face, infinite if there is none"
-    )
     path_parameter: FloatArray = _array("sample", about="path parameter from 0 to 1")
     time: FloatArray = _array("sample", "s", "time of each sample; NaN if the plan has no duration")
     mu: FloatArray = _array(
@@ -584,11 +586,11 @@ class Plan:
     )
     H_d: FloatArray = _array("sample row coordinate", about="planned displacement of the face")
     s: FloatArray = _array("sample view marker xy", "px", "predicted images of the face")
+    q: FloatArray = _array("sample joint", "rad or m", "joints that follow the motion, NaN if none do")
     margin: FloatArray = _array("sample view", about="visibility margin a·O, 1 at the start")
     border_distance: FloatArray = _array(
         "sample view", "px", "minimum distance of a marker from the image border"
     )
-    q: FloatArray = _array("sample joint", "rad or m", "joints that follow the motion, NaN if none do")
     joint_margin: FloatArray = _array(
         "sample", about="minimum distance from a joint limit over half the range"
     )
@@ -601,6 +603,12 @@ class Plan:
         "number",
     )
     min_margin_mu: FloatArray = _array("constraint part", about="fractions of t, r, p at that minimum")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TaskPartition:
+    """A reaching task as a translation and two rotations, from images of start and goal, [RH00] section 4."""
+
     s_start: FloatArray = _array("view marker xy", "px", "images at the start")
     s_star: FloatArray = _array("view marker xy", "px", "images at the goal")
     A: FloatArray = _array("marker coordinate", about="face at the start")
@@ -622,6 +630,12 @@ class Plan:
     sense_margin: FloatArray = _array(
         "solution view", about="minimum margin along each sense, 1 at the start"
     )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JointSpaceSearch:
+    """A search through joint space: its numbers, trees and required margins; none in other profiles."""
+
     n_goal_configurations: int | None = _scalar(
         about="number of goal configurations within the limits; none but in the profile joint_space",
         default=None,
@@ -638,13 +652,6 @@ class Plan:
         about="number of nodes of both search trees, of which the first are stored; none but in the "
         "profile joint_space",
         default=None,
-    )
-    rejected_profiles: tuple[str, ...] = _scalar(
-        about="profiles that auto rejected, each with the reason", default=()
-    )
-    relaxed_constraints: tuple[str, ...] = _scalar(
-        about="constraints relaxed at the start and the goal, which have smaller margins themselves",
-        default=(),
     )
     margins: FloatArray | None = _array(
         "sample margin_kind",
@@ -675,25 +682,52 @@ class Plan:
         "node", about="index of the parent of each node, -1 at a root", default=None
     )
 
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plan(JointSpaceSearch, TaskPartition, PlannedMotion):
+    """A reaching task as a translation and two rotations, and the motion planned for it.
+
+    Everything comes from the calibration and the start and goal images. Amplitudes are per view
+    where they concern visibility: None is stored as NaN where a motion never changes it.
+    """
+
+    profile: str = _scalar(about="profile of the motion")
+    feasible: bool = _scalar(
+        about="whether both cameras see the face all along; in the profile constrained, whether all "
+        "constraints hold; in the profile joint_space, whether a path was found"
+    )
+    reason: str = _scalar(about="reason why the plan is feasible or not")
+    tau: float = _scalar(about="amplitude of the translation, unit-norm kernel of (8)")
+    theta_r: float = _scalar("rad", "angle onto the target plane, in the sense chosen")
+    theta_p: float = _scalar("rad", "angle within the plane")
+    theta_s: float = _scalar("rad", "angle of both rotations together")
+    constraint: str = _scalar(
+        about="constraint with the smallest margin, as a fraction of its margin at the ends"
+    )
+    duration: float | None = _scalar(
+        "s",
+        "duration, as configured or at the joint-speed limit; none without a limit, or if no joints follow",
+    )
+    tau_limit: float = _scalar(
+        about="minimum visibility_fraction·tau_0 ahead of the face, infinite if there is none"
+    )
+    rejected_profiles: tuple[str, ...] = _scalar(
+        about="profiles that auto rejected, each with the reason", default=()
+    )
+    relaxed_constraints: tuple[str, ...] = _scalar(
+        about="constraints relaxed at the start and the goal, which have smaller margins themselves",
+        default=(),
+    )
+
     def rotation_sense(self) -> FloatArray:
         """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
         return in_sense(self.theta_r, self.theta_p, self.q_hat[1:3])
 
 
-@dataclass(frozen=True, eq=False)
-class Trace:
-    """One closed-loop run of one law, from the first instant to its verdict."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunMetrics:
+    """Numbers by which runs of laws are compared."""
 
-    law: str = _scalar(about="name of the control law")
-    mode: str = _scalar(
-        about="regulate: each step moves to the goal by the present images; track, image_track: by the plan"
-    )
-    planned_s: float | None = _scalar("s", "arrival of the followed plan; none for regulate")
-    verdict: str = _scalar(about="verdict of the run")
-    reason: str = _scalar(about="reason of the verdict, one sentence")
-    steps: int = _scalar(about="commands sent")
-    period: float = _scalar("s", "control period")
-    features: str = _scalar(about="image features: points or body")
     position_error_mm: float | None = _scalar(
         "mm", "true centre to true goal at the end; of the tool if the robot reports its true pose"
     )
@@ -703,6 +737,28 @@ class Trace:
     )
     remaining_rotation_deg: float | None = _scalar(
         "deg", "rotation that remains at the end, as the law measures it"
+    )
+    image_error_px: float | None = _scalar(
+        "px", "image_error at the end; none if a marker of the face was unseen", default=None
+    )
+    estimated_position_error_mm: float | None = _scalar(
+        "mm",
+        "estimated distance of the face from the goal, rms: by the images, with undetected_position_error_mm "
+        "and what goal images leave open; none if no length on the face is known, or images disagree with "
+        "the calibration",
+        default=None,
+    )
+    undetected_position_error_mm: float | None = _scalar(
+        "mm",
+        "part of it: by what no test tells from none, at two deviations, such as tags that moved less than "
+        "backlash hides; none if images are not tested",
+        default=None,
+    )
+    success: bool | None = _scalar(
+        about="whether it converged and at every time, in truth, no joint was past a limit, no camera "
+        "behind the face and every marker of the face in both images; none if the truth is "
+        "unknown",
+        default=None,
     )
     self_occluded_steps_left: int = _scalar(about="times at which the left camera is behind the face")
     self_occluded_steps_right: int = _scalar(about="times at which the right camera is behind the face")
@@ -726,6 +782,12 @@ class Trace:
     limit_joint: int = _scalar(
         about="the joint, from 0, that passed its limit first or stopped the run, -1 for none"
     )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunHistory:
+    """Arrays of a run over time: joints, images, errors, commands and true poses."""
+
     q: FloatArray = _array("time joint", "rad or m", "joints")
     s: FloatArray = _array("time view marker xy", "px", "measured images of the face")
     s_star: FloatArray = _array("view marker xy", "px", "target images")
@@ -754,43 +816,21 @@ class Trace:
     pose: FloatArray = _array("time row coordinate", "m", "true pose of the tool")
     goal_pose: FloatArray = _array("row coordinate", "m", "true goal pose, NaN if unknown")
     center: FloatArray = _array("time axis", "m", "true centre of the face")
-    image_error_px: float | None = _scalar(
-        "px", "image_error at the end; none if a marker of the face was unseen", default=None
-    )
-    estimated_position_error_mm: float | None = _scalar(
-        "mm",
-        "estimated distance of the face from the goal, rms: by the images, with undetected_position_error_mm "
-        "and what goal images leave open; none if no length on the face is known, or images disagree with "
-        "the calibration",
-        default=None,
-    )
-    undetected_position_error_mm: float | None = _scalar(
-        "mm",
-        "part of it: by what no test tells from none, at two deviations, such as tags that moved less than "
-        "backlash hides; none if images are not tested",
-        default=None,
-    )
-    success: bool | None = _scalar(
-        about="whether it converged and at every time, in truth, no joint was past a limit, no camera "
-        "behind the face and every marker of the face in both images; none if the truth is "
-        "unknown",
-        default=None,
-    )
-    replan_attempts: int = _scalar(about="number of replanning attempts", default=0)
-    unplanned: str = _scalar(
-        about="reason why a run in a following mode ran without the plan; empty if it followed", default=""
-    )
-    untested: str = _scalar(about="reason why the images were not tested against the calibration", default="")
-    overruns: int | None = _scalar(
-        about="number of missed periods; none for the ideal simulated robot",
-        default=None,
-    )
     latency: FloatArray | None = _array(
         "time view",
         "s",
         "time of the joint reading less the time of the image, as estimated in the run",
         default=None,
     )
+    q_read: FloatArray | None = _array(
+        "time joint", "rad or m", "joint readings, if they differ from the joints", default=None
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecordedFrames:
+    """Camera images that were kept of a run; absent if the robot provides none."""
+
     frame_index: IntArray | None = _array(
         "frame", about="time indices of the stored frames; absent if the robot provides none", default=None
     )
@@ -801,8 +841,30 @@ class Trace:
         "frame view", about="bytes of each frame in frame_jpeg", default=None
     )
     frame_jpeg: ByteArray | None = _array("frame_byte", about="frames as JPEG, concatenated", default=None)
-    q_read: FloatArray | None = _array(
-        "time joint", "rad or m", "joint readings, if they differ from the joints", default=None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trace(RecordedFrames, RunHistory, RunMetrics):
+    """One closed-loop run of one law, from the first instant to its verdict."""
+
+    law: str = _scalar(about="name of the control law")
+    mode: str = _scalar(
+        about="regulate: each step moves to the goal by the present images; track, image_track: by the plan"
+    )
+    planned_s: float | None = _scalar("s", "arrival of the followed plan; none for regulate")
+    verdict: str = _scalar(about="verdict of the run")
+    reason: str = _scalar(about="reason of the verdict, one sentence")
+    steps: int = _scalar(about="commands sent")
+    period: float = _scalar("s", "control period")
+    features: str = _scalar(about="image features: points or body")
+    replan_attempts: int = _scalar(about="number of replanning attempts", default=0)
+    unplanned: str = _scalar(
+        about="reason why a run in a following mode ran without the plan; empty if it followed", default=""
+    )
+    untested: str = _scalar(about="reason why the images were not tested against the calibration", default="")
+    overruns: int | None = _scalar(
+        about="number of missed periods; none for the ideal simulated robot",
+        default=None,
     )
 
 

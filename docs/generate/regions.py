@@ -39,9 +39,10 @@ def run_file() -> Iterator[str]:
 
 
 def fields(record: type, *, arrays: bool) -> Iterator[tuple[str, ...]]:
-    """Rows of the table of a record's attributes, or of its arrays."""
+    """Rows of the table of a record's attributes, or of its arrays: its own, then those of its parts."""
     hints = typing.get_type_hints(record)
-    for field in dataclasses.fields(record):
+    own = vars(record)["__annotations__"]
+    for field in sorted(dataclasses.fields(record), key=lambda field: field.name not in own):
         about, dims = field.metadata, field.metadata.get("dims")
         if arrays == (dims is not None):
             what = plain(hints[field.name]) if dims is None else text(", ".join(dims))
