@@ -1,4 +1,4 @@
-"""Sizes of images, one of both cameras or one of each, and their borders.
+"""Sizes of images, one of all cameras or one of each, and their borders.
 
 The centres of pixels have whole coordinates, so an image reaches from −½ to its size − ½. Kernels have the
 same rule in ``geometry.kinematics.from_border``.
@@ -13,13 +13,14 @@ from projservo_cli.records import BoolArray, FloatArray
 
 BEHIND = -1e9
 """Distance, px, from the border of an image of what no camera shows."""
-ImageSize = tuple[int, int] | tuple[tuple[int, int], tuple[int, int]]
-"""Width and height of the images, px: of both, or of the left and of the right."""
+ImageSize = tuple[int, int] | tuple[tuple[int, int], ...]
+"""Width and height of the images, px: of all views, or of one each."""
 
 
-def image_sizes(size: Any) -> FloatArray:
-    """Width and height (2, 2) of each image, px, by those of both or of one each; infinite for None."""
-    return np.broadcast_to(np.array(math.inf if size is None else size, dtype=np.float64), (2, 2)).copy()
+def image_sizes(size: Any, views: int = 2) -> FloatArray:
+    """Width and height (V, 2) of each image, px, by those of all views or of one each; infinite for None."""
+    sizes = np.array(math.inf if size is None else size, dtype=np.float64)
+    return np.broadcast_to(sizes, (views, 2)).copy()
 
 
 def image_corners(sizes: FloatArray) -> FloatArray:

@@ -31,7 +31,6 @@ WHY_LOST = ("still", "other body", "drifting", "hardly seen")
 
 # Dimensions that have the same size in every record.
 SIZES = {
-    "view": 2,
     "xy": 2,
     "image_row": 3,
     "row": 4,
@@ -231,6 +230,7 @@ class Observation:
     marker: IntArray = _array("marker", about="number of the marker")
     q: FloatArray = _array("pose joint", "rad or m", "joint readings")
     images: FloatArray = _array("pose view marker xy", "px", "pixels, NaN if unseen")
+    view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
     moving: IntArray | None = _array(
         "pose", about="number of the motion during which the pose was recorded, 0 at rest", default=None
     )
@@ -266,6 +266,7 @@ class ProjectiveKinematics:
     Points are scaled to ``a_inf @ M = 1``, so that the mean of points is their midpoint.
     """
 
+    view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
     joint_types: str = _scalar(about="one letter a joint, R or P")
     P: FloatArray = _array("view image_row coordinate", "px", "cameras, projective frame")
     H_hat_0: FloatArray = _array("joint row coordinate", about="joint operators at the reference")
@@ -299,7 +300,7 @@ class ProjectiveKinematics:
 
     def model(self) -> Model:
         """The kernels' view of the calibration."""
-        lens = NO_LENS if self.lens is None else self.lens
+        lens = np.tile(NO_LENS[:1], (len(self.P), 1)) if self.lens is None else self.lens
         return Model(
             P=self.P,
             H_hat_0=self.H_hat_0,
@@ -319,7 +320,7 @@ class ProjectiveKinematics:
         """Number of estimated terms of each lens: 0, k1 and k2, or those and the image centre u, v."""
         if self.lens is None:
             return 0
-        return (len(self.sqrt_cov_shared) - self.P.size - self.H_hat_0.size) // 2
+        return (len(self.sqrt_cov_shared) - self.P.size - self.H_hat_0.size) // len(self.P)
 
     @property
     def has_covariance(self) -> bool:
@@ -338,6 +339,9 @@ class FitQuality:
 
     rms_px: float = _scalar("px", "reprojection residual, rms per marker and view (Euclidean)")
     sigma_px: float = _scalar("px", "noise per image coordinate: configured, given or estimated")
+    sigma_view_px: FloatArray | None = _array(
+        "view", "px", "noise per coordinate of each view, if it is not common to all", default=None
+    )
     sigma_fitted_px: float = _scalar("px", "noise per coordinate from the residuals of the fit")
     chi2_per_dof: float = _scalar(about="squared residuals over sigma_px squared, per degree of freedom")
     dof: int = _scalar(about="degrees of freedom of the fit")
@@ -385,7 +389,7 @@ class Rejections:
 
     outlier: IntArray = _array(
         "outlier_row outlier_column",
-        about="rejected observations: pose, marker, view (0 left, 1 right, 2 both)",
+        about="rejected observations: pose, marker, index of the view (their number for all)",
     )
     suspect: IntArray = _array(
         "suspect_row suspect_column", about="joint readings that no image agrees with: pose, joint from 1"
@@ -404,7 +408,7 @@ class Rejections:
     )
     moved_images: IntArray | None = _array(
         "moved_row moved_column",
-        about="rejected images that a camera shows that moved: pose, view (0 left, 1 right)",
+        about="rejected images that a camera shows that moved: pose, index of the view",
         default=None,
     )
     placeholders: int = _scalar(about="number of detections that stood for unseen markers", default=0)

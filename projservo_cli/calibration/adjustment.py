@@ -66,10 +66,10 @@ def moved_operators(params: Parameters) -> list[FloatArray]:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Detections to fit and the order of the parameters: both cameras, joints, both lenses, then markers.
+    """Detections to fit and the order of the parameters: both cameras, joints, the lenses, then markers.
 
     Residuals and derivatives are weighted, so all have the noise of a pixel of weight one. The derivative of
-    the images is compact: (2, N, 2, c) for each detection by the c parameters it depends on, the last three
+    the images is compact: (V, N, 2, c) for each detection by the c parameters it depends on, the last three
     those of its marker. Offsets of joint readings follow the ``size`` parameters, (K, n) in units of ``tau``,
     in which their squares count as those of pixels.
     """
@@ -90,13 +90,14 @@ class LeastSquares:
 
         12 parameters a camera, 4 a revolute and 2 a prismatic joint, 3 a marker, ``lens_terms`` a lens.
         """
-        joint = 2 * CAMERA + np.concatenate([[0], np.cumsum(np.where(detections.prismatic, 2, 4))])
+        V = len(detections.seen)
+        joint = V * CAMERA + np.concatenate([[0], np.cumsum(np.where(detections.prismatic, 2, 4))])
         count = lens_terms
-        shared = int(joint[-1]) + 2 * count
-        view = np.arange(2)[:, None]
+        shared = int(joint[-1]) + V * count
+        view = np.arange(V)[:, None]
         parts = (
             view * CAMERA + np.arange(CAMERA),
-            np.broadcast_to(np.arange(joint[0], joint[-1]), (2, joint[-1] - joint[0])),
+            np.broadcast_to(np.arange(joint[0], joint[-1]), (V, joint[-1] - joint[0])),
             joint[-1] + view * count + np.arange(count),
         )
         columns = np.concatenate(parts, axis=1)
@@ -120,7 +121,7 @@ class LeastSquares:
     @property
     def lens_terms(self) -> int:
         """Number of parameters of each lens."""
-        return int(self.shared - self.joint[-1]) // 2
+        return int(self.shared - self.joint[-1]) // len(self.detections.seen)
 
     @property
     def by_pose(self) -> bool:
@@ -137,7 +138,7 @@ class LeastSquares:
         return smaller.with_noise(self.tau)
 
     def pixels(self, params: Parameters) -> tuple[FloatArray, FloatArray]:
-        """Predicted pixels (2, N, 2) of every observation and their depths (2, N)."""
+        """Predicted pixels (V, N, 2) of every observation and their depths (V, N)."""
         detections = self.detections
         points = params.moved(self.joints(params), detections.pose_of, detections.marker_of)
         m = image_points(params.P, points)
@@ -145,13 +146,13 @@ class LeastSquares:
         return pixels if params.lens is None else distort(params.lens[:, None], pixels), m[..., 2]
 
     def residual(self, params: Parameters) -> FloatArray:
-        """Predicted minus seen pixels (2, N, 2), weighted, zero where not seen."""
+        """Predicted minus seen pixels (V, N, 2), weighted, zero where not seen."""
         detections = self.detections
         residual = np.where(detections.seen[..., None], self.pixels(params)[0] - detections.pixels, 0.0)
         return np.asarray(residual * detections.weight[..., None])
 
     def derivative(self, params: Parameters) -> FloatArray:
-        """Compact derivative (2, N, 2, c) of the weighted images, columns as in ``columns``.
+        """Compact derivative (V, N, 2, c) of the weighted images, columns as in ``columns``.
 
         With Y_i the point behind joint i, D_i the derivative by it and B a generator, a joint contributes
         D_i (B Y_i − E_i B Y_{i+1}), where D_i E_i is D_{i+1}.
@@ -169,7 +170,7 @@ class LeastSquares:
         return np.concatenate(blocks, axis=3) * detections.weight[..., None, None]
 
     def joint_derivative(self, params: Parameters) -> FloatArray:
-        """Derivative (2, N, 2, n) of the weighted images by the joint values."""
+        """Derivative (V, N, 2, n) of the weighted images by the joint values."""
         images = params.images(self.joints(params), self.detections.pose_of, self.detections.marker_of)
         return images.by_joint(params.H_hat) * self.detections.weight[..., None, None]
 
@@ -197,11 +198,11 @@ class LeastSquares:
         if lens is not None:
             lens = lens.copy()
             terms = list(TERMS[: self.lens_terms])
-            lens[:, terms] += x[self.joint[-1] : self.shared].reshape(2, -1)
+            lens[:, terms] += x[self.joint[-1] : self.shared].reshape(len(lens), -1)
         offsets = params.offsets
         if self.tau is not None and further.size:
             offsets = (0.0 if offsets is None else offsets) + self.tau * further.reshape(self.q.shape)
-        P = params.P + x[: 2 * CAMERA].reshape(2, 3, 4)
+        P = params.P + x[: params.P.size].reshape(-1, 3, 4)
         return Parameters(P, H_hat, params.prismatic, M, lens, offsets, self.lens_terms)
 
     def gauge(self, params: Parameters) -> FloatArray:
@@ -213,16 +214,17 @@ class LeastSquares:
         motions[:3, :3, :3] = cross_matrix(np.eye(3))
         motions[3:6, :3, 3] = np.eye(3)
         motions[6:, :3, :3] = np.eye(3)
-        result = np.zeros((self.size, len(motions) + 2))
-        result[: 2 * CAMERA, :-2] = -(params.P @ motions[:, None]).reshape(len(motions), -1).T
+        V, g = len(params.P), len(motions)
+        result = np.zeros((self.size, g + V))
+        result[: V * CAMERA, :g] = -(params.P @ motions[:, None]).reshape(g, -1).T
         for i, (H_hat, reach) in enumerate(zip(params.H_hat, moved_operators(params), strict=True)):
             wanted = (motions @ H_hat - H_hat @ motions).reshape(-1, 16).T
             coefficients = np.linalg.lstsq(reach.reshape(-1, 16).T, wanted, rcond=None)[0]
-            result[self.joint[i] : self.joint[i + 1], :-2] = coefficients
+            result[self.joint[i] : self.joint[i + 1], :g] = coefficients
         moved = (params.M @ motions.swapaxes(1, 2))[..., :3]
-        result[self.shared :, :-2] = moved.reshape(len(motions), -1).T
-        for v in (0, 1):
-            result[v * CAMERA : (v + 1) * CAMERA, v - 2] = params.P[v].ravel()
+        result[self.shared :, :g] = moved.reshape(g, -1).T
+        for v in range(V):
+            result[v * CAMERA : (v + 1) * CAMERA, g + v] = params.P[v].ravel()
         return np.asarray(result / np.linalg.norm(result, axis=0))
 
     def at_poses(self, values: FloatArray) -> FloatArray:
@@ -230,32 +232,32 @@ class LeastSquares:
         return per_block(self.detections.pose_of, values, len(self.q))
 
     def dense(self, J: FloatArray, mask: BoolArray) -> FloatArray:
-        """Dense derivative (4 N, size), zero outside a mask (2, N), for uses that need more than JᵀJ."""
+        """Dense derivative (2 V N, size), zero outside a mask (V, N), for uses that need more than JᵀJ."""
         result = np.zeros((*J.shape[:3], self.size))
         J = J * mask[..., None, None]
-        for v in (0, 1):
-            result[v][..., self.columns[v]] = J[v, ..., :-3]
+        for v, columns in enumerate(self.columns):
+            result[v][..., columns] = J[v, ..., :-3]
         own = self.shared + 3 * self.detections.marker_of[None, :, None, None] + np.arange(3)
         np.put_along_axis(result, own, J[..., -3:], axis=3)
         return result.reshape(-1, self.size)
 
     def predicted(self, params: Parameters, errors: Errors) -> tuple[FloatArray, FloatArray]:
-        """Changes of the images by ``errors``: common ones (2, N, 2, r), and a marker's own (2, N, 2, 3)."""
+        """Changes of the images by ``errors``: common ones (V, N, 2, r), and a marker's own (V, N, 2, 3)."""
         J, marker_of = self.derivative(params), self.detections.marker_of
         common = J[..., -3:] @ errors.marker[marker_of]
-        for v in (0, 1):
-            common[v] += J[v, ..., :-3] @ errors.shared[self.columns[v]]
+        for v, columns in enumerate(self.columns):
+            common[v] += J[v, ..., :-3] @ errors.shared[columns]
         return common, J[..., -3:] @ errors.own[marker_of]
 
     def whitened(self, params: Parameters, rows: FloatArray, mask: BoolArray) -> FloatArray:
-        """Whiten rows (4 N, c) of coordinates in a mask (2, N) by S^-½, S = I + G τ² Gᵀ of each pose."""
+        """Whiten rows (2 V N, c) of coordinates in a mask (V, N) by S^-½, S = I + G τ² Gᵀ of each pose."""
         return rows if self.tau is None else JointErrors(self, params, mask, self.tau).whitened(rows)
 
 
 class JointErrors:
     """First-order images under errors of joint readings, (K, n) in units (n,), rad or m.
 
-    At each pose √w G = U s Vᵀ, with weights w (2, N) and derivatives G (2, N, 2, n); errors of unit variance
+    At each pose √w G = U s Vᵀ, with weights w (V, N) and derivatives G (V, N, 2, n); errors of unit variance
     give the images the covariance I + G Gᵀ.
     """
 
@@ -275,26 +277,26 @@ class JointErrors:
         self._U = csr_array((rows.ravel(), columns.ravel(), starts), shape=(rows.size // n, K * n))
 
     def parts(self, rows: FloatArray) -> FloatArray:
-        """Coefficients (K n, …), Uᵀ √w times rows (4 N, …)."""
+        """Coefficients (K n, …), Uᵀ √w times rows (2 V N, …)."""
         return np.asarray(self._U.T @ rows)
 
     def whitened(self, rows: FloatArray) -> FloatArray:
-        """Whiten rows (4 N, c) by (I + G Gᵀ)^-½, for weights of zero and one, in coordinates that count."""
+        """Whiten rows (2 V N, c) by (I + G Gᵀ)^-½, for weights of zero and one, in coordinates that count."""
         share = 1.0 - 1.0 / np.sqrt(1.0 + self.square.reshape(-1, 1))
         return np.asarray(rows - self._U @ (share * self.parts(rows)))
 
     def coloured(self, rows: FloatArray) -> FloatArray:
-        """Give back to whitened rows (4 N, c) the covariance I + G Gᵀ."""
+        """Give back to whitened rows (2 V N, c) the covariance I + G Gᵀ."""
         share = np.sqrt(1.0 + self.square.reshape(-1, 1)) - 1.0
         return np.asarray(rows + self._U @ (share * self.parts(rows)))
 
     def undoing(self, change: FloatArray) -> FloatArray:
-        """Errors (K, n) of unit variance that best undo a change (2, N, 2) of the images."""
+        """Errors (K, n) of unit variance that best undo a change (V, N, 2) of the images."""
         parts = self.parts(change.ravel()).reshape(self.square.shape)
         return -np.asarray((self.V @ (np.sqrt(self.square) / (1.0 + self.square) * parts)[..., None])[..., 0])
 
     def change(self, errors: FloatArray) -> FloatArray:
-        """Change (2, N, 2) of the images by errors (K, n)."""
+        """Change (V, N, 2) of the images by errors (K, n)."""
         return np.asarray((self.G @ errors[self.pose_of][..., None])[..., 0])
 
 
@@ -331,7 +333,7 @@ class _Fit:
     """Parameters and their residuals."""
 
     params: Parameters
-    residual: FloatArray  # (2, N, 2) predicted minus seen, px, zero where not seen
+    residual: FloatArray  # (V, N, 2) predicted minus seen, px, zero where not seen
     cost: float  # weighted sum of squares, px²
 
 
@@ -339,7 +341,7 @@ class _Family(NamedTuple):
     """Parameters in blocks, of which an observation depends on one: markers, or joint offsets at a pose."""
 
     of: IntArray  # (N,) block of an observation
-    J: FloatArray  # (2, N, 2, d) weighted derivatives by it
+    J: FloatArray  # (V, N, 2, d) weighted derivatives by it
     blocks: slice  # from the first to the last block, b in all
     sums: csr_array  # (b, N) adds up the observations of each block
 
@@ -356,11 +358,11 @@ class _Family(NamedTuple):
         return np.asarray(flat.reshape(self.sums.shape[0], *values.shape[1:]))
 
     def across(self, others: FloatArray) -> FloatArray:
-        """Products (b, d, c) of its derivatives with others (2, N, 2, c), summed over each block."""
+        """Products (b, d, c) of its derivatives with others (V, N, 2, c), summed over each block."""
         return self.added(_products(self.J, others))
 
     def gradient(self, change: FloatArray) -> FloatArray:
-        """Products (b, d) of its derivatives with a weighted change (2, N, 2) of the images."""
+        """Products (b, d) of its derivatives with a weighted change (V, N, 2) of the images."""
         return self.across(change[..., None])[..., 0]
 
 
@@ -375,13 +377,13 @@ class _Part(NamedTuple):
     """Derivatives of some observations, times the roots of their weights."""
 
     at: slice  # of the observations
-    shared: FloatArray  # (2, N, 2, c - 3) by the parameters common to all observations of a view
+    shared: FloatArray  # (V, N, 2, c - 3) by the parameters common to all observations of a view
     gone: _Family  # eliminated
     kept: _Family | None  # the other family
 
 
 class _Expansion:
-    """First-order images about some parameters, with weights (2, N), by the parameters from a first one on.
+    """First-order images about some parameters, with weights (V, N), by the parameters from a first one on.
 
     In units in which the diagonal of the normal matrix is at most one. Eliminating one of both families of
     blocks leaves a system in the other one and the shared parameters. Multipliers add a penalty on the gauge.
@@ -505,7 +507,7 @@ class _Expansion:
         return self._whole(velocity + 0.5 * acceleration)
 
     def solved(self, damping: float) -> Callable[[FloatArray, FloatArray], FloatArray] | None:
-        """Solver that maps a change (2, N, 2) of images and strains (K, n) to the step undoing it, in units.
+        """Solver that maps a change (V, N, 2) of images and strains (K, n) to the step undoing it, in units.
 
         None if the normal matrix is singular.
         """
@@ -563,7 +565,7 @@ class _Expansion:
         return np.concatenate([np.zeros(self.first), step[:count] / self.scale, step[count:]])
 
     def change(self, x: FloatArray) -> FloatArray:
-        """First-order change (2, N, 2) of the weighted images by a step (size or more,)."""
+        """First-order change (V, N, 2) of the weighted images by a step (size or more,)."""
         problem, result = self.problem, np.zeros_like(self.residual)
         shared, marker, offsets = np.split(x, [problem.shared, problem.size])
         families = [marker.reshape(-1, 3), offsets.reshape(problem.q.shape) if offsets.size else None]
@@ -587,16 +589,16 @@ def minimize(
     max_steps: int = 200,
     stalled: Callable[[FloatArray], bool] = lambda residual: False,
 ) -> _Fit:
-    """Minimize the squared residuals of some detections (2, N) from initial parameters.
+    """Minimize the squared residuals of some detections (V, N) from initial parameters.
 
-    rows : (2, N) detections that count.
+    rows : (V, N) detections that count.
     robust : minimize a Cauchy loss instead, its width from the residuals of each step.
     cameras : adjust all parameters; False fixes the cameras and stops early.
     stalled : called with the residuals after each step, ends the search when true.
     """
     residual = problem.residual(params)
     weight = _weights(residual, rows, robust)
-    scale = np.zeros(problem.size - (0 if cameras else 2 * CAMERA))
+    scale = np.zeros(problem.size - (0 if cameras else params.P.size))
     min_change = (_SETTLED if cameras else _ROUGHLY) ** 2
     damping = 1e-3
     settled = False
@@ -648,7 +650,7 @@ def fit_offsets(problem: LeastSquares, params: Parameters) -> Parameters:
 
 
 def _weights(residual: FloatArray, rows: BoolArray, robust: bool) -> FloatArray:
-    """Weights (2, N) of residuals (2, N, 2): one for some detections, or those of their Cauchy loss."""
+    """Weights (V, N) of residuals (V, N, 2): one for some detections, or those of their Cauchy loss."""
     if not robust:
         return rows.astype(np.float64)
     distance = np.linalg.norm(residual, axis=2)
@@ -657,5 +659,5 @@ def _weights(residual: FloatArray, rows: BoolArray, robust: bool) -> FloatArray:
 
 
 def _cost(weight: FloatArray, residual: FloatArray, strain: FloatArray) -> float:
-    """Weighted sum of squares of residuals (2, N, 2), plus that of strains (K, n) if any, px²."""
+    """Weighted sum of squares of residuals (V, N, 2), plus that of strains (K, n) if any, px²."""
     return float((weight[..., None] * residual**2).sum()) + float((strain**2).sum())

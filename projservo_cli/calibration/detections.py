@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.records import (
+    VIEWS,
     BoolArray,
     FloatArray,
     InputError,
@@ -60,7 +61,7 @@ SAME_READING = 2e-3
 class Detections:
     """Pixels of every marker seen at a pose by at least one camera, ordered by marker and then by pose.
 
-    A row (N,) is an observation, of one marker at one pose; a detection is its pixel in one view (2, N).
+    A row (N,) is an observation, of one marker at one pose; a detection is its pixel in one view (V, N).
     """
 
     q: FloatArray  # (K, n) joint readings, rad or m
@@ -69,10 +70,12 @@ class Detections:
     marker: IntArray  # (m,) numbers of the markers
     pose_of: IntArray  # (N,) row of ``q``
     marker_of: IntArray  # (N,) index into ``marker``, never falling
-    pixels: FloatArray  # (2, N, 2) px, zero where not seen
-    seen: BoolArray  # (2, N) whether the view saw the marker
-    weight: FloatArray  # (2, N) weights of residuals: ``stated_px`` over the standard deviation, or one
+    pixels: FloatArray  # (V, N, 2) px, zero where not seen
+    seen: BoolArray  # (V, N) whether the view saw the marker
+    weight: FloatArray  # (V, N) weights of residuals: ``stated_px`` over the standard deviation, or one
     stated_px: float | None  # root mean square of the stated standard deviations, px, if any
+    view: tuple[str, ...] = VIEWS  # names of the views
+    pair: tuple[int, int] = (0, 1)  # the views by which a fit begins and noise is known
 
     @classmethod
     def of(cls, observation: Observation, joint_types: str) -> "Detections":
@@ -110,20 +113,22 @@ class Detections:
             seen=seen,
             weight=weight,
             stated_px=stated_px,
+            view=observation.view,
         )
 
     def everywhere(self, q: FloatArray, which: IntArray | None = None) -> "Detections":
-        """Detections of all markers, or some, at joints (K, n), rad or m, all seen in both views at zero."""
+        """Detections of all markers, or some, at joints (K, n), rad or m, all seen in every view at zero."""
         which = np.arange(self.marker.size) if which is None else which
         marker_of, pose_of = np.repeat(which, len(q)), np.tile(np.arange(len(q)), which.size)
-        pixels, weight = np.zeros((2, marker_of.size, 2)), np.ones((2, marker_of.size))
+        V = len(self.seen)
+        pixels, weight = np.zeros((V, marker_of.size, 2)), np.ones((V, marker_of.size))
         where = np.arange(len(q)), self.marker, pose_of, marker_of
-        return Detections(q, self.prismatic, *where, pixels, weight > 0.0, weight, None)
+        return Detections(q, self.prismatic, *where, pixels, weight > 0.0, weight, None, self.view, self.pair)
 
     @property
     def both(self) -> BoolArray:
-        """Mask (N,) of the observations by both views."""
-        return np.asarray(np.logical_and(self.seen[0], self.seen[1]))
+        """Mask (N,) of the observations by both views of the pair."""
+        return np.asarray(np.logical_and(*self.seen[[*self.pair]]))
 
     def rows(self, keep: BoolArray | IntArray | slice) -> "Detections":
         """Select observations (N,); the lists of poses and markers stay."""
@@ -136,6 +141,23 @@ class Detections:
             weight=self.weight[:, keep],
         )
 
+    def of_views(self, which: list[int]) -> "Detections":
+        """Select views, in an order, of which the first two are the pair; and the observations by them."""
+        seen = self.seen[which]
+        some = dataclasses.replace(
+            self,
+            pixels=self.pixels[which],
+            seen=seen,
+            weight=self.weight[which],
+            view=tuple(self.view[v] for v in which),
+            pair=(0, 1),
+        ).rows(seen.any(axis=0))
+        return some.of_markers(np.isin(np.arange(self.marker.size), some.marker_of))
+
+    def of_pair(self) -> "Detections":
+        """Select the observations by the pair of views."""
+        return self if len(self.view) == 2 else self.of_views([*self.pair])
+
     def of_poses(self, keep: BoolArray) -> "Detections":
         """Select the observations at some poses (K,); the lists of poses and markers stay."""
         return self.rows(keep[self.pose_of])
@@ -147,11 +169,11 @@ class Detections:
         return dataclasses.replace(left, marker=self.marker[keep], marker_of=numbers)
 
     def count_at(self, mask: BoolArray) -> IntArray:
-        """Number (K,) of detections in a mask (2, N) at each pose."""
+        """Number (K,) of detections in a mask (V, N) at each pose."""
         return np.bincount(self.pose_of, mask.sum(axis=0), len(self.q)).astype(np.int64)
 
     def count_of(self, mask: BoolArray) -> IntArray:
-        """Number (m,) of detections in a mask (2, N) of each marker."""
+        """Number (m,) of detections in a mask (V, N) of each marker."""
         return np.bincount(self.marker_of, mask.sum(axis=0), self.marker.size).astype(np.int64)
 
     def home(self) -> int | None:
@@ -198,13 +220,13 @@ def require_shapes(observation: Observation) -> None:
         values, count = np.unique(numbers, return_counts=True)
         if (count > 1).any():
             raise InputError(f"{name} number {values[count > 1][0]} occurs twice: number each {name} once")
-    K, m = len(observation.q), len(observation.marker)
-    shapes = {"pose": (K,), "images": (K, 2, m, 2), "sigma": (K, 2, m), "moving": (K,), "t_q": (K,)}
-    for name, shape in (shapes | {"t_view": (K, 2)}).items():
+    K, V, m = len(observation.q), len(observation.view), len(observation.marker)
+    shapes = {"pose": (K,), "images": (K, V, m, 2), "sigma": (K, V, m), "moving": (K,), "t_q": (K,)}
+    for name, shape in (shapes | {"t_view": (K, V)}).items():
         given = getattr(observation, name)
         if given is not None and given.shape != shape:
             raise InputError(
-                f"{name} of shape {given.shape}: expected {shape} for {K} poses, two views, {m} markers"
+                f"{name} of shape {given.shape}: expected {shape} for {K} poses, {V} views, {m} markers"
             )
     if observation.sigma is not None:
         stated = observation.sigma[np.isfinite(observation.images).all(axis=3)]
@@ -354,9 +376,9 @@ def _spread(pixels: FloatArray) -> FloatArray:
 
 def _require_spread(detections: Detections, sigma: float) -> None:
     """Refuse a view that saw nothing, or whose pixels do not spread in two directions."""
-    for v, view in enumerate(("left", "right")):
+    for v, view in enumerate(detections.view):
         if not detections.seen[v].any():
-            raise WorkFailed(f"the {view} camera saw no marker: both must see them")
+            raise WorkFailed(f"the {view} camera saw no marker: each must see them")
         along, across = _spread(detections.pixels[v][detections.seen[v]])
         if across >= _MIN_SPREAD * sigma:
             continue
@@ -368,7 +390,7 @@ def _require_spread(detections: Detections, sigma: float) -> None:
         raise WorkFailed(
             f"the {view} images show no more than noise: their markers spread over {along:.3g} px, "
             f"less than {_MIN_SPREAD:g} times the noise of {sigma:.3g} px; check the pixel columns, and "
-            "that the left and right pixels of a row are of one marker at one pose"
+            "that the pixels of a row are of one marker at one pose"
         )
 
 
@@ -398,7 +420,7 @@ def _tracks(detections: Detections) -> tuple[FloatArray, IntArray]:
     """Pixels (L, 2) of each marker in each view that shows it twice or more, and their track index (L,)."""
     views = [np.flatnonzero(seen) for seen in detections.seen]
     pixels = np.concatenate([detections.pixels[v, rows] for v, rows in enumerate(views)])
-    track = np.concatenate([2 * detections.marker_of[rows] + v for v, rows in enumerate(views)])
+    track = np.concatenate([len(views) * detections.marker_of[rows] + v for v, rows in enumerate(views)])
     often = np.bincount(track)[track] > 1
     return pixels[often], np.unique(track[often], return_inverse=True)[1]
 

@@ -68,6 +68,7 @@ class Epipolar:
     F: FloatArray  # (3, 3) with rightᵀ F left = 0, unit norm, px
     sigma_px: float  # noise per image coordinate from the residuals, px
     inlier: BoolArray  # (N,) whether a correspondence used agrees with F
+    parallax_px: float  # median distance of the second view from a homography of the first
     core: "Core"  # the same noise, robust against many wrong correspondences, and its interval
 
     @classmethod
@@ -79,7 +80,8 @@ class Epipolar:
 
         Raises WorkFailed with fewer than eight pairs, or if they do not determine the geometry.
         """
-        (left, right), weight = detections.pixels[:, detections.both], detections.weight[:, detections.both]
+        both, pair = detections.both, [*detections.pair]
+        (left, right), weight = detections.pixels[pair][:, both], detections.weight[pair][:, both]
         count = len(left)
         if count < 8:
             raise WorkFailed(
@@ -87,7 +89,7 @@ class Epipolar:
                 "hold the pixels of both views"
             )
         T, T_ = _normalization(left), _normalization(right)
-        pose_of = detections.pose_of[detections.both]
+        pose_of = detections.pose_of[both]
         if count > _CORRESPONDENCES:
             some = rng.choice(count, _CORRESPONDENCES, replace=False)
             left, right, weight, count = left[some], right[some], weight[:, some], _CORRESPONDENCES
@@ -109,14 +111,14 @@ class Epipolar:
         if inlier.sum() <= _PARAMETERS:
             raise WorkFailed("the observations of the two cameras share no epipolar geometry: check the rows")
         sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
-        parallax = _transfer(a[inlier], b[inlier]) / T_[0, 0]
-        if float(np.median(parallax)) < _MIN_PARALLAX * sigma:
+        parallax = float(np.median(_transfer(a[inlier], b[inlier]) / T_[0, 0]))
+        if parallax < _MIN_PARALLAX * sigma:
             raise WorkFailed(
                 "both cameras see the same up to a change of image coordinates: without a baseline, or "
                 "with all markers always in one plane, there is no depth; move the cameras apart, or the "
                 "markers in depth"
             )
-        return cls(in_pixels, sigma, inlier, Core.of(residual, pose_of))
+        return cls(in_pixels, sigma, inlier, parallax, Core.of(residual, pose_of))
 
     @property
     def noise_px(self) -> float:
@@ -130,8 +132,9 @@ class Epipolar:
 
     def within(self, detections: Detections, deviations: float) -> BoolArray:
         """Mask (N,) of observations by both views that obey the geometry to some standard deviations."""
-        left, right = homogeneous(detections.pixels)
-        return np.abs(sampson(self.F, left, right, detections.weight)[0]) <= deviations * self.sigma_px
+        pair = [*detections.pair]
+        left, right = homogeneous(detections.pixels[pair])
+        return np.abs(sampson(self.F, left, right, detections.weight[pair])[0]) <= deviations * self.sigma_px
 
 
 class Core(NamedTuple):
@@ -272,7 +275,7 @@ def _canonical_pair(F: FloatArray) -> FloatArray:
 
 
 def triangulated(P: FloatArray, m: FloatArray) -> FloatArray:
-    """Points (N, 4) of unit norm from homogeneous pixels (2, N, 3) of cameras (2, N, 3, 4): [HZ04] 12.2.
+    """Points (N, 4) of unit norm from homogeneous pixels (V, N, 3) of cameras (V, N, 3, 4): [HZ04] 12.2.
 
     Linear and all at once, to start fits; ``geometry.stereo`` has the point of minimum reprojection error.
     """
@@ -295,7 +298,7 @@ def _isotropic_frame(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class ImageFrame:
-    """Guessed principal points (2, 2) and sizes (2,) of both images, px, and whether the size was given."""
+    """Guessed principal points (V, 2) and sizes (V,) of the images, px, and whether the size was given."""
 
     center: FloatArray
     size: FloatArray
@@ -305,14 +308,22 @@ class ImageFrame:
     def of(cls, detections: Detections, image_size: ImageSize | None) -> "ImageFrame":
         """Frame of widths and heights, px, else of the extent of the data in each view."""
         if image_size is not None:
-            sizes = image_sizes(image_size)
+            sizes = image_sizes(image_size, len(detections.seen))
             return cls(0.5 * sizes, sizes.max(axis=1), True)
         # The outermost percent may be outliers.
         low, high = np.stack(
-            [np.percentile(detections.pixels[v][detections.seen[v]], [1, 99], axis=0) for v in (0, 1)], axis=1
+            [
+                np.percentile(p[s], [1, 99], axis=0)
+                for p, s in zip(detections.pixels, detections.seen, strict=True)
+            ],
+            axis=1,
         )
         size = (high - low).max(axis=1)
         return cls(0.5 * (low + high), np.where(size > 0.0, size, 1.0), False)
+
+    def of_views(self, which: list[int]) -> "ImageFrame":
+        """Frame of some views."""
+        return ImageFrame(self.center[which], self.size[which], self.known)
 
 
 def metric_guesses(

@@ -49,9 +49,10 @@ from projservo_cli.calibration.lens_estimation import fit_lens, share_explained,
 from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.time_offset import with_time_offset
+from projservo_cli.calibration.views import with_all_views, with_best_pair, with_own_noise
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import ImageSize, border_distance, image_sizes
-from projservo_cli.records import VIEWS, Calibration, Errors, InputError, Observation, letters_of
+from projservo_cli.records import Calibration, Errors, FloatArray, InputError, Observation, letters_of
 
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
@@ -149,32 +150,32 @@ def calibrate(
     solution = None
     # The matrices are small: a second thread costs more than it gives.
     with threadpool_limits(limits=1):
-        detections = Detections.of(observation, joint_types)
-        require_motion(detections)
-        require_poses(detections)
+        whole = Detections.of(observation, joint_types)
+        require_motion(whole)
+        require_poses(whole)
         if image_size is not None:
-            _require_inside(detections, image_size, _LENS_STRAYS if lens else _STRAYS)
-        require_images(detections, sigma_px)
+            _require_inside(whole, image_size, _LENS_STRAYS if lens else _STRAYS)
+        require_images(whole, sigma_px)
+        whole = with_best_pair(whole)
+        detections = whole.of_pair()
         rng = np.random.default_rng(seed)
         epipolar = epipolar_geometry(detections, rng)
         expect = partial(Expected.of, sigma_px=sigma_px, source=source, stated_px=detections.stated_px)
         expected = expect(epipolar)
         if not lens:  # else after its estimation, since it bends the epipolar lines
             expected.require_scale()
-        require_images(detections, max(epipolar.sigma_px, expected.sigma_px))
+        require_images(whole, max(epipolar.sigma_px, expected.sigma_px))
         if method == "closed_form":
             result = _closed_form(detections, epipolar, expected)
         else:
-            problem = LeastSquares.of(detections, detections.reference())
-            search = Search(
-                problem, epipolar, ImageFrame.of(detections, image_size), rng, progress, joint_noise
+            problem, frame = (
+                LeastSquares.of(detections, detections.reference()),
+                ImageFrame.of(whole, image_size),
             )
-            limit = (
-                _MAX_PREDICTED * float(search.frame.size.max())
-                if max_predicted_px is None
-                else max_predicted_px
-            )
-            solution, expected, result = _maximum_likelihood(search, expect, lens, init, limit)
+            of_pair = frame if len(whole.view) == 2 else frame.of_views([*whole.pair])
+            search = Search(problem, epipolar, of_pair, rng, progress, joint_noise)
+            limit = _MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
+            solution, expected, result = _maximum_likelihood(search, whole, frame, expect, lens, init, limit)
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
             fitted(solution, expected.noise_px(solution))
@@ -202,9 +203,9 @@ def _is_positive(value: Any) -> bool:
 
 def _require_inside(detections: Detections, image_size: ImageSize, strays: float) -> None:
     """Refuse an image size, width and height in px, with more than a share of a view's pixels outside."""
-    pixels, sizes = detections.pixels, image_sizes(image_size)
+    pixels, sizes = detections.pixels, image_sizes(image_size, len(detections.seen))
     outside = detections.seen & (border_distance(pixels, sizes[:, None]) < -_BEYOND_PX)
-    for view, name in enumerate(VIEWS):
+    for view, name in enumerate(detections.view):
         seen = detections.seen[view]
         share = float(outside[view].sum() / max(seen.sum(), 1.0))
         if share > strays:
@@ -222,38 +223,51 @@ def _require_inside(detections: Detections, image_size: ImageSize, strays: float
 
 
 def _maximum_likelihood(
-    search: Search, expect: Callable[[Epipolar], Expected], lens: bool, init: Nominal | None, limit_px: float
+    start: Search,
+    whole: Detections,
+    frame: ImageFrame,
+    expect: Callable[[Epipolar], Expected],
+    lens: bool,
+    init: Nominal | None,
+    limit_px: float,
 ) -> tuple[Solution, Expected, Calibration]:
     """Maximum-likelihood solution, its expected noise and its record.
 
+    start : search by the pair of views; whole, frame : detections and images of all views.
     Raises Misfit, naming the joint at fault if one explains it.
     """
-    epipolar = search.epipolar
+    search, epipolar = start, start.epipolar
     expected = expect(epipolar)
     try:
-        solution, note = solve(search, expected, init)
+        solution, note = solve(start, expected, init)
+        if len(whole.view) > 2:
+            solution = with_own_noise(with_all_views(solution, whole, epipolar), epipolar)[0]
+            search = dataclasses.replace(start, problem=solution.problem, frame=frame)
         if lens:
             search.progress("calibration, lens", 0, 1)
             solution, epipolar = fit_lens(solution, search)
-            expected = expect(epipolar)
+        if len(whole.view) > 2:  # once more with the lenses
+            solution, epipolar = with_own_noise(solution, epipolar)
+        expected = expect(epipolar)
+        if lens:
             expected.require_scale()
         solution = fit_joint_noise(solution, expected, search.joint_noise)
-        result = _refined(solution, epipolar, expected, search.frame, limit_px)
+        result = _refined(solution, epipolar, expected, frame, limit_px)
     except Misfit as refused:
         # The joints of a simulation are as configured, so none is at fault.
-        cause = "" if expected.known else joint_at_fault(search, REFUSE_RATIO * expected.sigma_px)
+        cause = "" if expected.known else joint_at_fault(start, REFUSE_RATIO * expected.sigma_px)
         if not cause:
             raise
         raise Misfit(f"{cause}; as given, {refused}") from None
     if not expected.known and (straight := straight_joints(solution)):
-        seen = undistorted(search.problem.detections, solution.params.lens)
-        there = LeastSquares.of(seen, search.problem.q_reference)
-        search = dataclasses.replace(search, problem=there, epipolar=epipolar)
-        if cause := joint_at_fault(search, _AS_GOOD * solution.sigma_px, straight):
+        seen = undistorted(search.problem.detections, solution.params.lens).of_pair()
+        there = LeastSquares.of(seen, start.problem.q_reference)
+        start = dataclasses.replace(start, problem=there, epipolar=epipolar)
+        if cause := joint_at_fault(start, _AS_GOOD * solution.sigma_px, straight):
             raise Misfit(f"{cause}; as given, residuals of {solution.sigma_px:.3g} px show no turn of it")
     cause = ""
     if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
-        cause = joint_at_fault(search, _DOUBTFUL_SHARE * solution.sigma_px)
+        cause = joint_at_fault(start, _DOUBTFUL_SHARE * solution.sigma_px)
     advice = tuple(filter(None, (cause, *result.advice, note)))
     return solution, expected, dataclasses.replace(result, advice=advice[:_MAX_ADVICE])
 
@@ -314,7 +328,8 @@ def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tupl
             return ()
         return (f"lens distortion would explain {100.0 * share:.0f} % of the squared residuals: try --lens",)
     k, terms = calibration.lens[:, K1:].ravel(), calibration.lens_terms
-    of_lenses = calibration.sqrt_cov_shared[-2 * terms :].reshape(2, terms, -1)[:, :LENS].reshape(k.size, -1)
+    of_lenses = calibration.sqrt_cov_shared[-len(calibration.lens) * terms :]
+    of_lenses = of_lenses.reshape(-1, terms, of_lenses.shape[-1])[:, :LENS].reshape(k.size, -1)
     statistic = k @ np.linalg.solve(of_lenses @ of_lenses.T, k)
     if statistic < chdtri(k.size, _NO_LENS_TAIL):
         return ("the images show no lens distortion: omit --lens",)
@@ -378,6 +393,7 @@ def _record(
     return Calibration(
         method=method,
         source="",
+        view=detections.view,
         joint_types=letters_of(detections.prismatic),
         usable=verdict.usable,
         reason=verdict.reason,
@@ -422,12 +438,23 @@ def _record(
         predicted_rms_px=None if verdict.error is None else verdict.error[0],
         predicted_p99_px=None if verdict.error is None else verdict.error[1],
         lens=params.lens,
+        sigma_view_px=_noise_of_views(solution),
         sigma_q=None if joint_noise is None else joint_noise.sigma_q,
         sigma_q_interval=None if joint_noise is None else joint_noise.interval,
         encoder_counts=joint_noise is not None and joint_noise.ticks,
         model_px=float(np.sqrt(over)),
         **({} if check is None else _model_fields(result, solution, check)),
     )
+
+
+def _noise_of_views(solution: Solution) -> FloatArray | None:
+    """Noise of each view per coordinate, px, from the residuals; None for two views, which share one."""
+    if len(solution.used) == 2:
+        return None
+    squares = (solution.residual / solution.problem.detections.weight[..., None]) ** 2
+    count = np.maximum(solution.used.sum(axis=1), 1)
+    free = solution.dof / (2.0 * count.sum())
+    return np.asarray(np.sqrt((squares.sum(axis=2) * solution.used).sum(axis=1) / (2.0 * count * free)))
 
 
 def _model_fields(result: Projective, solution: Solution, check: ModelCheck) -> dict[str, Any]:

@@ -92,8 +92,8 @@ class Solution:
 
     problem: LeastSquares
     params: Parameters
-    residual: FloatArray  # (2, N, 2) predicted minus seen, px, weighted
-    used: BoolArray  # (2, N) detections that count; the rest of those seen are outliers
+    residual: FloatArray  # (V, N, 2) predicted minus seen, px, weighted
+    used: BoolArray  # (V, N) detections that count; the rest of those seen are outliers
     dof: int  # degrees of freedom
     joint_noise: JointNoise | None = None  # of joint readings; None if not estimated
 
@@ -117,15 +117,15 @@ class Solution:
         return float(np.sqrt(square.mean())), self.sigma_px * float(np.sqrt(plain.mean()))
 
     def corners(self) -> tuple[FloatArray | None, FloatArray | None]:
-        """Squared residuals (K, 2, m) over their variance, and joints (K, n); None if there are many."""
+        """Squared residuals (K, V, m) over their variance, and joints (K, n); None if there are many."""
         detections = self.problem.detections
-        shape = (len(detections.q), 2, len(detections.marker))
+        shape = (len(detections.q), len(detections.seen), len(detections.marker))
         if math.prod(shape) > _MAX_CORNERS or not self.sigma_px > 0.0:
             return None, None
         squares = np.full(shape, np.nan)
         found = np.where(self.used, np.square(self.residual).mean(axis=-1) / self.sigma_px**2, np.nan)
-        for view in (0, 1):
-            squares[detections.pose_of, view, detections.marker_of] = found[view]
+        for view, of_view in enumerate(found):
+            squares[detections.pose_of, view, detections.marker_of] = of_view
         return squares, detections.q.copy()
 
     @property
@@ -226,7 +226,9 @@ class Solution:
         lengths = np.diff(edges)
         for length in np.unique(lengths[lengths > 0]):
             alike = np.flatnonzero(lengths == length)
-            for markers in np.array_split(alike, 1 + 4 * length * count * alike.size // _AT_ONCE):
+            for markers in np.array_split(
+                alike, 1 + 2 * len(self.used) * length * count * alike.size // _AT_ONCE
+            ):
                 at = (edges[markers, None] + np.arange(length)).ravel()
                 part, used = problem.rows(at), self.used[:, at, None, None]
                 J = part.derivative(self.params) * used
@@ -239,11 +241,8 @@ class Solution:
                     G = part.joint_derivative(self.params) * problem.tau * used
                     np.put_along_axis(A, at_pose[None], G, axis=3)
                 A[..., count:] = J[..., -3:]
-                A = (
-                    A.reshape(2, markers.size, length, 2, -1)
-                    .swapaxes(0, 1)
-                    .reshape(markers.size, 4 * length, -1)
-                )
+                A = A.reshape(len(A), markers.size, length, 2, -1).swapaxes(0, 1)
+                A = A.reshape(markers.size, -1, A.shape[-1])
                 yield markers, A[..., :count], A[..., count:]
 
 
@@ -356,7 +355,7 @@ def chi2_band(dof: int) -> tuple[float, float]:
 
 
 def median_px(residual: FloatArray, mask: BoolArray) -> float:
-    """Median length of the residuals (2, N, 2) in a mask (2, N), px."""
+    """Median length of the residuals (V, N, 2) in a mask (V, N), px."""
     return float(np.median(np.linalg.norm(residual[mask], axis=1)))
 
 
@@ -382,7 +381,7 @@ def fit_from(problem: LeastSquares, params: Parameters, epipolar: Epipolar) -> S
 def _robust_search(
     problem: LeastSquares, params: Parameters, rows: BoolArray, epipolar: Epipolar
 ) -> tuple[Parameters, float]:
-    """Minimize a Cauchy loss over some detections (2, N), by the screws, then by all parameters.
+    """Minimize a Cauchy loss over some detections (V, N), by the screws, then by all parameters.
 
     Returns the parameters and the median residual, px.
     """
@@ -446,7 +445,7 @@ def _of_markers(
 
 
 def _sides(depth: FloatArray, used: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """Signs (2,) of the cameras, and whether points of depths (2, N) lie on the side of most used ones."""
+    """Signs (2,) of the cameras, and whether points of depths (V, N) lie on the side of most used ones."""
     sign = np.sign((depth * used).sum(axis=1))
     return sign, np.sign(depth) == sign[:, None]
 
@@ -454,7 +453,7 @@ def _sides(depth: FloatArray, used: BoolArray) -> tuple[FloatArray, BoolArray]:
 def _within(
     problem: LeastSquares, params: Parameters, sigma: float, middle: float, rig_px: float
 ) -> tuple[Parameters, BoolArray]:
-    """Inliers (2, N) at a noise σ, px, and the parameters with markers where most of their detections agree.
+    """Inliers (V, N) at a noise σ, px, and the parameters with markers where most of their detections agree.
 
     Inliers are within 5σ. If many are not, they agree with the others of their marker, and most of the marker
     do. A pose must have a share of inliers not far below the median and, if joints have noise, residuals that
@@ -490,7 +489,7 @@ def _within(
 
 
 def _near(problem: LeastSquares, params: Parameters, limit: float) -> BoolArray:
-    """Mask (2, N) of detections within a limit, px."""
+    """Mask (V, N) of detections within a limit, px."""
     near = np.linalg.norm(problem.residual(params), axis=2) <= limit
     return np.asarray(problem.detections.seen & near)
 
@@ -544,7 +543,7 @@ def left_out_px(solution: Solution) -> float:
     raw = problem.with_noise(None).residual(params)
     U = problem.whitened(params, problem.dense(problem.derivative(params), used), used) @ few.errors().dense()
     left = problem.whitened(params, few.raw.reshape(-1, 1), used)[:, 0]
-    pose_of = np.repeat(np.tile(detections.pose_of, 2), 2)
+    pose_of = np.repeat(np.tile(detections.pose_of, len(used)), 2)
     for k in np.unique(detections.pose_of):
         rows = np.flatnonzero(pose_of == k)
         P, s, _ = np.linalg.svd(U[rows], full_matrices=False)

@@ -88,9 +88,9 @@ _MIN_SCALE = 1e-3
 
 def stationary(detections: Detections, noise_px: float) -> BoolArray:
     """Mask (m,) of markers that move in no image and so are not on the robot."""
-    move = np.zeros((detections.marker.size, 2))
-    for v in (0, 1):
-        rows = np.flatnonzero(detections.seen[v])
+    move = np.zeros((detections.marker.size, len(detections.seen)))
+    for v, seen in enumerate(detections.seen):
+        rows = np.flatnonzero(seen)
         low, high = np.full((2, detections.marker.size, 2), [[[np.inf]], [[-np.inf]]])
         np.minimum.at(low, detections.marker_of[rows], detections.pixels[v, rows])
         np.maximum.at(high, detections.marker_of[rows], detections.pixels[v, rows])
@@ -412,7 +412,7 @@ class Nominal:
     """Nominal robot, rig and markers, in one metric frame."""
 
     where: str  # name of its file, for messages
-    P: FloatArray  # (2, 3, 4) cameras to pixels
+    P: FloatArray  # (V, 3, 4) cameras to pixels
     H_hat: FloatArray  # (n, 4, 4) twists at the reference: unit rotations without pitch, or unit translations
     q_reference: FloatArray  # (n,) rad or m
     marker: IntArray  # (m,) numbers of the markers

@@ -70,7 +70,7 @@ class JointNoise:
     def estimated(
         cls, problem: LeastSquares, params: Parameters, used: BoolArray, sigma_px: float | None
     ) -> "JointNoise":
-        """Estimate by maximum likelihood from the detections used (2, N), at a noise of pixels, None for any.
+        """Estimate by maximum likelihood from the detections used (V, N), at a noise of pixels, None for any.
 
         Zero if it is not significant; that of encoder ticks if readings lie on ticks and the interval
         contains it.

@@ -34,7 +34,7 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
 
 
 def _share(solution: Solution, params: Parameters, terms: int) -> float:
-    """Share of the squared residuals that the last two terms of both lenses explain; zero if by chance.
+    """Share of the squared residuals that the last two terms of the lenses explain; zero if by chance.
 
     A score test needs no fit: the scores, orthogonal to the other parameters, give the gain; C. R. Rao,
     "Large sample tests of statistical hypotheses concerning several parameters", 1948. Errors of a pose's
@@ -43,7 +43,7 @@ def _share(solution: Solution, params: Parameters, terms: int) -> float:
     """
     detections = solution.problem.detections
     poses = np.unique(detections.pose_of[solution.used.any(axis=0)])
-    K, d = poses.size, 2 * LENS
+    K, d = poses.size, len(solution.used) * LENS
     if d + 1 >= K:
         return 0.0
     columns = _cleared_columns(solution, params, terms)
@@ -59,17 +59,19 @@ def _share(solution: Solution, params: Parameters, terms: int) -> float:
 
 
 def _undistorted(frame: ImageFrame) -> FloatArray:
-    """Lenses (2, 5) without distortion about the image centres; the radius is half the image size."""
-    return np.concatenate([frame.center, 0.5 * frame.size[:, None], np.zeros((2, LENS))], axis=1)
+    """Lenses (V, 5) without distortion about the image centres; the radius is half the image size."""
+    return np.concatenate(
+        [frame.center, 0.5 * frame.size[:, None], np.zeros((len(frame.size), LENS))], axis=1
+    )
 
 
 def _cleared_columns(solution: Solution, params: Parameters, terms: int) -> FloatArray:
-    """Changes of the images by the last two terms of both lenses (4, 2, N, 2), orthogonal to all others."""
+    """Changes of the images by the last two terms of the lenses (4, 2, N, 2), orthogonal to all others."""
     exact = LeastSquares.of(solution.problem.detections, solution.problem.q_reference, terms)
     problem = exact.with_noise(solution.problem.tau)
     J = problem.whitened(params, problem.dense(problem.derivative(params), solution.used), solution.used)
     J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    tested = (problem.joint[-1] + np.arange(2 * terms).reshape(2, terms)[:, -LENS:]).ravel()
+    tested = (problem.joint[-1] + np.arange(len(solution.used) * terms).reshape(-1, terms)[:, -LENS:]).ravel()
     others, lenses = np.delete(J, tested, axis=1), J[:, tested]
     left = lenses - others @ np.linalg.lstsq(others, lenses, rcond=None)[0]
     return np.asarray(left.T.reshape(-1, *solution.residual.shape))
@@ -100,7 +102,7 @@ def fit_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
 
 
 def _fit_terms(solution: Solution, params: Parameters, terms: int, search: Search) -> Solution | None:
-    """Fit some terms of both lenses; None if it fails, or a lens folds within the images."""
+    """Fit some terms of the lenses; None if it fails, or a lens folds within the images."""
     problem = LeastSquares.of(solution.problem.detections, solution.problem.q_reference, terms)
     found = fit_from(problem, dataclasses.replace(params, lens_terms=terms), search.epipolar)
     if found is None or found.params.lens is None:
@@ -110,7 +112,7 @@ def _fit_terms(solution: Solution, params: Parameters, terms: int, search: Searc
 
 
 def undistorted(detections: Detections, lens: FloatArray | None) -> Detections:
-    """Undistort detections by lenses (2, 5); those that no point distorts to are unseen."""
+    """Undistort detections by lenses (V, 5); those that no point distorts to are unseen."""
     if lens is None:
         return detections
     pixels = undistort(lens, detections.pixels)

@@ -43,16 +43,16 @@ def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
 
 
 def image_points(P: FloatArray, points: FloatArray) -> FloatArray:
-    """Homogeneous image points (…, 2, m, 3) of points (…, m, 4) in both cameras (2, 3, 4), [RH00] eq. (1)."""
+    """Homogeneous image points (…, 2, m, 3) of points (…, m, 4) in all cameras (V, 3, 4), [RH00] eq. (1)."""
     return np.asarray(points[..., None, :, :] @ np.swapaxes(P, 1, 2))
 
 
 def projection_derivative(
     P: FloatArray, lens: FloatArray | None, points: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Pixels (2, N, 2) of points (N, 4), and derivatives by image points (2, N, 2, 3) and terms of a lens.
+    """Pixels (V, N, 2) of points (N, 4), and derivatives by image points (V, N, 2, 3) and terms of a lens.
 
-    [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3; then the lenses (2, 5).
+    [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3; then the lenses (V, 5).
     """
     m = image_points(P, points)
     pixels = m[..., :2] / m[..., 2:]
@@ -68,14 +68,14 @@ def projection_derivative(
 class Images(NamedTuple):
     """Pixels of N observations and their derivatives."""
 
-    pixels: FloatArray  # (2, N, 2) px
+    pixels: FloatArray  # (V, N, 2) px
     points: FloatArray  # (n + 1, N, 4) the point behind each joint, entry 0 moved by all joints
-    by_camera: FloatArray  # (2, N, 2, 12)
+    by_camera: FloatArray  # (V, N, 2, 12)
     by_point: FloatArray  # (n + 1, 2, N, 2, 4) by ``points``, for fixed joints before it
-    by_lens: FloatArray | None  # (2, N, 2, 4) by the ``TERMS`` of a lens, if there is one
+    by_lens: FloatArray | None  # (V, N, 2, 4) by the ``TERMS`` of a lens, if there is one
 
     def by_joint(self, H_hat: FloatArray) -> FloatArray:
-        """Derivative (2, N, 2, n) by the joints of operators (n, 4, 4), [RH00] eqs. (7), (19)."""
+        """Derivative (V, N, 2, n) by the joints of operators (n, 4, 4), [RH00] eqs. (7), (19)."""
         velocity = self.points[:-1] @ H_hat.swapaxes(1, 2)
         return np.asarray(np.einsum("ivNrc,iNc->vNri", self.by_point[:-1], velocity))
 
@@ -84,17 +84,17 @@ class Images(NamedTuple):
 class Parameters:
     """Fitted parameters of rig, robot and markers in one frame; joint values from the reference, rad or m."""
 
-    P: FloatArray  # (2, 3, 4) cameras to pixels
+    P: FloatArray  # (V, 3, 4) cameras to pixels
     H_hat: FloatArray  # (n, 4, 4) operators at the reference
     prismatic: BoolArray  # (n,) whether the joint is prismatic
     M: FloatArray  # (m, 4) markers at the reference
-    lens: FloatArray | None = None  # (2, 5) lenses, None without
+    lens: FloatArray | None = None  # (V, 5) lenses, None without
     # (K, n) true joints less their readings at the poses of a problem, rad or m; None if they are exact
     offsets: FloatArray | None = None
     lens_terms: int = 0  # number of estimated ``TERMS`` of each lens: 0, k1 and k2, or those and the centre
 
     def predict(self, q: FloatArray) -> FloatArray:
-        """Pixels (K, 2, m, 2) of all markers at joints (K, n), [RH00] eqs. (1), (6).
+        """Pixels (K, V, m, 2) of all markers at joints (K, n), [RH00] eqs. (1), (6).
 
         NaN for a point behind the camera, or beyond the radius at which its lens model folds back.
         """
@@ -130,16 +130,17 @@ class Parameters:
     def derivative(self, q: FloatArray, images: Images | None = None) -> tuple[FloatArray, FloatArray]:
         """Derivatives of all markers' pixels by P, H_hat (ravelled), and by the marker's own coordinates.
 
-        Of shapes (K, 2, m, 2, 24 + 16 n), with more columns for the ``lens_terms`` of both views, and
-        (K, 2, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so
+        Of shapes (K, V, m, 2, 12 V + 16 n), with more columns for the ``lens_terms`` of both views, and
+        (K, V, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so
         dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of ``everywhere``, if known.
         """
         (K, n), m = q.shape, len(self.M)
         pose_of = np.repeat(np.arange(K), m)
         images = self.everywhere(q) if images is None else images
-        joints, lenses, terms = 2 * CAMERA, 2 * CAMERA + 16 * n, self.lens_terms
-        J = np.zeros((2, K * m, 2, lenses + 2 * terms))
-        for v in (0, 1):
+        V, joints, terms = len(self.P), self.P.size, self.lens_terms
+        lenses = joints + 16 * n
+        J = np.zeros((V, K * m, 2, lenses + V * terms))
+        for v in range(V):
             J[v, ..., v * CAMERA : (v + 1) * CAMERA] = images.by_camera[v]
             if images.by_lens is not None:
                 J[v, ..., lenses + v * terms : lenses + (v + 1) * terms] = images.by_lens[v][..., :terms]
@@ -149,21 +150,23 @@ class Parameters:
             D, Y = images.by_point[i], images.points[i + 1]
             Y, HY = Y[:, None, None], (Y @ H.T)[:, None, None]
             block = D[..., None] * (s * Y + c * HY) + (c * (D @ H)[..., None]) * Y
-            J[..., joints + 16 * i : joints + 16 * (i + 1)] = block.reshape(2, K * m, 2, 16)
-        shared, own = (part.reshape(2, K, m, 2, -1).swapaxes(0, 1) for part in (J, images.by_point[n]))
+            J[..., joints + 16 * i : joints + 16 * (i + 1)] = block.reshape(V, K * m, 2, 16)
+        shared, own = (part.reshape(V, K, m, 2, -1).swapaxes(0, 1) for part in (J, images.by_point[n]))
         return shared, own
 
     def gauge(self) -> FloatArray:
-        """Orthonormal directions (24 + 16 n + 4 m, 18) of P, H_hat, M that change no image.
+        """Orthonormal directions (12 V + 16 n + 4 m, 16 + V) of P, H_hat, M that change no image.
 
         They change the frame and the scales of both cameras; rows of zeros for the lenses precede M.
         """
         Z = np.eye(16).reshape(16, 1, 4, 4)
-        lenses = np.zeros((16, 2 * self.lens_terms))
+        V = len(self.P)
+        lenses = np.zeros((16, V * self.lens_terms))
         parts = -(self.P @ Z), Z @ self.H_hat - self.H_hat @ Z, lenses, self.M @ Z.swapaxes(2, 3)
         frame = np.hstack([part.reshape(16, -1) for part in parts])
-        cameras = np.zeros((2, frame.shape[1]))
-        cameras[0, :CAMERA], cameras[1, CAMERA : 2 * CAMERA] = self.P.reshape(2, CAMERA)
+        cameras = np.zeros((V, frame.shape[1]))
+        for v, P in enumerate(self.P):
+            cameras[v, v * CAMERA : (v + 1) * CAMERA] = P.ravel()
         return np.asarray(np.linalg.svd(np.vstack([frame, cameras]).T, full_matrices=False)[0])
 
 
@@ -197,7 +200,7 @@ def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
 
     Returns
     -------
-    (K, 2, m, 2) pixels, markers in the order of ``calibration.marker``; NaN for a point behind the camera,
+    (K, V, m, 2) pixels, markers in the order of ``calibration.marker``; NaN for a point behind the camera,
     or beyond the radius at which its lens model folds back.
 
     Raises
@@ -210,13 +213,13 @@ def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
 
 
 def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
-    """Variances (K, 2, m, 2) of predicted pixels u, v from the covariance of the calibration, px².
+    """Variances (K, V, m, 2) of predicted pixels u, v from the covariance of the calibration, px².
 
     calibration : projective kinematics with its covariance; q : (K, n) joint readings, rad or m.
     Raises InputError if the readings have another number of joints or are not finite.
     """
     params, q = _checked(calibration, q)
-    result = np.empty((len(q), 2, len(params.M), 2))
+    result = np.empty((len(q), len(params.P), len(params.M), 2))
     for k in range(len(q)):  # a pose at a time, to bound the memory
         common, own = pixel_changes(params, calibration.errors, q[k : k + 1])
         result[k] = ((common**2).sum(axis=-1) + (own**2).sum(axis=-1))[0]
@@ -226,7 +229,7 @@ def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
 def pixel_changes(
     params: Parameters, errors: Errors, q: FloatArray, images: Images | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Changes of all pixels (K, 2, m, 2, r) and (K, 2, m, 2, 3) by ``errors``, joints from the reference."""
+    """Changes of all pixels (K, V, m, 2, r) and (K, V, m, 2, 3) by ``errors``, joints from the reference."""
     shared, by_marker = params.derivative(q, images)
     return shared @ errors.shared + by_marker @ errors.marker, by_marker @ errors.own
 
@@ -234,13 +237,13 @@ def pixel_changes(
 def dense_pixel_changes(
     params: Parameters, errors: Errors, q: FloatArray, images: Images | None = None
 ) -> FloatArray:
-    """Changes of all pixels by all ``errors``, (K, 2, m, 2, r + 3 m): for few markers."""
+    """Changes of all pixels by all ``errors``, (K, V, m, 2, r + 3 m): for few markers."""
     m = len(params.M)
     return apart(*pixel_changes(params, errors, q, images), np.arange(m)[:, None], m)
 
 
 def error_factor(calibration: Calibration) -> FloatArray:
-    """Factor (24 + 16 n + 4 m, r + 3 m) of the covariance of P, H_hat_0, lenses, M: for few markers.
+    """Factor (12 V + 16 n + 4 m, r + 3 m) of the covariance of P, H_hat_0, lenses, M: for few markers.
 
     The gauge is fixed to errors of minimum norm. Rows of the lenses precede M.
     """
@@ -258,7 +261,7 @@ def error_factor_with_model(calibration: Calibration) -> FloatArray:
 
 
 def joint_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
-    """Derivative (K, 2, m, 2, n) of predicted pixels by joints (K, n), px per rad or m."""
+    """Derivative (K, V, m, 2, n) of predicted pixels by joints (K, n), px per rad or m."""
     params, q = _checked(calibration, q)
     J = params.everywhere(q).by_joint(params.H_hat)
-    return np.asarray(J.reshape(2, len(q), len(params.M), *J.shape[2:]).swapaxes(0, 1))
+    return np.asarray(J.reshape(len(params.P), len(q), len(params.M), *J.shape[2:]).swapaxes(0, 1))

@@ -61,7 +61,9 @@ def require_seconds(where: str, observation: Observation) -> None:
     """
     motion = np.zeros(len(observation.pose)) if observation.moving is None else observation.moving
     spans = dict[str, float]()
-    for name, t in zip(("t_q", "t_left", "t_right"), _stamps(observation), strict=True):
+    for name, t in zip(
+        ("t_q", *(f"t_{name}" for name in observation.view)), _stamps(observation), strict=True
+    ):
         motions = [np.sort(t[motion == k]) for k in np.unique(motion[motion > 0])]
         steps = np.concatenate([np.diff(one[np.isfinite(one)]) for one in motions] or [np.zeros(0)])
         if not steps.any():
@@ -168,11 +170,13 @@ def with_time_offset(calibration: Calibration, observation: Observation) -> Cali
     moving, t_q = observation.moving, observation.t_q
     if moving is None or t_q is None:
         return calibration
-    for name, t in zip(("t_q", "t_left", "t_right"), _stamps(observation)[:, moving > 0], strict=True):
+    for name, t in zip(
+        ("t_q", *(f"t_{name}" for name in observation.view)), _stamps(observation)[:, moving > 0], strict=True
+    ):
         if t.size >= _MIN_FRAMES and (t == np.rint(t)).all() and (np.diff(t) == 0.0).any():
             whole = f"{name} of poses in motion are whole seconds, so no latency of the images was estimated"
             return replace(calibration, advice=(*calibration.advice, f"{whole}: record their fractions"))
-    views = [_Frames.of(calibration, observation, view, moving, t_q) for view in (0, 1)]
+    views = [_Frames.of(calibration, observation, view, moving, t_q) for view in range(len(observation.view))]
     found = [result for result in map(_time_offset, views) if result is not None]
     if len(found) < len(views):
         return calibration

@@ -51,7 +51,7 @@ class Tracks:
         self.motion = params.motion(problem.joints(params))
 
     def _grams(self, M: FloatArray, rows: IntArray, sigma: float) -> FloatArray:
-        """Gram matrices (2, R, 4, 4) of derivatives and residuals, in σ, of observations of points (R, 3)."""
+        """Gram matrices (V, R, 4, 4) of derivatives and residuals, in σ, of observations of points (R, 3)."""
         detections, params = self.detections, self.params
         motion = self.motion[detections.pose_of[rows]]
         points = (motion[..., :3] @ M[..., None])[..., 0] + motion[..., 3]
@@ -93,10 +93,11 @@ class Tracks:
         chosen = np.flatnonzero(count > number)
         step = np.maximum(count[chosen] / _CANDIDATES, 1.0)
         rows = both[first[chosen] + (number * step).astype(np.int64)]
-        pixels = detections.pixels[:, rows]
+        pair = [*detections.pair]
+        pixels = detections.pixels[pair][:, rows]
         if params.lens is not None:
-            pixels = undistort(params.lens, pixels)
-        M = triangulated(params.P[:, None] @ self.motion[detections.pose_of[rows]], homogeneous(pixels))
+            pixels = undistort(params.lens[pair], pixels)
+        M = triangulated(params.P[pair][:, None] @ self.motion[detections.pose_of[rows]], homogeneous(pixels))
         points = np.full((len(wanted), 3), np.nan)
         points[chosen] = M[:, :3] / M[:, 3:]
         return points
@@ -130,10 +131,10 @@ class Tracks:
         return best, loss
 
     def reject_misfits(self, sigma: float, used: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Markers (m, 4), and detections (2, N) that fit the prediction by the others of their marker.
+        """Markers (m, 4), and detections (V, N) that fit the prediction by the others of their marker.
 
         By χ² of each detection and of each observation by both views, at a noise σ, px. If no more misfit
-        than by chance, the given markers and detections ``used`` (2, N).
+        than by chance, the given markers and detections ``used`` (V, N).
         """
         M, used = self.params.M.copy(), used.copy()
         for rows, some, marker in self._parts(np.arange(used.shape[1])):
@@ -145,7 +146,7 @@ class Tracks:
     def _without_misfits(
         self, M: FloatArray, rows: IntArray, marker: IntArray, used: BoolArray, sigma: float
     ) -> tuple[FloatArray, BoolArray]:
-        """Reject misfits of the markers (m, 3) of some rows (R,); points, and detections (2, R) that fit.
+        """Reject misfits of the markers (m, 3) of some rows (R,); points, and detections (V, R) that fit.
 
         Ends of tracks after a slip are rejected first, then the worst misfits, since these spoil the
         prediction of the rest.
@@ -197,8 +198,8 @@ def _solve_grams(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _following(values: FloatArray | BoolArray, marker: IntArray) -> FloatArray:
-    """Sums (2, N, …) of values (2, N, …) over each observation and its successors in the track."""
-    sums = np.zeros((2, marker.size + 1, *values.shape[2:]))
+    """Sums (V, N, …) of values (V, N, …) over each observation and its successors in the track."""
+    sums = np.zeros((len(values), marker.size + 1, *values.shape[2:]))
     sums[:, :-1] = np.cumsum(values[:, ::-1], axis=1)[:, ::-1]
     return sums[:, :-1] - sums[:, np.searchsorted(marker, marker, side="right")]
 
@@ -206,10 +207,10 @@ def _following(values: FloatArray | BoolArray, marker: IntArray) -> FloatArray:
 def _slipped(
     counted: FloatArray, used: BoolArray, seen: BoolArray, total: FloatArray, marker: IntArray
 ) -> BoolArray:
-    """Detections (2, N) of the end of each track, in a view or both, that fits the rest worst, if it misfits.
+    """Detections (V, N) of the end of each track, in a view or both, that fits the rest worst, if it misfits.
 
     It tests whole ends, since two slips among five observations hide each other. At least half of a
-    track stays. From Gram matrices of detections that count (2, N, 4, 4), and their sums (m, 4, 4).
+    track stays. From Gram matrices of detections that count (V, N, 4, 4), and their sums (m, 4, 4).
     """
     end, count = _following(counted, marker), _following(used, marker)
     whole, kept = (np.bincount(marker, part.sum(axis=0), len(total)) for part in (seen, used))
@@ -233,9 +234,9 @@ def _slipped(
 
 
 def _slipping(square: FloatArray, seen: BoolArray) -> bool:
-    """Whether many more detections (2, N) have small errors than by chance, as in tracks that slip.
+    """Whether many more detections (V, N) have small errors than by chance, as in tracks that slip.
 
-    square : (2, N) squared residuals; an error is small between the bound of chance and gross errors.
+    square : (V, N) squared residuals; an error is small between the bound of chance and gross errors.
     """
     between = np.count_nonzero(seen & (square > chdtri(2, _THOUSANDTH)) & (square <= _GROSS**2))
     chance = _THOUSANDTH * np.count_nonzero(seen)

@@ -8,13 +8,14 @@ STEP = 1e-30  # of the complex differentiation: exact to round-off, nothing canc
 
 
 def images(x, joint_types, m, dq):
-    """Pixels (K, 2, m, 2) from cameras, axes, directions and markers ravelled in x; holds for complex x.
+    """Pixels (K, V, m, 2) from cameras, axes, directions and markers ravelled in x; holds for complex x.
 
     A screw is any (w, v): w is scaled to one and v freed of its part along w, so that the redundant
     directions of x change no image. A direction is scaled to one.
     """
     n = len(joint_types)
-    P, x = x[:24].reshape(2, 3, 4), x[24:]
+    cameras = len(x) - 6 * n - 3 * m
+    P, x = x[:cameras].reshape(-1, 3, 4), x[cameras:]
     screws, X = x[: 6 * n].reshape(n, 6), x[6 * n :].reshape(m, 3)
     points = np.broadcast_to(X, (len(dq), m, 3))
     for i in range(n - 1, -1, -1):

@@ -3,16 +3,19 @@
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import expm
 
 from projservo_cli.records import FloatArray, Observation
 
 IMAGE_SIZE = (1280, 1024)
+NAMES = ("left", "right", "top", "low")  # of the views
+PLACES = ((-0.5, 0.0), (0.5, 0.0), (0.1, 1.3), (-0.2, -0.9))  # of the cameras, in baselines
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """Metric truth: twists (n, 4, 4) at q_reference, cameras (2, 3, 4), markers (m, 4) at the reference."""
+    """Metric truth: twists (n, 4, 4) at q_reference, cameras (V, 3, 4), markers (m, 4) at the reference."""
 
     joint_types: str
     twists: FloatArray
@@ -21,8 +24,8 @@ class Robot:
     q_reference: FloatArray
 
     def projected(self, q: FloatArray) -> FloatArray:
-        """Homogeneous image points (K, 2, 3, m) at joint readings (K, n), the third the depths in m."""
-        result = np.empty((len(q), 2, 3, len(self.markers)))
+        """Homogeneous image points (K, V, 3, m) at joint readings (K, n), the third the depths in m."""
+        result = np.empty((len(q), len(self.cameras), 3, len(self.markers)))
         for k, row in enumerate(q):
             T = np.eye(4)
             for twist, amount in zip(self.twists, row - self.q_reference, strict=True):
@@ -31,23 +34,23 @@ class Robot:
         return result
 
     def images(self, q: FloatArray) -> FloatArray:
-        """Noise-free pixels (K, 2, m, 2) at joint readings (K, n)."""
+        """Noise-free pixels (K, V, m, 2) at joint readings (K, n)."""
         m = self.projected(q)
         return np.swapaxes(m[:, :, :2] / m[:, :, 2:], 2, 3)
 
-    def observe(self, q: FloatArray, sigma: float, rng: np.random.Generator) -> Observation:
-        """Observation with normal noise; the numbers of poses and markers have gaps on purpose."""
+    def observe(self, q: FloatArray, sigma: npt.ArrayLike, rng: np.random.Generator) -> Observation:
+        """Observation with normal noise of each view; numbers of poses and markers have gaps on purpose."""
         images = self.images(q)
-        images = images + sigma * rng.standard_normal(images.shape)
-        m = len(self.markers)
-        return Observation(3 + 2 * np.arange(len(q)), 5 + 3 * np.arange(m), q.copy(), images)
+        images = images + np.reshape(sigma, (-1, 1, 1)) * rng.standard_normal(images.shape)
+        m, view = len(self.markers), NAMES[: len(self.cameras)]
+        return Observation(3 + 2 * np.arange(len(q)), 5 + 3 * np.arange(m), q.copy(), images, view)
 
 
-def rig(baseline: float = 0.3, distance: float = 1.4, focal: float = 1200.0) -> FloatArray:
-    """Two converging cameras that look at the origin from a distance, px per m."""
+def rig(baseline: float = 0.3, distance: float = 1.4, focal: float = 1200.0, views: int = 2) -> FloatArray:
+    """Converging cameras that look at the origin from a distance, px per m; those beyond two from above."""
     cameras = []
-    for side in (-0.5, 0.5):
-        center = np.array([side * baseline, 0.0, -distance])
+    for side, above in PLACES[:views]:
+        center = np.array([side * baseline, above * baseline, -distance])
         z = -center / np.linalg.norm(center)
         x = np.cross([0.0, 1.0, 0.0], z)
         x /= np.linalg.norm(x)
@@ -73,7 +76,7 @@ def prismatic(v: FloatArray) -> FloatArray:
     return twist
 
 
-def random_robot(joint_types: str, rng: np.random.Generator, markers: int = 10) -> Robot:
+def random_robot(joint_types: str, rng: np.random.Generator, markers: int = 10, views: int = 2) -> Robot:
     """Axes of any direction through points within 0.4 m of the body's centre; a body of 0.1 m."""
     twists = []
     for letter in joint_types:
@@ -82,7 +85,7 @@ def random_robot(joint_types: str, rng: np.random.Generator, markers: int = 10) 
         twists.append(prismatic(direction) if letter == "P" else revolute(direction, point))
     body = rng.uniform(-0.1, 0.1, (markers, 3))
     q = rng.uniform(-1.0, 1.0, len(joint_types))
-    return Robot(joint_types, np.array(twists), rig(), np.hstack([body, np.ones((markers, 1))]), q)
+    return Robot(joint_types, np.array(twists), rig(views=views), np.hstack([body, np.ones((markers, 1))]), q)
 
 
 def trials(

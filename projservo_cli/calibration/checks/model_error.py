@@ -28,7 +28,7 @@ from projservo_cli.calibration.detections import SAME_READING, Detections, per_r
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.prediction import LENS, Images, Parameters
 from projservo_cli.geometry.displacements import cross_matrix
-from projservo_cli.records import CORNERS, VIEWS, BoolArray, Errors, FloatArray, IntArray, ModelError
+from projservo_cli.records import CORNERS, BoolArray, Errors, FloatArray, IntArray, ModelError
 
 # Probability of chance above which no nuisance is found.
 _CHANCE = 1e-4
@@ -92,7 +92,7 @@ class _Nuisance(NamedTuple):
     kind: str
     joints: tuple[int, ...]  # from 0
     view: int | None
-    columns: FloatArray  # (2, N, 2, d) weighted, by its amplitudes
+    columns: FloatArray  # (V, N, 2, d) weighted, by its amplitudes
     timed: int = _NO_TIME  # whether it drifts or steps over the order of poses
     tag: int | None = None  # of a single tag
 
@@ -117,7 +117,8 @@ class _Extent(NamedTuple):
         problem, detections, used = solution.problem, solution.problem.detections, solution.used
         q, depths = problem.q[np.unique(detections.pose_of)], problem.pixels(solution.params)[1]
         low, high = (
-            np.stack([end(detections.pixels[v][used[v]], axis=0) for v in (0, 1)]) for end in (np.min, np.max)
+            np.stack([end(seen[u], axis=0) for seen, u in zip(detections.pixels, used, strict=True)])
+            for end in (np.min, np.max)
         )
         depth = np.array([[d[u].mean(), max(d[u].std(), 1e-12)] for d, u in zip(depths, used, strict=True)])
         half = np.maximum(0.5 * np.ptp(q, axis=0), 1e-9)
@@ -130,7 +131,7 @@ def _nuisances(problem: LeastSquares, params: Parameters, extent: _Extent) -> li
     detections, q = problem.detections, problem.joints(params)
     images = params.images(q, detections.pose_of, detections.marker_of)
     found = _of_readings(problem, params, q, extent, images)
-    for v in (0, 1):
+    for v in range(len(params.P)):
         found += _of_view(problem, params, extent, images, v)
     center = params.M[:, :3].mean(axis=0)
     rigid = np.zeros((6, 4, 4))
@@ -246,13 +247,17 @@ class _Tests:
 
     def __init__(self, solution: Solution, errors: Errors, nuisances: Sequence[_Nuisance]) -> None:
         problem, params, used = solution.problem, solution.params, solution.used
-        pose_of = np.repeat(np.tile(problem.detections.pose_of, 2), 2)
+        pose_of = np.repeat(np.tile(problem.detections.pose_of, len(used)), 2)
         counted = np.flatnonzero(np.repeat(used.ravel(), 2))
         counted = counted[np.argsort(pose_of[counted], kind="stable")]
         self.poses, starts = np.unique(pose_of[counted], return_index=True)
         self.edges = np.append(starts, counted.size)
         self.nuisances, self.dof = nuisances, max(solution.dof, 1)
-        self.pose = problem.detections.pose
+        self.pose, self.view = problem.detections.pose, problem.detections.view
+        # Weights of residuals in each view, and in the last entry in all: those of two views are near one.
+        weights = [problem.detections.weight[v, u] for v, u in enumerate(used)]
+        weights.append(problem.detections.weight[used])
+        self.weight = [1.0 if len(used) == 2 else float(np.sqrt(np.mean(w**2))) for w in weights]
         self.posture = _postures(problem.q[self.poses])
 
         def whitened(columns: FloatArray) -> FloatArray:
@@ -265,7 +270,7 @@ class _Tests:
         r = -whitened(solution.raw.reshape(-1, 1))[:, 0]
         self.r = self.r_first = r - self.U @ (self.U.T @ r)
         flat = [one.columns * used[..., None, None] for one in nuisances]
-        Z = whitened(np.concatenate(flat, axis=3).reshape(4 * used.shape[1], -1))
+        Z = whitened(np.concatenate(flat, axis=3).reshape(2 * used.size, -1))
         self.parts = np.cumsum([0, *(one.columns.shape[3] for one in nuisances)])
         self.units = list[FloatArray]()
         for number, one in enumerate(nuisances):
@@ -468,7 +473,7 @@ def examine(
     """Test a fit for nuisances, and return their effect at other poses.
 
     solution : fit, of few markers; errors : of its parameters at a noise of one pixel.
-    there : problem of the same markers at the other poses; inside : (2, N) its images that count.
+    there : problem of the same markers at the other poses; inside : (V, N) its images that count.
     T : (rows, r) changes of these images by ``errors``; sigma_px : noise of a coordinate, px.
     """
     extent = _Extent.of(solution)
@@ -526,7 +531,10 @@ def stepped(solution: Solution, onset: int) -> ModelError | None:
         b = np.linalg.lstsq(Z, off)[0]
         if (square := float(np.square(off - Z @ b).sum())) < left:
             size = float(np.sqrt(np.mean((Z @ b / weight) ** 2)) if one.kind in _OF_IMAGES else -b[0])
-            joints, view = tuple(i + 1 for i in one.joints), "" if one.view is None else VIEWS[one.view]
+            joints, view = (
+                tuple(i + 1 for i in one.joints),
+                "" if one.view is None else detections.view[one.view],
+            )
             first, left = int(detections.pose[onset]), square
             best = ModelError(one.kind, joints, view, size, 0.0, abs(size), first)
     return best
@@ -641,10 +649,12 @@ def _described(
     one, length = tests.nuisances[number], max(float(np.linalg.norm(b)), 1e-300)
     sign = -1.0 if (len(b) == 1 or one.kind == "scale") and (b < 0.0).all() else 1.0
     deviation = float(np.sqrt(max(float(b @ covariance @ b), 0.0))) / length
-    joints, view = tuple(i + 1 for i in one.joints), "" if one.view is None else VIEWS[one.view]
+    joints, view = tuple(i + 1 for i in one.joints), "" if one.view is None else tests.view[one.view]
     size = _SIZES[one.kind]
     if one.kind == "scale":  # of several joints the root mean square
         size /= np.sqrt(len(joints))
+    if one.kind in _OF_IMAGES:  # px as seen
+        size /= tests.weight[-1 if one.view is None else one.view]
     return ModelError(one.kind, joints, view, sign * size * length, size * deviation, effect, first)
 
 

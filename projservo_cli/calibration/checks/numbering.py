@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, sampson
 from projservo_cli.geometry.displacements import homogeneous
-from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray, Observation, WorkFailed
+from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation, WorkFailed
 
 # Minimum number of poses at which both views saw a marker, to judge its number.
 _MIN_POSES = 8
@@ -64,8 +64,9 @@ def _require_one_pose(detections: Detections) -> None:
         with suppress(WorkFailed):
             noise_px = Epipolar.of(shifted, np.random.default_rng(0)).sigma_px
         if noise_px < _MUCH_NOISE_PX:
+            names = [detections.view[v] for v in detections.pair]
             raise WorkFailed(
-                f"each {VIEWS[late]} image shows the pose before that of the {VIEWS[1 - late]} one, by the "
+                f"each {names[late]} image shows the pose before that of the {names[1 - late]} one, by the "
                 "epipolar geometry: let each pose settle for longer (plant.settle_s), and take the newest "
                 "frame of both cameras"
             )
@@ -154,10 +155,11 @@ def _true_order(detections: Detections, epipolar: Epipolar, limit: float) -> Int
 
 
 def _dense(detections: Detections, which: IntArray) -> FloatArray:
-    """Pixels (2, K, s, 2) of some markers in both views, NaN where unseen."""
+    """Pixels (V, K, s, 2) of some markers in both views, NaN where unseen."""
     pixels = np.full((2, len(detections.q), detections.marker.size, 2), np.nan)
-    for v, seen in enumerate(detections.seen):
-        pixels[v, detections.pose_of[seen], detections.marker_of[seen]] = detections.pixels[v, seen]
+    for here, v in zip(pixels, detections.pair, strict=True):
+        seen = detections.seen[v]
+        here[detections.pose_of[seen], detections.marker_of[seen]] = detections.pixels[v, seen]
     return pixels[:, :, which]
 
 

@@ -16,7 +16,7 @@ from projservo_cli.calibration.epipolar import OUTLIER
 from projservo_cli.calibration.fit import Solution, median_px
 from projservo_cli.calibration.initialization import stationary
 from projservo_cli.calibration.prediction import Parameters
-from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray
+from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 # Median residual, in σ, below which a corrected joint reading explains a pose.
 _CORRECTED = 3.0
@@ -42,7 +42,7 @@ class Outliers:
     id_switches: IntArray  # (W, 3) row of the pose, index of the marker as numbered and of the true one
     poses: IntArray  # (P,) rows of poses whose images show other joints than those read
     moved: IntArray  # (V, 2) row of the pose and view of images that a motion of the camera explains
-    explained: BoolArray  # (2, N) detections that these explain
+    explained: BoolArray  # (V, N) detections that these explain
 
     @classmethod
     def empty(cls, detections: Detections) -> "Outliers":
@@ -80,7 +80,7 @@ class Outliers:
 
 
 def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
-    """Images (V, 2), pose and view, mostly rejected by ``out`` (2, N), that fit a camera that moved a little.
+    """Images (V, 2), pose and view, mostly rejected by ``out`` (V, N), that fit a camera that moved a little.
 
     It shifts, turns and scales the image, and is small against the spread of its markers, as the motion by a
     wrong joint is not.
@@ -89,7 +89,7 @@ def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
     detections = problem.detections
     residual = problem.with_noise(None).residual(solution.params)
     residual /= np.maximum(detections.weight[..., None], 1e-300)
-    for view, k in itertools.product((0, 1), np.unique(detections.pose_of[out.any(axis=0)])):
+    for view, k in itertools.product(range(len(out)), np.unique(detections.pose_of[out.any(axis=0)])):
         rows = np.flatnonzero(detections.seen[view] & (detections.pose_of == k))
         if rows.size < _SEEN_OF_IMAGE or np.count_nonzero(out[view, rows]) < _MOSTLY * rows.size:
             continue
@@ -111,7 +111,7 @@ def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
 def describe_moved(detections: Detections, moved: IntArray) -> str:
     """Describe images (V, 2) of cameras that moved, by runs of poses in the order of the recording."""
     present, sentences = np.unique(detections.pose_of), []
-    for view, name in enumerate(VIEWS):
+    for view, name in enumerate(detections.view):
         at = np.searchsorted(present, np.sort(moved[moved[:, 1] == view, 0]))
         if not at.size:
             continue
@@ -127,7 +127,7 @@ def describe_moved(detections: Detections, moved: IntArray) -> str:
 def _id_switches(
     problem: LeastSquares, params: Parameters, out: BoolArray, limit: float
 ) -> tuple[IntArray, BoolArray]:
-    """Observations (W, 3) that lie where another marker belongs in every view, and their detections (2, N).
+    """Observations (W, 3) that lie where another marker belongs in every view, and their detections (V, N).
 
     The other marker is unseen or rejected there. A detection that fits its own marker contradicts a switch.
     """
@@ -144,7 +144,7 @@ def _id_switches(
         free[detections.marker_of[here & ~out.any(axis=0)]] = False
         predicted = np.nan_to_num(params.predict(joints[k : k + 1])[0], nan=-np.inf)
         others = np.flatnonzero(free & np.isfinite(predicted).all(axis=(0, 2)))
-        trees = [cKDTree(predicted[v, others]) for v in (0, 1)]
+        trees = [cKDTree(of_view[others]) for of_view in predicted]
         for row in rows[here[rows]]:
             # A view that did not see the marker counts for nothing.
             near = [
@@ -210,9 +210,12 @@ def _corrected_level(pose: LeastSquares, params: Parameters, joints: list[int], 
 
 
 def outlier_rows(detections: Detections, out: BoolArray) -> IntArray:
-    """List the detections of a mask (2, N) as sorted rows (L, 3): pose, marker number, view (2 for both)."""
-    rows = np.flatnonzero(out.any(axis=0))
-    view = np.where(out[:, rows].all(axis=0), 2, np.where(out[0, rows], 0, 1))
+    """List the detections of a mask (V, N) as sorted rows (L, 3): pose, marker number, view (V for all).
+
+    An observation that several views lose, but not all of them, has a row for each.
+    """
+    whole = out.all(axis=0)
+    view, rows = np.nonzero(np.vstack([out & ~whole, whole]))
     found = np.stack(
         [detections.pose[detections.pose_of[rows]], detections.marker[detections.marker_of[rows]], view],
         axis=1,

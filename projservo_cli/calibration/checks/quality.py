@@ -70,7 +70,7 @@ class _Uncertainty:
         """Uncertainty at up to ``MAX_JUDGED`` markers, in the region of all."""
         detections = solution.problem.detections
         low, high = (
-            np.stack([extreme(detections.pixels[v][detections.seen[v]], axis=0) for v in (0, 1)])
+            np.stack([extreme(p[s], axis=0) for p, s in zip(detections.pixels, detections.seen, strict=True)])
             for extreme in (np.min, np.max)
         )
         wide = 0.5 * (high - low)
@@ -78,7 +78,7 @@ class _Uncertainty:
         return cls(solution.problem, solution.params, errors, which, np.stack([low - wide, high + wide]))
 
     def in_region(self, q: FloatArray) -> BoolArray:
-        """Mask (2, K, m) of images at poses (K, n) in the region."""
+        """Mask (V, K, m) of images at poses (K, n) in the region."""
         some = dataclasses.replace(self.params, M=self.params.M[self.which])
         pixels = some.predict(q - self.problem.q_reference).swapaxes(0, 1)
         low, high = self.region[:, :, None, None]
@@ -103,7 +103,7 @@ class _Uncertainty:
         detections = self.problem.detections.everywhere(q, self.which)
         there = LeastSquares.of(detections, q_reference, self.problem.lens_terms)
         common, own = there.predicted(self.params, self.errors)
-        inside = inside.swapaxes(1, 2).reshape(2, -1)  # observations are in the order of markers
+        inside = inside.swapaxes(1, 2).reshape(len(inside), -1)  # observations are in the order of markers
         marker = np.nonzero(inside)[1] // len(q)
         T = apart(common[inside], own[inside], marker[:, None], self.which.size)
         return _Predictions(there, inside, T.reshape(-1, T.shape[-1]))
@@ -136,7 +136,7 @@ class _Predictions(NamedTuple):
     """Predicted images of the markers assessed, and their changes by errors of the parameters."""
 
     there: LeastSquares  # of these images
-    inside: BoolArray  # (2, N) whether an image is in the region
+    inside: BoolArray  # (V, N) whether an image is in the region
     T: FloatArray  # (rows, r) changes of coordinates in the region by independent errors of size one
 
 

@@ -20,7 +20,7 @@ from projservo_cli.calibration.fit import (
 )
 from projservo_cli.calibration.initialization import Search, starting_markers, starts
 from projservo_cli.calibration.lens_estimation import undistorted
-from projservo_cli.records import VIEWS, BoolArray, FloatArray, WorkFailed, letters_of
+from projservo_cli.records import BoolArray, FloatArray, WorkFailed, letters_of
 
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
 DOUBTED_RATIO = 1.15
@@ -210,7 +210,10 @@ def describe_deviation(solution: Solution, expected: Expected) -> str:
     if expected.known or solution.dof <= 0:
         return ""
     errors = check_model(solution, solution.errors(), expected.noise_px(solution)).errors
-    onset, prismatic = _change(_rejected_views(solution))[0], solution.params.prismatic
+    onset, prismatic = (
+        _change(_rejected_views(solution), solution.problem.detections.view)[0],
+        solution.params.prismatic,
+    )
     if not onset and errors and errors[0].first is not None:
         onset = int(np.argmax(solution.problem.detections.pose == errors[0].first))
     found = (stepped(solution, onset) if onset else None) or next(iter(errors), None)
@@ -222,7 +225,8 @@ def refusal(solution: Solution, expected: Expected) -> str | None:
     if (of_noise := expected.refusal(solution)) is not None:
         return of_noise
     rejected = _rejected_views(solution)
-    return _change(rejected)[1] or _describe_order(solution, rejected) or _describe_unmoved(solution)
+    names = solution.problem.detections.view
+    return _change(rejected, names)[1] or _describe_order(solution, rejected) or _describe_unmoved(solution)
 
 
 def _describe_unmoved(solution: Solution) -> str | None:
@@ -238,23 +242,24 @@ def _describe_unmoved(solution: Solution) -> str | None:
 
 
 def _rejected_views(solution: Solution) -> BoolArray:
-    """Whether a view (2, K) of a pose is mostly rejected."""
+    """Whether a view (V, K) of a pose is mostly rejected."""
     detections = solution.problem.detections
-    seen, used = np.zeros((2, 2, len(detections.q)))
-    for view in (0, 1):
+    V = len(solution.used)
+    seen, used = np.zeros((2, V, len(detections.q)))
+    for view in range(V):
         np.add.at(seen[view], detections.pose_of, detections.seen[view])
         np.add.at(used[view], detections.pose_of, solution.used[view])
     return np.asarray(used < _KEPT * seen)
 
 
-def _change(rejected: BoolArray) -> tuple[int, str]:
+def _change(rejected: BoolArray, names: Sequence[str]) -> tuple[int, str]:
     """Row from or up to which poses are nearly all rejected, and a sentence on it; 0 and none without.
 
-    rejected : (2, K) views of poses that mostly are.
+    rejected : (V, K) views of poses that mostly are; names : of the views.
     """
     views = [
         ("", rejected.all(axis=0)),
-        *((f" in the {name} view", rejected[v]) for v, name in enumerate(VIEWS)),
+        *((f" in the {name} view", rejected[v]) for v, name in enumerate(names)),
     ]
     for where, gone in views:
         for which, row in (("first", gone), ("last", gone[::-1])):
@@ -272,7 +277,7 @@ def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:
     """Describe poses of several joints that are rejected where those of one are not, or None.
 
     One joint at a time moves alike whichever column its readings are in: only together they show the order.
-    rejected : (2, K) views of poses that mostly are.
+    rejected : (V, K) views of poses that mostly are.
     """
     detections, lost = solution.problem.detections, rejected.all(axis=0)
     away = np.abs(detections.q - np.median(detections.q, axis=0)) > _MOVED * np.ptp(detections.q, axis=0)

@@ -88,13 +88,14 @@ def _turns(q: FloatArray) -> FloatArray:
 
 
 def without_placeholders(images: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-    """Images (K, 2, m, 2) with NaN for numbers that stand for unseen markers, and advice that names them.
+    """Images (K, V, m, 2) with NaN for numbers that stand for unseen markers, and advice that names them.
 
     Such a number, as 9999, -1 or 0, repeats exactly over markers and poses: far outside the others or at the
     corner of the image in one coordinate, as one pixel of two markers in an image, or as a subpixel of many.
     """
     at = np.nonzero(np.isfinite(images).all(axis=-1))
-    seen, image, track = images[at], 2 * at[0] + at[1], 2 * at[2] + at[1]
+    V = images.shape[1]
+    seen, image, track = images[at], V * at[0] + at[1], V * at[2] + at[1]
     found = np.full(seen.shape, np.nan)
     for c, column in enumerate(seen.T if len(seen) else ()):
         values, count = np.unique(column, return_counts=True)
@@ -117,7 +118,7 @@ def without_placeholders(images: FloatArray) -> tuple[FloatArray, tuple[str, ...
             found[rows] = seen[rows]
     wrong = np.isfinite(found).any(axis=-1)
     # A view that shows nothing else shows one spot, which the checks of images refuse by its name.
-    if not wrong.any() or any(wrong[at[1] == view].all() for view in (0, 1)):
+    if not wrong.any() or any(wrong[at[1] == view].all() for view in range(V)):
         return images, ()
     named: dict[str, set[tuple[int, int]]] = {}
     for label, k, j in zip(found[wrong], at[0][wrong].tolist(), at[2][wrong].tolist(), strict=True):

@@ -66,7 +66,7 @@ def undecided_pairs(solution: Solution, sigma_px: float) -> IntArray:
 
 
 def _change(problem: LeastSquares, params: Parameters, order: Sequence[int]) -> FloatArray:
-    """Change (2, N, 2) of the images, px, if the joints come in another order, their operators with them."""
+    """Change (V, N, 2) of the images, px, if the joints come in another order, their operators with them."""
     at, there, q = list(order), problem.detections, problem.joints(params)
     other = dataclasses.replace(params, H_hat=params.H_hat[at], prismatic=params.prismatic[at], offsets=None)
     there = dataclasses.replace(there, q=q[:, at], prismatic=there.prismatic[at])

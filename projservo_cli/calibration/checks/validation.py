@@ -137,9 +137,9 @@ def _blocks(detections: Detections, folds: int, name: str) -> IntArray:
 def _of_parts(
     solution: Solution, part: IntArray, sigma_px: float, on_fold: Callable[[], None]
 ) -> tuple[FloatArray, FloatArray, list[str]]:
-    """Residuals of each part (K,) from a fit to the others, their deviations (K, 2, m, 2), and failures."""
+    """Residuals of each part (K,) from a fit to the others, their deviations (K, V, m, 2), and failures."""
     detections = solution.problem.detections
-    shape = (len(detections.q), 2, detections.marker.size, 2)
+    shape = (len(detections.q), len(detections.seen), detections.marker.size, 2)
     residual, predicted = np.full(shape, np.nan), np.full(shape, np.nan)
     failed = []
     for fold in range(int(part.max()) + 1):
@@ -148,7 +148,7 @@ def _of_parts(
         except WorkFailed as error:
             failed.append(f"part {fold + 1}: {error}")
         else:
-            for v in (0, 1):
+            for v in range(len(rows)):
                 at = np.flatnonzero(rows[v])
                 where = detections.pose_of[at], v, detections.marker_of[at]
                 residual[where], predicted[where] = difference[v, at], deviation[v, at]
@@ -190,7 +190,7 @@ def _held_out_residuals(
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Residuals of held-out poses (K,) from a fit to the others.
 
-    Returns the detections (2, N) predicted, seen minus predicted (2, N, 2) and its deviation (2, N, 2), px.
+    Returns the detections (V, N) predicted, seen minus predicted (V, N, 2) and its deviation (V, N, 2), px.
     Raises WorkFailed if the other poses do not determine the robot.
     """
     whole, q_reference = solution.problem.detections, solution.problem.q_reference

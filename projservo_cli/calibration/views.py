@@ -1,0 +1,172 @@
+"""Any number of views: the pair with which a fit begins, further cameras by resection, a noise of each.
+
+[HZ04] is R. Hartley, A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., 2004.
+"""
+
+import dataclasses
+from contextlib import suppress
+from itertools import combinations
+
+import numpy as np
+
+from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.detections import RAYLEIGH, Detections, cauchy_weights, deviation
+from projservo_cli.calibration.epipolar import Epipolar
+from projservo_cli.calibration.fit import Solution, fit_from, fit_inliers
+from projservo_cli.calibration.lens_estimation import undistorted
+from projservo_cli.calibration.triangulation import Tracks
+from projservo_cli.geometry.displacements import homogeneous
+from projservo_cli.records import FloatArray, WorkFailed
+
+# Number of points that determine a camera, and of random samples of them.
+_MINIMAL, _SAMPLES = 6, 300
+# Rounds of reweighting in a resection, and of the noise of each view.
+_ROUNDS, _NOISE_ROUNDS = 10, 6
+# Relative change of the noise of each view that ends these rounds.
+_SETTLED = 0.01
+# Minimum number of detections of a view for a camera: 11 numbers, and as many to judge them.
+_LEAST = 12
+
+
+def with_best_pair(detections: Detections) -> Detections:
+    """Choose the pair of views with the largest parallax over noise; two views are the pair.
+
+    Raises WorkFailed if no pair has an epipolar geometry.
+    """
+    V = len(detections.view)
+    if V == 2:
+        return detections
+    if V == 1:
+        raise WorkFailed(
+            f"only one view, {detections.view[0]}: a calibration begins with the epipolar geometry of two "
+            "views; add the images of a second camera"
+        )
+    found, failure = list[tuple[float, tuple[int, int]]](), None
+    for pair in combinations(range(V), 2):
+        try:
+            epipolar = Epipolar.of(detections.of_views([*pair]), np.random.default_rng(0))
+        except WorkFailed as error:
+            failure = error
+            continue
+        found.append((epipolar.parallax_px / epipolar.noise_px, pair))
+    if not found and failure is not None:
+        raise failure
+    return dataclasses.replace(detections, pair=max(found)[1])
+
+
+def with_all_views(of_pair: Solution, whole: Detections, epipolar: Epipolar) -> Solution:
+    """Fit to all views, from that to the pair: each further camera by resection, then a noise of each view.
+
+    Raises WorkFailed naming a view whose detections determine no camera.
+    """
+    problem = LeastSquares.of(whole, of_pair.problem.q_reference)
+    known = np.isin(whole.marker, of_pair.problem.detections.marker)
+    M = np.full((whole.marker.size, 4), np.nan)
+    M[known] = of_pair.params.M
+    P = np.full((len(whole.view), 3, 4), np.nan)
+    P[[*whole.pair]] = of_pair.params.P
+    params = dataclasses.replace(of_pair.params, P=P, M=M, offsets=None)
+    points = params.moved(problem.q, whole.pose_of, whole.marker_of)
+    for v in np.flatnonzero(np.isnan(P[:, 0, 0])):
+        rows = np.flatnonzero(whole.seen[v] & np.isfinite(points[:, 0]))
+        if rows.size < _LEAST:
+            raise WorkFailed(
+                f"the {whole.view[v]} camera saw {rows.size} markers that the "
+                f"{' and '.join(whole.view[i] for i in whole.pair)} cameras see too; {_LEAST} are required: "
+                "point it at the same markers, or leave this view out"
+            )
+        P[v] = _resected(points[rows], whole.pixels[v, rows])
+    if (lost := np.isnan(M[:, 0])).any():
+        params = dataclasses.replace(params, M=Tracks(problem, params).locate(lost, epipolar.noise_px))
+    solution = fit_from(problem, params, epipolar)
+    if solution is None:
+        raise WorkFailed(
+            f"no robot explains the images of the views {', '.join(whole.view)} together: check that they "
+            "show the same poses"
+        )
+    return solution
+
+
+def with_own_noise(solution: Solution, epipolar: Epipolar) -> tuple[Solution, Epipolar]:
+    """Weigh each view by its own noise until it settles; also the epipolar geometry of the quietest pair.
+
+    In units of the root mean square noise of this pair. Two views share one noise, which their epipolar
+    geometry shows.
+    """
+    if len(solution.used) == 2:
+        return solution, epipolar
+    for _ in range(_NOISE_ROUNDS):
+        detections = solution.problem.detections
+        noise = np.array([_noise(solution, v) for v in range(len(solution.used))])
+        first, second = np.sort(np.argsort(noise / detections.weight.max(axis=1))[:2]).tolist()
+        noise /= np.sqrt(np.mean(noise[[first, second]] ** 2))
+        if np.abs(np.log(noise)).max() <= _SETTLED:
+            break
+        weight = detections.weight / noise[:, None]
+        weighed = dataclasses.replace(detections, weight=weight, pair=(first, second))
+        problem = dataclasses.replace(solution.problem, detections=weighed)
+        found = fit_inliers(problem, solution.params, solution.typical_px / RAYLEIGH, epipolar.noise_px)
+        if found is None:
+            break
+        solution = found
+    with suppress(WorkFailed):  # without a baseline the first pair stays
+        seen = undistorted(solution.problem.detections, solution.params.lens)
+        epipolar = Epipolar.of(seen, np.random.default_rng(0))
+    return solution, epipolar
+
+
+def _noise(solution: Solution, v: int) -> float:
+    """Robust noise of a view per coordinate, weighted, px: of all that was seen, so that none is cut off."""
+    distance = np.linalg.norm(solution.residual[v, solution.problem.detections.seen[v]], axis=1)
+    return max(float(np.median(distance)) / RAYLEIGH, 1e-9)
+
+
+def _resected(points: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Camera (3, 4) of points (N, 4) and their pixels (N, 2), some of them wrong: [HZ04] 7.1.
+
+    The minimum median distance over random samples of six, then reweighted linear solutions.
+    """
+    rng, X = np.random.default_rng(0), points[:, :3] / points[:, 3:]
+    T, U = _normalization(pixels), _normalization(X)
+    x, X = homogeneous(pixels) @ T.T, homogeneous(X) @ U.T
+    picks = np.stack([rng.choice(len(x), _MINIMAL, replace=False) for _ in range(_SAMPLES)])
+    candidates = _linear(X[picks], x[picks])
+    medians = np.nanmedian(np.linalg.norm(_off(candidates, X, x), axis=-1), axis=-1)
+    P = candidates[np.nanargmin(medians)]
+    for _ in range(_ROUNDS):
+        distance = np.linalg.norm(_off(P, X, x), axis=-1)
+        weight = cauchy_weights((distance / (2.0 * deviation(distance, 1e-12))) ** 2)
+        P = _linear(X, x, np.sqrt(weight) / np.abs(X @ P[2]))
+    P = np.linalg.inv(T) @ P @ U
+    return P * np.sign(np.median(points @ P[2] / points[:, 3])) / np.linalg.norm(P[2])
+
+
+def _normalization(points: FloatArray) -> FloatArray:
+    """Similarity (d + 1, d + 1) that gives points (N, d) zero median and unit deviation."""
+    center, d = np.median(points, axis=0), points.shape[1]
+    spread = float(np.median(np.abs(points - center))) or 1.0
+    T = np.eye(d + 1) / spread
+    T[:d, d], T[d, d] = -center / spread, 1.0
+    return T
+
+
+def _off(P: FloatArray, X: FloatArray, x: FloatArray) -> FloatArray:
+    """Distances (…, N, 2) of projected points (N, 4) from pixels (N, 3) with a last coordinate of one."""
+    image = X @ np.swapaxes(P, -1, -2)
+    return np.asarray(image[..., :2] / image[..., 2:] - x[:, :2])
+
+
+def _linear(X: FloatArray, x: FloatArray, weight: FloatArray | None = None) -> FloatArray:
+    """Cameras (…, 3, 4) of unit norm from points (…, N, 4) and pixels (…, N, 3), linearly: [HZ04] 7.1."""
+    zero = np.zeros_like(X)
+    rows = np.concatenate(
+        [
+            np.concatenate([X, zero, -x[..., :1] * X], axis=-1),
+            np.concatenate([zero, X, -x[..., 1:2] * X], axis=-1),
+        ],
+        axis=-2,
+    )
+    if weight is not None:
+        rows = rows * np.concatenate([weight, weight])[:, None]
+    moments = np.swapaxes(rows, -1, -2) @ rows
+    return np.asarray(np.linalg.eigh(moments)[1][..., 0].reshape(*X.shape[:-2], 3, 4))

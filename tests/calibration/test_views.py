@@ -1,0 +1,84 @@
+"""Calibrations by three and four views: at the bound, whatever their order, and with a noise of each."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from projservo_cli.calibration import calibrate, predict, prediction_variance
+from projservo_cli.records import InputError, WorkFailed
+from tests.calibration.bound import Bound
+from tests.calibration.simulated_robot import around, random_robot, trials
+
+DRAWS = 12
+# Views of a calibration, and the noise of each, px.
+NOISE = {3: (0.3, 0.5, 1.2), 4: (0.4, 0.4, 0.4, 1.5)}
+
+
+def recorded(views, seed=5, types="RRRRRR"):
+    """Robot, poses of its recording with combined ones, and poses to predict."""
+    rng = np.random.default_rng(seed)
+    robot = random_robot(types, rng, markers=8, views=views)
+    q = np.concatenate([trials(robot, frames=4), around(robot, 16, rng)])
+    return robot, q, around(robot, 30, rng), rng
+
+
+def of_views(observation, which):
+    """Observation by some of the views, in an order."""
+    names = tuple(observation.view[v] for v in which)
+    return dataclasses.replace(observation, images=observation.images[:, which], view=names)
+
+
+@pytest.mark.parametrize("views", NOISE)
+def test_predictions_err_by_the_bound_and_as_stated(views):
+    robot, q, ahead, rng = recorded(views)
+    weight = np.broadcast_to(1.0 / np.reshape(NOISE[views], (-1, 1, 1)), (len(q), views, 8, 2)).ravel()
+    bound = Bound(robot, q, ahead, weight)
+    squares, stated, noise = [], [], []
+    for _ in range(DRAWS):
+        found = calibrate(robot.observe(q, NOISE[views], rng), robot.joint_types, source="recorded")
+        squares.append(np.mean((predict(found, ahead) - robot.images(ahead)) ** 2))
+        stated.append(np.mean(prediction_variance(found, ahead)))
+        noise.append(found.sigma_view_px)
+    # Weights are estimated, which costs a few per cent; three deviations of the mean over the draws.
+    chance = 3.0 * bound.relative_error(DRAWS)
+    assert np.mean(squares) == pytest.approx(bound.mean_square(), rel=chance + 0.05)
+    assert np.mean(stated) == pytest.approx(bound.mean_square(), rel=0.15)
+    np.testing.assert_allclose(np.median(noise, axis=0), NOISE[views], rtol=0.05)
+
+
+def test_order_and_names_of_views_do_not_matter():
+    robot, q, ahead, rng = recorded(4, seed=8, types="RRPR")
+    seen = robot.observe(q, 0.4, rng)
+    seen.images[rng.random(seen.images.shape[:3]) < 0.1] = np.nan
+    found, turned = (
+        calibrate(of_views(seen, v), "RRPR", source="recorded") for v in ([0, 1, 2, 3], [2, 0, 3, 1])
+    )
+    assert turned.view == ("top", "left", "low", "right")
+    np.testing.assert_allclose(predict(turned, ahead), predict(found, ahead)[:, [2, 0, 3, 1]], atol=1e-3)
+
+
+def test_a_third_view_with_few_markers_and_poses_is_of_use():
+    robot, q, ahead, rng = recorded(3, seed=3)
+    seen = robot.observe(q, 0.5, rng)
+    seen.images[::2, 2] = np.nan
+    seen.images[:, 2, :3] = np.nan
+    error = []
+    for which in ([0, 1], [0, 1, 2]):
+        found = calibrate(of_views(seen, which), robot.joint_types, source="recorded")
+        off = predict(found, ahead)[:, :2] - robot.images(ahead)[:, :2]
+        error.append(float(np.sqrt(np.mean(off**2))))
+    assert error[1] < error[0]
+
+
+def test_a_view_without_common_markers_and_one_view_alone_are_refused():
+    robot, q, _, rng = recorded(3)
+    seen = robot.observe(q, 0.5, rng)
+    with pytest.raises(WorkFailed, match="only one view, top"):
+        calibrate(of_views(seen, [2]), robot.joint_types, source="recorded")
+    seen.images[:, 2, 1:] = np.nan
+    seen.images[10:, 2] = np.nan
+    with pytest.raises(WorkFailed, match="the top camera saw 10 markers that the left and right cameras see"):
+        calibrate(seen, robot.joint_types, source="recorded")
+    with pytest.raises(InputError, match="3 views"):
+        calibrate(dataclasses.replace(seen, images=seen.images[:, :2]), robot.joint_types)
