@@ -75,7 +75,7 @@ class Detections:
     weight: FloatArray  # (V, N) weights of residuals: ``stated_px`` over the standard deviation, or one
     stated_px: float | None  # root mean square of the stated standard deviations, px, if any
     view: tuple[str, ...] = VIEWS  # names of the views
-    pair: tuple[int, int] = (0, 1)  # the views by which a fit begins and noise is known
+    pair: tuple[int, ...] = (0, 1)  # the one or two views by which a fit begins and noise is known
 
     @classmethod
     def of(cls, observation: Observation, joint_types: str) -> "Detections":
@@ -114,6 +114,7 @@ class Detections:
             weight=weight,
             stated_px=stated_px,
             view=observation.view,
+            pair=(0, 1)[: len(observation.view)],
         )
 
     def everywhere(self, q: FloatArray, which: IntArray | None = None) -> "Detections":
@@ -127,8 +128,8 @@ class Detections:
 
     @property
     def both(self) -> BoolArray:
-        """Mask (N,) of the observations by both views of the pair."""
-        return np.asarray(np.logical_and(*self.seen[[*self.pair]]))
+        """Mask (N,) of the observations by both views of the pair, or by the only view."""
+        return np.asarray(self.seen[[*self.pair]].all(axis=0))
 
     def rows(self, keep: BoolArray | IntArray | slice) -> "Detections":
         """Select observations (N,); the lists of poses and markers stay."""
@@ -156,7 +157,7 @@ class Detections:
 
     def of_pair(self) -> "Detections":
         """Select the observations by the pair of views."""
-        return self if len(self.view) == 2 else self.of_views([*self.pair])
+        return self if len(self.view) <= 2 else self.of_views([*self.pair])
 
     def of_poses(self, keep: BoolArray) -> "Detections":
         """Select the observations at some poses (K,); the lists of poses and markers stay."""

@@ -6,8 +6,9 @@ adjustment, which frees all of it and whose result is projective.
 [HZ04] is R. Hartley, A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., 2004.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
@@ -62,14 +63,44 @@ _FINE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Epipolar:
+class ImageGeometry(ABC):
+    """Geometry that images show without the joints, and the noise of its residuals."""
+
+    sigma_px: float  # noise per image coordinate from the residuals, px
+    core: "Core"  # the same noise, robust against many wrong correspondences, and its interval
+
+    origin: ClassVar[str]  # of the noise, for messages
+
+    @property
+    def noise_px(self) -> float:
+        """Noise, px per coordinate, at least ``MIN_SIGMA``."""
+        return max(self.sigma_px, MIN_SIGMA)
+
+    @property
+    @abstractmethod
+    def relative_error(self) -> float:
+        """Relative standard error of the noise."""
+
+    @abstractmethod
+    def within(self, detections: Detections, deviations: float) -> BoolArray:
+        """Mask (N,) of observations that obey the geometry to some standard deviations."""
+
+    @abstractmethod
+    def guesses(
+        self, detections: Detections, frame: "ImageFrame", factor: float
+    ) -> list[tuple[FloatArray, FloatArray]]:
+        """Cameras (V, 3, 4) and points (N, 3), NaN if unknown, in guessed metric frames, best first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Epipolar(ImageGeometry):
     """Fundamental matrix and the noise of its residuals."""
 
     F: FloatArray  # (3, 3) with rightᵀ F left = 0, unit norm, px
-    sigma_px: float  # noise per image coordinate from the residuals, px
     inlier: BoolArray  # (N,) whether a correspondence used agrees with F
     parallax_px: float  # median distance of the second view from a homography of the first
-    core: "Core"  # the same noise, robust against many wrong correspondences, and its interval
+
+    origin = "that the epipolar geometry shows"
 
     @classmethod
     def of(cls, detections: Detections, rng: np.random.Generator) -> "Epipolar":
@@ -88,7 +119,7 @@ class Epipolar:
                 f"{count} observations of a marker by both cameras at once (8 required): check that rows "
                 "hold the pixels of both views"
             )
-        T, T_ = _normalization(left), _normalization(right)
+        T, T_ = similarity(left), similarity(right)
         pose_of = detections.pose_of[both]
         if count > _CORRESPONDENCES:
             some = rng.choice(count, _CORRESPONDENCES, replace=False)
@@ -118,12 +149,7 @@ class Epipolar:
                 "with all markers always in one plane, there is no depth; move the cameras apart, or the "
                 "markers in depth"
             )
-        return cls(in_pixels, sigma, inlier, parallax, Core.of(residual, pose_of))
-
-    @property
-    def noise_px(self) -> float:
-        """Noise, px per coordinate, at least ``MIN_SIGMA``."""
-        return max(self.sigma_px, MIN_SIGMA)
+        return cls(sigma, Core.of(residual, pose_of), in_pixels, inlier, parallax)
 
     @property
     def relative_error(self) -> float:
@@ -135,6 +161,17 @@ class Epipolar:
         pair = [*detections.pair]
         left, right = homogeneous(detections.pixels[pair])
         return np.abs(sampson(self.F, left, right, detections.weight[pair])[0]) <= deviations * self.sigma_px
+
+    def guesses(
+        self, detections: Detections, frame: "ImageFrame", factor: float
+    ) -> list[tuple[FloatArray, FloatArray]]:
+        """Cameras and points by ``metric_guesses``, NaN where one view alone sees a marker."""
+        found = []
+        for P, points in metric_guesses(self, detections, frame, factor):
+            known = np.full((detections.pose_of.size, 3), np.nan)
+            known[detections.both] = points
+            found.append((P, known))
+        return found
 
 
 class Core(NamedTuple):
@@ -181,11 +218,13 @@ def _core_square(ratio: FloatArray) -> float:
     return square / max(count - flat, 1) / _CORE_MEAN
 
 
-def _normalization(pixels: FloatArray) -> FloatArray:
-    """Similarity (3, 3) that normalizes pixels (N, 2) to zero median and unit deviation: [HZ04] 4.4."""
-    center = np.median(pixels, axis=0)
-    spread = float(np.median(np.abs(pixels - center))) or 1.0
-    return np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, spread]]) / spread
+def similarity(points: FloatArray) -> FloatArray:
+    """Similarity (d + 1, d + 1) that gives points (N, d) zero median and unit deviation: [HZ04] 4.4."""
+    center, d = np.median(points, axis=0), points.shape[1]
+    spread = float(np.median(np.abs(points - center))) or 1.0
+    T = np.eye(d + 1)
+    T[:d, d], T[d, d] = -center, spread
+    return np.asarray(T / spread)
 
 
 def sampson(
@@ -254,7 +293,7 @@ def reconstruct(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[Flo
 
     Points are of unit norm, with positive depth in both views where the data allow it.
     """
-    T = np.stack([_normalization(left), _normalization(right)])
+    T = np.stack([similarity(left), similarity(right)])
     back = np.linalg.inv(T)
     P = _canonical_pair(back[1].T @ F @ back[0])
     # The right camera is known up to P' + e' vᵀ: a frame in which its left block is not singular.

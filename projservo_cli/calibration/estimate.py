@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_error import ModelCheck
-from projservo_cli.calibration.checks.numbering import epipolar_geometry
+from projservo_cli.calibration.checks.numbering import checked_geometry
 from projservo_cli.calibration.checks.outliers import (
     Outliers,
     describe_moved,
@@ -34,7 +34,7 @@ from projservo_cli.calibration.checks.refusal import (
 )
 from projservo_cli.calibration.checks.undecided import require_poses
 from projservo_cli.calibration.detections import Detections, require_images, require_motion
-from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
+from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, ImageGeometry
 from projservo_cli.calibration.fit import (
     CHECK_READINGS,
     REFUSE_RATIO,
@@ -159,20 +159,20 @@ def calibrate(
         whole = with_best_pair(whole)
         detections = whole.of_pair()
         rng = np.random.default_rng(seed)
-        epipolar = epipolar_geometry(detections, rng)
+        frame = ImageFrame.of(whole, image_size)
+        of_pair = frame.of_views([*whole.pair])
+        epipolar = checked_geometry(detections, of_pair, rng)
         expect = partial(Expected.of, sigma_px=sigma_px, source=source, stated_px=detections.stated_px)
         expected = expect(epipolar)
         if not lens:  # else after its estimation, since it bends the epipolar lines
             expected.require_scale()
         require_images(whole, max(epipolar.sigma_px, expected.sigma_px))
         if method == "closed_form":
+            if not isinstance(epipolar, Epipolar):
+                raise InputError("calibration method closed_form takes two views: choose bundle_adjustment")
             result = _closed_form(detections, epipolar, expected)
         else:
-            problem, frame = (
-                LeastSquares.of(detections, detections.reference()),
-                ImageFrame.of(whole, image_size),
-            )
-            of_pair = frame if len(whole.view) == 2 else frame.of_views([*whole.pair])
+            problem = LeastSquares.of(detections, detections.reference())
             search = Search(problem, epipolar, of_pair, rng, progress, joint_noise)
             limit = _MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
             solution, expected, result = _maximum_likelihood(search, whole, frame, expect, lens, init, limit)
@@ -226,7 +226,7 @@ def _maximum_likelihood(
     start: Search,
     whole: Detections,
     frame: ImageFrame,
-    expect: Callable[[Epipolar], Expected],
+    expect: Callable[[ImageGeometry], Expected],
     lens: bool,
     init: Nominal | None,
     limit_px: float,
@@ -273,7 +273,7 @@ def _maximum_likelihood(
 
 
 def _refined(
-    whole: Solution, epipolar: Epipolar, expected: Expected, frame: ImageFrame, limit_px: float
+    whole: Solution, epipolar: ImageGeometry, expected: Expected, frame: ImageFrame, limit_px: float
 ) -> Calibration:
     """Record of the maximum-likelihood solution in its projective frame, with its covariance."""
     share = share_explained(whole, frame)
@@ -449,7 +449,7 @@ def _record(
 
 def _noise_of_views(solution: Solution) -> FloatArray | None:
     """Noise of each view per coordinate, px, from the residuals; None for two views, which share one."""
-    if len(solution.used) == 2:
+    if len(solution.used) <= 2:
         return None
     squares = (solution.residual / solution.problem.detections.weight[..., None]) ** 2
     count = np.maximum(solution.used.sum(axis=1), 1)

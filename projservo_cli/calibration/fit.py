@@ -11,7 +11,7 @@ from scipy.special import chdtri
 
 from projservo_cli.calibration.adjustment import JointErrors, LeastSquares, fit_offsets, minimize
 from projservo_cli.calibration.detections import MAX_JUDGED, RAYLEIGH, even_choice, medians, per_rad
-from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
+from projservo_cli.calibration.epipolar import OUTLIER, ImageGeometry
 from projservo_cli.calibration.initialization import Nominal, Search, starting_markers, starts
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
 from projservo_cli.calibration.prediction import Parameters
@@ -271,7 +271,7 @@ class Expected:
 
     @classmethod
     def of(
-        cls, epipolar: Epipolar, sigma_px: float | None, source: str, stated_px: float | None
+        cls, epipolar: ImageGeometry, sigma_px: float | None, source: str, stated_px: float | None
     ) -> "Expected":
         """Given or stated noise, px, which is exact for a ``simulated`` source; else the noise of the rig.
 
@@ -281,7 +281,7 @@ class Expected:
         if sigma_px is not None:
             return cls(sigma_px, source == "simulated", "that were given", 0.0)
         if stated_px is None:
-            return cls(epipolar.noise_px, False, "that the epipolar geometry shows", epipolar.relative_error)
+            return cls(epipolar.noise_px, False, epipolar.origin, epipolar.relative_error)
         origin = "that the sigmas of the markers state"
         if source == "simulated":
             return cls(stated_px, True, origin, _STATED_ERROR)
@@ -372,14 +372,14 @@ def _stall_check(seen: BoolArray, far: float) -> Callable[[FloatArray], bool]:
     return stalled
 
 
-def fit_from(problem: LeastSquares, params: Parameters, epipolar: Epipolar) -> Solution | None:
+def fit_from(problem: LeastSquares, params: Parameters, epipolar: ImageGeometry) -> Solution | None:
     """Fit from initial parameters, by a robust search and ``fit_inliers``; None if it fails."""
     searched, level = _robust_search(problem, params, problem.detections.seen, epipolar)
     return fit_inliers(problem, searched, level / RAYLEIGH, epipolar.noise_px, hopeless=_HOPELESS)
 
 
 def _robust_search(
-    problem: LeastSquares, params: Parameters, rows: BoolArray, epipolar: Epipolar
+    problem: LeastSquares, params: Parameters, rows: BoolArray, epipolar: ImageGeometry
 ) -> tuple[Parameters, float]:
     """Minimize a Cauchy loss over some detections (V, N), by the screws, then by all parameters.
 

@@ -12,11 +12,10 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.detections import Detections, cauchy_weights, deviation, per_block
 from projservo_cli.calibration.epipolar import (
-    Epipolar,
     ImageFrame,
+    ImageGeometry,
     log_distances,
     marker_pairs,
-    metric_guesses,
 )
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.displacements import aligned, cross_matrix
@@ -39,7 +38,7 @@ class Search:
     """Inputs of a search for the maximum likelihood."""
 
     problem: LeastSquares
-    epipolar: Epipolar
+    epipolar: ImageGeometry
     frame: ImageFrame
     rng: np.random.Generator
     progress: Progress  # called with the current task, the amount done and the total
@@ -130,11 +129,11 @@ class _Alignment:
 
 
 def _grow_body(reconstructed: FloatArray, detections: Detections, rng: np.random.Generator) -> _Alignment:
-    """Body and poses from the points (N, 3) seen by both cameras, grown from a pose with many markers."""
-    K, both = len(detections.q), detections.both
+    """Body and poses from the points (N, 3) of observations, grown from a pose with many markers."""
+    K = len(detections.q)
     points = np.zeros((K, detections.marker.size, 3))
     seen = np.zeros(points.shape[:2], dtype=bool)
-    where = detections.pose_of[both], detections.marker_of[both]
+    where = detections.pose_of, detections.marker_of
     points[where], seen[where] = reconstructed, True
     R, t = np.tile(np.eye(3), (K, 1, 1)), np.zeros((K, 3))
     seed = _seed(reconstructed, *where)
@@ -340,7 +339,7 @@ def _solve_points(
     """
     (P, points), prismatic = guess, detections.prismatic
     n, m = w.shape[0], detections.marker.size
-    pose_of, marker_of = detections.pose_of[detections.both], detections.marker_of[detections.both]
+    pose_of, marker_of = detections.pose_of, detections.marker_of
     chain = _chain(w, q, prismatic)
     back = np.swapaxes(chain[n], 1, 2)
     by_joint = [
@@ -393,16 +392,16 @@ def starts(
     Raises WorkFailed if no three markers are seen together.
     """
     for factor in factors:
-        for guess in metric_guesses(search.epipolar, detections, search.frame, factor):
-            alignment = _grow_body(guess[1], detections, search.rng)
+        for P, points in search.epipolar.guesses(detections, search.frame, factor):
+            placed = np.isfinite(points[:, 0])
+            guess, known = (P, points[placed]), detections.rows(placed)
+            alignment = _grow_body(guess[1], known, search.rng)
             rigid = np.isfinite(alignment.body[:, 0])
             if int(rigid.sum()) < _MIN_MARKERS:
-                raise WorkFailed(
-                    "no three markers are seen together by both cameras: more must be seen at once"
-                )
+                raise WorkFailed("no three markers are seen together: more must be seen at once")
             q = search.problem.q
-            for w in _rotation_axes(alignment, q, detections.prismatic, search.rng):
-                params = _solve_points(w, guess, detections, q, rigid)
+            for w in _rotation_axes(alignment, q, known.prismatic, search.rng):
+                params = _solve_points(w, guess, known, q, rigid)
                 if np.isfinite(params.H_hat).all() and np.isfinite(params.M).all():
                     yield params
 

@@ -7,10 +7,11 @@ from scipy.special import fdtri
 
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.detections import MAX_JUDGED, Detections
-from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
+from projservo_cli.calibration.epipolar import ImageFrame, ImageGeometry
 from projservo_cli.calibration.fit import Solution, fit_from, left_out_px
 from projservo_cli.calibration.initialization import Search
 from projservo_cli.calibration.prediction import LENS, Parameters
+from projservo_cli.calibration.rigid_body import geometry_of
 from projservo_cli.geometry.lens import before_fold, undistort
 from projservo_cli.records import FloatArray, WorkFailed
 
@@ -77,7 +78,7 @@ def _cleared_columns(solution: Solution, params: Parameters, terms: int) -> Floa
     return np.asarray(left.T.reshape(-1, *solution.residual.shape))
 
 
-def fit_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
+def fit_lens(solution: Solution, search: Search) -> tuple[Solution, ImageGeometry]:
     """Fit with radial distortion, and estimate the epipolar geometry of the undistorted detections.
 
     The distortion is centred on the image, or where the residuals show another centre that predicts left-out
@@ -94,7 +95,7 @@ def fit_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
             if freed is not None and left_out_px(freed) < left_out_px(found):
                 found = freed
         detections = undistorted(solution.problem.detections, found.params.lens)
-        return found, Epipolar.of(detections, search.rng)
+        return found, geometry_of(detections, search.frame, search.rng)
     raise WorkFailed(
         "the images do not determine the distortion of the lenses: record poses with markers all over "
         "both images, or calibrate without lens (calibration.lens)"

@@ -73,8 +73,8 @@ class Tracks:
         detections, M = self.detections, self.params.M[:, :3].copy()
         rows = np.flatnonzero(wanted[detections.marker_of])
         best = np.full(len(M), np.inf)
-        for number in range(-1, _CANDIDATES):
-            points = self._triangulate(max(number, 0), wanted)
+        for number in range(-1, _CANDIDATES if len(detections.pair) > 1 else 0):
+            points = M if len(detections.pair) < 2 else self._triangulate(max(number, 0), wanted)
             if number < 0:  # the current point, else the median of all
                 points = np.where(np.isfinite(M), M, np.nanmedian(np.concatenate([M, points]), axis=0))
             for part, some, marker in self._parts(rows):
@@ -215,7 +215,8 @@ def _slipped(
     end, count = _following(counted, marker), _following(used, marker)
     whole, kept = (np.bincount(marker, part.sum(axis=0), len(total)) for part in (seen, used))
     of_all, worst, result = _solve_grams(total)[1][marker], np.zeros(len(total)), np.zeros_like(used)
-    for views in ([0], [1], [0, 1]):
+    V = len(used)
+    for views in [*([v] for v in range(V)), *([[*range(V)]] if V > 1 else [])]:
         gone = count[views].sum(axis=0)
         may = (gone > 0) & (2.0 * (kept[marker] - gone) >= whole[marker])
         rest = total[marker] - np.where(may[:, None, None], end[views].sum(axis=0), 0.0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.detections import RAYLEIGH, Detections, cauchy_weights, deviation
-from projservo_cli.calibration.epipolar import Epipolar
+from projservo_cli.calibration.epipolar import Epipolar, ImageGeometry, similarity
 from projservo_cli.calibration.fit import Solution, fit_from, fit_inliers
 from projservo_cli.calibration.lens_estimation import undistorted
 from projservo_cli.calibration.triangulation import Tracks
@@ -29,18 +29,13 @@ _LEAST = 12
 
 
 def with_best_pair(detections: Detections) -> Detections:
-    """Choose the pair of views with the largest parallax over noise; two views are the pair.
+    """Choose the pair of views with the largest parallax over noise; two views are the pair, one is alone.
 
     Raises WorkFailed if no pair has an epipolar geometry.
     """
     V = len(detections.view)
-    if V == 2:
+    if V <= 2:
         return detections
-    if V == 1:
-        raise WorkFailed(
-            f"only one view, {detections.view[0]}: a calibration begins with the epipolar geometry of two "
-            "views; add the images of a second camera"
-        )
     found, failure = list[tuple[float, tuple[int, int]]](), None
     for pair in combinations(range(V), 2):
         try:
@@ -54,7 +49,7 @@ def with_best_pair(detections: Detections) -> Detections:
     return dataclasses.replace(detections, pair=max(found)[1])
 
 
-def with_all_views(of_pair: Solution, whole: Detections, epipolar: Epipolar) -> Solution:
+def with_all_views(of_pair: Solution, whole: Detections, epipolar: ImageGeometry) -> Solution:
     """Fit to all views, from that to the pair: each further camera by resection, then a noise of each view.
 
     Raises WorkFailed naming a view whose detections determine no camera.
@@ -87,13 +82,13 @@ def with_all_views(of_pair: Solution, whole: Detections, epipolar: Epipolar) -> 
     return solution
 
 
-def with_own_noise(solution: Solution, epipolar: Epipolar) -> tuple[Solution, Epipolar]:
+def with_own_noise(solution: Solution, epipolar: ImageGeometry) -> tuple[Solution, ImageGeometry]:
     """Weigh each view by its own noise until it settles; also the epipolar geometry of the quietest pair.
 
     In units of the root mean square noise of this pair. Two views share one noise, which their epipolar
     geometry shows.
     """
-    if len(solution.used) == 2:
+    if len(solution.used) <= 2:
         return solution, epipolar
     for _ in range(_NOISE_ROUNDS):
         detections = solution.problem.detections
@@ -127,7 +122,7 @@ def _resected(points: FloatArray, pixels: FloatArray) -> FloatArray:
     The minimum median distance over random samples of six, then reweighted linear solutions.
     """
     rng, X = np.random.default_rng(0), points[:, :3] / points[:, 3:]
-    T, U = _normalization(pixels), _normalization(X)
+    T, U = similarity(pixels), similarity(X)
     x, X = homogeneous(pixels) @ T.T, homogeneous(X) @ U.T
     picks = np.stack([rng.choice(len(x), _MINIMAL, replace=False) for _ in range(_SAMPLES)])
     candidates = _linear(X[picks], x[picks])
@@ -139,15 +134,6 @@ def _resected(points: FloatArray, pixels: FloatArray) -> FloatArray:
         P = _linear(X, x, np.sqrt(weight) / np.abs(X @ P[2]))
     P = np.linalg.inv(T) @ P @ U
     return P * np.sign(np.median(points @ P[2] / points[:, 3])) / np.linalg.norm(P[2])
-
-
-def _normalization(points: FloatArray) -> FloatArray:
-    """Similarity (d + 1, d + 1) that gives points (N, d) zero median and unit deviation."""
-    center, d = np.median(points, axis=0), points.shape[1]
-    spread = float(np.median(np.abs(points - center))) or 1.0
-    T = np.eye(d + 1) / spread
-    T[:d, d], T[d, d] = -center / spread, 1.0
-    return T
 
 
 def _off(P: FloatArray, X: FloatArray, x: FloatArray) -> FloatArray:

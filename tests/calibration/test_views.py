@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict, prediction_variance
+from projservo_cli.calibration.checks.validation import residual_statistics
 from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.store.tables import read_table
 from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -71,11 +73,41 @@ def test_a_third_view_with_few_markers_and_poses_is_of_use():
     assert error[1] < error[0]
 
 
-def test_a_view_without_common_markers_and_one_view_alone_are_refused():
+@pytest.mark.parametrize(("types", "flat"), [("RRRRRR", False), ("RRPRRR", False), ("RRRRR", True)])
+def test_one_camera_is_enough(types, flat):
+    rng, draws = np.random.default_rng(11), 4
+    robot = random_robot(types, rng, markers=10, views=1)
+    if flat:
+        robot.markers[:, 2] = 0.0
+    q, ahead = np.concatenate([trials(robot, frames=6), around(robot, 12, rng)]), around(robot, 30, rng)
+    bound, squares = Bound(robot, q, ahead), []
+    for _ in range(draws):
+        seen = robot.observe(q, 0.5, rng)
+        seen.images[rng.random(seen.images.shape[:3]) < 0.02] = np.nan
+        found = calibrate(seen, types, source="recorded")
+        squares.append(np.mean((predict(found, ahead) - robot.images(ahead)) ** 2))
+        assert found.usable
+    chance = 3.0 * bound.relative_error(draws)  # and what the missing images cost
+    assert np.mean(squares) == pytest.approx(0.25 * bound.mean_square(), rel=chance + 0.05)
+
+
+@pytest.mark.parametrize(("data", "types", "rms_px"), [("ur5", "RRRRRR", 0.40), ("stanford", "RRPRRR", 0.46)])
+def test_left_images_alone_of_data_of_others(shared_data, data, types, rms_px):
+    trained, held_out = (
+        of_views(read_table(shared_data / data / name, types), [0])
+        for name in ("trials_0.5px.csv", "validation.csv")
+    )
+    found = calibrate(trained, types, source="recorded")
+    error = residual_statistics(found, held_out)
+    assert error["rms_px"] < rms_px
+    assert error["rms_px"] == pytest.approx(found.predicted_rms_px, rel=0.35)
+
+
+def test_views_that_cannot_be_used_are_refused():
     robot, q, _, rng = recorded(3)
     seen = robot.observe(q, 0.5, rng)
-    with pytest.raises(WorkFailed, match="only one view, top"):
-        calibrate(of_views(seen, [2]), robot.joint_types, source="recorded")
+    with pytest.raises(InputError, match="closed_form takes two views"):
+        calibrate(of_views(seen, [2]), robot.joint_types, source="recorded", method="closed_form")
     seen.images[:, 2, 1:] = np.nan
     seen.images[10:, 2] = np.nan
     with pytest.raises(WorkFailed, match="the top camera saw 10 markers that the left and right cameras see"):

@@ -10,7 +10,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components
 
 from projservo_cli.calibration.detections import Detections
-from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, sampson
+from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, ImageGeometry, sampson
+from projservo_cli.calibration.rigid_body import RigidBody
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation, WorkFailed
 
@@ -32,13 +33,15 @@ _CORNERS = 4
 _EXAMPLES = 3
 
 
-def epipolar_geometry(detections: Detections, rng: np.random.Generator) -> Epipolar:
-    """Estimate the epipolar geometry, and refuse views that number markers differently, or show other poses.
+def checked_geometry(detections: Detections, frame: ImageFrame, rng: np.random.Generator) -> ImageGeometry:
+    """Estimate the geometry of images; refuse views that number markers differently, or show other poses.
 
     The images do not tell which view is right, and goals are given by numbers, so nothing is renumbered.
 
     Raises WorkFailed naming the tags or markers or the view that is late, or as ``Epipolar.of`` does.
     """
+    if len(detections.pair) == 1:
+        return RigidBody.of(detections, frame)
     try:
         found = Epipolar.of(detections, rng)
     except WorkFailed:

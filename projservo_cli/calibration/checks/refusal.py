@@ -12,7 +12,7 @@ from projservo_cli.calibration.checks.outliers import MAX_OF_POSE, Outliers, fit
 from projservo_cli.calibration.checks.quality import check_model
 from projservo_cli.calibration.checks.validation import cross_validate
 from projservo_cli.calibration.detections import Detections
-from projservo_cli.calibration.epipolar import Epipolar
+from projservo_cli.calibration.epipolar import ImageGeometry
 from projservo_cli.calibration.fit import (
     Expected,
     Solution,
@@ -66,7 +66,7 @@ _DOUBTED_ERROR = 1.3
 _PARTS = 3
 
 
-def _doubtful_observations(solution: Solution, found: Outliers, epipolar: Epipolar) -> BoolArray:
+def _doubtful_observations(solution: Solution, found: Outliers, epipolar: ImageGeometry) -> BoolArray:
     """Mask (N,) of rejected, unexplained observations that both views agree on, if a pose has several.
 
     Errors of detection break the epipolar geometry; observations that obey it contradict the robot model.
@@ -80,7 +80,7 @@ def _doubtful_observations(solution: Solution, found: Outliers, epipolar: Epipol
     return np.asarray(out & (share >= _MIN_OF_POSE)[at])
 
 
-def describe_unexplained(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
+def describe_unexplained(solution: Solution, found: Outliers, epipolar: ImageGeometry) -> str:
     """Describe rejected observations that both views agree on, which contradict a fit; else empty."""
     total = int(solution.problem.detections.both.sum())
     count = int(_doubtful_observations(solution, found, epipolar).sum())
@@ -92,7 +92,7 @@ def describe_unexplained(solution: Solution, found: Outliers, epipolar: Epipolar
     )
 
 
-def describe_other_motion(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
+def describe_other_motion(solution: Solution, found: Outliers, epipolar: ImageGeometry) -> str:
     """Describe a motion other than the joint readings that rejected observations agree on; else empty.
 
     It takes observations that both views agree on, at poses of which the rest is kept. Corners of an image
@@ -294,7 +294,7 @@ def _describe_order(solution: Solution, rejected: BoolArray) -> str | None:
 
 
 def contradiction(
-    whole: Solution, solution: Solution, found: Outliers, epipolar: Epipolar, stated_px: float
+    whole: Solution, solution: Solution, found: Outliers, epipolar: ImageGeometry, stated_px: float
 ) -> str:
     """Describe evidence against a fit that rejects much, and a remedy; empty if there is none.
 

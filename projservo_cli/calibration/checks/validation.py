@@ -292,7 +292,7 @@ def _image_noise(calibration: Calibration, observation: Observation) -> float:
         seen = detections.seen & np.isfinite(straight).all(axis=2)
         detections = replace(detections, pixels=np.where(seen[..., None], straight, 0.0), seen=seen)
     sigma = calibration.sigma_px
-    if np.count_nonzero(detections.both) >= _NOISE_PAIRS:
+    if len(detections.pair) == 2 and np.count_nonzero(detections.both) >= _NOISE_PAIRS:
         with suppress(WorkFailed):
             sigma = Epipolar.of(detections, np.random.default_rng(0)).sigma_px
     return float(np.sqrt(2.0)) * sigma

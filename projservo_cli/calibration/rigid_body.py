@@ -1,0 +1,413 @@
+"""One view: the tool as a rigid body that moves freely before a camera, whatever the joints say.
+
+It starts a calibration by one camera, and shows the noise of its images, as the epipolar geometry does
+for two. A small body is nearly seen by scaled orthography: a factorisation gives its shape and its turns up
+to a reflection in depth. Perspective decides on the reflection and gives the focal length.
+C. Tomasi, T. Kanade, "Shape and motion from image streams under orthography", IJCV 9(2), 1992.
+
+[HZ04] is R. Hartley, A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., 2004.
+"""
+
+import warnings
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.calibration.detections import MAD, MIN_SIGMA, RAYLEIGH, Detections, even_choice
+from projservo_cli.calibration.epipolar import OUTLIER, Core, Epipolar, ImageFrame, ImageGeometry, similarity
+from projservo_cli.geometry.displacements import cross_matrix, homogeneous
+from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
+
+# Focal lengths with which the body is fitted, in image sizes.
+_FOCALS = (0.6, 1.0, 1.7, 3.0, 5.0)
+# Maximum numbers of poses and of markers in the fit, and minimum number of markers of a pose, of poses.
+_POSES, _MARKERS, _LEAST_MARKERS, _LEAST_POSES = 120, 40, 4, 4
+# Rounds of the factorisation, each of all cameras, then of the shape.
+_ROUNDS = 60
+# Minimum depth of a shape over its width in the frame of a factorisation, which noise may take below zero.
+_FLAT = 0.02
+# Distance from a homography, over the extent of the markers in the image, up to which a body is flat.
+_PLANE = 0.02
+# Number of the likeliest planes that are tried at each focal length.
+_PLANES_TRIED = 3
+# Tilts of these planes, rad.
+_TILTS = np.radians([15.0, 30.0, 45.0, 60.0, 72.0])
+# Evaluations of the images by a rough fit and by a full one, of the few best; precision of a linear step.
+_ROUGHLY, _EVALUATIONS, _FEW, _PRECISE = 8, 60, 3, 1e-12
+# Expected relative deviations of aspect and middle of the image, the latter over the focal length.
+_ASPECT, _MIDDLE = 0.01, 0.1
+# Cost over the best one up to which another focal length or reflection is a start too.
+_AS_LIKELY = 4.0
+# Number of intrinsic parameters: logarithm of the focal length, aspect, and the middle of the image.
+_INTRINSICS = 4
+# Directions of the change of frame and scale, which no image shows.
+_GAUGE = 7
+
+
+class _Start(NamedTuple):
+    """Guessed poses and shape of a body, and a focal length."""
+
+    R: FloatArray  # (K, 3, 3)
+    t: FloatArray  # (K, 3)
+    X: FloatArray  # (m, 3)
+    focal: float  # px
+
+
+class _Body(NamedTuple):
+    """A body, its poses before a camera, and the camera."""
+
+    R: FloatArray  # (K, 3, 3)
+    t: FloatArray  # (K, 3)
+    X: FloatArray  # (m, 3)
+    focal: FloatArray  # (2,) of u and v, px
+    middle: FloatArray  # (2,) px
+    cost: float  # of the fit
+    residual: FloatArray  # (N, 2) px
+
+    @property
+    def start(self) -> _Start:
+        """Start of a further fit."""
+        return _Start(self.R, self.t, self.X, float(self.focal[0]))
+
+    @property
+    def camera(self) -> FloatArray:
+        """Camera (1, 3, 4) at the origin of the frame."""
+        P = np.zeros((1, 3, 4))
+        P[0, [0, 1], [0, 1]], P[0, :2, 2], P[0, 2, 2] = self.focal, self.middle, 1.0
+        return P
+
+
+@dataclass(frozen=True, eq=False)
+class RigidBody(ImageGeometry):
+    """Rigid motions of the tool before one camera, and the noise of its images."""
+
+    bodies: list[_Body]  # fits that explain the images, best first
+    pose: IntArray  # (K,) rows of the poses in the fit
+    marker: IntArray  # (m,) numbers of the markers in the fit
+    dof: int
+
+    origin = "that a rigid body shows"
+
+    @classmethod
+    def of(cls, detections: Detections, frame: ImageFrame) -> "RigidBody":
+        """Fit a rigid body to the images of one view.
+
+        Raises WorkFailed with too few poses of four markers, or if no rigid body explains the images.
+        """
+        pose, marker, images = _chosen(detections)
+        focals, middle = float(frame.size[0]) * np.array(_FOCALS), frame.center[0]
+        starts = _flat_starts(images, focals, middle) or _deep_starts(images, focals, middle)
+        rough = [_fitted(images, start, middle, _ROUGHLY) for start in starts]
+        best = sorted((body for body in rough if body is not None), key=lambda body: body.cost)[:_FEW]
+        bodies = [_fitted(images, body.start, middle, _EVALUATIONS) for body in best]
+        bodies = sorted((body for body in bodies if body is not None), key=lambda body: body.cost)
+        if not bodies:
+            raise WorkFailed(
+                f"no rigid body explains the images of the {detections.view[0]} camera: check marker numbers"
+            )
+        count = 2 * len(bodies[0].residual)
+        dof = count - (6 * len(pose) + 3 * len(marker) + _INTRINSICS - _GAUGE)
+        if dof <= 0:
+            raise WorkFailed(
+                "too few markers for one camera: show four or more in each image, and more poses"
+            )
+        residual, seen = bodies[0].residual, np.isfinite(images[..., 0])
+        distance, factor = np.linalg.norm(residual, axis=1), float(np.sqrt(count / dof))
+        inlier = distance <= OUTLIER * factor * float(np.median(distance)) / RAYLEIGH
+        sigma = float(np.sqrt((distance[inlier] ** 2).sum() / max(dof - 2 * np.count_nonzero(~inlier), 1)))
+        core = Core.of(residual.ravel(), np.repeat(np.nonzero(seen)[0], 2))
+        core = Core(factor * core.sigma_px, factor * core.interval)
+        return cls(sigma, core, bodies, pose, detections.marker[marker], dof)
+
+    @property
+    def relative_error(self) -> float:
+        """Relative standard error of the noise."""
+        return float(1.0 / np.sqrt(2.0 * self.dof))
+
+    def _points(self, detections: Detections, body: _Body) -> FloatArray:
+        """Points (N, 3) of observations before the camera, NaN where pose or marker is not in the fit."""
+        row = np.full(len(detections.q), -1)
+        row[self.pose] = np.arange(len(self.pose))
+        number = {int(j): i for i, j in enumerate(self.marker)}
+        column = np.array([number.get(int(j), -1) for j in detections.marker], dtype=np.int64)
+        k, j = row[detections.pose_of], column[detections.marker_of]
+        points = (body.R[k] @ body.X[j][..., None])[..., 0] + body.t[k]
+        return np.where(((k >= 0) & (j >= 0))[:, None], points, np.nan)
+
+    def within(self, detections: Detections, deviations: float) -> BoolArray:
+        """Mask (N,) of observations that fit the body to some standard deviations."""
+        body = self.bodies[0]
+        m = self._points(detections, body) @ body.camera[0, :, :3].T
+        off = (m[:, :2] / m[:, 2:] - detections.pixels[0]) * detections.weight[0, :, None]
+        return np.asarray(np.linalg.norm(off, axis=1) <= deviations * self.sigma_px)
+
+    def guesses(
+        self, detections: Detections, frame: ImageFrame, factor: float
+    ) -> list[tuple[FloatArray, FloatArray]]:
+        """Cameras (1, 3, 4) and points (N, 3), NaN if unknown, in guessed metric frames, best first.
+
+        factor : on the focal length and the depth, which are hardly known apart.
+        """
+        found = []
+        for body in self.bodies:
+            if body.cost > _AS_LIKELY * self.bodies[0].cost:
+                break
+            P, points = body.camera, self._points(detections, body)
+            scale = float(np.nanmedian(points[:, 2])) or 1.0
+            P[0, [0, 1], [0, 1]] *= factor
+            found.append((P, points * [1.0, 1.0, factor] / (scale * factor)))
+        return found
+
+
+def _chosen(detections: Detections) -> tuple[IntArray, IntArray, FloatArray]:
+    """Rows of poses (K,), indices of markers (m,), and their images (K, m, 2), NaN if unseen."""
+    images = np.full((len(detections.q), detections.marker.size, 2), np.nan)
+    seen = detections.seen[0]
+    images[detections.pose_of[seen], detections.marker_of[seen]] = detections.pixels[0, seen]
+    often = np.isfinite(images[..., 0]).sum(axis=0)
+    marker = np.sort(np.argsort(-often, kind="stable")[:_MARKERS])
+    marker = marker[often[marker] >= _LEAST_POSES]
+    count = np.isfinite(images[:, marker, 0]).sum(axis=1)
+    pose = np.flatnonzero(count >= _LEAST_MARKERS)
+    if pose.size < _LEAST_POSES:
+        raise WorkFailed(
+            f"the {detections.view[0]} camera alone saw {_LEAST_MARKERS} markers at once in {pose.size} "
+            f"poses: {_LEAST_POSES} are required; show more markers, or add the images of a second camera"
+        )
+    pose = pose[even_choice(pose.size, _POSES)]
+    return pose, marker, images[np.ix_(pose, marker)]
+
+
+def _factorised(images: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Affine cameras A (K, 2, 3) and b (K, 2), and a shape (m, 3), of images (K, m, 2), NaN if unseen.
+
+    By alternating least squares, since markers are missing.
+    """
+    seen = np.isfinite(images[..., 0]).astype(np.float64)
+    known = np.nan_to_num(images)
+    center = (known * seen[..., None]).sum(axis=1) / seen.sum(axis=1)[:, None]
+    rows = ((known - center[:, None]) * seen[..., None]).swapaxes(1, 2).reshape(-1, images.shape[1])
+    X = np.linalg.svd(rows, full_matrices=False)[2][:3].T * np.sqrt(images.shape[1])
+    for _ in range(_ROUNDS):
+        H = np.hstack([X, np.ones((len(X), 1))])
+        G = np.einsum("kj,ja,jb->kab", seen, H, H) + 1e-9 * np.eye(4)
+        C = np.linalg.solve(G, np.einsum("kj,ja,kjc->kac", seen, H, known))
+        A, b = C[:, :3].swapaxes(1, 2), C[:, 3]
+        G = np.einsum("kj,kca,kcb->jab", seen, A, A)
+        G += 1e-12 * np.trace(G, axis1=1, axis2=2).max() * np.eye(3)
+        right = np.einsum("kj,kca,kjc->ja", seen, A, known - b[:, None])
+        X = np.linalg.solve(G, right[..., None])[..., 0]
+        X -= X.mean(axis=0)
+    return A, b, X
+
+
+def _upgraded(A: FloatArray, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Change the frame so that both rows of each camera (K, 2, 3) are of equal length and orthogonal."""
+    i, j = np.triu_indices(3)
+    twice = np.where(i == j, 0.5, 1.0)
+
+    def quadratic(u: FloatArray, v: FloatArray) -> FloatArray:
+        """Coefficients (K, 6) of uᵀ S v by the entries of a symmetric S."""
+        return np.asarray(twice * (u[:, i] * v[:, j] + u[:, j] * v[:, i]))
+
+    u, v = A[:, 0], A[:, 1]
+    rows = np.concatenate([quadratic(u, u) - quadratic(v, v), quadratic(u, v)])
+    rows /= np.tile((A**2).sum(axis=(1, 2)), 2)[:, None]
+    S = np.zeros((3, 3))
+    S[i, j] = S[j, i] = np.linalg.svd(rows)[2][-1]
+    values, V = np.linalg.eigh(S * np.sign(np.trace(S)))
+    Q = V * np.sqrt(np.maximum(values, _FLAT**2 * values.max()))
+    return A @ Q, X @ np.linalg.inv(Q).T
+
+
+def _deep_starts(images: FloatArray, focals: FloatArray, middle: FloatArray) -> list[_Start]:
+    """Starts of a body that is not flat: of both reflections at each focal length, px."""
+    A, b, X = _factorised(images)
+    A, X = _upgraded(A, X)
+    sides = (np.array([1.0, 1.0, side]) for side in (1.0, -1.0))
+    return [_posed(A * side, b, X * side, focal, middle) for side in sides for focal in focals.tolist()]
+
+
+def _posed(A: FloatArray, b: FloatArray, X: FloatArray, focal: float, middle: FloatArray) -> _Start:
+    """Start by scaled orthographic cameras A (K, 2, 3), b (K, 2) of a shape (m, 3), and a focal length, px.
+
+    Each turn is about the line of sight to the body.
+    """
+    U, s, Vt = np.linalg.svd(A)
+    across = U @ Vt[:, :2]
+    R = np.concatenate([across, np.cross(across[:, 0], across[:, 1])[:, None]], axis=1)
+    ray = np.hstack([(b - middle) / focal, np.ones((len(b), 1))])
+    turn = np.cross([0.0, 0.0, 1.0], ray)
+    size = np.linalg.norm(turn, axis=1, keepdims=True)
+    turn *= np.arctan(size) / np.maximum(size, 1e-12)
+    R = Rotation.from_rotvec(turn).as_matrix() @ R
+    return _Start(R, ray * (focal / s.mean(axis=1))[:, None], X, focal)
+
+
+def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray) -> list[_Start]:
+    """Starts of a flat body, empty if it is not flat: of the likeliest planes at each focal length, px.
+
+    Homographies from one image to the others, [HZ04] 4.1, show any plane; in metric coordinates of the right
+    plane the first two columns of each are orthogonal and of equal length, Z. Zhang, PAMI 22(11), 2000.
+    """
+    seen = np.isfinite(images[..., 0])
+    across = [np.linalg.svd(x[k] - x[k].mean(axis=0))[1] for x, k in zip(images, seen, strict=True)]
+    extent = np.array(across)[:, 1]
+    first = int(np.argmax(extent * (seen.sum(axis=1) >= 0.8 * seen.sum(axis=1).max())))
+    others = np.flatnonzero((seen & seen[first]).sum(axis=1) > _LEAST_MARKERS)
+    H, off = np.zeros((len(images), 3, 3)), np.full(len(images), np.inf)
+    for k in others:
+        both = seen[k] & seen[first]
+        H[k] = _planar_homography(images[first, both], images[k, both])
+        moved = homogeneous(images[first, both]) @ H[k].T
+        left = moved[:, :2] / moved[:, 2:] - images[k, both]
+        off[k] = np.median(np.linalg.norm(left, axis=1)) / max(float(extent[k]), 1e-9)
+    if others.size < _LEAST_POSES or float(np.median(off[others])) > _PLANE:
+        return []
+    known, starts = others[off[others] <= 4.0 * _PLANE], list[_Start]()
+    center = homogeneous(images[first, seen[first]].mean(axis=0)[None])[0]
+    for focal in focals.tolist():
+        camera = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
+        planes = _planes(np.linalg.solve(camera, center))
+        columns = np.linalg.solve(camera, H[known] @ camera)[:, None] @ planes  # (k, planes, 3, 3)
+        u, v = columns[..., 0], columns[..., 1]
+        uu, vv, uv = (u**2).sum(axis=-1), (v**2).sum(axis=-1), (u * v).sum(axis=-1)
+        wrong = np.median(((uu - vv) ** 2 + 4.0 * uv**2) / (uu + vv) ** 2, axis=0)
+        for number in np.argsort(wrong)[:_PLANES_TRIED]:
+            starts.append(_flat_start(images, camera, H, planes[number], off <= 4.0 * _PLANE))
+    return starts
+
+
+def _planes(ray: FloatArray) -> FloatArray:
+    """Planes (p, 3, 3) through a point on a ray: two directions of the plane, then the point, as columns."""
+    angles = np.arange(0.0, 2.0 * np.pi, np.pi / 8.0)
+    around = np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    turns = np.concatenate([np.zeros((1, 3)), *(tilt * around for tilt in _TILTS)])
+    planes = Rotation.from_rotvec(turns).as_matrix()
+    planes[..., 2] = ray
+    return np.asarray(planes)
+
+
+def _planar_homography(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Homography (3, 3) of pixels (N, 2) to others of the same markers, four or more, linearly."""
+    T, U = similarity(a), similarity(b)
+    x, y = homogeneous(a) @ T.T, homogeneous(b) @ U.T
+    zero = np.zeros_like(x)
+    rows = np.block([[x, zero, -y[:, :1] * x], [zero, x, -y[:, 1:2] * x]])
+    return np.asarray(np.linalg.inv(U) @ np.linalg.svd(rows)[2][8].reshape(3, 3) @ T)
+
+
+def _flat_start(
+    images: FloatArray, camera: FloatArray, H: FloatArray, plane: FloatArray, known: BoolArray
+) -> _Start:
+    """Start of a flat body in a plane (3, 3), by homographies (K, 3, 3) of which some are known."""
+    seen = np.isfinite(images[..., 0])
+    G = np.where(known[:, None, None], np.linalg.solve(camera, H @ camera) @ plane, plane)
+    back = np.linalg.inv(camera @ G)
+    on_plane = homogeneous(images.reshape(-1, 2)).reshape(*images.shape[:2], 3) @ back.swapaxes(1, 2)
+    places = np.where((seen & known[:, None])[..., None], on_plane[..., :2] / on_plane[..., 2:], np.nan)
+    X = np.zeros((images.shape[1], 3))
+    some = np.isfinite(places[..., 0]).any(axis=0)
+    X[some, :2] = np.nanmedian(places[:, some], axis=0)
+    size = np.linalg.norm(G[..., :2], axis=1).mean(axis=1)
+    G = G / size[:, None, None] * np.sign(G[:, 2, 2])[:, None, None]
+    U, _, Vt = np.linalg.svd(G[..., :2], full_matrices=False)
+    across = U @ Vt
+    R = np.concatenate([across, np.cross(across[..., 0], across[..., 1])[..., None]], axis=2)
+    return _Start(R, G[..., 2], X, float(camera[0, 0]))
+
+
+def _fitted(images: FloatArray, start: _Start, middle: FloatArray, evaluations: int) -> _Body | None:
+    """Fit body, poses and camera to images (K, m, 2) under a Cauchy loss; None if points fall behind it."""
+    R, t, X, focal = start
+    k, j = np.nonzero(np.isfinite(images[..., 0]))
+    seen, (K, m), N = images[k, j], images.shape[:2], len(k)
+    unit = float(np.linalg.norm(t, axis=1).mean())
+    ends = np.cumsum([_INTRINSICS, 3 * K, 3 * K])
+    prior = np.array([0.0, 1.0 / _ASPECT, 1.0 / _MIDDLE, 1.0 / _MIDDLE])
+
+    def placed(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Focal lengths, rotations, turned and placed points, and pixels."""
+        g, turns, places, shape = np.split(x, ends)
+        E = Rotation.from_rotvec(turns.reshape(K, 3)).as_matrix() @ R
+        turned = (E[k] @ shape.reshape(m, 3)[j][..., None])[..., 0]
+        Y = turned + places.reshape(K, 3)[k]
+        f = focal * np.exp(g[0]) * np.array([1.0, np.exp(g[1])])
+        return f, E, turned, Y, f * Y[:, :2] / Y[:, 2:] + middle + focal * g[2:]
+
+    def residual(x: FloatArray) -> FloatArray:
+        """Predicted minus seen pixels, then the priors of the camera."""
+        return np.concatenate([(placed(x)[-1] - seen).ravel(), prior * x[:_INTRINSICS]])
+
+    columns = [
+        np.broadcast_to(np.arange(_INTRINSICS), (N, _INTRINSICS)),
+        *(first + 3 * of[:, None] + np.arange(3) for first, of in zip(ends, (k, k, j), strict=True)),
+    ]
+    where = np.concatenate(
+        [np.repeat(np.concatenate(columns, axis=1), 2, axis=0).ravel(), np.arange(_INTRINSICS)]
+    )
+    width = _INTRINSICS + 9
+    rows = np.concatenate([np.repeat(np.arange(2 * N), width), 2 * N + np.arange(_INTRINSICS)])
+
+    def derivative(x: FloatArray) -> csr_array:
+        """Derivative of the residual."""
+        f, E, turned, Y, _ = placed(x)
+        D = np.zeros((N, 2, 3))
+        D[:, 0, 0], D[:, 1, 1] = f[0] / Y[:, 2], f[1] / Y[:, 2]
+        D[:, :, 2] = -f * Y[:, :2] / Y[:, 2:] ** 2
+        by_camera = np.zeros((N, 2, _INTRINSICS))
+        by_camera[..., 0] = f * Y[:, :2] / Y[:, 2:]
+        by_camera[:, 1, 1] = by_camera[:, 1, 0]
+        by_camera[:, 0, 2] = by_camera[:, 1, 3] = focal
+        by_turn = -D @ cross_matrix(turned) @ _left_jacobian(x[ends[0] : ends[1]].reshape(K, 3))[k]
+        blocks = np.concatenate([by_camera, by_turn, D, D @ E[k]], axis=2)
+        return csr_array(
+            (np.concatenate([blocks.ravel(), prior]), (rows, where)), shape=(2 * N + _INTRINSICS, len(x))
+        )
+
+    x = np.concatenate([np.zeros(_INTRINSICS + 3 * K), t.ravel() / unit, X.ravel() / unit])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of points in the plane of the camera
+        if not np.isfinite(residual(x)).all():
+            return None
+        for _ in range(2):  # the width of the loss follows the residuals
+            width_px = max(float(np.median(np.abs(residual(x)[: 2 * N]))) / MAD, MIN_SIGMA)
+            found = least_squares(
+                residual,
+                x,
+                derivative,
+                loss="cauchy",
+                f_scale=2.0 * width_px,
+                x_scale="jac",
+                tr_solver="lsmr",
+                tr_options={"maxiter": 2000, "atol": _PRECISE, "btol": _PRECISE},
+                ftol=1e-10,
+                xtol=1e-10,
+                max_nfev=evaluations,
+            )
+            x = found.x
+    f, E, _, Y, pixels = placed(x)
+    if not np.isfinite(pixels).all() or (Y[:, 2] <= 0.0).any():
+        return None
+    places, shape = x[ends[1] : ends[2]].reshape(K, 3), x[ends[2] :].reshape(m, 3)
+    off = pixels - seen
+    cost = float(np.median(np.linalg.norm(off, axis=1)))
+    return _Body(E, places, shape, f, middle + focal * x[2:_INTRINSICS], cost, off)
+
+
+def _left_jacobian(w: FloatArray) -> FloatArray:
+    """Derivatives (K, 3, 3) of rotations by their vectors (K, 3), as turns before them."""
+    W = cross_matrix(w)
+    angle = np.linalg.norm(w, axis=1)[:, None, None]
+    a = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    b = np.where(angle > 1e-4, (1.0 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1.0 / 6.0)
+    return np.asarray(np.eye(3) + a * W + b * (W @ W))
+
+
+def geometry_of(detections: Detections, frame: ImageFrame, rng: np.random.Generator) -> ImageGeometry:
+    """Geometry of the images of the pair of views, or of the only view."""
+    return RigidBody.of(detections, frame) if len(detections.pair) == 1 else Epipolar.of(detections, rng)
