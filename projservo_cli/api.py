@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli import plugins
-from projservo_cli.chain import compilation, listening, require_simulated
+from projservo_cli.chain import compilation, require_simulated
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
 from projservo_cli.config.inputs import (
     calibration_inputs,
@@ -29,6 +29,7 @@ from projservo_cli.files import working_in
 from projservo_cli.keys import File
 from projservo_cli.laws import CODES, REGULATE, law_and_mode, run_name, run_names
 from projservo_cli.observations import Observations, require_observations, rows_of
+from projservo_cli.progress import Listener
 from projservo_cli.records import Calibration, InputError, JointList, Plan
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.stages import Progress
@@ -90,7 +91,7 @@ def simulate(
     if seed is not None:
         seeded = config.replace({"calibration.seed": seed})
         config, seed = (seeded, None) if q is None else (config, seed)
-    with listening(progress) as listener:
+    with Listener(progress) as listener:
         require_simulated(config)
         trials = calibration_inputs(config.model_copy(update={"data": None})).source
         assert isinstance(trials, Trials)
@@ -146,7 +147,7 @@ def record(
         further = JointList(np.arange(len(rows)), rows, numbered=False, left=None, right=None)
     table = None if path is None else Path(path)
     with ExitStack() as stack:
-        listener = stack.enter_context(listening(progress))
+        listener = stack.enter_context(Listener(progress))
         if table is not None:
             stack.enter_context(working_in(table.parent, name=f".{table.name}.lock"))
         made = recording.new_recording(given, table, motions=further, force=force)
@@ -236,7 +237,7 @@ def calibrate(
     asked = Estimation(
         settings.method, settings.lens, file, settings.cross_validate, settings.max_predicted_px
     )
-    with listening(progress) as listener:
+    with Listener(progress) as listener:
         screened, calibration, held_out = calibrating.estimate(seen, asked, progress=listener.progress)
         return ImageModel.of(calibration, held_out, screened)
 
@@ -410,7 +411,7 @@ def sweep(
     begin = force or not all(design.sources.values())
     with ExitStack() as stack:
         folder = Folder(stack.enter_context(tempfile.TemporaryDirectory()) if path is None else path)
-        listener = stack.enter_context(listening(progress))
+        listener = stack.enter_context(Listener(progress))
         stack.enter_context(working_in(folder.path, "parts", "calibrations"))
         say = listener.say if path is not None else listener.detail
         run_sweep(design, folder, Engine(workers), listener.progress, say, force=begin)

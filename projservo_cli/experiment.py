@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli import plugins
-from projservo_cli.chain import FIGURES, Chain, Listener, listening
+from projservo_cli.chain import FIGURES, Chain
 from projservo_cli.config import Config, load_config, shipped
 from projservo_cli.config.inputs import joints_of
 from projservo_cli.display import Printed
 from projservo_cli.files import working_in
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import CODES, mode_in
+from projservo_cli.progress import Listener
 from projservo_cli.records import (
     Calibration,
     CrossValidation,
@@ -96,7 +97,7 @@ class Experiment(Printed):
             raise InputError(f"make: name the stages to make: {', '.join(STAGES)}")
         if self._in_memory and "report" in stages:
             raise InputError("make: a report is written into a folder: give Experiment a path")
-        with listening(self._progress) as listener:
+        with Listener(self._progress) as listener:
             if self._in_memory:
                 return self._make(stages, _targets(laws), listener, force=force, blind=blind)
             with working_in(self._run.path.parent, FIGURES):
@@ -106,8 +107,8 @@ class Experiment(Printed):
     def _make(
         self, stages: Sequence[str], laws: Sequence[str], listener: Listener, *, force: bool, blind: bool
     ) -> "Experiment":
-        how = {"in_memory": self._in_memory, "blind": blind}
-        chain = Chain.asked(listener, stages, self.config, self._run, laws=laws, force=force, **how)
+        how = {"force": force, "in_memory": self._in_memory, "blind": blind}
+        chain = Chain(listener, stages, self.config, self._run, laws, **how)
         chain.require_permitted(("law", "plant") if self._may_import else ())
         try:
             chain.make()

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from projservo_cli.masking import masked
-from projservo_cli.progress import Bar
+from projservo_cli.progress import Listener
 
 _UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _NOTES = {  # on runs, and their reasons
@@ -40,21 +40,15 @@ def visible(text: str) -> str:
     return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", masked(text))
 
 
-class Console:
+class Console(Listener):
     """Messages at the level of the user, and a progress bar in a terminal."""
 
     def __init__(self, *, quiet: bool = False, verbose: bool = False, as_json: bool = False) -> None:
+        super().__init__()
         self.quiet = quiet
         self.verbose = verbose
         self.as_json = as_json
         self._data = sys.stdout  # while a command works, what others print goes elsewhere
-        self._bar = Bar()
-
-    def __enter__(self) -> "Console":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
 
     def report(self, value: dict[str, Any], lines: Iterable[str]) -> None:
         """Data on standard output: one object of strict JSON in UTF-8, whatever the locale, or in words."""

@@ -269,13 +269,11 @@ def _asked(
             "use --set calibration.method=bundle_adjustment"
         )
     if wanted := _optional_files(options):
-        require_optional(config, wanted)
+        _require_optional(config, wanted)
     if records and recording is None:
         recording = pending_recording(config, stored, _motions(config, options), force=options["force"])
-    how = {name: bool(options.get(name)) for name in ("confirm", "blind")}
-    chain = Chain.asked(
-        console, names, config, stored, laws=laws, force=options["force"], recording=recording, **how
-    )
+    how = {name: bool(options.get(name)) for name in ("force", "confirm", "blind")}
+    chain = Chain(console, names, config, stored, laws, recording=recording, **how)
     if not options["dry_run"]:
         keys = {Override.parse(text).key for text in options["sets"]}
         named = {kind for kind, those in _NAMING.items() if options["config"] or keys & those}
@@ -283,7 +281,7 @@ def _asked(
     return _Call(console, options, chain)
 
 
-def require_optional(config: Any, wanted: Sequence[str]) -> None:
+def _require_optional(config: Any, wanted: Sequence[str]) -> None:
     """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted."""
     from projservo_cli.config.inputs import truth_of
     from projservo_cli.records import InputError
