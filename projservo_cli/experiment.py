@@ -28,7 +28,7 @@ from projservo_cli.records import (
 from projservo_cli.results import ImageModel, MotionPlan, PlanScene, RunTrace
 from projservo_cli.stages import Progress
 from projservo_cli.steps import STAGES
-from projservo_cli.store import Result, Run, load, run_path
+from projservo_cli.store import Result, Run, stored
 
 
 class Experiment(Printed):
@@ -54,7 +54,8 @@ class Experiment(Printed):
         progress: Progress | bool = True,
     ) -> None:
         self._config: Config | None = config if isinstance(config, Config) else load_config(shipped(config))
-        self._run, self._in_memory = _stored(path), path is None
+        self._run = Run(Path("memory", "run.h5")) if path is None else stored(path)
+        self._in_memory = path is None
         self._progress, self._may_import = progress, True
 
     @classmethod
@@ -101,7 +102,7 @@ class Experiment(Printed):
             if self._in_memory:
                 return self._make(stages, _targets(laws), listener, force=force, blind=blind)
             with working_in(self._run.path.parent, FIGURES):
-                self._run = _stored(self._run.path)  # another process may have written it until now
+                self._run = stored(self._run.path)  # another process may have written it until now
                 return self._make(stages, _targets(laws), listener, force=force, blind=blind)
 
     def _make(
@@ -208,14 +209,6 @@ def plan_scene_of(config: Config, calibration: Calibration) -> PlanScene:
         None if size is None else image_sizes(size),
         config.trajectory,
     )
-
-
-def _stored(path: "str | Path | None") -> Run:
-    """The run in a folder, empty where none is; for None one that is never saved."""
-    if path is None:
-        return Run(Path("memory", "run.h5"))
-    file = run_path(path)
-    return load(file) if file.exists() else Run(file)
 
 
 def _targets(laws: Sequence[str]) -> tuple[str, ...]:

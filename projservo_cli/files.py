@@ -6,7 +6,7 @@ import re
 import secrets
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 from projservo_cli.records import InputError
@@ -140,6 +140,11 @@ def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
         if new:
             with suppress(OSError):
                 folder.rmdir()
+
+
+def writing(path: Path) -> AbstractContextManager[None]:
+    """Make sure, before any work, that a file can be written, and keep other processes from it."""
+    return working_in(path.parent, name=f".{path.name}.lock")
 
 
 def tidy(folder: Path, *parts: str) -> None:

@@ -149,13 +149,6 @@ def require_new(path: Path, *, force: bool) -> None:
         raise click.UsageError(f"{path}: exists already; choose another, or replace it with --force")
 
 
-def writing(path: Path) -> contextlib.AbstractContextManager[None]:
-    """Make sure, before any work, that a file can be written, and keep other processes from it."""
-    from projservo_cli.files import working_in
-
-    return working_in(path.parent, name=f".{path.name}.lock")
-
-
 def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
     """The run that is named, as an argument or with ``-o``; None where none is."""
     if run is not None and output is not None:
@@ -172,11 +165,12 @@ def configured(
     Raises UsageError where a robot is named by the run alone, which starts no code.
     """
     from projservo_cli.config import load_config, shipped
+    from projservo_cli.store import stored
 
-    stored = None if config or run is None else _stored(run)
-    if stored is None or not stored.configuration:
+    held = None if config or run is None else stored(run)
+    if held is None or not held.configuration:
         return load_config(config or shipped("paper"), _overrides(options), teaching=teaching)
-    found = load_config(stored.path, _overrides(options), text=stored.configuration)
+    found = load_config(held.path, _overrides(options), text=held.configuration)
     if not found.plant.simulated:
         raise click.UsageError(
             f"plant {found.plant.use} is named by the stored run alone, which starts no code: give the "
@@ -187,10 +181,12 @@ def configured(
 
 def calibrated_run(run: Path | None, config: "Config") -> "Run | None":
     """The run that is named, by default that of the configuration's name; None without a calibration."""
-    found = _stored(run or _RESULTS / config.name)
-    if found is None and run is not None:
+    from projservo_cli.store import stored
+
+    found = stored(run or _RESULTS / config.name)
+    if run is not None and not found.path.exists():
         raise click.UsageError(f"{run}: there is no run; calibrate first, or leave it out")
-    return found if found is not None and "calibrate" in found.results else None
+    return found if "calibrate" in found.results else None
 
 
 def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Config", "Run"]:
@@ -200,17 +196,18 @@ def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Co
     it names another.
     """
     from projservo_cli.config import Override, load_config, to_yaml
+    from projservo_cli.store import stored
 
     if options.get("origin") is not None:
         return _from_sweep(options)
-    stored = _stored(options["output"]) if options["output"] else None
-    if not options["config"] and stored is not None and stored.configuration:
-        config = load_config(stored.path, _overrides(options), text=stored.configuration)
+    run = stored(options["output"]) if options["output"] else None
+    if not options["config"] and run is not None and run.configuration:
+        config = load_config(run.path, _overrides(options), text=run.configuration)
     elif not options["config"] and options["data"]:
         config = load_config(None, _overrides(options))
     else:
         config = configured(options["config"], options)
-    run = stored or _run_of(options, config)
+    run = run or _run_of(options, config)
     table = run.path.resolve().with_name(_TRIALS)
     if config.data is None and (recording or table.is_file()):
         in_folder = Override(f"{table}", "data.table", str(table))
@@ -230,8 +227,8 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
     if overrides := _overrides(options):
         config = load_config(config.name, overrides, text=to_yaml(config))
     run = _run_of(options, config)
-    stored = run.results.get("calibrate")
-    if calibration is not None and (stored is None or stored.key != calibration.key):
+    before = run.results.get("calibrate")
+    if calibration is not None and (before is None or before.key != calibration.key):
         run = Run(run.path, run.configuration, {"calibrate": calibration})
     return config, run
 
@@ -239,20 +236,13 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
 def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
     """The run where the user says, else in the folder of the configuration's name; empty where none is."""
     from projservo_cli.files import require_inside
-    from projservo_cli.store import Run, run_path
+    from projservo_cli.store import stored
 
     folder = options["output"]
     if not folder:
         folder = _RESULTS / config.name
         require_inside(folder, _RESULTS)
-    return _stored(folder) or Run(run_path(folder))
-
-
-def _stored(target: str | Path) -> "Run | None":
-    """The run in a folder or file; None where there is none yet."""
-    from projservo_cli.store import load, run_path
-
-    return load(target) if run_path(target).exists() else None
+    return stored(folder)
 
 
 def _overrides(options: Mapping[str, Any]) -> list["Override"]:

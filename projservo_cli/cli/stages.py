@@ -61,6 +61,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
         return _make(console, stages, options)
     from projservo_cli.chain import data_table, recording_made
     from projservo_cli.config.inputs import recording_inputs
+    from projservo_cli.files import writing
     from projservo_cli.stages.record import new_recording
 
     config = option.configured(options["config"], options)
@@ -70,7 +71,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     if not (recording.why or config.plant.simulated):
         console.say(f"record: {path} is up to date{_AGAIN}")
     if not options["dry_run"]:
-        with option.writing(path):
+        with writing(path):
             recording = new_recording(given, path, motions=poses, force=options["force"])
             reason = recording_made(console, config, recording, confirm=options["confirm"])
     value = _recording_object(recording, reason)
@@ -227,7 +228,7 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
     from projservo_cli.chain import FIGURES
-    from projservo_cli.files import tidy, working_in
+    from projservo_cli.files import tidy, working_in, writing
 
     call = _asked(console, names, options)
     chain = call.chain
@@ -243,7 +244,7 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     with working_in(folder, FIGURES):
         if chain.recording is None:  # again, since another process may have written the run until now
             return _work(_asked(console, names, options))
-        with option.writing(chain.recording.path):
+        with writing(chain.recording.path):
             call = _asked(console, names, options)
             if not call.chain.record():
                 return _work(call)

@@ -75,7 +75,7 @@ class _Joint(Section):
                 )
 
 
-class DHJoint(_Joint):
+class _DHJoint(_Joint):
     """A row of a Denavit-Hartenberg table; the joint reading adds to theta (R) or d (P)."""
 
     theta_deg: Number = Field(0.0, description="rotation about z")
@@ -102,7 +102,7 @@ class _DH(Section):
     convention: Literal["standard", "modified"] = Field(
         "standard", description="convention of the table; modified is Craig's"
     )
-    joints: tuple[DHJoint, ...] = Field(
+    joints: tuple[_DHJoint, ...] = Field(
         min_length=1, max_length=64, description="rows of the table, base to tool"
     )
     tool: Matrix44 = Field(_IDENTITY, description="pose of the tool in the frame of the last joint, m")
