@@ -262,11 +262,7 @@ def _detect(
     default=0.0,
     help="Deviation of the arm that no image shows, a coordinate, beyond the covariance.",
 )
-@click.option(
-    "--joint-unit",
-    type=click.Choice(["deg", "rad"]),
-    help="Unit of the table's revolute joints. Default: that of the run.",
-)
+@option.joint_unit(help="Unit of the table's revolute joints. Default: that of the run.")
 @option.explained
 def _validate(
     console: Console,

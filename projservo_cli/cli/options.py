@@ -54,6 +54,7 @@ _KEYS = {  # that options stand for
 configuration = functools.partial(click.option, "-c", "--config", metavar="FILE", type=click.Path())
 output = functools.partial(click.option, "-o", "--output", type=PATH)
 force = functools.partial(click.option, "--force", is_flag=True)
+joint_unit = functools.partial(click.option, "--joint-unit", type=click.Choice(["deg", "rad"]))
 threads = functools.partial(click.option, "-j", "--threads", metavar="N", type=click.IntRange(1, 256))
 
 override = click.option(
@@ -63,11 +64,6 @@ override = click.option(
     multiple=True,
     help="Override a value of the configuration; V is YAML, files are relative to the configuration. "
     "Repeatable.",
-)
-joint_unit = click.option(
-    "--joint-unit",
-    type=click.Choice(["deg", "rad"]),
-    help="Unit of the table's revolute joints. Default: rad.",
 )
 dry_run = click.option("-n", "--dry-run", is_flag=True, help="Say what would be done, do nothing.")
 speed_scale = click.option(
@@ -116,7 +112,7 @@ _OF_STAGES = (
     output(metavar="DIR", help="Folder of the run, or its run.h5. Default: results/<configuration name>."),
     click.option("--data", metavar="TABLE", type=click.Path(), help="Calibrate from this table (CSV)."),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
-    joint_unit,
+    joint_unit(help="Unit of the table's revolute joints. Default: rad."),
     click.option(
         "--noise-px", metavar="S", type=NUMBER, help="Pixel noise of the table. Default: estimated."
     ),

@@ -107,21 +107,19 @@ def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> It
     """Lines on the object of a stage or the report of a ``sweep``; ``detailed`` with claims and margins."""
     if "failed" in value:  # the reason is printed with the exit code
         yield f"{stage}: {'failed' if value['failed'].split('/')[0] == stage else 'not made'}"
-    elif stage == "record":
-        yield from _of_recording(value)
-    elif stage == "calibrate":
-        yield from _of_calibration(value, detailed)
-    elif stage == "plan":
-        yield from _of_plan(value, detailed)
-    elif stage == "servo":
-        yield from _of_laws(value)
-    elif stage == "sweep":
-        yield from _of_sweep(value)
-    else:
-        yield from _of_report(value, detailed)
+        return
+    of_stage = {
+        "record": _of_recording,
+        "calibrate": _of_calibration,
+        "plan": _of_plan,
+        "servo": _of_laws,
+        "sweep": _of_sweep,
+        "report": _of_report,
+    }
+    yield from of_stage[stage](value, detailed)
 
 
-def _of_recording(value: dict[str, Any]) -> Iterator[str]:
+def _of_recording(value: dict[str, Any], _: bool) -> Iterator[str]:
     yield (
         "record: {recorded} poses recorded, {found} there before, {pending} to be recorded; "
         "{markers} markers".format_map(value)
@@ -309,7 +307,7 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
             )
 
 
-def _of_laws(value: dict[str, Any]) -> Iterator[str]:
+def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
     from projservo_cli.laws import run_name
 
     known = any(trace["position_error_mm"] is not None for trace in value["laws"])
@@ -365,7 +363,7 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-def _of_sweep(found: dict[str, Any]) -> Iterator[str]:
+def _of_sweep(found: dict[str, Any], _: bool) -> Iterator[str]:
     """The table of cells, and that of pairs of laws on the same tasks."""
     yield (
         f"report: {found['runs']} of {found['total']} runs; shares in %, 95 % interval; medians of successes"

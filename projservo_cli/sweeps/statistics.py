@@ -47,6 +47,11 @@ class Rows:
             self._columns[name] = self._derived(name)
         return self._columns[name]
 
+    def read(self) -> None:
+        """Read all columns of the table."""
+        for name in self.table.names:
+            self[name]
+
     def _derived(self, name: str) -> npt.NDArray[Any]:
         if name == "success":
             return np.asarray(self.table.column(name) == 1)

@@ -1,6 +1,6 @@
 """A sweep as an object: its table as arrays, how often laws succeed, and laws against each other."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,16 +26,14 @@ class Study(Displayable):
 
     def __init__(self, table: SweepTable, names: Mapping[str, str] | None = None) -> None:
         self._rows, self._names = Rows(table), dict(names or {})
-        # In memory, stored files are gone when the caller sees the result.
-        self._columns = {name: self._rows[name] for name in (*table.names, "self_occluded", "left_image")}
-        self._columns["path_length_ratio"] = self._rows["path_length_ratio"]
+        self._rows.read()  # stored files are gone when the caller sees the result
         self._traces = {run: RunTrace.of(table.trace(run)) for run in table.traces}
         self.path: Path | None = table.path
 
     @cached_property
     def table(self) -> Mapping[str, npt.NDArray[Any]]:
         """Columns (k,) of all runs, by name; laws as their caller calls them."""
-        found = {name: self._columns[name] for name in self._rows.table.names}
+        found = {name: self._rows[name] for name in self._rows.table.names}
         if "law" in found and self._names:
             found["law"] = np.array([self._names.get(law, law) for law in found["law"].tolist()])
         return found
@@ -76,7 +74,8 @@ class Study(Displayable):
         InputError
             When the sweep has no such law.
         """
-        known = {self._names.get(law, law): law for law in self._laws()}
+        laws = dict(self._rows.axes).get("law", ())
+        known = {self._names.get(law, law): law for law in laws}
         asked = []
         for law in (first, second):
             name = law if isinstance(law, str) else law.__name__
@@ -109,9 +108,6 @@ class Study(Displayable):
             place = ", ".join(f"{name} {cell[name]}" for name, _ in self._rows.axes)
             values[place] = f"{cell['success_rate']:.1%} of {cell['runs']} succeed ({low:.1%} to {high:.1%})"
         return values | ({"more": f"{len(cells) - shown} cells"} if len(cells) > shown else {})
-
-    def _laws(self) -> Sequence[str]:
-        return next((values for name, values in self._rows.axes if name == "law"), [])
 
     def _named(self, values: dict[str, Any]) -> dict[str, Any]:
         return values | ({"law": self._names.get(values["law"], values["law"])} if "law" in values else {})
