@@ -4,6 +4,7 @@ import contextlib
 import functools
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -39,6 +40,7 @@ class NumberRange(_Finite, click.FloatRange):
 
 NUMBER = _Finite()
 _RESULTS = Path("results")
+_SIZE = re.compile(r"\s*(\d+)\s*[xX]\s*(\d+)\s*")
 _TRIALS = "trials.csv"  # in the folder of a run: the default table of a recording
 _KEYS = {  # that options stand for
     "data": "data.table",
@@ -255,14 +257,13 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
         value = os.path.abspath(given) if name in ("data", "init") else given
         found.append(Override(flag, key, value))
     if (size := options.get("image_size")) is not None:  # such as 1280x1024,1280x960
-        flag, sizes = f"--image-size {size}", [one.split("x") for one in size.lower().split(",")]
-        sides = [side.strip() for one in sizes for side in one]
-        if len(sizes) > 2 or any(len(one) != 2 for one in sizes) or not all(map(str.isdecimal, sides)):
+        flag, sizes = f"--image-size {size}", [_SIZE.fullmatch(one) for one in size.split(",")]
+        if len(sizes) > 2 or None in sizes:
             raise click.UsageError(
                 f"{flag}: expected width x height in px, such as 1280x1024, or 1280x1024,1280x960 where the "
                 "right images have another size"
             )
-        values = [[int(side) for side in one] for one in sizes]
+        values = [[int(one[1]), int(one[2])] for one in sizes if one is not None]
         found.append(Override(flag, "data.image_size_px", values if len(values) > 1 else values[0]))
     if (goal := options.get("goal")) is not None:
         named = goal if goal.endswith((".yaml", ".yml")) else f"{goal}.yaml"
