@@ -10,7 +10,7 @@ from typing import Any, Self
 TICK_S = 0.5
 
 
-class Bar:
+class _Bar:
     """Progress bar, one at a time; silent if standard error is no terminal."""
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ class Listener:
     """
 
     def __init__(self, progress: Callable[[str, int, int], None] | bool = True) -> None:
-        self._bar = Bar()
+        self._bar = _Bar()
         self._progress = self._bar if progress is True else progress
 
     def __enter__(self) -> Self:
