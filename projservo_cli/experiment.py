@@ -108,8 +108,8 @@ class Experiment(Printed):
     def _make(
         self, stages: Sequence[str], laws: Sequence[str], listener: Listener, *, force: bool, blind: bool
     ) -> "Experiment":
-        how = {"force": force, "in_memory": self._in_memory, "blind": blind}
-        chain = Chain(listener, stages, self.config, self._run, laws, **how)
+        run, stays = self._run, self._in_memory
+        chain = Chain(listener, stages, self.config, run, laws, force=force, in_memory=stays, blind=blind)
         chain.require_permitted(("law", "plant") if self._may_import else ())
         try:
             chain.make()

@@ -265,7 +265,7 @@ def _asked(
         _require_optional(config, wanted)
     if records and recording is None:
         recording = pending_recording(config, stored, _motions(config, options), force=options["force"])
-    how = {name: bool(options.get(name)) for name in ("force", "confirm", "blind")}
+    how: dict[str, Any] = {name: bool(options.get(name)) for name in ("force", "confirm", "blind")}
     chain = Chain(console, names, config, stored, laws, recording=recording, **how)
     if not options["dry_run"]:
         keys = {Override.parse(text).key for text in options["sets"]}
