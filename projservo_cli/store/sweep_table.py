@@ -35,8 +35,15 @@ _TRACES = "traces"
 _FAILURES = "failures"
 
 Array = npt.NDArray[Any]
-# Name, NumPy type, unit and description of a column.
-Heading = tuple[str, str, str, str]
+
+
+class Heading(NamedTuple):
+    """One column of the table: its name, NumPy type, unit and meaning."""
+
+    name: str
+    dtype: str
+    units: str
+    about: str
 
 
 class Failure(NamedTuple):
