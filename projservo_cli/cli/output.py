@@ -193,7 +193,6 @@ def _in_detail(value: dict[str, Any]) -> Iterator[str]:
             parts.append(f"of {name} rms {rms} px (predicted {predicted})")
         yield wrapped(f"in blocks {', '.join(parts)}", "  ")
         yield wrapped(held_out["reason"], "  ")
-    yield from _of_suggestions(value)
 
 
 _ONE_JOINT = "one joint: how it moves images is known; directions and lengths in space take more joints"
