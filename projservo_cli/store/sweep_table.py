@@ -186,8 +186,12 @@ class SweepTable:
             self.failures = {law: Failure(*one) for law, one in stored.items()}  # by law
             self.rows = len(file["run"])
             self.traces = tuple(sorted(map(int, file.get(_TRACES, ()))))  # numbers of runs
-        self.axes: list[tuple[str, list[Any]]] = [*map(tuple, self.attributes["axes"])]
         self._read: dict[str, Array] = {}
+
+    @property
+    def axes(self) -> list[tuple[str, list[Any]]]:
+        """Name and values of each axis of the grid, the last one running fastest."""
+        return [(name, values) for name, values in self.attributes["axes"]]
 
     def __getitem__(self, name: str) -> Array:
         """A column, or what follows from some, read once."""
