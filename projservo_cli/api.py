@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli import plugins
-from projservo_cli.chain import compilation, listening, require_simulated
+from projservo_cli.chain import compilation, require_simulated
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
 from projservo_cli.config.inputs import (
     calibration_inputs,
@@ -25,11 +25,12 @@ from projservo_cli.config.inputs import (
 )
 from projservo_cli.display import checked_array, numbers_in, require_radians
 from projservo_cli.experiment import Experiment, law_target, plan_scene_of
-from projservo_cli.files import working_in
+from projservo_cli.files import working_in, writing
 from projservo_cli.keys import File
 from projservo_cli.laws import CODES, REGULATE, law_and_mode, run_name, run_names
-from projservo_cli.observations import Observations, require_observations, rows_of
-from projservo_cli.records import Calibration, InputError, JointList, Plan
+from projservo_cli.observations import Observations, require_observations
+from projservo_cli.progress import Listener
+from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.stages import Progress
 from projservo_cli.stages import calibrate as calibrating
@@ -90,14 +91,14 @@ def simulate(
     if seed is not None:
         seeded = config.replace({"calibration.seed": seed})
         config, seed = (seeded, None) if q is None else (config, seed)
-    with listening(progress) as listener:
+    with Listener(progress) as listener:
         require_simulated(config)
         trials = calibration_inputs(config.model_copy(update={"data": None})).source
         assert isinstance(trials, Trials)
         if q is None:
             return calibrating.simulated(trials, progress=listener.progress)
         joints = joints_of(config).joints()
-        poses = rows_of(q, len(joints.types))
+        poses = _rows_of(q, len(joints.types))
         require_radians("q", poses, joints.types)
         for k, pose in enumerate(poses):
             if wrong := joints.limit_passed(pose):
@@ -142,13 +143,13 @@ def record(
     given, further = recording_inputs(asked), None
     joints = given.trials.joints.joints()
     if motions is not None:
-        rows = rows_of(motions, len(joints.types))
+        rows = _rows_of(motions, len(joints.types))
         further = JointList(np.arange(len(rows)), rows, numbered=False, left=None, right=None)
     table = None if path is None else Path(path)
     with ExitStack() as stack:
-        listener = stack.enter_context(listening(progress))
+        listener = stack.enter_context(Listener(progress))
         if table is not None:
-            stack.enter_context(working_in(table.parent, name=f".{table.name}.lock"))
+            stack.enter_context(writing(table))
         made = recording.new_recording(given, table, motions=further, force=force)
         if not (made.pending or asked.plant.simulated):
             listener.say(f"record: {table} is up to date, and the robot is not moved: use force=True")
@@ -236,7 +237,7 @@ def calibrate(
     asked = Estimation(
         settings.method, settings.lens, file, settings.cross_validate, settings.max_predicted_px
     )
-    with listening(progress) as listener:
+    with Listener(progress) as listener:
         screened, calibration, held_out = calibrating.estimate(seen, asked, progress=listener.progress)
         return ImageModel.of(calibration, held_out, screened)
 
@@ -410,7 +411,7 @@ def sweep(
     begin = force or not all(design.sources.values())
     with ExitStack() as stack:
         folder = Folder(stack.enter_context(tempfile.TemporaryDirectory()) if path is None else path)
-        listener = stack.enter_context(listening(progress))
+        listener = stack.enter_context(Listener(progress))
         stack.enter_context(working_in(folder.path, "parts", "calibrations"))
         say = listener.say if path is not None else listener.detail
         run_sweep(design, folder, Engine(workers), listener.progress, say, force=begin)
@@ -466,6 +467,12 @@ def _require_config(what: str, config: Any, calibration: Calibration | None = No
             f"{what}: the calibration is of joints {calibration.joint_types}, the configuration of "
             f"{config.joint_types}: take one of the same robot"
         )
+
+
+def _rows_of(q: npt.ArrayLike, n: int) -> FloatArray:
+    """Joint readings (K, n), rad or m, from rows or from one; an InputError for anything else."""
+    said = f"(K, {n}), rad or m"
+    return checked_array("q", np.atleast_2d(numbers_in("q", q, said)), (None, n), said, finite=True)
 
 
 def _say_compilation() -> None:

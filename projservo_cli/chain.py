@@ -2,10 +2,10 @@
 
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,13 +15,12 @@ from projservo_cli.config.inputs import about_of, joints_of, recording_inputs, s
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.keys import digest
 from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, run_name
-from projservo_cli.progress import Bar
+from projservo_cli.progress import Listener
 from projservo_cli.records import (
     InputError,
     JointList,
     WorkFailed,
 )
-from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.steps import STAGES, Step, inputs_of, result_of, steps_for
 from projservo_cli.store import SERVO, Run, save
@@ -29,56 +28,7 @@ from projservo_cli.store import SERVO, Run, save
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
 
 
-class Listener(Protocol):
-    """Who follows a chain, and may be asked before something moves."""
-
-    def say(self, text: str) -> None:
-        """Take note of a message."""
-
-    def detail(self, text: str) -> None:
-        """Take note of a message that few want to read."""
-
-    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
-        """Show how far the work is, with a note."""
-
-    def confirm(self, command: str, plant: Any) -> None:
-        """Ask before the first motion of a plant; raises KeyboardInterrupt where the answer is not yes."""
-
-
-@dataclass(frozen=True)
-class _Caller:
-    """A caller in Python, who is shown progress and messages, and confirms every call."""
-
-    shown: Progress
-    bar: Bar
-
-    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
-        """Show how far the work is; the function of a caller takes no note."""
-        del note
-        self.shown(what, done, total)
-
-    def say(self, text: str) -> None:
-        """Print a message on standard error."""
-        self.bar.say(text)
-
-    def detail(self, text: str) -> None:
-        """Leave a message unread that few want to read."""
-
-    def confirm(self, command: str, plant: Any) -> None:
-        """Agree."""
-
-
-@contextmanager
-def listening(progress: Progress | bool) -> Iterator[_Caller]:
-    """Who follows work that is called from Python: a function, or for True a bar in a terminal."""
-    bar = Bar()
-    try:
-        yield _Caller(progress if callable(progress) else silent if progress is False else bar, bar)
-    finally:
-        bar.close()
-
-
-class Shortfall(NamedTuple):
+class _Shortfall(NamedTuple):
     """A failure in words, and whether a call fails by it."""
 
     text: str
@@ -93,40 +43,26 @@ class Chain:
     names: Sequence[str]  # of the stages
     config: Config
     run: Run  # the stored run, with results made since
-    steps: Sequence[Step]
+    wanted: InitVar[Sequence[str]] = ()  # laws instead of ``control.laws``
+    _: KW_ONLY
+    force: InitVar[bool] = False  # whether to make the stages even where they are up to date
     recording: Any = None  # the recording before the calibration, if any
     confirm: bool = False  # whether to ask before the first motion
     in_memory: bool = False  # whether results stay in memory
     blind: bool = False  # whether a robot may move although cameras show nothing
+    steps: list[Step] = field(init=False)
     laws: tuple[str, ...] = field(init=False)  # names of the runs of laws that the steps make or need
     failed: str = ""  # name of the step that failed
     reason: str = ""  # why
     laws_done: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, wanted: Sequence[str], force: bool) -> None:
+        stages = [name for name in self.names if name != "record"]
+        why = "" if self.recording is None else self.recording.why
+        self.steps = steps_for(self.config, self.run, stages, laws=wanted, force=force, recording=why)
+        if self.recording is not None:
+            self.steps.insert(0, Step("record", "", "", {}, why))
         self.laws = tuple(step.law for step in self.steps if step.law)
-
-    @classmethod
-    def asked(
-        cls,
-        listener: Listener,
-        names: Sequence[str],
-        config: Config,
-        run: Run,
-        *,
-        laws: Sequence[str] = (),
-        force: bool = False,
-        recording: Any = None,
-        confirm: bool = False,
-        in_memory: bool = False,
-        blind: bool = False,
-    ) -> "Chain":
-        """Return the chain of named stages, whose recording, if any, comes first."""
-        stages, why = [name for name in names if name != "record"], "" if recording is None else recording.why
-        steps = steps_for(config, run, stages, laws=laws, force=force, recording=why)
-        if recording is not None:
-            steps.insert(0, Step("record", "", "", {}, why))
-        return cls(listener, names, config, run, steps, recording, confirm, in_memory, blind)
 
     @property
     def pending(self) -> bool:
@@ -268,32 +204,32 @@ class Chain:
         write_page(explained, about_of(config))
         return made
 
-    def findings(self, of_calibration: Mapping[str, Any]) -> Iterator["Shortfall"]:
+    def findings(self, of_calibration: Mapping[str, Any]) -> Iterator[_Shortfall]:
         """Yield the failures of the chain, and whether they end the call with exit code 1.
 
         of_calibration : whether joint types were assumed, and what came of suggestions.
         """
         if self.failed:
             yield from self._of_runs()
-            yield Shortfall(f"{self.failed}: {self.reason}", fatal=True)
+            yield _Shortfall(f"{self.failed}: {self.reason}", fatal=True)
             return
         results = self.run.results
         if "calibrate" in results and not self.run.calibration.usable:
             reason = " ".join(self.run.calibration.reason.split())
             text = f"calibrate: the calibration is not usable: {reason}"
-            yield Shortfall(text, fatal="calibrate" in self.names)
+            yield _Shortfall(text, fatal="calibrate" in self.names)
         if of_calibration.get("joint_types_assumed"):
             text = "calibrate: joint types are not given: all are taken as revolute (--joints)"
-            yield Shortfall(text, fatal=False)
+            yield _Shortfall(text, fatal=False)
         if of_calibration.get("suggestions") == []:
-            yield Shortfall(f"calibrate: {of_calibration['suggestions_reason']}", fatal=True)
+            yield _Shortfall(f"calibrate: {of_calibration['suggestions_reason']}", fatal=True)
         yield from self._of_runs()
         # Other profiles are those of the paper, of which the margins are only measured.
         searched = "plan" in results and self.run.plan.profile in ("constrained", "joint_space")
         if searched and not self.run.plan.feasible:
-            yield Shortfall(f"plan: {self.run.plan.reason}", fatal="plan" in self.names)
+            yield _Shortfall(f"plan: {self.run.plan.reason}", fatal="plan" in self.names)
 
-    def _of_runs(self) -> Iterator["Shortfall"]:
+    def _of_runs(self) -> Iterator[_Shortfall]:
         """A line on each run that did not converge or missed periods, and whether the call fails by it."""
         required = self.config.control.must_converge
         for trace in (self.run.traces[law] for law in self.laws_done):
@@ -312,7 +248,7 @@ class Chain:
                 )
             # Classical laws lead where nothing can be expected of them, images included.
             disturbed = trace.verdict == "fault detected" and trace.law not in POINT_LAWS
-            yield Shortfall(text, fatal=not converged and (must or disturbed))
+            yield _Shortfall(text, fatal=not converged and (must or disturbed))
 
     def _keep(self, run: Run) -> None:
         self.run = run if self.in_memory else save(run)

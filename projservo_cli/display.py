@@ -2,6 +2,7 @@
 
 import dataclasses
 import html
+import importlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -53,9 +54,14 @@ class Displayable(Printed):
         """
         from projservo_cli.store import dataset_of
 
+        xarray()
+        return dataset_of(self.record).assign_coords(self.coordinates())
+
+    @property
+    def record(self) -> Any:
+        """Record that a run file stores."""
         kind = next(base for base in type(self).__mro__[1:] if dataclasses.is_dataclass(base))
-        record = kind(**{field.name: getattr(self, field.name) for field in dataclasses.fields(kind)})
-        return dataset_of(record).assign_coords(self.coordinates())
+        return kind(**{field.name: getattr(self, field.name) for field in dataclasses.fields(kind)})
 
     def coordinates(self) -> dict[str, Any]:
         """Return coordinates of dimensions, by their names."""
@@ -89,20 +95,20 @@ def plain(value: Any, *, finite: bool = False) -> Any:
 
 def pandas() -> Any:
     """Return the package pandas. Raises InputError if it is not installed."""
-    try:
-        import pandas as found
-    except ImportError as error:
-        raise InputError("to_frame needs pandas: pip install '.[tables]'") from error
-    return found
+    return _imported("pandas", "to_frame")
 
 
 def xarray() -> Any:
     """Return the package xarray. Raises InputError if it is not installed."""
+    return _imported("xarray", "to_xarray")
+
+
+def _imported(package: str, method: str) -> Any:
+    """Import a package of the extra ``tables``, which a method needs."""
     try:
-        import xarray as found
+        return importlib.import_module(package)
     except ImportError as error:
-        raise InputError("to_xarray needs xarray: pip install '.[tables]'") from error
-    return found
+        raise InputError(f"{method} needs {package}: pip install '.[tables]'") from error
 
 
 def require_radians(

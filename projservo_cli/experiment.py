@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli import plugins
-from projservo_cli.chain import FIGURES, Chain, Listener, listening
+from projservo_cli.chain import FIGURES, Chain
 from projservo_cli.config import Config, load_config, shipped
 from projservo_cli.config.inputs import joints_of
 from projservo_cli.display import Printed
 from projservo_cli.files import working_in
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import CODES, mode_in
+from projservo_cli.progress import Listener
 from projservo_cli.records import (
     Calibration,
     CrossValidation,
@@ -27,7 +28,7 @@ from projservo_cli.records import (
 from projservo_cli.results import ImageModel, MotionPlan, PlanScene, RunTrace
 from projservo_cli.stages import Progress
 from projservo_cli.steps import STAGES
-from projservo_cli.store import Result, Run, load, run_path
+from projservo_cli.store import Result, Run, stored
 
 
 class Experiment(Printed):
@@ -53,7 +54,8 @@ class Experiment(Printed):
         progress: Progress | bool = True,
     ) -> None:
         self._config: Config | None = config if isinstance(config, Config) else load_config(shipped(config))
-        self._run, self._in_memory = _stored(path), path is None
+        self._run = Run(Path("memory", "run.h5")) if path is None else stored(path)
+        self._in_memory = path is None
         self._progress, self._may_import = progress, True
 
     @classmethod
@@ -96,18 +98,18 @@ class Experiment(Printed):
             raise InputError(f"make: name the stages to make: {', '.join(STAGES)}")
         if self._in_memory and "report" in stages:
             raise InputError("make: a report is written into a folder: give Experiment a path")
-        with listening(self._progress) as listener:
+        with Listener(self._progress) as listener:
             if self._in_memory:
                 return self._make(stages, _targets(laws), listener, force=force, blind=blind)
             with working_in(self._run.path.parent, FIGURES):
-                self._run = _stored(self._run.path)  # another process may have written it until now
+                self._run = stored(self._run.path)  # another process may have written it until now
                 return self._make(stages, _targets(laws), listener, force=force, blind=blind)
 
     def _make(
         self, stages: Sequence[str], laws: Sequence[str], listener: Listener, *, force: bool, blind: bool
     ) -> "Experiment":
-        how = {"in_memory": self._in_memory, "blind": blind}
-        chain = Chain.asked(listener, stages, self.config, self._run, laws=laws, force=force, **how)
+        run, stays = self._run, self._in_memory
+        chain = Chain(listener, stages, self.config, run, laws, force=force, in_memory=stays, blind=blind)
         chain.require_permitted(("law", "plant") if self._may_import else ())
         try:
             chain.make()
@@ -207,14 +209,6 @@ def plan_scene_of(config: Config, calibration: Calibration) -> PlanScene:
         None if size is None else image_sizes(size),
         config.trajectory,
     )
-
-
-def _stored(path: "str | Path | None") -> Run:
-    """The run in a folder, empty where none is; for None one that is never saved."""
-    if path is None:
-        return Run(Path("memory", "run.h5"))
-    file = run_path(path)
-    return load(file) if file.exists() else Run(file)
 
 
 def _targets(laws: Sequence[str]) -> tuple[str, ...]:

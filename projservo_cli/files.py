@@ -6,7 +6,7 @@ import re
 import secrets
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 from projservo_cli.records import InputError
@@ -24,11 +24,11 @@ def replacing(path: Path, *, durable: bool = True) -> Iterator[Path]:
         made again.
     Raises InputError if it cannot be written, or the disk is full.
     """
-    with _write_errors(path):
+    with _errors(path, "written"):
         path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
     try:
-        with _write_errors(path):
+        with _errors(path, "written"):
             temporary.touch(exist_ok=False)
             yield temporary
             if durable:
@@ -52,11 +52,8 @@ def write_whole(path: Path, content: str | bytes) -> Path:
 
 def bytes_of(path: Path | str, expected: str, max_bytes: int) -> bytes:
     """Content of a file of up to ``max_bytes``. Raises InputError, naming the ``expected`` content."""
-    try:
-        with Path(path).open("rb") as file:
-            content = file.read(max_bytes + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected {expected}") from error
+    with _errors(path, "read", f"; expected {expected}"), Path(path).open("rb") as file:
+        content = file.read(max_bytes + 1)
     if len(content) > max_bytes:
         raise InputError(f"{path}: larger than {max_bytes // 1_000_000} MB; expected {expected}")
     return content
@@ -82,7 +79,7 @@ def lines_of(path: Path | str, expected: str, max_bytes: int) -> Iterator[str]:
     """
     number, size = 1, 0
     try:
-        with Path(path).open("rb") as file:
+        with _errors(path, "read", f"; expected {expected}"), Path(path).open("rb") as file:
             while content := file.readline(_LONGEST + 1):
                 size += len(content)
                 if size > max_bytes:
@@ -94,8 +91,6 @@ def lines_of(path: Path | str, expected: str, max_bytes: int) -> Iterator[str]:
                 text = content.decode("utf-8-sig" if number == 1 else "utf-8")
                 yield from io.StringIO(text, newline="")
                 number += 1
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected {expected}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}:{number}: not UTF-8 text; expected {expected}") from error
 
@@ -115,7 +110,7 @@ def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
 
     path, new = folder / name, not folder.exists()
     lock = FileLock(path, timeout=0)
-    with _write_errors(folder, "; choose a folder you can write to"):
+    with _errors(folder, "written", "; choose a folder you can write to"):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire()
@@ -142,6 +137,11 @@ def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
                 folder.rmdir()
 
 
+def writing(path: Path) -> AbstractContextManager[None]:
+    """Make sure, before any work, that a file can be written, and keep other processes from it."""
+    return working_in(path.parent, name=f".{path.name}.lock")
+
+
 def tidy(folder: Path, *parts: str) -> None:
     """Remove leftovers of a killed process from a folder, if no other works there."""
     if (folder / _LOCK).exists():
@@ -166,12 +166,12 @@ def require_inside(path: Path, folder: Path) -> None:
 
 
 @contextmanager
-def _write_errors(path: Path, remedy: str = "") -> Iterator[None]:
-    """Turn an OSError into an InputError of one line."""
+def _errors(path: Path | str, done: str, remedy: str = "") -> Iterator[None]:
+    """Turn an OSError, as a file is read or written, into an InputError of one line."""
     try:
         yield
     except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}{remedy}") from error
+        raise InputError(f"{path}: cannot be {done}: {error.strerror or error}{remedy}") from error
 
 
 def _clear_leftovers(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Keys of results: hashes of the canonical bytes of the records that stages read, and the records again.
+"""Keys of results: hashes of the canonical bytes of the records that stages read.
 
 Equal values have equal bytes, so that the inputs of a stage alone decide whether its result is outdated.
 Files stand in them by their content.
@@ -6,9 +6,8 @@ Files stand in them by their content.
 
 import dataclasses
 import hashlib
-import importlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,24 +57,6 @@ def encoded(record: Any) -> bytes:
     return json.dumps(_canonical(record), separators=(",", ":"), ensure_ascii=False).encode()
 
 
-def decoded(content: bytes, files: Mapping[str, str]) -> Any:
-    """Return the record of which these are the canonical bytes.
-
-    files : where files lie, by the hash of their content.
-    """
-    return _value(json.loads(content), files)
-
-
-def files_in(record: Any) -> list[File]:
-    """Return all files of a record, each once."""
-    if isinstance(record, File):
-        return [record]
-    parts: Iterable[Any] = _fields(record).values()
-    if isinstance(record, (tuple, list, dict)):
-        parts = record.values() if isinstance(record, dict) else record
-    return list(dict.fromkeys(file for part in parts for file in files_in(part)))
-
-
 def _fields(record: Any) -> dict[str, Any]:
     """Values of a dataclass, a named tuple or a section by their names; none of other values."""
     if dataclasses.is_dataclass(record):
@@ -100,22 +81,3 @@ def _canonical(value: Any) -> Any:
     if isinstance(value, (tuple, list)):
         return {type(value).__name__: [_canonical(inner) for inner in value]}
     raise TypeError(f"{type(value).__name__} has no canonical bytes")
-
-
-def _value(plain: Any, files: Mapping[str, str]) -> Any:
-    if not isinstance(plain, dict):
-        return plain
-    ((kind, held),) = plain.items()
-    if kind == "file":
-        return File(files[held], held)
-    if kind == "array":
-        dtype, shape, content = held
-        return np.frombuffer(bytes.fromhex(content), dtype=dtype).reshape(shape).copy()
-    if kind in ("tuple", "list"):
-        found = [_value(inner, files) for inner in held]
-        return found if kind == "list" else tuple(found)
-    values = {name: _value(inner, files) for name, inner in held.items()}
-    if kind == "mapping":
-        return values
-    module, name = kind.split(":")
-    return getattr(importlib.import_module(module), name)(**values)

@@ -1,8 +1,7 @@
 """Observations of a robot by two cameras, with all inputs of a calibration besides the pixels."""
 
 import dataclasses
-import re
-import tempfile
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,8 @@ import numpy.typing as npt
 from projservo_cli.calibration.estimate import require_size_and_noise
 from projservo_cli.display import Displayable, checked_array, numbers_in, pandas
 from projservo_cli.image_size import ImageSize
-from projservo_cli.records import FloatArray, InputError, Observation
-from projservo_cli.store.tables import in_radians, or_empty, read_table, to_csv, write_table
-
-_TABLE = "table"  # name in messages of a table that is not a file
+from projservo_cli.records import InputError, Observation
+from projservo_cli.store.tables import in_radians, or_empty, read_table, table_text, to_csv
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -59,13 +56,6 @@ class Observations(Displayable, Observation):
         fields = {field.name: getattr(observation, field.name) for field in dataclasses.fields(Observation)}
         types = properties.pop("joint_types", None) or "R" * observation.q.shape[1]
         return cls(**fields, joint_types=types, **properties)
-
-    @property
-    def record(self) -> Observation:
-        """Record that a run file stores."""
-        return Observation(
-            **{field.name: getattr(self, field.name) for field in dataclasses.fields(Observation)}
-        )
 
     @classmethod
     def from_arrays(
@@ -160,16 +150,12 @@ class Observations(Displayable, Observation):
         if isinstance(table, (str, Path)):
             observation = read_table(table, types, joint_unit)
         else:
-            observation = _read(_text_of(table), types, joint_unit)
+            observation = read_table("table", types, joint_unit, frame=_text_of(table))
         return cls.of(observation, joint_types=types, image_size=image_size, noise_px=noise_px)
 
     def to_frame(self) -> Any:
         """Return the observation table as a pandas table; an InputError without pandas."""
-        of_pandas = pandas()
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder, _TABLE)
-            write_table(self, path)
-            return of_pandas.read_csv(path)
+        return pandas().read_csv(io.StringIO(table_text(self)))
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""
@@ -220,29 +206,6 @@ def _text_of(table: Any) -> str:
 def _unmasked(values: Any) -> npt.NDArray[Any]:
     """A column, NaN where it is masked."""
     return numbers_in("table", values, "(rows,)") if np.ma.is_masked(values) else np.asarray(values)
-
-
-def _read(text: str, joint_types: str | None, joint_unit: str | None) -> Observation:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, _TABLE)
-        path.write_text(text, encoding="utf-8")
-        try:
-            return read_table(path, joint_types, joint_unit)
-        except InputError as error:
-            message = str(error).replace(str(path), _TABLE).replace(f"{_TABLE}:1:", f"{_TABLE}:")
-            message = re.sub(r"\bline (\d+)", _row, re.sub(rf"{_TABLE}:(?=\d)", f"{_TABLE}: line ", message))
-            raise InputError(re.sub(r"--joint-unit (\w+)", r"joint_unit='\1'", message)) from error
-
-
-def _row(line: re.Match[str]) -> str:
-    """Row of a frame, which starts at 0, for a line of its file, the second of which it is."""
-    return f"row {int(line[1]) - 2}"
-
-
-def rows_of(q: npt.ArrayLike, n: int) -> FloatArray:
-    """Joint readings (K, n), rad or m, from rows or from one; an InputError for anything else."""
-    said = f"(K, {n}), rad or m"
-    return checked_array("q", np.atleast_2d(numbers_in("q", q, said)), (None, n), said, finite=True)
 
 
 def require_observations(what: str, observations: Any, kind: type[Observation] = Observations) -> None:

@@ -55,7 +55,7 @@ def find(kind: str, target: str) -> Any:
     where = f"{kind} {target}"
     found = _found(where, *target.split(":"))
     if isinstance(found, type):
-        _require_methods(where, found, kind)
+        require_object(kind, target, found)
     return found
 
 
@@ -88,7 +88,7 @@ def called(kind: str, target: str, found: Any, arguments: Sequence[Any], options
         raise
     except Exception as error:
         raise WorkFailed(f"{where}: cannot be made: {what_failed(error)}") from error
-    _require_methods(where, result, kind)
+    require_object(kind, target, result)
     return result
 
 
@@ -133,11 +133,6 @@ def _found(where: str, module: str, name: str) -> Any:
     return found
 
 
-def require_object(kind: str, target: str, given: Any) -> None:
-    """Refuse an object that lacks a method it must have, with an InputError."""
-    _require_methods(f"{kind} {target}", given, kind)
-
-
 def class_name(given: Any) -> str:
     """Return ``module:Class`` of a class, of a function or of an object's class."""
     kind = given if hasattr(given, "__qualname__") else type(given)
@@ -148,7 +143,7 @@ def class_name(given: Any) -> str:
 def bring(kind: str, given: Any) -> str:
     """Make a class that this process has be found by its name, which is returned."""
     target = class_name(given)
-    _require_methods(f"{kind} {target}", given, kind)
+    require_object(kind, target, given)
     _BROUGHT[target] = given
     return target
 
@@ -162,7 +157,9 @@ def importable(given: Any) -> bool:
     return found is given
 
 
-def _require_methods(where: str, found: Any, kind: str) -> None:
+def require_object(kind: str, target: str, found: Any) -> None:
+    """Refuse a class or an object that lacks a method it must have, with an InputError."""
+    where = f"{kind} {target}"
     methods = _METHODS[kind]
     if kind == "plant" and not callable(getattr(found, "read", None)) and brings_no_pixels(found):
         methods = tuple("joints" if name == "read" else name for name in methods)

@@ -1,15 +1,16 @@
-"""A progress bar on a terminal."""
+"""Who follows a piece of work: messages, and a progress bar on a terminal."""
 
 import sys
 import threading
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Self
 
 # Period at which the clock of a bar advances, s.
 TICK_S = 0.5
 
 
-class Bar:
+class _Bar:
     """Progress bar, one at a time; silent if standard error is no terminal."""
 
     def __init__(self) -> None:
@@ -49,3 +50,36 @@ class Bar:
         while self._bar is bar:
             bar.refresh()
             time.sleep(TICK_S)
+
+
+class Listener:
+    """A caller in Python: is shown progress and messages, and agrees to every motion.
+
+    progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
+    """
+
+    def __init__(self, progress: Callable[[str, int, int], None] | bool = True) -> None:
+        self._bar = _Bar()
+        self._progress = self._bar if progress is True else progress
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def say(self, text: str) -> None:
+        """Print a message on standard error."""
+        self._bar.say(text)
+
+    def detail(self, text: str) -> None:
+        """Leave a message unread that few want to read."""
+
+    def progress(self, what: str, done: int, total: int, note: str = "") -> None:
+        """Show how far the work is; the function of a caller takes no note."""
+        del note
+        if callable(self._progress):
+            self._progress(what, done, total)
+
+    def confirm(self, command: str, plant: Any) -> None:
+        """Agree to the first motion of a plant; raises KeyboardInterrupt where the answer is not yes."""

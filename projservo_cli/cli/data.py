@@ -61,7 +61,7 @@ def _teach(
     """
     from projservo_cli.config import plain_yaml
     from projservo_cli.config.inputs import plan_inputs, teach_inputs
-    from projservo_cli.files import write_whole
+    from projservo_cli.files import write_whole, writing
     from projservo_cli.records import InputError, WorkFailed
     from projservo_cli.settings.sections import JointVector
     from projservo_cli.stages import teach as stage
@@ -81,7 +81,7 @@ def _teach(
     calibrated = option.calibrated_run(run, settings)
     calibration = None if calibrated is None else calibrated.calibration
     asks = not settings.plant.simulated and sys.stdin.isatty()
-    with option.writing(output):
+    with writing(output):
         try:
             taught = stage.teach(teach_inputs(settings), frames, put, console.wait if asks else None)
             if start:
@@ -262,11 +262,7 @@ def _detect(
     default=0.0,
     help="Deviation of the arm that no image shows, a coordinate, beyond the covariance.",
 )
-@click.option(
-    "--joint-unit",
-    type=click.Choice(["deg", "rad"]),
-    help="Unit of the table's revolute joints. Default: that of the run.",
-)
+@option.joint_unit(help="Unit of the table's revolute joints. Default: that of the run.")
 @option.explained
 def _validate(
     console: Console,

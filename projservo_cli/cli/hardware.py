@@ -147,7 +147,7 @@ def doctor(
     options : sets, move and watch of ``doctor``.
     """
     from projservo_cli.config.inputs import preflight_inputs
-    from projservo_cli.files import write_whole
+    from projservo_cli.files import write_whole, writing
     from projservo_cli.report.live_page import preflight_page
     from projservo_cli.stages.doctor import check
 
@@ -156,7 +156,7 @@ def doctor(
     move, watch = options["move"], options["watch"]
     if move and not sys.stdin.isatty():
         raise click.UsageError("--move: standard input is no terminal, so nobody can be asked; leave it out")
-    with option.writing(output):
+    with writing(output):
         checked = check(
             preflight_inputs(settings),
             None if stored is None else stored.calibration,

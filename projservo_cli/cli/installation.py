@@ -34,7 +34,6 @@ def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None
     Writes a configuration that runs as it is, with a comment on every key, and next to it the schema by which
     editors complete and check it.
     """
-    from projservo_cli.config.arms import starter_for
     from projservo_cli.config.schema import json_schema, starter
     from projservo_cli.files import write_whole
 
@@ -43,7 +42,7 @@ def _init(console: Console, *, file: Path, arm: str | None, force: bool) -> None
         raise click.UsageError(f"{path}: name a YAML file to write, such as {path.with_suffix('.yaml')}")
     option.require_new(path, force=force)
     described = path.with_name(_SCHEMA)
-    write_whole(path, starter() if arm is None else starter_for(arm))
+    write_whole(path, starter(arm))
     write_whole(described, _as_text(json_schema()))
     words = [f"init: {path}, with {described} for editors"]
     if arm is None:

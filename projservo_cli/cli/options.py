@@ -4,6 +4,7 @@ import contextlib
 import functools
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -39,6 +40,7 @@ class NumberRange(_Finite, click.FloatRange):
 
 NUMBER = _Finite()
 _RESULTS = Path("results")
+_SIZE = re.compile(r"\s*(\d+)\s*[xX]\s*(\d+)\s*")
 _TRIALS = "trials.csv"  # in the folder of a run: the default table of a recording
 _KEYS = {  # that options stand for
     "data": "data.table",
@@ -54,6 +56,7 @@ _KEYS = {  # that options stand for
 configuration = functools.partial(click.option, "-c", "--config", metavar="FILE", type=click.Path())
 output = functools.partial(click.option, "-o", "--output", type=PATH)
 force = functools.partial(click.option, "--force", is_flag=True)
+joint_unit = functools.partial(click.option, "--joint-unit", type=click.Choice(["deg", "rad"]))
 threads = functools.partial(click.option, "-j", "--threads", metavar="N", type=click.IntRange(1, 256))
 
 override = click.option(
@@ -63,11 +66,6 @@ override = click.option(
     multiple=True,
     help="Override a value of the configuration; V is YAML, files are relative to the configuration. "
     "Repeatable.",
-)
-joint_unit = click.option(
-    "--joint-unit",
-    type=click.Choice(["deg", "rad"]),
-    help="Unit of the table's revolute joints. Default: rad.",
 )
 dry_run = click.option("-n", "--dry-run", is_flag=True, help="Say what would be done, do nothing.")
 speed_scale = click.option(
@@ -116,7 +114,7 @@ _OF_STAGES = (
     output(metavar="DIR", help="Folder of the run, or its run.h5. Default: results/<configuration name>."),
     click.option("--data", metavar="TABLE", type=click.Path(), help="Calibrate from this table (CSV)."),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
-    joint_unit,
+    joint_unit(help="Unit of the table's revolute joints. Default: rad."),
     click.option(
         "--noise-px", metavar="S", type=NUMBER, help="Pixel noise of the table. Default: estimated."
     ),
@@ -149,13 +147,6 @@ def require_new(path: Path, *, force: bool) -> None:
         raise click.UsageError(f"{path}: exists already; choose another, or replace it with --force")
 
 
-def writing(path: Path) -> contextlib.AbstractContextManager[None]:
-    """Make sure, before any work, that a file can be written, and keep other processes from it."""
-    from projservo_cli.files import working_in
-
-    return working_in(path.parent, name=f".{path.name}.lock")
-
-
 def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
     """The run that is named, as an argument or with ``-o``; None where none is."""
     if run is not None and output is not None:
@@ -172,11 +163,12 @@ def configured(
     Raises UsageError where a robot is named by the run alone, which starts no code.
     """
     from projservo_cli.config import load_config, shipped
+    from projservo_cli.store import stored
 
-    stored = None if config or run is None else _stored(run)
-    if stored is None or not stored.configuration:
+    held = None if config or run is None else stored(run)
+    if held is None or not held.configuration:
         return load_config(config or shipped("paper"), _overrides(options), teaching=teaching)
-    found = load_config(stored.path, _overrides(options), text=stored.configuration)
+    found = load_config(held.path, _overrides(options), text=held.configuration)
     if not found.plant.simulated:
         raise click.UsageError(
             f"plant {found.plant.use} is named by the stored run alone, which starts no code: give the "
@@ -187,10 +179,12 @@ def configured(
 
 def calibrated_run(run: Path | None, config: "Config") -> "Run | None":
     """The run that is named, by default that of the configuration's name; None without a calibration."""
-    found = _stored(run or _RESULTS / config.name)
-    if found is None and run is not None:
+    from projservo_cli.store import stored
+
+    found = stored(run or _RESULTS / config.name)
+    if run is not None and not found.path.exists():
         raise click.UsageError(f"{run}: there is no run; calibrate first, or leave it out")
-    return found if found is not None and "calibrate" in found.results else None
+    return found if "calibrate" in found.results else None
 
 
 def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Config", "Run"]:
@@ -200,17 +194,18 @@ def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Co
     it names another.
     """
     from projservo_cli.config import Override, load_config, to_yaml
+    from projservo_cli.store import stored
 
     if options.get("origin") is not None:
         return _from_sweep(options)
-    stored = _stored(options["output"]) if options["output"] else None
-    if not options["config"] and stored is not None and stored.configuration:
-        config = load_config(stored.path, _overrides(options), text=stored.configuration)
+    run = stored(options["output"]) if options["output"] else None
+    if not options["config"] and run is not None and run.configuration:
+        config = load_config(run.path, _overrides(options), text=run.configuration)
     elif not options["config"] and options["data"]:
         config = load_config(None, _overrides(options))
     else:
         config = configured(options["config"], options)
-    run = stored or _run_of(options, config)
+    run = run or _run_of(options, config)
     table = run.path.resolve().with_name(_TRIALS)
     if config.data is None and (recording or table.is_file()):
         in_folder = Override(f"{table}", "data.table", str(table))
@@ -230,8 +225,8 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
     if overrides := _overrides(options):
         config = load_config(config.name, overrides, text=to_yaml(config))
     run = _run_of(options, config)
-    stored = run.results.get("calibrate")
-    if calibration is not None and (stored is None or stored.key != calibration.key):
+    before = run.results.get("calibrate")
+    if calibration is not None and (before is None or before.key != calibration.key):
         run = Run(run.path, run.configuration, {"calibrate": calibration})
     return config, run
 
@@ -239,20 +234,13 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
 def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
     """The run where the user says, else in the folder of the configuration's name; empty where none is."""
     from projservo_cli.files import require_inside
-    from projservo_cli.store import Run, run_path
+    from projservo_cli.store import stored
 
     folder = options["output"]
     if not folder:
         folder = _RESULTS / config.name
         require_inside(folder, _RESULTS)
-    return _stored(folder) or Run(run_path(folder))
-
-
-def _stored(target: str | Path) -> "Run | None":
-    """The run in a folder or file; None where there is none yet."""
-    from projservo_cli.store import load, run_path
-
-    return load(target) if run_path(target).exists() else None
+    return stored(folder)
 
 
 def _overrides(options: Mapping[str, Any]) -> list["Override"]:
@@ -269,14 +257,13 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
         value = os.path.abspath(given) if name in ("data", "init") else given
         found.append(Override(flag, key, value))
     if (size := options.get("image_size")) is not None:  # such as 1280x1024,1280x960
-        flag, sizes = f"--image-size {size}", [one.split("x") for one in size.lower().split(",")]
-        sides = [side.strip() for one in sizes for side in one]
-        if len(sizes) > 2 or any(len(one) != 2 for one in sizes) or not all(map(str.isdecimal, sides)):
+        flag, sizes = f"--image-size {size}", [_SIZE.fullmatch(one) for one in size.split(",")]
+        if len(sizes) > 2 or None in sizes:
             raise click.UsageError(
                 f"{flag}: expected width x height in px, such as 1280x1024, or 1280x1024,1280x960 where the "
                 "right images have another size"
             )
-        values = [[int(side) for side in one] for one in sizes]
+        values = [[int(one[1]), int(one[2])] for one in sizes if one is not None]
         found.append(Override(flag, "data.image_size_px", values if len(values) > 1 else values[0]))
     if (goal := options.get("goal")) is not None:
         named = goal if goal.endswith((".yaml", ".yml")) else f"{goal}.yaml"

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from projservo_cli.masking import masked
-from projservo_cli.progress import Bar
+from projservo_cli.progress import Listener
 
 _UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _NOTES = {  # on runs, and their reasons
@@ -40,21 +40,15 @@ def visible(text: str) -> str:
     return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", masked(text))
 
 
-class Console:
+class Console(Listener):
     """Messages at the level of the user, and a progress bar in a terminal."""
 
     def __init__(self, *, quiet: bool = False, verbose: bool = False, as_json: bool = False) -> None:
+        super().__init__()
         self.quiet = quiet
         self.verbose = verbose
         self.as_json = as_json
         self._data = sys.stdout  # while a command works, what others print goes elsewhere
-        self._bar = Bar()
-
-    def __enter__(self) -> "Console":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
 
     def report(self, value: dict[str, Any], lines: Iterable[str]) -> None:
         """Data on standard output: one object of strict JSON in UTF-8, whatever the locale, or in words."""
@@ -113,21 +107,19 @@ def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> It
     """Lines on the object of a stage or the report of a ``sweep``; ``detailed`` with claims and margins."""
     if "failed" in value:  # the reason is printed with the exit code
         yield f"{stage}: {'failed' if value['failed'].split('/')[0] == stage else 'not made'}"
-    elif stage == "record":
-        yield from _of_recording(value)
-    elif stage == "calibrate":
-        yield from _of_calibration(value, detailed)
-    elif stage == "plan":
-        yield from _of_plan(value, detailed)
-    elif stage == "servo":
-        yield from _of_laws(value)
-    elif stage == "sweep":
-        yield from _of_sweep(value)
-    else:
-        yield from _of_report(value, detailed)
+        return
+    of_stage = {
+        "record": _of_recording,
+        "calibrate": _of_calibration,
+        "plan": _of_plan,
+        "servo": _of_laws,
+        "sweep": _of_sweep,
+        "report": _of_report,
+    }
+    yield from of_stage[stage](value, detailed)
 
 
-def _of_recording(value: dict[str, Any]) -> Iterator[str]:
+def _of_recording(value: dict[str, Any], _: bool) -> Iterator[str]:
     yield (
         "record: {recorded} poses recorded, {found} there before, {pending} to be recorded; "
         "{markers} markers".format_map(value)
@@ -201,7 +193,6 @@ def _in_detail(value: dict[str, Any]) -> Iterator[str]:
             parts.append(f"of {name} rms {rms} px (predicted {predicted})")
         yield wrapped(f"in blocks {', '.join(parts)}", "  ")
         yield wrapped(held_out["reason"], "  ")
-    yield from _of_suggestions(value)
 
 
 _ONE_JOINT = "one joint: how it moves images is known; directions and lengths in space take more joints"
@@ -315,7 +306,7 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
             )
 
 
-def _of_laws(value: dict[str, Any]) -> Iterator[str]:
+def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
     from projservo_cli.laws import run_name
 
     known = any(trace["position_error_mm"] is not None for trace in value["laws"])
@@ -371,7 +362,7 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-def _of_sweep(found: dict[str, Any]) -> Iterator[str]:
+def _of_sweep(found: dict[str, Any], _: bool) -> Iterator[str]:
     """The table of cells, and that of pairs of laws on the same tasks."""
     yield (
         f"report: {found['runs']} of {found['total']} runs; shares in %, 95 % interval; medians of successes"

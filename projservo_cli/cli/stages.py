@@ -2,15 +2,18 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from projservo_cli.cli import options as option
 from projservo_cli.cli.output import Console, visible, words_of, wrapped
 from projservo_cli.cli.program import FAILED, main
+
+if TYPE_CHECKING:
+    from projservo_cli.chain import Chain
 
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
 _AGAIN = ", and the robot is not moved: --force records all poses again"
@@ -35,7 +38,7 @@ def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -
     type=option.PATH,
     help="Further poses after the trial motions, a row each, with columns q1 ... qN.",
 )
-@option.joint_unit
+@option.joint_unit(help="Unit of the table's revolute joints. Default: rad.")
 @option.speed_scale
 @option.confirm
 @option.force(help="Start again, whatever the table holds.")
@@ -61,6 +64,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
         return _make(console, stages, options)
     from projservo_cli.chain import data_table, recording_made
     from projservo_cli.config.inputs import recording_inputs
+    from projservo_cli.files import writing
     from projservo_cli.stages.record import new_recording
 
     config = option.configured(options["config"], options)
@@ -70,7 +74,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     if not (recording.why or config.plant.simulated):
         console.say(f"record: {path} is up to date{_AGAIN}")
     if not options["dry_run"]:
-        with option.writing(path):
+        with writing(path):
             recording = new_recording(given, path, motions=poses, force=options["force"])
             reason = recording_made(console, config, recording, confirm=options["confirm"])
     value = _recording_object(recording, reason)
@@ -212,25 +216,14 @@ def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **op
     return _make(console, stages, options)
 
 
-@dataclass
-class _Call:
-    """One call of stages: its chain, its options, and its messages."""
-
-    console: Console
-    options: Mapping[str, Any]
-    chain: Any
-    beside: dict[str, dict[str, Any]] = field(default_factory=dict)  # further values of a stage's object
-
-
 def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) -> int:
     """Make the named stages and their missing inputs; return the exit code."""
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
     from projservo_cli.chain import FIGURES
-    from projservo_cli.files import tidy, working_in
+    from projservo_cli.files import tidy, working_in, writing
 
-    call = _asked(console, names, options)
-    chain = call.chain
+    chain = _asked(console, names, options)
     if options["dry_run"]:
         words = (f"{s.name}: {f'would be made ({s.why})' if s.why else s.status}" for s in chain.steps)
         steps = [{"stage": s.stage, "law": s.law or None, "why": s.why or None} for s in chain.steps]
@@ -239,22 +232,22 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     folder = chain.run.path.parent
     if not chain.pending and not _optional_files(options):
         tidy(folder, FIGURES)
-        return _work(call)
+        return _work(console, chain, options)
     with working_in(folder, FIGURES):
         if chain.recording is None:  # again, since another process may have written the run until now
-            return _work(_asked(console, names, options))
-        with option.writing(chain.recording.path):
-            call = _asked(console, names, options)
-            if not call.chain.record():
-                return _work(call)
-            unasked = {**options, "confirm": options["confirm"] and not call.chain.recording.why}
-            return _work(_asked(console, names, unasked, replace(call.chain.recording, why="")))
+            return _work(console, _asked(console, names, options), options)
+        with writing(chain.recording.path):
+            chain = _asked(console, names, options)
+            if chain.record():
+                unasked = {**options, "confirm": options["confirm"] and not chain.recording.why}
+                chain = _asked(console, names, unasked, replace(chain.recording, why=""))
+            return _work(console, chain, options)
 
 
 def _asked(
     console: Console, names: Sequence[str], options: Mapping[str, Any], recording: Any = None
-) -> _Call:
-    """Return the actions, by the configuration and the run; refuse forbidden ones.
+) -> "Chain":
+    """Return the chain of the call, by the configuration and the run; refuse a forbidden one.
 
     recording : where it was made just now.
     """
@@ -269,21 +262,19 @@ def _asked(
             "use --set calibration.method=bundle_adjustment"
         )
     if wanted := _optional_files(options):
-        require_optional(config, wanted)
+        _require_optional(config, wanted)
     if records and recording is None:
         recording = pending_recording(config, stored, _motions(config, options), force=options["force"])
-    how = {name: bool(options.get(name)) for name in ("confirm", "blind")}
-    chain = Chain.asked(
-        console, names, config, stored, laws=laws, force=options["force"], recording=recording, **how
-    )
+    how: dict[str, Any] = {name: bool(options.get(name)) for name in ("force", "confirm", "blind")}
+    chain = Chain(console, names, config, stored, laws, recording=recording, **how)
     if not options["dry_run"]:
         keys = {Override.parse(text).key for text in options["sets"]}
         named = {kind for kind, those in _NAMING.items() if options["config"] or keys & those}
         chain.require_permitted(named | ({"law"} if laws else set()))
-    return _Call(console, options, chain)
+    return chain
 
 
-def require_optional(config: Any, wanted: Sequence[str]) -> None:
+def _require_optional(config: Any, wanted: Sequence[str]) -> None:
     """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted."""
     from projservo_cli.config.inputs import truth_of
     from projservo_cli.records import InputError
@@ -319,19 +310,18 @@ def _law_names(names: Sequence[str]) -> tuple[str, ...]:
         raise click.UsageError(f"--{error}") from error
 
 
-def _work(call: _Call) -> int:
+def _work(console: Console, chain: "Chain", options: Mapping[str, Any]) -> int:
     """Make the outdated stages and print their results; return the exit code."""
-    console, chain = call.console, call.chain
     _announce(console, chain)
     chain.make()
-    if (count := call.options.get("suggest")) is not None and not chain.lacks("calibrate"):
-        call.beside["calibrate"] = chain.suggestions(count)
+    beside: dict[str, dict[str, Any]] = {"calibrate": {}, "report": {}}  # further values of their objects
+    if (count := options.get("suggest")) is not None and not chain.lacks("calibrate"):
+        beside["calibrate"] = chain.suggestions(count)
     if "calibrate" in chain.names:
-        assumed = chain.config.joint_types is None
-        call.beside.setdefault("calibrate", {})["joint_types_assumed"] = assumed
-    if (wanted := _optional_files(call.options)) and not chain.lacks("report"):
-        call.beside["report"] = chain.optional_files(wanted)
-    call.beside.setdefault("report", {})["replayed"] = chain.replayed()
+        beside["calibrate"]["joint_types_assumed"] = chain.config.joint_types is None
+    if (wanted := _optional_files(options)) and not chain.lacks("report"):
+        beside["report"] |= chain.optional_files(wanted)
+    beside["report"]["replayed"] = chain.replayed()
     from projservo_cli.report.report_data import failed_object, stage_object
 
     values, joints = {}, chain.config.joint_names
@@ -343,19 +333,19 @@ def _work(call: _Call) -> int:
             values[name] = failed_object(name, chain.run, chain.reason, chain.failed, chain.laws_done)
         else:
             values[name] = stage_object(name, chain.run, joints, chain.laws)
-            values[name] |= call.beside.get(name, {})
+            values[name] |= beside.get(name, {})
     words = [line for name in values for line in words_of(name, values[name], detailed=console.verbose)]
     words += [f"table: {chain.recording.path}"] if chain.recording is not None else []
     words += [f"run: {chain.run.path}"] if chain.run.results else []
     console.report(values if len(values) > 1 else values[chain.names[0]], words)
-    findings = list(chain.findings(call.beside.get("calibrate", {})))
+    findings = list(chain.findings(beside["calibrate"]))
     for finding in findings:
         if finding.fatal or not console.quiet:
             click.echo(visible(f"projservo: {finding.text}"), err=True)
     return FAILED if any(finding.fatal for finding in findings) else 0
 
 
-def _announce(console: Console, chain: Any) -> None:
+def _announce(console: Console, chain: "Chain") -> None:
     """Print the stages to make by reason, and those up to date."""
     reasons: dict[str, list[str]] = {}
     for step in chain.steps:

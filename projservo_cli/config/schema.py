@@ -13,7 +13,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from projservo_cli.config.loading import Config
 from projservo_cli.config.sweep import SweepConfig
 
-_EXAMPLE = Path(__file__).with_name("starter.yaml")
+_EXAMPLES = Path(__file__).parent
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
@@ -71,17 +71,18 @@ def _without_titles(value: Any) -> Any:
     return kept
 
 
-def starter() -> str:
-    """A configuration to start from that speaks of every key.
+def starter(arm: str | None = None) -> str:
+    """A configuration to start from: for a kind of arm that people build, else one that speaks of every key.
 
-    The example comments its sections itself, but for those of settings, of which it holds at most values
+    The latter comments its sections itself, but for those of settings, of which it holds at most values
     that are not the defaults: these are filled from the models.
     """
-    settings = r"^(\w+):\n((?:  \w+: .*\n)*)(?=\n|\Z)"
+    if arm is not None:
+        return (_EXAMPLES / f"starter_{arm}.yaml").read_text(encoding="utf-8")
     return re.sub(
-        settings,
+        r"^(\w+):\n((?:  \w+: .*\n)*)(?=\n|\Z)",
         lambda match: "\n".join(_settings(*match.groups())) + "\n",
-        _EXAMPLE.read_text(encoding="utf-8"),
+        (_EXAMPLES / "starter.yaml").read_text(encoding="utf-8"),
         flags=re.MULTILINE,
     )
 

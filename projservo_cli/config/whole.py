@@ -16,7 +16,7 @@ from projservo_cli.settings.cameras import Cameras
 from projservo_cli.settings.control import RENDERED, Control, PlantSettings, ReportSettings, Stop
 from projservo_cli.settings.disturbance import Disturbance
 from projservo_cli.settings.markers import Markers
-from projservo_cli.settings.robot import Rig, RobotSettings, are_degrees
+from projservo_cli.settings.robot import Rig, RobotSettings, like_degrees
 from projservo_cli.settings.sections import Finding, JointVector, Root, Whole
 from projservo_cli.settings.task import TaskSettings, Trajectory
 from projservo_cli.settings.trials import CalibrationSettings, Data, Noise
@@ -67,9 +67,8 @@ def _joint_vectors(
         yield ("robot", "limits", "joints"), f"{len(pairs)} pairs for {len(types)} joints ({types})"
     elif pairs is not None and robot is not None and robot.limits is not None and robot.limits.unit == "rad":
         for i, ((low, high), letter) in enumerate(zip(pairs, types or "R" * len(pairs), strict=True)):
-            if letter == "R" and are_degrees(low, high):
-                what = f"{low:g} to {high:g} rad is more than two turns to a side: degrees? set unit: deg"
-                yield ("robot", "limits", "joints", i), what
+            if letter == "R" and (what := like_degrees(low, high)):
+                yield ("robot", "limits", "joints", i), f"{what} set unit: deg"
     if task is not None:
         vectors["task", "start"] = task.start
         vectors["task", "start_offset"] = task.start_offset

@@ -42,7 +42,7 @@ _TARGET = {"type": "string", "pattern": plugins.TARGET}
 
 # A registered name is stored as the class it stands for, so that a run can be read where it is not installed.
 Law = Annotated[str, AfterValidator(_law), WithJsonSchema({"anyOf": [{"enum": list(LAWS)}, _TARGET]})]
-PlantClass = Annotated[str, AfterValidator(_plant), WithJsonSchema({"type": "string"})]
+_PlantClass = Annotated[str, AfterValidator(_plant), WithJsonSchema({"type": "string"})]
 
 
 def _as_given(value: Any) -> Any:
@@ -168,7 +168,7 @@ class PlantSettings(Section):
     external robot beyond its joint limits.
     """
 
-    use: PlantClass | None = Field(
+    use: _PlantClass | None = Field(
         None,
         description="class of an external robot (module:Class), or mujoco for a simulated arm with "
         "rendered cameras; null for a simulated arm whose points are projected",

@@ -59,7 +59,7 @@ class StuckEncoder(Section):
     steps: Count | None = Field(None, description="number of steps; null: until the end of the run")
 
 
-class CameraMoved(Section):
+class _CameraMoved(Section):
     """A camera that moves, which shifts its image."""
 
     at_step: Whole = Field(description="first step at which the image is shifted")
@@ -72,7 +72,7 @@ class CameraMoved(Section):
         return tuple(shift if self.view == view else (0.0, 0.0) for view in VIEWS)
 
 
-class MarkerMoved(Section):
+class _MarkerMoved(Section):
     """A marker that moves on the tool."""
 
     at_step: Whole = Field(description="first step at the new position")
@@ -155,8 +155,8 @@ class Events(Section):
     lost_markers: LostMarkers | None = None
     joint_moved: JointMoved | None = None
     stuck_encoder: StuckEncoder | None = None
-    camera_moved: CameraMoved | None = None
-    marker_moved: MarkerMoved | None = None
+    camera_moved: _CameraMoved | None = None
+    marker_moved: _MarkerMoved | None = None
 
 
 class Disturbance(Events, Faults):

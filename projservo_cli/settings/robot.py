@@ -22,6 +22,7 @@ from projservo_cli.settings.sections import (
     Vector3,
     not_a_screw,
     not_rigid,
+    upside_down,
 )
 
 _File = Annotated[str, StringConstraints(min_length=1)]
@@ -35,9 +36,10 @@ _IDENTITY: Matrix44 = (
 _MOST_DEG = 1000.0
 
 
-def are_degrees(low: float, high: float) -> bool:
-    """Tell whether limits of a revolute joint that are to be rad look like degrees."""
-    return TWO_TURNS < max(abs(low), abs(high)) <= _MOST_DEG
+def like_degrees(low: float, high: float) -> str:
+    """Return the reason why limits of a revolute joint that are to be rad look like degrees, else nothing."""
+    alike = TWO_TURNS < max(abs(low), abs(high)) <= _MOST_DEG
+    return f"{low:g} to {high:g} rad is more than two turns to a side: degrees?" if alike else ""
 
 
 class _Joint(Section):
@@ -58,7 +60,7 @@ class _Joint(Section):
 
     def contradictions(self) -> Iterator[Finding]:
         """Limits in two units, of the other type of joint, or upside down."""
-        given = [name for name in ("limits_deg", "limits_rad", "limits_m") if getattr(self, name) is not None]
+        given = self.given("limits_deg", "limits_rad", "limits_m")
         if len(given) > 1:
             yield (given[1],), f"{given[0]} is set as well; keep one"
         for name in given:
@@ -66,16 +68,13 @@ class _Joint(Section):
                 units = "limits_m" if self.type == "P" else "limits_deg or limits_rad"
                 yield (name,), f"a joint of type {self.type} takes {units}"
             low, high = getattr(self, name)
-            if not low < high:
-                yield (name,), f"the lower limit {low:g} must be below the upper limit {high:g}"
-            elif name == "limits_rad" and are_degrees(low, high):
-                yield (
-                    (name,),
-                    f"{low:g} to {high:g} rad is more than two turns to a side: degrees? set limits_deg",
-                )
+            if what := upside_down(low, high):
+                yield (name,), what
+            elif name == "limits_rad" and (what := like_degrees(low, high)):
+                yield (name,), f"{what} set limits_deg"
 
 
-class DHJoint(_Joint):
+class _DHJoint(_Joint):
     """A row of a Denavit-Hartenberg table; the joint reading adds to theta (R) or d (P)."""
 
     theta_deg: Number = Field(0.0, description="rotation about z")
@@ -102,7 +101,7 @@ class _DH(Section):
     convention: Literal["standard", "modified"] = Field(
         "standard", description="convention of the table; modified is Craig's"
     )
-    joints: tuple[DHJoint, ...] = Field(
+    joints: tuple[_DHJoint, ...] = Field(
         min_length=1, max_length=64, description="rows of the table, base to tool"
     )
     tool: Matrix44 = Field(_IDENTITY, description="pose of the tool in the frame of the last joint, m")
@@ -149,8 +148,8 @@ class _Limits(Section):
         if (self.joints is None) != (self.unit is None):
             yield ("unit",), "is that of joints: give both or neither"
         for i, (low, high) in enumerate(self.joints or ()):
-            if not low < high:
-                yield ("joints", i), f"the lower limit {low:g} must be below the upper limit {high:g}"
+            if what := upside_down(low, high):
+                yield ("joints", i), what
 
     def values(self, joint_types: str) -> tuple[tuple[float, float], ...]:
         """Those that are given, in rad (R) and m (P), one for each letter of ``joint_types``.
@@ -218,7 +217,7 @@ class Camera(Section):
     def contradictions(self) -> Iterator[Finding]:
         """Two descriptions, half a one, or one that is no camera."""
         wanted = ("focal_px", "principal_point_px", "position_m", "target_m")
-        given = [name for name in wanted if getattr(self, name) is not None]
+        given = self.given(*wanted)
         missing = [name for name in wanted if name not in given]
         if self.matrix is not None:
             if given:

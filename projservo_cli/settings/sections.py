@@ -65,6 +65,10 @@ class Section(BaseModel):
         """Yield the contradictions of this section, each value of which is valid by itself."""
         return ()
 
+    def given(self, *names: str) -> list[str]:
+        """Return those of some keys that have a value."""
+        return [name for name in names if getattr(self, name) is not None]
+
     def part(self, kind: type[_Part]) -> _Part:
         """Return the values that a section declares from which this one inherits."""
         return cast(_Part, kind.model_construct(**{name: getattr(self, name) for name in kind.model_fields}))
@@ -142,6 +146,11 @@ class JointVector(Section):
         if len(self.joints) != len(joint_types):
             what = f"{len(self.joints)} values for {len(joint_types)} joints ({joint_types})"
             yield (*path, "joints"), what
+
+
+def upside_down(low: float, high: float) -> str:
+    """Return the reason why two limits are none; empty if they are some."""
+    return "" if low < high else f"the lower limit {low:g} must be below the upper limit {high:g}"
 
 
 def not_rigid(T: Matrix44) -> str:

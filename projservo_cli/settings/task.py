@@ -83,7 +83,7 @@ class Goal(Section):
 
     def contradictions(self) -> Iterator[Finding]:
         """No goal, or several."""
-        kinds = [name for name in ("joints", "roll_deg", "images") if getattr(self, name) is not None]
+        kinds = self.given("joints", "roll_deg", "images")
         if len(kinds) != 1:
             given = f", not {' and '.join(kinds)}" if kinds else ""
             yield (), f"give exactly one of joints, roll_deg and images{given}"

@@ -167,6 +167,12 @@ def save(run: Run) -> Run:
     return dataclasses.replace(run, written=(stream.getvalue(), dict(run.results)))
 
 
+def stored(target: Path | str) -> Run:
+    """Read a run file as ``load`` does; an empty run where there is none yet."""
+    path = run_path(target)
+    return load(path) if path.exists() else Run(path)
+
+
 def load(target: Path | str) -> Run:
     """Read a run file. Raises InputError if it is missing, changed, or of another version."""
     path = run_path(target)
@@ -353,10 +359,8 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
 
 def dataset_of(record: Any) -> Any:
     """Convert a record to the xarray Dataset that its group in a run file opens as."""
-    try:
-        import xarray
-    except ImportError as error:
-        raise InputError("to_xarray needs xarray: pip install '.[tables]'") from error
+    import xarray
+
     image = io.BytesIO()
     with h5py.File(image, "w", libver=_FORMAT, track_order=True) as new, labelled(new) as file:
         save_record(file.create_group("record"), record)

@@ -113,15 +113,11 @@ def static_transforms(metric: Metric) -> str:
     return "\n".join([*lines, "</launch>"]) + "\n"
 
 
-def metric_object(metric: Metric) -> dict[str, Any]:
-    """All numbers of the metric, with their covariances, for JSON; lengths in m, angles in rad."""
+def to_json(metric: Metric, more: Mapping[str, Any]) -> str:
+    """All numbers of the metric, with their covariances, as JSON; lengths in m, angles in rad."""
     names = ("K", "lens", "poses", "axes", "markers")
     arrays = {name: getattr(metric, name).tolist() for name in names}
     covariances = {f"{name}_covariance": metric.covariance(name).tolist() for name in names}
     tool = metric.pose(np.zeros(len(metric.joint_types))).tolist()
-    return {"joint_types": metric.joint_types, "marker": metric.marker, "tool": tool, **arrays, **covariances}
-
-
-def to_json(metric: Metric, more: Mapping[str, Any]) -> str:
-    """The metric as JSON."""
-    return json.dumps({**metric_object(metric), **more}, indent=1, allow_nan=False) + "\n"
+    about = {"joint_types": metric.joint_types, "marker": metric.marker, "tool": tool}
+    return json.dumps({**about, **arrays, **covariances, **more}, indent=1, allow_nan=False) + "\n"

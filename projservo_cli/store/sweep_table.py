@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.records import SIZES, InputError, Trace
+from projservo_cli.records import SIZES, BoolArray, InputError, Trace
 from projservo_cli.store import (
     SCHEMA_VERSION,
     SWEEP,
@@ -35,8 +35,15 @@ _TRACES = "traces"
 _FAILURES = "failures"
 
 Array = npt.NDArray[Any]
-# Name, NumPy type, unit and description of a column.
-Heading = tuple[str, str, str, str]
+
+
+class Heading(NamedTuple):
+    """One column of the table: its name, NumPy type, unit and meaning."""
+
+    name: str
+    dtype: str
+    units: str
+    about: str
 
 
 class Failure(NamedTuple):
@@ -179,6 +186,46 @@ class SweepTable:
             self.failures = {law: Failure(*one) for law, one in stored.items()}  # by law
             self.rows = len(file["run"])
             self.traces = tuple(sorted(map(int, file.get(_TRACES, ()))))  # numbers of runs
+        self._read: dict[str, Array] = {}
+
+    @property
+    def axes(self) -> list[tuple[str, list[Any]]]:
+        """Name and values of each axis of the grid, the last one running fastest."""
+        return [(name, values) for name, values in self.attributes["axes"]]
+
+    def __getitem__(self, name: str) -> Array:
+        """A column, or what follows from some, read once."""
+        if name not in self._read:
+            self._read[name] = self._derived(name)
+        return self._read[name]
+
+    def _derived(self, name: str) -> Array:
+        if name == "success":
+            return np.asarray(self.column(name) == 1)
+        if name == "converged":
+            return np.asarray(self["verdict"] == name)
+        if name == "law" and name not in self.names:  # where an axis of another name sets it
+            return np.full(self.rows, "all")
+        if name == "self_occluded":
+            return (self["self_occluded_steps_left"] > 0) | (self["self_occluded_steps_right"] > 0)
+        if name == "left_image":
+            return self["first_outside_image"] >= 0
+        if name == "path_length_ratio":
+            straight = self["distance_mm"]
+            ratio = np.full(straight.shape, np.nan)
+            np.divide(self["path_length_mm"], straight, out=ratio, where=straight > 1.0)
+            return ratio
+        return self.column(name)
+
+    def values(self, cell: int) -> dict[str, Any]:
+        """Value of each axis in a cell."""
+        positions = np.unravel_index(cell, [len(values) for _, values in self.axes])
+        return {name: values[int(i)] for (name, values), i in zip(self.axes, positions, strict=True)}
+
+    def cells(self) -> Iterator[tuple[int, BoolArray]]:
+        """Each cell that has runs, and which they are."""
+        for cell in np.unique(self["cell"]):
+            yield int(cell), self["cell"] == cell
 
     def column(self, name: str) -> Array:
         """Values (k,) of a column; texts as Python texts would be, of fixed width."""

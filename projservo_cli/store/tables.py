@@ -54,10 +54,16 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 def read_table(
-    path: Path | str, joint_types: str | None = None, joint_unit: str | None = None
+    path: Path | str,
+    joint_types: str | None = None,
+    joint_unit: str | None = None,
+    *,
+    frame: str | None = None,
 ) -> Observation:
     """Read an observation table.
 
+    path : file, or the name of a frame.
+    frame : text of a frame that is in no file; messages count its rows from 0.
     joint_types : one letter a joint column, R or P, by default all R.
     joint_unit : unit of the revolute columns, ``deg`` or ``rad``; by default rad, and readings beyond two
         turns are refused as a mistaken unit.
@@ -65,7 +71,7 @@ def read_table(
     Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
     """
     optional = [*_SIGMAS, _MOVING, *_TIMES]
-    sheet = _Sheet(path, ["pose", "marker", *_PIXELS], joint_types, optional=optional)
+    sheet = _Sheet(path, ["pose", "marker", *_PIXELS], joint_types, optional=optional, frame=frame)
     stated = sheet.has_both(_SIGMAS)
     readings: dict[int, tuple[int, dict[str, float | None]]] = {}
     lines: dict[int, dict[int, int]] = {}  # of each marker at each pose
@@ -79,13 +85,12 @@ def read_table(
         if of_pose != first:
             name = next(name for name, value in of_pose.items() if value != first[name])
             raise InputError(
-                f"{row.where}: {name} of pose {pose} is {of_pose[name]!r}, but {first[name]!r} in line "
-                f"{line}; a pose has one joint reading"
+                f"{row.where}: {name} of pose {pose} is {of_pose[name]!r}, but {first[name]!r} in "
+                f"{sheet.named(line)}; a pose has one joint reading"
             )
         if (line := lines.setdefault(pose, {}).setdefault(marker, row.line)) != row.line:
-            raise InputError(f"{row.where}: marker {marker} at pose {pose} is already in line {line}")
-    if not rows:
-        raise InputError(f"{sheet.file}: the table has a header but no rows; add an observation a row")
+            raise InputError(f"{row.where}: marker {marker} at pose {pose} is already in {sheet.named(line)}")
+    sheet.require(rows, "an observation")
     del lines
     of_row = np.frombuffer(rows, dtype=np.int64).reshape(-1, 2)
     poses = {pose: k for k, pose in enumerate(readings)}
@@ -135,13 +140,12 @@ def read_joint_list(
     for row in sheet.rows():
         pose = row.integer("pose") if "pose" in sheet.columns else len(lines)
         if lines.setdefault(pose, row.line) != row.line:
-            raise InputError(f"{row.where}: pose {pose} is already in line {lines[pose]}")
+            raise InputError(f"{row.where}: pose {pose} is already in {sheet.named(lines[pose])}")
         readings.append([row.number(name) for name in sheet.joints])
         names.append([row[side] for side in ("left", "right") if side in sheet.columns])
         if "" in names[-1]:
             raise InputError(f"{row.where}: an image has no name; name both, or drop the row")
-    if not readings:
-        raise InputError(f"{sheet.file}: the list has a header but no rows; add a pose a row")
+    sheet.require(readings, "a pose")
     poses = np.array([*lines], dtype=np.int64)
     q = sheet.in_radians(poses, np.array(readings), joint_unit)
     left, right = zip(*names, strict=True) if names[0] else (None, None)
@@ -160,8 +164,7 @@ def read_positions(path: Path | str, joint_types: str, joint_unit: str | None = 
          row.number("sigma") if "sigma" in row else 0.0)
         for row in sheet.rows()
     ]  # fmt: skip
-    if not rows:
-        raise InputError(f"{sheet.file}: the table has a header but no rows; add a position a row")
+    sheet.require(rows, "a position")
     numbers, values, sigma = zip(*rows, strict=True)
     pose, found = np.array(numbers, dtype=np.int64), np.array(values)
     q = sheet.in_radians(pose, found[:, :-3], joint_unit)
@@ -194,7 +197,12 @@ def _recording(path: Path | str) -> str | None:
 def write_table(
     observation: Observation, path: Path | str, *, recording: str = "", identity: str = ""
 ) -> None:
-    """Write an observation table that ``read_table`` reads back to the last bit.
+    """Write an observation table, as ``table_text`` has it."""
+    write_whole(Path(path), table_text(observation, recording=recording, identity=identity))
+
+
+def table_text(observation: Observation, *, recording: str = "", identity: str = "") -> str:
+    """Return the observation table that ``read_table`` reads back to the last bit.
 
     Every marker of every pose has a row, with empty cells if unseen. ``recording`` fills a further column,
     with the ``identity`` of the robot.
@@ -215,7 +223,7 @@ def write_table(
             columns[name] = or_empty(np.repeat(values, m))
     if recording:
         columns[_RECORDING] = np.full(K * m, recording + (_IDENTITY + identity if identity else ""))
-    write_whole(Path(path), to_csv(columns))
+    return to_csv(columns)
 
 
 def or_empty(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -292,13 +300,8 @@ def in_radians(
 class _Row(dict[str, str]):
     """Cells of one line of a file by the names of their columns."""
 
-    file: str
     line: int
-
-    @property
-    def where(self) -> str:
-        """File and line, for messages."""
-        return f"{self.file}:{self.line}"
+    where: str  # file and line, for messages
 
     def observation(self, stated: bool) -> list[float]:
         """Pixels of both views, and their deviations if stated, NaN if unseen."""
@@ -355,9 +358,11 @@ class _Sheet:
         joint_types: str | None = None,
         *,
         optional: Sequence[str] = (),
+        frame: str | None = None,
     ) -> None:
-        self.file = str(path)
-        lines = lines_of(path, "a table as UTF-8 CSV", _MAX_BYTES)
+        self.file, self._of_frame = str(path), frame is not None
+        of_file = lines_of(path, "a table as UTF-8 CSV", _MAX_BYTES)
+        lines = of_file if frame is None else iter(io.StringIO(frame, newline=""))
         first, self._skipped = next(lines, ""), 0
         if first.strip().lower().startswith("sep="):  # of spreadsheets, for their own eyes
             first, self._skipped = next(lines, ""), 1
@@ -372,7 +377,7 @@ class _Sheet:
         self.joints = sorted(filter(_JOINT.fullmatch, set(names)), key=lambda name: int(name[1:]))
         wanted = [*needed, *self.joints, *(name for name in optional if name in names)]
         if wrong := self._wrong(names, needed, wanted, joint_types):
-            raise InputError(f"{self.file}:{1 + self._skipped}: {wrong}")
+            raise InputError(f"{self._place(1 + self._skipped)}: {wrong}")
         self._width, self._numeric = len(names), {*wanted} - {"left", "right", _RECORDING}
         self.columns = {name: names.index(name) for name in wanted}
         self._joint_types = joint_types or "R" * len(self.joints)
@@ -403,8 +408,23 @@ class _Sheet:
         """Whether both columns of a pair are present. Raises InputError for one without the other."""
         present = [name in self.columns for name in pair]
         if any(present) and not all(present):
-            raise InputError(f"{self.file}:1: give the columns {pair[0]} and {pair[1]} both, or neither")
+            raise InputError(f"{self._place(1)}: give the columns {pair[0]} and {pair[1]} both, or neither")
         return all(present)
+
+    def named(self, line: int) -> str:
+        """A line, which is a row of a frame, for messages."""
+        return f"row {line - 2}" if self._of_frame else f"line {line}"
+
+    def _place(self, line: int) -> str:
+        """The place of a line, for messages; of the header of a frame, the frame."""
+        if not self._of_frame:
+            return f"{self.file}:{line}"
+        return f"{self.file}: {self.named(line)}" if line > 1 else self.file
+
+    def require(self, rows: Sequence[Any], one: str) -> None:
+        """Refuse a table without rows, each of which is one of something, with an InputError."""
+        if not rows:
+            raise InputError(f"{self.file}: the table has a header but no rows; add {one} a row")
 
     def rows(self) -> Iterator[_Row]:
         """Yield the rows that are not blank. Raises InputError at a row of another length than the header."""
@@ -414,7 +434,7 @@ class _Sheet:
             line = self._reader.line_num + self._skipped
             if len(cells) != self._width:
                 raise InputError(
-                    f"{self.file}:{line}: {len(cells)} cells where the header has {self._width}; the row is "
+                    f"{self._place(line)}: {len(cells)} cells where the header has {self._width}; the row is "
                     "cut short or malformed"
                 )
             row = _Row({name: cells[i].strip() for name, i in self.columns.items()})
@@ -423,18 +443,17 @@ class _Sheet:
                     row[name] = ""
             if self._separator != ",":
                 row.update({name: row[name].replace(",", ".") for name in self._numeric})
-            row.file, row.line = self.file, line
+            row.line, row.where = line, self._place(line)
             yield row
 
     def _next(self) -> list[str] | None:
         try:
             return next(self._reader, None)
         except csv.Error as error:
-            raise InputError(
-                f"{self.file}:{self._reader.line_num + self._skipped}: {error}; expected values between "
-                f"{self._separator!r}"
-            ) from error
+            place = self._place(self._reader.line_num + self._skipped)
+            raise InputError(f"{place}: {error}; expected values between {self._separator!r}") from error
 
     def in_radians(self, pose: IntArray, q: FloatArray, unit: str | None) -> FloatArray:
         """Convert readings (K, n) to rad and m, as ``in_radians``."""
-        return in_radians(self.file, "".join(self._joint_types), pose, q, unit, "--joint-unit {}")
+        option = "joint_unit={!r}" if self._of_frame else "--joint-unit {}"
+        return in_radians(self.file, self._joint_types, pose, q, unit, option)

@@ -304,10 +304,10 @@ def _shares_settings(design: Design) -> bool:
     settings = math.lcm(design.sweep.calibrations, tasks)
     if design.sweep.random or settings > SETTINGS or design.sweep.runs < settings:
         return False
-    return all(in_kernel(design, cell) for cell in range(design.cells))
+    return all(_in_kernel(design, cell) for cell in range(design.cells))
 
 
-def in_kernel(design: Design, cell: int) -> bool:
+def _in_kernel(design: Design, cell: int) -> bool:
     """Whether the kernel of whole runs makes those of a cell."""
     config = design.cell(cell)
     return is_compiled(design, servo_inputs(config), name_of_run(config))
@@ -324,7 +324,7 @@ def _calibrate(wanted: tuple[str, Config]) -> _Calibrated:
 
 def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) -> None:
     """Fill an empty cache by one process, which ends here: the compiler keeps hundreds of megabytes."""
-    loop = LOOPS[in_kernel(design, 0)]
+    loop = LOOPS[_in_kernel(design, 0)]
     if not engine.here or engine.workers == 1 or CACHE_FOLDER is None or any(CACHE_FOLDER.rglob(loop)):
         return
     say("compiling kernels, once, before the processes start")

@@ -22,7 +22,7 @@ from projservo_cli.stages.plan import rotation_sense
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive, sense_is_enough
 from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
-from projservo_cli.store.sweep_table import Failure, merge_failures
+from projservo_cli.store.sweep_table import Failure, Heading, merge_failures
 from projservo_cli.sweeps.design import RUNS, Design, name_of_run
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
@@ -33,65 +33,56 @@ _LONGEST = 300  # characters of a reason that is kept
 NONE = -1  # in columns of counts, where a run did not begin
 
 
-class _Column(NamedTuple):
-    """One column of the table: its name, NumPy type, unit and meaning."""
-
-    name: str
-    dtype: str
-    units: str
-    about: str
-
-
-def _text(name: str, values: Sequence[str], about: str) -> _Column:
+def _text(name: str, values: Sequence[str], about: str) -> Heading:
     """A column of texts, as wide as the longest of the possible ones."""
-    return _Column(name, f"S{max(len(value.encode()) for value in values)}", "1", about)
+    return Heading(name, f"S{max(len(value.encode()) for value in values)}", "1", about)
 
 
 NUMBERED = (
-    _Column("run", "i8", "1", "number of the run"),
-    _Column("cell", "i8", "1", "number of its cell of the grid"),
-    _Column("draw", "i8", "1", "number of the run in its cell; runs of one number share task and noise"),
-    _Column("calibration", "i8", "1", "number of the calibration in the cell"),
-    _Column("task", "i8", "1", "number of the random task, -1 for that of the base"),
-    _Column("seed", "i8", "1", "seed of the run"),
+    Heading("run", "i8", "1", "number of the run"),
+    Heading("cell", "i8", "1", "number of its cell of the grid"),
+    Heading("draw", "i8", "1", "number of the run in its cell; runs of one number share task and noise"),
+    Heading("calibration", "i8", "1", "number of the calibration in the cell"),
+    Heading("task", "i8", "1", "number of the random task, -1 for that of the base"),
+    Heading("seed", "i8", "1", "seed of the run"),
 )
 MEASURED = (
     _text("verdict", ALL_VERDICTS, "verdict of the run"),
-    _Column(
+    Heading(
         "success",
         "u1",
         "1",
         "1 if it converged and at every time, in truth, no joint was past a limit, no camera behind "
         "the face and every marker of the face in both images",
     ),
-    _Column("usable", "i1", "1", "whether its calibration is usable"),
-    _Column("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
-    _Column("rotation_deg", "f8", "deg", "true rotation from start to goal"),
-    _Column("distance_mm", "f8", "mm", "true distance of the centre from start to goal"),
-    _Column("position_error_mm", "f8", "mm", "true centre to true goal at the end"),
-    _Column("rotation_error_deg", "f8", "deg", "true rotation to the goal at the end"),
-    _Column("image_error_px", "f8", "px", "image error at the end, rms over markers and views"),
-    _Column("self_occluded_steps_left", "i8", "1", "times at which the left camera is behind the face"),
-    _Column("self_occluded_steps_right", "i8", "1", "times at which the right camera is behind the face"),
-    _Column(
+    Heading("usable", "i1", "1", "whether its calibration is usable"),
+    Heading("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
+    Heading("rotation_deg", "f8", "deg", "true rotation from start to goal"),
+    Heading("distance_mm", "f8", "mm", "true distance of the centre from start to goal"),
+    Heading("position_error_mm", "f8", "mm", "true centre to true goal at the end"),
+    Heading("rotation_error_deg", "f8", "deg", "true rotation to the goal at the end"),
+    Heading("image_error_px", "f8", "px", "image error at the end, rms over markers and views"),
+    Heading("self_occluded_steps_left", "i8", "1", "times at which the left camera is behind the face"),
+    Heading("self_occluded_steps_right", "i8", "1", "times at which the right camera is behind the face"),
+    Heading(
         "first_outside_image", "i8", "1", "first time index with a marker outside an image, -1 for never"
     ),
-    _Column("first_beyond_limit", "i8", "1", "first time index beyond a joint limit, -1 for never"),
-    _Column("speed_limited_steps", "i8", "1", "commands scaled to the joint-speed limit"),
-    _Column(
+    Heading("first_beyond_limit", "i8", "1", "first time index beyond a joint limit, -1 for never"),
+    Heading("speed_limited_steps", "i8", "1", "commands scaled to the joint-speed limit"),
+    Heading(
         "visibility_limited_steps",
         "i8",
         "1",
         "commands whose translation was limited to visibility_fraction·tau_0",
     ),
-    _Column("path_length_mm", "f8", "mm", "length of the path of the centre, from sample to sample"),
-    _Column("center_deviation_at_samples_mm", "f8", "mm", "maximum distance of the centre from the line"),
-    _Column("effort", "f8", "rad²/s or m²/s", "integral of the squared joint velocities"),
+    Heading("path_length_mm", "f8", "mm", "length of the path of the centre, from sample to sample"),
+    Heading("center_deviation_at_samples_mm", "f8", "mm", "maximum distance of the centre from the line"),
+    Heading("effort", "f8", "rad²/s or m²/s", "integral of the squared joint velocities"),
 )
-BETWEEN = _Column("center_deviation_mm", "f8", "mm", "maximum distance of the centre, between samples too")
+BETWEEN = Heading("center_deviation_mm", "f8", "mm", "maximum distance of the centre, between samples too")
 
 
-def columns_of(design: Design) -> tuple[_Column, ...]:
+def columns_of(design: Design) -> tuple[Heading, ...]:
     """All columns of the table of a sweep: numbers, inputs, measured values."""
     axes = [_input(axis.name, axis.values, "value of the grid") for axis in design.axes]
     random = design.sweep.random.items()
@@ -100,12 +91,12 @@ def columns_of(design: Design) -> tuple[_Column, ...]:
     return (*NUMBERED, *axes, *drawn, *MEASURED, *between)
 
 
-def _input(name: str, values: Sequence[Any], about: str) -> _Column:
+def _input(name: str, values: Sequence[Any], about: str) -> Heading:
     """A column of values that are given: of numbers where all are, else of texts."""
     displayed = [_displayed(value) for value in values]
     if any(isinstance(value, str) for value in displayed):
         return _text(name, [str(value) for value in displayed], about)
-    return _Column(name, "f8", "1", about)
+    return Heading(name, "f8", "1", about)
 
 
 def _displayed(value: Any) -> Any:

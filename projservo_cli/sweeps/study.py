@@ -1,6 +1,6 @@
 """A sweep as an object: its table as arrays, how often laws succeed, and laws against each other."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from projservo_cli.display import Displayable, pandas, xarray
 from projservo_cli.records import InputError
 from projservo_cli.results import RunTrace
 from projservo_cli.store.sweep_table import Failure, SweepTable
-from projservo_cli.sweeps.statistics import Rows, of_runs, paired
+from projservo_cli.sweeps.statistics import of_runs, paired
 
 
 class Study(Displayable):
@@ -25,17 +25,16 @@ class Study(Displayable):
     """
 
     def __init__(self, table: SweepTable, names: Mapping[str, str] | None = None) -> None:
-        self._rows, self._names = Rows(table), dict(names or {})
-        # In memory, stored files are gone when the caller sees the result.
-        self._columns = {name: self._rows[name] for name in (*table.names, "self_occluded", "left_image")}
-        self._columns["path_length_ratio"] = self._rows["path_length_ratio"]
+        self._table, self._names = table, dict(names or {})
+        for name in table.names:  # stored files are gone when the caller sees the result
+            table[name]
         self._traces = {run: RunTrace.of(table.trace(run)) for run in table.traces}
         self.path: Path | None = table.path
 
     @cached_property
     def table(self) -> Mapping[str, npt.NDArray[Any]]:
         """Columns (k,) of all runs, by name; laws as their caller calls them."""
-        found = {name: self._columns[name] for name in self._rows.table.names}
+        found = {name: self._table[name] for name in self._table.names}
         if "law" in found and self._names:
             found["law"] = np.array([self._names.get(law, law) for law in found["law"].tolist()])
         return found
@@ -48,15 +47,15 @@ class Study(Displayable):
     @property
     def failures(self) -> Mapping[str, Failure]:
         """Runs that failed or did not start, by law: how many ``runs``, the ``first`` and its ``reason``."""
-        return {self._names.get(law, law): one for law, one in self._rows.table.failures.items()}
+        return {self._names.get(law, law): one for law, one in self._table.failures.items()}
 
     def success(self) -> list[dict[str, Any]]:
         """Return for each cell its values, ``runs``, ``successes``, ``success_rate`` and its interval.
 
         ``success_interval`` is that of Wilson, of 95 %; ``quantiles`` are of runs that succeeded.
         """
-        cells = ((self._rows.values(cell), of_runs(self._rows, these)) for cell, these in self._rows.cells())
-        return [self._named(values) | found for values, found in cells]
+        table = self._table
+        return [self._named(table.values(cell)) | of_runs(table, these) for cell, these in table.cells()]
 
     def paired(self, first: str | type, second: str | type) -> list[dict[str, Any]]:
         """Return how two laws compare on the same tasks with the same noise, for each combination of values.
@@ -76,14 +75,15 @@ class Study(Displayable):
         InputError
             When the sweep has no such law.
         """
-        known = {self._names.get(law, law): law for law in self._laws()}
+        laws = dict(self._table.axes).get("law", ())
+        known = {self._names.get(law, law): law for law in laws}
         asked = []
         for law in (first, second):
             name = law if isinstance(law, str) else law.__name__
             if name not in known and name not in known.values():
                 raise InputError(f"paired: no law {name} in this sweep; laws: {', '.join(known)}")
             asked.append(known.get(name, name))
-        found = paired(self._rows, asked)
+        found = paired(self._table, asked)
         return [one | {"laws": [self._names.get(law, law) for law in one["laws"]]} for one in found]
 
     def to_frame(self) -> Any:
@@ -101,17 +101,14 @@ class Study(Displayable):
         """Return a summary in words, by name."""
         cells = self.success()
         values = {"runs": f"{len(self.table['run'])} in {len(cells)} cells"}
-        failures = [*self._rows.table.failures.items()][:_SHOWN_FAILURES]
+        failures = [*self._table.failures.items()][:_SHOWN_FAILURES]
         values |= {f"failures of {self._names.get(law, law)}": one.words(law) for law, one in failures}
         shown = _SHOWN - len(failures)
         for cell in cells[:shown]:
             low, high = cell["success_interval"]
-            place = ", ".join(f"{name} {cell[name]}" for name, _ in self._rows.axes)
+            place = ", ".join(f"{name} {cell[name]}" for name, _ in self._table.axes)
             values[place] = f"{cell['success_rate']:.1%} of {cell['runs']} succeed ({low:.1%} to {high:.1%})"
         return values | ({"more": f"{len(cells) - shown} cells"} if len(cells) > shown else {})
-
-    def _laws(self) -> Sequence[str]:
-        return next((values for name, values in self._rows.axes if name == "law"), [])
 
     def _named(self, values: dict[str, Any]) -> dict[str, Any]:
         return values | ({"law": self._names.get(values["law"], values["law"])} if "law" in values else {})

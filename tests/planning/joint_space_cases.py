@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.planning.constraints import Constraints, constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.margins import Demands
-from projservo_cli.sweeps.design import random_tasks
+from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.target import TaskImages
 from tests.configured import joints_of, truth_of
 from tests.known import configured

@@ -9,7 +9,7 @@ import pytest
 from projservo_cli.calibration import predict
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.settings.sections import JointVector
-from projservo_cli.sweeps.design import random_tasks
+from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.target import followed
 from projservo_cli.task.trajectory import planned
 from tests.configured import calibrate, scenario_of, servo, truth_of

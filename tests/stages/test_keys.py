@@ -13,12 +13,13 @@ import yaml
 
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.config.inputs import calibration_inputs, files_of, plan_inputs, report_inputs, servo_inputs
-from projservo_cli.keys import decoded, encoded, files_in, key_of
+from projservo_cli.keys import encoded, key_of
 from projservo_cli.records import InputError
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.stages import calibrate, plan, servo
 from tests.configured import record
 from tests.conftest import ROOT
+from tests.stages.decoding import decoded, files_in
 
 GIVEN = {"calibrate": calibration_inputs, "plan": plan_inputs, "servo": servo_inputs, "report": report_inputs}
 # Short, and with all that is random: noise in trials, loop, start and goal.

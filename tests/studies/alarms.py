@@ -18,7 +18,7 @@ import numpy as np
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.sections import JointVector
-from projservo_cli.sweeps.design import random_tasks
+from projservo_cli.simulation.random_tasks import random_tasks
 from tests.configured import calibrate, plan, servo, truth_of
 from tests.known import configured
 from tests.studies.planning_tables import in_two_processes, quantiles, rate, write_rows

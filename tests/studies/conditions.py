@@ -15,7 +15,7 @@ import pytest
 
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.simulation.faults import FaultyRobot
-from projservo_cli.sweeps.design import STRATA, random_tasks
+from projservo_cli.simulation.random_tasks import STRATA, random_tasks
 from tests.configured import truth_of
 from tests.known import configured
 from tests.studies.planning_tables import write_rows

@@ -27,10 +27,10 @@ from projservo_cli.records import WorkFailed
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import KeptOut
 from projservo_cli.simulation.arm import METRIC_A_INF
+from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.servo import drive
-from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import TaskImages
 from tests.configured import calibrate, joints_of, plan, scenario_of, truth_of
 from tests.known import configured

@@ -17,7 +17,7 @@ from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path
 from projservo_cli.settings.sections import JointVector
-from projservo_cli.sweeps.design import random_tasks
+from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.target import TaskImages
 from tests.configured import joints_of, truth_of
 from tests.known import configured

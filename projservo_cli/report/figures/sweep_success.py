@@ -1,16 +1,104 @@
 """Figures of a sweep: success over a column or over two start offsets, and final errors."""
 
 import math
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.stats import binomtest
 
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data
+from projservo_cli.store.sweep_table import SweepTable
+
+_LAW = "law"  # column
+_OFFSET = "task.start_offset."  # prefix of the columns of a start offset
+_ANGLES = tuple(range(0, 181, 30))  # edges of rotations, deg
+_BINS = 8  # of a value that is drawn
+_POINTS = 2_000  # of a curve
 
 
-def draw_success(data: Data, figure: Figure) -> None:
+def wilson_interval(successes: int, count: int) -> tuple[float, float]:
+    """Return the 95 % interval of a proportion from counts.
+
+    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    Journal of the American Statistical Association 22 (1927), p. 209.
+    """
+    interval = binomtest(successes, count).proportion_ci(0.95, "wilson")
+    return float(interval.low), float(interval.high)
+
+
+def pictures(table: SweepTable) -> Iterator[tuple[str, Data, Any]]:
+    """Every figure that the columns of a sweep allow: the name of its files, its numbers, how it is drawn."""
+    axes = [name for name, values in table.axes if len(values) > 1 and {*map(type, values)} <= {int, float}]
+    for name in axes:
+        yield f"success_over_{name}", _success(table, name, name, None), _draw_success
+    drawn = [name for name in table.names if name in table.attributes["random"]]
+    for name in (name for name in drawn if table[name].dtype.kind == "f"):
+        edges = np.linspace(table[name].min(), np.nextafter(table[name].max(), math.inf), _BINS + 1)
+        yield f"success_over_{name}", _success(table, name, name, edges.tolist()), _draw_success
+    if np.nanmax(table["rotation_deg"], initial=0.0) - np.nanmin(table["rotation_deg"], initial=180.0) > 1.0:
+        data = _success(table, "rotation_deg", "rotation from start to goal (deg)", [*_ANGLES[:-1], 180.1])
+        yield "success_over_rotation", data, _draw_success
+    offsets = [name for name in axes if name.startswith(_OFFSET)]
+    if len(offsets) >= 2:
+        yield "basin", _basin(table, offsets[0], offsets[1]), draw_basin
+    if errors := _final_errors(table):
+        yield "final_error", errors, _draw_final_errors
+
+
+def _success(table: SweepTable, name: str, label: str, edges: Sequence[float] | None) -> Data:
+    """Success of each law over a column, at each of its values or within edges.
+
+    Of each law ``x``, ``runs``, ``rate``, and ``low`` and ``high`` of the interval (k,).
+    """
+    x, success, law = table[name], table["success"], table[_LAW]
+    data: Data = {"label": np.array(label)}
+    for one in dict.fromkeys(law.tolist()):
+        mine = law == one
+        bins = (
+            [(float(value), mine & (x == value)) for value in np.unique(x[mine])]
+            if edges is None
+            else [(0.5 * (low + high), mine & (x >= low) & (x < high)) for low, high in pairwise(edges)]
+        )
+        counted = [(at, int(these.sum()), int((these & success).sum())) for at, these in bins if these.any()]
+        at, count, good = (np.array([row[i] for row in counted]) for i in range(3))
+        intervals = [wilson_interval(*pair) for pair in zip(good, count, strict=True)]
+        low, high = np.array(intervals).reshape(-1, 2).T
+        columns = {"x": at, "runs": count, "rate": good / count, "low": low, "high": high}
+        data |= {f"{one}.{key}": values for key, values in columns.items()}
+    return data
+
+
+def _basin(table: SweepTable, first: str, second: str) -> Data:
+    x, y, begun = np.unique(table[first]), np.unique(table[second]), table["steps"] >= 0
+    data: Data = {"x": x, "y": y, "label_x": np.array(first), "label_y": np.array(second)}
+    for law in dict.fromkeys(table[_LAW].tolist()):
+        mine = table[_LAW] == law
+        share = np.full((len(y), len(x)), np.nan)
+        for i, j in np.ndindex(*share.shape):
+            these = mine & begun & (table[first] == x[j]) & (table[second] == y[i])
+            if these.any():
+                share[i, j] = table["success"][these].mean()
+        data[f"{law}.share"] = share
+    return data
+
+
+def _final_errors(table: SweepTable) -> Data:
+    data: Data = {}
+    for law in dict.fromkeys(table[_LAW].tolist()):
+        errors = table["position_error_mm"][table[_LAW] == law]
+        finite = np.sort(errors[np.isfinite(errors)])
+        if len(finite):
+            displayed = np.unique(np.linspace(0, len(finite) - 1, _POINTS).astype(np.int64))
+            data[f"{law}.error"] = np.maximum(finite[displayed], 1e-6)
+            data[f"{law}.share"] = (displayed + 1) / len(errors)
+    return data
+
+
+def _draw_success(data: Data, figure: Figure) -> None:
     """Success of each law, ``<law>.rate``, from ``.low`` to ``.high``, over ``.x``, which is a ``label``."""
     axes = figure.add_subplot()
     laws = _laws(data, ".rate")
@@ -51,7 +139,7 @@ def draw_basin(data: Data, figure: Figure) -> None:
     figure.colorbar(mesh, ax=panels.tolist(), label="success (%)")
 
 
-def draw_final_errors(data: Data, figure: Figure) -> None:
+def _draw_final_errors(data: Data, figure: Figure) -> None:
     """Share of the runs of each law that end within a distance of the goal.
 
     ``data`` has for each law ``<law>.error`` (k,), mm, sorted, and ``<law>.share`` (k,) of all its runs.

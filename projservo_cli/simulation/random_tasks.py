@@ -1,0 +1,87 @@
+"""Random reaching tasks of a simulated robot within sight of both cameras."""
+
+import math
+
+import numpy as np
+
+from projservo_cli.calibration.prediction import image_points, moved_points
+from projservo_cli.geometry.displacements import displacements
+from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.image_size import within_images
+from projservo_cli.records import FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.simulation.arm import METRIC_A_INF
+from projservo_cli.simulation.workspace import Truth
+
+_RANGE = 0.9  # share of the range of a joint that is drawn from
+_LEAST_COSINE = math.cos(math.radians(75.0))  # of the angle between the normal of the face and a ray
+STRATA = 6
+"""Equal parts of half a turn, of each of which there are as many tasks."""
+_BATCH = 2_000  # joint vectors drawn at once
+_MOST_DRAWS = 20_000_000  # joint vectors
+
+
+def random_tasks(
+    truth: Truth, q_front: FloatArray, count: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Draw tasks within sight of both cameras, one of each sixth of half a turn in turn.
+
+    q_front : (n,) joints at which the cameras see the front of the face, rad or m.
+    Returns joints (count, n) at start and goal, rad or m.
+    """
+    limits = truth.robot.limits
+    middle, half = 0.5 * (limits.lower + limits.upper), 0.5 * _RANGE * (limits.upper - limits.lower)
+    if not np.isfinite(half).all():
+        raise InputError("random tasks need joint limits: set limits of every joint of the robot")
+    front = math.copysign(1.0, float(_cosines(truth, _poses(truth, q_front[None]))[0, 0]))
+    quota = [count // STRATA + (i < count % STRATA) for i in range(STRATA)]
+    found: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in range(STRATA)]
+    waiting: list[tuple[FloatArray, FloatArray]] = []
+    drawn = 0
+    while any(len(tasks) < high for tasks, high in zip(found, quota, strict=True)):
+        if drawn >= _MOST_DRAWS:
+            raise WorkFailed(
+                f"of {drawn} joint vectors too few show the face to both cameras for {count} tasks: "
+                "turn the cameras towards the workspace or ask for fewer"
+            )
+        q = middle + half * rng.uniform(-1.0, 1.0, (_BATCH, len(middle)))
+        drawn += _BATCH
+        poses = _poses(truth, q)
+        waiting += [(q[i], poses[i, :3, :3]) for i in _accepted(truth, poses, front)]
+        while len(waiting) >= 2:
+            (start, R), (goal, R_goal) = waiting.pop(0), waiting.pop(0)
+            angle = math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(R.T @ R_goal)) - 1.0))))
+            stratum = min(STRATA - 1, int(STRATA * angle / math.pi))
+            if len(found[stratum]) < quota[stratum]:
+                found[stratum].append((start, goal))
+    tasks = [tasks[k] for k in range(max(quota)) for tasks in found if k < len(tasks)]
+    starts, goals = (np.array(column) for column in zip(*tasks, strict=True))
+    return starts, goals
+
+
+def _poses(truth: Truth, q: FloatArray) -> FloatArray:
+    """Displacements (k, 4, 4) from the reference at joints (k, n), [RH00] eq. (6) for many at once."""
+    robot = truth.robot
+    E = displacements(robot.H_hat_0, robot.prismatic, q - robot.q_reference)
+    return np.swapaxes(moved_points(E, np.eye(4))[0], 1, 2)
+
+
+def _cosines(truth: Truth, poses: FloatArray) -> FloatArray:
+    """Cosine (k, 2) of the angle between the normal of the face and the rays to the optical centres."""
+    M = truth.M_face[:, :3]
+    middle = M.mean(axis=0) if truth.center < 0 else M[truth.center]
+    normal = np.linalg.svd(M - M.mean(axis=0))[2][2]
+    rays = optical_centers(truth.P, METRIC_A_INF)[:, :3] - (
+        poses[:, None, :3, :3] @ middle + poses[:, None, :3, 3]
+    )
+    rays = rays / np.linalg.norm(rays, axis=2, keepdims=True)
+    return np.asarray(np.einsum("kvi,ki->kv", rays, poses[:, :3, :3] @ normal))
+
+
+def _accepted(truth: Truth, poses: FloatArray, front: float) -> IntArray:
+    """Indices of the poses that show the face to both cameras."""
+    m = image_points(truth.P, truth.M_face @ np.swapaxes(poses, 1, 2))
+    before = (m[..., 2] > 0.0).all(axis=(1, 2))
+    facing = (front * _cosines(truth, poses) >= _LEAST_COSINE).all(axis=1)
+    pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
+    inside = within_images(pixels, truth.image_size[:, None]).all(axis=(1, 2))
+    return np.flatnonzero(before & facing & inside)

@@ -1,0 +1,49 @@
+"""Records again from their canonical bytes, which shows that a key holds all that a stage reads."""
+
+import dataclasses
+import importlib
+import json
+
+import numpy as np
+
+from projservo_cli.keys import File
+
+
+def decoded(content, files):
+    """The record of which these are the canonical bytes.
+
+    files : where files lie, by the hash of their content.
+    """
+    return _value(json.loads(content), files)
+
+
+def files_in(record):
+    """All files of a record, each once."""
+    if isinstance(record, File):
+        return [record]
+    if dataclasses.is_dataclass(record):
+        parts = [getattr(record, field.name) for field in dataclasses.fields(record)]
+    elif isinstance(record, (tuple, list, dict)):
+        parts = record.values() if isinstance(record, dict) else record
+    else:
+        parts = [getattr(record, name) for name in getattr(type(record), "model_fields", ())]
+    return list(dict.fromkeys(file for part in parts for file in files_in(part)))
+
+
+def _value(plain, files):
+    if not isinstance(plain, dict):
+        return plain
+    ((kind, held),) = plain.items()
+    if kind == "file":
+        return File(files[held], held)
+    if kind == "array":
+        dtype, shape, content = held
+        return np.frombuffer(bytes.fromhex(content), dtype=dtype).reshape(shape).copy()
+    if kind in ("tuple", "list"):
+        found = [_value(inner, files) for inner in held]
+        return found if kind == "list" else tuple(found)
+    values = {name: _value(inner, files) for name, inner in held.items()}
+    if kind == "mapping":
+        return values
+    module, name = kind.split(":")
+    return getattr(importlib.import_module(module), name)(**values)
