@@ -70,7 +70,7 @@ class Displayable(Printed):
             value = getattr(self, field.name)
             if value is not None and "dims" in field.metadata:
                 sizes |= dict(zip(field.metadata["dims"], np.shape(value), strict=True))
-        found: dict[str, Any] = {"view": [*VIEWS], "xy": ["u", "v"]}
+        found: dict[str, Any] = {"view": [*getattr(self, "view", VIEWS)], "xy": ["u", "v"]}
         found = {name: values for name, values in found.items() if name in sizes}
         if "joint" in sizes:
             found["joint"] = [f"q{i + 1}" for i in range(sizes["joint"])]

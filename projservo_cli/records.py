@@ -230,7 +230,6 @@ class Observation:
     marker: IntArray = _array("marker", about="number of the marker")
     q: FloatArray = _array("pose joint", "rad or m", "joint readings")
     images: FloatArray = _array("pose view marker xy", "px", "pixels, NaN if unseen")
-    view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
     moving: IntArray | None = _array(
         "pose", about="number of the motion during which the pose was recorded, 0 at rest", default=None
     )
@@ -244,6 +243,7 @@ class Observation:
         "standard deviation of the pixels, per coordinate, NaN if unseen",
         default=None,
     )
+    view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
 
     def rows(self, keep: BoolArray) -> "Observation":
         """Some of the poses (K,)."""
@@ -326,6 +326,14 @@ class ProjectiveKinematics:
     def has_covariance(self) -> bool:
         """Whether the method says how far it is off."""
         return bool(np.isfinite(self.sqrt_cov_shared).all())
+
+    def require_left_and_right(self) -> None:
+        """Raise InputError unless the views are left and right, as tasks and laws take them."""
+        if self.view != VIEWS:
+            raise InputError(
+                f"the calibration has the views {', '.join(self.view)}; tasks, laws and tests of images take "
+                "left and right: calibrate from columns u_left, v_left, u_right, v_right"
+            )
 
     def indices_of(self, numbers: Iterable[int]) -> list[int]:
         """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""

@@ -25,7 +25,6 @@ from projservo_cli.metric.kinematic_errors import KinematicErrors, in_model_fram
 from projservo_cli.observations import require_observations
 from projservo_cli.records import (
     MM,
-    VIEWS,
     BoolArray,
     Calibration,
     CrossValidation,
@@ -341,7 +340,7 @@ class MetricModel(Printed, Metric):
                 "axes": (("joint", "screw"), self.axes, {"units": "w rad, v m, per rad or m"}),
                 "markers": (("marker", "axis"), self.markers, {"units": "m"}),
             },
-            {"view": [*VIEWS], "joint": joints, "marker": self.marker, "axis": [*"xyz"]},
+            {"view": [*self.view], "joint": joints, "marker": self.marker, "axis": [*"xyz"]},
         )
 
     def summary(self) -> dict[str, str]:
@@ -349,7 +348,7 @@ class MetricModel(Printed, Metric):
         places, of_poses = self.poses[:, :3, 3], self.covariance("poses")[:, 3:, 3:]
         focal, of_K = self.K[:, (0, 1), (0, 1)], np.sqrt(self.covariance("K")[:, 0, 0])
         found = {"joints": self.joint_types, "markers": f"{len(self.marker)}"}
-        for v, view in enumerate(VIEWS):
+        for v, view in enumerate(self.view):
             at, std = ", ".join(f"{x:.4g}" for x in places[v]), MM * np.sqrt(np.trace(of_poses[v]))
             found[f"{view} camera"] = (
                 f"at ({at}) m ± {std:.2g} mm, focal length {focal[v].mean():.5g} ± {of_K[v]:.2g} px"

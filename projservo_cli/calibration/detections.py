@@ -152,7 +152,7 @@ class Detections:
             weight=self.weight[which],
             view=tuple(self.view[v] for v in which),
             pair=(0, 1),
-        ).rows(seen.any(axis=0))
+        ).rows(np.asarray(seen.any(axis=0)))
         return some.of_markers(np.isin(np.arange(self.marker.size), some.marker_of))
 
     def of_pair(self) -> "Detections":

@@ -9,6 +9,7 @@ C. Tomasi, T. Kanade, "Shape and motion from image streams under orthography", I
 """
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -101,10 +102,8 @@ class RigidBody(ImageGeometry):
         pose, marker, images = _chosen(detections)
         focals, middle = float(frame.size[0]) * np.array(_FOCALS), frame.center[0]
         starts = _flat_starts(images, focals, middle) or _deep_starts(images, focals, middle)
-        rough = [_fitted(images, start, middle, _ROUGHLY) for start in starts]
-        best = sorted((body for body in rough if body is not None), key=lambda body: body.cost)[:_FEW]
-        bodies = [_fitted(images, body.start, middle, _EVALUATIONS) for body in best]
-        bodies = sorted((body for body in bodies if body is not None), key=lambda body: body.cost)
+        rough = _all_fitted(images, starts, middle, _ROUGHLY)[:_FEW]
+        bodies = _all_fitted(images, [body.start for body in rough], middle, _EVALUATIONS)
         if not bodies:
             raise WorkFailed(
                 f"no rigid body explains the images of the {detections.view[0]} camera: check marker numbers"
@@ -319,6 +318,14 @@ def _flat_start(
     across = U @ Vt
     R = np.concatenate([across, np.cross(across[..., 0], across[..., 1])[..., None]], axis=2)
     return _Start(R, G[..., 2], X, float(camera[0, 0]))
+
+
+def _all_fitted(
+    images: FloatArray, starts: Sequence[_Start], middle: FloatArray, evaluations: int
+) -> list[_Body]:
+    """Fits from starts that keep the body in front of the camera, best first."""
+    found = [_fitted(images, start, middle, evaluations) for start in starts]
+    return sorted((body for body in found if body is not None), key=lambda body: body.cost)
 
 
 def _fitted(images: FloatArray, start: _Start, middle: FloatArray, evaluations: int) -> _Body | None:

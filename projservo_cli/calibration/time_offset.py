@@ -75,7 +75,7 @@ def require_seconds(where: str, observation: Observation) -> None:
 
 def _stamps(observation: Observation) -> FloatArray:
     """Stamps (3, K) of joints, left and right images, s; NaN where unknown."""
-    nobody = np.full((len(observation.pose), 2), np.nan)
+    nobody = np.full((len(observation.pose), len(observation.view)), np.nan)
     t_q = nobody[:, 0] if observation.t_q is None else observation.t_q
     return np.vstack([t_q, (nobody if observation.t_view is None else observation.t_view).T])
 

@@ -133,7 +133,8 @@ def _resected(points: FloatArray, pixels: FloatArray) -> FloatArray:
         weight = cauchy_weights((distance / (2.0 * deviation(distance, 1e-12))) ** 2)
         P = _linear(X, x, np.sqrt(weight) / np.abs(X @ P[2]))
     P = np.linalg.inv(T) @ P @ U
-    return P * np.sign(np.median(points @ P[2] / points[:, 3])) / np.linalg.norm(P[2])
+    ahead = np.sign(np.median(points @ P[2] / points[:, 3]))
+    return np.asarray(ahead * P / np.linalg.norm(P[2]))
 
 
 def _off(P: FloatArray, X: FloatArray, x: FloatArray) -> FloatArray:

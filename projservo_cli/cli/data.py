@@ -244,6 +244,12 @@ def _detect(
 @option.output(metavar="DIR", help="The run, instead of an argument.")
 @click.option("--data", metavar="TABLE", type=option.PATH, help="Observation table (CSV).")
 @click.option(
+    "--readings",
+    metavar="TABLE",
+    type=option.PATH,
+    help="Joints of each pose (CSV), where --data lists detections: pose, camera, marker, u, v.",
+)
+@click.option(
     "--metric",
     metavar="TABLE",
     type=option.PATH,
@@ -270,6 +276,7 @@ def _validate(
     run: Path | None,
     output: Path | None,
     data: Path | None,
+    readings: Path | None,
     metric: Path | None,
     fit: Path | None,
     arm_std_mm: float,
@@ -291,13 +298,15 @@ def _validate(
         raise click.UsageError("--fit and --arm-std-mm are for --metric, which is not given")
     if data is None and metric is None:
         raise click.UsageError("validate needs --data TABLE, or else --metric TABLE")
+    if readings is not None and data is None:
+        raise click.UsageError("--readings are the joints beside --data, which is not given")
     if data is not None and metric is not None:
         raise click.UsageError("--data and --metric: validate takes one of them; leave the other out")
     from projservo_cli.calibration.checks.validation import residual_statistics
     from projservo_cli.config import load_config
     from projservo_cli.records import WorkFailed
     from projservo_cli.store import load
-    from projservo_cli.store.tables import read_table
+    from projservo_cli.store.tables import read_detections, read_table
 
     found = load(target)
     calibration = found.calibration
@@ -319,7 +328,8 @@ def _validate(
             )
         console.report({"run": found.path.resolve(), **value}, [text.format_map(value) for text in lines])
         return
-    observation = read_table(data, calibration.joint_types, joint_unit)
+    unit = calibration.joint_types, joint_unit
+    observation = read_table(data, *unit) if readings is None else read_detections(data, readings, *unit)
     value = {"run": found.path.resolve(), **residual_statistics(calibration, observation)}
     for text in value.get("advice", ()):
         console.say(f"validate: {text}")

@@ -225,7 +225,7 @@ def _in_metres(
         words.insert(0, f"cameras without skew cost Δχ² {found.skew_chi2:.3g} (2 on average)")
         if calibration.lens is not None:
             words[0] += f", OpenCV's lens {found.lens_chi2:.2g} ({found.lens_rms_px:.2g} px rms)"
-        return exports.opencv_yaml(found, config.image_size_px), value, words
+        return exports.opencv_yaml(found, config.image_size_px, metric.view), value, words
     if to == "urdf":
         names = [name or f"joint_{i}" for i, name in enumerate(config.joint_names, 1)]
         names += [f"joint_{i}" for i in range(len(names) + 1, len(metric.joint_types) + 1)]

@@ -44,6 +44,7 @@ _SIZE = re.compile(r"\s*(\d+)\s*[xX]\s*(\d+)\s*")
 _TRIALS = "trials.csv"  # in the folder of a run: the default table of a recording
 _KEYS = {  # that options stand for
     "data": "data.table",
+    "readings": "data.readings",
     "joints": "data.joints",
     "joint_unit": "data.joint_unit",
     "noise_px": "data.noise_px",
@@ -113,6 +114,12 @@ _OF_STAGES = (
     override,
     output(metavar="DIR", help="Folder of the run, or its run.h5. Default: results/<configuration name>."),
     click.option("--data", metavar="TABLE", type=click.Path(), help="Calibrate from this table (CSV)."),
+    click.option(
+        "--readings",
+        metavar="TABLE",
+        type=click.Path(),
+        help="Joints of each pose (CSV), where --data lists detections: pose, camera, marker, u, v.",
+    ),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
     joint_unit(help="Unit of the table's revolute joints. Default: rad."),
     click.option(
@@ -254,14 +261,14 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
         if given is None or given is False:
             continue
         flag = f"--{name.replace('_', '-')}" + ("" if given is True else f" {given}")
-        value = os.path.abspath(given) if name in ("data", "init") else given
+        value = os.path.abspath(given) if name in ("data", "readings", "init") else given
         found.append(Override(flag, key, value))
     if (size := options.get("image_size")) is not None:  # such as 1280x1024,1280x960
         flag, sizes = f"--image-size {size}", [_SIZE.fullmatch(one) for one in size.split(",")]
-        if len(sizes) > 2 or None in sizes:
+        if None in sizes:
             raise click.UsageError(
-                f"{flag}: expected width x height in px, such as 1280x1024, or 1280x1024,1280x960 where the "
-                "right images have another size"
+                f"{flag}: expected width x height in px, such as 1280x1024, or where views differ one each, "
+                "such as 1280x1024,1280x960"
             )
         values = [[int(one[1]), int(one[2])] for one in sizes if one is not None]
         found.append(Override(flag, "data.image_size_px", values if len(values) > 1 else values[0]))

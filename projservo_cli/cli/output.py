@@ -157,6 +157,9 @@ def _in_detail(value: dict[str, Any]) -> Iterator[str]:
         f"  residual {value['rms_px']:.4g} px a point, sigma {value['sigma_px']:.4g} px a coordinate, "
         f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s"
     )
+    if value["sigma_view_px"] is not None:
+        each = zip(value["view"], value["sigma_view_px"], strict=True)
+        yield wrapped(f"noise px: {', '.join(f'{view} {_number(sigma)}' for view, sigma in each)}", "  ")
     for view, terms in (value["lens"] or {}).items():  # at the radius of the view, half the image size
         yield (
             f"  lens {view}: k1 {terms['k1']:.3g}, k2 {terms['k2']:.3g} at {terms['radius_px']:.4g} px from "
@@ -208,7 +211,8 @@ def _rejected(value: dict[str, Any]) -> Iterator[str]:
     counts = value["rejected"]
     whole = {number for numbers in counts["tracks"].values() for number in numbers}
     single = [
-        f"marker {one['marker']} at pose {one['pose']}" + ("" if one["view"] == "both" else f" {one['view']}")
+        f"marker {one['marker']} at pose {one['pose']}"
+        + ("" if one["view"] in ("both", "all") else f" {one['view']}")
         for one in value["outliers"]
         if one["marker"] not in whole
     ]
@@ -248,7 +252,7 @@ def _joint_noise(value: dict[str, Any]) -> str:
 
 def _time_offsets(value: dict[str, Any]) -> Iterator[str]:
     """Time offset of each view, with its interval and its jitter, ms."""
-    for i, view in enumerate(("left", "right")):
+    for i, view in enumerate(value["view"]):
         offset = (
             value["time_offset_s"][i],
             *value["time_offset_interval_s"][i],

@@ -58,6 +58,7 @@ _TICKS = 4096  # in a turn of an encoder that is as coarse as any
 _ACCELERATION_DEG_S2, _ACCELERATION_M_S2 = 500.0, 2.0
 _EXPECTED = {
     "table": "a table, which projservo record calibrate makes",
+    "readings": "a table of joints: pose, q1 ... qN",
     "init": "JSON with screws, cameras and markers",
     "mjcf": "a model of MuJoCo",
 }
@@ -72,7 +73,8 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         data = config.data
         size = config.image_size_px
         stated = data.joint_order == "stated"
-        source = Table(table, config.joint_types, data.joint_unit, size, data.noise_px, _seed(config), stated)
+        readings, kind = _file(config, "readings", files), (config.joint_types, data.joint_unit)
+        source = Table(table, readings, *kind, size, data.noise_px, _seed(config), stated)
     else:
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
         source = _trials(config, _truth(config, face=False), files, speed_scale=1.0)
@@ -304,6 +306,7 @@ def _read(config: Config, kind: str, gone: Mapping[str, str]) -> File | None:
     rendered = config.plant.rendered is not None and config.arm is not None
     path = {
         "table": config.data.table if config.data is not None else None,
+        "readings": config.data.readings if config.data is not None else None,
         "init": config.calibration.init,
         "mjcf": config.arm.mjcf if config.arm is not None and rendered else None,
     }[kind]

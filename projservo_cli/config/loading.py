@@ -59,7 +59,10 @@ _PHRASES = {
 }
 
 # Values that name files, relative to the configuration.
-_FILES = (("data", "table"), ("calibration", "init"), ("robot", "mjcf"), ("robot", "urdf"))
+_FILES = (
+    *(("data", "table"), ("data", "readings")),
+    *(("calibration", "init"), ("robot", "mjcf"), ("robot", "urdf")),
+)
 _DIGITS = 9  # of a position in a list
 _MOST = 200  # problems that are looked at; who has more has taken another file
 _Path = tuple[str | int, ...]

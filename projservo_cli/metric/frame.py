@@ -232,13 +232,13 @@ class _Projective(NamedTuple):
         """The calibration, then pairs off by plus and minus a step of each column of the factor."""
         steps = _STEP * np.concatenate([np.zeros((len(factor), 1)), factor, -factor], axis=1).T
         n, B = len(c.H_hat_0), len(steps)
-        edges = np.cumsum([24, 16 * n, 2 * c.lens_terms])
+        edges = np.cumsum([c.P.size, 16 * n, len(c.P) * c.lens_terms])
         P, H_hat, k, M = np.split(steps, edges, axis=1)
         lenses = np.tile(lens, (B, 1, 1))
         if c.lens is not None:
-            lenses[..., list(TERMS[: c.lens_terms])] += k.reshape(B, 2, -1)
+            lenses[..., list(TERMS[: c.lens_terms])] += k.reshape(B, len(c.P), -1)
         return cls(
-            c.P + P.reshape(B, 2, 3, 4), c.H_hat_0 + H_hat.reshape(B, n, 4, 4), lenses,
+            c.P + P.reshape(B, -1, 3, 4), c.H_hat_0 + H_hat.reshape(B, n, 4, 4), lenses,
             c.M + M.reshape(B, -1, 4),
         )  # fmt: skip
 
@@ -270,7 +270,7 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> MetricP
 def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Upgrades (B, 4, 4) to a right-handed frame, and markers (B, m, 3) there.
 
-    Both cameras have the markers in front of them, so each determines the handedness of the frame.
+    Each camera has the markers in front of it, and so determines the handedness of the frame.
     Raises WorkFailed if they contradict each other.
     """
     M = models.M @ G.swapaxes(-1, -2)
@@ -278,7 +278,7 @@ def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, Float
     P = models.P @ np.linalg.inv(G)[:, None]
     depth = (P[:, :, 2] @ homogeneous(points).swapaxes(-1, -2)).mean(axis=-1)
     side = np.sign(np.linalg.det(P[..., :3]) * depth)
-    if side[0, 0] != side[0, 1]:
+    if (side[0] != side[0, 0]).any():
         raise WorkFailed("metric: one camera's images are mirrored: turn its flip off, and record again")
     flip = np.ones((len(G), 4))
     flip[:, 0] = side[:, 0]
@@ -294,6 +294,8 @@ def _length_of(body: MetricParameters, between: Scale, marker: list[int], prisma
             )
         return np.asarray(np.linalg.norm(body.axes[..., int(np.argmax(prismatic)), 3:], axis=-1))
     if between == "cameras":
+        if body.P.shape[-3] < 2:
+            raise InputError("metric: one camera has no distance to another: name two markers, or tags")
         centers = body.camera_poses()[..., :3, 3]
         return np.asarray(np.linalg.norm(centers[..., 1, :] - centers[..., 0, :], axis=-1))
     if between == "tags":
@@ -341,6 +343,7 @@ class Metric:
     order, with those of frames and of the known length.
     """
 
+    view: tuple[str, ...]  # names of the views
     joint_types: str  # one letter a joint, R or P
     marker: list[int]  # (m,) numbers of the markers
     sigma_px: float  # noise of a pixel, px
@@ -376,7 +379,7 @@ class Metric:
             )
         marker = c.marker.tolist()
         chosen = range(len(marker)) if face is None else _known_indices(face, marker)
-        lens = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2) if c.lens is None else c.lens
+        lens = c.model().lens
         models = _Projective.around(c, lens, factor)
         try:
             bodies = _bodies(models, c, list(chosen))
@@ -398,7 +401,7 @@ class Metric:
             parts = zip(bodies, off, strict=True)
             bodies = MetricParameters(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
         moved = np.stack([c.joint_min, c.joint_min + c.excitation], axis=1)
-        return cls(c.joint_types, marker, c.sigma_px, bodies, moved, c.q_reference)
+        return cls(c.view, c.joint_types, marker, c.sigma_px, bodies, moved, c.q_reference)
 
     @property
     def body(self) -> MetricParameters:
@@ -412,12 +415,12 @@ class Metric:
 
     @property
     def K(self) -> FloatArray:
-        """Intrinsic matrices (2, 3, 3) of both cameras, px."""
+        """Intrinsic matrices (V, 3, 3) of the cameras, px."""
         return self.body.intrinsics()
 
     @property
     def lens(self) -> FloatArray:
-        """Radial distortion (2, 5): centre u, v and radius, px, then k1, k2."""
+        """Radial distortion (V, 5): centre u, v and radius, px, then k1, k2."""
         return self.body.lens
 
     @property

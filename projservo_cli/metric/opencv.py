@@ -79,9 +79,9 @@ def opencv_cameras(metric: Metric, calibration: Calibration) -> OpenCV:
 def _straight_detections(calibration: Calibration) -> list[FloatArray]:
     """Undistorted pixels (k, 2) of the detections of each view, as predicted; (0, 2) where none are kept."""
     if calibration.corner_q is None or calibration.corner_squares is None or calibration.lens is None:
-        return [np.zeros((0, 2))] * 2
-    seen = np.isfinite(calibration.corner_squares).swapaxes(0, 1).reshape(2, -1)
-    pixels = predict(calibration, calibration.corner_q).swapaxes(0, 1).reshape(2, -1, 2)
+        return [np.zeros((0, 2))] * len(calibration.P)
+    seen = np.isfinite(calibration.corner_squares).swapaxes(0, 1).reshape(len(calibration.P), -1)
+    pixels = predict(calibration, calibration.corner_q).swapaxes(0, 1).reshape(len(calibration.P), -1, 2)
     straight = undistort(calibration.lens, np.ascontiguousarray(pixels))
     return [straight[v, seen[v]] for v in (0, 1)]
 

@@ -115,6 +115,7 @@ class ErrorModel:
     """
 
     def __init__(self, calibration: Calibration, sigma_px: float) -> None:
+        calibration.require_left_and_right()
         m, n = len(calibration.M), len(calibration.H_hat_0)
         self.calibration, self.scene = calibration, parameters_from(calibration)
         self.errors, self.e = calibration.errors, calibration.sqrt_cov_shared.shape[1] + 3 * m

@@ -60,7 +60,7 @@ _NUMBERS = (
 
 # Arrays of a calibration that are few numbers.
 _SHORT_ARRAYS = (
-    *("circular_joints", "undecided_order", "sigma_q_interval", "sigma_scale_interval"),
+    *("circular_joints", "undecided_order", "sigma_q_interval", "sigma_scale_interval", "sigma_view_px"),
     *("time_offset_s", "time_offset_interval_s", "time_offset_jitter_s"),
 )
 
@@ -337,7 +337,7 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
     ]
     lens = None  # not estimated
     if calibration.lens is not None:
-        terms = zip(VIEWS, calibration.lens.tolist(), strict=True)
+        terms = zip(calibration.view, calibration.lens.tolist(), strict=True)
         lens = {
             view: {"center_px": [u, v], "radius_px": r, "k1": k1, "k2": k2}
             for view, (u, v, r, k1, k2) in terms
@@ -390,15 +390,17 @@ def findings(calibration: Calibration) -> dict[str, Any]:
         array = getattr(calibration, name)
         return [] if array is None else array.tolist()
 
+    view = calibration.view
+    of = (*view, "both" if len(view) == 2 else "all")
     outliers, suspects, swaps = rows("outlier"), rows("suspect"), rows("id_switches")
     lost = rows("rejected_markers")
     tracks = {why: [marker for marker, reason in lost if reason == code] for code, why in enumerate(WHY_LOST)}
     whole = {marker for marker, _ in lost}
     return {
-        "outliers": [{"pose": p, "marker": m, "view": (*VIEWS, "both")[v]} for p, m, v in outliers],
+        "outliers": [{"pose": p, "marker": m, "view": of[v]} for p, m, v in outliers],
         "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
         "id_switches": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
-        "moved_images": [{"pose": p, "view": VIEWS[v]} for p, v in rows("moved_images")],
+        "moved_images": [{"pose": p, "view": view[v]} for p, v in rows("moved_images")],
         "poses_used": calibration.poses_used,
         "markers_used": calibration.markers_used,
         "rejected": {

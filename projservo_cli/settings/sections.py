@@ -33,12 +33,12 @@ Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
 
 
 def _one_or_each(value: Any, of_one: Callable[[Any], tuple[int, int]]) -> Any:
-    """Width and height of both images, or, where their sizes differ, those of the left and of the right."""
-    pair = isinstance(value, (list, tuple)) and len(value) == 2
-    if not pair or not all(isinstance(one, (list, tuple)) for one in value):
+    """Width and height of all images, or, where their sizes differ, those of each view."""
+    several = isinstance(value, (list, tuple)) and len(value) > 0
+    if not several or not all(isinstance(one, (list, tuple)) for one in value):
         return of_one(value)
-    left, right = map(of_one, value)
-    return left if left == right else (left, right)
+    sizes = tuple(map(of_one, value))
+    return sizes[0] if len({*sizes}) == 1 else sizes
 
 
 _TWO = {"type": "array", "minItems": 2, "maxItems": 2}
@@ -46,7 +46,7 @@ _SIZE = {"items": {"type": "integer", "minimum": 1, "maximum": 1_000_000}, **_TW
 Sizes = Annotated[
     tuple[Count, Count],
     WrapValidator(_one_or_each),
-    WithJsonSchema({"anyOf": [_SIZE, {"items": _SIZE, **_TWO}]}),
+    WithJsonSchema({"anyOf": [_SIZE, {"items": _SIZE, "type": "array", "minItems": 1}]}),
 ]
 # The path from a section to a value in it, and the error of that value.
 Finding = tuple[tuple[str | int, ...], str]

@@ -94,6 +94,11 @@ class Data(Section):
     table: Annotated[str, StringConstraints(min_length=1)] = Field(
         description="path of the table, relative to the configuration"
     )
+    readings: Annotated[str, StringConstraints(min_length=1)] | None = Field(
+        None,
+        description="path of a table of joints, pose and q1 ... qN, where table lists the detections of any "
+        "cameras: pose, camera, marker, u, v",
+    )
     joints: Annotated[str, StringConstraints(pattern=r"^[RrPp]+$"), AfterValidator(str.upper)] | None = Field(
         None,
         description="joint types, one letter R or P for each column q1 ... qN; null: those of robot, "
@@ -110,5 +115,6 @@ class Data(Section):
     )
     noise_px: Positive | None = Field(None, description="pixel noise per coordinate; null: estimated")
     image_size_px: Sizes | None = Field(
-        None, description="width and height of both images, or those of each; null: those of cameras or rig"
+        None,
+        description="width and height of all images, or those of each view; null: those of cameras or rig",
     )

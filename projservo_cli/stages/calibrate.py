@@ -21,7 +21,7 @@ from projservo_cli.simulation.streams import SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed
 from projservo_cli.stages.stage_inputs import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
-from projservo_cli.store.tables import read_table, to_csv
+from projservo_cli.store.tables import read_detections, read_table, to_csv
 
 
 def run(
@@ -40,8 +40,11 @@ def run(
 
 def recorded(table: Table) -> Observations:
     """Return the observations of a table."""
+    unit = table.joint_types, table.joint_unit
     return Observations.of(
-        read_table(table.file.path, table.joint_types, table.joint_unit),
+        read_table(table.file.path, *unit)
+        if table.readings is None
+        else read_detections(table.file.path, table.readings.path, *unit),
         joint_types=table.joint_types,
         image_size=table.image_size,
         noise_px=table.noise_px,

@@ -287,6 +287,8 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
     of it is missing, naming the key to set; WorkFailed if the goal cannot be reached or seen, or the body not
     be measured with.
     """
+    if calibration is not None:
+        calibration.require_left_and_right()
     truth, face, task = inputs.truth, inputs.face, inputs.task
     if task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")

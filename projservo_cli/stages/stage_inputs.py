@@ -101,6 +101,7 @@ class Table(NamedTuple):
     """A recorded table and its settings."""
 
     file: File
+    readings: File | None  # table of joints beside a list of detections
     joint_types: str | None  # one letter a joint, R or P; None for R
     joint_unit: str | None  # of revolute joints, deg or rad; None for rad unless readings look like degrees
     image_size: ImageSize | None  # width and height, px, of both images or of one each, if known

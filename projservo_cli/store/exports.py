@@ -12,32 +12,34 @@ from projservo_cli.geometry.displacements import rigid_inverse
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.metric.frame import Metric
 from projservo_cli.metric.opencv import OpenCV
-from projservo_cli.records import VIEWS, FloatArray
+from projservo_cli.records import FloatArray
 
 # Limits of a URDF joint that no calibration knows: N m or N, and rad/s or m/s.
 _EFFORT, _SPEED = 100.0, 1.0
 
 
-def opencv_yaml(found: OpenCV, size: ImageSize | None) -> str:
-    """Both cameras and the stereo rig for ``cv2.FileStorage``, in the words of OpenCV's calibration samples.
+def opencv_yaml(found: OpenCV, size: ImageSize | None, names: Sequence[str]) -> str:
+    """Cameras by their names, and of two the stereo rig, for ``cv2.FileStorage``, in words of its samples.
 
-    R and T of a camera map the base frame to it; those of the rig map the left camera to the right one.
+    R and T of a camera map the base frame to it; those of the rig map the first camera to the second.
     """
     K, poses = found.body.intrinsics(), found.body.camera_poses()
     lines = ["%YAML:1.0", "---", f"delta_chi2: {found.delta_chi2!r}"]
     if size is not None:
-        (left, right) = image_sizes(size).astype(int).tolist()
-        each = {"": left} if left == right else {"left_": left, "right_": right}
+        sizes = image_sizes(size, len(names)).astype(int)
+        alike = (sizes == sizes[0]).all()
+        each = {"": sizes[0]} if alike else {f"{n}_": one for n, one in zip(names, sizes, strict=True)}
         for name, (width, height) in each.items():
             lines += [f"{name}image_width: {width}", f"{name}image_height: {height}"]
     K[:, 0, 1] = 0.0  # what rounding leaves
     world = rigid_inverse(poses)
-    for v, view in enumerate(VIEWS):
+    for v, view in enumerate(names):
         lines += _matrix(f"{view}_camera_matrix", K[v])
         lines += _matrix(f"{view}_distortion_coefficients", found.distortion[v : v + 1])
         lines += _matrix(f"{view}_R", world[v, :3, :3]) + _matrix(f"{view}_T", world[v, :3, 3:])
-    stereo = world[1] @ poses[0]
-    lines += _matrix("R", stereo[:3, :3]) + _matrix("T", stereo[:3, 3:])
+    if len(names) == 2:
+        stereo = world[1] @ poses[0]
+        lines += _matrix("R", stereo[:3, :3]) + _matrix("T", stereo[:3, 3:])
     return "\n".join(lines) + "\n"
 
 
@@ -60,13 +62,13 @@ def _points(metric: Metric) -> FloatArray:
 
 
 def urdf(metric: Metric, names: Sequence[str], limits: FloatArray) -> str:
-    """The arm, its tool and both cameras as a URDF, with limits (n, 2) of its joints, rad or m.
+    """The arm, its tool and the cameras as a URDF, with limits (n, 2) of its joints, rad or m.
 
     All link frames are parallel to the base at readings of zero.
     """
     places, prismatic = _points(metric), metric.prismatic
     links = ["base_link", *(f"link_{i + 1}" for i in range(len(places))), "tool"]
-    links += [f"camera_{view}" for view in VIEWS]
+    links += [f"camera_{view}" for view in metric.view]
     lines = ['<?xml version="1.0"?>', '<robot name="calibrated">']
     # Masses, which no camera sees, for simulators that ask for some.
     lines += ['  <mujoco><compiler boundmass="0.001" boundinertia="1e-6" fusestatic="false"/></mujoco>']
@@ -85,8 +87,9 @@ def urdf(metric: Metric, names: Sequence[str], limits: FloatArray) -> str:
         last = place
     tool = metric.pose(np.zeros(len(places)))
     tool[:3, 3] -= last
-    parents = (links[len(places)], "base_link", "base_link")
-    for link, parent, T in zip(links[-3:], parents, (tool, *metric.poses), strict=True):
+    parents = (links[len(places)], *("base_link" for _ in metric.view))
+    fixed = zip(links[len(places) + 1 :], parents, (tool, *metric.poses), strict=True)
+    for link, parent, T in fixed:
         rpy = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
         lines += [
             f'  <joint name="{link}_fixed" type="fixed">',
@@ -102,9 +105,9 @@ def _numbers(values: FloatArray) -> str:
 
 
 def static_transforms(metric: Metric) -> str:
-    """A launch file of ROS 2 that publishes where both cameras are in the base frame."""
+    """A launch file of ROS 2 that publishes where the cameras are in the base frame."""
     lines = ["<launch>"]
-    for view, T in zip(VIEWS, metric.poses, strict=True):
+    for view, T in zip(metric.view, metric.poses, strict=True):
         quaternion = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
         values = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), [*T[:3, 3].tolist(), *quaternion], strict=True)
         where = " ".join(f"--{name} {value!r}" for name, value in values)

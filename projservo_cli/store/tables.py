@@ -1,7 +1,8 @@
 """Observation tables: one row per marker seen at one robot pose, as comma-separated values.
 
 Columns, in any order: ``pose, marker, q1 … qN, u_left, v_left, u_right, v_right``, and optionally
-``sigma_left, sigma_right, moving, t_q, t_left, t_right``; others are ignored. Joint readings are rad or m,
+``sigma_left, sigma_right, moving, t_q, t_left, t_right``; others are ignored. Views may have other names, and
+be one or more: each pair of columns ``u_NAME, v_NAME`` is a view. Joint readings are rad or m,
 pixels are raw; empty or ``nan``, they mean *unseen*. Sigmas are standard deviations of the pixels, px. A pose
 with a number in ``moving`` belongs to that motion; times are s, empty if unknown. Files are UTF-8 with or
 without byte-order mark, with any line ends. Columns are separated by commas, or as spreadsheets do by tabs or
@@ -27,6 +28,7 @@ from projservo_cli.metric.position_error import Positions
 from projservo_cli.records import (
     FARTHEST_M,
     TWO_TURNS,
+    VIEWS,
     FloatArray,
     InputError,
     IntArray,
@@ -38,10 +40,10 @@ _MAX_JOINTS = 64  # maximum number of joints, as in a configuration
 _MAX_COLUMNS = 10_000  # maximum number of columns
 _MAX_BYTES = 1_000_000_000  # maximum size of a table, far beyond the size of a calibration
 _MAX_CELLS = 12_000_000  # maximum of poses × markers: mistyped pose numbers must not fill the memory
-_PIXELS = ("u_left", "v_left", "u_right", "v_right")  # columns of pixels
-_SIGMAS = ("sigma_left", "sigma_right")  # columns of their standard deviations
+_OF_VIEW = re.compile(r"u_([a-z0-9][a-z0-9_]*)")  # column of pixels u of a view; that of v follows
+_DETECTION = ("pose", "camera", "marker", "u", "v")  # columns of a list of detections
 _MOVING = "moving"  # column of the number of a motion
-_TIMES = ("t_q", "t_left", "t_right")  # columns of times, s
+_T_Q = "t_q"  # column of the time of the joint readings, s
 _IDENTITY = " of "  # in that column, before the identity of the robot
 _XYZ = ("x", "y", "z")  # columns of a position, m
 _RECORDING = "recording"  # column of the recording that a row belongs to
@@ -70,17 +72,17 @@ def read_table(
     Returns poses in the order of their first row, markers by number; NaN if unseen; readings in rad and m.
     Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
     """
-    optional = [*_SIGMAS, _MOVING, *_TIMES]
-    sheet = _Sheet(path, ["pose", "marker", *_PIXELS], joint_types, optional=optional, frame=frame)
-    stated = sheet.has_both(_SIGMAS)
+    sheet = _Sheet(path, ["pose", "marker"], joint_types, optional=[_MOVING, _T_Q], frame=frame, seen=True)
+    stated = sheet.has_all([f"sigma_{view}" for view in sheet.views])
+    times_of = [_T_Q, *(f"t_{view}" for view in sheet.views)]
     readings: dict[int, tuple[int, dict[str, float | None]]] = {}
     lines: dict[int, dict[int, int]] = {}  # of each marker at each pose
     rows, seen = array("q"), array("d")  # pose and marker; pixels, then their deviations
     for row in sheet.rows():
         pose, marker = row.integer("pose"), row.integer("marker")
-        seen.extend(row.observation(stated))
+        seen.extend(row.observation(sheet.views, stated))
         rows.extend((pose, marker))
-        of_pose = {name: row.number(name) for name in sheet.joints} | row.moment()
+        of_pose = {name: row.number(name) for name in sheet.joints} | row.moment(times_of)
         line, first = readings.setdefault(pose, (row.line, of_pose))
         if of_pose != first:
             name = next(name for name, value in of_pose.items() if value != first[name])
@@ -98,23 +100,24 @@ def read_table(
     if len(poses) * len(markers) > _MAX_CELLS:
         raise InputError(f"{sheet.file}: {len(poses)} poses × {len(markers)} markers are too many to hold")
     k = np.array([poses[pose] for pose in of_row[:, 0].tolist()])
-    of_seen = np.frombuffer(seen).reshape(len(of_row), -1)
-    images = np.full((len(poses), 2, len(markers), 2), np.nan)
-    images[k, :, j] = of_seen[:, :4].reshape(-1, 2, 2)
+    of_seen, V = np.frombuffer(seen).reshape(len(of_row), -1), len(sheet.views)
+    images = np.full((len(poses), V, len(markers), 2), np.nan)
+    images[k, :, j] = of_seen[:, : 2 * V].reshape(-1, V, 2)
     sigma = np.full(images.shape[:3], np.nan) if stated else None
     if sigma is not None:
-        sigma[k, :, j] = of_seen[:, 4:]
+        sigma[k, :, j] = of_seen[:, 2 * V :]
     numbers, values = np.array([*poses], dtype=np.int64), [of_pose for _, of_pose in readings.values()]
     # (K, columns); unknown values become NaN
     q_read, moving, times = (
         np.array([[of_pose.get(name) for name in names] for of_pose in values], dtype=np.float64)
-        for names in (sheet.joints, (_MOVING,), _TIMES)
+        for names in (sheet.joints, (_MOVING,), times_of)
     )
     found = Observation(
         pose=numbers,
         marker=markers,
         q=sheet.in_radians(numbers, q_read, joint_unit),
         images=images,
+        view=sheet.views,
         moving=moving[:, 0].astype(np.int64) if np.nansum(moving) > 0.0 else None,
         t_q=times[:, 0] if np.isfinite(times[:, 0]).any() else None,
         t_view=times[:, 1:] if np.isfinite(times[:, 1:]).any() else None,
@@ -122,6 +125,69 @@ def read_table(
     )
     require_seconds(sheet.file, found)
     return found
+
+
+def read_detections(
+    path: Path | str, readings: Path | str, joint_types: str | None = None, joint_unit: str | None = None
+) -> Observation:
+    """Read a list of detections of any cameras, ``pose, camera, marker, u, v``, beside a table of joints.
+
+    Optional columns: ``sigma``, px, and ``t``, s, the time of an image. Views are the cameras in the order of
+    their first rows; one whose name is a number n is cam n. Poses of the table of joints that no row names
+    are poses that no camera saw.
+    readings : table of joints, ``pose, q1 … qN``; joint_types, joint_unit : as for an observation table.
+    Raises InputError ``file:line: message`` if a file cannot be read or a row is not valid.
+    """
+    joints = read_joint_list(readings, joint_types, joint_unit)
+    sheet = _Sheet(path, _DETECTION, optional=["sigma", "t"], joints=False)
+    poses = {int(pose): k for k, pose in enumerate(joints.pose)}
+    views: dict[str, int] = {}
+    lines: dict[tuple[int, int, int], int] = {}
+    rows = list[tuple[int, int, int]]()
+    values = list[tuple[float, float, float, float]]()
+    for row in sheet.rows():
+        if (pose := row.integer("pose")) not in poses:
+            raise InputError(
+                f"{row.where}: pose {pose} has no joint readings in {readings}: add its row there"
+            )
+        name = row["camera"].lower()
+        name = f"cam{name}" if name.isdigit() else name
+        if not _OF_VIEW.fullmatch(f"u_{name}"):
+            raise InputError(f"{row.where}: camera is {row['camera']!r}; expected a number or a word")
+        where = poses[pose], views.setdefault(name, len(views)), row.integer("marker")
+        if (line := lines.setdefault(where, row.line)) != row.line:
+            raise InputError(
+                f"{row.where}: marker {where[2]} of camera {name} at pose {pose} is already in "
+                f"{sheet.named(line)}"
+            )
+        rows.append(where)
+        sigma = row.deviation("sigma") if row.get("sigma") else math.nan
+        values.append(
+            (row.number("u"), row.number("v"), sigma, row.number("t") if row.get("t") else math.nan)
+        )
+    sheet.require(rows, "a detection")
+    k, v, number = np.array(rows).T
+    markers, j = np.unique(number, return_inverse=True)
+    if len(poses) * len(markers) > _MAX_CELLS:
+        raise InputError(f"{sheet.file}: {len(poses)} poses × {len(markers)} markers are too many to hold")
+    found = np.array(values)
+    images = np.full((len(poses), len(views), len(markers), 2), np.nan)
+    images[k, v, j] = found[:, :2]
+    sigma_of, t_view = np.full(images.shape[:3], np.nan), np.full(images.shape[:2], np.nan)
+    sigma_of[k, v, j], t_view[k, v] = found[:, 2], found[:, 3]
+    if (some := np.isnan(found[:, 2])).any() and not some.all():
+        raise InputError(
+            f"{sheet.file}: sigma is empty in {np.count_nonzero(some)} rows; state it in all or none"
+        )
+    return Observation(
+        pose=joints.pose,
+        marker=markers,
+        q=joints.q,
+        images=images,
+        view=tuple(views),
+        t_view=t_view if np.isfinite(t_view).any() else None,
+        sigma=None if some.all() else sigma_of,
+    )
 
 
 def read_joint_list(
@@ -134,7 +200,7 @@ def read_joint_list(
     Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
     """
     sheet = _Sheet(path, [], joint_types, optional=["pose", "left", "right"])
-    sheet.has_both(("left", "right"))
+    sheet.has_all(("left", "right"))
     lines: dict[int, int] = {}
     readings, names = [], []
     for row in sheet.rows():
@@ -210,14 +276,15 @@ def table_text(observation: Observation, *, recording: str = "", identity: str =
     K, m = len(observation.pose), len(observation.marker)
     columns = {"pose": np.repeat(observation.pose, m), "marker": np.tile(observation.marker, K)}
     columns |= {f"q{i}": np.repeat(values, m) for i, values in enumerate(observation.q.T, 1)}
-    pixels = np.moveaxis(observation.images, 1, 2).reshape(K * m, 4).T
-    columns |= {name: or_empty(values) for name, values in zip(_PIXELS, pixels, strict=True)}
+    for v, view in enumerate(observation.view):
+        for name, pixels in zip("uv", observation.images[:, v].reshape(K * m, 2).T, strict=True):
+            columns[f"{name}_{view}"] = or_empty(pixels)
     if observation.sigma is not None:
         sigma = np.where(np.isnan(observation.images[..., 0]), np.nan, observation.sigma)
-        columns |= {name: or_empty(sigma[:, v].ravel()) for v, name in enumerate(_SIGMAS)}
-    moments = {_MOVING: observation.moving, "t_q": observation.t_q}
+        columns |= {f"sigma_{view}": or_empty(sigma[:, v].ravel()) for v, view in enumerate(observation.view)}
+    moments = {_MOVING: observation.moving, _T_Q: observation.t_q}
     if observation.t_view is not None:
-        moments |= dict(zip(_TIMES[1:], observation.t_view.T, strict=True))
+        moments |= {f"t_{view}": t for view, t in zip(observation.view, observation.t_view.T, strict=True)}
     for name, values in moments.items():
         if values is not None:
             columns[name] = or_empty(np.repeat(values, m))
@@ -303,10 +370,11 @@ class _Row(dict[str, str]):
     line: int
     where: str  # file and line, for messages
 
-    def observation(self, stated: bool) -> list[float]:
-        """Pixels of both views, and their deviations if stated, NaN if unseen."""
+    def observation(self, views: Sequence[str], stated: bool) -> list[float]:
+        """Pixels of all views, and their deviations if stated, NaN if unseen."""
         pixels, sigmas = [], []
-        for u, v, deviation in zip(_PIXELS[::2], _PIXELS[1::2], _SIGMAS, strict=True):
+        for view in views:
+            u, v, deviation = f"u_{view}", f"v_{view}", f"sigma_{view}"
             seen = self[u] != ""
             if seen != (self[v] != ""):
                 raise InputError(f"{self.where}: one of {u}, {v} is empty; give both or neither")
@@ -321,16 +389,16 @@ class _Row(dict[str, str]):
             raise InputError(f"{self.where}: {column} is {self[column]!r}; expected an integer")
         return int(found[1])
 
-    def moment(self) -> dict[str, float | None]:
+    def moment(self, times: Sequence[str]) -> dict[str, float | None]:
         """Number of the motion and times of a pose, by column; None for an unknown time."""
         found: dict[str, float | None] = {
-            name: self.number(name) if self[name] else None for name in _TIMES if name in self
+            name: self.number(name) if self[name] else None for name in times if name in self
         }
         if _MOVING in self:
             found[_MOVING] = moving = self.integer(_MOVING)
             if moving < 0:
                 raise InputError(f"{self.where}: moving is {moving}; number motions from 1, 0 is at rest")
-            if moving > 0 and found.get("t_q") is None:
+            if moving > 0 and found.get(_T_Q) is None:
                 raise InputError(f"{self.where}: a pose in motion needs t_q, when its joints were read, in s")
         return found
 
@@ -348,6 +416,21 @@ class _Row(dict[str, str]):
         return value
 
 
+def _views_in(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of the views of a header, in its order; of left and right alone in this one; both without any."""
+    found = [match[1] for match in map(_OF_VIEW.fullmatch, names) if match]
+    views = [view for view in found if f"v_{view}" in names or view in VIEWS]
+    views += [view for view in VIEWS if f"v_{view}" in names and view not in views]
+    if {*views} <= {*VIEWS}:
+        return tuple(view for view in VIEWS if view in views) or VIEWS
+    return tuple(dict.fromkeys(views))
+
+
+def _columns_of(views: Sequence[str]) -> list[str]:
+    """Columns of the pixels of views."""
+    return [f"{name}_{view}" for view in views for name in "uv"]
+
+
 class _Sheet:
     """A table with the columns that are read (needed ones, q1 … qN, optional ones if present)."""
 
@@ -359,6 +442,8 @@ class _Sheet:
         *,
         optional: Sequence[str] = (),
         frame: str | None = None,
+        seen: bool = False,
+        joints: bool = True,
     ) -> None:
         self.file, self._of_frame = str(path), frame is not None
         of_file = lines_of(path, "a table as UTF-8 CSV", _MAX_BYTES)
@@ -371,19 +456,28 @@ class _Sheet:
             chain([first] * (first != ""), lines), strict=True, delimiter=self._separator
         )
         if (header := self._next()) is None:
-            expected = [*needed[:2], "q1…qN", *needed[2:]]
+            expected = [*needed[:2], *["q1…qN"] * joints, *(_columns_of(VIEWS) if seen else needed[2:])]
             raise InputError(f"{self.file}: the table is empty; expected a header {','.join(expected)}")
         names = [name.strip().lower() for name in header]
         self.joints = sorted(filter(_JOINT.fullmatch, set(names)), key=lambda name: int(name[1:]))
+        self.views = _views_in(names) if seen else ()
+        needed = [*needed, *_columns_of(self.views)]
+        optional = [*optional, *(f"{what}_{view}" for view in self.views for what in ("sigma", "t"))]
+        self._blank = {*_columns_of(self.views), *optional} - {_MOVING, _RECORDING, "left", "right", "pose"}
         wanted = [*needed, *self.joints, *(name for name in optional if name in names)]
-        if wrong := self._wrong(names, needed, wanted, joint_types):
+        if wrong := self._wrong(names, needed, wanted, joint_types, joints):
             raise InputError(f"{self._place(1 + self._skipped)}: {wrong}")
-        self._width, self._numeric = len(names), {*wanted} - {"left", "right", _RECORDING}
+        self._width, self._numeric = len(names), {*wanted} - {"left", "right", "camera", _RECORDING}
         self.columns = {name: names.index(name) for name in wanted}
         self._joint_types = joint_types or "R" * len(self.joints)
 
     def _wrong(
-        self, names: Sequence[str], needed: Sequence[str], wanted: Sequence[str], joint_types: str | None
+        self,
+        names: Sequence[str],
+        needed: Sequence[str],
+        wanted: Sequence[str],
+        joint_types: str | None,
+        joints: bool,
     ) -> str:
         """Describe an error of the header; empty if there is none."""
         n = len(self.joints)
@@ -391,7 +485,7 @@ class _Sheet:
             return f"{len(names)} columns; a table has at most {_MAX_COLUMNS}"
         if wrong := [name for name in names if re.fullmatch(r"q0[0-9]*", name)]:
             return f"the header has {wrong[0]}: number the joint columns q1, q2, … from base to tool"
-        if missing := [name for name in needed if name not in names] + ([] if n else ["q1"]):
+        if missing := [name for name in needed if name not in names] + ["q1"] * (joints and not n):
             return f"the header lacks the column(s) {', '.join(missing)}"
         if twice := sorted({name for name in wanted if names.count(name) > 1}):
             return f"the header names the column(s) {', '.join(twice)} more than once"
@@ -404,11 +498,12 @@ class _Sheet:
             return f"{n} joint columns q1…q{n}, but joints {letters}; give one R or P a column"
         return ""
 
-    def has_both(self, pair: tuple[str, str]) -> bool:
-        """Whether both columns of a pair are present. Raises InputError for one without the other."""
-        present = [name in self.columns for name in pair]
+    def has_all(self, names: Sequence[str]) -> bool:
+        """Whether some columns are present. Raises InputError for some of them without the others."""
+        present = [name in self.columns for name in names]
         if any(present) and not all(present):
-            raise InputError(f"{self._place(1)}: give the columns {pair[0]} and {pair[1]} both, or neither")
+            how = "both, or neither" if len(names) == 2 else "all, or none"
+            raise InputError(f"{self._place(1)}: give the columns {' and '.join(names)} {how}")
         return all(present)
 
     def named(self, line: int) -> str:
@@ -438,7 +533,7 @@ class _Sheet:
                     "cut short or malformed"
                 )
             row = _Row({name: cells[i].strip() for name, i in self.columns.items()})
-            for name in (*_PIXELS, *_SIGMAS, *_TIMES):
+            for name in self._blank:
                 if row.get(name, "").lower() in _UNKNOWN:
                     row[name] = ""
             if self._separator != ",":

@@ -43,7 +43,7 @@ class Robot:
         images = self.images(q)
         images = images + np.reshape(sigma, (-1, 1, 1)) * rng.standard_normal(images.shape)
         m, view = len(self.markers), NAMES[: len(self.cameras)]
-        return Observation(3 + 2 * np.arange(len(q)), 5 + 3 * np.arange(m), q.copy(), images, view)
+        return Observation(3 + 2 * np.arange(len(q)), 5 + 3 * np.arange(m), q.copy(), images, view=view)
 
 
 def rig(baseline: float = 0.3, distance: float = 1.4, focal: float = 1200.0, views: int = 2) -> FloatArray:

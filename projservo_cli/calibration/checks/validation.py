@@ -249,7 +249,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     unknown markers, behind the camera, and missing; ``advice`` about placeholders, which are missing ones.
     Raises InputError if the readings have another number of joints or are not finite.
     """
-    observation = observation.at_rest
+    observation = of_views(observation.at_rest, calibration.view)
     images, advice = without_placeholders(observation.images)
     observation = replace(observation, images=images)
     known = np.isin(observation.marker, calibration.marker)
@@ -279,6 +279,26 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
         },
         "advice": list(advice),
     }
+
+
+def of_views(observation: Observation, names: tuple[str, ...]) -> Observation:
+    """Select the views of a calibration, by their names.
+
+    Raises InputError if one is missing.
+    """
+    if observation.view == names:
+        return observation
+    if missing := [name for name in names if name not in observation.view]:
+        raise InputError(
+            f"the images are of {', '.join(observation.view)}, and those of the calibration of "
+            f"{', '.join(names)}: add {', '.join(missing)}, or calibrate without"
+        )
+    which = [observation.view.index(name) for name in names]
+    some: dict[str, Any] = {"images": observation.images[:, which]}
+    for name in ("sigma", "t_view"):
+        values = getattr(observation, name)
+        some[name] = None if values is None else values[:, which]
+    return replace(observation, view=names, **some)
 
 
 def _image_noise(calibration: Calibration, observation: Observation) -> float:

@@ -16,7 +16,7 @@ from projservo_cli.calibration.prediction import (
 )
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
 from projservo_cli.report import style
-from projservo_cli.report.report_data import VIEWS, Data, Fit, registered
+from projservo_cli.report.report_data import Data, Fit, registered
 
 _BOTH = 2
 _ARROW = 0.04  # length of an arrow of the rms residual, as a fraction of the extent of the observations
@@ -68,7 +68,7 @@ def _data(fit: Fit) -> Data:
         predictable: BoolArray = np.all(np.isfinite(fit.held_out.residual), axis=-1)
         result |= _by_pose(predictable, fit.held_out.residual, fit.held_out.predicted**2)
     unknown = observation.images[:, :, ~np.isin(observation.marker, calibration.marker)]
-    for v, view in enumerate(VIEWS):
+    for v, view in enumerate(calibration.view):
         unidentified = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
         result[f"seen_{view}"] = pixels[:, v][used[:, v]]
         result[f"residual_{view}"] = residual[:, v][used[:, v]]
@@ -78,7 +78,7 @@ def _data(fit: Fit) -> Data:
             f"rejected_{kind}_{view}": of_kind
             for kind, of_kind in zip(_KINDS, (*positions, unidentified), strict=True)
         }
-    extent = max(float(np.ptp(pixels[:, v][measured[:, v]], axis=0).max()) for v in (0, 1))
+    extent = max(float(np.ptp(pixels[:, v][measured[:, v]], axis=0).max()) for v in range(pixels.shape[1]))
     residual = result["residual"]
     rms = float(np.sqrt(2.0 * np.mean(residual**2))) if residual.size else 0.0
     result["factor"] = np.array(style.magnification(rms, _ARROW * extent))
@@ -202,13 +202,16 @@ def _expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """Residuals over both images; their histogram and error of each pose; excitation and information."""
-    panels = figure.subplots(3, 2, height_ratios=(1.15, 1.0, 0.9))
-    for axes, view in zip(panels[0], VIEWS, strict=True):
-        _arrows(axes, data, view)
-    _histogram(panels[1, 0], data)
-    _poses(panels[1, 1], data)
-    _excitation(panels[2, 0], data)
-    _spectrum(panels[2, 1], data)
+    views = [name.removeprefix("seen_") for name in data if name.startswith("seen_")]
+    grid = figure.add_gridspec(3, 2, height_ratios=(1.15, 1.0, 0.9))
+    images = grid[0, :].subgridspec(1, len(views))
+    for v, view in enumerate(views):
+        _arrows(figure.add_subplot(images[0, v]), data, view)
+    panels = [[figure.add_subplot(grid[i, j]) for j in (0, 1)] for i in (1, 2)]
+    _histogram(panels[0][0], data)
+    _poses(panels[0][1], data)
+    _excitation(panels[1][0], data)
+    _spectrum(panels[1][1], data)
     notes = [
         _RESIDUAL | {"label": f"residual, {data['factor']:,g} times"},
         style.line(style.PALE, width=6, label="95 % of poses in the model"),

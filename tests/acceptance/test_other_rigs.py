@@ -1,0 +1,63 @@
+"""One camera, and three: what calibrate, validate, report and export do, and that tasks take two views."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.monitoring.innovation_tests import ErrorModel
+from projservo_cli.records import InputError
+from projservo_cli.store import load
+from projservo_cli.store.tables import to_csv, write_table
+from tests.calibration.simulated_robot import around, random_robot, trials
+
+FEW = 4  # of the corners of the board, every so many
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_a_chain_of_another_rig(answer, elsewhere, views):
+    rng = np.random.default_rng(2)
+    robot = random_robot("RRRRR", rng, markers=8, views=views)
+    poses = np.concatenate([trials(robot, frames=4), around(robot, 12, rng)])
+    write_table(robot.observe(poses, 0.4, rng), "table.csv")
+    write_table(robot.observe(around(robot, 8, rng), 0.4, rng), "ahead.csv")
+    code, found, error = answer("calibrate", "--data", "table.csv", "-o", "out")
+    assert code == 0, error
+    assert (code, found["usable"], found["view"]) == (0, True, ["left", "right", "top"][:views])
+    assert (found["sigma_view_px"] is None) == (views < 3)
+    code, value, _ = answer("validate", "out", "--data", "ahead.csv")
+    assert (code, value["count"]) == (0, views * 8 * 8)
+    assert value["median_px"] <= value["limit_px"]
+    code, value, _ = answer("report", "-o", "out", "calibrate")
+    assert code == 0, value
+    assert any("calibration" in name for name in value["report"]["figures"])
+    for kind in ("opencv", "urdf", "ros", "json"):
+        code, _, error = answer("export", "out", "--to", kind, "--metric", "0.1", "--between", "5,8")
+        assert code in (0, 1), (kind, error)
+    with pytest.raises(InputError, match="the calibration has the views left.*; tasks, laws"):
+        ErrorModel(load("out").calibration, 0.4)
+
+
+def test_three_webcams_before_a_real_arm(answer, elsewhere, shared_data):
+    """A list of detections beside joints, of a quarter of the corners; bars are those of all corners."""
+    rows = np.genfromtxt(shared_data / "ur3e" / "detections_cam123.csv", delimiter=",", names=True)
+    joints = np.genfromtxt(shared_data / "ur3e" / "joints.csv", delimiter=",", names=True)
+    few = rows[rows["marker"] % FEW == 0]
+    for name, held_out in (("train", False), ("test", True)):
+        some, at = (part[(part["pose"] % 4 == 0) == held_out] for part in (few, joints))
+        for file, table, whole in ((name, some, ("pose", "camera", "marker")), (f"{name}_q", at, ("pose",))):
+            columns = {
+                key: table[key].astype(int) if key in whole else table[key] for key in table.dtype.names
+            }
+            with open(f"{file}.csv", "w", encoding="utf-8") as out:
+                out.write(to_csv(columns))
+    tables = "--data", "train.csv", "--readings", "train_q.csv"
+    code, found, _ = answer("calibrate", *tables, "--joint-unit", "deg", "--lens", "-o", "out")
+    assert (code, found["usable"], found["view"]) == (0, True, ["cam1", "cam2", "cam3"])
+    code, value, _ = answer(
+        "validate", "out", "--data", "test.csv", "--readings", "test_q.csv", "--joint-unit", "deg"
+    )
+    assert code == 0
+    assert value["median_px"] <= 0.40
+    assert {25, 26} <= set(found["rejected"]["poses"])
+    assert {1, 2} & {one["pose"] for one in found["moved_images"]}
+    assert found["sigma_view_px"][2] > 2.0 * max(found["sigma_view_px"][:2])
+    assert not any(text.startswith(("joint ", "check the joint")) for text in found["advice"])
