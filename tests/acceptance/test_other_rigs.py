@@ -32,7 +32,7 @@ def test_a_chain_of_another_rig(answer, elsewhere, views):
     for kind in ("opencv", "urdf", "ros", "json"):
         code, _, error = answer("export", "out", "--to", kind, "--metric", "0.1", "--between", "5,8")
         assert code in (0, 1), (kind, error)
-    with pytest.raises(InputError, match="the calibration has the views left.*; tasks, laws"):
+    with pytest.raises(InputError, match=r"the calibration has the views left.*; tasks, laws"):
         ErrorModel(load("out").calibration, 0.4)
 
 

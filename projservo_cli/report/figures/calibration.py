@@ -18,7 +18,6 @@ from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, 
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, Fit, registered
 
-_BOTH = 2
 _ARROW = 0.04  # length of an arrow of the rms residual, as a fraction of the extent of the observations
 _BAND = (0.025, 0.975)  # shares of χ² between which the residuals of a pose are expected
 _BINS = 40
@@ -129,16 +128,16 @@ def _observed(calibration: Calibration, observation: Observation) -> tuple[Float
 
     Those are outliers (1), markers that were read under another number (2), and poses in doubt (3).
     """
-    pixels = observation.images[:, :, _columns(calibration, observation)]
+    pixels, every = observation.images[:, :, _columns(calibration, observation)], len(calibration.view)
     reason = np.zeros(pixels.shape[:3], dtype=np.int64)
     row = {number: k for k, number in enumerate(observation.pose.tolist())}
     column = {number: j for j, number in enumerate(calibration.marker.tolist())}
     # The marker that it is was not seen there, or is left out as well: an exchange is listed once.
-    renamed = [(pose, number, _BOTH) for pose, *pair in calibration.id_switches.tolist() for number in pair]
+    renamed = [(pose, number, every) for pose, *pair in calibration.id_switches.tolist() for number in pair]
     for why, positions in ((2, renamed), (1, calibration.outlier.tolist())):
         for pose, number, view in positions:
             if pose in row and number in column:
-                reason[row[pose], slice(None) if view == _BOTH else view, column[number]] = why
+                reason[row[pose], slice(None) if view == every else view, column[number]] = why
     doubted = calibration.suspect[:, 0]
     if calibration.rejected_poses is not None:
         doubted = np.append(doubted, calibration.rejected_poses)
