@@ -1,7 +1,5 @@
 """The simulated truth: other software's robots, start and goal, and what is refused."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -26,29 +24,6 @@ def test_configuration_is_the_reference_robot_unchanged(name, reference_truth):
     body = np.linalg.solve(truth.robot.base_tool, truth.M.T).T[:, :3]
     assert body == pytest.approx(np.array(reference["markers_tool"]), abs=1e-14)
     assert truth.face == tuple(reference["face_markers"])
-
-
-def test_the_benchmark_is_within_its_promised_dimensions():
-    """Baseline 0.2–0.5 m, 1.2–1.6 m to the face, view ≤ 60°, face ≤ 0.12 m, 5–10 markers; 180°."""
-    example = case("paper")
-    truth = example.truth
-    centers = np.array([-np.linalg.solve(P[:, :3], P[:, 3]) for P in truth.P])
-    assert 0.2 <= np.linalg.norm(centers[1] - centers[0]) <= 0.5
-    face = truth.M_face @ (truth.robot.pose(example.ends.q_start) @ np.linalg.inv(truth.robot.base_tool)).T
-    for center in centers:
-        assert 1.2 <= np.linalg.norm(face[:, :3].mean(axis=0) - center) <= 1.6
-    spread = np.linalg.norm(face[:, None, :3] - face[None, :, :3], axis=2).max()
-    assert spread <= 0.12 * math.sqrt(2)
-    assert 5 <= len(truth.M) <= 10
-    for P, (width, _) in zip(truth.P, truth.image_size, strict=True):
-        K = np.linalg.inv(np.linalg.qr(np.linalg.inv(P[:, :3]))[1])
-        focal = abs(K[0, 0] / K[2, 2])
-        assert 2 * math.degrees(math.atan(width / 2 / focal)) <= 60.0
-    # Transversal to the image planes: the normal lies far from the viewing direction.
-    M = face[:, :3]
-    normal = np.cross(M[1] - M[0], M[2] - M[0])
-    cosine = abs(normal[0]) / np.linalg.norm(normal)
-    assert math.degrees(math.acos(cosine)) > 45.0
 
 
 @pytest.mark.parametrize("scale", [-1.0, 250.0, -1e-3])
