@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import yaml
 
+from tests.hardware.still import Quiet
 from tests.hardware.streams import Stream, picture
 from tests.hardware.test_doctor import CONFIGURATION
 
 
-class Walking:
+class Walking(Quiet):
     """Two joints that stand where they are sent, but for a tenth of a degree of the second one."""
 
     def __init__(self):
@@ -17,20 +18,11 @@ class Walking:
     def now(self):
         return self.time
 
-    def open(self):
-        pass
-
     def joints(self):
         return self.q + np.radians([0.0, -0.1]), self.time
 
     def command(self, target, speed, due):
         self.q, self.time = target.copy(), due
-
-    def stop(self):
-        pass
-
-    def close(self):
-        pass
 
 
 @pytest.fixture
