@@ -10,23 +10,19 @@ at the readings of a goal by joints; tags that moved on the tool do not move tha
 
 import json
 from collections import Counter
-from contextlib import suppress
 
 import numpy as np
 
-from projservo_cli.records import WorkFailed
-from tests.configured import plan
 from tests.monitoring.stand_in import ARMS, KINDS, LAST, StandIn, tool_pose
 from tests.studies.common import in_two_processes, parser_of, quantiles, rate, written
 from tests.studies.monitoring import (
     Rig,
     calibrated,
-    config_of,
     moved_so_far,
     off_mm,
+    planned,
     rigs,
     run_of,
-    tasks,
     taught,
 )
 
@@ -80,13 +76,7 @@ def driven(job):
             rng = np.random.default_rng([SEED, list(SIZES).index(kind), number])
             size = float(rng.uniform(*SIZES[kind]))
             how = str(rng.choice(["images", "taught"] if kind == "goal" else ["joints", "images", "taught"]))
-            for start, goal in tasks(rig, rng):
-                shown = goal_of(rig, goal, how)
-                with suppress(WorkFailed):
-                    if plan.run(
-                        config_of(rig, (start, shown), "none.csv", rig.options()), calibration
-                    ).feasible:
-                        break
+            start, goal, shown, _ = planned(rig, rng, lambda q, how=how: goal_of(rig, q, how))
             there = tool_pose(arm, np.radians(goal))
             fault = fault_of(kind, size, there, rng)
             if how != "joints":

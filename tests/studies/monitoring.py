@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections import Counter
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -177,6 +177,17 @@ def tasks(rig, rng):
             yield ends.round(3).tolist()
 
 
+def planned(rig, rng, shown):
+    """The first task with a plan: start and goal readings, deg, what is shown of the goal, and the plan."""
+    for start, goal in tasks(rig, rng):
+        given = shown(goal)
+        with suppress(WorkFailed):
+            made = plan.run(config_of(rig, (start, given), "none.csv", rig.options()), calibrated(rig))
+            if made.feasible:
+                return start, goal, given, made
+    raise AssertionError("tasks do not end")
+
+
 def taught(rig, q_deg, fault=None):
     """Goal images as they are taught, the mean of eight frames; as taught with a fault."""
     robot = StandIn(**rig.options(at_deg=q_deg, fault=fault, seed=2))
@@ -292,12 +303,7 @@ def driven(job):
             continue
         rng = np.random.default_rng([SEED, sum(map(ord, cell)), number])
         by_images = bool(rng.integers(2)) or level[0] == "taught"
-        for start, goal in tasks(rig, rng):
-            shown = taught(rig, goal) if by_images else goal
-            with suppress(WorkFailed):
-                made = plan.run(config_of(rig, (start, shown), "none.csv", rig.options()), calibration)
-                if made.feasible:
-                    break
+        start, goal, shown, made = planned(rig, rng, partial(taught, rig) if by_images else list)
         there = [tool_pose(arm, np.radians(q)) for q in (start, goal)]
         fault, expected = fault_of(level, there[level[0] == "taught"], len(arm.home), rng)
         row |= {"goal": "images" if by_images else "joints", "expected": expected}
