@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from projservo_cli.config import load_config
+from projservo_cli.settings.sections import JointVector
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.servo import drive
 from tests.configured import scenario_of, trajectory_of
@@ -12,6 +13,14 @@ from tests.conftest import ROOT
 def configured(name, *overrides):
     """A shipped configuration."""
     return load_config(ROOT / "configs" / f"{name}.yaml", list(overrides))
+
+
+def with_task(config, ends, aim=None, **more):
+    """A configuration with joints (n,), rad or m, as start and goal, or another goal, and with other keys."""
+    start, goal = (JointVector(joints=tuple(q.tolist()), unit="rad") for q in ends)
+    aim = type(config.task.goal)(joints=goal) if aim is None else aim
+    task = config.task.model_copy(update={"start": start, "goal": aim})
+    return config.model_copy(update={"task": task, **more})
 
 
 def known_scenario(config):

@@ -167,13 +167,13 @@ def test_a_table_of_a_spreadsheet_is_read(recorded, tmp_path, separator, comma, 
         read_table(tmp_path / "broken.csv")
 
 
-MIXED = [("9999", "9999"), ("-1", "-1"), ("-1000000000", "-1000000000"), ("65535", "65535")]
+MIXED = [("9999", "9999"), ("-1", "-1"), ("-1000000000", "-1000000000")]
 
 
 @pytest.mark.parametrize(
     "placeholders",
-    [[MIXED[1]], [MIXED[2]], [MIXED[3]], MIXED[:2], [("-1", None)], [(None, "9999")]],
-    ids=["-1", "-1e9", "65535", "mixed", "u alone", "v alone"],
+    [[MIXED[2]], MIXED[:2], [("-1", None)], [(None, "9999")]],
+    ids=["-1e9", "mixed", "u alone", "v alone"],
 )
 def test_numbers_for_unseen_markers_are_named_and_taken_as_unseen(told, recorded, tmp_path, placeholders):
     header, *rows = (line.split(",") for line in recorded.read_text().splitlines())

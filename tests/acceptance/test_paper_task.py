@@ -1,29 +1,18 @@
-"""The paper's 180° task on both six-joint arms: ten calibrations at 0.5 px each, and the true operators."""
+"""The paper's 180° task on both six-joint arms: four calibrations at 0.5 px each, and the true operators."""
 
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
-from projservo_cli.calibration import predict
-from projservo_cli.config import load_config
-from tests.configured import calibrate, plan, servo, truth_of
-from tests.known import driven as driven_with
-from tests.known import known_scenario, planned
+from tests.configured import calibrate, plan, servo
+from tests.known import configured, driven, known_scenario, planned
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 ARMS = ("paper", "ur5")
-SEEDS = range(10)
-PER_STEP = (0.5, 0.3, 0.1, 0.05, 0.02)
+SEEDS = range(4)
+PER_STEP = (0.5, 0.1, 0.02)
 
 pytestmark = pytest.mark.volume
-
-
-@lru_cache(maxsize=64)
-def configured(arm, *overrides):
-    return load_config(CONFIGS / f"{arm}.yaml", overrides)
 
 
 @lru_cache(maxsize=64)
@@ -33,43 +22,15 @@ def calibrated(arm, seed):
     return calibration, plan.run(config, calibration)
 
 
-@lru_cache(maxsize=256)
-def driven(arm, seed, law):
-    return servo.run(configured(arm, f"seed={seed}"), *calibrated(arm, seed), law)
-
-
-@pytest.mark.parametrize("arm", ARMS)
-@pytest.mark.parametrize("seed", SEEDS)
-def test_held_out_prediction_and_chi_square(arm, seed):
-    """Prediction error at random poses within ±0.5 rad, px rms per marker and view."""
-    calibration, _ = calibrated(arm, seed)
-    truth = truth_of(configured(arm))
-    q = calibration.q_reference + np.random.default_rng(99).uniform(-0.5, 0.5, (200, 6))
-    true = np.stack([truth.images(row, truth.M) for row in q])
-    error = np.linalg.norm(predict(calibration, q) - true, axis=-1)
-    assert np.sqrt(np.mean(error**2)) <= 0.35
-    lower, upper = chi2.ppf([1e-4, 1 - 1e-4], calibration.dof) / calibration.dof
-    assert lower < calibration.chi2_per_dof < upper
-
-
 @pytest.mark.parametrize("law", ["direct_three", "direct_two"])
 @pytest.mark.parametrize("arm", ARMS)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_direct_laws_converge_without_occlusion(arm, seed, law):
-    trace = driven(arm, seed, law)
+    trace = servo.run(configured(arm, f"seed={seed}"), *calibrated(arm, seed), law)
     assert trace.verdict == "converged", trace.reason
     assert not trace.self_occluded.any()
     assert trace.position_error_mm < 0.1
     assert trace.rotation_error_deg < 0.05
-
-
-@pytest.mark.parametrize("arm", ARMS)
-def test_classical_laws_pass_through_occlusion_or_fail(arm):
-    for law in ("stacked", "euclidean_points"):
-        trace = driven(arm, 1, law)
-        assert trace.self_occluded_steps_left > 0
-        assert trace.self_occluded_steps_right > 0
-    assert driven(arm, 1, "blockwise").verdict != "converged"
 
 
 @pytest.mark.parametrize("law", ["direct_three", "direct_two"])
@@ -82,7 +43,7 @@ def test_drift_falls_with_the_gain_and_with_the_limit(arm, law):
         for limit, drift in drifts.items():
             scenario = known_scenario(configured(arm, *gains, f"control.joint_speed_limit_deg_s={limit}"))
             model = scenario.truth.model
-            drift.append(driven_with(scenario, planned(scenario, model), law, model).center_deviation_mm)
+            drift.append(driven(scenario, planned(scenario, model), law, model).center_deviation_mm)
     free, limited = map(np.array, drifts.values())
     assert np.all(np.diff(free) < 0), free
     # Where the limit bends only the first of 541 steps it moves the phase at which the peak is sampled,

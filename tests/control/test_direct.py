@@ -2,13 +2,11 @@
 
 import inspect
 import math
-import runpy
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli import laws
 from projservo_cli.control import classical, direct
 from projservo_cli.control.law import TAU_AFFINE, THETA_P, THETA_R, THETA_S
 from projservo_cli.laws import CODES, LAWS
@@ -105,9 +103,3 @@ def test_laws_are_given_images_joints_and_a_model_and_nothing_else():
         parameters = inspect.signature(getattr(found[law], "py_func", found[law])).parameters
         assert list(parameters) == ["model", "task", "gains", "s", "q", "state"]
     assert [*CODES.items()] == [(law, code) for code, law in enumerate(LAWS)]
-
-
-def test_a_law_that_the_if_chain_does_not_know_is_refused(monkeypatch):
-    monkeypatch.setattr(laws, "LAWS", (*LAWS, "another"))
-    with pytest.raises(ValueError, match="unpack"):
-        runpy.run_module("projservo_cli.control.__init__", run_name="again")

@@ -104,14 +104,6 @@ def test_the_speed_limit_slows_the_plan_and_never_bends_the_path():
     assert run.log.H @ np.linalg.inv(run.log.H[0]) == pytest.approx(goal, abs=1e-9)
 
 
-@pytest.mark.parametrize("law", TRACKING)
-def test_every_law_arrives_about_when_it_was_planned(law):
-    sc = scene()
-    run = Followed(sc, law, bounds=limits(speed=np.full(6, 1.2 * SPEED), image_error_px=0.5))
-    assert run.verdict == "converged"
-    assert run.steps == pytest.approx(run.periods, abs=1.0 if law == "exact" else 8.0)
-
-
 def test_image_track_keeps_to_the_planned_images():
     sc = scene()
     run = Followed(
@@ -129,17 +121,6 @@ def test_image_track_keeps_to_the_planned_images():
     assert np.linalg.norm(plain.log.s - planned_at, axis=-1).max() > 30.0
 
 
-@pytest.mark.parametrize("duration", [None, 6.0])
-def test_a_motion_with_ramps_starts_and_ends_at_rest_and_is_never_faster(duration):
-    sc = scene()
-    shortest, eased = planned(sc), planned(sc, duration=duration, ramp=0.5)
-    assert eased.duration == pytest.approx(duration or shortest.duration + 0.5, abs=1e-12)
-    assert (np.diff(eased.time) > 0.0).all()
-    rate = np.abs(np.diff(eased.q, axis=0)).max(axis=1) / np.diff(eased.time)
-    assert rate.max() <= SPEED * (1.0 + 1e-9)
-    assert max(rate[0], rate[-1]) < 0.35 * rate.max()
-
-
 @pytest.mark.parametrize("share", [0.2, 1.0, 2.5])
 def test_the_pace_of_a_ramp_is_even(share):
     """The pace is a trapezoid; where the ramps meet, a triangle of the same slope."""
@@ -154,3 +135,4 @@ def test_the_pace_of_a_ramp_is_even(share):
     assert pace.max() <= min(1.0, math.sqrt(total / ramp)) * (1.0 + 1e-9)
     assert np.abs(change).max() <= (1.0 + 1e-6) / ramp
     assert pace[0] < 0.5 * pace.max() > pace[-1]
+    assert planned(scene(), duration=6.0, ramp=ramp).duration == pytest.approx(6.0, abs=1e-12)

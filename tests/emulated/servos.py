@@ -9,7 +9,7 @@ import os
 import select
 import threading
 import tty
-from collections import Counter, deque
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,27 +20,9 @@ BYTE_S, USB_S, DELAY_UNIT_S = 10e-6, 1e-3, 2e-6  # a byte at 1 Mbaud, a USB fram
 TURN = 4096
 # Memory of a servo as it comes: address, bytes (1 or 2), value.
 _FACTORY = (
-    *(
-        (0, 1, 3),
-        (1, 1, 10),
-        (3, 2, 777),
-        (5, 1, 1),
-        (6, 1, 0),
-        (7, 1, 0),
-        (8, 1, 1),
-        (9, 2, 0),
-        (11, 2, 4095),
-    ),
-    *(
-        (13, 1, 70),
-        (14, 1, 80),
-        (15, 1, 40),
-        (16, 2, 1000),
-        (18, 1, 12),
-        (19, 1, 44),
-        (21, 1, 32),
-        (22, 1, 32),
-    ),
+    *((0, 1, 3), (1, 1, 10), (3, 2, 777), (5, 1, 1), (6, 1, 0), (7, 1, 0), (8, 1, 1), (9, 2, 0)),
+    *((11, 2, 4095), (13, 1, 70), (14, 1, 80), (15, 1, 40), (16, 2, 1000), (18, 1, 12), (19, 1, 44)),
+    *((21, 1, 32), (22, 1, 32)),
     *((24, 2, 16), (26, 1, 1), (27, 1, 1), (28, 2, 500), (30, 1, 1), (34, 1, 20), (35, 1, 200), (36, 1, 80)),
     *((48, 2, 1000), (55, 1, 1), (62, 1, 74), (63, 1, 31)),
 )
@@ -74,7 +56,7 @@ class Servo:
         for address, size, value in _FACTORY:
             self.put(address, size, value)
         self.memory[5] = number
-        self.moments, self.refused = [], 0  # when it was sent where; writes that it did not take
+        self.moments = []  # when it was sent where
         self.reads = deque(maxlen=200)  # when it was read, and the angle in its reply
 
     def get(self, address, size=2):
@@ -120,9 +102,7 @@ class Servo:
     def write(self, address, values):
         """Take what is written, as a servo does: stored registers only where they are unlocked."""
         for i, value in enumerate(values):
-            if address + i < _STORED and self.memory[55]:
-                self.refused += 1
-            else:
+            if address + i >= _STORED or not self.memory[55]:
                 self.memory[address + i] = value
         touched = range(address, address + len(values))
         if 40 in touched and self.memory[40] == 128:
@@ -164,7 +144,7 @@ class Servo:
 class Bus:
     """A port with servos 1 to 6, the last of which is the gripper; ``port`` names it.
 
-    ``requests`` counts instructions; ``writes`` lists those that write: when, to which id, address, values.
+    ``writes`` lists instructions that write: when, to which id, address, values.
     """
 
     def __init__(self, arm, faults=None, zeros=(2048, 1800, 2300, 1900, 2100), signs=(1, -1, 1, -1, 1)):
@@ -172,7 +152,7 @@ class Bus:
         joints = zip(range(arm.n), zeros, signs, strict=True)
         self.servos = {j + 1: Servo(j + 1, arm, j, zero, sign) for j, zero, sign in joints}
         self.servos[arm.n + 1] = Servo(arm.n + 1, arm, None, 1500, 1)
-        self.requests, self.writes, self._random = Counter(), [], np.random.default_rng(self.faults.seed)
+        self.writes, self._random = [], np.random.default_rng(self.faults.seed)
         self._silent_until, self._stopping = -math.inf, threading.Event()
 
     def __enter__(self):
@@ -237,7 +217,6 @@ class Bus:
         if packet is None or not self.faults.supply or self.clock.now() < self._silent_until:
             return
         number, instruction, given = packet[2], packet[4], packet[5:-1]
-        self.requests[instruction] += 1
         taken = len(packet) * BYTE_S + USB_S
         with self.arm.lock:
             self.arm.advance()

@@ -1,21 +1,28 @@
-"""Exponentials against SciPy, and the scale of a homography that is a displacement."""
+"""Exponentials against SciPy and rigid displacements, and the scale of a homography that is one."""
 
 import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.geometry.displacements import (
+    cross_matrix,
     exp_rotation,
     normalize_displacement,
+    rigid_inverse,
+    screw_displacements,
+    screws,
     translation,
+    twists,
 )
 from projservo_cli.records import WorkFailed
 from tests.samples import displacement, frame, prismatic, revolute
 
-ANGLES = [0.0, 1e-12, 1e-4, 0.3, math.pi / 2, 3.0, math.pi, 4.0, 2 * math.pi, -0.7, -math.pi, 17.0]
+ANGLES = st.one_of(st.sampled_from([0.0, 1e-12, 1e-4, math.pi, -math.pi, 2 * math.pi]), st.floats(-17, 17))
 
 
 def conjugate(operator, seed):
@@ -23,19 +30,37 @@ def conjugate(operator, seed):
     return G @ operator @ np.linalg.inv(G)
 
 
-@pytest.mark.parametrize("theta", ANGLES)
-def test_rotation_is_the_matrix_exponential(theta):
-    for seed in range(4):
-        H_hat = conjugate(revolute([0.3, -0.2, 1.5], [1, 2, -3]), seed)
-        # Round-off of entries of size 10 through the powers of the series.
-        assert exp_rotation(H_hat, theta) == pytest.approx(expm(theta * H_hat), abs=1e-12)
+@given(ANGLES, st.integers(0, 100))
+def test_rotation_is_the_matrix_exponential(theta, seed):
+    H_hat = conjugate(revolute([0.3, -0.2, 1.5], [1, 2, -3]), seed)
+    # Round-off of entries of size 10 through the powers of the series.
+    assert exp_rotation(H_hat, theta) == pytest.approx(expm(theta * H_hat), abs=2e-12)
 
 
-@pytest.mark.parametrize("tau", [0.0, 1e-9, 0.2, -3.0])
-def test_translation_is_the_matrix_exponential(tau):
-    for seed in range(4):
-        H_hat = conjugate(prismatic([1, 2, -3]), seed)
-        assert as_array(translation(mat(H_hat), tau)) == pytest.approx(expm(tau * H_hat), abs=1e-13)
+@given(st.floats(-3.0, 3.0), st.integers(0, 100))
+def test_translation_is_the_matrix_exponential(tau, seed):
+    H_hat = conjugate(prismatic([1, 2, -3]), seed)
+    assert as_array(translation(mat(H_hat), tau)) == pytest.approx(expm(tau * H_hat), abs=1e-12)
+
+
+def test_cross_matrices_are_those_of_numpy_in_its_memory_layout(rng):
+    w = rng.standard_normal((4, 5, 3))
+    W = cross_matrix(w)
+    np.testing.assert_array_equal(W, np.cross(w[..., None, :], np.eye(3)).swapaxes(-1, -2))
+    assert W.swapaxes(-1, -2).flags.c_contiguous  # products of matrices sum in the order of their layout
+
+
+def test_exponentials_of_screws_are_rigid_and_those_of_scipy(rng):
+    axes, slides = rng.standard_normal((6, 6)), np.array([False, True] * 3)
+    axes[:, :3] /= np.linalg.norm(axes[:, :3], axis=1, keepdims=True)
+    axes[slides, :3] = 0.0
+    # A pure rotation has no velocity along its axis.
+    axes[~slides, 3:] = np.cross(axes[~slides, :3], axes[~slides, 3:])
+    q = rng.uniform(-3.0, 3.0, 6)
+    T = screw_displacements(axes, slides, q)
+    np.testing.assert_allclose(T, [expm(x * H) for x, H in zip(q, twists(axes), strict=True)], atol=1e-12)
+    np.testing.assert_allclose(T @ rigid_inverse(T), np.broadcast_to(np.eye(4), T.shape), atol=1e-12)
+    np.testing.assert_allclose(screws(twists(axes)), axes, atol=1e-15)
 
 
 def test_scale_of_a_homography_keeps_points_on_their_side_of_infinity():

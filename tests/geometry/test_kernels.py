@@ -65,20 +65,17 @@ def test_noisy_kernel_is_the_least_right_singular_vector(rng, n, noise):
 @pytest.mark.parametrize("n", [5, 6, 7])
 def test_a_kernel_of_two_dimensions_is_refused(rng, n):
     """Two dimensions, three, and all of them; exactly and up to round-off."""
-    for missing in (2, 3):
-        found, x = kernel(singular(rng, 8, n, rng.uniform(0.1, 10.0, n - missing)))
+    A = rng.normal(size=(8, n))
+    twice, empty = A.copy(), A.copy()
+    twice[:, 1], twice[:, 3] = A[:, 0], A[:, 2]
+    empty[:, [1, 3]] = 0.0
+    missing = [singular(rng, 8, n, rng.uniform(0.1, 10.0, n - k)) for k in (2, 3)]
+    # Nor is one where the least singular value has the size of the others: nothing is left still.
+    full = singular(rng, 8, n, rng.uniform(1.0, 2.0, n))
+    for matrix in (*missing, twice, empty, np.zeros((8, n)), full):
+        found, x = kernel(matrix)
         assert not found
         assert not x.any()
-    A = rng.normal(size=(8, n))
-    A[:, 1], A[:, 3] = A[:, 0], A[:, 2]
-    assert not kernel(A)[0]
-    A[:, 1] = A[:, 3] = 0.0
-    assert not kernel(A)[0]
-    assert not kernel(np.zeros((8, n)))[0]
-    # Nor is one where the least singular value has the size of the others: nothing is left still.
-    found, x = kernel(singular(rng, 8, n, rng.uniform(1.0, 2.0, n)))
-    assert not found
-    assert not x.any()
 
 
 def test_kernel_scales_with_its_matrix(rng):

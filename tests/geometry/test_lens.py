@@ -55,15 +55,13 @@ def test_a_bent_pixel_is_that_of_opencv(rng):
 def test_derivatives_agree_with_differences(k1, k2, rng):
     pixels = lens(k1, k2)[:2] + rng.uniform(-400.0, 400.0, (20, 2))
     by_pixel, by_lens = distort_derivative(lens(k1, k2), pixels)
-    for c in range(2):
-        # Central differences: 1e-3 px of 650 leave (1e-3/650)² of truncation and 1e-13/1e-3 of round-off.
-        step = 1e-3 * np.eye(2)[c]
-        numeric = (distort(lens(k1, k2), pixels + step) - distort(lens(k1, k2), pixels - step)) / 2e-3
-        assert np.abs(numeric - by_pixel[..., c]).max() < 1e-8
-        k = 1e-3 * np.eye(2)[c]
-        numeric = (distort(lens(k1 + k[0], k2 + k[1]), pixels) - distort(lens(k1, k2), pixels)) / 1e-3
-        # Pixels are linear in k: differences are exact but for round-off, 1e-13 of 1e3 over 1e-3.
-        assert np.abs(numeric - by_lens[..., c]).max() < 1e-6
+    # Central differences: 1e-3 px of 650 leave (1e-3/650)² of truncation and 1e-13/1e-3 of round-off. Pixels
+    # are linear in k: those differences are exact but for round-off, 1e-13 of 1e3 over 1e-3.
+    for c, step in enumerate(1e-3 * np.eye(2)):
+        numeric = distort(lens(k1, k2), pixels + step) - distort(lens(k1, k2), pixels - step)
+        assert np.abs(numeric / 2e-3 - by_pixel[..., c]).max() < 1e-8
+        numeric = distort(lens(k1 + step[0], k2 + step[1]), pixels) - distort(lens(k1, k2), pixels)
+        assert np.abs(numeric / 1e-3 - by_lens[..., c]).max() < 1e-6
 
 
 @given(st.integers(-1000, 1000), st.integers(-1000, 1000))
@@ -78,17 +76,12 @@ def test_pixels_are_bent_up_to_where_the_bent_radius_turns(k1, k2):
 
 
 def test_what_lies_beyond_the_turn_has_no_image():
-    barrel = lens(-0.2, 0.0)  # turns at ρ² = 1/0.6, where the bent radius is 2/3 of it: 559.4 px
+    barrel = lens(-0.2, 0.0)  # turns at ρ² = 1/0.6, where the bent radius is 2/3 of it
     edge = 650.0 / np.sqrt(0.6)
-    pixels = np.array([[640.0 + edge - 1.0, 500.0], [640.0 + edge + 1.0, 500.0], [np.nan, 500.0]])
-    seen = distort_visible(barrel, pixels)
-    assert np.isfinite(seen[0]).all()
-    assert np.isnan(seen[1:]).all()
-    assert np.isnan(distort_pixel(barrel, *pixels[1])).all()
-    reach = 2.0 / 3.0 * edge
-    assert np.isfinite(undistort_pixel(barrel, 640.0 + reach - 0.01, 500.0)).all()
-    assert np.isnan(undistort_pixel(barrel, 640.0 + reach + 0.01, 500.0)).all()
-    assert np.isnan(undistort_pixel(barrel, np.nan, 500.0)).all()
+    for straight in (640.0 + edge + 1.0, np.nan):
+        assert np.isnan(distort_pixel(barrel, straight, 500.0)).all()
+    for bent, known in ((edge / 1.5 - 0.01, True), (edge / 1.5 + 0.01, False), (np.nan, False)):
+        assert np.isfinite(undistort_pixel(barrel, 640.0 + bent, 500.0)).all() == known
 
 
 def test_without_distortion_pixels_are_the_same_to_the_bit(rng):

@@ -111,25 +111,39 @@ def test_planar_revolution_keeps_its_plane_and_its_point(types, seed, inside):
     assert min(np.abs(metric - wanted).max(), np.abs(metric + wanted).max()) < 1e-11
 
 
-def test_a_redundant_arm_has_no_unique_motion():
+def redundant():
     model = arm("RRRRRRR")
-    H_hat = joint_operators(model, model.q_reference + 0.2)
-    assert not found(translation_mechanism, H_hat, face()[0], face()[1] - face()[0])[0]
-    assert not found(rotation_mechanism, H_hat, face()[0], face()[1])[0]
-    assert not found(planar_mechanism, H_hat, plane_through(face()), face()[0])[0]
+    return joint_operators(model, model.q_reference + 0.2)
 
 
-def test_a_gantry_cannot_rotate():
-    """Six translations: the kernel of (9) holds no rotation that could be scaled to radians."""
-    H_hat = np.array([prismatic(axis) for axis in np.eye(3)])
-    assert not found(rotation_mechanism, H_hat, face()[0], face()[1])[0]
-
-
-def test_two_joints_on_one_axis_are_a_singularity():
-    model = arm()
-    H_hat = model.H_hat_0.copy()
+def two_on_one_axis():
+    H_hat = arm().H_hat_0.copy()
     H_hat[4] = -H_hat[2]
-    assert not found(translation_mechanism, H_hat, face()[0], face()[1] - face()[0])[0]
+    return H_hat
+
+
+def gantry():
+    """Translations: the kernel of (9) holds no rotation that could be scaled to radians."""
+    return np.array([prismatic(axis) for axis in np.eye(3)])
+
+
+@pytest.mark.parametrize(
+    ("operators", "mechanisms"),
+    [
+        (redundant, (translation_mechanism, rotation_mechanism, planar_mechanism)),
+        (two_on_one_axis, (translation_mechanism,)),
+        (gantry, (rotation_mechanism,)),
+    ],
+)
+def test_an_arm_without_a_unique_motion_says_so(operators, mechanisms):
+    A = face()
+    given = {
+        translation_mechanism: (A[0], A[1] - A[0]),
+        rotation_mechanism: (A[0], A[1]),
+        planar_mechanism: (plane_through(A), A[0]),
+    }
+    for mechanism in mechanisms:
+        assert not found(mechanism, operators(), *given[mechanism])[0]
 
 
 # Arms: redundant ones, general short ones, and one whose joints turn about one direction alone.

@@ -7,10 +7,10 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import recording_inputs, truth_of
 from projservo_cli.hardware import checks_in_motion
-from projservo_cli.records import InputError
 from projservo_cli.robots.contract import PluginRobot, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from tests.configured import bounds_of, joints_of
+from tests.hardware.still import Quiet
 
 SETTINGS = ("markers={tags: roof, tag_size_m: 0.03}", "control.joint_speed_limit_deg_s=60")
 COUNT = 2.0 * np.pi / 4096
@@ -32,7 +32,7 @@ class Faults:
     loose_px: float = 0.0
 
 
-class Wiggled:
+class Wiggled(Quiet):
     """The arm of configs/hobby.yaml as its joints, with stamps of the frames, by the contract of robots."""
 
     def __init__(self, truth, faults, q_deg=(0.0, 10.0, -25.0, 15.0, 0.0), seed=0):
@@ -44,9 +44,6 @@ class Wiggled:
 
     def now(self):
         return self.time
-
-    def open(self):
-        pass
 
     def command(self, target, speed, due):
         self.goal, faults = target.copy(), self.faults
@@ -81,18 +78,11 @@ class Wiggled:
         q = np.round(self.q / COUNT) * COUNT
         return q, np.stack(views), self.time, *stamps, np.full((2, len(self.tag)), faults.noise_px)
 
-    def stop(self):
-        pass
 
-    def close(self):
-        pass
-
-
-class Rail:
+class Rail(Quiet):
     """A joint that turns and one that slides, at once where they are sent, and two tags that both move."""
 
-    def __init__(self, frozen=(), refuses=False):
-        self.refuses = refuses
+    def __init__(self, frozen=()):
         self.q, self.time, self.sent = np.zeros(2), 0.0, []
         self.frozen = [*frozen]  # views, 0 or 1, of which one frame is repeated
         type(self).last = self
@@ -100,12 +90,7 @@ class Rail:
     def now(self):
         return self.time
 
-    def open(self):
-        pass
-
     def command(self, target, speed, due):
-        if self.refuses:
-            raise InputError("nothing was moved: look at its key")
         self.q, self.time = target.copy(), due
         self.sent.append((due, *target))
 
@@ -114,12 +99,6 @@ class Rail:
         stamps, still = np.full(2, self.time), s - s[0, 0] + 100.0
         s[self.frozen], stamps[self.frozen] = still[self.frozen], 0.0
         return self.q, s, self.time, *stamps
-
-    def stop(self):
-        pass
-
-    def close(self):
-        pass
 
 
 def findings(faults, **given):

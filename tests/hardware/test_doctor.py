@@ -15,7 +15,6 @@ import pytest
 from projservo_cli.calibration import predict
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs
-from projservo_cli.detection import TagFinder
 from projservo_cli.files import working_in
 from projservo_cli.hardware.checks_at_rest import FAULT, FINE, Finding
 from projservo_cli.report.live_page import LivePage
@@ -67,23 +66,6 @@ def doctor(projservo, tmp_path, monkeypatch):
     yield check
     for stream in streams:
         stream.close()
-
-
-def seen_from(x_m, tilt_deg=20.0, size=(640, 480)):
-    """Image of a tag of 40 mm, half a metre away, by a camera so far to the side that looks at it."""
-    c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
-    corners = 0.02 * np.array([(-1, -c, -s), (1, -c, -s), (1, c, s), (-1, c, s)])
-    position = np.array([x_m, 0.0, -0.5])
-    z = -position / np.linalg.norm(position)
-    x = np.cross([0.0, 1.0, 0.0], z)
-    seen = (corners - position) @ np.array([x, np.cross(z, x), z]).T
-    pixels = 600.0 * seen[:, :2] / seen[:, 2:] + np.array(size) / 2
-    tag = TagFinder("4X4_50").picture(0, 40)
-    outer = np.array([(40, 40), (280, 40), (280, 280), (40, 280)], dtype=np.float32) - 0.5
-    H = cv2.getPerspectiveTransform(outer, (4.0 * pixels + 1.5).astype(np.float32))
-    big = (4 * size[0], 4 * size[1])
-    image = cv2.warpPerspective(tag, H, big, borderValue=130, flags=cv2.INTER_AREA)
-    return cv2.GaussianBlur(cv2.resize(image, size, interpolation=cv2.INTER_AREA), (0, 0), 0.7)
 
 
 def test_a_sound_set_up_is_ready_and_shown_on_a_page(doctor, tmp_path):

@@ -25,18 +25,6 @@ def test_without_noise_both_observations_drive_alike(law):
     assert np.isnan(points.log.fit).all()
 
 
-def test_the_last_residual_is_that_of_the_noise(rng):
-    """Per degree of freedom; the prediction adds nothing where the joints are read exactly."""
-    sc = with_pins(scene())
-    bounds = limits(max_steps=120, image_error_px=1e-9)
-    run = body_run(sc, "exact", bounds=bounds, noise=0.5 * rng.normal(size=(121, 2, 9, 2)))
-    before, after, views = run.log.fit.T
-    dof = 2 * views - 6
-    # Means of 121 sums of 30 and 36 squares: four standard deviations.
-    assert np.sum(after) / np.sum(dof) == pytest.approx(0.25, rel=4 * np.sqrt(2 / np.sum(dof)))
-    assert np.sum(before) / np.sum(2 * views) == pytest.approx(0.25, rel=4 * np.sqrt(1 / np.sum(views)))
-
-
 @pytest.mark.parametrize("shown", [9, 4], ids=["pins shown at the goal", "pins not shown at the goal"])
 def test_an_opaque_face_is_measured_by_the_pins(shown):
     """The face looks away all along: its markers are hidden, the body is not."""

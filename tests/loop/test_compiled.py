@@ -4,13 +4,18 @@ import math
 
 import numpy as np
 import pytest
+from numba import typeof
 
-from projservo_cli.control.law import Law, reset
+from projservo_cli.control.law import ERRORS, Law, State, new_state, reset
 from projservo_cli.laws import CODES, LAWS
 from projservo_cli.loop.compiled import Course, run_compiled
+from projservo_cli.loop.jit_warmup import calls
 from projservo_cli.loop.run_metrics import SUBSAMPLES, Ended, path_deviation, summarize
-from projservo_cli.loop.verdicts import CONVERGED, MAX_STEPS
-from projservo_cli.simulation.analytic_plant import Ends
+from projservo_cli.loop.verdicts import CONVERGED, MAX_STEPS, Log, new_log
+from projservo_cli.records import Model
+from projservo_cli.simulation.analytic_plant import Ends, Plant
+from projservo_cli.task.face import Task
+from tests.known import configured, known_scenario
 from tests.samples import poe
 from tests.scene import GAINS, STEP, Run, limits, scene
 
@@ -142,3 +147,22 @@ def test_success_is_told_of_the_truth(rng):
     hidden = run.log.hidden.copy()
     hidden[run.steps // 2, 1] = 1.0
     assert success(log=run.log._replace(hidden=hidden)) == 0.0
+
+
+def test_records_are_of_the_types_of_a_run():
+    scenario = known_scenario(configured("paper"))
+    real = {
+        Model: scenario.model,
+        Task: scenario.ends.task(scenario.model),
+        Plant: scenario.plant_of("exact"),
+        State: new_state(6, scenario.m),
+        Log: new_log(6, scenario.m, 3, len(ERRORS)),
+        Ends: scenario.true_ends,
+    }
+    met = set()
+    for _, arguments in calls():
+        for argument in arguments:
+            if type(argument) in real:
+                assert typeof(argument) == typeof(real[type(argument)])
+                met.add(type(argument))
+    assert met == set(real)

@@ -162,3 +162,117 @@ def test_a_command_that_is_no_number_diverges():
         Towards(np.full(6, np.nan)), plant, sc.s_star, 0.04, limits(max_steps=3)
     )
     assert (VERDICTS[verdict], steps) == ("diverged", 0)
+
+
+STOP = {"stop_at_joint_limit": True}
+
+
+def narrowed(share=0.5, joint=2):
+    """Scene with a joint limited at a share of its way, and gains that know the limits."""
+    sc = scene()
+    upper = sc.plant.limits.upper.copy()
+    upper[joint] = sc.q_start[joint] + share * STEP[joint]
+    sc = sc._replace(plant=sc.plant._replace(limits=sc.plant.limits._replace(upper=upper)))
+    return sc, GAINS._replace(limits=GAINS.limits._replace(lower=sc.plant.limits.lower, upper=upper))
+
+
+def off_line(center):
+    """Distances of centres (k, 3) from the line of a free run of the law."""
+    free = Run(scene(), "exact").center
+    way = (free[-1] - free[0]) / np.linalg.norm(free[-1] - free[0])
+    off = center - free[0]
+    return np.linalg.norm(off - np.outer(off @ way, way), axis=1)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5])
+def test_exact_goes_along_its_path_to_the_limit(share):
+    sc, gains = narrowed(share)
+    stopped = Run(sc, "exact", gains, limits(**STOP))
+    assert stopped.verdict == "joint limit"
+    assert stopped.log.events[1:3].tolist() == [-1, 2]
+    assert 0 <= sc.plant.limits.upper[2] - stopped.log.q[-1, 2] < 1e-9
+    assert off_line(stopped.center).max() < 1e-10
+    # What is left is what the law measures there: the task was not finished, the face moved on the way.
+    first, last = stopped.log.errors[0], stopped.log.errors[-1]
+    assert 0 < last[1] < first[1]
+    assert 0 < last[4] < first[4]
+    # A law that leaves the limit to the loop bends off the line instead.
+    bent = Run(sc, "direct_two", gains, limits(**STOP))
+    assert bent.verdict == "joint limit"
+    assert share < 0.1 or off_line(bent.center).max() > 1e-6
+
+
+@pytest.mark.parametrize(("law", "sigma"), [("exact", 0.3), ("direct_two", 0.0)])
+def test_both_loops_end_at_the_limit_alike(law, sigma, rng):
+    sc, gains = narrowed()
+    bounds = limits(max_steps=200, **STOP)
+    noise = sigma * rng.normal(size=(201, 2, 4, 2))
+    compiled = Run(sc, law, gains, bounds, noise)
+    code, steps, log = in_python(sc, law, bounds, noise, gains=gains)
+    assert (VERDICTS[code], steps) == (compiled.verdict, compiled.steps)
+    assert compiled.verdict == "joint limit"
+    assert (log.q[: steps + 1] <= sc.plant.limits.upper).all()
+    same_logs(log, compiled.full, steps)
+
+
+def unseen(gone, steps=60):
+    """Noise that hides all markers at the instants ``gone``."""
+    noise = np.zeros((steps + 1, 2, 4, 2))
+    noise[list(gone)] = np.nan
+    return noise
+
+
+@pytest.mark.parametrize(
+    ("gone", "waits", "verdict", "steps"),
+    [
+        (range(5, 9), 4, "max steps", 60),
+        (range(5, 9), 3, "markers lost", 8),
+        ([0, 1], 2, "max steps", 60),
+        ([2, 3, 5, 6, 8, 9], 2, "max steps", 60),  # only those in a row count
+        (range(58, 61), 9, "markers lost", 60),
+    ],
+)
+def test_both_loops_wait_alike(gone, waits, verdict, steps):
+    sc, noise = scene(), unseen(gone)
+    bounds = limits(max_steps=60, image_error_px=1e-12, max_lost_periods=waits, stall_periods=100)
+    compiled = Run(sc, "direct_three", bounds=bounds, noise=noise)
+    code, sent, log = in_python(sc, "direct_three", bounds, noise)
+    assert (VERDICTS[code], sent) == (compiled.verdict, compiled.steps) == (verdict, steps)
+    same_logs(log, compiled.full, sent)
+
+
+def test_held_joints_stand_still_and_the_run_goes_on_as_it_would_have():
+    sc = scene()
+    bounds = limits(max_steps=60, image_error_px=1e-12, max_lost_periods=4, stall_periods=100)
+    whole = Run(sc, "direct_three", bounds=bounds, noise=unseen([]))
+    held = Run(sc, "direct_three", bounds=bounds, noise=unseen(range(5, 9)))
+    assert (held.log.q_dot[5:9] == 0.0).all()
+    for k in range(5, 9):
+        np.testing.assert_array_equal(held.log.q[k + 1], held.log.q[5])
+    np.testing.assert_array_equal(np.delete(held.log.q, range(5, 9), axis=0), whole.log.q[:-4])
+
+
+class Noted(AnalyticPlant):
+    """Notes what it is sent."""
+
+    def __init__(self, sc, steps=200, takes_parts=False, bumped=None):
+        super().__init__(sc.plant, sc.q_start, np.zeros((steps + 1, 2, 4, 2)))
+        self.takes_parts, self.bumped = takes_parts, bumped
+        self.sent = []
+
+    def observe(self):
+        s = super().observe()
+        self.disturbance = "bumped" if self.observations - 1 == self.bumped else ""
+        return s
+
+    def command(self, step, period):
+        self.sent.append((step, period))
+        super().command(step, period)
+
+
+def test_a_disturbance_ends_the_run_before_any_other_verdict():
+    sc = scene()
+    for bumped, verdict in ((7, "converged"), (0, "fault detected")):
+        plant, ends = Noted(sc, bumped=bumped), limits(max_steps=199, image_error_px=1e9)
+        code, steps, _ = run_in_python(Towards(sc.q_goal), plant, sc.s_star, 0.04, ends)
+        assert (VERDICTS[code], steps, plant.sent) == (verdict, 0, [])

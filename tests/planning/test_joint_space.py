@@ -8,13 +8,12 @@ import pytest
 
 from projservo_cli.calibration import predict
 from projservo_cli.geometry.kinematics import forward_kinematics
-from projservo_cli.settings.sections import JointVector
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.target import followed
 from projservo_cli.task.trajectory import planned
 from tests.configured import calibrate, scenario_of, servo, truth_of
 from tests.configured import plan as planning
-from tests.known import configured
+from tests.known import configured, with_task
 
 pytestmark = pytest.mark.volume
 COUNT = 6
@@ -34,10 +33,8 @@ def calibrated(name):
 def guided(name, k, profile="joint_space"):
     """Configuration, calibration and plan of a random task."""
     config, calibration, tasks = calibrated(name)
-    start, goal = (JointVector(joints=tuple(q[k].tolist()), unit="rad") for q in tasks)
-    task = config.task.model_copy(update={"start": start, "goal": type(config.task.goal)(joints=goal)})
     motion = config.trajectory.model_copy(update={"profile": profile})
-    config = config.model_copy(update={"task": task, "trajectory": motion})
+    config = with_task(config, [q[k] for q in tasks], trajectory=motion)
     return config, calibration, planning.run(config, calibration)
 
 

@@ -18,7 +18,7 @@ from projservo_cli.planning.product_space import shortest, widest
 from projservo_cli.planning.time_parameterization import minimum_time
 from projservo_cli.records import position_limits
 from tests.planning.cases import reaching_of
-from tests.samples import frame, in_frame, pixels, poe
+from tests.samples import pixels
 from tests.stages.cases import case
 
 SHARES = np.array([[0.0, 0.0, 0.0], [0.2, 0.7, 0.1], [0.6, 0.3, 0.9], [1.0, 0.0, 0.5], [1.0, 1.0, 1.0]])
@@ -72,23 +72,6 @@ def test_margin_of_joint_limits():
         q = np.array([q_0, 99.0])
         assert [joint_margin(demands, q, i) for i in range(2)] == [wanted, 1.0]
         assert limit_margin(demands, q) == wanted
-
-
-@pytest.mark.parametrize("name", ["paper", "ur5"])
-def test_joints_follow_the_planned_displacement(name):
-    """The product of exponentials at the joints moves the face as planned, in any projective frame."""
-    example = case(name)
-    reaching = reaching_of(name)
-    mu = np.linspace(0.0, 1.0, 5)[:, None] * np.array([1.0, 1.0, 1.0])
-    found = along_shares(reaching, mu).along
-    start = np.linalg.inv(poe(example.truth.model, reaching.q_start))
-    plan = example.plan
-    for q, share in zip(found.q, mu, strict=True):
-        H = poe(example.truth.model, q) @ start
-        np.testing.assert_allclose(plan.A @ H.T, plan.A @ displacement(plan, share).T, atol=1e-9)
-    there = along_shares(reaching_of(name, in_frame(example.truth.model, frame(3))), mu).along
-    np.testing.assert_allclose(there.q, found.q, atol=1e-7)
-    np.testing.assert_allclose(there.condition, found.condition, rtol=1e-6)
 
 
 def test_joints_that_cannot_follow_are_none_from_there_on():

@@ -15,7 +15,7 @@ from tests.configured import truth_of
 from tests.known import asked, configured, known_scenario
 from tests.planning.cases import constrained
 from tests.planning.oracle import TrueTask
-from tests.samples import frame, in_frame, pixels, poe
+from tests.samples import pixels, poe
 from tests.stages.cases import case
 
 pytestmark = pytest.mark.volume
@@ -79,14 +79,6 @@ def test_a_planned_motion_keeps_what_it_says(name):
     assert steps.sum() == pytest.approx(plan.duration, rel=0.02)
     # Corners of the path are cut between samples; away from them every step takes the same time.
     assert np.median(steps) == pytest.approx(plan.duration / 100, rel=0.02)
-
-
-@pytest.mark.parametrize("name", ["coupled"])  # on the others several paths are as good
-def test_a_planned_motion_does_not_depend_on_the_frame(name):
-    here = constrained(name)
-    there = constrained(name, in_frame(case(name).truth.model, frame(2, mirrored=True)))
-    assert there.min_margin == pytest.approx(here.min_margin, rel=1e-2)
-    assert there.duration == pytest.approx(here.duration, rel=1e-2)
 
 
 def orders(true, senses):

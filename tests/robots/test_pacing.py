@@ -1,12 +1,13 @@
-"""Set-points: integrated, bounded, and where an arm that lags and sags comes to rest behind them."""
+"""Set-points, where an arm that lags and sags rests behind them, and when images were taken."""
 
 import math
 
 import numpy as np
 import pytest
 
-from projservo_cli.records import JointLimits
+from projservo_cli.records import JointLimits, WorkFailed
 from projservo_cli.robots.contract import Bounds
+from projservo_cli.robots.latency import NOTHING_KNOWN, Delays, History
 from projservo_cli.robots.pacing import SetPoint
 
 PERIOD = 0.04
@@ -57,3 +58,108 @@ def test_a_set_point_leads_no_farther_than_it_may_and_stays_within_the_limits():
     for _ in range(20):
         point.step(np.array([0.08, 0.0]), PERIOD)
     assert point.target[0] == 1.5
+
+
+NOISE = 0.5
+EXACT, PLAY = np.zeros(2), 0.04  # of readings; rad
+RNG = np.random.default_rng(0)
+FAR = RNG.uniform(300.0, 900.0, (2, 5, 2))
+PULL = 300.0 * RNG.standard_normal((2, 2, 5, 2))  # px per rad of two joints
+
+
+def predicted(q):
+    """Images of two joints, linear in both."""
+    return FAR + np.einsum("kn,nvmc->kvmc", q, PULL)
+
+
+def motion(t):
+    """At rest, then to and fro."""
+    t = np.maximum(t, 0.0)
+    return np.stack([1.0 - np.cos(2.0 * t), np.sin(1.3 * t) * np.sin(0.4 * t)], axis=-1)
+
+
+def looks(delays, late, steps=60, stamped=None, noise=NOISE, first=-4):
+    """What comes of looking at a motion with images so late (2,); errors of the instants, s."""
+    rng, history, off = np.random.default_rng(1), History(), []
+    for k in range(first, steps):
+        now = k * PERIOD
+        history.add(now, motion(now))
+        taken = now - np.asarray(late)
+        s = np.stack([predicted(motion(t)[None])[0, view] for view, t in enumerate(taken)])
+        s += noise * rng.standard_normal(s.shape)
+        stamps = np.full(2, np.nan) if stamped is None else taken + stamped
+        off.append(delays.update(stamps, s, history).t - taken)
+    return np.array(off)
+
+
+@pytest.mark.parametrize("late", [(0.0, 0.0), (0.04, 0.12), (0.3, 0.25)])
+@pytest.mark.parametrize("clock", [None, 0.003, 5e4])
+def test_an_unknown_delay_is_found_as_soon_as_joints_move(late, clock):
+    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT)
+    off = looks(delays, late, stamped=clock)
+    assert np.abs(off[20:]).max() < 0.01
+    if clock is None:
+        np.testing.assert_allclose(delays.mean, late, atol=0.004)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.08])
+def test_play_in_the_joints_is_no_delay(late):
+    """While joints go through it readings move and images do not; by 12 px here, 24 times the noise."""
+    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, np.full(2, PLAY / np.sqrt(12.0)))
+    history, rng, links, off = History(), np.random.default_rng(4), [np.zeros(2)], []
+    for k in range(-10, 60):
+        now = k * PERIOD
+        history.add(now, motion(now))
+        # What is driven follows at the end of its play, which it went to before.
+        links.append(np.clip(links[-1], motion(now) - PLAY, motion(now)))
+        times = PERIOD * np.arange(-11, k + 1)
+        link = [np.interp(now - late, times, [q[i] for q in links]) for i in range(2)]
+        s = predicted(np.array(link)[None])[0]
+        off.append(
+            delays.update(np.full(2, np.nan), s + NOISE * rng.standard_normal(s.shape), history).t - now
+        )
+    assert np.abs(np.array(off)[10:] + late).max() < 0.15
+    assert np.abs(np.array(off)[30:] + late).max() < 0.06
+
+
+def test_a_delay_that_changes_is_followed():
+    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT)
+    history, rng = History(), np.random.default_rng(3)
+    for k in range(120):
+        now, late = k * PERIOD, 0.05 if k < 50 else 0.2
+        history.add(now, motion(now))
+        s = predicted(motion(now - late)[None])[0]
+        delays.update(np.full(2, np.nan), s + NOISE * rng.standard_normal(s.shape), history)
+    np.testing.assert_allclose(delays.mean, 0.2, atol=0.01)
+
+
+def test_an_image_that_comes_twice_keeps_its_instant():
+    delays = Delays(predicted, NOTHING_KNOWN._replace(sigma=np.zeros(2)), NOISE, 1.0, EXACT)
+    history, unstamped = History(), np.full(2, np.nan)
+    history.add(0.0, motion(0.0))
+    s = predicted(motion(0.0)[None])[0]
+    assert delays.update(unstamped, s, history).fresh.all()
+    history.add(PERIOD, motion(PERIOD))
+    other = np.stack([s[0], s[1] + 1.0])
+    frames = delays.update(unstamped, other, history)
+    assert frames.fresh.tolist() == [False, True]
+    assert frames.t[0] == 0.0
+    assert not delays.update(unstamped, np.full(s.shape, np.nan), history).fresh.any()
+
+
+def test_a_camera_that_stands_still_while_joints_move_is_named():
+    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT)
+    history, rng = History(), np.random.default_rng(0)
+    still = predicted(np.zeros((1, 2)))[0, 1]
+
+    def look(now, q):
+        history.add(now, q)
+        s = predicted(q[None])[0, 0] + NOISE * rng.standard_normal(still.shape)
+        delays.update(np.full(2, np.nan), np.stack([s, still]), history)
+
+    for k in range(26):
+        look(k * PERIOD, motion(k * PERIOD))
+    with pytest.raises(WorkFailed, match="right image has stood still"):
+        look(40 * PERIOD, motion(40 * PERIOD))
+    for k in range(41, 100):  # at rest it may
+        look(k * PERIOD, np.zeros(2))

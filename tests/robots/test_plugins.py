@@ -60,14 +60,6 @@ def test_what_cannot_be_used_is_said_in_one_line(target, message):
     assert "\n" not in str(caught.value)
 
 
-MADE = {
-    "in __init__": "def __init__(self):\n        self.open = self.close = self.stop = print",
-    "by a loop": "def __init__(self):\n        [setattr(self, n, print) for n in ('open', 'close', 'stop')]",
-    "by delegation": "def __getattr__(self, name):\n        return getattr(Bare, name)",
-    "too few": "def __init__(self):\n        self.open = self.close = print\n        self.stop = None",
-}
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [

@@ -5,25 +5,14 @@ import pytest
 
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.simulation.analytic_plant import observe
-from tests.samples import displacement, poe
-from tests.scene import STEP, scene
+from tests.samples import displacement
+from tests.scene import scene
 
 
 def observed(plant, H):
     M, s, hidden = np.zeros_like(plant.M), np.zeros((2, len(plant.M), 2)), np.zeros(2)
     in_front = observe(plant, mat(H), M, s, hidden)
     return in_front, M, s, hidden
-
-
-@pytest.mark.parametrize("types", ["RRRRRR", "RRPRRR"])
-def test_pixels_of_the_moved_face(types):
-    sc = scene(types=types)
-    H = poe(sc.model, sc.q_start + 0.5 * STEP)
-    in_front, M, s, hidden = observed(sc.plant, H)
-    assert in_front
-    assert pytest.approx(sc.plant.M @ H.T, abs=1e-13) == M
-    assert s == pytest.approx(sc.images(sc.q_start + 0.5 * STEP), abs=1e-9)
-    assert hidden.tolist() == [0.0, 0.0]
 
 
 def around_the_vertical(angle):

@@ -1,5 +1,6 @@
 """Recording the simulated robot: the table, interruptions, limits, refusals."""
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -366,3 +367,34 @@ def test_after_each_joint_what_it_showed_must_be_of_use_and_is_kept():
     assert sound.sent == []
     stage.record(config, stage.new_recording(config, Path("t.csv"), force=True), driven(config, sound))
     assert len(np.unique(read_table("t.csv").at_rest.pose)) == 13
+
+
+SHORT = ("-c", STANFORD, "--set", "calibration.frames_per_joint=4")
+
+
+def test_suggest_record_calibrate_again(projservo):
+    """Suggested poses are recorded and make the next calibration better: the loop a user goes through."""
+    first = projservo("--suggest", "calibrate", *SHORT, "-o", "run", "--json")
+    assert first.code == 0, first.err
+    rows = first.json["suggestions"]
+    assert len(rows) == 5
+    assert Path(first.json["suggestions_file"]) == Path("run/suggestions.csv").resolve()
+    motions = read_joint_list("run/suggestions.csv", "RRPRRR")
+    np.testing.assert_array_equal(motions.q, [row["q"] for row in rows])
+    with open("run/suggestions.csv", newline="") as file:
+        listed = list(csv.DictReader(file))
+    assert [int(row["from_pose"]) for row in listed] == [row["from_pose"] for row in rows]
+    assert float(listed[2]["delta_q3"]) == rows[2]["delta"][2]
+    # Within the limits of the robot, or record would refuse.
+    answer = projservo("record", *SHORT, "--motions", "run/suggestions.csv", "-o", "t.csv", "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["poses"] == 25 + 5
+    np.testing.assert_array_equal(read_table("t.csv", "RRPRRR").q[25:], motions.q)
+    again = projservo("calibrate", "--data", "t.csv", "--joints", "RRPRRR", "--noise-px", "0.5", "-o", "two")
+    assert again.code == 0, again.err
+    # Held out: trial motions of another seed.
+    assert projservo("record", *SHORT, "--set", "seed=9", "-o", "v.csv", "-q").code == 0
+    errors = [
+        projservo("validate", run, "--data", "v.csv", "--json").json["rms_px"] for run in ("run", "two")
+    ]
+    assert errors[1] < 1.05 * errors[0]

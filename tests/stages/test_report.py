@@ -12,25 +12,11 @@ from tests.configured import report_on
 from tests.report.cases import GAINS, PERIODS_S, SPECS, case
 from tests.report.conftest import stored
 
-NONE = np.zeros(0)
-
 
 def changed(material, **traces):
     """The material with some traces replaced; None drops one."""
     kept = {law: trace for law, trace in (material.traces | traces).items() if trace is not None}
     return dataclasses.replace(material, traces=kept)
-
-
-def short(trace, steps):
-    """A trace cut after some steps."""
-    fields = {field.name: field.metadata.get("dims", ()) for field in dataclasses.fields(trace)}
-    cut = {
-        name: getattr(trace, name)[: steps + 1]
-        for name, dims in fields.items()
-        if dims[:1] == ("instant",) and getattr(trace, name) is not None
-    }
-    cut |= {name: getattr(trace, name)[:steps] for name, dims in fields.items() if dims[:1] == ("step",)}
-    return dataclasses.replace(trace, steps=steps, verdict="diverged", **cut)
 
 
 @pytest.fixture

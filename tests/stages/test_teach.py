@@ -3,21 +3,20 @@
 import numpy as np
 import pytest
 
-from projservo_cli.config import load_config, plain_yaml
+from projservo_cli.config import plain_yaml
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.standstill import averaged
 from tests.configured import calibrate, checked, plan, require_face, servo, teach, truth_of
-from tests.conftest import ROOT
+from tests.known import configured
 
-HOBBY = ROOT / "configs" / "hobby.yaml"
 SHARP = ("noise.calibration_px=0.05", "noise.servo_px=0.05")
 PLAY = (*SHARP, "disturbance.backlash_deg=0.5")
 AT = np.radians([20.0, -5.0, 5.0, -10.0, 80.0])
 
 
 def config(*overrides):
-    return load_config(HOBBY, [*SHARP, *overrides])
+    return configured("hobby", *SHARP, *overrides)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +48,7 @@ def test_with_play_a_taught_goal_is_met_where_joints_would_miss_it(calibration, 
     given = config(*PLAY)
     path = tmp_path / "goal.yaml"
     path.write_text(plain_yaml(teach(given, 20, AT).as_goal()), encoding="utf-8")
-    asked = load_config(HOBBY, [*SHARP, f"task.goal={path}", f"task.start={path}"])
+    asked = config(f"task.goal={path}", f"task.start={path}")
     assert asked.task.start.values("RRRRR") == pytest.approx(AT)
     taught = config(*PLAY, f"task.goal={path}", "stop.innovation_threshold=0")
     assert len(taught.task.goal.images.markers) == 8

@@ -1,12 +1,14 @@
 """The simulated truth: other software's robots, start and goal, and what is refused."""
 
-import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
-from tests.configured import scenario_of, simulate, truth_of
+from tests.configured import joints_of, scenario_of, simulate, truth_of
+from tests.configured import record as trials
 from tests.known import configured as loaded
 from tests.known import known_scenario
 from tests.stages.cases import case
@@ -26,29 +28,6 @@ def test_configuration_is_the_reference_robot_unchanged(name, reference_truth):
     body = np.linalg.solve(truth.robot.base_tool, truth.M.T).T[:, :3]
     assert body == pytest.approx(np.array(reference["markers_tool"]), abs=1e-14)
     assert truth.face == tuple(reference["face_markers"])
-
-
-def test_the_benchmark_is_within_its_promised_dimensions():
-    """Baseline 0.2–0.5 m, 1.2–1.6 m to the face, view ≤ 60°, face ≤ 0.12 m, 5–10 markers; 180°."""
-    example = case("paper")
-    truth = example.truth
-    centers = np.array([-np.linalg.solve(P[:, :3], P[:, 3]) for P in truth.P])
-    assert 0.2 <= np.linalg.norm(centers[1] - centers[0]) <= 0.5
-    face = truth.M_face @ (truth.robot.pose(example.ends.q_start) @ np.linalg.inv(truth.robot.base_tool)).T
-    for center in centers:
-        assert 1.2 <= np.linalg.norm(face[:, :3].mean(axis=0) - center) <= 1.6
-    spread = np.linalg.norm(face[:, None, :3] - face[None, :, :3], axis=2).max()
-    assert spread <= 0.12 * math.sqrt(2)
-    assert 5 <= len(truth.M) <= 10
-    for P, (width, _) in zip(truth.P, truth.image_size, strict=True):
-        K = np.linalg.inv(np.linalg.qr(np.linalg.inv(P[:, :3]))[1])
-        focal = abs(K[0, 0] / K[2, 2])
-        assert 2 * math.degrees(math.atan(width / 2 / focal)) <= 60.0
-    # Transversal to the image planes: the normal lies far from the viewing direction.
-    M = face[:, :3]
-    normal = np.cross(M[1] - M[0], M[2] - M[0])
-    cosine = abs(normal[0]) / np.linalg.norm(normal)
-    assert math.degrees(math.acos(cosine)) > 45.0
 
 
 @pytest.mark.parametrize("scale", [-1.0, 250.0, -1e-3])
@@ -87,3 +66,32 @@ def test_noise_is_on_start_and_goal_images_and_that_of_trials_has_a_seed_of_its_
     noise = [simulate(config, truth_of(config)).images[0].tolist() for config in (own, other, both)]
     assert noise[1] == noise[2] != noise[0]
     assert other.seed == own.seed
+
+
+UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
+
+
+def test_poses_of_all_joints_follow_and_no_reading_comes_twice():
+    config = load_config(UR5, ["disturbance.jitter_s=0.001"])
+    q, truth, joints = trials.trial_motions(config), truth_of(config), joints_of(config)
+    assert q.shape == (1 + 6 * 8 + 12, 6)
+    np.testing.assert_array_equal(q, trials.trial_motions(config))
+    assert all(len(np.unique(column)) == len(q) for column in q.T)
+    tick = 2.0 * np.pi / 4096
+    moved = np.abs(q - q[0]) > 2.0 * tick
+    assert (moved[1:49].sum(axis=1) <= 1).all()
+    assert (moved[49:].sum(axis=1) >= 5).all()
+    assert np.abs(q - q[0]).max() <= np.radians(30.0) + 2.0 * tick
+    assert ((q >= joints.limits.lower) & (q <= joints.limits.upper)).all()
+    seen = np.isfinite(trials.simulate(config, truth).images).all(axis=(1, 3))
+    assert seen.mean(axis=1).min() >= 0.5
+
+
+def test_an_ideal_robot_gets_those_that_are_asked_for():
+    config = load_config(UR5)
+    asked = load_config(UR5, ["calibration.random_poses=5"])
+    plain, more = trials.trial_motions(config), trials.trial_motions(asked)
+    assert len(plain) == 49
+    np.testing.assert_array_equal(more[:49], plain)
+    assert (more[49:] != plain[0]).all()
+    assert len(more) == 54

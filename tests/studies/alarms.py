@@ -9,19 +9,16 @@ occurs in the first half of that path. A fault counts as named if the run ends a
 any other verdict, for the reason expected and no other; an ambiguous reason does not count.
 """
 
-import argparse
 import re
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.settings.sections import JointVector
 from projservo_cli.simulation.random_tasks import random_tasks
 from tests.configured import calibrate, plan, servo, truth_of
-from tests.known import configured
-from tests.studies.planning_tables import in_two_processes, quantiles, rate, write_rows
+from tests.known import configured, with_task
+from tests.studies.common import in_two_processes, parser_of, quantiles, rate, write_rows
 
 ARMS = ("ur5", "hobby")
 RECORDINGS = 10
@@ -100,13 +97,6 @@ def tasks(config, count, seed):
     return zip(*random_tasks(truth_of(config), front, count, np.random.default_rng(seed)), strict=True)
 
 
-def with_task(config, ends, seed):
-    """The configuration with a task and a seed."""
-    start, goal = (JointVector(joints=tuple(q.tolist()), unit="rad") for q in ends)
-    task = config.task.model_copy(update={"start": start, "goal": type(config.task.goal)(joints=goal)})
-    return config.model_copy(update={"task": task, "seed": seed})
-
-
 def run_of(config, calibration):
     """One run, or why there is none."""
     try:
@@ -134,7 +124,7 @@ def driven(job):
     rows = []
     for seed, ends in enumerate(tasks(config, count, 100 + recording)):
         row = told | {"seed": seed}
-        quiet, why = run_of(with_task(config, ends, seed), calibration)
+        quiet, why = run_of(with_task(config, ends, seed=seed), calibration)
         if quiet is None:
             rows.append(row | {"verdict": "not started", "reason": why})
             continue
@@ -150,7 +140,7 @@ def driven(job):
 
 def judged(struck, config, ends, row, calibration):
     """What a struck run says."""
-    trace, why = run_of(with_task(config, ends, row["seed"]), calibration)
+    trace, why = run_of(with_task(config, ends, seed=row["seed"]), calibration)
     if trace is None:
         return {"verdict": "not started", "reason": why}
     said = trace.reason.partition("by the calibration: ")[2]
@@ -179,14 +169,8 @@ def tell(arm, fault, rows):
 
 def main():
     """Drive all runs and print a line for each arm and fault, and all false alarms together."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=1000, help="of each arm and fault")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
-    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=list(FAULTS))
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("alarms_study.csv"), help="every row, as CSV"
-    )
-    given = parser.parse_args()
+    counted = [("runs", 1000, "of each arm and fault")]
+    given = parser_of("alarms_study", __doc__, counted, arms=ARMS, faults=FAULTS).parse_args()
     pairs = [(arm, fault) for arm in given.arms for fault in given.faults]
     each = -(-given.runs // RECORDINGS)
     jobs = [(*pair, recording, each) for pair in pairs for recording in range(RECORDINGS)]

@@ -30,7 +30,7 @@ from tests.monitoring.corners import (
     harmonics,
     pose_of,
 )
-from tests.studies.planning_tables import in_two_processes
+from tests.studies.common import in_two_processes
 
 BLURS = (0.7, 1.8)  # px: a lens in focus, and a frame that is blurred
 PHASES, REPEATS = 10, 2

@@ -8,30 +8,23 @@ more than ``TIMES`` what is stated. The truth is where the tool was when its goa
 at the readings of a goal by joints; tags that moved on the tool do not move that.
 """
 
-import argparse
-import csv
 import json
 from collections import Counter
-from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.records import WorkFailed
-from tests.configured import plan
 from tests.monitoring.stand_in import ARMS, KINDS, LAST, StandIn, tool_pose
+from tests.studies.common import in_two_processes, parser_of, quantiles, rate, written
 from tests.studies.monitoring import (
     Rig,
     calibrated,
-    config_of,
     moved_so_far,
     off_mm,
+    planned,
     rigs,
     run_of,
-    tasks,
     taught,
 )
-from tests.studies.planning_tables import in_two_processes, quantiles, rate
 
 SEED, PERIOD_S, TIMES, RIGS, BAR = 4848, 0.04, 1.5, 20, 97.0
 # Least and greatest size: camera turned before the run, px; drift of one, px a period; one view of the goal
@@ -83,13 +76,7 @@ def driven(job):
             rng = np.random.default_rng([SEED, list(SIZES).index(kind), number])
             size = float(rng.uniform(*SIZES[kind]))
             how = str(rng.choice(["images", "taught"] if kind == "goal" else ["joints", "images", "taught"]))
-            for start, goal in tasks(rig, rng):
-                shown = goal_of(rig, goal, how)
-                with suppress(WorkFailed):
-                    if plan.run(
-                        config_of(rig, (start, shown), "none.csv", rig.options()), calibration
-                    ).feasible:
-                        break
+            start, goal, shown, _ = planned(rig, rng, lambda q, how=how: goal_of(rig, q, how))
             there = tool_pose(arm, np.radians(goal))
             fault = fault_of(kind, size, there, rng)
             if how != "joints":
@@ -129,22 +116,12 @@ def tell(kind, rows):
 
 def main():
     """Drive the runs of all kinds and print a summary."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=40, help="of each kind")
-    parser.add_argument("--kinds", nargs="+", choices=SIZES, default=list(SIZES))
-    parser.add_argument("--corners", nargs="+", choices=KINDS, default=list(KINDS))
-    parser.add_argument("-o", "--output", type=Path, default=Path("last_metre_study.csv"), help="every run")
-    given = parser.parse_args()
+    counted = [("runs", 40, "of each kind")]
+    given = parser_of("last_metre_study", __doc__, counted, kinds=SIZES, corners=KINDS).parse_args()
     some = rigs(given.corners)[: min(RIGS, max(1, given.runs // 4))]
     each = -(-given.runs // len(some))
-    jobs, every = [(rig, i * each, each, given.kinds) for i, rig in enumerate(some)], []
-    with open(given.output, "w", encoding="utf-8", newline="") as file:
-        table = csv.DictWriter(file, COLUMNS)
-        table.writeheader()
-        for rows in in_two_processes(driven, jobs, "rigs"):
-            table.writerows(rows)
-            file.flush()
-            every += rows
+    jobs = [(rig, i * each, each, given.kinds) for i, rig in enumerate(some)]
+    every = written(given.output, COLUMNS, in_two_processes(driven, jobs, "rigs"))
     for kind in given.kinds:
         tell(kind, every)
 

@@ -13,29 +13,24 @@ of several the one with the largest effect counts. ``--sound`` adds tables witho
 six kinds of ``tests.studies.monitoring``; ``--seeds 0`` leaves faults out.
 """
 
-import argparse
 import csv
 import itertools
 import os
-import sys
 import time
 import warnings
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
 from functools import cached_property, lru_cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 import projservo_cli as projservo
 from projservo_cli.calibration import predict, prediction_variance
 from tests.monitoring.corners import CornerMap
 from tests.monitoring.stand_in import KINDS
+from tests.studies.common import in_two_processes, parser_of, quantiles, rate, written
 from tests.studies.faulty_arms import ARMS, FAULTS, IMAGE, WITH_LENS, World, alternatives, chain, faults_of
-from tests.studies.planning_tables import quantiles, rate
 
 AMPLITUDES = Path(__file__).with_suffix(".csv")
 SEED, NOISE_PX = 47, 0.3
@@ -349,17 +344,15 @@ def read_rows(path):
 
 def main():
     """Calibrate the tables of the study and print a summary."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    kinds = ("white", "shared", *KINDS)
-    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=FAULTS)
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=tuple(ARMS))
+    numbers = [
+        ("seeds", SEEDS, "of each fault, arm and size"),
+        ("sound", 0, "number of tables without faults"),
+        ("jobs", 2, "number of processes"),
+    ]
+    corners = ["white", "shared", *KINDS], list(KINDS)
+    parser = parser_of("model_errors_study", __doc__, numbers, faults=[*FAULTS], arms=ARMS, corners=corners)
     parser.add_argument("--sizes", nargs="+", type=float, choices=SIZES, default=SIZES)
-    parser.add_argument("--seeds", type=int, default=SEEDS)
-    parser.add_argument("--sound", type=int, default=0, help="number of tables without faults")
-    parser.add_argument("--corners", nargs="+", choices=kinds, default=tuple(KINDS), help="of sound tables")
-    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--amplitudes", action="store_true", help=f"remake {AMPLITUDES.name}")
-    parser.add_argument("-o", "--output", type=Path, default=Path("model_errors_study.csv"), help="every run")
     parser.add_argument("--read", type=Path, nargs="+", help="tables of earlier runs, to print their summary")
     given = parser.parse_args()
     if given.read:
@@ -371,22 +364,10 @@ def main():
             table.writerows([("fault", "arm", "size", "stated_px", "amplitude"), *amplitudes()])
         return
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # of the processes to come
-    jobs, rows, empty = (
-        list(tables(given)),
-        [],
-        dict.fromkeys(COLUMNS, np.nan) | {"judged": "", "others_wrong": 0},
-    )
-    with (
-        open(given.output, "w", encoding="utf-8", newline="") as file,
-        ProcessPoolExecutor(given.jobs, get_context("spawn"), os.nice, (10,)) as pool,
-    ):
-        table = csv.DictWriter(file, COLUMNS)
-        table.writeheader()
-        for row in tqdm(pool.map(judged, jobs), "tables", len(jobs), disable=not sys.stderr.isatty()):
-            rows.append(empty | row)
-            table.writerow(rows[-1])
-            file.flush()
-    tell(rows)
+    jobs = list(tables(given))
+    empty = dict.fromkeys(COLUMNS, np.nan) | {"judged": "", "others_wrong": 0}
+    made = in_two_processes(judged, jobs, "tables", given.jobs)
+    tell(written(given.output, COLUMNS, ([empty | row] for row in made)))
 
 
 if __name__ == "__main__":

@@ -5,11 +5,9 @@
 Runs are drawn by seed from a fractional design: faults of a cell x arms x corners x backlash x latency x kind
 of goal. Each rig is calibrated once from a recording of its own. Numbers of runs are of each cell; of faults
 and of sound ones, of each fault and each kind of corners. A row says which causes were named, judged by
-``CAUSES`` alone; what images cannot tell apart is in ``PAIRS``. ``--against`` compares with an earlier table.
+``CAUSES`` alone; what images cannot tell apart is in ``PAIRS``.
 """
 
-import argparse
-import csv
 import itertools
 import json
 import re
@@ -17,7 +15,7 @@ import tempfile
 import time
 from collections import Counter
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,7 +27,7 @@ from projservo_cli.monitoring.innovation_tests import ErrorModel
 from projservo_cli.records import WorkFailed
 from tests.configured import calibrate, plan, record, servo
 from tests.monitoring.stand_in import ARMS, KINDS, LAST, TAG_M, StandIn, seen, tool_pose
-from tests.studies.planning_tables import in_two_processes, quantiles, rate
+from tests.studies.common import in_two_processes, parser_of, quantiles, rate, written
 
 # Causes as they are worded; a group of an expression is the joint.
 CAUSES = {
@@ -179,6 +177,17 @@ def tasks(rig, rng):
             yield ends.round(3).tolist()
 
 
+def planned(rig, rng, shown):
+    """The first task with a plan: start and goal readings, deg, what is shown of the goal, and the plan."""
+    for start, goal in tasks(rig, rng):
+        given = shown(goal)
+        with suppress(WorkFailed):
+            made = plan.run(config_of(rig, (start, given), "none.csv", rig.options()), calibrated(rig))
+            if made.feasible:
+                return start, goal, given, made
+    raise AssertionError("tasks do not end")
+
+
 def taught(rig, q_deg, fault=None):
     """Goal images as they are taught, the mean of eight frames; as taught with a fault."""
     robot = StandIn(**rig.options(at_deg=q_deg, fault=fault, seed=2))
@@ -294,12 +303,7 @@ def driven(job):
             continue
         rng = np.random.default_rng([SEED, sum(map(ord, cell)), number])
         by_images = bool(rng.integers(2)) or level[0] == "taught"
-        for start, goal in tasks(rig, rng):
-            shown = taught(rig, goal) if by_images else goal
-            with suppress(WorkFailed):
-                made = plan.run(config_of(rig, (start, shown), "none.csv", rig.options()), calibration)
-                if made.feasible:
-                    break
+        start, goal, shown, made = planned(rig, rng, partial(taught, rig) if by_images else list)
         there = [tool_pose(arm, np.radians(q)) for q in (start, goal)]
         fault, expected = fault_of(level, there[level[0] == "taught"], len(arm.home), rng)
         row |= {"goal": "images" if by_images else "joints", "expected": expected}
@@ -375,7 +379,7 @@ COLUMNS = (
 )
 
 
-def tell(rows, before):
+def tell(rows):
     """Lines on each cell, against its bars."""
     for (kind, why), count in Counter((r["corners"], r["reason"]) for r in rows if "level" not in r).items():
         print(f"no calibration, {kind}, {count} runs: {why}"[:260])
@@ -415,10 +419,6 @@ def tell(rows, before):
                 f"sound, {kind}: alarms {len(alarms)} of {len(some)}; arrived {len(arrived)}; error (mm) "
                 f"{quantiles([row['error_mm'] for row in some])}; {dict(Counter(r['verdict'] for r in some))}"
             )
-            both = [(row["error_mm"], old) for row in some if (old := before.get(key_of(row))) is not None]
-            if both:
-                new, old = np.median(np.array(both), axis=0)
-                print(f"    median of {len(both)} runs {new:.4g} mm, before {old:.4g}")
     for row in rows:
         alarm = row["cell"] == "sound" and row["verdict"] in ("fault detected", "not started")
         bad = row["judged"] in ("wrong", "two") or alarm
@@ -434,35 +434,16 @@ def said(rows):
     )
 
 
-def key_of(row):
-    """What a run of the design is known by."""
-    return row["cell"], int(row["number"]), row["corners"]
-
-
 def main():
     """Drive the runs of all cells and print a summary."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    cells = ("before", "during", "faults", "sound")
-    parser.add_argument("--cells", nargs="+", choices=cells, default=list(cells))
-    parser.add_argument("--runs", type=int, default=300, help="of each cell, fault and sound kind of corners")
-    parser.add_argument("--corners", nargs="+", choices=KINDS, default=list(KINDS))
+    counted = [("runs", 300, "of each cell, fault and sound kind of corners")]
+    cells = ["before", "during", "faults", "sound"]
+    parser = parser_of("monitoring_study", __doc__, counted, cells=cells, corners=KINDS)
     parser.add_argument("--blind", action="store_true", help="with noise that grows: the study must fail")
-    parser.add_argument("--against", type=Path, help="an earlier table of as many runs, to compare with")
-    parser.add_argument("-o", "--output", type=Path, default=Path("monitoring_study.csv"), help="every run")
     given = parser.parse_args()
-    before = {}
-    if given.against is not None:
-        with open(given.against, encoding="utf-8", newline="") as file:
-            before = {key_of(row): float(row["error_mm"]) for row in csv.DictReader(file)}
-    jobs, every = jobs_of(given.cells, given.runs, given.corners), []
-    with open(given.output, "w", encoding="utf-8", newline="") as file:
-        table = csv.DictWriter(file, COLUMNS)
-        table.writeheader()
-        for rows in in_two_processes(blinded if given.blind else driven, jobs, "rigs"):
-            table.writerows(rows)
-            file.flush()
-            every += rows
-    tell(every, before)
+    jobs = jobs_of(given.cells, given.runs, given.corners)
+    batches = in_two_processes(blinded if given.blind else driven, jobs, "rigs")
+    tell(written(given.output, COLUMNS, batches))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from collections import Counter
 
 from projservo_cli.records import WorkFailed
 from tests.configured import calibrate, plan, servo
-from tests.studies.planning_tables import (
+from tests.studies.common import (
     asked_for,
     in_two_processes,
     quantiles,

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
-from scipy.stats import binomtest
 
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.planning.constraints import constraints_of
@@ -24,7 +23,6 @@ from projservo_cli.planning.keep_out import keep_out_of
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, within_region
 from projservo_cli.records import WorkFailed
-from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import KeptOut
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.simulation.random_tasks import random_tasks
@@ -33,7 +31,8 @@ from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.servo import drive
 from projservo_cli.task.target import TaskImages
 from tests.configured import calibrate, joints_of, plan, scenario_of, truth_of
-from tests.known import configured
+from tests.known import configured, with_task
+from tests.studies.common import rate
 
 ARMS = {"paper": 67, "ur5": 67, "stanford": 66}
 SEEDS = {"paper": (15, 5, 1), "ur5": (15, 5, 2), "stanford": (15, 5, 3)}
@@ -216,10 +215,8 @@ def driven_behind(scenario, planned, truth: Truth, box: Box):
 
 def judged(config, calibration, truth: Truth, task: Drawn, tally):
     """What is wrong with how a task ends, in words; what else befell it is counted."""
-    start, goal = (JointVector(joints=tuple(q.tolist()), unit="rad") for q in (task.q_start, task.q_goal))
-    asked = config.task.model_copy(update={"start": start, "goal": type(config.task.goal)(joints=goal)})
     motion = config.trajectory.model_copy(update={"keep_out": task.regions})
-    config = config.model_copy(update={"task": asked, "trajectory": motion})
+    config = with_task(config, (task.q_start, task.q_goal), trajectory=motion)
     try:
         planned = plan.run(config, calibration)
     except WorkFailed as error:
@@ -267,17 +264,11 @@ def study(name, count, profile):
             told = f"a way exists ({searches} searches)" if exists else f"no way ({searches} searches)"
             print(f"{name} {k}: {wrong}; {told}", flush=True)
     print(
-        f"{name}: {good} of {ways} with a way, {count} tasks ({told_of(good, ways)}); of all "
-        f"{told_of(good, count)}; {dict(tally)}",
+        f"{name}: {good} of {ways} with a way, {count} tasks, {rate(good, ways)} %; of all "
+        f"{rate(good, count)} %; {dict(tally)}",
         flush=True,
     )
     return good, ways, count, tally["entered"]
-
-
-def told_of(good, count):
-    """A rate with its Wilson interval."""
-    interval = binomtest(int(good), int(count)).proportion_ci(0.95, "wilson")
-    return f"{good / count:.1%}, {interval.low:.1%} to {interval.high:.1%}"
 
 
 def main(arguments):
@@ -286,7 +277,7 @@ def main(arguments):
     named = dict(word.split("=") for word in arguments if "=" in word)
     arms = {name: int(count) for name, count in named.items()} or ARMS
     good, ways, count, entered = np.sum([study(name, n, profile) for name, n in arms.items()], axis=0)
-    print(f"{profile}: {good} of {ways} with a way ({told_of(good, ways)}), {count} tasks; entered {entered}")
+    print(f"{profile}: {good} of {ways} with a way ({rate(good, ways)} %), {count} tasks; entered {entered}")
 
 
 if __name__ == "__main__":

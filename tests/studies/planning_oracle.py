@@ -19,7 +19,7 @@ from projservo_cli.planning.constraints import demands_into
 from projservo_cli.planning.margins import MARGINS
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at, with_ends
 from projservo_cli.planning.time_parameterization import minimum_time
-from tests.studies.planning_tables import asked_for, quantiles, task_configs, true_search, write_rows
+from tests.studies.common import asked_for, quantiles, task_configs, true_search, write_rows
 
 SEEDS = 5
 # That OMPL searches, and then shortens, at most, s.

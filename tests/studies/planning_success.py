@@ -8,10 +8,8 @@ the true model: where 20 searches of 100,000 samples each find no way, borders a
 there is *no way*, and rates are told with and without it. Every run is a row of the CSV file, with its seed.
 """
 
-import argparse
 from collections import Counter
 from itertools import groupby
-from pathlib import Path
 
 import numpy as np
 
@@ -19,7 +17,7 @@ from projservo_cli.records import WorkFailed
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweeps.folder import Folder, run_of
 from tests.configured import plan, servo, truth_of
-from tests.studies.planning_tables import has_no_way, in_two_processes, quantiles, rate, write_rows
+from tests.studies.common import has_no_way, in_two_processes, parser_of, quantiles, rate, write_rows
 
 GUIDED, ALONE = "exact_track", "exact"
 KEPT = ("run", "noise_px", "law", "draw", "task", "seed", "verdict", "success", "usable", "steps")
@@ -113,11 +111,8 @@ def tell(title, rows):
 
 def main():
     """Read the sweeps, look into what failed, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of("success_study", __doc__)
     parser.add_argument("folders", nargs="+", help="of sweeps of configs/sweep_guidance.yaml")
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("success_study.csv"), help="every run, as CSV"
-    )
     given = parser.parse_args()
     rows = [row for folder in given.folders for row in rows_of(folder)]
     failed = [row for row in rows if row["law"] == GUIDED and not row["success"]]

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from projservo_cli.records import WorkFailed
 from tests.configured import calibrate, plan, scenario_of
-from tests.studies.planning_tables import asked_for, quantiles, task_configs, write_rows
+from tests.studies.common import asked_for, quantiles, task_configs, write_rows
 
 PROFILES = ("joint_space", "auto")
 

@@ -10,7 +10,6 @@ one that leaves the least of the same images, with true intrinsics, the goal fro
 kinematics of the true model, once straight and then corrected by three looks.
 """
 
-import argparse
 import math
 import subprocess
 import sys
@@ -28,9 +27,8 @@ from projservo_cli.simulation.faults import FaultyRobot
 from tests.configured import calibrate, observed_in_frames, plan, record, robot_by_itself, servo, truth_of
 from tests.conftest import ROOT
 from tests.studies import hand_eye
-from tests.studies.arrival import errors
-from tests.studies.conditions import NEAR_DEG, NEAR_MM
-from tests.studies.planning_tables import in_two_processes, quantiles, write_rows
+from tests.studies.common import in_two_processes, parser_of, quantiles, write_rows
+from tests.studies.conditions import NEAR_DEG, NEAR_MM, errors
 from tests.studies.rendered_conditions import (
     CONDITIONS,
     LATEST,
@@ -205,11 +203,8 @@ def run_chain():
 
 def main():
     """Record under every condition, drive all tasks, and print what came of it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--conditions", nargs="+", choices=CONDITIONS, default=list(CONDITIONS))
-    parser.add_argument("--tasks", type=int, default=len(SEEDS), help="of each condition")
-    parser.add_argument("-o", "--output", type=Path, default=Path("rendered_study.csv"), help="every run")
-    given = parser.parse_args()
+    counted = [("tasks", len(SEEDS), "of each condition")]
+    given = parser_of("rendered_study", __doc__, counted, conditions=CONDITIONS).parse_args()
     run_chain()
     made = {}
     counts, squares = np.zeros(len(DECADES) - 1), np.zeros(len(DECADES) - 1)

@@ -5,19 +5,17 @@
 draws the tasks anew and writes rendered_tasks.csv beside this file, which the study reads.
 """
 
-import csv
 from pathlib import Path
 
 import numpy as np
 
 from projservo_cli.records import FloatArray
-from projservo_cli.settings.sections import JointVector
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.random_tasks import STRATA, random_tasks
 from tests.configured import observed_in_frames, robot_by_itself, truth_of
 from tests.conftest import SHARED
-from tests.known import configured
-from tests.studies.planning_tables import write_rows
+from tests.known import configured, with_task
+from tests.studies.common import row_of, tasks_in, write_rows
 
 TASKS = Path(__file__).with_name("rendered_tasks.csv")
 SEEDS = range(1, 31)
@@ -67,26 +65,15 @@ def base_of(condition):
 
 def tasks_of():
     """Start and goal joints, rad, by seed."""
-    with open(TASKS, encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    return {
-        int(row["seed"]): tuple(
-            np.array([float(row[f"{end}_q{i}"]) for i in range(1, 7)]) for end in ("start", "goal")
-        )
-        for row in rows
-    }
+    return tasks_in(TASKS)
 
 
 def task_config(config, seed, *, taught=False):
     """A configuration with the task of a seed; its goal is taught by images, or joints."""
-    start, goal = tasks_of()[seed]
-    vectors = [JointVector(joints=tuple(q.tolist()), unit="rad") for q in (start, goal)]
-    kind = type(config.task.goal)
-    aim = kind(joints=vectors[1])
+    ends, aim = tasks_of()[seed], None
     if taught:
-        aim = kind.model_validate({"images": taught_images(config, goal, seed)})
-    task = config.task.model_copy(update={"start": vectors[0], "goal": aim})
-    return config.model_copy(update={"task": task, "seed": seed})
+        aim = type(config.task.goal).model_validate({"images": taught_images(config, ends[1], seed)})
+    return with_task(config, ends, aim, seed=seed)
 
 
 def taught_images(config, q: FloatArray, seed):
@@ -114,11 +101,7 @@ def drawn():
             robots = [robot_by_itself(config, truth, q, 0.0, 0, 0) for q in ends]
             free = not any("touches" in obstruction_of(robot) for robot in robots)
             found = ends if free and all(_shows(config, truth, q) for q in ends) else None
-        yield {"seed": seed} | {
-            f"{end}_q{i}": repr(float(x))
-            for end, q in zip(("start", "goal"), found, strict=True)
-            for i, x in enumerate(q, 1)
-        }
+        yield {"seed": seed} | row_of(found)
 
 
 def _shows(config, truth, q):

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.cli import run
 from projservo_cli.config.inputs import truth_of
-from tests.studies.planning_tables import quantiles
+from tests.studies.common import quantiles
 from tests.studies.so101_tutorial import SHORTER, START, benched, by_hand, configure, through_all
 
 SEED, GOALS = 3232, 20

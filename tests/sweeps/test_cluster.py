@@ -50,26 +50,20 @@ class Dask:
 
 @pytest.fixture
 def cluster(tmp_path):
-    """What starts a cluster, which ends with the test."""
-    started = []
-
-    def begin():
-        started.append(Dask(tmp_path / f"cluster{len(started)}"))
-        return started[-1]
-
-    yield begin
-    for one in started:
-        one.kill()
+    """A cluster, which ends with the test."""
+    started = Dask(tmp_path / "cluster")
+    yield started
+    started.kill()
 
 
 def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(cluster, whole, tmp_path):
     config, reference = whole
-    out, first = tmp_path / "out", cluster()
-    process = processes.start(config, out, "--scheduler", first.address)
+    out = tmp_path / "out"
+    process = processes.start(config, out, "--scheduler", cluster.address)
     processes.wait_for_parts(process, out, 2)
-    processes.kill_group(first.processes[1])
+    processes.kill_group(cluster.processes[1])
     processes.wait_for_parts(process, out, 8)  # more than were under way
-    processes.kill_group(first.processes[0])
+    processes.kill_group(cluster.processes[0])
     code, _, err = processes.finish(process)
     assert code == 1
     assert "2 workers of tcp://127.0.0.1" in err
@@ -77,7 +71,7 @@ def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(clu
     assert "Traceback" not in err, err
     stored = len(processes.parts(out))
     assert 8 <= stored < 2 * processes.RUNS / processes.CHUNK
-    code, _, err = processes.finish(processes.start(config, out, "--scheduler", cluster().address))
+    code, _, err = processes.finish(processes.start(config, out, "-j", "2"))
     assert code == 0, err
     assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in err
     assert not processes.differences(out, reference)

@@ -21,13 +21,6 @@ def test_shares_grow_from_nothing_to_all(profile):
     assert (np.diff(mu, axis=0) >= 0).all()
 
 
-def test_every_profile_is_another():
-    shares = [profile_shares(profile, SIGMA) for profile in PROFILES]
-    for i in range(len(shares)):
-        for other in shares[:i]:
-            assert np.abs(shares[i] - other).max() > 0.3
-
-
 @pytest.mark.parametrize(
     ("profile", "first", "later"),
     [("rotation_first", [1], [0]), ("translation_first", [0], [1]), ("planar_first", [2], [0, 1])],
@@ -45,11 +38,6 @@ def test_linear_and_exponential():
     # What is left decays by a constant factor once its end, exp(−k), is added again: k = 5.
     left = 1 - mu * (1 - math.exp(-5))
     assert left[1:] / left[:-1] == pytest.approx(math.exp(-5 / 200) * np.ones(200), abs=1e-13)
-
-
-def test_an_unknown_profile_lists_the_valid_ones():
-    with pytest.raises(ValueError, match="rotation_first, translation_first"):
-        profile_shares("sideways", SIGMA)
 
 
 def test_planned_displacement_is_the_product_in_the_order_of_the_paper():

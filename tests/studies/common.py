@@ -1,4 +1,4 @@
-"""What studies of guidance share: tasks by seed, the true model as a judge, rates, two processes, tables."""
+"""What studies share: tasks by seed, the true model as a judge, command lines, rates, processes, tables."""
 
 import argparse
 import csv
@@ -16,11 +16,10 @@ from projservo_cli.planning.constraints import constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path
-from projservo_cli.settings.sections import JointVector
 from projservo_cli.simulation.random_tasks import random_tasks
 from projservo_cli.task.target import TaskImages
 from tests.configured import joints_of, truth_of
-from tests.known import configured
+from tests.known import configured, with_task
 
 # Configurations with images of 0.5 px noise, each with a seed of its own for its tasks.
 ARMS = {"paper": 151, "ur5": 152, "stanford": 153, "seven": 154}
@@ -32,13 +31,28 @@ def task_configs(name, count, *overrides):
     """Configurations of random tasks of an arm, images and trials at 0.5 px, run k with the seed k."""
     config = configured(name, "noise.calibration_px=0.5", "noise.servo_px=0.5", *overrides)
     front = np.array(config.task.start.values(config.joint_types))
-    for k, ends in enumerate(
-        zip(*random_tasks(truth_of(config), front, count, np.random.default_rng(ARMS[name])), strict=True)
-    ):
-        start, goal = (JointVector(joints=tuple(q.tolist()), unit="rad") for q in ends)
-        asked = {"start": start, "goal": type(config.task.goal)(joints=goal)}
-        task = config.task.model_copy(update=asked)
-        yield config.model_copy(update={"task": task, "seed": k})
+    tasks = random_tasks(truth_of(config), front, count, np.random.default_rng(ARMS[name]))
+    for k, ends in enumerate(zip(*tasks, strict=True)):
+        yield with_task(config, ends, seed=k)
+
+
+def tasks_in(path, **only):
+    """Start and goal joints, rad, by seed, from the rows of a file in which columns have these values."""
+    with open(path, encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if only.items() <= row.items()]
+    return {
+        int(row["seed"]): tuple(
+            np.array([float(row[f"{end}_q{i}"]) for i in range(1, 10) if row.get(f"{end}_q{i}")])
+            for end in ("start", "goal")
+        )
+        for row in rows
+    }
+
+
+def row_of(ends):
+    """Start and goal joints, rad, as ``tasks_in`` reads them."""
+    named = zip(("start", "goal"), ends, strict=True)
+    return {f"{end}_q{i}": repr(float(x)) for end, q in named for i, x in enumerate(q, 1)}
 
 
 def true_search(config, *, margins=False):
@@ -61,13 +75,25 @@ def true_search(config, *, margins=False):
     return c, GoalFeatures(task.A_star, s_star, 0.0), q_start, q_goal
 
 
-def asked_for(study, about, tasks, arms=tuple(ARMS), counted="of each arm"):
-    """What the command line of a study asks for: tasks, arms and where its table goes."""
+def parser_of(study, about, numbers=(), **choices):
+    """A parser of the command line of a study.
+
+    numbers : name, default and help of each number that is asked for.
+    choices : by name what may be chosen, all by default, or a pair of that and the default.
+    """
     parser = argparse.ArgumentParser(description=about.splitlines()[0])
-    parser.add_argument("--tasks", type=int, default=tasks, help=counted)
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(arms))
+    for name, default, counted in numbers:
+        parser.add_argument(f"--{name}", type=int, default=default, help=counted)
+    for name, choice in choices.items():
+        every, chosen = choice if isinstance(choice, tuple) else (choice, list(choice))
+        parser.add_argument(f"--{name}", nargs="+", choices=every, default=chosen)
     parser.add_argument("-o", "--output", type=Path, default=Path(f"{study}.csv"), help="every row, as CSV")
-    return parser.parse_args()
+    return parser
+
+
+def asked_for(study, about, tasks, arms=tuple(ARMS), counted="of each arm"):
+    """What the command line of a study of planning asks for: tasks, arms and where its table goes."""
+    return parser_of(study, about, [("tasks", tasks, counted)], arms=(ARMS, list(arms))).parse_args()
 
 
 def has_no_way(config):
@@ -94,10 +120,23 @@ def quantiles(values, shares=(0.5, 0.95, 1.0)):
     return " / ".join(f"{q:.4g}" for q in np.quantile(values, shares)) if len(values) else "-"
 
 
-def in_two_processes(function, jobs, what):
+def in_two_processes(function, jobs, what, processes=2):
     """Results of jobs in their order, behind other work of the machine, with a progress bar."""
-    with ProcessPoolExecutor(2, get_context("spawn"), os.nice, (10,)) as pool:
+    with ProcessPoolExecutor(processes, get_context("spawn"), os.nice, (10,)) as pool:
         yield from tqdm(pool.map(function, jobs), what, len(jobs), disable=not sys.stderr.isatty())
+
+
+def written(path, columns, batches):
+    """All rows of batches, each written to a table as soon as it comes."""
+    every = []
+    with open(path, "w", encoding="utf-8", newline="") as file:
+        table = csv.DictWriter(file, columns)
+        table.writeheader()
+        for rows in batches:
+            table.writerows(rows)
+            file.flush()
+            every += rows
+    return every
 
 
 def write_rows(path, rows):
