@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict, prediction_variance
-from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.records import WorkFailed
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot
 
 SIGMA = 0.5
@@ -118,10 +118,3 @@ def test_straight_images_show_no_lens_and_lose_little(robot, poses):
         assert np.sqrt(np.mean(off**2) / np.mean(variance)) < 1.4
     # Four parameters more cost certainty, by the Cramér–Rao bound, and never add any.
     assert (prediction_variance(with_lens, q) >= 0.999 * prediction_variance(without, q)).mean() > 0.99
-
-
-def test_what_cannot_be_asked_for(robot, bent):
-    with pytest.raises(InputError, match="closed_form"):
-        calibrate(bent, robot.joint_types, method="closed_form", lens=True)
-    with pytest.raises(InputError, match="width before height"):
-        calibrate(bent, robot.joint_types, image_size=(500, 1024), lens=True)
