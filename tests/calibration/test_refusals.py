@@ -155,19 +155,20 @@ def test_a_joint_that_stands_still_in_poses_of_all_joints_is_named():
 
 
 def test_what_no_single_joint_explains_names_none():
-    geared, shuffled = AROUND.copy(), np.random.default_rng(0).permutation(AROUND)
+    geared = AROUND.copy()
     geared[:, 0] = AROUND[0, 0] + 1.3 * (AROUND[:, 0] - AROUND[0, 0])
-    for readings in (geared, shuffled):
-        message = refusal(changed(seen(PRISMATIC, AROUND), q=readings), "RPRP")
-        assert "by the images" not in message
-        assert "does not describe the data" in message or "contradict the joint readings" in message
+    message = refusal(changed(seen(PRISMATIC, AROUND), q=geared), "RPRP")
+    assert "by the images" not in message
+    assert "does not describe the data" in message or "contradict the joint readings" in message
+
+
+def test_readings_in_degrees_and_views_exchanged_now_and_then_are_told():
     observation = seen(SMALL)
     assert "units" in refusal(changed(observation, q=np.degrees(observation.q)), "RRR")
     images = observation.images.copy()
-    images[::2] = images[::2, ::-1]  # views exchanged now and then
-    for method in METHODS:
-        message = refusal(changed(observation, images=images), "RRR", method=method)
-        assert "does not describe the data" in message or "correspondences" in message
+    images[::2] = images[::2, ::-1]
+    message = refusal(changed(observation, images=images), "RRR")
+    assert "does not describe the data" in message or "correspondences" in message
 
 
 @pytest.mark.parametrize(

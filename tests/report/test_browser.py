@@ -75,7 +75,7 @@ def pages(run, view, tmp_path_factory):
 @pytest.mark.parametrize("width", [390, 1400])
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 @pytest.mark.parametrize("name", ["report", "comparison", "view"])
-def test_everything_is_seen_at_every_width(browser, pages, name, width, dark):
+def test_pages_fit_every_width_in_light_and_in_dark(browser, pages, name, width, dark):
     with opened(browser, pages[name], width, dark) as page:
         assert page.evaluate("document.documentElement.scrollWidth") <= width, page.evaluate(BEYOND, width)
         ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
