@@ -19,7 +19,7 @@ from projservo_cli.store.tables import read_table, write_table
 from tests.configured import calibrate
 from tests.conftest import ROOT
 
-CONFIGS = ("apart", "coupled", "hobby", "paper", "seven", "stanford", "ur5")
+CONFIGS = ("apart", "coupled", "hobby", "stanford")
 LATE = {"disturbance.camera_latency_s": 0.1, "disturbance.servo_time_constant_s": 0.05}
 FEW = {"calibration.frames_per_joint": 3, "calibration.random_poses": 6}
 
@@ -139,11 +139,10 @@ def test_a_run_has_the_start_and_goal_of_its_plan(config, made):
 @pytest.mark.parametrize(
     ("changed", "what"),
     [
-        (lambda s: s[::-1], "leaves .* px rms a marker"),
         (lambda s: s + np.array([[[0.0, 20.0]], [[0.0, 0.0]]]), "leaves .* px rms a marker"),
         (lambda s: s + 15.0 * (np.arange(16).reshape(2, 4, 2) == 4), "marker 2 is .* px off in the left one"),
     ],
-    ids=["exchanged", "shifted", "one marker"],
+    ids=["shifted", "one marker"],
 )
 def test_goal_images_without_joints_must_fit_the_calibration(config, made, changed, what):
     _, calibration, plan = made
@@ -191,10 +190,7 @@ def test_a_sweep_in_memory_compares_classes_and_laws(config):
     class Slow(Resolved):
         gain = 0.5
 
-    studies = [ps.sweep(config, laws=[Slow, Resolved, "exact"], tasks=2, seed=3) for _ in range(2)]
-    for name, values in studies[0].table.items():
-        np.testing.assert_array_equal(values, studies[1].table[name])
-    study = studies[0]
+    study = ps.sweep(config, laws=[Slow, Resolved, "exact"], tasks=2, seed=3)
     assert study.path is None
     assert [cell["law"] for cell in study.success()] == ["Slow", "Resolved", "exact"]
     low, high = study.success()[2]["success_interval"]
@@ -249,17 +245,10 @@ def test_a_sweep_says_why_laws_failed(config, tmp_path, capsys):
     }
     told = capsys.readouterr().err.splitlines()
     assert len(told) == 2
-    sweep = f"{{base: {ROOT / 'configs' / 'ur5.yaml'}, runs: 2, grid: {{law: ['{__name__}:Broken']}}}}"
-    (tmp_path / "again.yaml").write_text(sweep, encoding="utf-8")
-    command = ["sweep", "-c", str(tmp_path / "again.yaml"), "-j", "1", "-o", str(tmp_path / "again")]
-    assert cli.run(command) == 0
-    said = " ".join(capsys.readouterr().err.split())
-    assert f"law {__name__}:Broken: 2 runs failed or did not start, first run 0: {reasons['Broken']}" in said
     stored = ps.load(tmp_path)
     for (law, reason), line in zip(reasons.items(), told, strict=True):
         first = study.table["run"][study.table["law"] == law][0]
         assert line.startswith(f"law {law}: 8 runs failed or did not start, first run {first}: {reason}")
-        assert study.summary()[f"failures of {law}"] in line
         assert f"failures of {law} " in repr(study)
         assert study.failures[law][:2] == (8, first)
         assert study.failures[law] == stored.failures[f"{__name__}:{law}"]
@@ -308,10 +297,6 @@ def test_an_experiment_is_made_once_resumed_and_opened_again(config, tmp_path):
     assert {name: again.results[name].key for name in keys} == keys
     np.testing.assert_array_equal(again.calibration.P, run.calibration.P)
     assert ps.load(tmp_path / "run").traces["exact"].verdict == "converged"
-    with pytest.raises(ps.InputError, match="give Experiment a path"):
-        ps.Experiment(config).make("report")
-    with pytest.raises(ps.InputError, match="no such stage; stages: calibrate, plan, servo, report"):
-        run.make("prepare")
 
 
 def test_a_law_of_a_notebook_is_never_up_to_date(config, tmp_path, monkeypatch):
@@ -329,145 +314,95 @@ def test_a_stored_run_starts_no_code_that_it_names(config, tmp_path):
         ps.load(tmp_path / "run").make("servo")
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda c: ps.Config.load("ur6"), r"ur6: no file, and no shipped configuration; did you mean ur5\?"),
-        (lambda c: c.replace({"control": {"gian_t": 1}}), "control.gian_t: unknown key; did you mean gain_t"),
-        (
-            lambda c: c.replace({"control.gain_t": -1.0}),
-            "control.gain_t=-1.0: control.gain_t: must be",
-        ),
-        (lambda c: ps.simulate(c, np.zeros((2, 5))), r"q of shape \(2, 5\): expected \(K, 6\), rad or m"),
-        (lambda c: ps.simulate(c, np.full((1, 6), np.nan)), "q: holds a number that is not finite"),
-        (lambda c: ps.simulate(c, np.full((1, 6), 7.0)), "q: pose 0: joint 1 would be at 7 rad, beyond"),
-        (lambda c: ps.simulate(c, np.full((1, 6), 90.0)), "q: joint 1 at 90 is more than two turns in rad"),
-        (lambda c: ps.simulate(c, np.zeros((1, 6)), seed=-1), "calibration.seed: must be at least 0"),
-        (lambda c: ps.simulate("ur5"), "simulate: config of type str: read one with Config.load"),
-        (lambda c: ps.sweep(c, laws=["exact"], workers=0), "workers=0: give a whole number of one or more"),
-        (
-            lambda c: ps.Experiment(c).make("servo", laws=[Resolved]),
-            "make: law <class .*: give the name of a law, or module:Class, such as '.*test_api:Resolved'",
-        ),
-        (lambda c: ps.Experiment(c).plan, r"holds no result of plan; make it first: make\('plan'\)"),
-        (lambda c: ps.calibrate(np.zeros(3)), "observations of type ndarray; make them with"),
-        (
-            lambda c: ps.calibrate(ps.simulate(c), method="best"),
-            "method: 'best' is not one of them",
-        ),
-        (
-            lambda c: ps.calibrate(ps.simulate(c), lens="yes"),
-            "calibration.lens='yes': calibration.lens: ",
-        ),
-        (lambda c: ps.simulate(c, "here"), r"q: no array of numbers; expected shape \(K, 6\), rad or m"),
-        (lambda c: ps.Config.load(5), "a configuration of type int: give the path of a file, or a name"),
-        (lambda c: ps.load(5), "load: a path of type int: give the folder of a run or of a sweep"),
-        (lambda c: ps.load("configs/ur5.yaml"), "a configuration, which Config.load reads"),
-        (lambda c: ps.sweep(c, laws=["exact"], runs=0), "^sweep: runs: must be at least 1, not 0$"),
-        (
-            lambda c: ps.sweep(c, laws=["exact"], tasks=-1),
-            "^sweep: tasks.random: must be at least 1, not -1$",
-        ),
-        (lambda c: ps.sweep(c, laws=[]), "sweep: name one law or more"),
-        (lambda c: ps.sweep(c, laws="exact"), r"sweep: laws 'exact': give a list of them, such as laws=\["),
-        (lambda c: ps.sweep(c, laws=Resolved), "sweep: laws <class .* give a list of them"),
-        (lambda c: ps.sweep(c, laws=[3]), "law 3: expected a name, or a class or function that makes a law"),
-        (lambda c: ps.sweep(c, laws=[Resolved, Resolved]), "grid.law: a value stands there twice"),
-        (lambda c: ps.sweep(c, laws=["best"]), "law best: no such law; laws: direct_three"),
-        (lambda c: ps.sweep(c, laws=["exact"], grid={"noise.servo": [0]}), "noise.servo: unknown key"),
-    ],
-)
-def test_what_makes_no_sense_is_said_in_a_sentence(config, call, message):
-    with pytest.raises(ps.InputError, match=message):
-        call(config)
+def arrays(**given):
+    """Observations of four poses and three markers, but for what is given."""
+    return ps.Observations.from_arrays(**{"q": np.zeros((4, 6)), "pixels": np.ones((4, 2, 3, 2)), **given})
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (
-            lambda c, k, p: ps.plan(c, k, q_start=np.degrees(p.q_start)),
-            "q_start: .* two turns in rad",
-        ),
-        (lambda c, k, p: ps.plan(c, k, q_start=[1, 2]), r"q_start of shape \(2,\): expected \(6,\)"),
-        (
-            lambda c, k, p: ps.plan(c, k, goal=np.zeros((2, 3, 2))),
-            r"\(6,\) joint readings, or \(2, 4, 2\)",
-        ),
-        (
-            lambda c, k, p: ps.plan(ps.Config.load("stanford"), k),
-            "the configuration of RRPRRR: take one",
-        ),
-        (lambda c, k, p: ps.servo(ps.Config.load("stanford"), k, p), "the calibration is of joints RRRRRR"),
-        (
-            lambda c, k, p: ps.plan(c, k, goal=[[1, 2], [3]]),
-            r"goal: no array of numbers; expected .* \(2, 4, 2\)",
-        ),
-        (lambda c, k, p: ps.servo(c, k, p.q), "servo: plan of type ndarray: make one with plan"),
-        (lambda c, k, p: ps.servo(c, k, p, law="exakt"), "law exakt: no such law; laws: direct_three"),
-        (lambda c, k, p: ps.servo(c, k, p, law=3), "law 3: expected a name, or a class or function"),
-        (lambda c, k, p: ps.servo(c, k, p, mode="follow"), "'follow' is not one of them; valid: regulate"),
-        (
-            lambda c, k, p: ps.servo(c, k, p, law="stacked", mode="track"),
-            "^control.mode track: stacked has no such mode, only regulate and image_track; laws that have",
-        ),
-        (
-            lambda c, k, p: ps.servo(c, k, p, law=Resolved, mode="track"),
-            r"^control.mode track: .*:Resolved has no such mode, only regulate; ",
-        ),
-        (
-            lambda c, k, p: ps.servo(c, k, p, law="exact_track", mode="regulate"),
-            "^servo: law exact_track is exact in mode track, not 'regulate': leave mode out$",
-        ),
-        (lambda c, k, p: k.predict("here"), r"joint readings: no array of numbers; expected shape \(6,\) or"),
-        (lambda c, k, p: k.project("here"), r"points: no array of numbers; expected shape \(..., 4\)"),
-        (lambda c, k, p: k.score({"q1": [0.0]}), "score: observations of type dict; make them with"),
-        (lambda c, k, p: k.score(np.zeros((2, 4, 2))), "score: observations of type ndarray; make them with"),
-        (lambda c, k, p: p.plot(np.zeros(2)), "plot: ax of type ndarray: give one axes of a figure"),
-        (lambda c, k, p: k.predict(np.full(6, 90.0)), "joint readings: joint 1 at 90 is more than two turns"),
-    ],
-)
-def test_what_does_not_fit_a_calibration_is_said_in_a_sentence(config, made, call, message):
+MIXED = {"q": np.full((4, 6), 0.5) + 150.0 * (np.arange(6) == 2), "joint_types": "RRPRRR"}
+# What is asked of a configuration c, a calibration k or a plan p, and the words that refuse it.
+REFUSED = [
+    (lambda c, k, p: ps.Config.load("ur6"), r"no file, and no shipped configuration; did you mean ur5\?"),
+    (lambda c, k, p: ps.Config.load(5), "a configuration of type int: give the path of a file, or a name"),
+    (lambda c, k, p: c.replace({"control.gain_t": -1.0}), "control.gain_t=-1.0: control.gain_t: must be"),
+    (lambda c, k, p: ps.load(5), "load: a path of type int: give the folder of a run or of a sweep"),
+    (lambda c, k, p: ps.load("configs/ur5.yaml"), "a configuration, which Config.load reads"),
+    (lambda c, k, p: ps.simulate(c, np.zeros((2, 5))), r"q of shape \(2, 5\): expected \(K, 6\), rad or m"),
+    (lambda c, k, p: ps.simulate(c, np.full((1, 6), np.nan)), "q: holds a number that is not finite"),
+    (lambda c, k, p: ps.simulate(c, np.full((1, 6), 7.0)), "q: pose 0: joint 1 would be at 7 rad, beyond"),
+    (lambda c, k, p: ps.simulate(c, np.full((1, 6), 90.0)), "joint 1 at 90 is more than two turns in rad"),
+    (lambda c, k, p: ps.simulate(c, "here"), r"q: no array of numbers; expected shape \(K, 6\), rad or m"),
+    (lambda c, k, p: ps.simulate(c, seed=-1), "calibration.seed: must be at least 0"),
+    (lambda c, k, p: ps.simulate("ur5"), "simulate: config of type str: read one with Config.load"),
+    (lambda c, k, p: ps.calibrate(np.zeros(3)), "observations of type ndarray; make them with"),
+    (lambda c, k, p: ps.calibrate(ps.simulate(c), method="best"), "method: 'best' is not one of them"),
+    (lambda c, k, p: ps.Experiment(c).plan, r"holds no result of plan; make it first: make\('plan'\)"),
+    (lambda c, k, p: ps.Experiment(c).make("report"), "give Experiment a path"),
+    (lambda c, k, p: ps.Experiment(c).make("prepare"), "no such stage; stages: calibrate, plan, servo, rep"),
+    (lambda c, k, p: ps.Experiment(c).make("servo", laws=[Resolved]), "such as '.*test_api:Resolved'"),
+    (lambda c, k, p: ps.sweep(c, laws=["exact"], workers=0), "workers=0: give a whole number of one or more"),
+    (lambda c, k, p: ps.sweep(c, laws=["exact"], runs=0), "^sweep: runs: must be at least 1, not 0$"),
+    (lambda c, k, p: ps.sweep(c, laws=[]), "sweep: name one law or more"),
+    (lambda c, k, p: ps.sweep(c, laws="exact"), r"sweep: laws 'exact': give a list of them, such as laws=\["),
+    (
+        lambda c, k, p: ps.sweep(c, laws=[3]),
+        "law 3: expected a name, or a class or function that makes a law",
+    ),
+    (lambda c, k, p: ps.sweep(c, laws=[Resolved, Resolved]), "grid.law: a value stands there twice"),
+    (lambda c, k, p: ps.sweep(c, laws=["best"]), "law best: no such law; laws: direct_three"),
+    (lambda c, k, p: ps.plan(c, k, q_start=np.degrees(p.q_start)), "q_start: .* two turns in rad"),
+    (lambda c, k, p: ps.plan(c, k, q_start=[1, 2]), r"q_start of shape \(2,\): expected \(6,\)"),
+    (lambda c, k, p: ps.plan(c, k, goal=np.zeros((2, 3, 2))), r"\(6,\) joint readings, or \(2, 4, 2\)"),
+    (lambda c, k, p: ps.plan(c, k, goal=[[1, 2], [3]]), r"goal: no array of numbers; .* \(2, 4, 2\)"),
+    (lambda c, k, p: ps.plan(ps.Config.load("stanford"), k), "the configuration of RRPRRR: take one"),
+    (lambda c, k, p: ps.servo(c, k, p.q), "servo: plan of type ndarray: make one with plan"),
+    (lambda c, k, p: ps.servo(c, k, p, law="exakt"), "law exakt: no such law; laws: direct_three"),
+    (lambda c, k, p: ps.servo(c, k, p, law=3), "law 3: expected a name, or a class or function"),
+    (lambda c, k, p: ps.servo(c, k, p, mode="follow"), "'follow' is not one of them; valid: regulate"),
+    (
+        lambda c, k, p: ps.servo(c, k, p, law="stacked", mode="track"),
+        "^control.mode track: stacked has no such mode, only regulate and image_track; laws that have",
+    ),
+    (
+        lambda c, k, p: ps.servo(c, k, p, law=Resolved, mode="track"),
+        r"^control.mode track: .*:Resolved has no such mode, only regulate; ",
+    ),
+    (
+        lambda c, k, p: ps.servo(c, k, p, law="exact_track", mode="regulate"),
+        "^servo: law exact_track is exact in mode track, not 'regulate': leave mode out$",
+    ),
+    (lambda c, k, p: k.predict("here"), r"joint readings: no array of numbers; expected shape \(6,\) or"),
+    (lambda c, k, p: k.predict(np.full(6, 90.0)), "joint readings: joint 1 at 90 is more than two turns"),
+    (lambda c, k, p: k.project("here"), r"points: no array of numbers; expected shape \(..., 4\)"),
+    (lambda c, k, p: k.score({"q1": [0.0]}), "score: observations of type dict; make them with"),
+    (lambda c, k, p: p.plot(np.zeros(2)), "plot: ax of type ndarray: give one axes of a figure"),
+    (lambda c, k, p: arrays(q=np.zeros((3, 6))), r"q of shape \(3, 6\): expected \(4, n\)"),
+    (lambda c, k, p: arrays(pixels=np.zeros((4, 3, 2))), r"\(4, 3, 2\): expected \(K, 2, m, 2\)"),
+    (lambda c, k, p: arrays(pixels=np.ones((4, 2, 3, 2)) + 1j), "pixels: complex numbers; expected real"),
+    (lambda c, k, p: arrays(q=np.ma.masked_equal(np.zeros((4, 6)), 0.0)), "q: holds a number that is not"),
+    (lambda c, k, p: arrays(pixels=np.full((4, 2, 3, 2), np.inf)), r"at pose 0, view 0 is at \(inf, inf\): "),
+    (lambda c, k, p: arrays(q=np.full((4, 6), 90.0)), "they look like degrees; give joint_unit='deg'"),
+    (lambda c, k, p: arrays(**MIXED), r"q3 of pose 0 is 150\.5, of a prismatic .*they look like millimetres"),
+    (lambda c, k, p: arrays(joint_unit="degrees"), "q: joint_unit 'degrees': give deg or rad"),
+    (lambda c, k, p: arrays(joint_types="RRR"), "joint_types: 'RRR': expected 6 letters R or P"),
+    (lambda c, k, p: arrays(joint_types=6), "joint_types: 6: expected 6 letters R or P"),
+    (
+        lambda c, k, p: arrays(image_size=(1280,)),
+        r"image size \(1280,\): give a positive width and height, px",
+    ),
+    (lambda c, k, p: arrays(image_size="1280x1024"), "image size '1280x1024': give a positive width and"),
+    (lambda c, k, p: arrays(noise_px=0), "pixel noise 0: give a positive number, or none to estimate it"),
+    (lambda c, k, p: arrays(noise_px=float("nan")), "pixel noise nan: give a positive number"),
+    (lambda c, k, p: arrays(noise_px="a"), "pixel noise 'a': give a positive number"),
+    (lambda c, k, p: arrays(marker=[1, 1, 2]), "marker: expected 3 different whole numbers"),
+    (lambda c, k, p: arrays(sigma=np.zeros((4, 2, 3))), "sigma: must be positive wherever a marker is seen"),
+]
+
+
+@pytest.mark.parametrize(("call", "message"), REFUSED)
+def test_what_makes_no_sense_is_said_in_a_sentence(config, made, call, message):
     with pytest.raises(ps.InputError, match=message):
         call(config, *made[1:])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"q": np.zeros((3, 6))}, r"q of shape \(3, 6\): expected \(4, n\)"),
-        ({"pixels": np.zeros((4, 3, 2))}, r"pixels of shape \(4, 3, 2\): expected \(K, 2, m, 2\)"),
-        ({"pixels": "here"}, "pixels: no array of numbers"),
-        ({"pixels": np.ones((4, 2, 3, 2)) + 1j}, "pixels: complex numbers; expected real ones of shape"),
-        ({"q": np.ma.masked_equal(np.zeros((4, 6)), 0.0)}, "q: holds a number that is not finite"),
-        (
-            {"pixels": np.full((4, 2, 3, 2), np.inf)},
-            r"marker 0 at pose 0, view 0 is at \(inf, inf\): ",
-        ),
-        ({"q": np.full((4, 6), 90.0)}, "they look like degrees; give joint_unit='deg'"),
-        (
-            {"q": np.full((4, 6), 0.5) + 150.0 * (np.arange(6) == 2), "joint_types": "RRPRRR"},
-            r"q3 of pose 0 is 150\.5, of a prismatic joint in m \(4 such .*they look like millimetres",
-        ),
-        ({"joint_unit": "degrees"}, "q: joint_unit 'degrees': give deg or rad"),
-        ({"joint_types": "RRR"}, "joint_types: 'RRR': expected 6 letters R or P"),
-        ({"image_size": (1280,)}, r"image size \(1280,\): give a positive width and height, px"),
-        ({"image_size": (-100, 100)}, r"image size \(-100, 100\): give a positive width and height, px"),
-        ({"image_size": 1280}, "image size 1280: give a positive width and height, px"),
-        ({"image_size": "1280x1024"}, "image size '1280x1024': give a positive width and height, px"),
-        ({"noise_px": 0}, "pixel noise 0: give a positive number, or none to estimate it"),
-        ({"noise_px": float("nan")}, "pixel noise nan: give a positive number"),
-        ({"noise_px": "a"}, "pixel noise 'a': give a positive number"),
-        ({"joint_types": list("RRR")}, r"joint_types: \['R', 'R', 'R'\]: expected 6 letters R or P"),
-        ({"joint_types": 6}, "joint_types: 6: expected 6 letters R or P"),
-        ({"marker": [1, 1, 2]}, "marker: expected 3 different whole numbers"),
-        ({"sigma": np.zeros((4, 2, 3))}, "sigma: must be positive wherever a marker is seen"),
-    ],
-)
-def test_arrays_that_make_no_sense_are_refused(change, message):
-    given = {"q": np.zeros((4, 6)), "pixels": np.ones((4, 2, 3, 2))} | change
-    with pytest.raises(ps.InputError, match=message):
-        ps.Observations.from_arrays(given.pop("q"), given.pop("pixels"), **given)
 
 
 def test_arrays_tables_and_frames_hold_the_same(made, tmp_path):
@@ -481,17 +416,13 @@ def test_arrays_tables_and_frames_hold_the_same(made, tmp_path):
     tables = tmp_path / "table.csv", observations.to_frame(), dict(observations.to_frame())
     for one in (shuffled, *map(ps.Observations.from_frame, tables)):
         alike(one, table, Observation)
-    for types in ("rrrrrr", [*"RRRRRR"], np.array([*"rRrRrR"])):
-        arrays = ps.Observations.from_arrays(observations.q, observations.images, joint_types=types)
+    for types in ("rrrrrr", np.array([*"rRrRrR"])):
+        given = ps.Observations.from_arrays(observations.q, observations.images, joint_types=types)
         frame = ps.Observations.from_frame(observations.to_frame(), joint_types=types)
-        assert arrays.joint_types == frame.joint_types == "RRRRRR"
-    with pytest.raises(ps.InputError, match="joint_types: 'RRRRRX': expected letters R or P, one a joint"):
-        ps.Observations.from_frame(observations.to_frame(), joint_types="RRRRRX")
+        assert given.joint_types == frame.joint_types == "RRRRRR"
     q, pixels = np.degrees(observations.q), observations.images
     degrees = ps.Observations.from_arrays(q, pixels, joint_unit="deg")
     np.testing.assert_allclose(degrees.q, observations.q, atol=1e-12)
-    with pytest.raises(ps.InputError, match=r"^table: the header lacks the column\(s\) marker"):
-        ps.Observations.from_frame(observations.to_frame().drop(columns="marker"))
     columns = dict(observations.to_frame())
     joined = ps.Observations.from_frame(columns | {"marker": columns["marker"].astype(float)})
     alike(joined, table, Observation)
@@ -500,8 +431,6 @@ def test_arrays_tables_and_frames_hold_the_same(made, tmp_path):
         ps.Observations.from_frame(columns | {"marker": bare})
     with pytest.raises(ps.InputError, match="joint_unit='deg', or joint_unit='rad' if they are"):
         ps.Observations.from_frame(columns | {"q1": columns["q1"] + 90.0})
-    with pytest.raises(ps.InputError, match="table: joint_unit 'degrees': give deg or rad"):
-        ps.Observations.from_frame(columns, joint_unit="degrees")
 
 
 def test_what_is_masked_is_unseen(made):

@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from tests.calibration.simulated_robot import Robot
-
 STEP = 1e-30  # of the complex differentiation: exact to round-off, nothing cancels
 
 
@@ -84,18 +82,6 @@ class Bound:
         """Standard error of the mean square over independent draws of normal errors, relative."""
         spectrum = np.linalg.svd(self.factor, compute_uv=False) ** 2
         return float(np.sqrt(2.0 * (spectrum**2).sum() / draws) / spectrum.sum())
-
-
-def robot_of(truth):
-    screws = truth["screws"]
-    twists = np.zeros((len(screws), 4, 4))
-    for twist, screw in zip(twists, screws, strict=True):
-        twist[:3, :3] = np.cross(np.eye(3), screw["w"])
-        twist[:3, 3] = screw["v"]
-    tool = np.array(truth["T_base_tool_at_reference"])
-    markers = np.c_[np.array(truth["markers_tool"]), np.ones(len(truth["markers_tool"]))] @ tool.T
-    cameras = np.array([truth["camera_left"], truth["camera_right"]])
-    return Robot(truth["joint_types"], twists, cameras, markers, np.array(truth["q_reference"]))
 
 
 def errors_of_the_best(mistaken):

@@ -35,21 +35,10 @@ class Mistaken:
     ahead: FloatArray  # (60, n) poses held out, within the ranges of the joints
 
     @property
-    def right(self) -> Observation:
-        """What is right of it alone."""
-        wrong = (self.kind != 0)[:, None, :, None]
-        return dataclasses.replace(self.observation, images=np.where(wrong, np.nan, self.observation.images))
-
-    @property
     def counted(self) -> BoolArray:
         """Tracks (m,) of at least four sightings of which more than half are right."""
         seen = (self.kind >= 0).sum(axis=0)
         return (seen >= 4) & (2 * (self.kind == 0).sum(axis=0) > seen)
-
-    @property
-    def wrong_poses(self) -> IntArray:
-        """Poses of which the joint readings are wrong."""
-        return np.flatnonzero((self.kind == KINDS.index("readings")).any(axis=1))
 
 
 def table(

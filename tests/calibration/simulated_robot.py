@@ -7,6 +7,7 @@ import numpy.typing as npt
 from scipy.linalg import expm
 
 from projservo_cli.records import FloatArray, Observation
+from tests.samples import prismatic, revolute
 
 IMAGE_SIZE = (1280, 1024)
 NAMES = ("left", "right", "top", "low")  # of the views
@@ -60,29 +61,13 @@ def rig(baseline: float = 0.3, distance: float = 1.4, focal: float = 1200.0, vie
     return np.array(cameras)
 
 
-def revolute(w: FloatArray, p: FloatArray) -> FloatArray:
-    """Twist of a turn by one rad about the axis w through p."""
-    w = np.asarray(w) / np.linalg.norm(w)
-    twist = np.zeros((4, 4))
-    twist[:3, :3] = np.cross(np.eye(3), w)  # rows e_i × w: the matrix of w ×
-    twist[:3, 3] = -twist[:3, :3] @ p
-    return twist
-
-
-def prismatic(v: FloatArray) -> FloatArray:
-    """Twist of a translation by one metre along v."""
-    twist = np.zeros((4, 4))
-    twist[:3, 3] = np.asarray(v) / np.linalg.norm(v)
-    return twist
-
-
 def random_robot(joint_types: str, rng: np.random.Generator, markers: int = 10, views: int = 2) -> Robot:
     """Axes of any direction through points within 0.4 m of the body's centre; a body of 0.1 m."""
     twists = []
     for letter in joint_types:
         direction = rng.standard_normal(3)
         point = rng.uniform(-0.4, 0.4, 3)
-        twists.append(prismatic(direction) if letter == "P" else revolute(direction, point))
+        twists.append(prismatic(direction) if letter == "P" else revolute(point, direction))
     body = rng.uniform(-0.1, 0.1, (markers, 3))
     q = rng.uniform(-1.0, 1.0, len(joint_types))
     return Robot(joint_types, np.array(twists), rig(views=views), np.hstack([body, np.ones((markers, 1))]), q)

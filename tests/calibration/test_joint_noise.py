@@ -12,29 +12,21 @@ UNIT = np.array([1.0, 0.3, 1.0, 1.0])  # rad and m
 TYPES, SIGMA, SIGMA_Q = "RPRR", 0.2, 1e-3
 
 
-def recorded(seed, error, markers=5):
-    """Robot, true joints, and what was seen where joints are read with an error (K, n)."""
+def recorded(seed, markers=5):
+    """Robot, true joints, and what was seen where joints are read with normal errors."""
     rng = np.random.default_rng([seed, 16])
     robot = random_robot(TYPES, rng, markers)
     q = np.concatenate([trials(robot, frames=5), around(robot, 10, rng)])
     q = q + 2e-3 * rng.uniform(-1.0, 1.0, q.shape)
     seen = robot.observe(q, SIGMA, rng)
-    seen.q[:] += error(q, rng)
+    seen.q[:] += SIGMA_Q * UNIT * rng.standard_normal(q.shape)
     return robot, q, seen
-
-
-def normal(q, rng):
-    return SIGMA_Q * UNIT * rng.standard_normal(q.shape)
-
-
-def exact(q, rng):
-    return np.zeros_like(q)
 
 
 def test_noise_of_joints_is_told_from_that_of_pixels_with_an_interval_that_holds():
     ratio, held, square = [], [], []
     for seed in range(12):
-        robot, _q, seen = recorded(seed, normal)
+        robot, _q, seen = recorded(seed)
         # In every other case the noise of the pixels is known.
         known = {"sigma_px": SIGMA, "source": "simulated"} if seed % 2 else {"source": "recorded"}
         found = calibrate(seen, TYPES, joint_noise=None, **known)
@@ -57,7 +49,7 @@ def test_noise_of_joints_is_told_from_that_of_pixels_with_an_interval_that_holds
 
 def test_the_fit_is_that_of_least_squares_over_robot_and_joints_at_once():
     """Beside a model of its own, with all true joints as parameters, and dense covariances."""
-    robot, q, seen = recorded(3, normal, markers=4)
+    robot, q, seen = recorded(3, markers=4)
     held = []
     found = calibrate(
         seen,
@@ -91,7 +83,7 @@ def test_the_fit_is_that_of_least_squares_over_robot_and_joints_at_once():
 
 
 def test_a_wrong_reading_is_found_among_small_errors_and_these_are_not_suspected():
-    _robot, _q, seen = recorded(6, normal)
+    _robot, _q, seen = recorded(6)
     seen.q[20, 2] += 0.05
     found = calibrate(seen, TYPES, source="recorded", joint_noise=None)
     assert found.suspect.tolist() == [[seen.pose[20], 3]]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from projservo_cli import Observations, calibrate
-from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 COMMUTING = {("P", "P")}
@@ -51,10 +50,7 @@ def test_single_joint_trials_show_no_order_and_combined_poses_all_of_it(types):
 def test_a_stated_order_and_that_of_a_simulation_need_no_poses():
     robot = random_robot("RRR", np.random.default_rng(4), markers=8)
     observations = seen(robot, trials(robot, 8))
-    stated = calibrate(dataclasses.replace(observations, order_stated=True), progress=False)
-    assert stated.undecided_order is None
-    assert not stated.order_advice
-    simulated = calibrate(dataclasses.replace(observations, source="simulated"), progress=False)
-    assert simulated.undecided_order is None
-    assert not simulated.order_advice
-    assert isinstance(simulated.observation, Observation)
+    for known in ({"order_stated": True}, {"source": "simulated"}):
+        found = calibrate(dataclasses.replace(observations, **known), progress=False)
+        assert found.undecided_order is None
+        assert not found.order_advice

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict, prediction_variance
-from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.records import WorkFailed
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot
 
 SIGMA = 0.5
@@ -40,19 +40,13 @@ def observed(robot, q, lens, seed=1):
     return dataclasses.replace(observation, images=np.where(inside[..., None], images, np.nan))
 
 
-@pytest.fixture(scope="module")
-def bent(robot, poses):
-    return observed(robot, poses, LENS)
+def calibrated(robot, observation, **given):
+    given = {"source": "recorded", "image_size": IMAGE_SIZE} | given
+    return calibrate(observation, robot.joint_types, **given)
 
 
-@pytest.fixture(scope="module")
-def fitted(robot, bent):
-    return calibrate(
-        bent, robot.joint_types, sigma_px=SIGMA, source="recorded", image_size=IMAGE_SIZE, lens=True
-    )
-
-
-def test_known_distortion_is_recovered_within_its_uncertainty(fitted):
+def test_known_distortion_is_recovered_within_its_uncertainty(robot, poses):
+    fitted = calibrated(robot, observed(robot, poses, LENS), sigma_px=SIGMA, lens=True)
     off = (fitted.lens[:, 3:] - LENS[:, 3:]).ravel()
     spread = fitted.sqrt_cov_shared[-4:] @ fitted.sqrt_cov_shared[-4:].T
     assert np.array_equal(fitted.lens[:, :3], LENS[:, :3])
@@ -69,9 +63,7 @@ def test_known_distortion_is_recovered_within_its_uncertainty(fitted):
 def test_a_centre_of_the_lens_elsewhere_is_found(robot, poses, size):
     """Off the middle of the image by far more than it is uncertain, the centre is estimated too."""
     lens = LENS + np.array([[80.0, -60.0, 0.0, 0.0, 0.0], [-70.0, 90.0, 0.0, 0.0, 0.0]])
-    found = calibrate(
-        observed(robot, poses, lens), robot.joint_types, source="recorded", image_size=size, lens=True
-    )
+    found = calibrated(robot, observed(robot, poses, lens), image_size=size, lens=True)
     assert found.lens_terms == 4
     off = (found.lens[:, :2] - lens[:, :2]).ravel()
     centers = found.sqrt_cov_shared[-8:].reshape(2, 4, -1)[:, 2:].reshape(4, -1)
@@ -85,9 +77,7 @@ def test_a_centre_of_the_lens_elsewhere_is_found(robot, poses, size):
 
 def test_without_the_lens_the_fit_says_what_would_explain_it(robot, poses):
     weak = LENS * [1.0, 1.0, 1.0, 0.3, 0.3]
-    calibration = calibrate(
-        observed(robot, poses, weak), robot.joint_types, source="recorded", image_size=IMAGE_SIZE
-    )
+    calibration = calibrated(robot, observed(robot, poses, weak))
     assert any("try --lens" in text for text in calibration.advice)
     assert "limited by lens" in calibration.reason
     assert calibration.lens is None
@@ -96,16 +86,13 @@ def test_without_the_lens_the_fit_says_what_would_explain_it(robot, poses):
 def test_a_fit_that_a_lens_spoils_is_refused_with_the_remedy(robot, poses):
     strong = observed(robot, poses, LENS * [1.0, 1.0, 1.0, 3.0, 3.0])
     with pytest.raises(WorkFailed, match="try --lens"):
-        calibrate(strong, robot.joint_types, source="recorded", image_size=IMAGE_SIZE)
+        calibrated(robot, strong)
 
 
 def test_straight_images_show_no_lens_and_lose_little(robot, poses):
     straight = observed(robot, poses, LENS * [1.0, 1.0, 1.0, 0.0, 0.0])
     without, with_lens = (
-        calibrate(
-            straight, robot.joint_types, sigma_px=SIGMA, source="simulated", image_size=IMAGE_SIZE, lens=lens
-        )
-        for lens in (False, True)
+        calibrated(robot, straight, sigma_px=SIGMA, source="simulated", lens=lens) for lens in (False, True)
     )
     k = with_lens.lens[:, 3:].ravel()
     assert k @ np.linalg.solve(with_lens.sqrt_cov_shared[-4:] @ with_lens.sqrt_cov_shared[-4:].T, k) < 18.5
@@ -118,10 +105,3 @@ def test_straight_images_show_no_lens_and_lose_little(robot, poses):
         assert np.sqrt(np.mean(off**2) / np.mean(variance)) < 1.4
     # Four parameters more cost certainty, by the Cramér–Rao bound, and never add any.
     assert (prediction_variance(with_lens, q) >= 0.999 * prediction_variance(without, q)).mean() > 0.99
-
-
-def test_what_cannot_be_asked_for(robot, bent):
-    with pytest.raises(InputError, match="closed_form"):
-        calibrate(bent, robot.joint_types, method="closed_form", lens=True)
-    with pytest.raises(InputError, match="width before height"):
-        calibrate(bent, robot.joint_types, image_size=(500, 1024), lens=True)

@@ -10,6 +10,7 @@ from projservo_cli.records import WorkFailed
 from projservo_cli.report.report_data import findings
 from tests.calibration.bound import errors_of_the_best
 from tests.calibration.mistakes import KINDS, MISTAKES, median_error, shares_left_out, table
+from tests.calibration.simulated_robot import random_robot, trials
 
 
 def calibrated(mistaken, **given):
@@ -38,6 +39,25 @@ def test_tracks_of_something_else_are_told_with_the_reason(mistake, why):
     assert set(told["tracks"][why]) == set(truth.tolist())
     assert told["observations"] <= 3
     assert told["poses"] == []
+
+
+@pytest.mark.parametrize("lost", ["swept away", "seen once, wrongly"])
+def test_a_marker_whose_readings_are_all_wrong_costs_that_marker_alone(lost):
+    robot, column = random_robot("RRRRRR", np.random.default_rng(30)), 4
+    observation = robot.observe(trials(robot), 0.5, np.random.default_rng(1))
+    images, number = observation.images, observation.marker[column]
+    if lost == "swept away":
+        images[:, :, column] += np.random.default_rng(6).uniform(60, 200, (len(images), 2, 2))
+    else:
+        images[1:, :, column] = np.nan
+        images[0, 0, column] += 150.0
+    found = calibrate(observation, "RRRRRR", source="recorded")
+    assert found.usable, found.reason
+    assert number not in found.marker
+    assert len(found.marker) == len(found.M) == len(observation.marker) - 1
+    seen = np.isfinite(images[:, :, column, 0])
+    assert (found.outlier[:, 1] == number).sum() == seen.any(axis=1).sum()
+    assert any(f"marker {number}" in text for text in found.advice)
 
 
 def test_sightings_left_out_that_agree_on_other_joints_are_told():

@@ -49,7 +49,7 @@ FAULTS = {
 
 def table(robot, fault, i, size, seed):
     """Observation of an arm with a fault, and the joints as read."""
-    q = robot.q_reference + around(robot, K, np.random.default_rng(seed), angle=ANGLE) - robot.q_reference
+    q = around(robot, K, np.random.default_rng(seed), angle=ANGLE)
     true = robot.q_reference + fault(q - robot.q_reference, i, size)
     seen = robot.observe(true, SIGMA, np.random.default_rng(seed + 1))
     return dataclasses.replace(seen, q=q)

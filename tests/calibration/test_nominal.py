@@ -90,10 +90,6 @@ def wrong_zero(values):
     return values | {"q_reference": np.add(values["q_reference"], [1.0, 0.3, -1.0, 2.0]).tolist()}
 
 
-def exchanged_cameras(values):
-    return values | {"camera_left": values["camera_right"], "camera_right": values["camera_left"]}
-
-
 def renumbered(values):
     return values | {"marker_numbers": values["marker_numbers"][::-1]}
 
@@ -102,7 +98,7 @@ def behind(values):
     return values | {"T_base_tool_at_reference": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -1.4], [0, 0, 0, 1]]}
 
 
-@pytest.mark.parametrize("spoil", [wrong_robot, wrong_zero, exchanged_cameras, renumbered, behind])
+@pytest.mark.parametrize("spoil", [wrong_robot, wrong_zero, renumbered, behind])
 def test_a_wrong_start_leads_to_the_same_fit_all_the_same(robot, observation, alone, written, spoil):
     values = spoil(described(robot, observation))
     found = calibrate(observation, "RPRR", sigma_px=SIGMA, init=read_nominal(written(values)))
@@ -116,20 +112,11 @@ def test_a_wrong_start_leads_to_the_same_fit_all_the_same(robot, observation, al
 BAD = {
     "nothing": ("", r":1:1: not JSON: Expecting value"),
     "no camera": ({"camera_left": None}, r": camera_left: input should be a valid array"),
-    "NaN": ({"q_reference": [float("nan"), 0, 0, 0]}, r": q_reference.0: input should be a finite number"),
     "few joints": ({"q_reference": [0.0]}, r": q_reference: 1 values for 4 screws"),
     "flat camera": ({"camera_right": [[1, 0, 0, 0]] * 3}, r": camera_right: a camera matrix has three indep"),
     "twice": (
         {"marker_numbers": [1, 1, 2, 3, 4, 5]},
         r": marker_numbers: give each of the 6 markers its own",
-    ),
-    "skewed": (
-        {"T_base_tool_at_reference": np.diag([2, 2, 2, 1]).tolist()},
-        r": T_base_tool_at_reference: the upper left 3×3 block must be a rotation",
-    ),
-    "long axis": (
-        {"screws": [{"w": [0, 0, 2], "v": [0, 0, 0]}] * 4},
-        r": screws.0: w must be of unit length",
     ),
     "no axis": ({"screws": [{"w": [0, 0, float("nan")], "v": [0, 0, 0]}] * 4}, r": screws.0.w.2: .*finite"),
     "helix": ({"screws": [{"w": [0, 0, 1], "v": [0, 0, 1]}] * 4}, r": screws.0: v must be orthogonal to w"),

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from projservo_cli.calibration import calibrate
 from projservo_cli.records import Observation, WorkFailed
-from tests.calibration.simulated_robot import random_robot, trials
+from tests.calibration.simulated_robot import around, random_robot, trials
 
 SIGMA = 0.5
 TYPES = "RRRRRR"
@@ -17,32 +17,21 @@ METHODS = ("bundle_adjustment", "closed_form")
 ROBOT = random_robot(TYPES, np.random.default_rng(1), markers=6)
 SMALL = random_robot("RRR", np.random.default_rng(1), markers=6)
 Q = trials(ROBOT, 4)
-DIRECTION = np.array([0.6, 0.3, 0.5]) / np.linalg.norm([0.6, 0.3, 0.5])
+LINE = np.array([0.6, 0.3, 0.5]) / np.linalg.norm([0.6, 0.3, 0.5])
 
 
-def with_body(robot, points):
-    return dataclasses.replace(robot, markers=np.c_[points, np.ones(len(points))])
-
-
-def line(length, count):
-    return np.linspace(-0.5, 0.5, count)[:, None] * length * DIRECTION
-
-
-def seen(robot=ROBOT, q=None, sigma=SIGMA, seed=2):
-    return robot.observe(trials(robot, 4) if q is None else q, sigma, np.random.default_rng(seed))
+def seen(robot=ROBOT, q=None, sigma=SIGMA):
+    return robot.observe(trials(robot, 4) if q is None else q, sigma, np.random.default_rng(2))
 
 
 def changed(observation, **arrays):
     return dataclasses.replace(observation, **arrays)
 
 
-def some(observation, poses=slice(None), markers=slice(None)):
-    return Observation(
-        observation.pose[poses],
-        observation.marker[markers],
-        observation.q[poses],
-        observation.images[poses][:, :, markers],
-    )
+def some(poses=slice(None), markers=slice(None)):
+    observation = seen()
+    images = observation.images[poses][:, :, markers]
+    return Observation(observation.pose[poses], observation.marker[markers], observation.q[poses], images)
 
 
 def refusal(observation, types=TYPES, **given):
@@ -60,25 +49,45 @@ def noise(sigma, shape):
     return sigma * np.random.default_rng(8).standard_normal(shape)
 
 
+IMAGES = seen().images
+BLIND = np.where(np.arange(2)[:, None, None] == 1, np.nan, IMAGES)
+LITTLE = {
+    "no marker": some(markers=slice(0)),
+    "only one marker": some(markers=slice(1)),
+    "only two markers": some(markers=slice(2)),
+    "only one pose": some(poses=slice(1)),
+    "the right camera saw no marker": changed(seen(), images=BLIND),
+    "no marker was seen": changed(seen(), images=np.full_like(IMAGES, np.nan)),
+    "without a baseline": changed(seen(), images=IMAGES[:, [0, 0]]),
+}
+
+
+@pytest.mark.parametrize("words", LITTLE)
+def test_what_shows_too_little_says_what_lacks(words):
+    assert words in refusal(LITTLE[words])
+
+
 @pytest.mark.parametrize(
-    ("count", "words"), [(0, "no marker"), (1, "only one marker"), (2, "only two markers")]
+    ("types", "count", "enough"), [("RRRRRR", 5, 6), ("RRPRRR", 5, 6), ("RRRR", 4, 5), ("RRR", 3, 4)]
 )
-def test_too_few_markers(count, words):
-    assert words in refusal(some(seen(), markers=slice(count)))
-
-
-def test_a_single_pose():
-    assert "only one pose" in refusal(some(seen(), poses=slice(1)))
+def test_as_few_numbers_as_the_joints_have_are_refused(types, count, enough):
+    robot, q = random_robot(types, np.random.default_rng(3)), []
+    for number in (count, enough + 2):
+        q.append(around(robot, number, np.random.default_rng(3)))
+    for copies in (1, 4):  # copies show nothing more
+        message = refusal(seen(robot, np.repeat(q[0], copies, axis=0)), types)
+        assert re.match(rf"{count} poses show .* record {enough} or more", message)
+    calibrate(seen(robot, q[1]), types, source="recorded")
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_joint_without_trials_is_named(method):
     moved = np.abs(Q - Q[0]) > 1e-9
-    for joint in (0, 3, 5):
-        message = refusal(some(seen(), poses=~moved[:, joint]), method=method)
+    for joint in (0, 5):
+        message = refusal(some(poses=~moved[:, joint]), method=method)
         assert f"joint {joint + 1} has no trial motion" in message
     # … nor one whose trials no camera saw.
-    images = np.where(moved[:, 3, None, None, None], np.nan, seen().images)
+    images = np.where(moved[:, 3, None, None, None], np.nan, IMAGES)
     assert "joint 4 has no trial motion" in refusal(changed(seen(), images=images), method=method)
 
 
@@ -99,61 +108,90 @@ def test_motion_lost_in_the_noise_names_the_joint_and_what_to_do(types, joint, a
     assert re.search(words, message)
 
 
-def test_a_view_that_sees_nothing_or_what_the_other_sees():
-    images = seen().images
-    blind = images.copy()
-    blind[:, 1] = np.nan
-    assert "the right camera saw no marker" in refusal(changed(seen(), images=blind))
-    assert "no marker was seen" in refusal(changed(seen(), images=np.full_like(images, np.nan)))
-    assert "without a baseline" in refusal(changed(seen(), images=images[:, [0, 0]]))
-
-
 @pytest.mark.parametrize("sigma", [0.0, SIGMA])
 def test_images_that_show_one_place_or_one_line(sigma):
-    observation = seen()
-    shape = observation.images.shape
-    images = observation.images.copy()
+    images = IMAGES.copy()
     images[:, 1] = 300.0 + noise(sigma, images[:, 1].shape)
-    message = refusal(changed(observation, images=images))
+    message = refusal(changed(seen(), images=images))
     # Without noise the first check says it, with noise the epipolar geometry has to be known.
     assert "the right images show no more than noise" in message or sigma > 0.0
-    assert "no more than noise" in refusal(changed(observation, images=300.0 + noise(sigma, shape)))
-    column = observation.images[..., 0]
-    images = np.stack([column, 0.3 * column + 7.0], axis=-1) + noise(sigma, shape)
-    message = refusal(changed(observation, images=images))
+    column = IMAGES[..., 0]
+    images = np.stack([column, 0.3 * column + 7.0], axis=-1) + noise(sigma, IMAGES.shape)
+    message = refusal(changed(seen(), images=images))
     assert "left images show all markers at all poses on one line" in message
-
-
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("sigma", [0.0, SIGMA])
-def test_a_joint_that_reads_but_stands_still_is_named(method, sigma):
-    for joint in (0, 3, 5):
-        still = Q.copy()
-        still[:, joint] = Q[0, joint]
-        message = refusal(changed(seen(q=still, sigma=sigma), q=Q), method=method)
-        assert f"joint {joint + 1} stands still" in message
-        assert "60°" in message
 
 
 @pytest.mark.parametrize("sigma", [0.0, SIGMA])
 @pytest.mark.parametrize("wrong", [0.0, 0.05])
 def test_markers_on_a_line_are_seen_through_wrong_detections(sigma, wrong):
-    observation = seen(with_body(ROBOT, line(0.15, 8)), trials(ROBOT), sigma)
+    points = np.linspace(-0.5, 0.5, 8)[:, None] * 0.15 * LINE
+    observation = seen(changed(ROBOT, markers=np.c_[points, np.ones(8)]), trials(ROBOT), sigma)
     images = observation.images.copy()
     images[np.random.default_rng(5).random(images.shape[:3]) < wrong] += 40.0
     for method in METHODS:
         assert "the markers lie on one line" in refusal(changed(observation, images=images), method=method)
 
 
-def test_joint_readings_and_types_that_are_not_the_robots():
-    """Joint readings in degrees, and exchanged views; others in ``test_diagnosis``."""
-    observation = seen(SMALL, trials(SMALL, 4))
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("sigma", [0.0, SIGMA])
+def test_a_joint_that_reads_but_stands_still_is_named(method, sigma):
+    still = Q.copy()
+    still[:, 3] = Q[0, 3]
+    message = refusal(changed(seen(q=still, sigma=sigma), q=Q), method=method)
+    assert "joint 4 stands still" in message
+    assert "60°" in message
+
+
+PRISMATIC = random_robot("RPRP", np.random.default_rng(3), markers=6)
+AROUND = around(PRISMATIC, 40, np.random.default_rng(1))
+
+
+def test_a_joint_that_stands_still_in_poses_of_all_joints_is_named():
+    true = AROUND.copy()
+    true[:, 1] = PRISMATIC.q_reference[1]
+    message = refusal(changed(seen(PRISMATIC, true), q=AROUND), "RPRP")
+    assert "joint 2 stands still" in message
+    assert "its readings" in message
+
+
+def test_what_no_single_joint_explains_names_none():
+    geared = AROUND.copy()
+    geared[:, 0] = AROUND[0, 0] + 1.3 * (AROUND[:, 0] - AROUND[0, 0])
+    message = refusal(changed(seen(PRISMATIC, AROUND), q=geared), "RPRP")
+    assert "by the images" not in message
+    assert "does not describe the data" in message or "contradict the joint readings" in message
+
+
+def test_readings_in_degrees_and_views_exchanged_now_and_then_are_told():
+    observation = seen(SMALL)
     assert "units" in refusal(changed(observation, q=np.degrees(observation.q)), "RRR")
     images = observation.images.copy()
     images[::2] = images[::2, ::-1]
-    for method in METHODS:
-        message = refusal(changed(observation, images=images), "RRR", method=method)
-        assert "does not describe the data" in message or "correspondences" in message
+    message = refusal(changed(observation, images=images), "RRR")
+    assert "does not describe the data" in message or "correspondences" in message
+
+
+@pytest.mark.parametrize(
+    ("types", "joint", "seed", "motions"), [("RRPRRR", 2, 5, trials), ("RPRP", 0, 3, lambda robot: AROUND)]
+)
+def test_a_joint_of_the_wrong_type_is_named(types, joint, seed, motions):
+    robot = random_robot(types, np.random.default_rng(seed), markers=6)
+    right, wrong = ("revolute", "prismatic") if types[joint] == "R" else ("prismatic", "revolute")
+    flipped = types[:joint] + ("P" if types[joint] == "R" else "R") + types[joint + 1 :]
+    message = refusal(seen(robot, motions(robot)), flipped)
+    assert message.startswith(f"by the images joint {joint + 1} is {right}, not {wrong}: check the types")
+
+
+@pytest.mark.parametrize(("kinds", "length", "single"), [("PRRRRR", 0.05, True), ("RRRRP", 0.02, False)])
+def test_a_prismatic_joint_whose_fit_as_revolute_would_pass_is_named(kinds, length, single):
+    """With an axis far away, three to eleven times the stated error."""
+    robot = random_robot(kinds, np.random.default_rng(1))
+    rng = np.random.default_rng(2)
+    poses = trials(robot, length=length) if single else around(robot, 60, rng, length=length)
+    observation = robot.observe(poses, 0.3, rng)
+    message = refusal(observation, "R" * len(kinds), joint_noise=None)
+    assert re.search(rf"joint {kinds.index('P') + 1} is prismatic, .*{kinds} would fit", message)
+    assert calibrate(observation, kinds, source="recorded", joint_noise=None).usable
 
 
 @pytest.mark.parametrize("tail", [1e-4, 1.0 - 1e-4])

@@ -40,7 +40,7 @@ class Cameras:
         return k, middle[k]
 
 
-def on_the_way(robot, cameras, rng, *, stamped=False, tick=0.0):
+def on_the_way(robot, cameras, rng, *, stamped=False):
     """Poses in motion, smooth from rest to rest, and the mean delay (2,) of their frames, each once."""
     pose = np.concatenate([robot.q_reference[None], around(robot, MOTIONS, rng)])
     rows, late, frames = [], [[], []], {}
@@ -68,8 +68,7 @@ def on_the_way(robot, cameras, rng, *, stamped=False, tick=0.0):
                 frames[view, number] = pixels + SIGMA * rng.standard_normal(pixels.shape)
                 late[view].append(now - middle)
             shown[view], stamps[view] = frames[view, number], middle + 77.0 + view
-        q = joints(now)
-        rows.append((int(k) + 1, now, q if tick == 0.0 else np.round(q / tick) * tick, shown, stamps))
+        rows.append((int(k) + 1, now, joints(now), shown, stamps))
     moving, t_q, q, images, stamps = (np.array(column) for column in zip(*rows, strict=True))
     seen = Observation(-1 - np.arange(len(rows)), 5 + 3 * np.arange(6), q, images, moving, t_q)
     return dataclasses.replace(seen, t_view=stamps if stamped else None), np.array([np.mean(d) for d in late])

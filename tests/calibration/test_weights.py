@@ -9,8 +9,7 @@ import pytest
 from projservo_cli.calibration import calibrate, cross_validate, predict, prediction_variance
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import Epipolar
-from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.store.tables import read_table, write_table
+from projservo_cli.records import WorkFailed
 from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -58,24 +57,6 @@ def test_the_bound_is_reached_and_chi2_is_one(draws):
             [(h.residual / h.predicted)[o.sigma == sigma].ravel() for h, o in zip(held, seen, strict=True)]
         )
         assert np.sqrt(np.nanmean(each**2)) == pytest.approx(1.0, abs=0.1)
-
-
-def test_tables_keep_deviations_to_the_bit_and_refuse_what_is_none(draws, tmp_path):
-    observation, path = draws[3][0], tmp_path / "table.csv"
-    images = observation.images.copy()
-    images[2, 1, 3] = np.nan
-    write_table(dataclasses.replace(observation, images=images), path)
-    found = read_table(path)
-    np.testing.assert_array_equal(found.sigma, np.where(np.isnan(images[..., 0]), np.nan, observation.sigma))
-    text = path.read_text(encoding="utf-8")
-    for wrong, message in (
-        (text.replace("sigma_right", "other"), r":1: give the columns sigma_left and sigma_right both"),
-        (text.replace(",0.1,", ",-0.1,", 1), "sigma_left is '-0.1'; expected a positive number, px"),
-        (text.replace(",0.1,", ",,", 1), "sigma_left is ''; expected a finite number"),
-    ):
-        path.write_text(wrong, encoding="utf-8")
-        with pytest.raises(InputError, match=message):
-            read_table(path)
 
 
 def misstated(observation, factor):

@@ -95,26 +95,12 @@ def test_laws_are_those_asked_for_in_their_order_and_others_stay(projservo, repo
     assert list(load("out").traces) == ["direct_three", "stacked", "blockwise"]
 
 
-CALIBRATE_KEYS = {
-    *("run", "usable", "reason", "advice", "rms_px", "sigma_px", "chi2_per_dof", "seconds", "joints"),
-    *("outliers", "suspect_joint_readings", "id_switches", "poses_used", "markers_used"),
-    "rejected",
-}
-LAW_KEYS = {
-    *("law", "verdict", "steps", "position_error_mm", "rotation_error_deg"),
-    *("self_occluded_steps_left", "self_occluded_steps_right"),
-    *("center_deviation_mm", "center_deviation_at_samples_mm"),
-}
-
-
-def test_json_objects_have_the_documented_keys(projservo, stages, tmp_path):
-    answer = projservo("servo", "plan", "calibrate", "-c", "tiny.yaml", "-o", "out", "--json")
-    value = answer.json
+def test_json_objects_have_names_for_numbers_and_null_for_none(projservo, stages, tmp_path):
+    """That they have the documented keys is tested with the page on commands."""
+    value = projservo("servo", "plan", "calibrate", "-c", "tiny.yaml", "-o", "out", "--json").json
     assert all(part["run"] == str(tmp_path / "out/run.h5") for part in value.values())
     calibrate = value["calibrate"]
-    assert set(calibrate) >= CALIBRATE_KEYS
-    assert calibrate["usable"] is True
-    assert calibrate["advice"] == ["more"]
+    assert (calibrate["usable"], calibrate["advice"], calibrate["poses_used"]) == (True, ["more"], 3)
     assert calibrate["chi2_per_dof"] is None  # not a number
     assert calibrate["outliers"] == [
         {"pose": 3, "marker": 1, "view": "left"},
@@ -122,13 +108,9 @@ def test_json_objects_have_the_documented_keys(projservo, stages, tmp_path):
     ]
     assert calibrate["suspect_joint_readings"] == []
     assert (calibrate["rejected"]["observations"], calibrate["rejected"]["poses"]) == (2, [])
-    assert calibrate["poses_used"] == 3
     names = [(joint["name"], joint["type"]) for joint in calibrate["joints"]]
     assert names == [("q1", "R"), ("elbow", "R")]
-    assert set(calibrate["joints"][0]) >= {"name", "type", "excitation", "poorly_observable"}
-    assert set(value["servo"]["laws"][0]) >= LAW_KEYS
     assert value["servo"]["laws"][0]["position_error_mm"] is None
-    assert set(projservo("plan", "-o", "out", "--json").json) >= {"run", "feasible", "reason", "theta_s_deg"}
 
 
 def test_what_fails_is_an_object_with_exit_code_1(projservo, stages, refused):
@@ -141,7 +123,6 @@ def test_what_fails_is_an_object_with_exit_code_1(projservo, stages, refused):
     stages.fails["calibrate"] = refused
     chain = projservo("calibrate", "plan", "servo", "-c", "tiny.yaml", "-o", "new", "--json")
     assert chain.code == 1
-    assert set(chain.json["calibrate"]) >= CALIBRATE_KEYS
     assert (chain.json["calibrate"]["usable"], chain.json["calibrate"]["reason"]) == (False, str(refused))
     assert chain.json["servo"]["laws"] == []
     assert chain.json["servo"]["failed"] == "calibrate"
@@ -157,11 +138,6 @@ def test_a_law_that_must_converge_decides_the_exit_code(projservo, stages):
     assert "direct_three must converge, but ended in no progress" in answer.err
     assert answer.json["laws"][0]["verdict"] == "no progress"
     assert projservo("servo", "report", "-o", "out").code == 1  # up to date, and still not converged
-    assert projservo("servo", "-o", "out", "--set", "control.must_converge=[stacked]").code == 1
-    stages.verdicts = {}
-    assert projservo("servo", "-o", "out", "--law", "stacked", "--force").code == 0
-    assert projservo("servo", "-o", "out").code == 0
-    assert projservo("servo", "-o", "out", "--set", "control.must_converge=[direct_three]").code == 1
 
 
 OWN = "tests.cli.conftest:Law"

@@ -16,7 +16,7 @@ from projservo_cli.config import load_config
 from projservo_cli.simulation.mjcf import mujoco
 from tests.configured import truth_of
 from tests.detection.rendering import render, square
-from tests.documentation.blocks import PAGES, ROOT, blocks_of, matches, run_page
+from tests.documentation.blocks import PAGES, ROOT, blocks_of, run_page
 
 # Those that run laws or plan: only with the compiler.
 DRIVING = {
@@ -35,21 +35,6 @@ DRIVING = {
 LANGUAGES = {"sh", "python", "text", "xml", "yaml"}
 # What cannot be run by a test, and how often it stands there.
 NOT_RUN = {"install": 1, "rendered-cameras": 1, "so101": 5, "use-a-cluster": 1}
-
-
-@pytest.mark.parametrize(
-    ("shown", "same"),
-    [
-        ("steps 101 mm\n0.0118, 0.4 s", True),
-        ("steps 103 mm 0.01185, 9 s", True),
-        ("steps 106 mm 0.0118, 0.4 s", False),
-        ("steps 101 mm 0.0121, 0.4 s", False),
-        ("15 omitted", False),
-        ("omitted", True),
-    ],
-)
-def test_an_output_is_compared_with_its_numbers_but_not_how_long_it_took(shown, same):
-    assert matches(shown, "law: steps 101 mm 0.0118, 0.4 s\n16 omitted") == same
 
 
 @pytest.fixture
@@ -129,10 +114,7 @@ def check_installation(folder, names, read):
 
 def check_tutorial(folder, names, read):
     run = projservo_cli.load("results/task")
-    assert {name: trace.verdict for name, trace in run.traces.items() if name in {"direct_two", "exact"}} == {
-        "direct_two": "converged",
-        "exact": "converged",
-    }
+    assert {run.traces[name].verdict for name in ("direct_two", "exact")} == {"converged"}
     assert run.calibration.source == "recorded"
     drift = {name: run.traces[name].center_deviation_mm for name in ("exact", "direct_two")}
     assert drift["exact"] < drift["direct_two"]
@@ -201,10 +183,9 @@ def check_robot(folder, names, read):
     """Both laws converge within their limits, and an arm without commands comes to rest."""
     assert names["robot"].q == pytest.approx(names["gone"], abs=1e-6)
     run = projservo_cli.load("results/mine")
-    assert {name: trace.verdict for name, trace in run.traces.items()} == {
-        "direct_three": "converged",
-        "exact": "converged",
-    }
+    assert {law: trace.verdict for law, trace in run.traces.items()} == dict.fromkeys(
+        ("direct_three", "exact"), "converged"
+    )
     task = load_config("mine.yaml").task
     for trace in run.traces.values():
         np.testing.assert_allclose(trace.q[0], task.start.joints, atol=1e-3)
@@ -217,24 +198,22 @@ def check_robot(folder, names, read):
 
 
 def check_teach(folder, names, read):
-    assert (
-        len(load_config("configs/ur5.yaml", [f"task.goal={folder / 'there.yaml'}"]).task.goal.images.markers)
-        == 10
-    )
+    config = load_config("configs/ur5.yaml", [f"task.goal={folder / 'there.yaml'}"])
+    assert len(config.task.goal.images.markers) == 10
 
 
 def check_paper(folder, names, read):
     """The table of claims is that of the report: each claim, and whether it holds."""
     text = PAGES["reproduce-the-paper"].read_text(encoding="utf-8")
-    told = {row[1].strip(): row[4].strip(" *") for row in map(cells, text.splitlines()) if len(row) == 6}
+    told = {
+        row[1].strip(): row[4].strip(" *")
+        for row in (line.split("|") for line in text.splitlines())
+        if len(row) == 6
+    }
     claims = json.loads(Path("results/paper/claims.json").read_text(encoding="utf-8"))["claims"]
     assert {claim["claim"]: "yes" if claim["holds"] else "no" for claim in claims}.items() <= told.items()
     figures = set(re.findall(r"`(fig\d\d_\w+)`", text))
     assert figures == {path.stem for path in Path("results/paper/figures").glob("*.svg")}
-
-
-def cells(line):
-    return line.split("|")
 
 
 HAS = {

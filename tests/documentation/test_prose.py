@@ -45,13 +45,6 @@ def test_sentences_are_short(page):
     assert len(long) <= max((1 - SHARE) * len(found), 1), long
 
 
-def test_no_page_names_the_profile_joint_space_by_half():
-    """The configuration refuses `joint`; in generated regions it is a key."""
-    assert [
-        page.name for page in PROSE if "`joint`" in REGION.sub("", page.read_text(encoding="utf-8"))
-    ] == []
-
-
 # What a maintainer searches for, and the file below the package that defines it.
 TERMS = {
     "April ?tag": "detection",

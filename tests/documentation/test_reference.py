@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from docs.generate import generated, keys, python, regions, regions_of
+from docs.generate import generated, keys, regions, regions_of
 from docs.generate.python import INTERFACE
 from projservo_cli import records
 from projservo_cli.cli import main
@@ -38,33 +38,9 @@ def test_every_key_has_a_row(schema):
     assert all(len(row) == 5 and row[4] for row in rows)
 
 
-PAIR = "list of 2 × (whole number, ≥ 1, ≤ 1,000,000)"
-
-
-def test_a_key_is_told_as_it_is():
-    rows = [tuple(row[:4]) for row in told(keys.all_keys(json_schema()))]
-    assert {
-        ("`period_s`", "number, > 0", "`0.04`", "s"),
-        ("`joint_speed_limit_deg_s`", "number, > 0 or null", "`125.0`", "°/s"),
-        ("`gain_t`", "number, > 0", "`2.5`", "1/s"),
-        ("`self_occlusion`", "`transparent`, `opaque`", "`transparent`", ""),
-        ("`image_size_px`", PAIR + f" or list of 2 × ({PAIR})", "required", "px"),
-        ("`table`", "text", "required", ""),
-        ("`lens`", "true or false", "`false`", ""),
-    } <= set(rows)
-
-
-def test_every_column_of_a_sweep_has_a_row():
-    *lines, last = regions.sweep_columns()
-    rows = {row[0].strip("`"): row for row in told(lines)}
-    assert list(rows) == [column.name for column in (*NUMBERED, *MEASURED, BETWEEN)]
-    assert rows["path_length_mm"] == [
-        *("`path_length_mm`", "number", "mm", "length of the path of the centre, from sample to sample")
-    ]
-    assert "between_samples" in last
-
-
-def test_every_field_of_every_record_has_a_row():
+def test_every_column_field_command_and_equation_is_there():
+    columns = [row[0].strip("`") for row in told(regions.sweep_columns())]
+    assert columns == [column.name for column in (*NUMBERED, *MEASURED, BETWEEN)]
     rows = told(regions.run_file())
     classes = filter(dataclasses.is_dataclass, vars(records).values())
     named = {kind for kind in classes if dataclasses.fields(kind)[0].metadata}
@@ -72,21 +48,9 @@ def test_every_field_of_every_record_has_a_row():
     assert set(regions.GROUPS.values()) == kinds
     assert len(rows) == sum(len(dataclasses.fields(kind)) for kind in kinds)
     assert all(len(row) == 4 and row[1] and row[3] for row in rows)
-
-
-def test_every_command_and_equation_is_there():
     commands = "\n".join(regions.commands())
     assert re.findall(r"^## projservo ([\w-]+)$", commands, flags=re.MULTILINE) == list(main.commands)
     assert len(cells(regions.equations())) == 2 + len(REGISTER)
-
-
-def test_sections_of_docstrings_become_lists():
-    given = "Parameters\n----------\nq, q_dot : (n,) readings of ``x``,\n    rad or m.\n\n"
-    raised = "Raises\n------\nInputError\n    If not."
-    assert [line for line in python.markdown(f"Summary.\n\n{given}{raised}") if line] == [
-        *("Summary.", "**Parameters**", "- `q, q_dot`: (n,) readings of `x`, rad or m."),
-        *("**Raises**", "- `InputError`: If not."),
-    ]
 
 
 def test_the_generated_regions_are_current():

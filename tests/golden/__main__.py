@@ -1,10 +1,10 @@
 """Keep every number of what projservo ships, and compare two such sets.
 
-    OPENBLAS_NUM_THREADS=1 python -m tests.golden make FOLDER [--chains NAME ...] [--keep]
+    OPENBLAS_NUM_THREADS=1 python -m tests.golden make FOLDER [--chains NAME ...]
     python -m tests.golden compare OLD NEW
 
-``make`` runs each chain as a command of its own, stores its numbers in FOLDER/NAME.npz, and says whether they
-are those of ``hashes.json``, which ``--keep`` writes anew. Numbers agree to the bit on one machine alone.
+``make`` runs each chain as a command of its own and stores its numbers in FOLDER/NAME.npz. Numbers agree to
+the bit on one machine alone.
 ``compare`` ends with exit code 1 where a number is lost, or off by more than 1e-9.
 """
 
@@ -22,9 +22,8 @@ import numpy as np
 import yaml
 
 from tests.conftest import ROOT
-from tests.golden.numbers import differences, digest_of, of_file, of_json, plain
+from tests.golden.numbers import differences, of_file, of_json, plain
 
-HASHES = Path(__file__).with_name("hashes.json")
 CONFIGS, DATA = ROOT / "configs", ROOT.parent / "shared" / "data"
 FEW = 2  # values of an axis of a sweep, and runs and tasks of it
 LISTED = 40  # names that are told of a kind
@@ -110,23 +109,15 @@ def calibrated(path: Path) -> str:
         return str(file["calibrate"].attrs["configuration"]).replace(str(ROOT), "")
 
 
-def make(folder: Path, names: list[str], keep: bool) -> int:
-    """Store the numbers of chains; 1 where they are not those of the repository."""
+def make(folder: Path, names: list[str]) -> None:
+    """Store the numbers of chains."""
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         sys.exit("set OPENBLAS_NUM_THREADS=1: sums of several threads differ in the last bits")
     folder.mkdir(parents=True, exist_ok=True)
-    hashes = json.loads(HASHES.read_text(encoding="utf-8")) if HASHES.exists() else {}
-    off = 0
     for name in names:
         numbers = numbers_of(name, folder)
         np.savez_compressed(folder / f"{name}.npz", **numbers)
-        digest = digest_of(numbers)
-        print(f"{name}: {len(numbers)} numbers, {'as' if hashes.get(name) == digest else 'not as'} kept")
-        off += hashes.get(name) != digest
-        hashes[name] = digest
-        if keep:
-            HASHES.write_text(json.dumps(hashes, indent=2, sort_keys=True) + "\n", encoding="utf-8")
-    return int(off > 0 and not keep)
+        print(f"{name}: {len(numbers)} numbers")
 
 
 def compare(old: Path, new: Path) -> int:
@@ -154,13 +145,13 @@ def main() -> None:
     making = verbs.add_parser("make")
     making.add_argument("folder", type=Path)
     making.add_argument("--chains", nargs="+", choices=chains(), default=chains())
-    making.add_argument("--keep", action="store_true", help="write hashes.json anew")
     comparing = verbs.add_parser("compare")
     comparing.add_argument("old", type=Path)
     comparing.add_argument("new", type=Path)
     given = parser.parse_args()
     if given.verb == "make":
-        sys.exit(make(given.folder, given.chains, given.keep))
+        make(given.folder, given.chains)
+        return
     sys.exit(compare(given.old, given.new))
 
 

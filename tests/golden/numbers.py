@@ -1,6 +1,5 @@
 """Numbers of run files and of ``--json``, read by h5py and json alone, and how two sets of them differ."""
 
-import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping
@@ -68,16 +67,6 @@ def plain(array: np.ndarray, folder: Path) -> np.ndarray:
         text = json.dumps(array.tolist(), default=str)
         return np.array(text.replace(str(folder.resolve()), "FOLDER").replace(str(folder), "FOLDER"))
     return array
-
-
-def digest_of(numbers: Mapping[str, np.ndarray]) -> str:
-    """Hash of all names, types, shapes and bytes."""
-    digest = hashlib.sha256()
-    for name in sorted(numbers):
-        value = np.ascontiguousarray(numbers[name])
-        digest.update(f"{name}|{value.dtype.str}|{value.shape}|".encode())
-        digest.update(value.tobytes())
-    return digest.hexdigest()
 
 
 def differences(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> dict[str, list[str]]:

@@ -12,8 +12,9 @@ from projservo_cli.config.inputs import truth_of
 from projservo_cli.metric.frame import Metric
 from projservo_cli.records import Calibration, InputError, WorkFailed
 from projservo_cli.results import ImageModel
-from tests.calibration.simulated_robot import Robot, prismatic, revolute, rig
+from tests.calibration.simulated_robot import Robot, rig
 from tests.known import configured
+from tests.samples import prismatic, revolute
 
 POINTS = np.array([[0.1, 0, 0, 1], [0, 0.12, 0, 1], [0, 0, 0.08, 1], [-0.05, 0.02, 0.03, 1]])
 X, Y, Z = np.eye(3)
@@ -50,7 +51,7 @@ def calibrated(arm, frame):
     return ImageModel(**fields)
 
 
-ELBOW = (revolute(Z, 0.1 * X), revolute(Y, 0.2 * Z), revolute(Y, 0.4 * Z), revolute(X, 0.5 * Z))
+ELBOW = (revolute(0.1 * X, Z), revolute(0.2 * Z, Y), revolute(0.4 * Z, Y), revolute(0.5 * Z, X))
 
 
 @pytest.fixture

@@ -15,16 +15,7 @@ from tests.configured import compared, view_of
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 # A machine without a graphics processor draws three dimensions by software.
 ARGUMENTS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-# Boxes of all figures, and whether their lines are drawn; elements that reach beyond the page, but those
-# within what scrolls by itself.
-FIGURES = """() => [...document.querySelectorAll("figure")].map(figure => {
-  const image = figure.querySelector("img"), box = image.getBoundingClientRect();
-  const canvas = Object.assign(document.createElement("canvas"), {width: 200, height: 200});
-  const context = canvas.getContext("2d");
-  context.drawImage(image, 0, 0, 200, 200);
-  const dark = context.getImageData(0, 0, 200, 200).data.filter((value, k) => k % 4 == 0 && value < 128);
-  return [box.left, box.right, box.width, box.height, dark.length > 20];
-})"""
+# Elements that reach beyond the page, but those within what scrolls by itself.
 BEYOND = """width => [...document.querySelectorAll("body *")]
   .filter(e => e.getBoundingClientRect().right > width + 1 && !e.closest(".scene")
     && !(e.parentElement.closest(".wide, pre") && getComputedStyle(e.parentElement.closest(".wide, pre"))
@@ -83,21 +74,12 @@ def pages(run, view, tmp_path_factory):
 
 @pytest.mark.parametrize("width", [390, 1400])
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-@pytest.mark.parametrize(("name", "figures"), [("report", 4), ("comparison", 8), ("view", 0)])
-def test_everything_is_seen_at_every_width(browser, pages, name, figures, width, dark):
+@pytest.mark.parametrize("name", ["report", "comparison", "view"])
+def test_pages_fit_every_width_in_light_and_in_dark(browser, pages, name, width, dark):
     with opened(browser, pages[name], width, dark) as page:
         assert page.evaluate("document.documentElement.scrollWidth") <= width, page.evaluate(BEYOND, width)
         ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert (ground == "rgb(255, 255, 255)") != dark
-        boxes = page.evaluate(FIGURES)
-    assert len(boxes) == figures
-    share = 0.4 if name == "comparison" and width > 390 else 0.85
-    for left, right, wide, high, ink in boxes:
-        assert left >= 0
-        assert right <= width
-        assert wide >= share * min(width, 700)
-        assert high > 100
-        assert ink
 
 
 def robot(page):

@@ -1,7 +1,5 @@
-"""A run as an object: what its calibration predicts, against the run's own data and differences."""
+"""A run as an object: what its calibration predicts, against differences and limits."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +7,6 @@ import pytest
 
 import projservo_cli
 from projservo_cli import cli
-from projservo_cli.config import load_config
-from tests.configured import truth_of
 
 STANFORD = Path(__file__).parents[2] / "configs" / "stanford.yaml"
 
@@ -20,20 +16,6 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     assert cli.run(["calibrate", "-c", str(STANFORD), "-o", str(folder), "-q"]) == 0
     return projservo_cli.load(folder)
-
-
-def test_predictions_are_near_the_truth(run):
-    calibration = run.calibration
-    truth = truth_of(load_config(STANFORD))
-    rng = np.random.default_rng(0)
-    q = calibration.q_reference + rng.uniform(-0.3, 0.3, (20, 6)) * [1, 1, 0.3, 1, 1, 1]
-    true = np.array([truth.images(row, truth.M) for row in q])
-    predicted = calibration.predict(q)
-    assert predicted.shape == (20, 2, 10, 2)
-    assert (
-        np.sqrt(np.mean((predicted - true) ** 2)) < 0.3
-    )  # 0.15 px per coordinate is what 0.5 px noise leaves
-    np.testing.assert_allclose(calibration.predict(q[3]), predicted[3], atol=1e-9)
 
 
 def test_the_jacobian_is_the_derivative_of_the_prediction(run):
@@ -60,13 +42,3 @@ def test_points_behind_a_camera_have_no_pixels_and_those_at_infinity_vanishing_p
     limit = np.where(np.isnan(far[0]), far[1], far[0])
     for point in (way, -way):
         np.testing.assert_allclose(calibration.project(point), limit, rtol=1e-6)
-
-
-def test_importing_the_package_stays_light():
-    code = (
-        "import sys, projservo_cli; projservo_cli.__all__, projservo_cli.__version__\n"
-        "heavy = {'numpy', 'scipy', 'numba', 'pydantic', 'yaml', 'h5py', 'matplotlib', 'click'}\n"
-        "sys.exit(' '.join(sorted(heavy & set(sys.modules))) or 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")

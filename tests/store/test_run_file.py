@@ -19,6 +19,13 @@ SEAL_SIZE = 83  # bytes of the line behind the data
 LONG = "name: ä\n" * 30_000  # 240 kB: beyond what an HDF5 object header holds
 
 
+@pytest.fixture
+def path(tmp_path):
+    found = tmp_path / "run.h5"
+    found.write_bytes(sound_file())
+    return found
+
+
 def assert_same(a, b):
     assert type(a) is type(b)
     for field in dataclasses.fields(a):

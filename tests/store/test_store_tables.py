@@ -11,6 +11,7 @@ from projservo_cli.records import InputError, Observation
 from projservo_cli.store.tables import read_joint_list, read_table, write_table
 
 HEADER = "pose,marker,q1,q2,u_left,v_left,u_right,v_right"
+SIGMAS = f"{HEADER},sigma_left,sigma_right"
 ROWS = ["0,1,0.5,-1,10,20,30,40", "0,0,0.5,-1,11,21,31,41", "7,1,0.25,2e-1,12.5,22,,"]
 
 
@@ -42,6 +43,9 @@ BAD = {
     "two moments": (
         [f"{HEADER},t_q", f"{ROWS[0]},0.5", f"{ROWS[1]},"], ":3: t_q of pose 0 is None, but 0.5 in line 2"
     ),
+    "deviation of one view": ([f"{HEADER},sigma_left", f"{ROWS[0]},1"], ":1: give the columns sigma_l"),
+    "negative deviation": ([SIGMAS, f"{ROWS[0]},-0.1,1"], ":2: sigma_left is '-0.1'; expected a positive"),
+    "no deviation": ([SIGMAS, f"{ROWS[0]},,1"], ":2: sigma_left is ''; expected a finite number"),
     "open quote": ([HEADER, ROWS[0], '"0,1'], ":3: "),
     "nul byte": ([HEADER, "0,\0,1"], ":2: not a text file"),
 }  # fmt: skip
@@ -95,11 +99,15 @@ def test_writing_and_reading_is_exact(tmp_path_factory, data):
     for k, view, j in np.ndindex(images.shape[:3]):
         if data.draw(st.booleans()):
             images[k, view, j] = np.nan
-    table = Observation(np.array(poses), np.array(markers), q, images)
+    stated = data.draw(st.floats(1e-3, 1e3)) * (
+        1.0 + np.arange(images[..., 0].size).reshape(images.shape[:3])
+    )
+    sigma = np.where(np.isnan(images[..., 0]), np.nan, stated)
+    table = Observation(np.array(poses), np.array(markers), q, images, sigma=sigma)
     path = tmp_path_factory.mktemp("tables") / "table.csv"
     write_table(table, path)
     back = read_table(path, joint_unit="rad")
-    for name in ("pose", "marker", "q", "images"):
+    for name in ("pose", "marker", "q", "images", "sigma"):
         np.testing.assert_array_equal(getattr(back, name), getattr(table, name))
 
 

@@ -42,14 +42,6 @@ def _value(line: bytes, rng: np.random.Generator) -> list[bytes]:
     return [b": ".join(pieces)]
 
 
-def _number(line: bytes, rng: np.random.Generator) -> list[bytes]:
-    words = line.replace(b",", b" , ").replace(b"]", b" ]").replace(b"[", b"[ ").split(b" ")
-    places = [i for i, word in enumerate(words) if word[-1:].isdigit()]
-    if places:
-        words[places[rng.integers(len(places))]] = VALUES[rng.integers(len(VALUES))].encode()
-    return [b" ".join(words)]
-
-
 def _cell(line: bytes, rng: np.random.Generator) -> list[bytes]:
     cells = line.split(b",")
     cells[rng.integers(len(cells))] = CELLS[rng.integers(len(CELLS))].encode()
@@ -112,7 +104,6 @@ ANY: dict[str, Change] = {
 YAML = ANY | {
     "another value": _line(_value),
     "another value, again": _line(_value),
-    "another number": _line(_number),
     "another key": _line(lambda line, rng: [line.replace(b":", b"x:", 1)]),
     "indented": _line(lambda line, rng: [b" " * int(rng.integers(1, 5)) + line]),
     "bomb": _bomb,

@@ -1,6 +1,9 @@
 """Mistaken configurations and tables end in messages, and calls that are killed leave whole files."""
 
+import multiprocessing
 import os
+import shutil
+import sys
 import time
 import traceback
 from pathlib import Path
@@ -8,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from projservo_cli import cli
 from projservo_cli.config import load_config, load_sweep
 from projservo_cli.config.schema import starter
 from projservo_cli.records import InputError
@@ -15,7 +19,6 @@ from projservo_cli.store import load
 from projservo_cli.store.tables import read_joint_list, read_table
 from tests.conftest import ROOT
 from tests.survival.changes import CSV, YAML, Change
-from tests.survival.kills import killed
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="calls are forked here")
 SECONDS = 30.0  # of the processor; 7 where lines are counted. What unfolds without bounds takes minutes
@@ -81,7 +84,41 @@ def test_mistaken_configurations_and_tables_end_in_messages(tmp_path, first):
         assert wrong_reading(path) == "", (number, name, kind)
 
 
+SETTINGS = (
+    *("calibration.frames_per_joint=4", "control.laws=[direct_three, stacked]", "stop.max_steps=12"),
+    *("control.must_converge=[]", "control.features=points", "trajectory.n_samples=6"),
+)
+
+
+def call(folder: Path, seed: int, kill_after: float | None = None) -> int | None:
+    """Call the stages in a forked process, where nothing has to be imported anew: the exit code."""
+    settings = [part for value in (*SETTINGS, f"seed={seed}") for part in ("--set", value)]
+    config = str(ROOT / "configs" / "paper.yaml")
+    words = ["calibrate", "plan", "servo", "-q", "-c", config, "-o", str(folder), *settings]
+    child = multiprocessing.get_context("fork").Process(target=lambda: sys.exit(cli.run(words)))
+    child.start()
+    child.join(kill_after)
+    child.kill()
+    child.join()
+    return child.exitcode
+
+
 @pytest.mark.volume
 def test_a_killed_call_leaves_whole_files_and_is_finished_by_the_next(tmp_path):
-    assert killed(tmp_path / "killed", (0.3, 0.8)) == [[], []]
-    assert load(tmp_path / "killed").traces.keys() == {"direct_three", "stacked"}
+    """In a folder that holds a complete run of another seed."""
+    whole, folder = tmp_path / "whole", tmp_path / "killed"
+    assert call(whole, 0) == 0
+    shutil.copytree(whole, folder)
+    began = time.monotonic()
+    assert call(folder, 1) == 0
+    seconds = time.monotonic() - began
+    for share in (0.3, 0.8):
+        shutil.rmtree(folder)
+        shutil.copytree(whole, folder)
+        call(folder, 1, share * seconds)
+        # A lock, or what was being written, begins with a dot.
+        assert [path.name for path in folder.iterdir() if path.name[0] != "."] == ["run.h5"]
+        assert load(folder).results
+        assert call(folder, 1) == 0
+        assert [path.name for path in folder.iterdir()] == ["run.h5"]
+        assert load(folder).traces.keys() == {"direct_three", "stacked"}

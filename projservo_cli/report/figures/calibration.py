@@ -46,7 +46,7 @@ def _data(fit: Fit) -> Data:
     excluded = (rejected > 0) | ~np.isfinite(predicted).all(axis=-1)
     used = measured & ~excluded
     residual, variance = pixels - predicted, prediction_variance(calibration, observation.q)
-    weighed = calibration.sigma_q or observation.sigma is not None
+    weighed = calibration.sigma_q or observation.sigma is not None or calibration.sigma_view_px is not None
     if weighed:
         residual, variance = _as_tested(fit, residual, used)
     result: Data = {
@@ -94,9 +94,11 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
     """
     calibration, q = fit.calibration, fit.observation.q
     weight = np.ones(used.shape)
+    if calibration.sigma_view_px is not None:
+        weight *= (calibration.sigma_px / calibration.sigma_view_px)[None, :, None]
     if (stated := fit.observation.sigma) is not None:
         stated = stated[:, :, _columns(calibration, fit.observation)]
-        weight[used] = np.sqrt(np.mean(stated[used] ** 2)) / stated[used]
+        weight[used] *= np.sqrt(np.mean(stated[used] ** 2)) / stated[used]
     noise = (calibration.sigma_q or 0.0) * per_rad(calibration.prismatic) / calibration.sigma_px
     G = weight[..., None, None] * joint_derivative(calibration, q) * noise
     tested, variance = residual * weight[..., None], np.empty_like(residual)
@@ -205,7 +207,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     grid = figure.add_gridspec(3, 2, height_ratios=(1.15, 1.0, 0.9))
     images = grid[0, :].subgridspec(1, len(views))
     for v, view in enumerate(views):
-        _arrows(figure.add_subplot(images[0, v]), data, view)
+        _arrows(figure.add_subplot(images[0, v]), data, view, ", " if len(views) <= 2 else "\n")
     panels = [[figure.add_subplot(grid[i, j]) for j in (0, 1)] for i in (1, 2)]
     _histogram(panels[0][0], data)
     _poses(panels[0][1], data)
@@ -219,7 +221,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     style.legend_below(figure, 3, notes)
 
 
-def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
+def _arrows(axes: "style.Axes", data: Data, view: str, separator: str) -> None:
     """Draw residuals as arrows in one image, magnified, and the observations that were rejected."""
     used, rejected = data[f"seen_{view}"], {kind: data[f"rejected_{kind}_{view}"] for kind in _KINDS}
     count = sum(map(len, rejected.values()))
@@ -231,7 +233,7 @@ def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
     for kind, positions in rejected.items():
         if len(positions):
             axes.plot(*positions.T, **_LEFT_OUT[kind], markersize=size, markeredgewidth=0.9)
-    title = f"{view}: {len(used):,} observations, {count:,} rejected"
+    title = f"{view}: {len(used):,} observations{separator}{count:,} rejected"
     style.image_axes(axes, title, np.concatenate([used, used + arrows, *rejected.values()]))
 
 
