@@ -204,12 +204,12 @@ def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
         return "its inputs are made again"
     if step.unkeyed:
         return "its law has no source to compare"
-    if step.stage == "report" and missing(run):
+    if step.stage == "report" and _missing(run):
         return "a file of it is missing"
     return "asked for by --force" if forced else ""
 
 
-def missing(run: Run) -> bool:
+def _missing(run: Run) -> bool:
     """Whether a file that the stored report wrote is not there any more."""
     figures = run.results["report"].records[""].figures
     return not all((run.path.parent / name).is_file() for name in (*figures, CLAIMS_FILE, PAGE_FILE))

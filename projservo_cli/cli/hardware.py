@@ -1,6 +1,5 @@
 """Commands for hardware of people: ``tags``, and ``doctor`` for a robot with its cameras."""
 
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -154,8 +153,6 @@ def doctor(
     settings = option.configured(config, options, teaching=True)
     stored = option.calibrated_run(run, settings)
     move, watch = options["move"], options["watch"]
-    if move and not sys.stdin.isatty():
-        raise click.UsageError("--move: standard input is no terminal, so nobody can be asked; leave it out")
     with writing(output):
         checked = check(
             preflight_inputs(settings),

@@ -83,7 +83,7 @@ def _as_text(schema: dict[str, Any]) -> str:
 @option.configuration(help="Configuration (YAML) of a robot to check. Default: check the installation.")
 @option.override
 @option.output(metavar="FILE", help="Page to write. Default: preflight.html.")
-@click.option("--move", is_flag=True, help="Ask, then move each joint by 3° or 16 mm to either side.")
+@option.asking("--move", help="Ask, then move each joint by 3° or 16 mm to either side.")
 @click.option("--watch", is_flag=True, help="Show both images in a browser of this machine until Ctrl-C.")
 @option.explained
 def _doctor(

@@ -75,18 +75,16 @@ speed_scale = click.option(
 
 
 def _with_terminal(context: click.Context, parameter: click.Parameter, value: bool) -> bool:
-    """Refuse ``--confirm`` where nobody can answer."""
-    del context, parameter
+    """Refuse an option that asks somebody where nobody can answer."""
+    del context
     if value and not sys.stdin.isatty():
-        raise click.UsageError(
-            "--confirm: standard input is no terminal, so nobody can be asked; leave it out"
-        )
+        what = "standard input is no terminal, so nobody can be asked; leave it out"
+        raise click.UsageError(f"{parameter.opts[0]}: {what}")
     return value
 
 
-confirm = click.option(
-    "--confirm", is_flag=True, callback=_with_terminal, help="Ask on the terminal before the first motion."
-)
+asking = functools.partial(click.option, is_flag=True, callback=_with_terminal)
+confirm = asking("--confirm", help="Ask on the terminal before the first motion.")
 
 
 def explained(function: _Function) -> _Function:

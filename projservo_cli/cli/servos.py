@@ -39,11 +39,11 @@ def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
     stay. Nothing is ever moved beyond them.
     """
     from projservo_cli.config.editing import with_limits
-    from projservo_cli.files import write_whole
+    from projservo_cli.files import text_of, write_whole
     from projservo_cli.hardware import joint_limits
 
     path = Path(config).resolve()  # the file itself where the name is a link
-    text = _text_of(config)
+    text = text_of(Path(config), "a configuration", _MAX_BYTES)
     with_limits(text, [], config)  # before somebody moves the arm for it
     with _servos(console, config, text) as servos:
         joint_limits.require_known(shift, len(servos.ids))
@@ -59,12 +59,6 @@ def _limits(console: Console, *, config: str, shift: tuple[int, ...]) -> None:
     words = [f"limits: joint {k} {low:g} to {high:g} deg" for k, (low, high) in enumerate(limits, 1)]
     value = {"configuration": path, "limits_deg": limits, "shifted": sorted(shift)}
     console.report(value, [*words, f"written to {config}: robot.limits"])
-
-
-def _text_of(config: str) -> str:
-    from projservo_cli.files import text_of
-
-    return text_of(Path(config), "a configuration", _MAX_BYTES)
 
 
 def _require_limits(text: str, limits_deg: list[tuple[float, float]], config: str) -> None:
@@ -94,9 +88,11 @@ def _release(console: Console, *, config: str) -> None:
 
     Switches the torque of all its servos off, the gripper's too. The arm falls where nobody holds it.
     """
+    from projservo_cli.files import text_of
     from projservo_cli.records import WorkFailed
 
-    with _servos(console, config, _text_of(config), whole=False) as servos:
+    text = text_of(Path(config), "a configuration", _MAX_BYTES)
+    with _servos(console, config, text, whole=False) as servos:
         console.wait("take hold of the arm, and of what its gripper holds: they will be released")
         servos.release(all_of_them=True)
         lost = ", ".join(map(servos.name, sorted(servos.lost)))
