@@ -26,11 +26,11 @@ from projservo_cli.config.inputs import (
 from projservo_cli.display import checked_array, numbers_in, require_radians
 from projservo_cli.experiment import Experiment, law_target, plan_scene_of
 from projservo_cli.files import working_in, writing
-from projservo_cli.keys import File
 from projservo_cli.laws import CODES, REGULATE, law_and_mode, run_name, run_names
 from projservo_cli.observations import Observations, require_observations
 from projservo_cli.progress import Listener
 from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan
+from projservo_cli.result_keys import File
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.stages import Progress
 from projservo_cli.stages import calibrate as calibrating

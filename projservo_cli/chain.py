@@ -13,7 +13,6 @@ from projservo_cli import plugins
 from projservo_cli.config import Config, stored_yaml
 from projservo_cli.config.inputs import about_of, joints_of, recording_inputs, scenery_of, suggestion_inputs
 from projservo_cli.geometry.jit import CACHE_FOLDER
-from projservo_cli.keys import digest
 from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, run_name
 from projservo_cli.progress import Listener
 from projservo_cli.records import (
@@ -21,6 +20,7 @@ from projservo_cli.records import (
     JointList,
     WorkFailed,
 )
+from projservo_cli.result_keys import digest
 from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.steps import STAGES, Step, inputs_of, result_of, steps_for
 from projservo_cli.store import SERVO, Run, save

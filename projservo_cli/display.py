@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.keys import File
 from projservo_cli.records import FARTHEST_M, TWO_TURNS, VIEWS, FloatArray, InputError
+from projservo_cli.result_keys import File
 
 _WIDTH = 100  # maximum length of a line, characters
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.calibration.estimate import require_size_and_noise
+from projservo_cli.calibration.pipeline import require_size_and_noise
 from projservo_cli.display import Displayable, checked_array, numbers_in, pandas
 from projservo_cli.image_size import ImageSize
 from projservo_cli.records import InputError, Observation
-from projservo_cli.store.tables import in_radians, or_empty, read_table, table_text, to_csv
+from projservo_cli.store.observation_tables import in_radians, or_empty, read_table, table_text, to_csv
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import Detections, cauchy_weights, deviation, per_block
 from projservo_cli.calibration.epipolar import (
     ImageFrame,

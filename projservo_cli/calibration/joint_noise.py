@@ -20,7 +20,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import JointErrors, LeastSquares
+from projservo_cli.calibration.bundle_adjustment import JointErrors, LeastSquares
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.records import BoolArray, FloatArray

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 from scipy.special import fdtri
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import MAX_JUDGED, Detections
 from projservo_cli.calibration.epipolar import ImageFrame, ImageGeometry
-from projservo_cli.calibration.fit import Solution, fit_from, left_out_px
 from projservo_cli.calibration.initialization import Search
 from projservo_cli.calibration.prediction import LENS, Parameters
 from projservo_cli.calibration.rigid_body import geometry_of
+from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_px
 from projservo_cli.geometry.lens import before_fold, undistort
 from projservo_cli.records import FloatArray, WorkFailed
 

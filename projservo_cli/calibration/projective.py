@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from projservo_cli.calibration.adjustment import moved_operators
+from projservo_cli.calibration.bundle_adjustment import moved_operators
 from projservo_cli.calibration.detections import MAX_JUDGED, ON_A_LINE, Detections, even_choice
 from projservo_cli.calibration.epipolar import reconstruct
-from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
 from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.calibration.robust_fit import OPEN_DIRECTION, Solution
 from projservo_cli.geometry.displacements import normalize_displacement
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import per_block
 from projservo_cli.calibration.epipolar import triangulated
 from projservo_cli.calibration.prediction import Parameters, projection_derivative

@@ -9,11 +9,11 @@ from itertools import combinations
 
 import numpy as np
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import RAYLEIGH, Detections, cauchy_weights, deviation
 from projservo_cli.calibration.epipolar import Epipolar, ImageGeometry, similarity
-from projservo_cli.calibration.fit import Solution, fit_from, fit_inliers
 from projservo_cli.calibration.lens_estimation import undistorted
+from projservo_cli.calibration.robust_fit import Solution, fit_from, fit_inliers
 from projservo_cli.calibration.triangulation import Tracks
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.records import FloatArray, WorkFailed

@@ -201,7 +201,7 @@ def _detect(
     import numpy as np
 
     from projservo_cli.detection import TagFinder, hidden_images, observe_tags, pair_images
-    from projservo_cli.store.tables import read_joint_list, write_table
+    from projservo_cli.store.observation_tables import read_joint_list, write_table
 
     option.require_new(output, force=force)
     finder = TagFinder(dictionary)
@@ -306,7 +306,7 @@ def _validate(
     from projservo_cli.config import load_config
     from projservo_cli.records import WorkFailed
     from projservo_cli.store import load
-    from projservo_cli.store.tables import read_detections, read_table
+    from projservo_cli.store.observation_tables import read_detections, read_table
 
     found = load(target)
     calibration = found.calibration
@@ -361,7 +361,7 @@ def _position_errors(
     """Statistics of the arm's positions against a table, and against a second one if it is fitted."""
     from projservo_cli.metric.position_error import position_errors
     from projservo_cli.results import ImageModel
-    from projservo_cli.store.tables import read_positions
+    from projservo_cli.store.observation_tables import read_positions
 
     types = calibration.joint_types
     table, fit = (None if path is None else read_positions(path, types, joint_unit) for path in tables)

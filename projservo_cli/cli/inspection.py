@@ -251,7 +251,7 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
     import numpy as np
 
     from projservo_cli.files import write_whole
-    from projservo_cli.store.tables import to_csv
+    from projservo_cli.store.observation_tables import to_csv
 
     rows, tables = [], {}
     records = {(n, label): r for n, result in run.results.items() for label, r in result.records.items()}

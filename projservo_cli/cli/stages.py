@@ -92,7 +92,7 @@ def _recording_object(recording: Any, reason: str) -> dict[str, Any]:
 
 def _motions(config: Any, options: Mapping[str, Any]) -> Any:
     """The list of ``--motions``; None where none is given."""
-    from projservo_cli.store.tables import read_joint_list
+    from projservo_cli.store.observation_tables import read_joint_list
 
     if options["motions"] is None:
         return None

@@ -16,8 +16,8 @@ import numpy as np
 from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.control.law import Gains
 from projservo_cli.display import About
-from projservo_cli.keys import File
 from projservo_cli.records import CORNERS, InputError
+from projservo_cli.result_keys import File
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
 from projservo_cli.simulation.described import (
@@ -50,7 +50,7 @@ from projservo_cli.stages.stage_inputs import (
     TeachInputs,
     Trials,
 )
-from projservo_cli.store.tables import identity_in
+from projservo_cli.store.observation_tables import identity_in
 
 _RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
 _TICKS = 4096  # in a turn of an encoder that is as coarse as any

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import dense_pixel_changes, parameters_from
-from projservo_cli.planning.prediction_covariance import Region, drawn_poses
+from projservo_cli.planning.model_spread import Region, drawn_poses
 from projservo_cli.records import (
     Calibration,
     FloatArray,

@@ -14,7 +14,7 @@ import numpy as np
 
 from projservo_cli.calibration.checks.quality import WEAK_NOISE
 from projservo_cli.calibration.detections import REACH_M, REACH_RAD
-from projservo_cli.calibration.fit import chi2_band
+from projservo_cli.calibration.robust_fit import chi2_band
 from projservo_cli.display import About
 from projservo_cli.files import lies_inside, write_whole
 from projservo_cli.laws import must_converge, run_name

@@ -13,15 +13,15 @@ from projservo_cli.files import write_whole
 from projservo_cli.image_size import image_corners, image_sizes
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
+from projservo_cli.planning.model_spread import Region
 from projservo_cli.planning.pose_selection import Suggestion, suggest
-from projservo_cli.planning.prediction_covariance import Region
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, IntArray, Observation, WorkFailed
 from projservo_cli.robots.settings import JointSettings
 from projservo_cli.simulation.streams import SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed
 from projservo_cli.stages.stage_inputs import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
-from projservo_cli.store.tables import read_detections, read_table, to_csv
+from projservo_cli.store.observation_tables import read_detections, read_table, to_csv
 
 
 def run(

@@ -13,7 +13,7 @@ from projservo_cli.planning.constraints import Constraints, constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.keep_out import keep_out_of
 from projservo_cli.planning.margins import CLEAR, IMAGE, Demands, Motion, Reaching, along_joints, along_shares
-from projservo_cli.planning.prediction_covariance import spread_of
+from projservo_cli.planning.model_spread import spread_of
 from projservo_cli.planning.product_space import duration, evenly, plan_path
 from projservo_cli.planning.rrt_connect import (
     JointPath,

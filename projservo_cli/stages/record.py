@@ -38,7 +38,7 @@ from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import path_to, plugin_robot, simulated_robot
 from projservo_cli.stages.stage_inputs import OwnRobot, RecordingInputs, Trials
-from projservo_cli.store.tables import identity_in, read_table, recording_of, write_table
+from projservo_cli.store.observation_tables import identity_in, read_table, recording_of, write_table
 
 SAVE_EVERY = 1.0  # s; maximum loss by an interruption without warning
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be

@@ -44,7 +44,7 @@ from projservo_cli.stages.studies import (
     run_studies,
 )
 from projservo_cli.store import Result
-from projservo_cli.store.tables import to_csv
+from projservo_cli.store.observation_tables import to_csv
 from projservo_cli.task.face import cyclic_order
 
 if TYPE_CHECKING:

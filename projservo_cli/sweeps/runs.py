@@ -11,12 +11,12 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.keys import key_of
 from projservo_cli.laws import BODY_LAWS, CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled import Course
 from projservo_cli.loop.verdicts import FAILED, RUNNING, VERDICTS
 from projservo_cli.records import Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
+from projservo_cli.result_keys import key_of
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rotation_sense
 from projservo_cli.stages.scenario import RunScenario, run_scenario

@@ -16,8 +16,8 @@ from projservo_cli.records import BoolArray
 from projservo_cli.report import style
 from projservo_cli.report.figures.sweep_success import draw_basin, pictures, wilson_interval
 from projservo_cli.stages import Progress
+from projservo_cli.store.observation_tables import to_csv
 from projservo_cli.store.sweep_table import SweepTable
-from projservo_cli.store.tables import to_csv
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 MEASURES = (

@@ -9,7 +9,7 @@ import pytest
 from projservo_cli import cli
 from projservo_cli.config import load_config
 from projservo_cli.records import VIEWS, InputError
-from projservo_cli.store.tables import read_table
+from projservo_cli.store.observation_tables import read_table
 from tests.conftest import ROOT
 
 

@@ -16,7 +16,7 @@ from projservo_cli.calibration import calibrate, residual_statistics
 from projservo_cli.metric.position_error import position_errors
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.results import ImageModel
-from projservo_cli.store.tables import read_positions, read_table
+from projservo_cli.store.observation_tables import read_positions, read_table
 from tests.calibration import damage
 
 SIZE = (6000, 4000)

@@ -6,7 +6,7 @@ import pytest
 from projservo_cli.monitoring.innovation_tests import ErrorModel
 from projservo_cli.records import InputError
 from projservo_cli.store import load
-from projservo_cli.store.tables import to_csv, write_table
+from projservo_cli.store.observation_tables import to_csv, write_table
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 FEW = 4  # of the corners of the board, every so many

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli import store
 from projservo_cli.calibration import predict
-from projservo_cli.store.tables import read_table
+from projservo_cli.store.observation_tables import read_table
 
 JOINTS = {"ur5": "RRRRRR", "stanford": "RRPRRR"}
 # Limits on the median and the 95th percentile of the held-out distance per marker and view, px.

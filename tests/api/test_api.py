@@ -15,7 +15,7 @@ import projservo_cli as ps
 from projservo_cli import cli
 from projservo_cli.calibration import prediction_variance
 from projservo_cli.records import Calibration, Observation, Trace
-from projservo_cli.store.tables import read_table, write_table
+from projservo_cli.store.observation_tables import read_table, write_table
 from tests.configured import calibrate
 from tests.conftest import ROOT
 

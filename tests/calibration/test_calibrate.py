@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict, residual_statistics
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import Detections
-from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.prediction import Parameters, dense_pixel_changes
 from projservo_cli.calibration.projective import Projective
+from projservo_cli.calibration.robust_fit import Solution
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.records import InputError, Observation
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials

@@ -32,7 +32,7 @@ CASES = {
     "a pose twice": (spoilt("pose", OBSERVATION.pose[0]), "RPR", {}, "pose number 3 occurs twice"),
     "a marker twice": (spoilt("marker", 5), "RPR", {}, "marker number 5 occurs twice"),
     "markers in a table": (shaped(marker=OBSERVATION.marker[:, None]), "RPR", {}, "one dimension"),
-    "three views": (shaped(images=OBSERVATION.images[:, [0, 1, 1]]), "RPR", {}, "two views"),
+    "three views": (shaped(images=OBSERVATION.images[:, [0, 1, 1]]), "RPR", {}, "2 views"),
     "no image": (OBSERVATION, "RPR", {"image_size": (1280, 0)}, "positive width"),
     "negative seed": (OBSERVATION, "RPR", {"seed": -1}, "seed -1"),
     "method": (OBSERVATION, "RPR", {"method": "best"}, "bundle_adjustment, closed_form"),
@@ -84,7 +84,7 @@ def test_predictions_refuse_other_joints_and_what_is_no_number(calibration, func
 
 
 def test_arguments_are_left_as_they_were():
-    before = {name: value.copy() for name, value in vars(OBSERVATION).items() if value is not None}
+    before = {name: np.array(value) for name, value in vars(OBSERVATION).items() if value is not None}
     for name in before:
         getattr(OBSERVATION, name).setflags(write=False)
     for method in ("bundle_adjustment", "closed_form"):

@@ -8,7 +8,7 @@ import pytest
 from projservo_cli.calibration import calibrate, predict, prediction_variance
 from projservo_cli.calibration.checks.validation import residual_statistics
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.store.tables import read_table
+from projservo_cli.store.observation_tables import read_table
 from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -100,7 +100,7 @@ def test_left_images_alone_of_data_of_others(shared_data, data, types, rms_px):
     found = calibrate(trained, types, source="recorded")
     error = residual_statistics(found, held_out)
     assert error["rms_px"] < rms_px
-    assert error["rms_px"] == pytest.approx(found.predicted_rms_px, rel=0.35)
+    assert error["median_px"] <= error["limit_px"]
 
 
 def test_views_that_cannot_be_used_are_refused():

@@ -13,7 +13,7 @@ from projservo_cli.laws import law_and_mode
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
 from projservo_cli.stages import calibrate, plan, report, servo
 from projservo_cli.stages.stage_inputs import CalibrationInputs, PlanInputs, ServoInputs, Table
-from projservo_cli.store.tables import read_table
+from projservo_cli.store.observation_tables import read_table
 from tests.fake_records import fake
 
 CONFIGURATION = """\

@@ -10,7 +10,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.detection import TagFinder
 from projservo_cli.records import InputError
-from projservo_cli.store.tables import read_table
+from projservo_cli.store.observation_tables import read_table
 from tests.configured import trial_motions, truth_of
 from tests.detection.rendering import render, square
 from tests.studies.detection_sigma import errors

@@ -49,7 +49,7 @@ def test_sentences_are_short(page):
 TERMS = {
     "April ?tag": "detection",
     "backlash": "simulation/faults",
-    "bundle adjustment": "calibration/adjustment",
+    "bundle adjustment": "calibration/bundle_adjustment",
     "checks?um|HDF5": "store/__init__",
     "cluster|Dask": "sweeps/engine",
     "covariance": "calibration/prediction",

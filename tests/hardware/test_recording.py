@@ -8,7 +8,7 @@ import yaml
 
 from projservo_cli.records import JointLimits, Observation, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, at_rest_after
-from projservo_cli.store.tables import identity_in, recording_of, write_table
+from projservo_cli.store.observation_tables import identity_in, recording_of, write_table
 from tests.hardware.still import Quiet
 from tests.hardware.streams import Stream, picture
 from tests.hardware.test_doctor import CONFIGURATION

@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
-from projservo_cli.store.tables import read_table
+from projservo_cli.store.observation_tables import read_table
 from tests.configured import calibrate, plan, record, scenario_of
 
 ROOT = Path(__file__).parents[2]

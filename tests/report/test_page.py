@@ -11,7 +11,7 @@ from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import CrossValidation
 from projservo_cli.report.report_data import PAGE_FILE
 from projservo_cli.store import Result
-from projservo_cli.store.tables import to_csv
+from projservo_cli.store.observation_tables import to_csv
 from tests.configured import compared, page_of
 from tests.fake_records import fake
 from tests.report.cases import SPECS, case

@@ -10,7 +10,7 @@ from projservo_cli.cli.output import Console
 from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
 from projservo_cli.robots.contract import PluginRobot
-from projservo_cli.store.tables import read_joint_list, read_table
+from projservo_cli.store.observation_tables import read_joint_list, read_table
 from tests.configured import bounds_of, joints_of, simulate, trial_motions, truth_of
 from tests.configured import record as stage
 

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.calibration.checks.validation import of_views
 from projservo_cli.records import VIEWS, InputError
-from projservo_cli.store.tables import read_detections, read_table, write_table
+from projservo_cli.store.observation_tables import read_detections, read_table, write_table
 from tests.calibration.simulated_robot import random_robot, trials
 
 

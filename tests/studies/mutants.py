@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[2]
 MODULES = (
     *("geometry/*", "task/*", "control/*", "planning/margins", "planning/constraints"),
     *(
-        "calibration/adjustment",
+        "calibration/bundle_adjustment",
         "calibration/triangulation",
         "calibration/epipolar",
         "monitoring/innovation_tests",

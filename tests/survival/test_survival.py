@@ -16,7 +16,7 @@ from projservo_cli.config import load_config, load_sweep
 from projservo_cli.config.schema import starter
 from projservo_cli.records import InputError
 from projservo_cli.store import load
-from projservo_cli.store.tables import read_joint_list, read_table
+from projservo_cli.store.observation_tables import read_joint_list, read_table
 from tests.conftest import ROOT
 from tests.survival.changes import CSV, YAML, Change
 

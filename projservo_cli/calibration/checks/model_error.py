@@ -23,10 +23,10 @@ import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.special import fdtrc
 
-from projservo_cli.calibration.adjustment import LeastSquares, minimize
+from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
 from projservo_cli.calibration.detections import SAME_READING, Detections, per_rad
-from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.prediction import LENS, Images, Parameters
+from projservo_cli.calibration.robust_fit import Solution
 from projservo_cli.geometry.displacements import cross_matrix
 from projservo_cli.records import CORNERS, BoolArray, Errors, FloatArray, IntArray, ModelError
 

@@ -9,13 +9,13 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
-from projservo_cli.calibration.adjustment import LeastSquares, fit_offsets
+from projservo_cli.calibration.bundle_adjustment import LeastSquares, fit_offsets
 from projservo_cli.calibration.checks.model_error import image_motions
 from projservo_cli.calibration.detections import RAYLEIGH, Detections
 from projservo_cli.calibration.epipolar import OUTLIER
-from projservo_cli.calibration.fit import Solution, median_px
 from projservo_cli.calibration.initialization import stationary
 from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.calibration.robust_fit import Solution, median_px
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 # Median residual, in σ, below which a corrected joint reading explains a pose.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_error import ModelCheck, describe, examine
 from projservo_cli.calibration.detections import (
     MAX_JUDGED,
@@ -19,9 +19,9 @@ from projservo_cli.calibration.detections import (
     require_motion,
     require_moved,
 )
-from projservo_cli.calibration.fit import Expected, Solution
 from projservo_cli.calibration.joint_noise import quantile
 from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.calibration.robust_fit import Expected, Solution
 from projservo_cli.records import (
     BoolArray,
     Errors,

@@ -6,20 +6,20 @@ from itertools import islice
 
 import numpy as np
 
-from projservo_cli.calibration.adjustment import LeastSquares, minimize
+from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
 from projservo_cli.calibration.checks.model_error import describe, stepped
 from projservo_cli.calibration.checks.outliers import MAX_OF_POSE, Outliers, fits_other_joints
 from projservo_cli.calibration.checks.quality import check_model
 from projservo_cli.calibration.checks.validation import cross_validate
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import ImageGeometry
-from projservo_cli.calibration.fit import (
+from projservo_cli.calibration.initialization import Search, starting_markers, starts
+from projservo_cli.calibration.lens_estimation import undistorted
+from projservo_cli.calibration.robust_fit import (
     Expected,
     Solution,
     fit_from,
 )
-from projservo_cli.calibration.initialization import Search, starting_markers, starts
-from projservo_cli.calibration.lens_estimation import undistorted
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed, letters_of
 
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.

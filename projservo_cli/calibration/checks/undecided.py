@@ -11,10 +11,10 @@ from itertools import combinations, product
 
 import numpy as np
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import MIN_MOTION, SAME_READING, Detections
-from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
 from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.calibration.robust_fit import OPEN_DIRECTION, Solution
 from projservo_cli.records import FloatArray, IntArray, WorkFailed
 
 # Increase of χ² by another order above which the images decide against it: ten standard deviations.

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.quality import UNDETERMINED_NOISE
 from projservo_cli.calibration.checks.screening import without_placeholders
 from projservo_cli.calibration.detections import (
@@ -19,8 +19,8 @@ from projservo_cli.calibration.detections import (
     require_motion,
 )
 from projservo_cli.calibration.epipolar import Epipolar
-from projservo_cli.calibration.fit import WARN_RATIO, Solution, fit_inliers
 from projservo_cli.calibration.prediction import joint_derivative, predict, prediction_variance
+from projservo_cli.calibration.robust_fit import WARN_RATIO, Solution, fit_inliers
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import (
     BoolArray,

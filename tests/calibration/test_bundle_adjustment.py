@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.calibration import adjustment
-from projservo_cli.calibration.adjustment import LeastSquares, minimize
+from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.displacements import displacements

@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import JointErrors, LeastSquares, fit_offsets, minimize
+from projservo_cli.calibration.bundle_adjustment import JointErrors, LeastSquares, fit_offsets, minimize
 from projservo_cli.calibration.detections import MAX_JUDGED, RAYLEIGH, even_choice, medians, per_rad
 from projservo_cli.calibration.epipolar import OUTLIER, ImageGeometry
 from projservo_cli.calibration.initialization import Nominal, Search, starting_markers, starts

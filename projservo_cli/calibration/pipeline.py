@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.model_error import ModelCheck
 from projservo_cli.calibration.checks.numbering import checked_geometry
 from projservo_cli.calibration.checks.outliers import (
@@ -35,7 +35,11 @@ from projservo_cli.calibration.checks.refusal import (
 from projservo_cli.calibration.checks.undecided import require_poses
 from projservo_cli.calibration.detections import Detections, require_images, require_motion
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, ImageGeometry
-from projservo_cli.calibration.fit import (
+from projservo_cli.calibration.initialization import Nominal, Progress, Search
+from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
+from projservo_cli.calibration.prediction import LENS
+from projservo_cli.calibration.projective import Projective, closed_form_operators
+from projservo_cli.calibration.robust_fit import (
     CHECK_READINGS,
     REFUSE_RATIO,
     Expected,
@@ -44,10 +48,6 @@ from projservo_cli.calibration.fit import (
     fit_joint_noise,
     solve,
 )
-from projservo_cli.calibration.initialization import Nominal, Progress, Search
-from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
-from projservo_cli.calibration.prediction import LENS
-from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.calibration.views import with_all_views, with_best_pair, with_own_noise
 from projservo_cli.geometry.lens import K1

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.records import InputError, Observation
-from projservo_cli.store.tables import read_joint_list, read_table, write_table
+from projservo_cli.store.observation_tables import read_joint_list, read_table, write_table
 
 HEADER = "pose,marker,q1,q2,u_left,v_left,u_right,v_right"
 SIGMAS = f"{HEADER},sigma_left,sigma_right"
