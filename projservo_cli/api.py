@@ -30,7 +30,7 @@ from projservo_cli.laws import CODES, REGULATE, law_and_mode, run_name, run_name
 from projservo_cli.observations import Observations, require_observations
 from projservo_cli.progress import Listener
 from projservo_cli.records import Calibration, FloatArray, InputError, JointList, Plan
-from projservo_cli.result_keys import File
+from projservo_cli.result_hashes import File
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.stages import Progress
 from projservo_cli.stages import calibrate as calibrating

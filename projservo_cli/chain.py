@@ -20,7 +20,7 @@ from projservo_cli.records import (
     JointList,
     WorkFailed,
 )
-from projservo_cli.result_keys import digest
+from projservo_cli.result_hashes import digest
 from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.steps import STAGES, Step, inputs_of, result_of, steps_for
 from projservo_cli.store import SERVO, Run, save

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.records import FARTHEST_M, TWO_TURNS, VIEWS, FloatArray, InputError
-from projservo_cli.result_keys import File
+from projservo_cli.result_hashes import File
 
 _WIDTH = 100  # maximum length of a line, characters
 

@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from projservo_cli.masking import masked
+from projservo_cli.passwords import masked
 
 __version__ = "0.1.0"
 _PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")

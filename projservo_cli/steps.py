@@ -23,7 +23,7 @@ from projservo_cli.config.inputs import (
 from projservo_cli.laws import law_and_mode, run_names
 from projservo_cli.records import InputError
 from projservo_cli.report.report_data import CLAIMS_FILE, PAGE_FILE
-from projservo_cli.result_keys import key_of
+from projservo_cli.result_hashes import key_of
 from projservo_cli.robots.source import source_hash
 from projservo_cli.store import SERVO, Result, Run
 

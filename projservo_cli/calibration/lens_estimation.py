@@ -10,8 +10,8 @@ from projservo_cli.calibration.detections import MAX_JUDGED, Detections
 from projservo_cli.calibration.epipolar import ImageFrame, ImageGeometry
 from projservo_cli.calibration.initialization import Search
 from projservo_cli.calibration.prediction import LENS, Parameters
-from projservo_cli.calibration.rigid_body import geometry_of
 from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_px
+from projservo_cli.calibration.single_view import geometry_of
 from projservo_cli.geometry.lens import before_fold, undistort
 from projservo_cli.records import FloatArray, WorkFailed
 

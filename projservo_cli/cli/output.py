@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from projservo_cli.masking import masked
+from projservo_cli.passwords import masked
 from projservo_cli.progress import Listener
 
 _UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")

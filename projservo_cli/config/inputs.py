@@ -17,7 +17,7 @@ from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.control.law import Gains
 from projservo_cli.display import About
 from projservo_cli.records import CORNERS, InputError
-from projservo_cli.result_keys import File
+from projservo_cli.result_hashes import File
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
 from projservo_cli.simulation.described import (

@@ -23,7 +23,7 @@ from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.config.whole import Settings
 from projservo_cli.display import plain
 from projservo_cli.files import bytes_of, text_of
-from projservo_cli.masking import masked
+from projservo_cli.passwords import masked
 from projservo_cli.records import InputError
 from projservo_cli.settings.control import RENDERED, RenderedOptions
 from projservo_cli.settings.sections import CONTRADICTIONS, Finding, Root

@@ -13,7 +13,7 @@ from projservo_cli.detection import DICTIONARY
 from projservo_cli.geometry.displacements import twists
 from projservo_cli.image_size import image_sizes
 from projservo_cli.records import NO_LENS, FloatArray, position_limits, prismatic_of
-from projservo_cli.result_keys import File
+from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.robot import Camera, Rig, RobotSettings

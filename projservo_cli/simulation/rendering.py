@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import CORNERS, ByteArray, FloatArray, InputError, IntArray
-from projservo_cli.result_keys import File
+from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Tag
 from projservo_cli.simulation.arm import SerialArm, roll_axis

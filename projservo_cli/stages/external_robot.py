@@ -12,9 +12,9 @@ from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.image_size import image_sizes
-from projservo_cli.masking import MASK
 from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW
+from projservo_cli.passwords import MASK
 from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot

@@ -7,7 +7,7 @@ from projservo_cli.control.law import Gains
 from projservo_cli.display import About
 from projservo_cli.image_size import ImageSize
 from projservo_cli.records import FloatArray
-from projservo_cli.result_keys import File, digest, encoded
+from projservo_cli.result_hashes import File, digest, encoded
 from projservo_cli.robots.settings import Following, JointSettings
 from projservo_cli.settings.cameras import Cameras
 from projservo_cli.settings.control import Stop

@@ -17,7 +17,7 @@ from projservo_cli.config.inputs import calibration_inputs, truth_of
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.laws import law_and_mode, run_names
 from projservo_cli.records import FloatArray, InputError, IntArray
-from projservo_cli.result_keys import digest, key_of
+from projservo_cli.result_hashes import digest, key_of
 from projservo_cli.robots.source import source_hash
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, TaskSettings

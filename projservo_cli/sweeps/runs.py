@@ -16,7 +16,7 @@ from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled import Course
 from projservo_cli.loop.verdicts import FAILED, RUNNING, VERDICTS
 from projservo_cli.records import Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
-from projservo_cli.result_keys import key_of
+from projservo_cli.result_hashes import key_of
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rotation_sense
 from projservo_cli.stages.scenario import RunScenario, run_scenario

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projservo_cli.calibration import adjustment
+from projservo_cli.calibration import bundle_adjustment
 from projservo_cli.calibration.bundle_adjustment import LeastSquares, minimize
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.prediction import Parameters
@@ -101,10 +101,10 @@ def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, mo
     A /= np.outer(scale, scale)
     A[: problem.size, : problem.size] += tied @ tied.T + damping * np.eye(problem.size)
     wanted = -np.linalg.solve(A, g / scale) / scale
-    for at_once, kept in ((adjustment._AT_ONCE, adjustment._MAX_KEPT), (7, 0)):
-        monkeypatch.setattr(adjustment, "_AT_ONCE", at_once)
-        monkeypatch.setattr(adjustment, "_MAX_KEPT", kept)
-        here = adjustment._Expansion(problem, scene, residual, weight, np.zeros(problem.size))
+    for at_once, kept in ((bundle_adjustment._AT_ONCE, bundle_adjustment._MAX_KEPT), (7, 0)):
+        monkeypatch.setattr(bundle_adjustment, "_AT_ONCE", at_once)
+        monkeypatch.setattr(bundle_adjustment, "_MAX_KEPT", kept)
+        here = bundle_adjustment._Expansion(problem, scene, residual, weight, np.zeros(problem.size))
         assert here.by_pose == (joint_noise and poses == 30)
         found = here._whole(here.solved(damping)(residual, strain))
         assert np.abs((found - wanted) * scale).max() < 1e-9 * np.abs(wanted * scale).max()
@@ -113,8 +113,8 @@ def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, mo
 
 def test_memory_of_a_search_grows_by_little_a_sighting(monkeypatch):
     """Ten sightings a marker: derivatives alone, of all at once, would take 1,250 bytes each."""
-    monkeypatch.setattr(adjustment, "_AT_ONCE", 256)
-    monkeypatch.setattr(adjustment, "_MAX_KEPT", 0)
+    monkeypatch.setattr(bundle_adjustment, "_AT_ONCE", 256)
+    monkeypatch.setattr(bundle_adjustment, "_MAX_KEPT", 0)
     most = []
     for markers in (200, 800):
         robot = random_robot("RRRRRR", np.random.default_rng(3), markers=markers)

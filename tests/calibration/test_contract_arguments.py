@@ -84,7 +84,8 @@ def test_predictions_refuse_other_joints_and_what_is_no_number(calibration, func
 
 
 def test_arguments_are_left_as_they_were():
-    before = {name: np.array(value) for name, value in vars(OBSERVATION).items() if value is not None}
+    arrays = {name: value for name, value in vars(OBSERVATION).items() if isinstance(value, np.ndarray)}
+    before = {name: value.copy() for name, value in arrays.items()}
     for name in before:
         getattr(OBSERVATION, name).setflags(write=False)
     for method in ("bundle_adjustment", "closed_form"):

@@ -104,7 +104,7 @@ def pretend(patch, folder):
     patch.setattr(plan, "run", lambda *given: pretended.plan(*given))
     patch.setattr(servo, "run", lambda *given, **brought: pretended.servo(*given))
     patch.setattr(report, "run", lambda *given, **named: pretended.report(*given, **named))
-    patch.setattr(steps, "missing", lambda run: pretended.gone)
+    patch.setattr(steps, "_missing", lambda run: pretended.gone)
     patch.chdir(folder)
     (folder / "tiny.yaml").write_text(CONFIGURATION, encoding="utf-8")
     (folder / "t.csv").write_text(TABLE, encoding="utf-8")

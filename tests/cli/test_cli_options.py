@@ -4,6 +4,7 @@ import itertools
 import shlex
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -22,7 +23,7 @@ def test_options_stand_anywhere_in_a_chain(projservo, stages):
 
 
 @pytest.mark.parametrize("name", main.commands)
-def test_help_has_an_example_that_the_command_line_takes(projservo, name):
+def test_help_has_an_example_that_the_command_line_takes(projservo, monkeypatch, name):
     answer = projservo(name, "--help")
     assert answer == projservo("-h", name)
     assert answer.code == 0
@@ -33,7 +34,8 @@ def test_help_has_an_example_that_the_command_line_takes(projservo, name):
     program, *words = shlex.split(told)
     assert program == "projservo"
     assert name in words
-    # What it says is taken, up to files that are not here.
+    # What it says is taken, up to files that are not here, by one who sits at a terminal.
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True))
     with main.make_context("projservo", words) as context:
         assert name in context.obj
         _, command, rest = main.resolve_command(context, [*context.obj[:1], *context.args])

@@ -8,7 +8,7 @@ from projservo_cli.config import load_config, to_yaml
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.laws import LAWS
 from projservo_cli.records import InputError
-from projservo_cli.result_keys import encoded
+from projservo_cli.result_hashes import encoded
 from tests.conftest import SHIPPED
 
 GOOD = """\

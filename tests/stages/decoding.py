@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from projservo_cli.result_keys import File
+from projservo_cli.result_hashes import File
 
 
 def decoded(content, files):

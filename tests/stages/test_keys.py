@@ -10,7 +10,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs, files_of, plan_inputs, report_inputs, servo_inputs
-from projservo_cli.result_keys import encoded, key_of
+from projservo_cli.result_hashes import encoded, key_of
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.stages import calibrate, plan, servo
 from tests.configured import record

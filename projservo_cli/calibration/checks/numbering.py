@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, ImageGeometry, sampson
-from projservo_cli.calibration.rigid_body import RigidBody
+from projservo_cli.calibration.single_view import RigidBody
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.records import BoolArray, FloatArray, IntArray, Observation, WorkFailed
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.masking import masked
+from projservo_cli.passwords import masked
 from projservo_cli.records import InputError
 
 
