@@ -2,10 +2,10 @@
 
     python -m tests.studies.one_camera [--draws 20] [--rigs NAME ...] [-o one_camera.csv]
 
-Arms are the UR5 and the RRPRRR arm of the reference data, before their left camera, and a tool of eight markers
-in a plane on the UR5. Trials are of single joints, six frames to ±30° or ±0.15 m, or have twelve combined poses
-besides. Noise is 0.5 px. Held-out poses are random, within ±50° or ±0.2 m. The bound is that of Cramér and Rao of
-the design, and that of the pair beside it is of both cameras.
+Arms are the UR5 and the RRPRRR arm of the reference data, before their left camera, and a tool of eight
+markers in a plane on the UR5. Trials are of single joints, six frames to ±30° or ±0.15 m, or have twelve
+combined poses besides. Noise is 0.5 px. Held-out poses are random, within ±50° or ±0.2 m. The bound is that of
+Cramér and Rao of the design, and that of the pair beside it is of both cameras.
 """
 
 import json
@@ -101,9 +101,7 @@ def main():
     jobs = [(name, draw, bounds[name][0]) for name in asked.rigs for draw in range(asked.draws)]
     rows = list(in_two_processes(judged, jobs, "one camera"))
     write_rows(asked.output, rows)
-    print(
-        "rig: found (95 %), rms over the bound (1.1), bound over that of the pair (1.45), errors px 50/95/100 %"
-    )
+    print("rig: found (95 %), rms over the bound (1.1), bound over the pair's (1.45), errors px")
     for name, (alone, pair) in bounds.items():
         some = [row for row in rows if row["rig"] == name]
         errors = np.array([row["error_px"] for row in some if row["found"]])
