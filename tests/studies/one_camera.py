@@ -4,8 +4,8 @@
 
 Arms are the UR5 and the RRPRRR arm of the reference data, before their left camera, and a tool of eight
 markers in a plane on the UR5. Trials are of single joints, six frames to ±30° or ±0.15 m, or have twelve
-combined poses besides. Noise is 0.5 px. Held-out poses are random, within ±50° or ±0.2 m. The bound is that of
-Cramér and Rao of the design, and that of the pair beside it is of both cameras.
+combined poses besides. Noise is 0.5 px. Held-out poses are random, within ±50° or ±0.2 m. The bound is that
+of Cramér and Rao of the design, and that of the pair beside it is of both cameras.
 """
 
 import json
