@@ -75,6 +75,8 @@ _LENS_STRAYS = 0.01
 _BEYOND_PX = 1.0
 # Effect of deviations from the model, over the image size, above which a calibration is not usable.
 _MAX_PREDICTED = 0.01
+# Noise of a camera over that of the quietest one from which it is named.
+_NOISY = 2.0
 # Maximum number of lines of advice.
 _MAX_ADVICE = 5
 # Maximum number of markers that a message names.
@@ -268,7 +270,7 @@ def _maximum_likelihood(
     cause = ""
     if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
         cause = joint_at_fault(start, _DOUBTFUL_SHARE * solution.sigma_px)
-    advice = tuple(filter(None, (cause, *result.advice, note)))
+    advice = tuple(filter(None, (cause, *result.advice[:1], _worst_view(result), *result.advice[1:], note)))
     return solution, expected, dataclasses.replace(result, advice=advice[:_MAX_ADVICE])
 
 
@@ -444,6 +446,18 @@ def _record(
         encoder_counts=joint_noise is not None and joint_noise.ticks,
         model_px=float(np.sqrt(over)),
         **({} if check is None else _model_fields(result, solution, check)),
+    )
+
+
+def _worst_view(calibration: Calibration) -> str:
+    """Advice about a camera that is much noisier than another; empty if there is none."""
+    noise = calibration.sigma_view_px
+    if noise is None or noise.max() <= _NOISY * noise.min():
+        return ""
+    worst, best = (calibration.view[int(v)] for v in (np.argmax(noise), np.argmin(noise)))
+    return (
+        f"the {worst} camera is {noise.max() / noise.min():.2g} times as noisy as the {best} one "
+        f"({noise.max():.2g} and {noise.min():.2g} px), and counts less: check its focus, light and mount"
     )
 
 

@@ -60,4 +60,5 @@ def test_three_webcams_before_a_real_arm(answer, elsewhere, shared_data):
     assert {25, 26} <= set(found["rejected"]["poses"])
     assert {1, 2} & {one["pose"] for one in found["moved_images"]}
     assert found["sigma_view_px"][2] > 2.0 * max(found["sigma_view_px"][:2])
+    assert any(text.startswith("the cam3 camera is") for text in found["advice"])
     assert not any(text.startswith(("joint ", "check the joint")) for text in found["advice"])
