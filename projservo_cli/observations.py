@@ -12,7 +12,7 @@ import numpy.typing as npt
 from projservo_cli.calibration.pipeline import require_size_and_noise
 from projservo_cli.display import Displayable, checked_array, numbers_in, pandas
 from projservo_cli.image_size import ImageSize
-from projservo_cli.records import InputError, Observation
+from projservo_cli.records import WORLD, InputError, Observation
 from projservo_cli.store.observation_tables import in_radians, or_empty, read_table, table_text, to_csv
 
 
@@ -34,6 +34,7 @@ class Observations(Displayable, Observation):
     source : ``simulated`` or ``recorded``.
     exact : whether pixel noise is their only error, so that χ² decides against ``noise_px``.
     seed : seed of the random starts of a calibration.
+    mount : ``world`` for cameras that watch the tool, ``tool`` for cameras on it.
     order_stated : whether the order of the joints along the arm is known to be that of q.
     """
 
@@ -44,6 +45,7 @@ class Observations(Displayable, Observation):
     source: str = "recorded"
     exact: bool = False
     seed: int = 0
+    mount: str = WORLD
     order_stated: bool = False
 
     def __post_init__(self) -> None:

@@ -21,6 +21,7 @@ BoolArray = npt.NDArray[np.bool_]
 ByteArray = npt.NDArray[np.uint8]
 
 VIEWS = ("left", "right")
+WORLD, TOOL = "world", "tool"  # where the cameras are mounted: the markers are on the other
 MM = 1e3  # mm in a metre
 TWO_TURNS = 4.0 * np.pi  # rad; no revolute joint of an arm with stops turns that far from its zero
 FARTHEST_M = 20.0  # no prismatic joint that two cameras watch goes farther
@@ -267,6 +268,9 @@ class ProjectiveKinematics:
     """
 
     view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
+    mount: str = _scalar(
+        about="world: cameras stand still and watch the tool; tool: the reverse", default=WORLD
+    )
     joint_types: str = _scalar(about="one letter a joint, R or P")
     P: FloatArray = _array("view image_row coordinate", "px", "cameras, projective frame")
     H_hat_0: FloatArray = _array("joint row coordinate", about="joint operators at the reference")
@@ -328,7 +332,12 @@ class ProjectiveKinematics:
         return bool(np.isfinite(self.sqrt_cov_shared).all())
 
     def require_left_and_right(self) -> None:
-        """Raise InputError unless the views are left and right, as tasks and laws take them."""
+        """Raise InputError unless two fixed views are left and right, as tasks and laws take them."""
+        if self.mount != WORLD:
+            raise InputError(
+                "the cameras of the calibration are on the tool; tasks, laws and tests of images take "
+                "cameras that stand still: it serves calibrate and validate"
+            )
         if self.view != VIEWS:
             raise InputError(
                 f"the calibration has the views {', '.join(self.view)}; tasks, laws and tests of images take "

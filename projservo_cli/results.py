@@ -25,6 +25,7 @@ from projservo_cli.metric.kinematic_errors import KinematicErrors, in_model_fram
 from projservo_cli.observations import require_observations
 from projservo_cli.records import (
     MM,
+    TOOL,
     BoolArray,
     Calibration,
     CrossValidation,
@@ -209,6 +210,8 @@ class ImageModel(Displayable, Calibration):
             If the joints determine no metric, the images of one camera are mirrored, the length is not known,
             or the method has no covariance.
         """
+        if self.mount == TOOL:
+            raise InputError("metric: takes fixed cameras; those of this calibration are on the tool")
         if not self.has_covariance or not self.sqrt_cov_shared.size:
             raise InputError(f"metric: the method {self.method} has no covariance: use bundle_adjustment")
         return MetricModel.of(

@@ -12,7 +12,9 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.records import (
+    TOOL,
     VIEWS,
+    WORLD,
     BoolArray,
     FloatArray,
     InputError,
@@ -75,12 +77,14 @@ class Detections:
     weight: FloatArray  # (V, N) weights of residuals: ``stated_px`` over the standard deviation, or one
     stated_px: float | None  # root mean square of the stated standard deviations, px, if any
     view: tuple[str, ...] = VIEWS  # names of the views
+    mount: str = WORLD  # of cameras on the tool, the chain is that of the scene: joints in reverse, negated
     pair: tuple[int, ...] = (0, 1)  # the one or two views by which a fit begins and noise is known
 
     @classmethod
-    def of(cls, observation: Observation, joint_types: str) -> "Detections":
+    def of(cls, observation: Observation, joint_types: str, mount: str = WORLD) -> "Detections":
         """Flatten the poses at rest of an observation; one letter a joint, R or P.
 
+        On the tool X_camera = (∏ exp(q_i Ĥ_i))⁻¹ X: the product of the exponentials of −q_n Ĥ_n to −q_1 Ĥ_1.
         Raises InputError if the arrays or the letters do not fit each other, or values are not finite.
         """
         require_shapes(observation)
@@ -101,10 +105,13 @@ class Detections:
             sigma = np.maximum(observation.sigma[pose_of, :, marker_of].T[seen], MIN_SIGMA)
             stated_px = float(np.sqrt(np.mean(sigma**2)))
             weight[seen] = stated_px / sigma
+        q, prismatic = np.array(observation.q, dtype=np.float64), prismatic_of(letters)
+        if mount == TOOL:
+            q, prismatic = np.ascontiguousarray(-q[:, ::-1]), prismatic[::-1].copy()
         present, marker_of_present = np.unique(marker_of, return_inverse=True)
         return cls(
-            q=np.array(observation.q, dtype=np.float64),
-            prismatic=prismatic_of(letters),
+            q=q,
+            prismatic=prismatic,
             pose=observation.pose,
             marker=observation.marker[present],
             pose_of=pose_of,
@@ -114,6 +121,7 @@ class Detections:
             weight=weight,
             stated_px=stated_px,
             view=observation.view,
+            mount=mount,
             pair=(0, 1)[: len(observation.view)],
         )
 
@@ -124,7 +132,15 @@ class Detections:
         V = len(self.seen)
         pixels, weight = np.zeros((V, marker_of.size, 2)), np.ones((V, marker_of.size))
         where = np.arange(len(q)), self.marker, pose_of, marker_of
-        return Detections(q, self.prismatic, *where, pixels, weight > 0.0, weight, None, self.view, self.pair)
+        return Detections(
+            q, self.prismatic, *where, pixels, weight > 0.0, weight, None, self.view, self.mount, self.pair
+        )
+
+    @property
+    def numbers(self) -> IntArray:
+        """Numbers (n,) of the joints along the arm, from 1."""
+        numbers = np.arange(1, self.prismatic.size + 1)
+        return numbers[::-1] if self.mount == TOOL else numbers
 
     @property
     def both(self) -> BoolArray:
@@ -264,7 +280,8 @@ def require_motion(detections: Detections) -> FloatArray:
     span: FloatArray = np.ptp(detections.q[np.unique(detections.pose_of)], axis=0)
     for i in np.flatnonzero(span <= _MIN_SPAN):
         raise WorkFailed(
-            f"joint {i + 1} has no trial motion: it never moves in the data; record poses in which it does"
+            f"joint {detections.numbers[i]} has no trial motion: it never moves in the data; record poses in "
+            "which it does"
         )
     return span
 
@@ -274,6 +291,7 @@ def describe_joints(
     span: FloatArray,
     prismatic: BoolArray,
     needed: FloatArray,
+    numbers: IntArray,
     alone: FloatArray | None = None,
 ) -> tuple[str, ...]:
     """Advice for joints that moved too little, or never apart from the others, one line for all alike.
@@ -281,6 +299,7 @@ def describe_joints(
     which : (k,) indices of these joints.
     span : (n,) range of each joint in the data, rad or m.
     needed : (n,) range of a trial motion that would determine it, rad or m; NaN if none would.
+    numbers : (n,) of the joints along the arm.
     alone : (n,) range over which it moved alone, rad or m, if known.
     """
     single = len(span) == 1
@@ -314,7 +333,7 @@ def describe_joints(
                 _join_words([_format_motion(values[i], bool(prismatic[i])) for i in rows])
                 for values in (span, needed)
             )
-            joints = f"joint{'s' * (rows.size > 1)} {_join_words([str(i + 1) for i in rows])}"
+            joints = f"joint{'s' * (rows.size > 1)} {_join_words([str(i) for i in numbers[rows]])}"
             it = "it" if rows.size == 1 else "each"
             lines.append(text.format(joints=joints, moved=moved, needed=required, it=it))
     return tuple(lines)
@@ -325,8 +344,8 @@ def _join_words(words: list[str]) -> str:
     return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
 
-def require_moved(i: int, span: float, prismatic: bool, motion_px: float, sigma_px: float) -> None:
-    """Refuse joint i if its range moves the images by no more than noise: too short, or it did not follow."""
+def require_moved(number: int, span: float, prismatic: bool, motion_px: float, sigma_px: float) -> None:
+    """Refuse a joint if its range moves the images by no more than noise: too short, or it did not follow."""
     if motion_px >= MIN_MOTION * sigma_px:
         return
     seen = (
@@ -335,12 +354,12 @@ def require_moved(i: int, span: float, prismatic: bool, motion_px: float, sigma_
     reach = REACH_M if prismatic else REACH_RAD
     if span < _STANDING * reach:
         advice = (
-            f"joint {i + 1} moved only {_format_motion(span, prismatic)}: move it at least "
+            f"joint {number} moved only {_format_motion(span, prismatic)}: move it at least "
             f"{_format_motion(0.5 * reach, prismatic)}"
         )
-        raise WorkFailed(f"too little excitation: the range of joint {i + 1} moves {seen}; {advice}")
+        raise WorkFailed(f"too little excitation: the range of joint {number} moves {seen}; {advice}")
     raise WorkFailed(
-        f"joint {i + 1} stands still: its readings range over {_format_motion(span, prismatic)} but "
+        f"joint {number} stands still: its readings range over {_format_motion(span, prismatic)} but "
         f"move {seen}; check that it moved and that its readings are its own, or move a marker off its axis"
     )
 
@@ -414,7 +433,7 @@ def _require_moving(detections: Detections, sigma: float) -> None:
         square = 12.0 * _variances(*_tracks(detections.of_poses(poses))).sum(axis=1)
         path = np.sqrt(max(float(square.mean()) - 24.0 * sigma**2, 0.0)) if square.size else np.inf
         span = float(np.ptp(detections.q[poses, i]))
-        require_moved(i, span, bool(detections.prismatic[i]), path, sigma)
+        require_moved(int(detections.numbers[i]), span, bool(detections.prismatic[i]), path, sigma)
 
 
 def _tracks(detections: Detections) -> tuple[FloatArray, IntArray]:

@@ -37,7 +37,7 @@ from projservo_cli.calibration.detections import Detections, require_images, req
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, ImageGeometry
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
-from projservo_cli.calibration.prediction import LENS
+from projservo_cli.calibration.prediction import LENS, along_the_arm
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.robust_fit import (
     CHECK_READINGS,
@@ -52,7 +52,16 @@ from projservo_cli.calibration.time_offset import with_time_offset
 from projservo_cli.calibration.views import with_all_views, with_best_pair, with_own_noise
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import ImageSize, border_distance, image_sizes
-from projservo_cli.records import Calibration, Errors, FloatArray, InputError, Observation, letters_of
+from projservo_cli.records import (
+    TOOL,
+    WORLD,
+    Calibration,
+    Errors,
+    FloatArray,
+    InputError,
+    Observation,
+    letters_of,
+)
 
 _METHODS = ("bundle_adjustment", "closed_form")
 # Fitted over expected noise above which a fit that passes may still have one joint at fault.
@@ -96,6 +105,7 @@ def calibrate(
     init: Nominal | None = None,
     joint_noise: float | None = 0.0,
     max_predicted_px: float | None = None,
+    mount: str = WORLD,
     fitted: Callable[[Solution, float], None] | None = None,
     progress: Progress = lambda what, done, total: None,
 ) -> Calibration:
@@ -119,6 +129,7 @@ def calibrate(
         ``bundle_adjustment``; None estimates it, and takes 0 unless the images show it.
     max_predicted_px : error of predictions by deviations from the model, px, above which the calibration is
         not usable; None takes 1 % of the image size.
+    mount : ``world`` for cameras that watch the tool, ``tool`` for cameras on it that watch the scene.
     fitted : called with the solution of ``bundle_adjustment`` and its noise, px.
     progress : called with the current task of ``bundle_adjustment``, how much of it is done, and its total.
 
@@ -144,6 +155,12 @@ def calibrate(
         raise InputError(f"max_predicted_px {max_predicted_px!r}: give a positive number, or none")
     if joint_noise is not None and not 0.0 <= joint_noise < np.inf:
         raise InputError(f"joint noise {joint_noise!r}: give a number that is not negative, or none")
+    if mount not in (WORLD, TOOL):
+        raise InputError(f"mount {mount!r}: choose {WORLD} or {TOOL}")
+    if mount == TOOL and (init is not None or method != "bundle_adjustment"):
+        raise InputError(
+            "cameras on the tool are calibrated by bundle_adjustment from images alone: leave out init"
+        )
     if lens and method != "bundle_adjustment":
         raise InputError(
             f"calibration method {method!r} estimates no lens: choose bundle_adjustment, or calibrate without"
@@ -152,7 +169,7 @@ def calibrate(
     solution = None
     # The matrices are small: a second thread costs more than it gives.
     with threadpool_limits(limits=1):
-        whole = Detections.of(observation, joint_types)
+        whole = Detections.of(observation, joint_types, mount)
         require_motion(whole)
         require_poses(whole)
         if image_size is not None:
@@ -181,6 +198,8 @@ def calibrate(
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
             fitted(solution, expected.noise_px(solution))
+        if mount == TOOL:
+            result = along_the_arm(result)
         if method == "bundle_adjustment":
             result = with_time_offset(result, observation)
     return dataclasses.replace(result, source=source, seconds=seconds)
@@ -396,6 +415,7 @@ def _record(
         method=method,
         source="",
         view=detections.view,
+        mount=detections.mount,
         joint_types=letters_of(detections.prismatic),
         usable=verdict.usable,
         reason=verdict.reason,
@@ -431,7 +451,9 @@ def _record(
         poses_used=int(np.unique(detections.pose_of[used_rows]).size),
         markers_used=int(np.unique(detections.marker_of[used_rows]).size),
         outlier=outlier,
-        suspect=np.stack([detections.pose[found.suspect[:, 0]], found.suspect[:, 1] + 1], axis=1),
+        suspect=np.stack(
+            [detections.pose[found.suspect[:, 0]], detections.numbers[found.suspect[:, 1]]], axis=1
+        ),
         rejected_poses=detections.pose[found.poses],
         moved_images=np.stack([detections.pose[found.moved[:, 0]], found.moved[:, 1]], axis=1),
         id_switches=np.concatenate(

@@ -4,15 +4,16 @@ It has the equations of the kernels in ``geometry`` for all poses and points tog
 predictions and random tasks.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from projservo_cli.geometry.displacements import displacements, sine_and_versine
 from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible
 from projservo_cli.records import (
+    TOOL,
     BoolArray,
     Calibration,
     Errors,
@@ -26,6 +27,11 @@ from projservo_cli.records import (
 CAMERA = 12
 # Number of parameters of a lens about a given image centre, k1 and k2; two more are its centre.
 LENS = 2
+# Fields of a calibration with an entry for each joint, besides those in the sense of its readings.
+_PER_JOINT = (
+    *("H_hat_0", "excitation", "poorly_observable", "prediction_noise"),
+    *("operator_defect", "trace_defect", "plane_defect"),
+)
 
 
 def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
@@ -171,9 +177,47 @@ class Parameters:
 
 
 def parameters_from(calibration: Calibration) -> Parameters:
-    """Parameters of a calibration record."""
-    c = calibration
-    return Parameters(c.P, c.H_hat_0, c.prismatic, c.M, c.lens, lens_terms=c.lens_terms)
+    """Parameters of a calibration record; of cameras on the tool, those of the chain of the scene."""
+    c, way = calibration, -1 if calibration.mount == TOOL else 1
+    return Parameters(c.P, c.H_hat_0[::way], c.prismatic[::way], c.M, c.lens, lens_terms=c.lens_terms)
+
+
+def errors_of(calibration: Calibration) -> Errors:
+    """Errors of the parameters of a calibration, in their order."""
+    return _reordered(calibration.errors, calibration) if calibration.mount == TOOL else calibration.errors
+
+
+def from_reference(calibration: Calibration, q: FloatArray) -> FloatArray:
+    """Values (K, n) of the joints of its parameters from their reference, at readings (K, n)."""
+    away = q - calibration.q_reference
+    return np.ascontiguousarray(-away[:, ::-1]) if calibration.mount == TOOL else away
+
+
+def _reordered(errors: Errors, c: Calibration) -> Errors:
+    """Errors with the operators in reverse."""
+    n, first = len(c.H_hat_0), c.P.size
+    rows = np.arange(len(errors.shared))
+    blocks = rows[first : first + 16 * n].reshape(n, 16)
+    rows[first : first + 16 * n] = blocks[::-1].ravel()
+    return Errors(errors.shared[rows], errors.marker, errors.own)
+
+
+def along_the_arm(c: Calibration) -> Calibration:
+    """Return the record of cameras on the tool, with joints in the order and sense of the readings."""
+    first, bias = len(c.sqrt_cov_shared), c.model_error_bias
+    if bias is not None:
+        bias = np.concatenate([_reordered(Errors(bias[:first], c.M, c.M), c).shared, bias[first:]])
+    per_joint: dict[str, Any] = {name: np.ascontiguousarray(getattr(c, name)[::-1]) for name in _PER_JOINT}
+    return replace(
+        c,
+        **per_joint,
+        joint_types=c.joint_types[::-1],
+        q_reference=np.ascontiguousarray(-c.q_reference[::-1]),
+        joint_min=np.ascontiguousarray(-(c.joint_min + c.excitation)[::-1]),
+        corner_q=None if c.corner_q is None else np.ascontiguousarray(-c.corner_q[:, ::-1]),
+        sqrt_cov_shared=_reordered(c.errors, c).shared,
+        model_error_bias=bias,
+    )
 
 
 def _checked(calibration: Calibration, q: FloatArray) -> tuple[Parameters, FloatArray]:
@@ -187,7 +231,7 @@ def _checked(calibration: Calibration, q: FloatArray) -> tuple[Parameters, Float
         raise InputError(f"joint readings of shape {q.shape}: expected (poses, {n})")
     if not np.isfinite(q).all():
         raise InputError("joint readings must be finite numbers")
-    return parameters_from(calibration), q - calibration.q_reference
+    return parameters_from(calibration), from_reference(calibration, q)
 
 
 def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
@@ -221,7 +265,7 @@ def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
     params, q = _checked(calibration, q)
     result = np.empty((len(q), len(params.P), len(params.M), 2))
     for k in range(len(q)):  # a pose at a time, to bound the memory
-        common, own = pixel_changes(params, calibration.errors, q[k : k + 1])
+        common, own = pixel_changes(params, errors_of(calibration), q[k : k + 1])
         result[k] = ((common**2).sum(axis=-1) + (own**2).sum(axis=-1))[0]
     return result
 
@@ -247,8 +291,13 @@ def error_factor(calibration: Calibration) -> FloatArray:
 
     The gauge is fixed to errors of minimum norm. Rows of the lenses precede M.
     """
-    factor, free = calibration.errors.dense(), parameters_from(calibration).gauge()
-    return np.asarray(factor - free @ (free.T @ factor))
+    factor, free = errors_of(calibration).dense(), parameters_from(calibration).gauge()
+    factor = np.asarray(factor - free @ (free.T @ factor))
+    if calibration.mount == TOOL:
+        s = len(calibration.sqrt_cov_shared)
+        none = np.zeros((0, 4, 0))
+        factor[:s] = _reordered(Errors(factor[:s], none, none), calibration).shared
+    return factor
 
 
 def error_factor_with_model(calibration: Calibration) -> FloatArray:
@@ -264,4 +313,5 @@ def joint_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
     """Derivative (K, V, m, 2, n) of predicted pixels by joints (K, n), px per rad or m."""
     params, q = _checked(calibration, q)
     J = params.everywhere(q).by_joint(params.H_hat)
+    J = -J[..., ::-1] if calibration.mount == TOOL else J
     return np.asarray(J.reshape(len(params.P), len(q), len(params.M), *J.shape[2:]).swapaxes(0, 1))

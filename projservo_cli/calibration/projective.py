@@ -198,11 +198,11 @@ def _mean_operator(
         try:
             H = normalize_displacement(_homography(A, B), A, depth)
         except WorkFailed as error:
-            raise WorkFailed(f"joint {i + 1}, pose {detections.pose[k]}: {error}") from None
+            raise WorkFailed(f"joint {detections.numbers[i]}, pose {detections.pose[k]}: {error}") from None
         total += 0.5 * lever * (H - np.linalg.inv(H))
         weights += lever**2
     if weights == 0.0:
-        raise WorkFailed(f"joint {i + 1} has no usable trial: {refused}")
+        raise WorkFailed(f"joint {detections.numbers[i]} has no usable trial: {refused}")
     return total / weights
 
 

@@ -45,6 +45,7 @@ _TRIALS = "trials.csv"  # in the folder of a run: the default table of a recordi
 _KEYS = {  # that options stand for
     "data": "data.table",
     "readings": "data.readings",
+    "mount": "data.mount",
     "joints": "data.joints",
     "joint_unit": "data.joint_unit",
     "noise_px": "data.noise_px",
@@ -117,6 +118,11 @@ _OF_STAGES = (
         metavar="TABLE",
         type=click.Path(),
         help="Joints of each pose (CSV), where --data lists detections: pose, camera, marker, u, v.",
+    ),
+    click.option(
+        "--mount",
+        type=click.Choice(["world", "tool"]),
+        help="Where the table's cameras are: they stand still, or are on the tool. Default: world.",
     ),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
     joint_unit(help="Unit of the table's revolute joints. Default: rad."),

@@ -74,7 +74,7 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         size = config.image_size_px
         stated = data.joint_order == "stated"
         readings, kind = _file(config, "readings", files), (config.joint_types, data.joint_unit)
-        source = Table(table, readings, *kind, size, data.noise_px, _seed(config), stated)
+        source = Table(table, readings, *kind, size, data.noise_px, _seed(config), data.mount, stated)
     else:
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
         source = _trials(config, _truth(config, face=False), files, speed_scale=1.0)

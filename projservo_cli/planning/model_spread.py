@@ -6,7 +6,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import dense_pixel_changes, error_factor, parameters_from
+from projservo_cli.calibration.prediction import (
+    dense_pixel_changes,
+    error_factor,
+    from_reference,
+    parameters_from,
+)
 from projservo_cli.image_size import image_corners
 from projservo_cli.records import NO_SPREAD, BoolArray, Calibration, FloatArray, Spread
 
@@ -29,7 +34,7 @@ def drawn_poses(
     scene, (low, high) = parameters_from(calibration), region.image.swapaxes(0, 1)[:, :, None]
     for _ in range(batches):
         q = rng.uniform(region.low, region.high, (_BATCH, len(region.low)))
-        pixels = scene.predict(q - calibration.q_reference)
+        pixels = scene.predict(from_reference(calibration, q))
         yield q, ((pixels >= low) & (pixels <= high)).all(axis=-1)  # none that is NaN, behind the camera
 
 

@@ -5,7 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
-from projservo_cli.calibration.prediction import dense_pixel_changes, parameters_from
+from projservo_cli.calibration.prediction import (
+    dense_pixel_changes,
+    errors_of,
+    from_reference,
+    parameters_from,
+)
 from projservo_cli.planning.model_spread import Region, drawn_poses
 from projservo_cli.records import (
     Calibration,
@@ -115,7 +120,7 @@ def _visible_poses(
     for q, in_view in drawn_poses(calibration, region, _BATCHES, rng):
         enough = np.flatnonzero(in_view.all(axis=1).sum(axis=1) >= _LEAST_SEEN)[: count - len(poses)]
         if enough.size:
-            J = dense_pixel_changes(scene, calibration.errors, q[enough] - calibration.q_reference)
+            J = dense_pixel_changes(scene, errors_of(calibration), from_reference(calibration, q[enough]))
             sharp = np.sqrt((J**2).sum(axis=-1)).max(axis=-1) <= _VAGUE * np.ptp(region.image, axis=1).max()
             in_view = in_view[enough] & sharp
             J[~in_view] = 0.0
@@ -126,7 +131,7 @@ def _visible_poses(
             break
     if not poses:
         raise WorkFailed(
-            f"no further pose to suggest: none within the joint ranges shows {_LEAST_SEEN} markers to both "
+            f"no further pose to suggest: none within the joint ranges shows {_LEAST_SEEN} markers to all "
             "cameras by this calibration; improve it with single-joint trials first"
         )
     return np.array(poses), np.array(rows)

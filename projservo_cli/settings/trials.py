@@ -104,6 +104,10 @@ class Data(Section):
         description="joint types, one letter R or P for each column q1 ... qN; null: those of robot, "
         "else all R",
     )
+    mount: Literal["world", "tool"] = Field(
+        "world",
+        description="world: cameras stand still and watch the tool; tool: they are on it and watch the scene",
+    )
     joint_unit: Literal["deg", "rad"] | None = Field(
         None,
         description="unit of revolute joints; null: rad, and readings that look like degrees are refused",

@@ -49,6 +49,7 @@ def recorded(table: Table) -> Observations:
         image_size=table.image_size,
         noise_px=table.noise_px,
         seed=table.seed,
+        mount=table.mount,
         order_stated=table.order_stated,
     )
 
@@ -104,6 +105,7 @@ def estimate(
             init=Nominal(**read_nominal(asked.init.path)) if asked.init is not None else None,
             joint_noise=seen.joint_noise,
             max_predicted_px=asked.max_predicted_px,
+            mount=seen.mount,
             fitted=judge,
             progress=progress,
         )

@@ -107,6 +107,7 @@ class Table(NamedTuple):
     image_size: ImageSize | None  # width and height, px, of both images or of one each, if known
     noise_px: float | None  # standard deviation of a coordinate; None to estimate it
     seed: int  # of random starts
+    mount: str  # of the cameras, world or tool
     order_stated: bool  # whether somebody stated the order of the joints
 
 

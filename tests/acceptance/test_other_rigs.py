@@ -8,6 +8,7 @@ from projservo_cli.records import InputError
 from projservo_cli.store import load
 from projservo_cli.store.observation_tables import to_csv, write_table
 from tests.calibration.simulated_robot import around, random_robot, trials
+from tests.calibration.test_cameras_on_the_tool import Hand
 
 FEW = 4  # of the corners of the board, every so many
 
@@ -34,6 +35,30 @@ def test_a_chain_of_another_rig(answer, elsewhere, views):
         assert code in (0, 1), (kind, error)
     with pytest.raises(InputError, match=r"the calibration has the views left.*; tasks, laws"):
         ErrorModel(load("out").calibration, 0.4)
+
+
+def test_cameras_on_the_tool(answer, elsewhere):
+    rng = np.random.default_rng(4)
+    arm = Hand(**vars(random_robot("RRPRR", rng, markers=9)))
+    write_table(
+        arm.observe(np.concatenate([trials(arm, frames=5), around(arm, 14, rng)]), 0.4, rng), "table.csv"
+    )
+    write_table(arm.observe(around(arm, 8, rng), 0.4, rng), "ahead.csv")
+    words = "calibrate", "--data", "table.csv", "--joints", "RRPRR", "-o", "out"
+    code, _, error = answer(*words)
+    assert code == 1
+    assert "by the images the cameras are on the tool: give --mount tool" in error
+    code, found, _ = answer(*words, "--mount", "tool", "--suggest", "2")
+    assert (code, found["usable"], found["mount"]) == (0, True, "tool")
+    assert [joint["type"] for joint in found["joints"]] == [*"RRPRR"]
+    assert len(found["suggestions"]) == 2
+    code, value, _ = answer("validate", "out", "--data", "ahead.csv")
+    assert code == 0
+    assert value["median_px"] <= value["limit_px"]
+    assert answer("report", "-o", "out", "calibrate")[0] == 0
+    code, _, error = answer("export", "out", "--to", "urdf", "--metric", "0.1", "--between", "5,8")
+    assert code == 2
+    assert "metric: takes fixed cameras; those of this calibration are on the tool" in error
 
 
 def test_three_webcams_before_a_real_arm(answer, elsewhere, shared_data):

@@ -254,6 +254,7 @@ class _Tests:
         self.edges = np.append(starts, counted.size)
         self.nuisances, self.dof = nuisances, max(solution.dof, 1)
         self.pose, self.view = problem.detections.pose, problem.detections.view
+        self.numbers = problem.detections.numbers
         # Weights of residuals in each view, and in the last entry in all: those of two views are near one.
         weights = [problem.detections.weight[v, u] for v, u in enumerate(used)]
         weights.append(problem.detections.weight[used])
@@ -531,10 +532,8 @@ def stepped(solution: Solution, onset: int) -> ModelError | None:
         b = np.linalg.lstsq(Z, off)[0]
         if (square := float(np.square(off - Z @ b).sum())) < left:
             size = float(np.sqrt(np.mean((Z @ b / weight) ** 2)) if one.kind in _OF_IMAGES else -b[0])
-            joints, view = (
-                tuple(i + 1 for i in one.joints),
-                "" if one.view is None else detections.view[one.view],
-            )
+            joints = tuple(int(detections.numbers[i]) for i in one.joints)
+            view = "" if one.view is None else detections.view[one.view]
             first, left = int(detections.pose[onset]), square
             best = ModelError(one.kind, joints, view, size, 0.0, abs(size), first)
     return best
@@ -649,7 +648,8 @@ def _described(
     one, length = tests.nuisances[number], max(float(np.linalg.norm(b)), 1e-300)
     sign = -1.0 if (len(b) == 1 or one.kind == "scale") and (b < 0.0).all() else 1.0
     deviation = float(np.sqrt(max(float(b @ covariance @ b), 0.0))) / length
-    joints, view = tuple(i + 1 for i in one.joints), "" if one.view is None else tests.view[one.view]
+    joints = tuple(int(tests.numbers[i]) for i in one.joints)
+    view = "" if one.view is None else tests.view[one.view]
     size = _SIZES[one.kind]
     if one.kind == "scale":  # of several joints the root mean square
         size /= np.sqrt(len(joints))

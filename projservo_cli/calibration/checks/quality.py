@@ -226,7 +226,7 @@ def assess(
     max_predicted_px : effect of deviations from the model on predictions above which it is not usable.
     Raises WorkFailed naming a joint that moves no image, or whose operator is not determined.
     """
-    prismatic = solution.params.prismatic
+    prismatic, numbers = solution.params.prismatic, solution.problem.detections.numbers
     # Residuals of a method without covariance are its own errors, not noise of the images.
     sigma = expected.sigma_px if errors is None else expected.noise_px(solution)
     span = _require_joints_seen(solution, sigma)
@@ -247,9 +247,9 @@ def assess(
         i = int(np.argmax(noise))
         if noise[i] > UNDETERMINED_NOISE:
             raise WorkFailed(
-                f"joint {i + 1} is not determined: near the reference its predicted images err by "
+                f"joint {numbers[i]} is not determined: near the reference its predicted images err by "
                 f"{noise[i]:.3g} times the pixel noise; "
-                + "".join(describe_joints(np.array([i]), span, prismatic, needed))
+                + "".join(describe_joints(np.array([i]), span, prismatic, needed, numbers))
             )
         weak = noise > WEAK_NOISE
         if weak.any() and solution.problem.tau is not None:
@@ -258,7 +258,7 @@ def assess(
                 np.array([_rms(T) for T in _Uncertainty.of(exact, exact.errors()).at_reach()]) > WEAK_NOISE
             )
         alone = _span_alone(solution.problem.detections)
-        advice += describe_joints(np.flatnonzero(weak), span, prismatic, needed, alone)
+        advice += describe_joints(np.flatnonzero(weak), span, prismatic, needed, numbers, alone)
     warned, share = expected.warns(solution), expected.ratio(solution)
     found = f"{solution.sigma_px:.3g} px a coordinate"
     wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
@@ -331,5 +331,7 @@ def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
     rate = there.joint_derivative(solution.params)
     motion = np.linalg.norm(rate, axis=2).mean(axis=(0, 1)) * span
     i = int(np.argmin(motion))
-    require_moved(i, float(span[i]), bool(detections.prismatic[i]), float(motion[i]), sigma_px)
+    require_moved(
+        int(detections.numbers[i]), float(span[i]), bool(detections.prismatic[i]), float(motion[i]), sigma_px
+    )
     return span

@@ -20,7 +20,7 @@ from projservo_cli.calibration.robust_fit import (
     Solution,
     fit_from,
 )
-from projservo_cli.records import BoolArray, FloatArray, WorkFailed, letters_of
+from projservo_cli.records import TOOL, WORLD, BoolArray, FloatArray, WorkFailed, letters_of
 
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.
 DOUBTED_RATIO = 1.15
@@ -39,8 +39,8 @@ _AGREEING = 5
 _MANY_POSES = 0.4
 # Number of hypotheses about a joint at fault that are fitted completely.
 _FOLLOWED = 2
-# Number of hypotheses about the order of images, the first ones.
-_ORDERS = 2
+# Number of hypotheses about the mount and the order of images, the first ones.
+_ORDERS = 3
 # Number of adjustment steps of the screws by which hypotheses are compared before.
 _SCREW_STEPS = 8
 # Log residual added to a joint of the other type, which explains more: one that stands still is simpler.
@@ -178,26 +178,31 @@ def joint_at_fault(search: Search, max_px: float, straight: Sequence[int] | None
 
 def _hypotheses(detections: Detections, q_reference: FloatArray) -> list[tuple[str, LeastSquares, float]]:
     """Hypotheses that a joint is of the other type or stands still, or of late images; with a penalty."""
-    found, q = [], detections.q
+    found, q, numbers = [], detections.q, detections.numbers
     for order, shifted, remedy in (
         ("before", np.vstack([q[:1], q[:-1]]), "let each pose settle for longer (plant.settle_s)"),
         ("after", np.vstack([q[1:], q[-1:]]), "store readings with the image of the same pose"),
     ):
         words = f"each image shows the pose {order} its reading: {remedy}, and take the newest frame"
         found.append((words, LeastSquares.of(dataclasses.replace(detections, q=shifted), q_reference), 0.0))
+    other, there = (TOOL, "on the tool") if detections.mount == WORLD else (WORLD, "fixed")
+    backwards = dataclasses.replace(
+        detections, q=np.ascontiguousarray(-q[:, ::-1]), prismatic=detections.prismatic[::-1], mount=other
+    )
+    words = f"by the images the cameras are {there}: give --mount {other} (data.mount)"
+    found.insert(0, (words, LeastSquares.of(backwards, -q_reference[::-1]), 0.0))
     for i, slides in enumerate(detections.prismatic):
         flipped = detections.prismatic.copy()
         flipped[i] = not slides
         given, fits = ("prismatic", "revolute") if slides else ("revolute", "prismatic")
-        letters = letters_of(flipped)
+        letters = letters_of(flipped[numbers.argsort()])
         remedy = f"check the types of joints, --joints or joint_types ({letters} would fit)"
-        words = f"by the images joint {i + 1} is {fits}, not {given}: {remedy}"
-        other = dataclasses.replace(detections, prismatic=flipped)
-        found.append((words, LeastSquares.of(other, q_reference), _SIMPLER))
+        words = f"by the images joint {numbers[i]} is {fits}, not {given}: {remedy}"
+        turned = dataclasses.replace(detections, prismatic=flipped)
+        found.append((words, LeastSquares.of(turned, q_reference), _SIMPLER))
     for i in range(len(q_reference) if len(q_reference) > 1 else 0):
-        words = (
-            f"by the images joint {i + 1} stands still while its readings move: check that they are its own"
-        )
+        still = f"by the images joint {numbers[i]} stands still while its readings move"
+        words = f"{still}: check that they are its own"
         fewer = dataclasses.replace(
             detections, q=np.delete(detections.q, i, axis=1), prismatic=np.delete(detections.prismatic, i)
         )
@@ -238,7 +243,8 @@ def _describe_unmoved(solution: Solution) -> str | None:
     if not short.any():
         return None
     i = int(np.argmax(short))
-    return f"the fit rejects most motion of joint {i + 1}; check its readings and its type (R or P)"
+    number = detections.numbers[i]
+    return f"the fit rejects most motion of joint {number}; check its readings and its type (R or P)"
 
 
 def _rejected_views(solution: Solution) -> BoolArray:

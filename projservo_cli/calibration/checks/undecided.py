@@ -62,7 +62,8 @@ def undecided_pairs(solution: Solution, sigma_px: float) -> IntArray:
                 break
             excluded.append(inverted)
     pairs = [pair for pair in sorted(pairs) if _effect(solution, *pair) > MIN_MOTION * sigma_px]
-    return np.array(pairs, dtype=np.int64).reshape(-1, 2) + 1
+    found = problem.detections.numbers[np.array(pairs, dtype=np.int64).reshape(-1, 2)]
+    return np.sort(found, axis=1)[np.lexsort(np.sort(found, axis=1).T[::-1])]
 
 
 def _change(problem: LeastSquares, params: Parameters, order: Sequence[int]) -> FloatArray:
@@ -99,7 +100,8 @@ def require_poses(detections: Detections) -> None:
         needed, shown = own + min(_SPARE * (j - i), _OF_MOTION), _OF_MOTION * (poses - 1)
         if shown >= needed or j - i == 1:  # of a single joint range and noise decide
             continue
-        what, enough = f"postures of joints {i + 1} to {j}", -(-needed // _OF_MOTION) + 1
+        first, last = sorted(detections.numbers[[i, j - 1]].tolist())
+        what, enough = f"postures of joints {first} to {last}", -(-needed // _OF_MOTION) + 1
         raise WorkFailed(
             f"{poses} {'poses' if j - i == n else what} show {shown} numbers of the arm, {_OF_MOTION} a "
             f"motion between two, less than the {needed} required ({own} unknown and {needed - own} to "

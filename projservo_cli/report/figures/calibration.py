@@ -8,6 +8,8 @@ from scipy.special import chdtri
 from projservo_cli.calibration.detections import MAX_JUDGED, even_choice, per_rad
 from projservo_cli.calibration.prediction import (
     error_factor,
+    errors_of,
+    from_reference,
     joint_derivative,
     parameters_from,
     pixel_changes,
@@ -104,7 +106,7 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
     tested, variance = residual * weight[..., None], np.empty_like(residual)
     for k, of_pose in enumerate(used):
         parts = pixel_changes(
-            parameters_from(calibration), calibration.errors, q[k : k + 1] - calibration.q_reference
+            parameters_from(calibration), errors_of(calibration), from_reference(calibration, q[k : k + 1])
         )
         common, own = (part[0] * weight[k, ..., None, None] for part in parts)
         variance[k] = (common**2).sum(axis=-1) + (own**2).sum(axis=-1)
