@@ -119,9 +119,12 @@ class Engine:
             yield of_processes
         finally:
             processes = list((of_processes._processes or {}).values())
+            results = of_processes._result_queue
             of_processes.shutdown(wait=False, cancel_futures=True)
             for process in processes:
                 process.terminate()
+            # One that ended amid a result leaves a part of it, for the rest of which this process would wait.
+            results._writer.close()  # type: ignore[attr-defined]  # no name of its own closes it
 
     def check(self) -> None:
         """Raise WorkFailed if no result can arrive; a pool of this machine raises by itself."""

@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import shutil
+import subprocess
 import sys
 import time
 import traceback
@@ -122,3 +123,10 @@ def test_a_killed_call_leaves_whole_files_and_is_finished_by_the_next(tmp_path):
         assert call(folder, 1) == 0
         assert [path.name for path in folder.iterdir()] == ["run.h5"]
         assert load(folder).traces.keys() == {"direct_three", "stacked"}
+
+
+def test_an_interrupted_sweep_ends_although_a_worker_has_sent_a_part_of_its_result():
+    command = [sys.executable, "-m", "tests.survival.half_a_result"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1
+    assert done.stderr.startswith("interrupted")
