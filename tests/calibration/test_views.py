@@ -5,8 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+import projservo_cli as projservo
 from projservo_cli.calibration import calibrate, predict, prediction_variance
 from projservo_cli.calibration.checks.validation import residual_statistics
+from projservo_cli.metric.frame import links
+from projservo_cli.observations import Observations
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.store.observation_tables import read_table
 from tests.calibration.bound import Bound
@@ -101,6 +104,25 @@ def test_left_images_alone_of_data_of_others(shared_data, data, types, rms_px):
     error = residual_statistics(found, held_out)
     assert error["rms_px"] < rms_px
     assert error["median_px"] <= error["limit_px"]
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_metres_by_another_rig(views):
+    """Intrinsic matrices and distances between axes of the truth, within four of their deviations."""
+    rng = np.random.default_rng(2)
+    robot = random_robot("RRRRR", rng, markers=8, views=views)
+    q = np.concatenate([trials(robot, frames=6), around(robot, 20, rng)])
+    seen = Observations.of(robot.observe(q, 0.2, rng), joint_types=robot.joint_types)
+    length = float(np.linalg.norm(robot.markers[0] - robot.markers[1]))
+    metric = projservo.calibrate(seen, progress=False).metric(length, (5, 8))
+    K = np.array([[1200.0, 0.0, 640.0], [0.0, 1200.0, 512.0], [0.0, 0.0, 1.0]])
+    deviation = np.sqrt(np.diagonal(metric.covariance("K"), axis1=-2, axis2=-1))
+    off = (metric.K - K)[:, (0, 0, 0, 1, 1), (0, 1, 2, 1, 2)]
+    assert (np.abs(off) <= 4.0 * deviation).all()
+    w = np.stack([robot.twists[:, 2, 1], robot.twists[:, 0, 2], robot.twists[:, 1, 0]], axis=1)
+    p, across = np.cross(w, robot.twists[:, :3, 3]), np.cross(w[:-1], w[1:])
+    apart = np.abs((np.diff(p, axis=0) * across).sum(axis=1)) / np.linalg.norm(across, axis=1)
+    np.testing.assert_allclose(links(metric.axes, metric.prismatic, metric.axes)[1], apart, atol=3e-3)
 
 
 def test_views_that_cannot_be_used_are_refused():
