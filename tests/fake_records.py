@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.records import SIZES, VIEWS
+from projservo_cli.records import SIZES, VIEWS, WORLD
 
 EXTENTS = {"view": len(VIEWS), "joint": 6, "marker": 4, "pose": 5, "instant": 7, "step": 6, "constraint": 4}
 SCALARS = {float: 1.5, int: 3, str: "text ä", bool: True}
@@ -22,6 +22,8 @@ def fake(kind: type, seed: int = 0, sizes: dict[str, int] | None = None, **given
         given.setdefault("joint_types", "R" * extent["joint"])
     if "view" in hints:
         given.setdefault("view", VIEWS)
+    if "mount" in hints:
+        given.setdefault("mount", WORLD)
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
         if field.name in given:

@@ -261,9 +261,9 @@ def _known_lengths(config: Config) -> KnownLengths:
 def about_of(config: Config, read: Iterable[File] = ()) -> About:
     """Return the part of a configuration for the page; paths of its files may change."""
     files = {file.path: file for file in read}
-    pieces = [stored_yaml(config)]
-    if files:
-        pieces = re.split("(" + "|".join(map(re.escape, files)) + ")", pieces[0])
+    named = {f"__file_{i}__": file for i, file in enumerate(files.values())}
+    text = stored_yaml(config, {file.path: name for name, file in named.items()})
+    pieces = re.split(f"({'|'.join(named)})", text) if named else [text]
     return About(
         name=config.name,
         seed=config.seed,
@@ -271,7 +271,7 @@ def about_of(config: Config, read: Iterable[File] = ()) -> About:
         estimates_noise=config.data is not None and config.data.noise_px is None,
         joints=config.joint_names,
         required=config.control.must_converge,
-        text=tuple(files.get(piece, piece) for piece in pieces),
+        text=tuple(named.get(piece, piece) for piece in pieces),
     )
 
 

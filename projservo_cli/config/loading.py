@@ -13,6 +13,7 @@ import re
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import yaml
@@ -417,9 +418,21 @@ def to_yaml(config: Config) -> str:
     return plain_yaml(_without_unset(config))
 
 
-def stored_yaml(config: Config) -> str:
-    """The configuration as ``to_yaml``, with the passwords of URLs masked: for files and pages."""
-    return plain_yaml(masked(_without_unset(config)))
+def stored_yaml(config: Config, names: Mapping[str, str] = MappingProxyType({})) -> str:
+    """The configuration as ``to_yaml``, with the passwords of URLs masked: for files and pages.
+
+    names : by texts, such as paths, what is to stand for them: lines then break alike however long they are.
+    """
+    return plain_yaml(_renamed(masked(_without_unset(config)), names))
+
+
+def _renamed(values: Any, names: Mapping[str, str]) -> Any:
+    """Plain values with some of their texts replaced."""
+    if isinstance(values, dict):
+        return {key: _renamed(value, names) for key, value in values.items()}
+    if isinstance(values, list):
+        return [_renamed(value, names) for value in values]
+    return names.get(values, values) if isinstance(values, str) else values
 
 
 def plain_yaml(values: Any) -> str:

@@ -88,7 +88,8 @@ def test_advice_in_words(span, prismatic, needed, text):
     spans, ranges = np.full(4, 1.0), np.full(4, 0.1)
     spans[3], ranges[3] = span, needed
     which = np.array([3])
-    assert describe_joints(which, spans, np.array([False] * 3 + [prismatic]), ranges) == (text,)
+    kinds, numbers = np.array([False] * 3 + [prismatic]), np.arange(1, 5)
+    assert describe_joints(which, spans, kinds, ranges, numbers) == (text,)
 
 
 def test_joints_that_are_off_are_told_in_px_and_no_joint_is_to_move_for_them():
