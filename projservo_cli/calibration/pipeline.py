@@ -211,7 +211,7 @@ def require_size_and_noise(image_size: Any, sigma_px: Any) -> None:
         raise InputError(f"pixel noise {sigma_px!r}: give a positive number, or none to estimate it")
     if image_size is not None:
         given = tuple(image_size) if np.iterable(image_size) else ()
-        for lengths in given if len(given) == 2 and all(map(np.iterable, given)) else (given,):
+        for lengths in given if given and all(map(np.iterable, given)) else (given,):
             if len(lengths) != 2 or not all(map(_is_positive, lengths)):
                 raise InputError(
                     f"image size {image_size!r}: give a positive width and height, px, or one pair a camera"
@@ -224,6 +224,11 @@ def _is_positive(value: Any) -> bool:
 
 def _require_inside(detections: Detections, image_size: ImageSize, strays: float) -> None:
     """Refuse an image size, width and height in px, with more than a share of a view's pixels outside."""
+    if np.ndim(image_size) == 2 and len(image_size) != len(detections.view):
+        raise InputError(
+            f"{len(image_size)} image sizes for the views {', '.join(detections.view)}: give one, or one a "
+            "view"
+        )
     pixels, sizes = detections.pixels, image_sizes(image_size, len(detections.seen))
     outside = detections.seen & (border_distance(pixels, sizes[:, None]) < -_BEYOND_PX)
     for view, name in enumerate(detections.view):

@@ -141,7 +141,7 @@ def suggest_motions(
     pixels, size = observation.images, inputs.image_size
     image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
     if size is not None:
-        image = image_corners(image_sizes(size))
+        image = image_corners(image_sizes(size, len(observation.view)))
     targets = _region(inputs.joints, observation.q, WIDER, image)
     candidates = targets if inputs.recorded else _region(inputs.joints, observation.q, FARTHER, image)
     rng = generator(inputs.seed, SUGGESTIONS)

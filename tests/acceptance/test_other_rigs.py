@@ -24,6 +24,13 @@ def test_a_chain_of_another_rig(answer, elsewhere, views):
     assert code == 0, error
     assert (code, found["usable"], found["view"]) == (0, True, ["left", "right", "top"][:views])
     assert (found["sigma_view_px"] is None) == (views < 3)
+    words, sizes = ("calibrate", "--data", "table.csv"), ["1280x1024", "1281x1024", "1282x1024"]
+    sized = "-o", "sized", "--image-size", ",".join(sizes[:views])
+    code, again, error = answer(*words, *sized, "--suggest", "1")
+    assert (code, len(again["suggestions"])) == (0, 1), error
+    code, _, error = answer(*words, "-o", "other", "--image-size", ",".join(sizes[:2]))
+    assert code == 2
+    assert f"2 image sizes for the views {', '.join(found['view'])}: give one, or one a view" in error
     code, value, _ = answer("validate", "out", "--data", "ahead.csv")
     assert (code, value["count"]) == (0, views * 8 * 8)
     assert value["median_px"] <= value["limit_px"]
