@@ -4,7 +4,6 @@
 """
 
 import dataclasses
-from contextlib import suppress
 from itertools import combinations
 
 import numpy as np
@@ -50,7 +49,7 @@ def with_best_pair(detections: Detections) -> Detections:
 
 
 def with_all_views(of_pair: Solution, whole: Detections, epipolar: ImageGeometry) -> Solution:
-    """Fit to all views, from that to the pair: each further camera by resection, then a noise of each view.
+    """Fit to all views, from that to the pair: each further camera by resection.
 
     Raises WorkFailed naming a view whose detections determine no camera.
     """
@@ -90,6 +89,7 @@ def with_own_noise(solution: Solution, epipolar: ImageGeometry) -> tuple[Solutio
     """
     if len(solution.used) <= 2:
         return solution, epipolar
+    first_pair = solution.problem.detections.pair
     for _ in range(_NOISE_ROUNDS):
         detections = solution.problem.detections
         noise = np.array([_noise(solution, v) for v in range(len(solution.used))])
@@ -104,10 +104,14 @@ def with_own_noise(solution: Solution, epipolar: ImageGeometry) -> tuple[Solutio
         if found is None:
             break
         solution = found
-    with suppress(WorkFailed):  # without a baseline the first pair stays
-        seen = undistorted(solution.problem.detections, solution.params.lens)
-        epipolar = Epipolar.of(seen, np.random.default_rng(0))
-    return solution, epipolar
+    seen = undistorted(solution.problem.detections, solution.params.lens)
+    try:
+        return solution, Epipolar.of(seen, np.random.default_rng(0))
+    except WorkFailed:  # without a baseline: the first pair has one
+        detections = dataclasses.replace(solution.problem.detections, pair=first_pair)
+        problem = dataclasses.replace(solution.problem, detections=detections)
+        seen = dataclasses.replace(seen, pair=first_pair)
+        return dataclasses.replace(solution, problem=problem), Epipolar.of(seen, np.random.default_rng(0))
 
 
 def _noise(solution: Solution, v: int) -> float:
