@@ -158,6 +158,13 @@ class Detections:
             weight=self.weight[:, keep],
         )
 
+    def dense(self) -> FloatArray:
+        """Pixels (V, K, m, 2) of all markers at all poses, NaN where unseen."""
+        pixels = np.full((len(self.seen), len(self.q), self.marker.size, 2), np.nan)
+        for here, seen, found in zip(pixels, self.seen, self.pixels, strict=True):
+            here[self.pose_of[seen], self.marker_of[seen]] = found[seen]
+        return pixels
+
     def of_views(self, which: list[int]) -> "Detections":
         """Select views, in an order, of which the first two are the pair; and the observations by them."""
         seen = self.seen[which]

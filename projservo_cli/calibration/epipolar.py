@@ -281,11 +281,16 @@ def _refine(F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArr
 
 def _transfer(left: FloatArray, right: FloatArray) -> FloatArray:
     """Distance (N,) of the right points from a homography of the left ones, in their units: [HZ04] 4.1."""
-    zero = np.zeros_like(left)
-    rows = np.block([[left, zero, -right[:, :1] * left], [zero, left, -right[:, 1:2] * left]])
-    H = np.linalg.svd(rows, full_matrices=False)[2][8].reshape(3, 3)
-    moved = left @ H.T
+    moved = left @ planar_homography(left, right).T
     return np.asarray(np.linalg.norm(moved[:, :2] / moved[:, 2:] - right[:, :2], axis=1))
+
+
+def planar_homography(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Homography (3, 3) b ∼ H a of normalized points (N, 3), four or more, with a last coordinate of one."""
+    zero = np.zeros_like(a)
+    rows = np.block([[a, zero, -b[:, :1] * a], [zero, a, -b[:, 1:2] * a]])
+    # Four points leave eight rows: their null vector is among all nine right singular ones alone.
+    return np.asarray(np.linalg.svd(rows, full_matrices=len(rows) < rows.shape[1])[2][8].reshape(3, 3))
 
 
 def reconstruct(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:

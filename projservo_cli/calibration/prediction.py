@@ -184,7 +184,10 @@ def parameters_from(calibration: Calibration) -> Parameters:
 
 def errors_of(calibration: Calibration) -> Errors:
     """Errors of the parameters of a calibration, in their order."""
-    return _reordered(calibration.errors, calibration) if calibration.mount == TOOL else calibration.errors
+    errors = calibration.errors
+    if calibration.mount == TOOL:
+        errors = errors._replace(shared=errors.shared[_in_reverse(calibration)])
+    return errors
 
 
 def from_reference(calibration: Calibration, q: FloatArray) -> FloatArray:
@@ -193,20 +196,18 @@ def from_reference(calibration: Calibration, q: FloatArray) -> FloatArray:
     return np.ascontiguousarray(-away[:, ::-1]) if calibration.mount == TOOL else away
 
 
-def _reordered(errors: Errors, c: Calibration) -> Errors:
-    """Errors with the operators in reverse."""
-    n, first = len(c.H_hat_0), c.P.size
-    rows = np.arange(len(errors.shared))
-    blocks = rows[first : first + 16 * n].reshape(n, 16)
-    rows[first : first + 16 * n] = blocks[::-1].ravel()
-    return Errors(errors.shared[rows], errors.marker, errors.own)
+def _in_reverse(c: Calibration) -> IntArray:
+    """Rows of ``sqrt_cov_shared`` with the operators in reverse."""
+    rows, own = np.arange(len(c.sqrt_cov_shared)), slice(c.P.size, c.P.size + c.H_hat_0.size)
+    rows[own] = rows[own].reshape(-1, 16)[::-1].ravel()
+    return rows
 
 
 def along_the_arm(c: Calibration) -> Calibration:
     """Return the record of cameras on the tool, with joints in the order and sense of the readings."""
-    first, bias = len(c.sqrt_cov_shared), c.model_error_bias
+    rows, bias = _in_reverse(c), c.model_error_bias
     if bias is not None:
-        bias = np.concatenate([_reordered(Errors(bias[:first], c.M, c.M), c).shared, bias[first:]])
+        bias = np.concatenate([bias[rows], bias[len(rows) :]])
     per_joint: dict[str, Any] = {name: np.ascontiguousarray(getattr(c, name)[::-1]) for name in _PER_JOINT}
     return replace(
         c,
@@ -215,7 +216,7 @@ def along_the_arm(c: Calibration) -> Calibration:
         q_reference=np.ascontiguousarray(-c.q_reference[::-1]),
         joint_min=np.ascontiguousarray(-(c.joint_min + c.excitation)[::-1]),
         corner_q=None if c.corner_q is None else np.ascontiguousarray(-c.corner_q[:, ::-1]),
-        sqrt_cov_shared=_reordered(c.errors, c).shared,
+        sqrt_cov_shared=c.sqrt_cov_shared[rows],
         model_error_bias=bias,
     )
 
@@ -294,9 +295,8 @@ def error_factor(calibration: Calibration) -> FloatArray:
     factor, free = errors_of(calibration).dense(), parameters_from(calibration).gauge()
     factor = np.asarray(factor - free @ (free.T @ factor))
     if calibration.mount == TOOL:
-        s = len(calibration.sqrt_cov_shared)
-        none = np.zeros((0, 4, 0))
-        factor[:s] = _reordered(Errors(factor[:s], none, none), calibration).shared
+        rows = _in_reverse(calibration)
+        factor[: len(rows)] = factor[rows]
     return factor
 
 

@@ -19,7 +19,15 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.detections import MAD, MIN_SIGMA, RAYLEIGH, Detections, even_choice
-from projservo_cli.calibration.epipolar import OUTLIER, Core, Epipolar, ImageFrame, ImageGeometry, similarity
+from projservo_cli.calibration.epipolar import (
+    OUTLIER,
+    Core,
+    Epipolar,
+    ImageFrame,
+    ImageGeometry,
+    planar_homography,
+    similarity,
+)
 from projservo_cli.geometry.displacements import cross_matrix, homogeneous
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
@@ -164,9 +172,7 @@ class RigidBody(ImageGeometry):
 
 def _chosen(detections: Detections) -> tuple[IntArray, IntArray, FloatArray]:
     """Rows of poses (K,), indices of markers (m,), and their images (K, m, 2), NaN if unseen."""
-    images = np.full((len(detections.q), detections.marker.size, 2), np.nan)
-    seen = detections.seen[0]
-    images[detections.pose_of[seen], detections.marker_of[seen]] = detections.pixels[0, seen]
+    images = detections.dense()[0]
     often = np.isfinite(images[..., 0]).sum(axis=0)
     marker = np.sort(np.argsort(-often, kind="stable")[:_MARKERS])
     marker = marker[often[marker] >= _LEAST_POSES]
@@ -261,7 +267,7 @@ def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray) -> 
     H, off = np.zeros((len(images), 3, 3)), np.full(len(images), np.inf)
     for k in others:
         both = seen[k] & seen[first]
-        H[k] = _planar_homography(images[first, both], images[k, both])
+        H[k] = _moved_plane(images[first, both], images[k, both])
         moved = homogeneous(images[first, both]) @ H[k].T
         left = moved[:, :2] / moved[:, 2:] - images[k, both]
         off[k] = np.median(np.linalg.norm(left, axis=1)) / max(float(extent[k]), 1e-9)
@@ -291,13 +297,11 @@ def _planes(ray: FloatArray) -> FloatArray:
     return np.asarray(planes)
 
 
-def _planar_homography(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Homography (3, 3) of pixels (N, 2) to others of the same markers, four or more, linearly."""
+def _moved_plane(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Homography (3, 3) of pixels (N, 2) to others of the same markers, four or more: [HZ04] 4.1."""
     T, U = similarity(a), similarity(b)
-    x, y = homogeneous(a) @ T.T, homogeneous(b) @ U.T
-    zero = np.zeros_like(x)
-    rows = np.block([[x, zero, -y[:, :1] * x], [zero, x, -y[:, 1:2] * x]])
-    return np.asarray(np.linalg.inv(U) @ np.linalg.svd(rows)[2][8].reshape(3, 3) @ T)
+    H = planar_homography(homogeneous(a) @ T.T, homogeneous(b) @ U.T)
+    return np.asarray(np.linalg.inv(U) @ H @ T)
 
 
 def _flat_start(

@@ -158,12 +158,8 @@ def _true_order(detections: Detections, epipolar: Epipolar, limit: float) -> Int
 
 
 def _dense(detections: Detections, which: IntArray) -> FloatArray:
-    """Pixels (V, K, s, 2) of some markers in both views, NaN where unseen."""
-    pixels = np.full((2, len(detections.q), detections.marker.size, 2), np.nan)
-    for here, v in zip(pixels, detections.pair, strict=True):
-        seen = detections.seen[v]
-        here[detections.pose_of[seen], detections.marker_of[seen]] = detections.pixels[v, seen]
-    return pixels[:, :, which]
+    """Pixels (2, K, s, 2) of some markers in both views of the pair, NaN where unseen."""
+    return detections.dense()[[*detections.pair]][:, :, which]
 
 
 def _misfits(pixels: FloatArray, F: FloatArray, limit: float) -> FloatArray:
