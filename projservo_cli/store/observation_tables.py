@@ -486,7 +486,9 @@ class _Sheet:
         if wrong := [name for name in names if re.fullmatch(r"q0[0-9]*", name)]:
             return f"the header has {wrong[0]}: number the joint columns q1, q2, … from base to tool"
         if missing := [name for name in needed if name not in names] + ["q1"] * (joints and not n):
-            return f"the header lacks the column(s) {', '.join(missing)}"
+            listed = "camera" in names and "camera" not in needed
+            other = "; a list of detections has its joints in another table: give --readings" * listed
+            return f"the header lacks the column(s) {', '.join(missing)}{other}"
         if twice := sorted({name for name in wanted if names.count(name) > 1}):
             return f"the header names the column(s) {', '.join(twice)} more than once"
         if n > _MAX_JOINTS:

@@ -94,6 +94,12 @@ def test_a_view_needs_both_columns(header, tmp_path):
         read_table(tmp_path / "t.csv")
 
 
+def test_a_list_without_its_joints_is_told_where_they_go(tmp_path):
+    (tmp_path / "d.csv").write_text("pose,camera,marker,u,v\n0,1,0,1,2\n")
+    with pytest.raises(InputError, match="has its joints in another table: give --readings"):
+        read_table(tmp_path / "d.csv")
+
+
 def test_a_view_that_is_missing_is_named(seen):
     some = of_views(seen, ("left", "top"))
     with pytest.raises(InputError, match="those of the calibration of left, right: add right"):
