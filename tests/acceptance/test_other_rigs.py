@@ -93,4 +93,6 @@ def test_three_webcams_before_a_real_arm(answer, elsewhere, shared_data):
     assert {1, 2} & {one["pose"] for one in found["moved_images"]}
     assert found["sigma_view_px"][2] > 2.0 * max(found["sigma_view_px"][:2])
     assert any(text.startswith("the cam3 camera is") for text in found["advice"])
+    code, value, error = answer("report", "-o", "out", "calibrate")  # with poses that are left out as a whole
+    assert (code, value["report"]["figures"]) == (0, ["figures/fig13_calibration.svg"]), error
     assert not any(text.startswith(("joint ", "check the joint")) for text in found["advice"])

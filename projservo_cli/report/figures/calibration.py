@@ -110,6 +110,8 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
         )
         common, own = (part[0] * weight[k, ..., None, None] for part in parts)
         variance[k] = (common**2).sum(axis=-1) + (own**2).sum(axis=-1)
+        if not of_pose.any():  # of a pose that is left out nothing is tested
+            continue
         U, s, _ = np.linalg.svd(G[k][of_pose].reshape(-1, len(q[k])), full_matrices=False)
         rows = np.concatenate([tested[k][..., None], common], axis=-1)[of_pose].reshape(len(U), -1)
         across = U * (1.0 - 1.0 / np.sqrt(1.0 + s**2))
