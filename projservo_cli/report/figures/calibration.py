@@ -210,8 +210,12 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     views = [name.removeprefix("seen_") for name in data if name.startswith("seen_")]
     grid = figure.add_gridspec(3, 2, height_ratios=(1.15, 1.0, 0.9))
     images = grid[0, :].subgridspec(1, len(views))
+    many = len(views) > 2
     for v, view in enumerate(views):
-        _arrows(figure.add_subplot(images[0, v]), data, view, ", " if len(views) <= 2 else "\n")
+        axes = figure.add_subplot(images[0, v])
+        _arrows(axes, data, view, "\n" if many else ", ")
+        if many and v:  # panels stand closer
+            axes.set_ylabel("")
     panels = [[figure.add_subplot(grid[i, j]) for j in (0, 1)] for i in (1, 2)]
     _histogram(panels[0][0], data)
     _poses(panels[0][1], data)
