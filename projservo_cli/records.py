@@ -21,6 +21,7 @@ BoolArray = npt.NDArray[np.bool_]
 ByteArray = npt.NDArray[np.uint8]
 
 VIEWS = ("left", "right")
+VIEW_NAME = r"[a-z0-9][a-z0-9_]*"  # of a view, as in the columns u_NAME, v_NAME
 WORLD, TOOL = "world", "tool"  # where the cameras are mounted: the markers are on the other
 MM = 1e3  # mm in a metre
 TWO_TURNS = 4.0 * np.pi  # rad; no revolute joint of an arm with stops turns that far from its zero
@@ -51,7 +52,6 @@ SIZES = {
     "operators": 2,
     "limit": 2,
     "end": 2,
-    "margin_kind": 10,
     "model_error_column": 4,
 }
 
@@ -94,6 +94,11 @@ class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming err
 NO_LENS = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2)
 
 
+def no_lenses(views: int) -> FloatArray:
+    """Lenses (V, 5) that do not distort."""
+    return np.tile(NO_LENS[:1], (views, 1))
+
+
 class JointLimits(NamedTuple):
     """Limits of joints, (n,) each; infinite for none."""
 
@@ -126,13 +131,17 @@ class Model(NamedTuple):
     base, where the operators are 4×4 twists and ``a_inf`` is (0, 0, 0, 1).
     """
 
-    P: FloatArray  # (2, 3, 4) cameras, left and right, to pixels
-    H_hat_0: FloatArray  # (n, 4, 4) joint operators at the reference, one unit of motion per rad or m
+    P: FloatArray  # (V, 3, 4) cameras to pixels
+    # (n, 4, 4) joint operators at the reference, one unit of motion per rad or m; of cameras on the tool they
+    # move the scene before them, in the order of the arm
+    H_hat_0: FloatArray
     prismatic: BoolArray  # (n,) whether a joint is prismatic; it is revolute else
     q_reference: FloatArray  # (n,) joint reading at the reference, rad or m
     a_inf: FloatArray  # (4,) plane at infinity, the common left null vector of the operators
-    # (2, 5) radial distortion of both views: image centre u, v and radius, px, then k1, k2
+    # (V, 5) radial distortion of the views: image centre u, v and radius, px, then k1, k2
     lens: FloatArray = NO_LENS
+    # whether the cameras are on the tool: the joints then move the scene, the last one first
+    on_tool: bool = False
 
 
 class Spread(NamedTuple):
@@ -304,14 +313,15 @@ class ProjectiveKinematics:
 
     def model(self) -> Model:
         """The kernels' view of the calibration."""
-        lens = np.tile(NO_LENS[:1], (len(self.P), 1)) if self.lens is None else self.lens
+        on_tool = self.mount == TOOL
         return Model(
             P=self.P,
-            H_hat_0=self.H_hat_0,
+            H_hat_0=-self.H_hat_0 if on_tool else self.H_hat_0,
             prismatic=self.prismatic,
             q_reference=self.q_reference,
             a_inf=self.a_inf,
-            lens=lens,
+            lens=no_lenses(len(self.P)) if self.lens is None else self.lens,
+            on_tool=on_tool,
         )
 
     @property
@@ -712,6 +722,7 @@ class Plan(JointSpaceSearch, TaskPartition, PlannedMotion):
     where they concern visibility: None is stored as NaN where a motion never changes it.
     """
 
+    view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
     profile: str = _scalar(about="profile of the motion")
     feasible: bool = _scalar(
         about="whether both cameras see the face all along; in the profile constrained, whether all "
@@ -868,6 +879,7 @@ class RecordedFrames:
 class Trace(RecordedFrames, RunHistory, RunMetrics):
     """One closed-loop run of one law, from the first instant to its verdict."""
 
+    view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
     law: str = _scalar(about="name of the control law")
     mode: str = _scalar(
         about="regulate: each step moves to the goal by the present images; track, image_track: by the plan"

@@ -74,7 +74,7 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         size = config.image_size_px
         stated = data.joint_order == "stated"
         readings, kind = _file(config, "readings", files), (config.joint_types, data.joint_unit)
-        source = Table(table, readings, *kind, size, data.noise_px, _seed(config), data.mount, stated)
+        source = Table(table, readings, *kind, size, data.noise_px, _seed(config), config.mount, stated)
     else:
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
         source = _trials(config, _truth(config, face=False), files, speed_scale=1.0)
@@ -173,6 +173,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         truth=truth_of(config) if simulated else None,
         arm=None if config.arm is None else arm_of(config.arm),
         P=None if config.rig is None else cameras_of(config.rig),
+        mount=config.mount,
         scene=scene_of(config, files) if simulated else None,
         face=face,
         center=center_in_face(markers),

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, StringConstraints
 from projservo_cli.display import Printed
 from projservo_cli.image_size import ImageSize
 from projservo_cli.laws import REGULATE
-from projservo_cli.records import LIMITS_MISSING, InputError
+from projservo_cli.records import LIMITS_MISSING, TOOL, WORLD, InputError
 from projservo_cli.settings.cameras import Cameras
 from projservo_cli.settings.control import RENDERED, Control, PlantSettings, ReportSettings, Stop
 from projservo_cli.settings.disturbance import Disturbance
@@ -155,6 +155,18 @@ def _cameras(plant: PlantSettings, markers: Markers | None, cameras: Cameras | N
         yield ("cameras",), "find tags: set markers.tags, or markers.numbers of their corners (4 t + k)"
 
 
+def _same_mount(rig: Rig | None, data: Data | None) -> Iterator[Finding]:
+    """Yield a mount that rig and table state otherwise."""
+    if rig is not None and data is not None and data.mount not in (None, rig.mount):
+        yield ("data", "mount"), f"is {data.mount} where rig.mount is {rig.mount}: keep one"
+
+
+def _moving_images(rig: Rig | None, trajectory: Trajectory) -> Iterator[Finding]:
+    """Yield regions of images that move with the tool."""
+    if rig is not None and rig.mount == TOOL and trajectory.keep_out:
+        yield ("trajectory", "keep_out"), "are regions of images that stand still; cameras on the tool move"
+
+
 def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> Iterator[Finding]:
     if robot is None or not robot.joints:
         return
@@ -210,7 +222,16 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
     rule: {*inspect.signature(rule).parameters}
     for rule in (
         *(_same_joints, _joint_vectors, _goal_images, _simulated_alone, _rendered),
-        *(_dictionary, _cameras, _disturbed_joints, _disturbed_markers, _plan_to_follow, _keeping_out),
+        *(
+            _dictionary,
+            _cameras,
+            _same_mount,
+            _moving_images,
+            _disturbed_joints,
+            _disturbed_markers,
+            _plan_to_follow,
+            _keeping_out,
+        ),
         *(_speed_in_joint_space, _limits_in_joint_space),
     )
 }
@@ -296,6 +317,12 @@ class Settings(Printed, Root):
         noise = self.noise.model_copy(update={"servo_px": 0.0})
         plant = self.plant.model_copy(update={"use": None, "options": {}})
         return self.model_copy(update={"noise": noise, "plant": plant, "disturbance": Disturbance()})
+
+    @property
+    def mount(self) -> str:
+        """Mount of the cameras: world, or tool."""
+        stated = None if self.data is None else self.data.mount
+        return stated or (WORLD if self.rig is None else self.rig.mount)
 
     @property
     def has_task(self) -> bool:

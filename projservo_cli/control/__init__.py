@@ -22,7 +22,7 @@ _DIRECT_THREE, _DIRECT_TWO, _STACKED, _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = ra
 def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
     """Run a law on undistorted images; the only dispatch on its code.
 
-    s : (2, b, 2) pixels as the cameras report them, NaN if unseen.
+    s : (V, b, 2) pixels as the cameras report them, NaN if unseen.
     Returns the status of the law; ``LOST`` for a state made for another number of markers.
     """
     code, model, task, gains = law

@@ -9,7 +9,7 @@ from projservo_cli.task.face import Task
 
 @merged
 def stacked(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
-    """Joint velocity −λ J⁺ (s − s*) with both views stacked.
+    """Joint velocity −λ J⁺ (s − s*) with all views stacked; with one the textbook's monocular law.
 
     Source: the law of reference [8] in [RH00], with the Jacobian of [RH00] eq. (7) at each instant.
     """
@@ -17,9 +17,10 @@ def stacked(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray
         return LOST
     n = q.shape[0]
     rows = 2 * state.A.shape[0]
-    for view in range(2):
+    V = model.P.shape[0]
+    for view in range(V):
         view_into(model, task, s, state, view, view * rows)
-    if not pseudo_inverse(state, 2 * rows, state.q_dot):
+    if not pseudo_inverse(state, V * rows, state.q_dot):
         return SINGULAR
     for i in range(n):
         state.q_dot[i] *= -gains.gain
@@ -28,7 +29,7 @@ def stacked(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray
 
 @merged
 def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
-    """Joint velocity −λ (J_left⁺ e_left + J_right⁺ e_right), each view by itself.
+    """Joint velocity −λ (J_left⁺ e_left + J_right⁺ e_right …), each view that shows the face by itself.
 
     Source: the law of reference [10] in [RH00], with the Jacobian of [RH00] eq. (7) at each instant.
     """
@@ -36,9 +37,10 @@ def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArr
         return LOST
     n = q.shape[0]
     state.q_dot[:] = 0.0
-    for view in range(2):
+    for view in range(model.P.shape[0]):
         # An expression, as the compiler would compile the function again for a constant.
-        view_into(model, task, s, state, view, 0 * view)
+        if view_into(model, task, s, state, view, 0 * view) == 0:
+            continue
         rows = 2 * state.A.shape[0]
         if not pseudo_inverse(state, rows, state.work.newton):
             return SINGULAR

@@ -30,9 +30,17 @@ from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, least_squares
 from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
 from projservo_cli.geometry.lens import undistort_pixel
-from projservo_cli.geometry.mechanisms import OWN, Span, Work, joint_motion, rotation_mechanism, workspace
+from projservo_cli.geometry.mechanisms import (
+    OWN,
+    Span,
+    Work,
+    joint_motion,
+    rotation_mechanism,
+    rows_of,
+    workspace,
+)
 from projservo_cli.geometry.stereo import triangulate
-from projservo_cli.records import FloatArray, IntArray, JointLimits, Model, position_limits
+from projservo_cli.records import VIEWS, FloatArray, IntArray, JointLimits, Model, position_limits
 from projservo_cli.task.body import ALL_VIEWS, GOAL_VIEWS, carry, fit_body
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import NO_PARTS, Parts, Split, partition
@@ -118,15 +126,15 @@ class State(NamedTuple):
     share: FloatArray
     parts: IntArray  # (1,) number of parts of the step in ``path``; 0 if the joints move linearly to the end
     blocked: IntArray  # (1,) joint at whose limit the step ends, −1 for none
-    straight: FloatArray  # (2, b, 2) undistorted pixels if there is a lens
+    straight: FloatArray  # (V, b, 2) undistorted pixels if there is a lens
     clock: FloatArray  # (1,) completed periods of the plan, if there is one
     A_ref: FloatArray  # (m, 4) points of the face by the plan
-    s_ref: FloatArray  # (2, m, 2) target pixels of the image-based law by the plan
+    s_ref: FloatArray  # (V, m, 2) target pixels of the image-based law by the plan
     q_ahead: FloatArray  # (n,) joint motion of the plan in the next period; zero without a plan
 
 
-def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
-    """Initial state for n joints and m face markers.
+def new_state(n: int, m: int, observed: int = 0, span: Span = OWN, views: int = len(VIEWS)) -> State:
+    """Initial state for n joints and m face markers in a number of views.
 
     observed : number of markers in images, m or more; span : of an arm of n ≠ 6 joints.
     """
@@ -134,7 +142,7 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
     own = len(span.H_hat) == 0
     k = n if own else COORDINATES
     return State(
-        work=workspace(n, 4 * m, span),
+        work=workspace(n, rows_of(views, m), span),
         A=np.zeros((m, 4)),
         A_t=np.zeros((m, 4)),
         A_r=np.zeros((m, 4)),
@@ -151,10 +159,10 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
         share=np.full(1, -1.0),
         parts=np.zeros(1, dtype=np.int64),
         blocked=np.full(1, -1, dtype=np.int64),
-        straight=np.zeros((2, max(m, observed), 2)),
+        straight=np.zeros((views, max(m, observed), 2)),
         clock=np.zeros(1),
         A_ref=np.zeros((m, 4)),
-        s_ref=np.zeros((2, m, 2)),
+        s_ref=np.zeros((views, m, 2)),
         q_ahead=np.zeros(n),
     )
 
@@ -193,15 +201,14 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
     H = operators_at(model, q, state.work.H_hat)
     if task.body.M.shape[0] > 0:
         return _measure_body(model, task, s, H, state)
+    if task.pair.shape[0] == 0:
+        return False
     for k in range(state.A.shape[0]):
-        if not (
-            math.isfinite(s[0, k, 0])
-            and math.isfinite(s[0, k, 1])
-            and math.isfinite(s[1, k, 0])
-            and math.isfinite(s[1, k, 1])
-        ):
-            return False
-        finite, M = triangulate(model.P, task.F, model.a_inf, s[0, k], s[1, k])
+        for i in range(2):
+            view = task.pair[i]
+            if not (math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])):
+                return False
+        finite, M = triangulate(model.P, task.pair, task.F, model.a_inf, s, k)
         if not finite:
             return False
         vec_into(state.A[k], M)
@@ -233,7 +240,7 @@ def _measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State
 def _predicted_error(P: FloatArray, A: FloatArray, A_star: FloatArray) -> float:
     """Image error between points A and A_star (m, 4), px rms per point and view, [RH00] eq. (1)."""
     total = 0.0
-    for view in range(2):
+    for view in range(P.shape[0]):
         for k in range(A.shape[0]):
             M, M_star = vec(A[k]), vec(A_star[k])
             depth, depth_star = row(P[view], 2, M), row(P[view], 2, M_star)
@@ -242,7 +249,7 @@ def _predicted_error(P: FloatArray, A: FloatArray, A_star: FloatArray) -> float:
             for i in range(2):
                 d = row(P[view], i, M) / depth - row(P[view], i, M_star) / depth_star
                 total += d * d
-    return math.sqrt(total / (2 * A.shape[0]))
+    return math.sqrt(total / (P.shape[0] * A.shape[0]))
 
 
 @merged
@@ -287,7 +294,7 @@ def joint_velocity_into(state: State) -> bool:
 
 @internal
 def translation_rate(task: Task, gains: Gains, parts: Parts, state: State) -> float:
-    """Rate λ_t τ of the translation, with its step within δ τ_0 of both cameras."""
+    """Rate λ_t τ of the translation, with its step within δ τ_0 of all cameras."""
     wanted = gains.gain_t * parts.tau * gains.period
     allowed = limited_translation(parts.a, parts.H_t, wanted, gains.visibility_fraction, task)
     if allowed < wanted:
@@ -344,8 +351,12 @@ def single_rotation(
 
 
 @internal
-def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, first: int) -> None:
-    """Write the interaction matrix and image error of one view, [RH00] eq. (7), to rows from ``first`` on."""
+def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, first: int) -> int:
+    """Write the interaction matrix and image error of one view, [RH00] eq. (7), to rows from ``first`` on.
+
+    Rows of a marker that it does not show, now or at the goal, are zero. Returns how many it shows.
+    """
+    shown = 0
     system, operators = state.work.system, state.work.columns
     for i in range(operators.shape[0]):
         operator = mat(operators[i])
@@ -360,8 +371,16 @@ def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, 
         else:
             target = task.s_star[view, k]
             u, v = undistort_pixel(model.lens[view], float(target[0]), float(target[1]))
-        system.rhs[first + 2 * k] = s[view, k, 0] - u
-        system.rhs[first + 2 * k + 1] = s[view, k, 1] - v
+        e_u, e_v = s[view, k, 0] - u, s[view, k, 1] - v
+        if math.isfinite(e_u + e_v):
+            shown += 1
+        else:
+            e_u = e_v = 0.0
+            for i in range(operators.shape[0]):
+                system.B[i, first + 2 * k] = system.B[i, first + 2 * k + 1] = 0.0
+        system.rhs[first + 2 * k] = e_u
+        system.rhs[first + 2 * k + 1] = e_v
+    return shown
 
 
 @internal

@@ -9,7 +9,7 @@ from projservo_cli.geometry.displacements import rotation, rotation_and_inverse,
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.image_size import BEHIND
-from projservo_cli.records import NO_LENS, FloatArray, JointLimits, Model
+from projservo_cli.records import FloatArray, JointLimits, Model
 
 
 @internal
@@ -20,11 +20,18 @@ def _joint_displacement(H_hat: Mat4, prismatic: bool, q: float) -> Mat4:
     return rotation(H_hat, q)
 
 
+@inline
+def _in_order(model: Model, j: int) -> int:
+    """Joint at place j of the product of [RH00] eq. (6); of cameras on the tool the last one is first."""
+    return model.q_reference.shape[0] - 1 - j if model.on_tool else j
+
+
 @njit
 def forward(model: Model, q: FloatArray) -> Mat4:
     """Forward kinematics, the product of exponentials of [RH00] eq. (6), q rad or m."""
     H = IDENTITY
-    for i in range(q.shape[0]):
+    for j in range(q.shape[0]):
+        i = _in_order(model, j)
         amount = float(q[i]) - float(model.q_reference[i])
         H = mul(H, _joint_displacement(mat(model.H_hat_0[i]), model.prismatic[i], amount))
     return H
@@ -34,7 +41,8 @@ def forward(model: Model, q: FloatArray) -> Mat4:
 def backward(model: Model, q: FloatArray) -> Mat4:
     """Inverse of the forward kinematics, the reversed product of [RH00] eq. (6)."""
     H = IDENTITY
-    for i in range(q.shape[0]):
+    for j in range(q.shape[0]):
+        i = _in_order(model, j)
         amount = float(q[i]) - float(model.q_reference[i])
         H = mul(_joint_displacement(mat(model.H_hat_0[i]), model.prismatic[i], -amount), H)
     return H
@@ -44,7 +52,8 @@ def backward(model: Model, q: FloatArray) -> Mat4:
 def forward_between(model: Model, q: FloatArray, i: int, x: float) -> Mat4:
     """Forward kinematics, [RH00] eq. (6), interpolated by x from row i of joints (k, n) to the next."""
     H = IDENTITY
-    for l in range(q.shape[1]):
+    for j in range(q.shape[1]):
+        l = _in_order(model, j)
         amount = (1.0 - x) * float(q[i, l]) + x * float(q[i + 1, l]) - float(model.q_reference[l])
         H = mul(H, _joint_displacement(mat(model.H_hat_0[l]), model.prismatic[l], amount))
     return H
@@ -60,11 +69,12 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
     n = q.shape[0]
     H = IDENTITY
     H_inverse = IDENTITY
-    for i in range(n):
+    for j in range(n):
+        i = _in_order(model, j)
         operator = mat(model.H_hat_0[i])
         mat_into(H_hat[i], mul(mul(H, operator), H_inverse))
         amount = float(q[i]) - float(model.q_reference[i])
-        if i == n - 1:
+        if j == n - 1:
             H = mul(H, _joint_displacement(operator, model.prismatic[i], amount))
         elif model.prismatic[i]:
             H = mul(H, translation(operator, amount))
@@ -105,14 +115,6 @@ def image_velocity(P: FloatArray, A: Vec4, D: Vec4) -> tuple[float, float, float
 
 
 @merged
-def image_motion(P: FloatArray, A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
-    """Pixels of a point in both views (2, 3, 4), left u, v and right, and their velocities."""
-    u, v, u_dot, v_dot = image_velocity(P[0], A, D)
-    x, y, x_dot, y_dot = image_velocity(P[1], A, D)
-    return (u, v, x, y), (u_dot, v_dot, x_dot, y_dot)
-
-
-@merged
 def from_border(image_size: FloatArray, u: float, v: float) -> float:
     """Distance of a pixel from the border of an image, px; negative outside, ``BEHIND`` of none.
 
@@ -141,20 +143,22 @@ def joint_operators(model: Model, q: FloatArray) -> FloatArray:
     return H_hat
 
 
-def project(P: FloatArray, M: FloatArray, lens: FloatArray = NO_LENS) -> FloatArray:
-    """Pixels (2, ..., 2) of points (..., 4) by cameras (2, 3, 4) and lenses (2, 5), [RH00] eq. (1)."""
+def project(P: FloatArray, M: FloatArray, lens: FloatArray | None = None) -> FloatArray:
+    """Pixels (V, ..., 2) of points (..., 4) by cameras (V, 3, 4) and lenses (V, 5), [RH00] eq. (1)."""
     m = np.einsum("vij,...j->v...i", P, M)
     pixels: FloatArray = m[..., :2] / m[..., 2:]
+    if lens is None:
+        return pixels
     return distort_visible(lens.reshape(len(lens), *(1,) * (m.ndim - 2), 5), pixels)
 
 
 def image_jacobian(P: FloatArray, M: FloatArray, H_hat: FloatArray) -> FloatArray:
-    """Interaction matrix (2, m, 2, n), joint to image velocities, px per rad or m: [RH00] eq. (7), corrected.
+    """Interaction matrix (V, m, 2, n), joint to image velocities, px per rad or m: [RH00] eq. (7), corrected.
 
-    For cameras (2, 3, 4), points (m, 4) and the operators (n, 4, 4) at the current joints.
+    For cameras (V, 3, 4), points (m, 4) and the operators (n, 4, 4) at the current joints.
     """
-    J = np.empty((2, M.shape[0], 2, H_hat.shape[0]))
-    for view in range(2):
+    J = np.empty((len(P), M.shape[0], 2, H_hat.shape[0]))
+    for view in range(len(P)):
         for k in range(M.shape[0]):
             for i in range(H_hat.shape[0]):
                 D = vec(H_hat[i] @ M[k])

@@ -106,7 +106,7 @@ def undistort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]
 
 @merged
 def distorts(lens: FloatArray) -> bool:
-    """Whether any of the lenses (2, 5) distorts."""
+    """Whether any of the lenses (V, 5) distorts."""
     for view in range(lens.shape[0]):
         if float(lens[view, 3]) != 0.0 or float(lens[view, 4]) != 0.0:
             return True
@@ -115,7 +115,7 @@ def distorts(lens: FloatArray) -> bool:
 
 @merged
 def undistort_into(lens: FloatArray, s: FloatArray, straight: FloatArray) -> None:
-    """Undistort pixels (2, N, 2) by lenses (2, 5) into ``straight``; NaN as for ``undistort_pixel``."""
+    """Undistort pixels (V, N, 2) by lenses (V, 5) into ``straight``; NaN as for ``undistort_pixel``."""
     for view in range(s.shape[0]):
         for k in range(s.shape[1]):
             pixel = undistort_pixel(lens[view], float(s[view, k, 0]), float(s[view, k, 1]))
@@ -152,7 +152,7 @@ def distort(lens: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def undistort(lens: FloatArray, s: FloatArray) -> FloatArray:
-    """Undistort pixels (2, N, 2), NaN if unseen, by lenses (2, 5); the pixels themselves without a lens."""
+    """Undistort pixels (V, N, 2), NaN if unseen, by lenses (V, 5); the pixels themselves without a lens."""
     s = np.ascontiguousarray(s, dtype=np.float64)
     if not distorts(lens):
         return s

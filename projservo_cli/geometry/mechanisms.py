@@ -72,6 +72,11 @@ class Work(NamedTuple):
     newton: FloatArray  # (n,) one Newton step
 
 
+def rows_of(views: int, m: int) -> int:
+    """Most rows of a matrix of m points: their four coordinates, or two for each of the views."""
+    return max(4, 2 * views) * m
+
+
 def workspace(n: int, rows: int, span: Span = OWN) -> Work:
     """Arrays for n joints and matrices of at most ``rows`` rows, with the span of an arm of n ≠ 6."""
     H_hat = np.zeros((n, 4, 4))
@@ -230,7 +235,7 @@ def reach(model: Model, face: MeasuredFace, goal: Mat4, q: FloatArray, work: Wor
     every period from joints nearby, so it has neither the damping nor the starts of
     ``planning.goal_configurations``, which knows no joints nearby.
 
-    work : for n joints and 4m rows.
+    work : for n joints and 4m rows or more.
     settled : maximum joint motion of the last step, rad or m.
     Returns false if the steps did not settle or the operators are singular.
     """

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Vec4, dot, meet, scale, vec, vec_into
 from projservo_cli.geometry.jit import inline, merged
-from projservo_cli.records import FloatArray, WorkFailed
+from projservo_cli.records import FloatArray, IntArray, WorkFailed
 
 NO_POINT = "marker {} of the face: its two rays do not meet in a finite point"
 # Rows of a camera other than the first, second or third.
@@ -28,7 +28,7 @@ def _plane_of(P: FloatArray, l0: float, l1: float, l2: float) -> Vec4:
 
 @merged
 def triangulate(
-    P: FloatArray, F: FloatArray, a_inf: FloatArray, left: FloatArray, right: FloatArray
+    P: FloatArray, pair: IntArray, F: FloatArray, a_inf: FloatArray, s: FloatArray, k: int
 ) -> tuple[bool, Vec4]:
     """Point of minimum reprojection error from one pixel in each view, scaled to a_inf·M = 1.
 
@@ -36,12 +36,15 @@ def triangulate(
     epipolar lines, within round-off of the optimum. Then the left ray meets the plane of the line through the
     right pixel that is perpendicular to its epipolar line.
 
+    P : (V, 3, 4) cameras; pair : (2,) views, the left and the right one; F : (3, 3) their fundamental matrix.
+    s : (V, m, 2) pixels, of which those of marker k are taken.
     Returns false and zeros if the rays do not determine a finite point.
     """
-    u = float(left[0])
-    v = float(left[1])
-    x = float(right[0])
-    y = float(right[1])
+    left, right = pair[0], pair[1]
+    u = float(s[left, k, 0])
+    v = float(s[left, k, 1])
+    x = float(s[right, k, 0])
+    y = float(s[right, k, 1])
     f00, f01, f02 = float(F[0, 0]), float(F[0, 1]), float(F[0, 2])
     f10, f11, f12 = float(F[1, 0]), float(F[1, 1]), float(F[1, 2])
     f20, f21, f22 = float(F[2, 0]), float(F[2, 1]), float(F[2, 2])
@@ -74,9 +77,9 @@ def triangulate(
     x -= step * k0
     y -= step * k1
     M = meet(
-        _plane_of(P[0], 1.0, 0.0, -u),
-        _plane_of(P[0], 0.0, 1.0, -v),
-        _plane_of(P[1], -k1, k0, k1 * x - k0 * y),
+        _plane_of(P[left], 1.0, 0.0, -u),
+        _plane_of(P[left], 0.0, 1.0, -v),
+        _plane_of(P[right], -k1, k0, k1 * x - k0 * y),
     )
     w = dot(vec(a_inf), M)
     if w * w <= 1e-28 * dot(M, M) or not w * w > 0.0:
@@ -85,7 +88,7 @@ def triangulate(
 
 
 def fundamental_matrix(P: FloatArray) -> FloatArray:
-    """Fundamental matrix F with rightᵀ F left = 0 of a pair of cameras.
+    """Fundamental matrix F with rightᵀ F left = 0 of a pair of cameras (2, 3, 4).
 
     Of unit norm, (3, 3). Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., eq. (17.3).
 
@@ -102,7 +105,7 @@ def fundamental_matrix(P: FloatArray) -> FloatArray:
 
 
 def optical_centers(P: FloatArray, a_inf: FloatArray) -> FloatArray:
-    """Optical centres (2, 4) of both cameras, scaled to a_inf·O = 1."""
+    """Optical centres (V, 4) of the cameras (V, 3, 4), scaled to a_inf·O = 1."""
     centers = np.array([np.linalg.svd(camera)[2][3] for camera in P])
     result: FloatArray = centers / (centers @ a_inf)[:, None]
     return result
@@ -114,17 +117,19 @@ def triangulate_points(P: FloatArray, a_inf: FloatArray, s: FloatArray) -> Float
     Raises WorkFailed if the rays of a marker do not determine a finite point.
     """
     M = np.empty((s.shape[1], 4))
-    lost = points_into(P, fundamental_matrix(P), a_inf, s, M)
+    lost = points_into(P, np.arange(2), fundamental_matrix(P), a_inf, s, M)
     if lost >= 0:
         raise WorkFailed(NO_POINT.format(lost))
     return M
 
 
 @inline
-def points_into(P: FloatArray, F: FloatArray, a_inf: FloatArray, s: FloatArray, M: FloatArray) -> int:
-    """Triangulate the first m stereo pixels into M (m, 4); the first pixel without a point, or −1."""
+def points_into(
+    P: FloatArray, pair: IntArray, F: FloatArray, a_inf: FloatArray, s: FloatArray, M: FloatArray
+) -> int:
+    """Triangulate the first m pixels of a pair of views into M (m, 4); the first without a point, or −1."""
     for k in range(M.shape[0]):
-        finite, point = triangulate(P, F, a_inf, s[0, k], s[1, k])
+        finite, point = triangulate(P, pair, F, a_inf, s, k)
         if not finite:
             return k
         vec_into(M[k], point)

@@ -22,7 +22,7 @@ from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.rehearsal import Rehearsal, first_parts, is_half_turn
 from projservo_cli.loop.run_metrics import Ended, Summary, summarize
 from projservo_cli.loop.verdicts import RUNNING, Log, new_log
-from projservo_cli.records import FloatArray, Model
+from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.simulation.analytic_plant import Ends
 from projservo_cli.task.body import Body
 from projservo_cli.task.face import (
@@ -53,12 +53,14 @@ class Setting(NamedTuple):
     gains: Gains  # of the law
     course: Course  # true robot as the law observes it, from its first joints
     ends: Ends  # true poses of the tool
+    pair: IntArray  # (2,) views from which the face is triangulated; none of one view
+    q_near: FloatArray  # (n,) joints near those of the goal, rad or m
 
 
 class _Scratch(NamedTuple):
     """Workspace in which the task of a run is measured, and the run driven."""
 
-    images: FloatArray  # (2, 2, b, 2) straight pixels of the images at the start and at the goal
+    images: FloatArray  # (2, V, b, 2) straight pixels of the images at the start and at the goal
     task: Task
     own_task: Task  # task, own_task: as partitioned, and as a law with other features sees it
     state: State
@@ -76,17 +78,18 @@ class Batch:
     def __init__(self, setting: Setting, images: int) -> None:
         plant, limits, q_start = setting.course
         n, m = len(q_start), len(plant.M)
-        observed, s_star = m + len(plant.pins), np.zeros((2, m, 2))
-        body = setting.body._replace(in_goal=np.zeros((2, len(setting.body.M)), dtype=np.bool_))
+        V, pair, least = len(plant.O), setting.pair, plant.least_views
+        observed, s_star = m + len(plant.pins), np.zeros((V, m, 2))
+        body = setting.body._replace(in_goal=np.zeros((V, len(setting.body.M)), dtype=np.bool_))
         self.setting = setting
         self.scratch = _Scratch(
-            images=np.zeros((2, 2, images, 2)),
-            task=new_task(setting.model, s_star, plant.center)._replace(body=body),
-            own_task=new_task(setting.believed, s_star, plant.center),
-            state=new_state(n, m, images),
-            own_state=new_state(n, m, observed),
+            images=np.zeros((2, V, images, 2)),
+            task=new_task(setting.model, s_star, plant.center, pair, least)._replace(body=body),
+            own_task=new_task(setting.believed, s_star, plant.center, pair, least),
+            state=new_state(n, m, images, views=V),
+            own_state=new_state(n, m, observed, views=V),
             log=new_log(
-                n, observed, limits.max_steps, len(ERRORS), MAX_PARTS if setting.gains.substeps else 0
+                n, observed, limits.max_steps, len(ERRORS), MAX_PARTS if setting.gains.substeps else 0, V
             ),
         )
         self.rehearsal = Rehearsal(setting.model, q_start, m, plant.limits)
@@ -94,8 +97,8 @@ class Batch:
     def numbers(self, images: FloatArray, noise: FloatArray) -> FloatArray:
         """Measure the task, partition it, drive the law to its verdict and sum up: (r, ``NUMBERS``).
 
-        images : (r, 2, 2, b, 2) of each run at the start and at the goal, the face first, px.
-        noise : (r, k, 2, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
+        images : (r, 2, V, b, 2) of each run at the start and at the goal, the face first, px.
+        noise : (r, k, V, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
             short.
         """
         numbers = np.full((len(images), len(NUMBERS)), math.nan)
@@ -153,8 +156,8 @@ def _open(setting: Setting, images: FloatArray, scratch: _Scratch) -> tuple[int,
 
 @inline
 def _measured_into(setting: Setting, model: Model, images: FloatArray, scratch: _Scratch, task: Task) -> int:
-    """Measure a task from images (2, 2, b, 2) at its start and goal, px; return the verdict."""
-    for view in range(2):
+    """Measure a task from images (2, V, b, 2) at its start and goal, px; return the verdict."""
+    for view in range(task.s_star.shape[0]):
         for k in range(task.s_star.shape[1]):
             for i in range(2):
                 task.s_star[view, k, i] = images[1, view, k, i]
@@ -163,8 +166,8 @@ def _measured_into(setting: Setting, model: Model, images: FloatArray, scratch: 
     state = scratch.state
     status, _ = task_into(model, scratch.images, task, state.A, state.work.system.rhs)
     if status == FOUND and task.body.M.shape[0] > 0:
-        q_start = setting.course.q_start
-        status, _ = body_task_into(model, q_start, scratch.images, task, make_split(state), state.normal)
+        ends = setting.course.q_start, setting.q_near
+        status, _ = body_task_into(model, ends, scratch.images, task, make_split(state), state.normal)
     return status
 
 

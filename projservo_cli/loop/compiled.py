@@ -35,7 +35,7 @@ class Course(NamedTuple):
 def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log: Log) -> tuple[int, int]:
     """Drive a law to its verdict.
 
-    noise : (k, 2, m + p, 2) added to the true pixels of the first k instants, px.
+    noise : (k, V, m + p, 2) added to the true pixels of the first k instants, px.
     state, log : of this run alone; the log is filled up to the last instant, whatever it held before.
     Returns verdict: code of the verdict; ``RUNNING`` where the noise ended before the run, which needs more
     of it to be redrawn; steps: commands sent; the log has one instant more.
@@ -56,7 +56,7 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
         s = log.s[k]
         in_front = observe(plant, mat(log.H[k]), M, s, log.hidden[k])
         distance = rig_distance(plant, M)
-        for view in range(2):
+        for view in range(s.shape[0]):
             for j in range(s.shape[1]):
                 s[view, j, 0] += noise[k, view, j, 0]
                 s[view, j, 1] += noise[k, view, j, 1]

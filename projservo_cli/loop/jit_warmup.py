@@ -53,9 +53,11 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         A_star=matrices[0],
         order=order,
         center=0,
+        pair=order,
         F=np.zeros((3, 3)),
         O=O,
         visible=q,
+        least_views=2,
     )
     plant = Plant(
         model=model,
@@ -67,6 +69,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         image_size=np.zeros((2, 2)),
         limits=limits,
         opaque=True,
+        least_views=2,
     )
     state, log = new_state(4, 4), new_log(4, 4, 1, len(ERRORS))
     reaching = Reaching(
@@ -77,6 +80,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         A=matrices[0],
         a=q,
         O=O,
+        visible=q,
         q_start=q,
     )
     along = room_along(reaching, 1)

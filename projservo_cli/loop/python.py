@@ -161,7 +161,7 @@ class LoopLaw(Protocol):
     errors: FloatArray
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
-        """Status and joint velocity (n,), rad/s or m/s, for pixels (2, m, 2) and joints (n,).
+        """Status and joint velocity (n,), rad/s or m/s, for pixels (V, m, 2) and joints (n,).
 
         Pixels are NaN where a marker was not seen; the status is LOST where too little was.
         """
@@ -176,13 +176,13 @@ class _LoopPlant(Monitored, Protocol):
     in_front: bool  # hidden, in_front: as of ``simulation.analytic_plant.observe``, when last observed
     markers: int  # how many are observed, those of the face first
     takes_parts: bool  # whether a long step is sent in the parts that the law split it into
-    weight: FloatArray | None  # (2, markers) of the pixels last observed in a fit; None for one
+    weight: FloatArray | None  # (V, markers) of the pixels last observed in a fit; None for one
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
 
     def observe(self) -> FloatArray:
-        """Pixels (2, markers, 2), NaN where unseen."""
+        """Pixels (V, markers, 2), NaN where unseen."""
 
     def distance(self) -> float:
         """Distance of the face from the rig when last observed, m; constant where it is unknown."""
@@ -200,8 +200,9 @@ class BuiltInLaw:
     def __init__(self, code: int, model: Model, task: Task, gains: Gains) -> None:
         self.gains = gains
         span = make_span(model, task.A_star)
-        self.state = new_state(len(model.H_hat_0), len(task.A_star), len(task.body.M), span)
-        self._weight = np.ones_like(task.body.weight)
+        n, m, V = len(model.H_hat_0), len(task.A_star), len(model.P)
+        self.state = new_state(n, m, len(task.body.M), span, V)
+        self._weight = np.ones((V, len(task.body.M)))
         self.law = Law(code, model, self._weighed(task), gains)
         self._bound: Any = None  # until it is called from Python
         self.errors, self.share, self.fit = self.state.errors, self.state.share, self.state.fit
@@ -218,7 +219,7 @@ class BuiltInLaw:
         return task._replace(body=task.body._replace(weight=self._weight))
 
     def weigh(self, weight: FloatArray) -> None:
-        """Weigh the pixels (2, k) of the next instant in the fit of the body."""
+        """Weigh the pixels (V, k) of the next instant in the fit of the body."""
         k = min(weight.shape[1], self._weight.shape[1])
         self._weight[:, :k] = weight[:, :k]
 
@@ -249,7 +250,7 @@ def run_in_python(
     """Drive a law on a plant to its verdict.
 
     plant : any; it is stopped however the run ends.
-    s_star : (2, m, 2) target pixels; period : control period, s; scale : factor of every command.
+    s_star : (V, m, 2) target pixels; period : control period, s; scale : factor of every command.
     stall : of a robot that may lag behind its set-points; execution : of a plan that another may replace.
     Returns verdict, steps, log: as of the compiled loop, to the bit for the built-in laws. Raises InputError
     if the law has an attribute that is a misspelt one of ``_OPTIONAL``; WorkFailed if the plant or the law
@@ -257,7 +258,8 @@ def run_in_python(
     """
     try:
         require_spelt(f"law {type(law).__name__}", law, ("errors", *_OPTIONAL))
-        log = new_log(len(plant.plant.limits.lower), plant.markers, limits.max_steps, len(ERRORS))
+        n, V = len(plant.plant.limits.lower), len(s_star)
+        log = new_log(n, plant.markers, limits.max_steps, len(ERRORS), views=V)
         for column in (log.read, log.q, log.s, log.error, log.judged):
             column[:] = math.nan
         monitors = Monitors(plant, limits, stall, execution)

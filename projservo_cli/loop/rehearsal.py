@@ -51,8 +51,10 @@ class Rehearsal:
         self, model: Model, q_start: FloatArray, m: int, bounds: JointLimits, span: Span = OWN
     ) -> None:
         self.model, self.q_start, self.bounds, n = model, q_start, bounds, len(q_start)
-        self.noise, self.state = np.zeros((_REHEARSAL_STEPS + 1, 2, m, 2)), new_state(n, m, span=span)
-        self.log = new_log(n, m, _REHEARSAL_STEPS, len(ERRORS))
+        V = len(model.P)
+        self.noise = np.zeros((_REHEARSAL_STEPS + 1, V, m, 2))
+        self.state = new_state(n, m, span=span, views=V)
+        self.log = new_log(n, m, _REHEARSAL_STEPS, len(ERRORS), views=V)
 
     def better(self, task: Task, state: State) -> tuple[int, Parts, bool]:
         """A partitioned task in the better sense: its verdict, its parts, and whether it arrives."""
@@ -61,9 +63,21 @@ class Rehearsal:
         depth = model.P[:, 2] @ np.array(center_of(state.A, MIDPOINT))
         seen = model._replace(P=model.P * np.sign(depth)[:, None, None])
         M = np.ascontiguousarray(state.A @ as_array(backward(model, self.q_start)).T)
-        endless = np.full((2, 2), np.inf)
-        plant = Plant(seen, M, task.order, task.center, task.O, task.visible, endless, self.bounds, False)
-        law = Law(_DIRECT_TWO, seen, task._replace(body=NO_BODY), _REHEARSAL)
+        plant = Plant(
+            model=seen,
+            M=M,
+            order=task.order,
+            center=task.center,
+            O=task.O,
+            visible=task.visible,
+            image_size=np.full((len(task.O), 2), np.inf),
+            limits=self.bounds,
+            opaque=False,
+            least_views=task.least_views,
+        )
+        # The face alone is shown, by points where a pair of views shows it.
+        body = NO_BODY if len(task.pair) else task.body._replace(weight=np.ones_like(task.body.weight))
+        law = Law(_DIRECT_TWO, seen, task._replace(body=body), _REHEARSAL)
         step = np.full(len(self.q_start), _REHEARSAL_STEP)
         q_hat_p = state.q_hat[2].copy()
 
@@ -98,14 +112,14 @@ def begin(
     """Measure and partition the task at its start.
 
     model : calibrated; task : in its frame.
-    s : (2, b, 2) straight pixels at the start; q_start : (n,) joints there, rad or m.
+    s : (V, b, 2) straight pixels at the start; q_start : (n,) joints there, rad or m.
     bounds : limits of the joints, where a half turn is to be made in the sense
         that is better when rehearsed.
     Returns the state with the face and the joint motions; the parts; False where neither sense of a half turn
     arrived. Raises WorkFailed if the face is not seen, or a motion not unique.
     """
     m, span, arrives = len(task.A_star), make_span(model, task.A_star), True
-    state = new_state(len(q_start), m, span=span)
+    state = new_state(len(q_start), m, s.shape[1], span, len(s))
     status, parts = first_parts(model, task, s, q_start, state)
     if status == FOUND and bounds is not None and is_half_turn(parts.theta_p):
         status, parts, arrives = Rehearsal(model, q_start, m, bounds, span).better(task, state)

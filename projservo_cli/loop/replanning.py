@@ -41,13 +41,13 @@ class _Replanner(Protocol):
     """Paths to the goal of a task."""
 
     def predicted(self, q: FloatArray) -> FloatArray:
-        """Pixels (2, b, 2) of the body at joints (n,), by the calibration, those of the face first."""
+        """Pixels (V, b, 2) of the body at joints (n,), by the calibration, those of the face first."""
 
     def leaves(self, q: FloatArray, off: FloatArray) -> bool:
-        """Whether a path of joints (s, n) leaves an image, where images are off by (s, 2, 2), px."""
+        """Whether a path of joints (s, n) leaves an image, where images are off by (s, V, 2), px."""
 
     def replan(self, q: FloatArray, excluded: FloatArray, off: FloatArray) -> Plan | None:
-        """Plan of a path from joints (n,), off by (2, 2) px, to other goals than those excluded (k, n)."""
+        """Plan of a path from joints (n,), off by (V, 2) px, to other goals than those excluded (k, n)."""
 
 
 class ExecutionMonitor:
@@ -147,7 +147,7 @@ class ExecutionMonitor:
         return RUNNING
 
     def _off(self, log: Log, k: int) -> FloatArray:
-        """Return the offset (2, 2) of both images from their prediction, px; 0 if unseen."""
+        """Return the offset (V, 2) of the images from their prediction, px; 0 if unseen."""
         rows = slice(max(0, k + 1 - LAST), k + 1)
         predicted = np.array([self.replanner.predicted(q) for q in log.read[rows]])
         b = min(log.s.shape[2], predicted.shape[2])

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, sub, vec, vec_into
 from projservo_cli.geometry.jit import inline, merged, njit
-from projservo_cli.geometry.kinematics import beyond_limits, forward
+from projservo_cli.geometry.kinematics import backward, beyond_limits, forward
 from projservo_cli.loop.verdicts import CONVERGED, Log
 from projservo_cli.records import MM, FloatArray
 from projservo_cli.simulation.analytic_plant import Ends, Plant, shows_face
@@ -26,11 +26,12 @@ class Ended(NamedTuple):
 class Summary(NamedTuple):
     """Numbers of a run that ended; NaN where they need the true goal and that is not known."""
 
-    # 1 where it converged and, at every instant, both cameras truly saw the face whole and from its front and
-    # no joint was past a limit, 0 where not; what happens between the instants is not looked at
+    # 1 where it converged and, at every instant, enough cameras truly saw the face whole and from its front
+    # and no joint was past a limit, 0 where not; what happens between the instants is not looked at
     success: float
     image_error_px: float  # at the end, rms over markers and views
-    # self_occluded_steps_left, self_occluded_steps_right: instants at which a camera is behind the face
+    # self_occluded_steps_left, self_occluded_steps_right: instants at which the first and the last camera are
+    # behind the face; a trace counts those of each
     self_occluded_steps_left: int
     self_occluded_steps_right: int
     first_outside_image: int
@@ -55,7 +56,7 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
     for k in range(steps + 1):
         if log.hidden[k, 0] > 0.5:
             hidden_left += 1
-        if log.hidden[k, 1] > 0.5:
+        if log.hidden[k, log.hidden.shape[1] - 1] > 0.5:
             hidden_right += 1
         if k < steps and log.factor[k] < 1.0:
             slowed += 1
@@ -66,7 +67,13 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
     if math.isfinite(goal[0]):
         length, at_samples = _path_along(plant, log, steps, start, goal)
     base_tool, goal_pose = mat(ends.base_tool), mat(ends.goal_pose)
-    arrived = ended.verdict == CONVERGED and hidden_left == 0 and hidden_right == 0
+    pose_first, pose = mul(first, base_tool), mul(last, base_tool)
+    error = _distance(end, goal)
+    if plant.model.on_tool:  # the displacement is that of the scene: the error is that of the tool's origin
+        pose_first = mul(backward(plant.model, log.q[0]), base_tool)
+        pose = mul(backward(plant.model, log.q[steps]), base_tool)
+        error = _distance(_origin(pose), _origin(goal_pose))
+    arrived = ended.verdict == CONVERGED
     return Summary(
         success=1.0 if arrived and _keeps_within(plant, log, steps) else 0.0,
         image_error_px=float(log.error[steps]),
@@ -77,10 +84,10 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
         speed_limited_steps=slowed,
         visibility_limited_steps=int(ended.limited),
         effort=_effort(log, steps, period),
-        rotation_deg=math.degrees(angle_between(mul(first, base_tool), goal_pose)),
+        rotation_deg=math.degrees(angle_between(pose_first, goal_pose)),
         distance_mm=MM * _distance(start, goal),
-        position_error_mm=MM * _distance(end, goal),
-        rotation_error_deg=math.degrees(angle_between(mul(last, base_tool), goal_pose)),
+        position_error_mm=MM * error,
+        rotation_error_deg=math.degrees(angle_between(pose, goal_pose)),
         path_length_mm=MM * length,
         center_deviation_at_samples_mm=MM * at_samples,
     )
@@ -88,11 +95,11 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
 
 @merged
 def _keeps_within(plant: Plant, log: Log, steps: int) -> bool:
-    """Whether at each instant all joints are within their limits and the face within both true images."""
+    """Whether at each instant all joints are within their limits and the face within enough true images."""
     for k in range(steps + 1):
         if beyond_limits(plant.limits, log.q[k], _ROUND_OFF) >= 0:
             return False
-        if not shows_face(plant, mat(log.H[k]), log.scratch[0]):
+        if not shows_face(plant, mat(log.H[k]), log.hidden[k], log.scratch[0]):
             return False
     return True
 
@@ -105,6 +112,12 @@ def _effort(log: Log, steps: int, period: float) -> float:
         for i in range(log.q_dot.shape[1]):
             total += log.q_dot[k, i] * log.q_dot[k, i]
     return total * period
+
+
+@inline
+def _origin(pose: Mat4) -> Vec4:
+    """Origin of a pose."""
+    return (pose[3], pose[7], pose[11], 1.0)
 
 
 @merged

@@ -27,7 +27,7 @@ import numpy as np
 from projservo_cli.control.law import LOST, SINGULAR, limit_speed
 from projservo_cli.geometry.jit import merged
 from projservo_cli.geometry.kinematics import beyond_limits, from_border
-from projservo_cli.records import FloatArray, IntArray
+from projservo_cli.records import VIEWS, FloatArray, IntArray
 from projservo_cli.simulation.analytic_plant import Plant
 
 RUNNING = -1
@@ -75,8 +75,8 @@ class Log(NamedTuple):
     q: FloatArray  # (k, n) true joints, rad or m
     read: FloatArray  # (k, n) joint readings, the input of the law
     H: FloatArray  # (k, 4, 4) true displacement of the face from the reference
-    s: FloatArray  # (k, 2, m, 2) measured pixels of the face and, after them, of the pins
-    hidden: FloatArray  # (k, 2) 1 where a view is self-occluded
+    s: FloatArray  # (k, V, m, 2) measured pixels of the face and, after them, of the pins
+    hidden: FloatArray  # (k, V) 1 where a view is self-occluded
     error: FloatArray  # (k,) image error of the face as it is seen, px rms per marker and view
     # (k,) image error by which the run ends: of the body where it is measured, else as seen
     judged: FloatArray
@@ -96,15 +96,15 @@ class Log(NamedTuple):
     scratch: FloatArray  # M, scratch: (m, 4) and (3, n), at least (3, 2), workspaces of the simulated robot
 
 
-def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
-    """Empty log for n joints, m markers seen, at most ``max_steps`` commands and ``parts`` parts of one."""
+def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0, views: int = len(VIEWS)) -> Log:
+    """Empty log for n joints, m markers in so many views, at most ``max_steps`` commands of so many parts."""
     rows = max_steps + 1
     return Log(
         q=np.zeros((rows, n)),
         read=np.zeros((rows, n)),
         H=np.zeros((rows, 4, 4)),
-        s=np.zeros((rows, 2, m, 2)),
-        hidden=np.zeros((rows, 2)),
+        s=np.zeros((rows, views, m, 2)),
+        hidden=np.zeros((rows, views)),
         error=np.zeros(rows),
         judged=np.zeros(rows),
         errors=np.full((rows, errors), np.nan),
@@ -123,7 +123,7 @@ def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
 @merged
 def note(log: Log, k: int, s_star: FloatArray, plant: Plant, limits: Limits) -> bool:
     """Log what images and readings of an instant say by themselves; whether a face marker left an image."""
-    left = _outside(log.s[k], s_star.shape[1], plant.image_size)
+    left = _outside(log.s[k], s_star.shape[1], plant)
     if left and log.events[0] < 0.0:
         log.events[0] = k
     joint = beyond_limits(plant.limits, log.read[k], 0.0)
@@ -143,7 +143,7 @@ def _image_error(s: FloatArray, s_star: FloatArray) -> float:
     """
     total = 0.0
     count = 0
-    for view in range(2):
+    for view in range(s_star.shape[0]):
         for k in range(s_star.shape[1]):
             du = s[view, k, 0] - s_star[view, k, 0]
             dv = s[view, k, 1] - s_star[view, k, 1]
@@ -154,20 +154,23 @@ def _image_error(s: FloatArray, s_star: FloatArray) -> float:
 
 
 @merged
-def _outside(s: FloatArray, m: int, image_size: FloatArray) -> bool:
-    """Whether one of the first m markers was seen outside an image."""
-    for view in range(2):
+def _outside(s: FloatArray, m: int, plant: Plant) -> bool:
+    """Whether one of the first m markers was seen outside, in more images than may be left out."""
+    left_out = 0
+    for view in range(s.shape[0]):
+        outside = False
         for k in range(m):
             u, v = s[view, k, 0], s[view, k, 1]
-            if math.isfinite(u + v) and from_border(image_size[view], u, v) < 0.0:
-                return True
-    return False
+            if math.isfinite(u + v) and from_border(plant.image_size[view], u, v) < 0.0:
+                outside = True
+        left_out += outside
+    return bool(left_out > s.shape[0] - plant.least_views)
 
 
 class Instant(NamedTuple):
     """Inputs of a verdict in addition to a row of the log, before its command."""
 
-    in_front: bool  # whether every face marker is in front of both cameras; the law is asked only then
+    in_front: bool  # whether enough cameras have every face marker before them; the law is asked only then
     left: bool  # whether a face marker lies outside an image
     distance: float  # of the face from the rig, m
     status: int  # of the law

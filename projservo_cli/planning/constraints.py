@@ -23,20 +23,31 @@ from projservo_cli.geometry.kinematics import (
     limit_distance,
     row,
 )
-from projservo_cli.planning.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance, squared
+from projservo_cli.planning.keep_out import NO_KEEP_OUT, SEVERAL, KeepOut, clearance, draws, squared
 from projservo_cli.planning.margins import (
     CLEAR,
+    CONDITIONING,
     FRONT,
     IMAGE,
     JOINTS,
-    MARGINS,
     VISIBILITY,
+    WIDTH,
     Demands,
+    column,
+    columns,
     pixel,
     straight_pixel,
     tag_planes,
 )
-from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, JointLimits, Model, Spread
+from projservo_cli.records import (
+    NO_SPREAD,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    JointLimits,
+    Model,
+    Spread,
+)
 from projservo_cli.task.face import Task, center_of, face_plane
 
 # Required fraction of the margins of start and goal near them.
@@ -62,14 +73,15 @@ class Constraints(NamedTuple):
     face: int  # how many are of the face
     tags: IntArray  # (t, k) markers of the face, or of tags, of which one is to be in sight
     a: FloatArray  # (t, 4) their planes at the reference
-    O: FloatArray  # (2, 4) optical centres, a·O = 1 of the face at the start
-    depth: FloatArray  # (2,) minimum third coordinate of a marker at the start
+    O: FloatArray  # (V, 4) optical centres, a·O = 1 of the face at the start where they are before it
+    depth: FloatArray  # (V,) minimum third coordinate of a marker at the start
     limits: JointLimits  # of the joints
-    image_size: FloatArray  # (2, 2) px, of each; infinite where an image has no border
+    image_size: FloatArray  # (V, 2) px, of each; infinite where an image has no border
+    least_views: int  # number of views that are to see the face, the best ones
     keep: FloatArray  # (n,) distance from a limit that counts as margin one, rad or m
-    full: FloatArray  # (10,) margins asked for
+    full: FloatArray  # (c,) margins asked for, in the columns of ``planning.margins``
     ends: FloatArray  # (k, n) start and goals, near which constraints are relaxed
-    end_demands: FloatArray  # (k, 10) required margins there
+    end_demands: FloatArray  # (k, c) required margins there
     spread: Spread = NO_SPREAD
     keep_out: KeepOut = NO_KEEP_OUT
 
@@ -86,26 +98,29 @@ def constraints_of(
 
     Signs are those at the start: [RH00] section 4.2 carries them along.
     """
-    m, n, tags = len(task.order), len(q_start), demands.tags
+    m, n, V, tags = len(task.order), len(q_start), len(task.O), demands.tags
     face = np.array(face_plane(A[:m], task.order, center_of(A[:m], task.center)))
     H = forward_kinematics(model, q_start)
     sides = np.sign((A @ model.P[:, 2].T)[0])
     model = model._replace(P=np.ascontiguousarray(model.P * sides[:, None, None]))
-    steep, border = demands.min_face_px, demands.border_px
+    full = np.zeros(column(CONDITIONING, V))
+    full[JOINTS], full[columns(CLEAR, V)] = 1.0, FINE_PX
+    full[columns(WIDTH, V)], full[columns(IMAGE, V)] = demands.min_face_px, demands.border_px
     return Constraints(
         model=model,
         M=np.ascontiguousarray(A @ np.linalg.inv(H).T),
         face=m,
         tags=tags if len(tags) else np.arange(m)[None],
         a=np.ascontiguousarray((tag_planes(tags, A, m, face) if len(tags) else face[None]) @ H),
-        O=np.ascontiguousarray(task.O / (task.O @ face)[:, None]),
+        O=np.ascontiguousarray(task.O / (task.visible * np.abs(task.O @ face))[:, None]),
         depth=(A @ model.P[:, 2].T).min(axis=0),
         limits=demands.limits,
         image_size=demands.image_size,
+        least_views=demands.least_views or V,
         keep=np.maximum(demands.keep, 1e-9),
-        full=np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, FINE_PX]),
+        full=full,
         ends=np.zeros((0, n)),
-        end_demands=np.zeros((0, MARGINS)),
+        end_demands=np.zeros((0, len(full))),
         keep_out=keep_out,
     )
 
@@ -120,8 +135,12 @@ def _limits_into(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
 
 @merged
 def _images_into(c: Constraints, H: Mat4, s: FloatArray, margins: FloatArray) -> bool:
-    """Write the images (2, b, 2) of the displaced body; False where a marker is behind a camera."""
-    for view in range(2):
+    """Write the images (V, b, 2) of the displaced body; False where too few cameras have it before them.
+
+    A camera that has not all of it before it shows nothing.
+    """
+    V, before = c.O.shape[0], 0
+    for view in range(V):
         nearest = math.inf
         for k in range(c.M.shape[0]):
             A = apply(H, vec(c.M[k]))
@@ -129,8 +148,14 @@ def _images_into(c: Constraints, H: Mat4, s: FloatArray, margins: FloatArray) ->
             nearest = min(nearest, depth)
             if depth > 0.0:
                 s[view, k, 0], s[view, k, 1] = pixel(c.model, view, A)
-        margins[FRONT + view] = nearest / c.depth[view]
-    return bool(margins[FRONT] > 0.0 and margins[FRONT + 1] > 0.0)
+        front = nearest / c.depth[view]
+        margins[column(FRONT, V) + view] = front
+        if front > 0.0:
+            before += 1
+        else:
+            for k in range(c.M.shape[0]):
+                s[view, k, 0] = s[view, k, 1] = math.nan
+    return before >= c.least_views
 
 
 @internal
@@ -157,32 +182,67 @@ def width(s: FloatArray, which: IntArray) -> float:
 def _sight_into(
     c: Constraints, tag: int, back: Mat4, visible: bool, s: FloatArray, sight: FloatArray
 ) -> None:
-    """Write side, width and border (6,) of a tag; the latter by images (2, b, 2), if they are shown.
+    """Write side, width and border (3 V,) of a tag; the latter by images (V, b, 2), if they are shown.
 
     back : inverse of the forward kinematics.
     """
-    for view in range(2):
+    V = c.O.shape[0]
+    for view in range(V):
+        shown = visible and math.isfinite(s[view, 0, 0])
         sight[view] = dot(vec(c.a[tag]), apply(back, vec(c.O[view])))
-        sight[2 + view] = width(s[view], c.tags[tag]) if visible else -math.inf
-        sight[4 + view] = math.inf if visible else -math.inf
+        sight[V + view] = width(s[view], c.tags[tag]) if shown else -math.inf
+        sight[2 * V + view] = math.inf if shown else -math.inf
         for k in c.tags[tag]:
             border = from_border(c.image_size[view], s[view, k, 0], s[view, k, 1])
-            sight[4 + view] = min(sight[4 + view], border)
+            sight[2 * V + view] = min(sight[2 * V + view], border)
+
+
+@internal
+def _excess(c: Constraints, view: int, trial: "Trial") -> float:
+    """Least excess of side, width and border of one tag in a view over the required margins."""
+    V, minimum = c.O.shape[0], math.inf
+    for kind in range(3):
+        unit = 1.0 if kind == 0 else FINE_PX
+        asked = trial.demands[column(VISIBILITY, V) + kind * V + view]
+        minimum = min(minimum, (trial.sight[kind * V + view] - asked) / unit)
+    return minimum
+
+
+@internal
+def _rank(trial: "Trial", view: int) -> int:
+    """Number of views that show the tag better."""
+    better = 0
+    for other in range(trial.excess.shape[0]):
+        more = trial.excess[other] > trial.excess[view]
+        better += more or (trial.excess[other] == trial.excess[view] and other < view)
+    return better
 
 
 @internal
 def _best_sight_into(c: Constraints, q: FloatArray, visible: bool, trial: "Trial") -> None:
-    """Write side, width and border of the tag whose minimum excess over the required margin is largest."""
-    best, back = -math.inf, backward(c.model, q)
+    """Write side, width and border of the tag whose minimum excess over the required margin is largest.
+
+    The views that count are the best ones; margins of the others are infinite.
+    """
+    best, back, V = -math.inf, backward(c.model, q), c.O.shape[0]
+    first, end = column(VISIBILITY, V), column(CLEAR, V)
     for tag in range(c.tags.shape[0]):
         _sight_into(c, tag, back, visible, trial.s, trial.sight)
         minimum = math.inf
-        for i in range(6):
-            unit = 1.0 if i < 2 else FINE_PX
-            minimum = min(minimum, (trial.sight[i] - trial.demands[VISIBILITY + i]) / unit)
+        for view in range(V):
+            trial.excess[view] = _excess(c, view, trial)
+        for view in range(V):
+            if _rank(trial, view) < c.least_views:
+                minimum = min(minimum, trial.excess[view])
         if tag == 0 or minimum > best:
             best = minimum
-            row_into(trial.margins[VISIBILITY:CLEAR], trial.sight)
+            row_into(trial.margins[first:end], trial.sight)
+            for view in range(V):
+                trial.counts[view] = _rank(trial, view) < c.least_views
+    for view in range(V):
+        if not trial.counts[view]:
+            for kind in range(4):
+                trial.margins[column(FRONT, V) + kind * V + view] = math.inf
 
 
 @merged
@@ -196,46 +256,60 @@ def twin_of(c: Constraints, j: int) -> Model:
         q_reference=m.q_reference,
         a_inf=m.a_inf,
         lens=m.lens,
+        on_tool=m.on_tool,
     )
 
 
 @internal
-def max_error(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
-    """Standard deviation of a coordinate in each image, px, at the worst marker along each direction."""
-    left = right = c.spread.rest * c.spread.rest
+def max_error(c: Constraints, q: FloatArray, H: Mat4, error: FloatArray) -> float:
+    """Largest standard deviation of a coordinate, px, at the worst marker along each direction.
+
+    error : (V,) on return that of each image.
+    """
+    V = c.O.shape[0]
+    for view in range(V):
+        error[view] = c.spread.rest * c.spread.rest
     for j in range(1, c.spread.P.shape[0]):
         twin = twin_of(c, j)
         H_j = forward(twin, q)
-        worst_left, worst_right = 0.0, 0.0
-        for k in range(c.M.shape[0]):
-            A, A_j = apply(H, vec(c.M[k])), apply(H_j, vec(c.spread.M[j, k]))
-            s_left, s_right = straight_pixel(c.model.P[0], A), straight_pixel(c.model.P[1], A)
-            worst_left = max(worst_left, squared(s_left, straight_pixel(twin.P[0], A_j)))
-            worst_right = max(worst_right, squared(s_right, straight_pixel(twin.P[1], A_j)))
-        left, right = left + 0.5 * worst_left, right + 0.5 * worst_right
-    return math.sqrt(left), math.sqrt(right)
+        for view in range(V):
+            worst = 0.0
+            for k in range(c.M.shape[0]):
+                A, A_j = apply(H, vec(c.M[k])), apply(H_j, vec(c.spread.M[j, k]))
+                s, s_j = straight_pixel(c.model.P[view], A), straight_pixel(twin.P[view], A_j)
+                worst = max(worst, squared(s, s_j))
+            error[view] += 0.5 * worst
+    maximum = 0.0
+    for view in range(V):
+        error[view] = math.sqrt(error[view])
+        maximum = max(maximum, error[view])
+    return maximum
 
 
 @internal
 def clear_by(c: Constraints, H: Mat4, s: FloatArray) -> float:
-    """Least distance, px, of the displaced body with images s (2, b, 2) from regions that are kept out of.
+    """Least distance, px, of the displaced body with images s (V, b, 2) from regions that are kept out of.
 
     A point is clear if one camera sees it outside a region. Markers of a face that the obstacle may hide
-    are so in both images, and all markers in the only image in which a region is drawn.
+    are so in all images, and all markers in the only image in which a region is drawn.
     """
     keep, minimum = c.keep_out, math.inf
     for region in range(keep.occludes.shape[0]):
-        both = keep.views[region] == BOTH
+        several = keep.views[region] == SEVERAL
         for k in range(c.M.shape[0]):
-            left, right = (s[0, k, 0], s[0, k, 1]), (s[1, k, 0], s[1, k, 1])
-            first, second = clearance(keep, region, 0, left), clearance(keep, region, 1, right)
-            if not both or (keep.occludes[region] == 1 and k < c.face):
-                minimum = min(minimum, first, second)
-            else:
-                first = min(first, from_border(c.image_size[0], left[0], left[1]))
-                second = min(second, from_border(c.image_size[1], right[0], right[1]))
-                minimum = min(minimum, max(first, second))
-        for k in range(c.face if both else 0):
+            in_all = not several or (keep.occludes[region] == 1 and k < c.face)
+            clear = math.inf if in_all else -math.inf
+            for view in range(c.O.shape[0]):
+                if not draws(keep, region, view):
+                    continue
+                at = (s[view, k, 0], s[view, k, 1])
+                here = clearance(keep, region, view, at)
+                if in_all:
+                    clear = min(clear, here)
+                else:
+                    clear = max(clear, min(here, from_border(c.image_size[view], at[0], at[1])))
+            minimum = min(minimum, clear)
+        for k in range(c.face if several else 0):
             A = apply(H, vec(c.M[k]))
             for l in range(k):
                 minimum = min(minimum, _clear_between(c, region, A, apply(H, vec(c.M[l]))))
@@ -246,7 +320,7 @@ def clear_by(c: Constraints, H: Mat4, s: FloatArray) -> float:
 def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
     """Least distance, px, of a segment from a region of both images, as above; never too large.
 
-    Pieces of it, of the segment in space and so the same in both images, are halved until their images are
+    Pieces of it, of the segment in space and so the same in all images, are halved until their images are
     short, or short against the distance of their middles and on one side of the required margin: a distance
     changes by no more than the path.
     """
@@ -259,7 +333,9 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
             _combined(done + step, A, B),
         )
         here, along, half = -math.inf, -math.inf, 0.0
-        for view in range(2):
+        for view in range(c.O.shape[0]):
+            if not draws(c.keep_out, region, view):
+                continue
             s, at, t = pixel(c.model, view, first), pixel(c.model, view, middle), pixel(c.model, view, last)
             radius = math.sqrt(max(squared(at, s), squared(at, t)))
             clear = min(
@@ -285,29 +361,31 @@ def _combined(x: float, A: Vec4, B: Vec4) -> Vec4:
 @njit
 def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
     """Write margins, required margins, and images at joints (n,), rad or m."""
-    margins, s = trial.margins, trial.s
+    margins, s, V = trial.margins, trial.s, c.O.shape[0]
+    clear, image = column(CLEAR, V), column(IMAGE, V)
     demands_into(c, q, trial.demands)
     _limits_into(c, q, margins)
     H = forward(c.model, q)
     visible = _images_into(c, H, s, margins)
     _best_sight_into(c, q, visible, trial)
-    margins[CLEAR] = clear_by(c, H, s) if visible else -math.inf
+    margins[clear] = clear_by(c, H, s) if visible else -math.inf
     # Error of a prediction: its maximum or, if that could decide, its value there.
-    left = right = maximum = c.spread.most
+    maximum, room = c.spread.most, math.inf
     anywhere = _FAR_OFF * maximum
-    room = min(margins[IMAGE] - c.full[IMAGE], margins[IMAGE + 1] - c.full[IMAGE + 1])
-    near = room < DEVIATIONS * maximum or margins[CLEAR] - c.full[CLEAR] < DEVIATIONS * anywhere
+    for view in range(V):
+        trial.error[view] = maximum
+        room = min(room, margins[image + view] - c.full[image + view])
+    near = room < DEVIATIONS * maximum or margins[clear] - c.full[clear] < DEVIATIONS * anywhere
     if visible and maximum > 0.0 and near:
-        left, right = max_error(c, q, H)
-        anywhere = max(left, right)
-    margins[IMAGE] -= DEVIATIONS * left
-    margins[IMAGE + 1] -= DEVIATIONS * right
-    margins[CLEAR] -= DEVIATIONS * anywhere
+        anywhere = max_error(c, q, H, trial.error)
+    for view in range(V):
+        margins[image + view] -= DEVIATIONS * trial.error[view]
+    margins[clear] -= DEVIATIONS * anywhere
 
 
 @njit
 def margins_along_into(c: Constraints, q: FloatArray, trial: "Trial", margins: FloatArray) -> None:
-    """Write margins and required margins (2, k, 10) along joints (k, n)."""
+    """Write margins and required margins (2, k, c) along joints (k, n)."""
     for i in range(q.shape[0]):
         margins_into(c, q[i], trial)
         row_into(margins[0, i], trial.margins)
@@ -316,13 +394,13 @@ def margins_along_into(c: Constraints, q: FloatArray, trial: "Trial", margins: F
 
 @njit
 def demands_into(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
-    """Write the required margins (10,) at joints (n,): the full ones, or less near start and goals."""
-    for i in range(MARGINS):
+    """Write the required margins (c,) at joints (n,): the full ones, or less near start and goals."""
+    for i in range(c.full.shape[0]):
         demands[i] = c.full[i]
     for e in range(c.ends.shape[0]):
         rise = time_between(c.limits.speed, q, c.ends[e]) / _RISE
         if rise < 1.0:
-            for i in range(MARGINS):
+            for i in range(c.full.shape[0]):
                 demands[i] = min(demands[i], c.end_demands[e, i] + rise * (c.full[i] - c.end_demands[e, i]))
 
 
@@ -337,18 +415,19 @@ def time_between(speed: FloatArray, q: FloatArray, r: FloatArray) -> float:
 
 @merged
 def _moved(s: FloatArray, before: FloatArray) -> float:
-    """Longest way of an image point between two views (2, b, 2), px."""
+    """Longest way of an image point that is seen before and after, of images (V, b, 2), px."""
     maximum = 0.0
-    for view in range(2):
+    for view in range(s.shape[0]):
         for k in range(s.shape[1]):
             du, dv = s[view, k, 0] - before[view, k, 0], s[view, k, 1] - before[view, k, 1]
-            maximum = max(maximum, du * du + dv * dv)
+            if math.isfinite(du + dv):
+                maximum = max(maximum, du * du + dv * dv)
     return math.sqrt(maximum)
 
 
 @merged
 def _keep_images(trial: "Trial") -> None:
-    for view in range(2):
+    for view in range(trial.s.shape[0]):
         for k in range(trial.s.shape[1]):
             row_into(trial.s_before[view, k], trial.s[view, k])
 
@@ -357,25 +436,32 @@ class Trial(NamedTuple):
     """Workspace of one test of joints, or of the path between two."""
 
     margins: FloatArray
-    demands: FloatArray  # margins, demands: (10,)
-    sight: FloatArray  # (6,) side, width and border of one tag
+    demands: FloatArray  # margins, demands: (c,)
+    sight: FloatArray  # (3 V,) side, width and border of one tag
+    excess: FloatArray  # (V,) least excess of these in each view
+    counts: BoolArray  # (V,) whether a view is one of those that are to see the face
+    error: FloatArray  # (V,) error of a prediction in each image, px
     s: FloatArray
-    s_before: FloatArray  # s, s_before: (2, b, 2) px
+    s_before: FloatArray  # s, s_before: (V, b, 2) px
     q: FloatArray  # (n,)
-    failures: IntArray  # (10 + n,) how often each margin failed; of the limits, how often each joint
+    failures: IntArray  # (c + n,) how often each margin failed; of the limits, how often each joint
 
 
-def new_trial(n: int, b: int) -> Trial:
-    """Workspace for n joints and b markers."""
-    margins, s = np.zeros(MARGINS), np.zeros((2, b, 2))
+def new_trial(c: Constraints) -> Trial:
+    """Workspace for tests of constraints."""
+    (V, n), b = (len(c.O), len(c.keep)), len(c.M)
+    margins, s = np.zeros_like(c.full), np.zeros((V, b, 2))
     return Trial(
         margins=margins,
         demands=margins.copy(),
-        sight=np.zeros(6),
+        sight=np.zeros(3 * V),
+        excess=np.zeros(V),
+        counts=np.ones(V, np.bool_),
+        error=np.zeros(V),
         s=s,
         s_before=s.copy(),
         q=np.zeros(n),
-        failures=np.zeros(MARGINS + n, np.int64),
+        failures=np.zeros(len(margins) + n, np.int64),
     )
 
 
@@ -383,12 +469,12 @@ def new_trial(n: int, b: int) -> Trial:
 def _valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
     """Tell whether joints keep all margins; count failures, write the images."""
     margins_into(c, q, trial)
-    for i in range(MARGINS):
+    for i in range(c.full.shape[0]):
         if not trial.margins[i] > trial.demands[i]:
             trial.failures[i] += 1
             for j in range(q.shape[0] if i == JOINTS else 0):
                 room = limit_distance(c.limits, q, j) / c.keep[j]
-                trial.failures[MARGINS + j] += not room > trial.demands[JOINTS]
+                trial.failures[c.full.shape[0] + j] += not room > trial.demands[JOINTS]
             return False
     return True
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, sub, vec, vec_into, wrapped_angle
+from projservo_cli.geometry.algebra import Vec4, apply, mat, sub, vec, vec_into, wrapped_angle
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import row_into, solve_normal
-from projservo_cli.geometry.kinematics import forward, image_motion, operators_at
+from projservo_cli.geometry.kinematics import forward, image_velocity, operators_at
 from projservo_cli.planning.constraints import (
     DEVIATIONS,
     FINE_PX,
@@ -25,7 +25,7 @@ from projservo_cli.planning.constraints import (
     new_trial,
     twin_of,
 )
-from projservo_cli.planning.margins import IMAGE, straight_pixel
+from projservo_cli.planning.margins import FRONT, IMAGE, column, straight_pixel
 from projservo_cli.records import FloatArray
 
 # Maximum number of Newton steps from one start.
@@ -66,7 +66,7 @@ class GoalFeatures(NamedTuple):
     """Images of the goal."""
 
     A_star: FloatArray  # (m, 4) face at the goal, a_inf·A = 1
-    s_star: FloatArray  # (2, m, 2) its images as projective cameras see them, px
+    s_star: FloatArray  # (V, m, 2) its images as projective cameras see them, px
     sigma: float  # standard deviation of a coordinate of them, px
 
 
@@ -83,8 +83,10 @@ class _Scratch(NamedTuple):
 
     H_hat: FloatArray  # (n, 4, 4) operators at the joints
     N: FloatArray  # (n, n + 1) normal equations, right-hand side in the last column
-    J: FloatArray  # (m, n + 1, 4) derivatives of points, or their images, by the joints; last the residual
+    # (m, n + 1, 4 or 2 V) derivatives of points, or their images, by the joints; last the residual
+    J: FloatArray
     L: FloatArray  # (n, n + 1) damped and solved
+    off: FloatArray  # (2 V,) images by a deviation of the calibration
     q: FloatArray  # (n,) trial
 
 
@@ -103,20 +105,46 @@ def _normal_equations_into(
     total = 0.0
     for k in range(c.face):
         A, J = apply(H, vec(c.M[k])), scratch.J[k]
-        s, aimed = A, vec(goal.A_star[k])
-        if images:
-            left, right = goal.s_star[0, k], goal.s_star[1, k]
-            aimed = (left[0], left[1], right[0], right[1])
+        terms = 2 * goal.s_star.shape[0] if images else 4
+        if not images:
+            vec_into(J[n], sub(vec(goal.A_star[k]), A))
         for i in range(n):
             D = apply(mat(scratch.H_hat[i]), A)
             if images:
-                s, D = image_motion(c.model.P, A, D)
-            vec_into(J[i], D)
-        vec_into(J[n], sub(aimed, s))
+                _image_row_into(c.model.P, goal.s_star, k, (A, D), J[i], J[n])
+            else:
+                vec_into(J[i], D)
         for i in range(n):
             for j in range(i, n + 1):
-                N[i, j] += dot(vec(J[i]), vec(J[j]))
-        total += dot(vec(J[n]), vec(J[n]))
+                N[i, j] += _product(J[i], J[j], terms)
+        total += _product(J[n], J[n], terms)
+    return total
+
+
+@merged
+def _image_row_into(
+    P: FloatArray, s_star: FloatArray, k: int, moving: tuple[Vec4, Vec4], J: FloatArray, off: FloatArray
+) -> None:
+    """Write the velocities (2 V,) of the images of a point at a velocity, and how far they are off, px.
+
+    s_star : (V, m, 2) images that are aimed at; both are zero where marker k is not among them.
+    """
+    A, D = moving
+    for view in range(s_star.shape[0]):
+        u, v, u_dot, v_dot = image_velocity(P[view], A, D)
+        e_u, e_v = float(s_star[view, k, 0]) - u, float(s_star[view, k, 1]) - v
+        if not math.isfinite(e_u + e_v):
+            u_dot = v_dot = e_u = e_v = 0.0
+        J[2 * view], J[2 * view + 1] = u_dot, v_dot
+        off[2 * view], off[2 * view + 1] = e_u, e_v
+
+
+@merged
+def _product(x: FloatArray, y: FloatArray, terms: int) -> float:
+    """Scalar product of the first terms, an even number, in pairs."""
+    total = 0.0
+    for i in range(0, terms, 2):
+        total += float(x[i]) * float(y[i]) + float(x[i + 1]) * float(y[i + 1])
     return total
 
 
@@ -171,10 +199,11 @@ def _settled(
 
 
 @merged
-def _seen(P: FloatArray, H: Mat4, M: FloatArray) -> Vec4:
-    """Pixels u, v of a displaced point in both views (2, 3, 4), left and right."""
-    A = apply(H, vec(M))
-    return straight_pixel(P[0], A) + straight_pixel(P[1], A)
+def _apart_into(P: FloatArray, A: Vec4, P_j: FloatArray, A_j: Vec4, off: FloatArray) -> None:
+    """Write how far the images (2 V,) of a point by other cameras are from those of another point, px."""
+    for view in range(P.shape[0]):
+        s, s_j = straight_pixel(P[view], A), straight_pixel(P_j[view], A_j)
+        off[2 * view], off[2 * view + 1] = s_j[0] - s[0], s_j[1] - s[1]
 
 
 @internal
@@ -189,7 +218,8 @@ def _explained(
     """
     n = q.shape[0]
     noise = goal.sigma * goal.sigma + _LEAST_SIGMA * _LEAST_SIGMA + c.spread.rest * c.spread.rest
-    total: float = (4.0 * c.face - min(n, 6)) * noise
+    terms = 2 * goal.s_star.shape[0]
+    total: float = (float(terms) * c.face - min(n, 6)) * noise
     _normal_equations_into(c, goal, q, True, scratch)
     for i in range(n):
         for j in range(n):
@@ -206,10 +236,11 @@ def _explained(
         away = 0.0
         scratch.N[:, n] = 0.0
         for k in range(c.face):
-            off = sub(_seen(twin.P, H_j, c.spread.M[j, k]), _seen(c.model.P, H, c.M[k]))
-            away += dot(off, off)
+            A, A_j, off = apply(H, vec(c.M[k])), apply(H_j, vec(c.spread.M[j, k])), scratch.off
+            _apart_into(c.model.P, A, twin.P, A_j, off)
+            away += _product(off, off, terms)
             for i in range(n):
-                scratch.N[i, n] += dot(vec(scratch.J[k, i]), off)
+                scratch.N[i, n] += _product(scratch.J[k, i], off, terms)
         if _damped_step_into(scratch.N, 0.0, scratch.L):
             for i in range(n):
                 away -= scratch.L[i, n] * scratch.N[i, n]
@@ -270,13 +301,13 @@ def _solutions_into(
 def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
     """Whether joints (n,) show the goal, but for their limits: ``_SHOWN``, ``HIDDEN`` or ``_BLOCKED``."""
     margins_into(c, q, trial)
-    for j in range(1, IMAGE):
+    V = c.O.shape[0]
+    for j in range(column(FRONT, V), column(IMAGE, V)):
         if not trial.margins[j] > 0.0:
             return HIDDEN
     # A goal was chosen, and is seen on arrival: what its prediction may be off speaks for it.
     H = forward(c.model, q)
-    left, right = max_error(c, q, H)
-    doubt = min(DEVIATIONS * max(left, right), FINE_PX)
+    doubt = min(DEVIATIONS * max_error(c, q, H, trial.error), FINE_PX)
     return _SHOWN if clear_by(c, H, trial.s) > -doubt else _BLOCKED
 
 
@@ -329,12 +360,13 @@ def goals_of(
     """
     n, maximum = len(start), STARTS if len(start) <= 6 else _SAMPLED
     solutions = _Solutions(np.zeros((maximum, n)), np.zeros(maximum), np.zeros((maximum, n)))
-    shapes = (n, 4, 4), (n, n + 1), (c.face, n + 1, 4), (n, n + 1), (n,)
+    terms = 2 * len(c.O)
+    shapes = (n, 4, 4), (n, n + 1), (c.face, n + 1, max(4, terms)), (n, n + 1), (terms,), (n,)
     scratch = _Scratch(*(np.zeros(shape) for shape in shapes))
     count = _solutions_into(c, goal, taught, starts, solutions, scratch)
     minimum = max(solutions.left[len(taught) : count].min(initial=math.inf), 4.0 * c.face * _LEAST_SIGMA**2)
     good = np.flatnonzero(solutions.left[:count] <= _MUCH**2 * minimum)
-    goals, ranks, met, trial = [np.zeros((0, n))], [np.zeros(0)], [0, 0, 0], new_trial(n, len(c.M))
+    goals, ranks, met, trial = [np.zeros((0, n))], [np.zeros(0)], [0, 0, 0], new_trial(c)
     for k in good:
         solution, deviation, certain = solutions.q[k], solutions.deviation[k], solutions.left[k] == 0.0
         slack = ROUND_OFF + (0.0 if certain else 1.0) * np.minimum(DEVIATIONS * deviation, _DEFINITE)

@@ -1,6 +1,6 @@
-"""Regions of both images that the body keeps out of: polygons that somebody drew around an obstacle.
+"""Regions of the images that the body keeps out of: polygons that somebody drew around an obstacle.
 
-A point in space lies in front of, behind or in an obstacle where both cameras show it within the outline;
+A point in space lies in front of, behind or in an obstacle where all cameras show it within the outline;
 if one camera sees it outside the outline, it is outside the obstacle. This needs no metric.
 """
 
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.records import FloatArray, IntArray
 
-BOTH = 2
+SEVERAL = -1  # in place of the only image in which a region is drawn
 Pixel = tuple[float, float]
 
 
@@ -23,33 +23,33 @@ class KeepOut(NamedTuple):
 
     corners: FloatArray  # (k, 2) of all polygons, px
     first: IntArray  # (p + 1,) the first corner of each polygon, and how many there are
-    image: IntArray  # (p,) in which of both it is drawn
+    image: IntArray  # (p,) in which image it is drawn
     region: IntArray  # (p,) of which region it is
-    occludes: IntArray  # (r,) 1 where markers of the face stay outside in both images
-    views: IntArray  # (r,) the only image in which a region is drawn, or ``BOTH``
+    occludes: IntArray  # (r,) 1 where markers of the face stay outside in all images
+    views: IntArray  # (r,) the only image in which a region is drawn, or ``SEVERAL``
 
 
 NO_KEEP_OUT = KeepOut(np.zeros((0, 2)), np.zeros(1, np.int64), *(np.zeros(0, np.int64) for _ in range(4)))
 
 
-def keep_out_of(regions: Sequence[tuple[ArrayLike | None, ArrayLike | None, bool]]) -> KeepOut:
-    """Regions, each of polygons (k, 2) in the left and the right image, None for none, and if it hides."""
+def keep_out_of(regions: Sequence[tuple[Sequence[ArrayLike | None], bool]]) -> KeepOut:
+    """Regions, each of a polygon (k, 2) in each image, None for none, and whether it hides."""
     polygons = [
         (r, view, np.asarray(drawn, dtype=np.float64))
         for r, region in enumerate(regions)
-        for view, drawn in enumerate(region[:2])
+        for view, drawn in enumerate(region[0])
         if drawn is not None
     ]
     if not polygons:
         return NO_KEEP_OUT
-    views = [int(left is None) if left is None or right is None else BOTH for left, right, _ in regions]
+    drawn_in = [[view for view, drawn in enumerate(region[0]) if drawn is not None] for region in regions]
     return KeepOut(
         corners=np.ascontiguousarray(np.vstack([corners for _, _, corners in polygons])),
         first=np.cumsum([0, *(len(corners) for _, _, corners in polygons)]),
         image=np.array([view for _, view, _ in polygons]),
         region=np.array([r for r, _, _ in polygons]),
-        occludes=np.array([int(hides) for _, _, hides in regions]),
-        views=np.array(views),
+        occludes=np.array([int(hides) for _, hides in regions]),
+        views=np.array([views[0] if len(views) == 1 else SEVERAL for views in drawn_in]),
     )
 
 
@@ -88,6 +88,15 @@ def outside_polygon(corners: FloatArray, first: int, last: int, s: Pixel) -> flo
         if (a[1] > s[1]) != (b[1] > s[1]) and s[0] < a[0] + (s[1] - a[1]) * (b[0] - a[0]) / (b[1] - a[1]):
             within = not within
     return -math.sqrt(minimum) if within else math.sqrt(minimum)
+
+
+@merged
+def draws(keep: KeepOut, region: int, view: int) -> bool:
+    """Whether a region is drawn in an image."""
+    for p in range(keep.image.shape[0]):
+        if keep.region[p] == region and keep.image[p] == view:
+            return True
+    return False
 
 
 @merged

@@ -12,7 +12,7 @@ writes them, less the error of a prediction:
 - clear: the minimum distance from a keep-out region, px: of all markers, and of all points between
   those of the face.
 
-Of a motion of the face, the worse camera counts, and
+Of a motion of the face, the worst of the views that are to see it counts, and
 
 - image: that distance less ``border_px``, over half the shorter side of the image less ``border_px``; 1 in
   the middle of a square image;
@@ -40,31 +40,44 @@ from projservo_cli.geometry.algebra import (
     meet,
     mul,
     vec,
-    vec_into,
 )
-from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
 from projservo_cli.geometry.kinematics import (
     backward,
     forward,
-    image_motion,
+    image_velocity,
     limit_distance,
     operators_at,
     project,
     row,
 )
 from projservo_cli.geometry.lens import distort_pixel, distorts
-from projservo_cli.geometry.mechanisms import SETTLED, MeasuredFace, Work, make_span, reach, workspace
+from projservo_cli.geometry.mechanisms import (
+    SETTLED,
+    MeasuredFace,
+    Work,
+    make_span,
+    reach,
+    rows_of,
+    workspace,
+)
 from projservo_cli.image_size import BEHIND, border_distance
-from projservo_cli.records import FloatArray, IntArray, JointLimits, Model
+from projservo_cli.records import VIEWS, FloatArray, IntArray, JointLimits, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients
 
-# Columns of the margins of joints, a pair of them where each camera has its own.
-JOINTS, FRONT, VISIBILITY, WIDTH, IMAGE, CLEAR = 0, 1, 3, 5, 7, 9
-MARGINS = 10
-# No margin of joints alone: the motion between them has it.
-CONDITIONING = MARGINS
+# Kinds of constraints. Margins of joints have a column of each, and one a view where each camera has its own;
+# the last one is of a motion between them alone.
+JOINTS, FRONT, VISIBILITY, WIDTH, IMAGE, CLEAR, CONDITIONING = range(7)
+
+
+@inline
+def column(kind: int, views: int) -> int:
+    """First column of a kind in margins of joints before so many views; of ``CONDITIONING`` their number."""
+    if kind >= CLEAR:
+        return 1 + (CLEAR - FRONT) * views + kind - CLEAR
+    return 1 + (kind - FRONT) * views if kind >= FRONT else 0
 
 
 class _Words(NamedTuple):
@@ -95,10 +108,15 @@ CONSTRAINTS = {
 OF_MOTION = (VISIBILITY, IMAGE, JOINTS, CONDITIONING)
 
 
-def constraint_at(column: int) -> tuple[_Words, int]:
-    """Return the words of a margin, and its view if each camera has its own."""
-    first = max(first for first in CONSTRAINTS if first <= column)
-    return CONSTRAINTS[first], column - first
+def columns(kind: int, views: int) -> slice:
+    """Columns of a kind in margins of joints."""
+    return slice(column(kind, views), column(kind + 1, views))
+
+
+def constraint_at(margin: int, views: int) -> tuple[_Words, int]:
+    """Return the words of a column of margins, and its view if each camera has its own."""
+    kind = max(kind for kind in CONSTRAINTS if column(kind, views) <= margin)
+    return CONSTRAINTS[kind], margin - column(kind, views)
 
 
 # A margin this bad is as bad as it gets: joints out of reach.
@@ -112,7 +130,7 @@ class Demands(NamedTuple):
     """Constraints of a planned motion."""
 
     limits: JointLimits  # of the joints
-    image_size: FloatArray  # (2, 2) width and height of each image, px; infinite where it has no border
+    image_size: FloatArray  # (V, 2) width and height of each image, px; infinite where it has no border
     border_px: float  # minimum distance of a marker from the border of an image, px
     conditioning: float  # minimum reciprocal condition number of the image Jacobian of the face
     keep: FloatArray  # (n,) minimum distance from a joint limit, rad or m, along a path through joint space
@@ -121,13 +139,15 @@ class Demands(NamedTuple):
     # both cameras; none where the face is
     tags: IntArray = np.zeros((0, 4), np.int64)
     units: tuple[str, ...] = ()  # of each joint in messages: deg, rad or m
+    view: tuple[str, ...] = VIEWS  # names of the views
+    least_views: int = 0  # number of views that are to see the face, the best ones; 0 for all
 
 
-def limits_alone(limits: JointLimits) -> Demands:
+def limits_alone(limits: JointLimits, views: int = len(VIEWS)) -> Demands:
     """Demands of joint limits alone."""
     return Demands(
         limits=limits,
-        image_size=np.full((2, 2), math.inf),
+        image_size=np.full((views, 2), math.inf),
         border_px=0.0,
         conditioning=0.0,
         keep=np.zeros(len(limits.lower)),
@@ -143,7 +163,8 @@ class Reaching(NamedTuple):
     amplitudes: FloatArray  # (3,) τ in the unit of Ĥ_t, θ_r and θ_p in rad
     A: FloatArray  # (m, 4) face at the start
     a: FloatArray  # (4,) its plane
-    O: FloatArray  # (2, 4) optical centres
+    O: FloatArray  # (V, 4) optical centres
+    visible: FloatArray  # (V,) sign of a·O on the visible side of the face
     q_start: FloatArray  # (n,) joints at the start, rad or m
     body: FloatArray = np.zeros(
         (0, 4)
@@ -154,9 +175,9 @@ class Along(NamedTuple):
     """Quantities along a motion, at s samples."""
 
     H_d: FloatArray  # (s, 4, 4) displacement of the face
-    s: FloatArray  # (s, 2, m, 2) its images, px
-    visibility: FloatArray  # (s, 2) margins a·O, 1 at the start
-    # (s, 2) minimum distance of a marker from the image border, px; ``BEHIND`` where none shows it
+    s: FloatArray  # (s, V, m, 2) its images, px
+    visibility: FloatArray  # (s, V) margins a·O, 1 at the start
+    # (s, V) minimum distance of a marker from the image border, px; ``BEHIND`` where none shows it
     distance: FloatArray
     q: FloatArray  # (s, n) joints, rad or m; NaN from where they cannot follow
     limit: FloatArray  # (s,) margins of the joint limits, NaN likewise
@@ -167,8 +188,8 @@ class Along(NamedTuple):
 
 def room_along(reaching: Reaching, count: int) -> Along:
     """Return empty arrays for a number of samples of a motion."""
-    m, n = len(reaching.A), len(reaching.q_start)
-    shapes = (4, 4), (2, m, 2), (2,), (2,), (n,), (), (), (4,)
+    m, n, V = len(reaching.A), len(reaching.q_start), len(reaching.O)
+    shapes = (4, 4), (V, m, 2), (V,), (V,), (n,), (), (), (4,)
     return Along(*(np.full((count, *shape), np.nan) for shape in shapes))
 
 
@@ -202,7 +223,8 @@ def _visibility(reaching: Reaching, view: int, mu_t: float, mu_r: float) -> floa
     moved = axpy(-mu_t * float(reaching.amplitudes[0]), apply(mat(reaching.H_hat[0]), O), O)
     c_0, c_s, c_c = margin_coefficients(a, mat(reaching.H_hat[1]), moved)
     theta = mu_r * float(reaching.amplitudes[1])
-    return (c_0 + c_s * math.sin(theta) + c_c * math.cos(theta)) / dot(a, O)
+    side: float = reaching.visible[view] * (c_0 + c_s * math.sin(theta) + c_c * math.cos(theta))
+    return side / abs(dot(a, O))
 
 
 @merged
@@ -252,14 +274,15 @@ class Carrier(NamedTuple):
     """State that carries the joints along a path."""
 
     reaching: Reaching  # the task
-    work: Work  # workspace of n joints and 4m rows
+    work: Work  # workspace of n joints and the rows of the images of m markers
     before: FloatArray  # (n,) joints before a part of it
 
 
 def carrier_of(reaching: Reaching) -> Carrier:
     """Workspace in which the joints of a task are carried."""
     n = len(reaching.q_start)
-    work = workspace(n, 4 * len(reaching.A), make_span(reaching.model, reaching.A))
+    rows = rows_of(len(reaching.O), len(reaching.A))
+    work = workspace(n, rows, make_span(reaching.model, reaching.A))
     return Carrier(reaching, work, np.empty(n))
 
 
@@ -305,13 +328,16 @@ def _reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
     The operators at the joints are in the workspace.
     """
     work, A, P = carrier.work, carrier.reaching.A, carrier.reaching.model.P
-    n, m = work.H_hat.shape[0], A.shape[0]
+    n, m, V = work.H_hat.shape[0], A.shape[0], P.shape[0]
     for k in range(m):
         M = apply(H, vec(A[k]))
         for i in range(n):
-            _, s_dot = image_motion(P, M, apply(mat(work.H_hat[i]), M))
-            vec_into(work.system.B[i, 4 * k : 4 * k + 4], s_dot)
-    first, _, last = orthogonalize(work.system, 4 * m, n, False)
+            D = apply(mat(work.H_hat[i]), M)
+            for view in range(V):
+                _, _, u_dot, v_dot = image_velocity(P[view], M, D)
+                at = 2 * (V * k + view)
+                work.system.B[i, at], work.system.B[i, at + 1] = u_dot, v_dot
+    first, _, last = orthogonalize(work.system, 2 * V * m, n, False)
     if n > COORDINATES:  # further joints add no motion of the face
         sixth = work.system.B[COORDINATES - 1, COORDINATES - 1]
         last = 1.0 / sixth if sixth > 0.0 else 0.0
@@ -322,7 +348,7 @@ def _reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
 def displacement_into(reaching: Reaching, mu: FloatArray, along: Along, i: int) -> None:
     """Write displacement and visibility of one instant, at shares (3,)."""
     mat_into(along.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2]))
-    for view in range(2):
+    for view in range(reaching.O.shape[0]):
         along.visibility[i, view] = _visibility(reaching, view, mu[0], mu[1])
 
 
@@ -362,9 +388,10 @@ def _moved_into(carrier: Carrier, along: Along) -> None:
         along.condition[i] = _reciprocal_condition(carrier, H)
         along.limit[i] = limit_margin(reaching.demands, along.q[i])
         H_back = mul(start, backward(model, along.q[i]))
-        for view in range(2):
+        for view in range(reaching.O.shape[0]):
             O = vec(reaching.O[view])
-            along.visibility[i, view] = dot(a, apply(H_back, O)) / dot(a, O)
+            side = reaching.visible[view] * dot(a, apply(H_back, O))
+            along.visibility[i, view] = side / abs(dot(a, O))
 
 
 def along_shares(reaching: Reaching, mu: FloatArray, q: FloatArray | None = None) -> Motion:
@@ -399,10 +426,20 @@ def measured(motion: Motion) -> Motion:
     along.distance[:] = border[:, :, :m].min(axis=2)
     if len(demands.tags):
         _best_tag_into(reaching, border, along)
-    along.margins[:, OF_MOTION.index(VISIBILITY)] = along.visibility.min(axis=1)
-    along.margins[:, OF_MOTION.index(IMAGE)] = image_margin(demands, along.distance.min(axis=1))
+    visibility, distance = best_views(demands, along.visibility, along.distance)
+    along.margins[:, OF_MOTION.index(VISIBILITY)] = visibility.min(axis=-1)
+    along.margins[:, OF_MOTION.index(IMAGE)] = image_margin(demands, distance.min(axis=-1))
     joint_margins_into(demands, along)
     return motion
+
+
+def best_views(
+    demands: Demands, visibility: FloatArray, distance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Visibility and distance from the border, px, (..., V) both, of the best views that are asked for."""
+    worse = np.minimum(visibility, image_margin(demands, distance))
+    best = np.argsort(-worse, axis=-1, kind="stable")[..., : demands.least_views or worse.shape[-1]]
+    return np.take_along_axis(visibility, best, -1), np.take_along_axis(distance, best, -1)
 
 
 def joint_margins_into(demands: Demands, along: Along) -> None:
@@ -427,11 +464,13 @@ def tag_planes(tags: IntArray, body: FloatArray, m: int, a: FloatArray) -> Float
 
 
 def _best_tag_into(reaching: Reaching, border: FloatArray, along: Along) -> None:
-    """Write visibility and distance of the tag that keeps them best, of distances (s, 2, b) of markers."""
+    """Write visibility and distance of the tag that keeps them best, of distances (s, V, b) of markers."""
     tags = reaching.demands.tags
     planes = tag_planes(tags, reaching.body, len(reaching.A), reaching.a)
-    back = np.linalg.inv(along.H_d) @ (reaching.O / (reaching.O @ reaching.a)[:, None]).T
-    side, distance = planes @ back, border[:, :, tags].min(axis=3).swapaxes(1, 2)  # (s, t, 2) both
-    worst = np.minimum(side.min(axis=2), image_margin(reaching.demands, distance.min(axis=2)))
+    scale = reaching.visible * np.abs(reaching.O @ reaching.a)
+    back = np.linalg.inv(along.H_d) @ (reaching.O / scale[:, None]).T
+    side, distance = planes @ back, border[:, :, tags].min(axis=3).swapaxes(1, 2)  # (s, t, V) both
+    sides, distances = best_views(reaching.demands, side, distance)
+    worst = np.minimum(sides.min(axis=2), image_margin(reaching.demands, distances.min(axis=2)))
     best = np.arange(len(worst)), worst.argmax(axis=1)
     along.visibility[:], along.distance[:] = side[best], distance[best]

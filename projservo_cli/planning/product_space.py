@@ -52,7 +52,7 @@ ROUND_OFF = 1e-9
 CHECKS = 151
 # Shares of this part of the best one are as good; the quicker path is better.
 _EQUALLY = 0.95
-VIEWS = [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]
+SIGHT = [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]
 
 
 def duration(motion: Motion) -> float:
@@ -115,7 +115,7 @@ def _senses(amplitudes: FloatArray) -> list[FloatArray]:
 
 def _best_of(paths: list[Motion]) -> Motion:
     """Of the paths in view, or of all if none is, the quickest whose smallest share is as good as any."""
-    paths = [path for path in paths if path.shares()[:, VIEWS].min() > 0.0] or paths
+    paths = [path for path in paths if path.shares()[:, SIGHT].min() > 0.0] or paths
     minimum = [float(path.shares().min()) for path in paths]
     good = min(_EQUALLY * max(minimum), max(minimum))
     paths = [path for path, share in zip(paths, minimum, strict=True) if share >= good]
@@ -137,7 +137,7 @@ class _Lattice(NamedTuple):
         """Smallest share (s,) along a motion in the lattice."""
         ends = self.nodes.along.margins[[0, -1]].min(axis=0)
         shares = motion.along.margins / np.where(ends > 0.0, ends, 1.0)
-        return np.asarray(shares[:, slice(None) if self.follows else VIEWS].min(axis=1))
+        return np.asarray(shares[:, slice(None) if self.follows else SIGHT].min(axis=1))
 
     def moved(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
         """Return the duration terms along a motion in the lattice (s, n), and its speeds (n,)."""

@@ -23,7 +23,7 @@ from projservo_cli.planning.constraints import (
 )
 from projservo_cli.planning.goal_configurations import STARTS, UNSURE, GoalFeatures, goals_of
 from projservo_cli.planning.keep_out import only
-from projservo_cli.planning.margins import CLEAR, FRONT, IMAGE, JOINTS
+from projservo_cli.planning.margins import CLEAR, FRONT, IMAGE, JOINTS, column, columns
 from projservo_cli.planning.time_parameterization import TimedPath, minimum_time, time_parameterized
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, JointLimits
 
@@ -68,8 +68,8 @@ class JointPath(NamedTuple):
     solutions: int  # how many apart from whole turns
     hidden: int  # how many of those lie beyond the limits or do not show the face
     blocked: int  # how many of those lie within a region that is kept out of
-    failures: IntArray  # (10 + n,) how often each margin, and each joint's limit, stopped the search
-    start_clearance: FloatArray  # (10,) margins of the start
+    failures: IntArray  # (c + n,) how often each margin, and each joint's limit, stopped the search
+    start_clearance: FloatArray  # (c,) margins of the start
     region: int  # the one that the start is within, counted from 1; 0 for none
     constraints: Constraints  # with less asked for at start and goals
     corners: FloatArray  # (k, n) of the path; none where none was found
@@ -79,8 +79,8 @@ class JointPath(NamedTuple):
 
 
 def may_start(clearance: FloatArray) -> bool:
-    """Whether a path may begin at joints of such margins (10,): at a limit, but not at the edge of a view."""
-    return bool(clearance[JOINTS] >= 0.0 and (clearance[FRONT:] > 0.0).all())
+    """Whether a path may begin at joints of such margins (c,): at a limit, but not at the edge of a view."""
+    return bool(clearance[JOINTS] >= 0.0 and (clearance[column(FRONT, 0) :] > 0.0).all())
 
 
 def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
@@ -99,8 +99,8 @@ def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
 
 
 def margins_at(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Margins (10,) and images (2, b, 2), px, at joints (n,)."""
-    trial = new_trial(len(q), len(c.M))
+    """Margins (c,) and images (V, b, 2), px, at joints (n,)."""
+    trial = new_trial(c)
     margins_into(c, q, trial)
     return trial.margins, trial.s
 
@@ -108,13 +108,19 @@ def margins_at(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
 def within_region(c: Constraints, q: FloatArray) -> int:
     """Number, counted from 1, of the region that the body is in at joints (n,); 0 for none."""
     c = c._replace(spread=NO_SPREAD)
-    return _nearest_region(c, q) if -math.inf < margins_at(c, q)[0][CLEAR] <= 0.0 else 0
+    return _nearest_region(c, q) if -math.inf < margins_at(c, q)[0][_clear(c)] <= 0.0 else 0
 
 
 def _nearest_region(c: Constraints, q: FloatArray) -> int:
     """Number, counted from 1, of the region that the body is deepest in, or nearest to, at joints (n,)."""
     regions = [only(c.keep_out, r) for r in range(len(c.keep_out.occludes))]
-    return 1 + int(np.argmin([margins_at(c._replace(keep_out=region), q)[0][CLEAR] for region in regions]))
+    clear = [margins_at(c._replace(keep_out=region), q)[0][_clear(c)] for region in regions]
+    return 1 + int(np.argmin(clear))
+
+
+def _clear(c: Constraints) -> int:
+    """Column of the margin of regions."""
+    return column(CLEAR, len(c.O))
 
 
 def first_within(c: Constraints, q: FloatArray) -> tuple[int, int]:
@@ -124,11 +130,11 @@ def first_within(c: Constraints, q: FloatArray) -> tuple[int, int]:
     """
     n = q.shape[1]
     endless = np.full(n, math.inf)
-    full = np.r_[np.full(CLEAR, -1e12), c.full[CLEAR]]  # finite, as demands are interpolated
+    full = np.r_[np.full(_clear(c), -1e12), c.full[_clear(c)]]  # finite, as demands are interpolated
     speed = np.where(np.isfinite(c.limits.speed), c.limits.speed, 1.0)
     limits = JointLimits(-endless, endless, speed, c.limits.acceleration)
     c = with_ends(c._replace(limits=limits, full=full), q[[0, -1]])
-    trial = new_trial(n, len(c.M))
+    trial = new_trial(c)
     for i in range(len(q) - 1):
         if reached(c, q[i], q[i + 1], trial) < 1.0:
             return i, _nearest_region(c, trial.q)
@@ -155,8 +161,8 @@ def find_path(
     far = np.all(np.max(off, axis=2, initial=0.0) > _NEARBY, axis=1)
     goals, rank = goals[far], rank[far]
     clearance, _ = margins_at(c._replace(spread=NO_SPREAD), start)
-    clearance[IMAGE:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
-    trial = new_trial(n, len(c.M))
+    clearance[columns(IMAGE, len(c.O))] += DEVIATIONS * c.spread.most  # the face was seen there
+    trial = new_trial(c)
     path = JointPath(
         goals=goals,
         n_goals=len(every),

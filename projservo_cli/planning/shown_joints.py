@@ -20,7 +20,7 @@ def joints_showing(
     q_start: FloatArray,
     near_px: float = NEAR_PX,
 ) -> tuple[FloatArray, float]:
-    """Joints (n,) at which markers are predicted where images (2, b, 2) show them, and the median error, px.
+    """Joints (n,) at which markers are predicted where images (V, b, 2) show them, and the median error, px.
 
     Least squares from joints (n,) and from others about them, until a start leads near enough; else the
     nearest. s : NaN where unseen.

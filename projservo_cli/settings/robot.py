@@ -1,13 +1,14 @@
 """The robot and its rig, in metric terms: the truth of a simulation."""
 
 import math
+import re
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, StringConstraints
+from pydantic import ConfigDict, Field, StringConstraints
 
-from projservo_cli.records import TWO_TURNS
+from projservo_cli.records import TWO_TURNS, VIEW_NAME, VIEWS
 from projservo_cli.settings.sections import (
     Finding,
     JointVector,
@@ -237,8 +238,31 @@ class Camera(Section):
 
 
 class Rig(Section):
-    """Two cameras that look at the robot and do not move."""
+    """Cameras by their names, which watch the robot, or are on its tool and watch the scene."""
 
-    image_size_px: Sizes = Field(description="width and height of both images, or those of each")
-    left: Camera = Field(description="left camera")
-    right: Camera = Field(description="right camera")
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Camera]
+
+    image_size_px: Sizes = Field(description="width and height of all images, or those of each")
+    mount: Literal["world", "tool"] = Field(
+        "world",
+        description="world: cameras stand still, given in the base frame; tool: they are on it, given in its "
+        "frame, and markers belong to the scene, given in the base frame",
+    )
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """The cameras by their names: left and right first, others in the order of the file."""
+        found = self.__pydantic_extra__ or {}
+        return {name: found[name] for name in (*filter(found.__contains__, VIEWS), *found)}
+
+    def contradictions(self) -> Iterator[Finding]:
+        """No camera, a name that no column can have, or sizes of other numbers of images."""
+        names = [*self.cameras]
+        if not names:
+            yield (), "has no camera: give one or more by their names, such as left and right"
+        for name in names:
+            if not re.fullmatch(VIEW_NAME, name):
+                yield (name,), "is no name of a camera: give small letters, digits and underscores"
+        if np.ndim(self.image_size_px) > 1 and len(self.image_size_px) != len(names):
+            yield ("image_size_px",), f"{len(self.image_size_px)} sizes for {len(names)} cameras"

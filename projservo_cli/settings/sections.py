@@ -119,7 +119,7 @@ def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...
             yield here, what
         if isinstance(part, Section):
             yield from ((here + at, what) for at, what in part.contradictions())
-            yield from _contradictions(vars(part).items(), here)
+            yield from _contradictions({**vars(part), **(part.model_extra or {})}.items(), here)
         elif isinstance(part, dict):
             yield from _contradictions(part.items(), here)
         elif isinstance(part, tuple) and part and isinstance(part[0], Section):

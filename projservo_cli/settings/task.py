@@ -5,8 +5,9 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import Annotated, Literal
 
-from pydantic import Field, StrictBool, StrictInt
+from pydantic import ConfigDict, Field, StrictBool, StrictInt
 
+from projservo_cli.records import InputError
 from projservo_cli.settings.sections import (
     Count,
     Finding,
@@ -108,22 +109,37 @@ _Polygon = Annotated[tuple[Vector2, ...], Field(min_length=3, max_length=200)]
 
 
 class KeptOut(Section):
-    """Region that an obstacle covers in the images: simple polygons, convex or not, px."""
+    """Region that an obstacle covers in the images, by their names: simple polygons, convex or not, px."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, _Polygon | None]
 
     left: _Polygon | None = Field(None, description="corners u and v in the left image, px; null: none")
     right: _Polygon | None = Field(None, description="corners u and v in the right image, px; null: none")
     occludes: StrictBool = Field(
         True,
-        description="whether the obstacle may occlude markers; those of the face stay outside in both images",
+        description="whether the obstacle may occlude markers; those of the face stay outside in all images",
     )
 
     def contradictions(self) -> Iterator[Finding]:
         """No polygon, or one that is none."""
-        if self.left is None and self.right is None:
+        if not self.drawn:
             yield (), "give left, right or both: the corners of the region that the obstacle covers there"
-        for side, corners in (("left", self.left), ("right", self.right)):
-            if corners is not None and (what := _not_simple(corners)):
-                yield (side,), what
+        for name, corners in self.drawn.items():
+            if what := _not_simple(corners):
+                yield (name,), what
+
+    @property
+    def drawn(self) -> dict[str, _Polygon]:
+        """Its polygons by the names of the views in which it is drawn."""
+        each = {"left": self.left, "right": self.right, **(self.model_extra or {})}
+        return {name: corners for name, corners in each.items() if corners is not None}
+
+    def polygons(self, view: Sequence[str]) -> list[_Polygon | None]:
+        """Its polygon in each of the views, None for none. Raises InputError for another name."""
+        if unknown := [name for name in self.drawn if name not in view]:
+            raise InputError(f"trajectory.keep_out: {unknown[0]} is no view: {', '.join(view)} are")
+        return [self.drawn.get(name) for name in view]
 
 
 def _not_simple(corners: Sequence[Vector2]) -> str:
@@ -216,6 +232,10 @@ class Trajectory(Section):
         description="minimum width of the face in an image, profile joint_space",
     )
     search: _Search = Field(_Search(), description="limits and seed of the search, profile joint_space")
+    visible_views: Literal["all"] | Count = Field(
+        "all",
+        description="number of views that are to see the whole face at every instant; all of them",
+    )
     keep_out: Annotated[tuple[KeptOut, ...], Field(max_length=100)] = Field(
         (),
         description="outlines of obstacles, each {left: [[u, v], ...], right: [[u, v], ...], "

@@ -104,7 +104,7 @@ class Data(Section):
         description="joint types, one letter R or P for each column q1 ... qN; null: those of robot, "
         "else all R",
     )
-    mount: Literal["world", "tool"] = Field(
+    mount: Literal["world", "tool"] | None = Field(
         "world",
         description="world: cameras stand still and watch the tool; tool: they are on it and watch the scene",
     )

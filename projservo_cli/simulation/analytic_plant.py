@@ -30,11 +30,12 @@ class Plant(NamedTuple):
     M: FloatArray  # (m, 4) points of the face at the reference, m
     order: IntArray  # (m,) markers around the face
     center: int  # index of the centre marker, or ``MIDPOINT``
-    O: FloatArray  # (2, 4) optical centres
-    visible: FloatArray  # (2,) sign of a·O on the visible side of the face
-    image_size: FloatArray  # (2, 2) width and height of each image, px; infinite where it has no border
+    O: FloatArray  # (V, 4) optical centres
+    visible: FloatArray  # (V,) sign of a·O on the visible side of the face
+    image_size: FloatArray  # (V, 2) width and height of each image, px; infinite where it has no border
     limits: JointLimits  # of the joints
     opaque: bool  # whether the face hides its markers from a camera behind it
+    least_views: int  # number of views that are to see the face
     # (p, 4) further markers of the body at the reference, m; a camera sees those within its image
     pins: FloatArray = NO_PINS
 
@@ -44,16 +45,17 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
     """True pixels of the face after the displacement H.
 
     M : (m, 4) on return the points of the face.
-    s : (2, m + p, 2) on return the pixels of face and pins, NaN where unseen.
-    hidden : (2,) on return 1 where the face is self-occluded in a view.
-    Returns false where a marker is not in front of a camera.
+    s : (V, m + p, 2) on return the pixels of face and pins, NaN where unseen.
+    hidden : (V,) on return 1 where the face is self-occluded in a view.
+    Returns false where fewer cameras than are to see it have the whole face before them.
     """
     m = M.shape[0]
     for k in range(m):
         vec_into(M[k], apply(H, vec(plant.M[k])))
     a = face_plane(M, plant.order, center_of(M, plant.center))
-    in_front = True
-    for view in range(2):
+    behind = 0
+    for view in range(plant.O.shape[0]):
+        in_front = True
         visible = plant.visible[view] * dot(a, vec(plant.O[view])) > 0.0
         hidden[view] = 0.0 if visible else 1.0
         camera, lens = plant.model.P[view], plant.model.lens[view]
@@ -69,7 +71,8 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
             projected = _put_pixel(camera, lens, A, pixel)
             if projected and from_border(plant.image_size[view], pixel[0], pixel[1]) < 0.0:
                 pixel[:] = math.nan
-    return in_front
+        behind += not in_front
+    return bool(behind <= plant.O.shape[0] - plant.least_views)
 
 
 @merged
@@ -84,26 +87,32 @@ def _put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray)
 
 
 @merged
-def shows_face(plant: Plant, H: Mat4, pixel: FloatArray) -> bool:
-    """Whether both images truly show every marker of the face after the displacement H.
+def shows_face(plant: Plant, H: Mat4, hidden: FloatArray, pixel: FloatArray) -> bool:
+    """Whether enough images truly show every marker of the face, from its front, after the displacement H.
 
-    pixel : (2 or more,) workspace.
+    hidden : (V,) 1 where the face is self-occluded; pixel : (2 or more,) workspace.
     """
-    for k in range(plant.M.shape[0]):
-        A = apply(H, vec(plant.M[k]))
-        for view in range(2):
-            if not _put_pixel(plant.model.P[view], plant.model.lens[view], A, pixel):
-                return False
-            if from_border(plant.image_size[view], pixel[0], pixel[1]) < 0.0:
-                return False
-    return True
+    shown = 0
+    for view in range(plant.O.shape[0]):
+        whole = not hidden[view] > 0.5
+        for k in range(plant.M.shape[0]):
+            A = apply(H, vec(plant.M[k]))
+            if (
+                not _put_pixel(plant.model.P[view], plant.model.lens[view], A, pixel)
+                or from_border(plant.image_size[view], pixel[0], pixel[1]) < 0.0
+            ):
+                whole = False
+        shown += whole
+    return bool(shown >= plant.least_views)
 
 
 @merged
 def rig_distance(plant: Plant, M: FloatArray) -> float:
     """Distance of the centre of the face M (m, 4) from the middle of the optical centres, m."""
-    middle = axpy(1.0, vec(plant.O[0]), vec(plant.O[1]))
-    distance = axpy(-0.5, middle, center_of(M, plant.center))
+    middle, V = vec(plant.O[0]), plant.O.shape[0]
+    for view in range(1, V):
+        middle = axpy(1.0, middle, vec(plant.O[view]))
+    distance = axpy(-1.0 / V, middle, center_of(M, plant.center))
     return math.sqrt(dot(distance, distance))
 
 
@@ -112,12 +121,13 @@ class AnalyticPlant:
 
     plant : the truth.
     q_start : (n,) first joints, rad or m.
-    noise : (k, 2, markers, 2) added to the pixels of each observation in turn, px.
+    noise : (k, V, markers, 2) added to the pixels of each observation in turn, px.
     ``q, H``: (n,) true joints, rad or m, and (4, 4) displacement of the face. ``in_front``: whether every
-    marker was in front of both cameras when last observed. ``markers``: how many are observed, those of the
-    face first. ``hidden``: (2,) 1 where the face was self-occluded when last observed. ``disturbance``: why
-    the law that drove it failed; else empty. ``takes_parts``: it goes straight to the end of each step; the
-    samples are the same. ``weight``: all pixels weigh alike. ``holds, pending``: nothing tests its images.
+    marker was in front of enough cameras when last observed. ``markers``: how many are observed, those of
+    the face first. ``hidden``: (V,) 1 where the face was self-occluded when last observed.
+    ``disturbance``: why the law that drove it failed; else empty. ``takes_parts``: it goes straight to the
+    end of each step; the samples are the same. ``weight``: all pixels weigh alike. ``holds, pending``:
+    nothing tests its images.
     """
 
     takes_parts = False
@@ -131,7 +141,7 @@ class AnalyticPlant:
         self.H = as_array(forward(plant.model, self.q))
         self.observations = 0
         self.M = np.zeros_like(plant.M)
-        self.hidden = np.zeros(2)
+        self.hidden = np.zeros(len(plant.O))
         self.in_front = True
         self.markers = len(plant.M) + len(plant.pins)
         self.disturbance = ""
@@ -141,8 +151,8 @@ class AnalyticPlant:
         return self.q.copy()
 
     def observe(self) -> FloatArray:
-        """Noisy pixels (2, markers, 2), NaN where unseen."""
-        s = np.zeros((2, self.markers, 2))
+        """Noisy pixels (V, markers, 2), NaN where unseen."""
+        s = np.zeros((len(self.hidden), self.markers, 2))
         self.in_front = observe(self.plant, mat(self.H), self.M, s, self.hidden)
         s += self.noise[self.observations]
         self.observations += 1

@@ -9,9 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.displacements import rigid, twists
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.records import BoolArray, FloatArray, JointLimits, Model, WorkFailed
+from projservo_cli.records import BoolArray, FloatArray, JointLimits, Model, WorkFailed, no_lenses
 
 METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
+# Mean of the viewing directions of a rig that has a roll axis, at least.
+_COMMON = 0.1
 # Screws of a shift along z and of a turn about it.
 _Z_SHIFT, _Z_TURN = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
@@ -25,19 +27,24 @@ class SerialArm(NamedTuple):
     base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
     limits: JointLimits  # of the joints
 
-    def model(self, P: FloatArray) -> Model:
-        """Metric model of the robot seen by the cameras P (2, 3, 4)."""
+    def model(self, P: FloatArray, lens: FloatArray | None = None, *, on_tool: bool = False) -> Model:
+        """Metric model of the robot seen by the cameras P (V, 3, 4) with lenses (V, 5).
+
+        on_tool : whether they are on the tool; P is then from the base frame at the reference.
+        """
         return Model(
-            np.ascontiguousarray(P, dtype=np.float64),
-            self.H_hat_0,
-            self.prismatic,
-            self.q_reference,
-            METRIC_A_INF.copy(),
+            P=np.ascontiguousarray(P, dtype=np.float64),
+            H_hat_0=-self.H_hat_0 if on_tool else self.H_hat_0,
+            prismatic=self.prismatic,
+            q_reference=self.q_reference,
+            a_inf=METRIC_A_INF.copy(),
+            lens=no_lenses(len(P)) if lens is None else lens,
+            on_tool=on_tool,
         )
 
     def pose(self, q: FloatArray) -> FloatArray:
         """Pose (4, 4) of the tool at the joints q (n,), m."""
-        result: FloatArray = forward_kinematics(self.model(np.zeros((2, 3, 4))), q) @ self.base_tool
+        result: FloatArray = forward_kinematics(self.model(np.zeros((1, 3, 4))), q) @ self.base_tool
         return result
 
 
@@ -53,12 +60,17 @@ def _optical_axis(camera: FloatArray) -> FloatArray:
 
 
 def roll_axis(P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Roll axis of a rig: the point midway between the optical centres, m, and the mean direction.
+    """Roll axis of a rig: the point amid the optical centres, m, and the mean direction.
 
-    P : (2, 3, 4) metric cameras.
+    P : (V, 3, 4) metric cameras. Raises WorkFailed if they look in directions that cancel.
     """
-    point = 0.5 * (camera_center(P[0]) + camera_center(P[1]))
-    direction = _optical_axis(P[0]) + _optical_axis(P[1])
+    point = np.sum([camera_center(camera) for camera in P], axis=0) / len(P)
+    direction = np.sum([_optical_axis(camera) for camera in P], axis=0)
+    if not np.linalg.norm(direction) > _COMMON * len(P):
+        raise WorkFailed(
+            "task.goal.roll_deg turns about the common direction of the cameras, and these look in "
+            "directions that cancel: give task.goal.joints"
+        )
     return point, direction / np.linalg.norm(direction)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from projservo_cli.detection import DICTIONARY
 from projservo_cli.geometry.displacements import twists
 from projservo_cli.image_size import image_sizes
-from projservo_cli.records import NO_LENS, FloatArray, position_limits, prismatic_of
+from projservo_cli.records import TOOL, FloatArray, no_lenses, position_limits, prismatic_of
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Markers
@@ -46,8 +46,8 @@ def arm_of(robot: RobotSettings) -> SerialArm:
 
 @lru_cache(maxsize=32)
 def cameras_of(rig: Rig) -> FloatArray:
-    """Cameras (2, 3, 4) of a rig, to px."""
-    return np.array([_camera(rig.left), _camera(rig.right)])
+    """Cameras (V, 3, 4) of a rig, to px, from the base frame or, of those on the tool, from its frame."""
+    return np.array([_camera(camera) for camera in rig.cameras.values()])
 
 
 def _camera(camera: Camera) -> FloatArray:
@@ -95,17 +95,21 @@ def described_truth(robot: RobotSettings, rig: Rig, markers: Markers, k1: float,
     """
     arm, P, numbers = arm_of(robot), cameras_of(rig), markers.known
     assert numbers is not None
-    points = np.c_[markers.points, np.ones(len(numbers))]
+    points, on_tool = np.c_[markers.points, np.ones(len(numbers))], rig.mount == TOOL
+    # What rides on the tool is given in its frame, and what stands still in that of the base.
+    base_tool = np.eye(4) if on_tool else arm.base_tool
     return Truth(
         robot=arm,
-        P=P,
-        M=points @ arm.base_tool.T,
+        P=P @ np.linalg.inv(arm.base_tool) if on_tool else P,
+        M=points @ base_tool.T,
         number=numbers,
         face=tuple(numbers.index(number) for number in markers.front or ()) if face else (),
         center=center_in_face(markers),
-        image_size=image_sizes(rig.image_size_px),
-        lens=lens_of(P, k1) if k1 else NO_LENS,
-        normals=np.zeros(3) if markers.normals is None else markers.normals @ arm.base_tool[:3, :3].T,
+        image_size=image_sizes(rig.image_size_px, len(P)),
+        lens=lens_of(P, k1) if k1 else no_lenses(len(P)),
+        normals=np.zeros(3) if markers.normals is None else markers.normals @ base_tool[:3, :3].T,
+        view=tuple(rig.cameras),
+        on_tool=on_tool,
     )
 
 

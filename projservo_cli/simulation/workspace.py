@@ -12,7 +12,7 @@ from projservo_cli.geometry.displacements import rigid
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import within_images
-from projservo_cli.records import NO_LENS, BoolArray, FloatArray, Model, WorkFailed
+from projservo_cli.records import NO_LENS, VIEWS, BoolArray, FloatArray, Model, WorkFailed
 from projservo_cli.settings.task import Goal
 from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.simulation.arm import (
@@ -25,6 +25,7 @@ from projservo_cli.simulation.arm import (
 )
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 
+_EDGE_OF_FACE = 1e-9  # of a·O, from where a face is seen edge-on
 _EDGE_ON = math.cos(math.radians(70.0))  # of the angle to a camera from which tags are not found
 
 
@@ -33,20 +34,22 @@ class Truth:
     """Robot, rig and markers as they are."""
 
     robot: SerialArm  # true kinematics
-    P: FloatArray  # (2, 3, 4) true cameras, px
+    P: FloatArray  # (V, 3, 4) true cameras at the robot's reference, from the base frame, px
     M: FloatArray  # (m, 4) all markers at the robot's reference, m
     number: tuple[int, ...]  # (m,) their numbers
     face: tuple[int, ...]  # indices of the face markers; none where the configuration has no face
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
-    image_size: FloatArray  # (2, 2) width and height of each image, px
-    lens: FloatArray = field(default_factory=NO_LENS.copy)  # (2, 5) true lenses
+    image_size: FloatArray  # (V, 2) width and height of each image, px
+    lens: FloatArray = field(default_factory=NO_LENS.copy)  # (V, 5) true lenses
     # (m, 3) directions that markers look in at the robot's reference; zero where they are seen from anywhere
     normals: FloatArray = field(default_factory=lambda: np.zeros(3))
+    view: tuple[str, ...] = VIEWS  # names of the views
+    on_tool: bool = False  # whether the cameras are on the tool, and markers belong to the scene
 
     @cached_property
     def model(self) -> Model:
         """Metric model, for the plant and for the law that is given one."""
-        return self.robot.model(self.P)._replace(lens=self.lens)
+        return self.robot.model(self.P, self.lens, on_tool=self.on_tool)
 
     @cached_property
     def M_face(self) -> FloatArray:
@@ -66,27 +69,34 @@ class Truth:
         """Return the poses of the tool at the reference and at the goal joints (n,)."""
         base_tool, pose = self.robot.base_tool, self.robot.pose(q_goal)
         middle = np.array(center_of(self.M_face, self.center))
+        if self.on_tool:
+            return Ends(base_tool, pose, self.displacement(q_goal) @ middle)
         return Ends(base_tool, pose, pose @ np.linalg.solve(base_tool, middle))
 
     def images(self, q: FloatArray, M: FloatArray) -> FloatArray:
-        """True pixels (2, k, 2) of markers M (k, 4), given at the reference, at the joints q (n,)."""
+        """True pixels (V, k, 2) of markers M (k, 4), given at the reference, at the joints q (n,)."""
         return project(self.P, M @ self.displacement(q).T, self.lens)
 
     def faces(self, q: FloatArray) -> BoolArray:
-        """Whether markers look towards each camera (2, m) at the joints q (n,), and are not seen edge-on."""
+        """Whether markers look towards each camera (V, m) at the joints q (n,), and are not seen edge-on."""
         H = self.displacement(q)
         away = np.array([camera_center(camera) for camera in self.P])[:, None] - (self.M @ H.T)[:, :3]
         towards = (away * (self.normals @ H[:3, :3].T)).sum(axis=2) / np.linalg.norm(away, axis=2)
         return np.asarray((towards > _EDGE_ON) | ~self.normals.any(axis=-1))
 
     def within(self, pixels: FloatArray, view: int | slice = slice(None)) -> FloatArray:
-        """Pixels (..., 2, m, 2), or (m, 2) of a view, NaN outside an image: centres reach to size − ½."""
+        """Pixels (..., V, m, 2), or (m, 2) of a view, NaN outside an image: centres reach to size − ½."""
         inside = within_images(pixels, self.image_size[view, ..., None, :])
         return np.where(inside[..., None], pixels, np.nan)
 
     def displacement(self, q: FloatArray) -> FloatArray:
-        """True displacement (4, 4) of the face from the reference at the joints q (n,)."""
-        return self.robot.pose(q) @ self._from_tool
+        """True displacement (4, 4) of the face before the cameras from the reference, at joints q (n,)."""
+        moved = self.robot.pose(q) @ self._from_tool
+        return np.asarray(np.linalg.inv(moved)) if self.on_tool else moved
+
+    def cameras_at(self, q: FloatArray) -> FloatArray:
+        """Cameras (V, 3, 4) from the base frame at the joints q (n,), px."""
+        return self.P @ self.displacement(q) if self.on_tool else self.P
 
     @cached_property
     def _from_tool(self) -> FloatArray:
@@ -96,8 +106,8 @@ class Truth:
 def turned(goal: Goal, arm: SerialArm, P: FloatArray, q_start: FloatArray) -> FloatArray:
     """Joints (n,) of a goal that is a turn of the tool about the roll axis of the rig from joints (n,).
 
-    arm, P : the arm before cameras (2, 3, 4), m. The pose is perhaps displaced a little along the axes of the
-    tool. Raises WorkFailed where no joints reach it.
+    arm, P : the arm and the cameras (V, 3, 4) where it stands, m. The pose is perhaps displaced a little
+    along the axes of the tool. Raises WorkFailed where no joints reach it.
     """
     assert goal.roll_deg is not None
     point, direction = roll_axis(P)
@@ -110,27 +120,45 @@ def turned(goal: Goal, arm: SerialArm, P: FloatArray, q_start: FloatArray) -> Fl
     return inverse_kinematics(arm, pose, q_start)
 
 
-def plant_of(truth: Truth, q_start: FloatArray, *, opaque: bool) -> Plant:
+def plant_of(truth: Truth, q_start: FloatArray, *, opaque: bool, least_views: int = 0) -> Plant:
     """The truth as the loop sees it from the joints q_start (n,), undisturbed.
 
     opaque : whether the face hides its markers from a camera behind it.
+    least_views : number of views that are to see the face, 0 for all.
     Raises WorkFailed if a camera sees the face edge-on there.
     """
-    return _plant_at(truth, q_start.tobytes(), opaque)
+    return _plant_at(truth, q_start.tobytes(), opaque, least_views or len(truth.P))
+
+
+def _front(truth: Truth, H: FloatArray, a: FloatArray, sides: FloatArray, least_views: int) -> float:
+    """Sign of the plane a (4,) of the face before it, after the displacement H (4, 4).
+
+    By the directions that its markers look in where so many cameras see them; else that of most cameras,
+    whose sides of it are a·O (V,).
+    """
+    normals = truth.normals[list(truth.face)] if truth.normals.ndim > 1 else truth.normals[None]
+    towards = np.sign(a[:3] @ H[:3, :3] @ normals.mean(axis=0))
+    if np.sum(towards * sides > _EDGE_OF_FACE) >= least_views:
+        return float(towards)
+    total = np.sign(sides).sum()
+    return float(np.sign(total if total else sides[0]) or 1.0)
 
 
 @lru_cache(maxsize=2048)
-def _plant_at(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
+def _plant_at(truth: Truth, start_bytes: bytes, opaque: bool, least_views: int) -> Plant:
     q_start = np.frombuffer(start_bytes)
     M = truth.M_face
-    start = M @ truth.displacement(q_start).T
+    H = truth.displacement(q_start)
+    start = M @ H.T
     order = cyclic_order(start)
     O = optical_centers(truth.P, METRIC_A_INF)
-    sides = O @ np.array(face_plane(start, order, center_of(start, truth.center)))
-    if np.abs(sides).min() < 1e-9 or sides[0] * sides[1] < 0.0:
+    a = np.array(face_plane(start, order, center_of(start, truth.center)))
+    sides = O @ a
+    front = _front(truth, H, a, sides, least_views)
+    if np.sum(front * sides > _EDGE_OF_FACE) < least_views:
         raise WorkFailed(
             "task.start: the cameras see different sides of the face, or one sees it edge-on: "
-            "turn the face towards both"
+            f"turn the face towards {'both' if len(O) == 2 else 'them' if least_views == len(O) else 'more'}"
         )
     return Plant(
         model=truth.model,
@@ -138,8 +166,9 @@ def _plant_at(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
         order=order,
         center=truth.center,
         O=O,
-        visible=np.where(sides > 0.0, 1.0, -1.0),
+        visible=np.full(len(O), front),
         image_size=truth.image_size,
         limits=truth.robot.limits,
         opaque=opaque,
+        least_views=least_views,
     )

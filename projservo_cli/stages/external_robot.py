@@ -180,10 +180,10 @@ def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -
     face, others, workspace = list(truth.face), list(truth.pins), np.zeros_like(plant.M)
 
     def see(q: FloatArray, M: FloatArray) -> FloatArray:
-        """Return the pixels of markers (m, 4) in both views at joints (n,)."""
-        s, ordered = np.zeros((2, len(M), 2)), np.zeros((2, len(M), 2))
+        """Return the pixels of markers (m, 4) in all views at joints (n,)."""
+        s, ordered = np.zeros((2, len(truth.P), len(M), 2))
         H = mat(truth.displacement(q))
-        observe(plant._replace(M=M[face], pins=M[others]), H, workspace, ordered, np.zeros(2))
+        observe(plant._replace(M=M[face], pins=M[others]), H, workspace, ordered, np.zeros(len(ordered)))
         s[:, face + others] = ordered
         return s
 
@@ -218,7 +218,8 @@ def connected_robot(scenario: RunScenario, law: str, given: Robot | None = None)
 
 def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
     """Return the calibrated robot and its face."""
-    task = scenario.ends.by_points().task(scenario.model)
+    images = scenario.ends.by_points() if len(scenario.ends.pair) else scenario.ends
+    task = images.task(scenario.model)
     return Plant(
         model=scenario.model,
         M=np.ascontiguousarray(calibration.M[calibration.indices_of(scenario.numbers[: scenario.m])]),
@@ -226,9 +227,10 @@ def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
         center=task.center,
         O=task.O,
         visible=task.visible,
-        image_size=image_sizes(scenario.inputs.image_size),
+        image_size=image_sizes(scenario.inputs.image_size, len(scenario.view)),
         limits=scenario.joints.limits,
         opaque=False,
+        least_views=scenario.least_views,
     )
 
 
@@ -247,7 +249,7 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
 
 
 def _delays_of(given: tuple[float, float] | None, calibration: Calibration) -> DelayPrior:
-    """Return the prior of the delays of both views: given, calibrated, or wide."""
+    """Return the prior of the delays of the views: given, calibrated, or wide."""
     known = NOTHING_KNOWN
     if calibration.time_offset_s is not None:
         interval, jitter = calibration.time_offset_interval_s, calibration.time_offset_jitter_s
@@ -256,5 +258,5 @@ def _delays_of(given: tuple[float, float] | None, calibration: Calibration) -> D
         sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
         known = DelayPrior(calibration.time_offset_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
     if given is not None:
-        known = known._replace(mean=np.array(given), sigma=np.zeros(2))
+        known = known._replace(mean=np.array(given), sigma=np.zeros(len(given)))
     return known

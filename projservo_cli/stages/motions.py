@@ -12,7 +12,17 @@ from projservo_cli.geometry.lens import undistort
 from projservo_cli.planning.constraints import Constraints, constraints_of
 from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.keep_out import keep_out_of
-from projservo_cli.planning.margins import CLEAR, IMAGE, Demands, Motion, Reaching, along_joints, along_shares
+from projservo_cli.planning.margins import (
+    CLEAR,
+    IMAGE,
+    Demands,
+    Motion,
+    Reaching,
+    along_joints,
+    along_shares,
+    column,
+    columns,
+)
 from projservo_cli.planning.model_spread import spread_of
 from projservo_cli.planning.product_space import duration, evenly, plan_path
 from projservo_cli.planning.rrt_connect import (
@@ -97,6 +107,7 @@ def search_of(scenario: Scenario) -> JointSearch:
             scenario.m,
             (tuple(demands.limits.lower), tuple(demands.limits.upper), tuple(map(tuple, demands.image_size))),
             scenario.inputs.trajectory.search.seed,
+            scenario.least_views,
         )
     limits, closed = scenario.joints.limits, ""
     if scenario.truth is None and not (np.isfinite(limits.lower) & np.isfinite(limits.upper)).all():
@@ -168,7 +179,8 @@ _INTERPOLATED_PX = 0.05
 
 def _joint_constraints(reaching: Reaching, task: Task, trajectory: Trajectory, spread: Spread) -> Constraints:
     """Return the constraints of the joints."""
-    drawn = keep_out_of([(one.left, one.right, one.occludes) for one in trajectory.keep_out])
+    view = reaching.demands.view
+    drawn = keep_out_of([(one.polygons(view), one.occludes) for one in trajectory.keep_out])
     c = constraints_of(reaching.model, reaching.body, task, reaching.q_start, reaching.demands, drawn)
     return c._replace(spread=spread)
 
@@ -234,34 +246,35 @@ class PathReplanner:
         self._plan, self._search, self._made = plan, search_of(scenario), 0
         parts = plan.H_hat, amplitudes, plan.A, plan.a
         body = body_at_start(model, task, images, plan.A)
-        self._reaching = Reaching(model, scenario.demands, *parts, task.O, images.q_start, body)
+        self._reaching = Reaching(model, scenario.demands, *parts, task.O, task.visible, images.q_start, body)
         self._c = _joint_constraints(self._reaching, task, self._trajectory, self._search.spread)
         self._goal = GoalFeatures(task.A_star, undistort(model.lens, task.s_star), self._search.sigma)
 
     def predicted(self, q: FloatArray) -> FloatArray:
-        """Pixels (2, b, 2) of the body at joints (n,), by the calibration, those of the face first."""
+        """Pixels (V, b, 2) of the body at joints (n,), by the calibration, those of the face first."""
         model = self._c.model
         return project(model.P, self._c.M @ forward_kinematics(model, q).T, model.lens)
 
     def leaves(self, q: FloatArray, off: FloatArray) -> bool:
-        """Whether a path of joints (s, n) leaves an image, where images are off by (s, 2, 2), px."""
+        """Whether a path of joints (s, n) leaves an image, where images are off by (s, V, 2), px."""
         for joints, px in zip(q, off, strict=True):
             P = self._c.model.P.copy()
             P[:, :2] += px[:, :, None] * P[:, 2:]
             c = self._c._replace(spread=NO_SPREAD, model=self._c.model._replace(P=P))
-            if margins_at(c, joints)[0][IMAGE:].min() < 0.0:
+            if margins_at(c, joints)[0][column(IMAGE, len(P)) :].min() < 0.0:
                 return True
         return False
 
     def replan(self, q: FloatArray, excluded: FloatArray, off: FloatArray) -> Plan | None:
-        """Plan of a path from joints (n,), off by (2, 2) px, to other goals than those excluded (k, n).
+        """Plan of a path from joints (n,), off by (V, 2) px, to other goals than those excluded (k, n).
 
         It keeps that much farther from borders and regions. Each search has its own seed.
         """
         self._made += 1
         plan, asked, full = self._plan, self._trajectory, self._c.full.copy()
-        full[IMAGE:CLEAR] += np.abs(off).max(axis=1)
-        full[CLEAR] += np.abs(off).max()
+        V = len(off)
+        full[columns(IMAGE, V)] += np.abs(off).max(axis=1)
+        full[columns(CLEAR, V)] += np.abs(off).max()
         c = self._c._replace(full=full)
         how = SearchLimits(
             asked.search.max_samples, asked.search.seed + self._made, asked.max_goal_configurations, excluded

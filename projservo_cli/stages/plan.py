@@ -1,6 +1,7 @@
 """Stage plan: the task's partition, where the face stays visible, and a motion that keeps it so."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +21,6 @@ from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
     NO_SPREAD,
-    VIEWS,
     Calibration,
     FloatArray,
     InputError,
@@ -92,7 +92,7 @@ STAGES = 20
 def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: FloatArray) -> None:
     """Refuse a task whose goal leaves more than ``LEFT_PX`` wherever the joints bring the face.
 
-    The joints that bring the face A (m, 4) nearest to its planned images (s, 2, m, 2), in px, are carried
+    The joints that bring the face A (m, 4) nearest to its planned images (s, V, m, 2), in px, are carried
     along the plan from those at the start (n,); SciPy's least squares do for twenty images.
     """
     M = A @ np.linalg.inv(forward_kinematics(model, q_start)).T
@@ -130,18 +130,24 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
     search = search_of(scenario) if trajectory.needs_covariance else None
     plan = plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
     face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
-    notes = [plan.reason, calibration.order_advice, _borders(inputs), "" if face is None else _uneven(face)]
+    notes = [
+        plan.reason,
+        calibration.order_advice,
+        _borders(inputs, calibration.view),
+        "" if face is None else _uneven(face),
+    ]
     return replace(plan, reason="; ".join(filter(None, notes)))
 
 
-def _borders(inputs: PlanInputs) -> str:
+def _borders(inputs: PlanInputs, view: Sequence[str]) -> str:
     """Tell which borders images of an unknown size are taken to have; empty where the size is known."""
     if inputs.image_size is not None:
         return ""
-    sizes = ["x".join(f"{side:.0f}" for side in one) for one in image_sizes(inputs.seen_px)]
+    sizes = ["x".join(f"{side:.0f}" for side in one) for one in image_sizes(inputs.seen_px, len(view))]
+    told = " and ".join(f"{size} {name}" for size, name in zip(sizes, view, strict=True))
     return (
-        f"the size of the images is not known: they are taken to reach to the last pixels seen, {sizes[0]} "
-        f"left and {sizes[1]} right; give it: --image-size, or size_px of both cameras"
+        f"the size of the images is not known: they are taken to reach to the last pixels seen, {told}; "
+        f"give it: --image-size, or size_px of {'both' if len(view) == 2 else 'all'} cameras"
     )
 
 
@@ -165,7 +171,10 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     images = task.goal.images if task is not None else None
     if images is None or (whole := scenario.goal_pixels) is None:
         return
-    pixels, size = images.pixels(scenario.inputs.face), image_sizes(scenario.inputs.image_size)
+    pixels, size = (
+        images.pixels(scenario.inputs.face),
+        image_sizes(scenario.inputs.image_size, len(scenario.view)),
+    )
     numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
     if images.joints is not None:
         q = images.joints.values(calibration.joint_types)
@@ -195,7 +204,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     if alone[view, k] > near_px:
         raise WorkFailed(
             f"the goal images fit no pose of the arm: marker {calibration.marker[k]} is {alone[view, k]:.3g} "
-            f"px off in the {VIEWS[view]} one, {near_px:.3g} px are allowed; {check}"
+            f"px off in the {scenario.view[view]} one, {near_px:.3g} px are allowed; {check}"
         )
     if enough and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
         raise WorkFailed(_CHANGED.format(fault=fault, advice=advice))
@@ -306,6 +315,7 @@ def _planned(
         A=state.A,
         a=a,
         O=task.O,
+        visible=task.visible,
         q_start=images.q_start,
         body=body,
     )
@@ -320,7 +330,8 @@ def _planned(
     plan = Plan(
         profile=trajectory.profile,
         feasible=found.feasible,
-        reason=found.reason + note if path is None else reason_of(path),
+        reason=found.reason + note if path is None else reason_of(path, images.view),
+        view=images.view,
         tau=tau,
         theta_r=theta_r,
         theta_p=theta_p,
@@ -359,13 +370,13 @@ def _planned(
         theta_0=theta_0,
         sense=sense,
         sense_margin=sense_margin,
-        **({} if path is None else search_summary(path, along.q, time, trajectory.search.seed)),
+        **({} if path is None else search_summary(path, along.q, time, trajectory.search.seed, images.view)),
     )
     return plan, found.entered or ("" if holds or (path is not None and found.feasible) else words)
 
 
 def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, FloatArray]:
-    """τ_0 (2,) and θ_0± (2, 2) of both cameras; NaN where a motion never changes visibility."""
+    """τ_0 (V,) and θ_0± (V, 2) of the cameras; NaN where a motion never changes visibility."""
     tau_0 = [visibility_translation(a, H_hat[0], O) for O in task.O]
     theta_0 = [visibility_angles(a, H_hat[1], O) for O in task.O]
     return (
@@ -378,7 +389,7 @@ def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:
     """Return both senses of the rotation onto the plane, and each camera's minimum margin along them."""
     other = parts.theta_r - math.copysign(2.0 * math.pi, parts.theta_r)
     senses = np.array(sorted((parts.theta_r, other), key=abs))
-    margins = np.zeros((2, 2))
+    margins = np.zeros((2, len(task.O)))
     for view, O in enumerate(task.O):
         c = np.array(margin_coefficients(parts.a, parts.H_r, vec(O)))
         c_0, c_s, c_c = (c * (task.visible[view] / abs(c[0] + c[2]))).tolist()

@@ -1,7 +1,7 @@
 """Summary of a plan: whether it may be followed, its smallest margin, and the result of its search."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,17 +13,17 @@ from projservo_cli.planning.margins import (
     CONSTRAINTS,
     IMAGE,
     JOINTS,
-    MARGINS,
     OF_MOTION,
     VISIBILITY,
     Demands,
     Motion,
+    best_views,
     constraint_at,
     joint_margin,
 )
 from projservo_cli.planning.rrt_connect import JointPath, Tree, may_start
 from projservo_cli.planning.time_parameterization import TimedPath
-from projservo_cli.records import VIEWS, FloatArray, IntArray, in_unit
+from projservo_cli.records import FloatArray, IntArray, in_unit
 
 
 def verdict_of(motion: Motion) -> tuple[bool, str, str]:
@@ -48,13 +48,14 @@ def _words(motion: Motion, constraint: int, instant: int) -> str:
     """One constraint at one time, with its margin."""
     along, demands = motion.along, motion.reaching.demands
     at = "at mu_t {:.2f}, mu_r {:.2f}, mu_p {:.2f}".format(*motion.mu[instant])
-    if constraint == VISIBILITY:
-        view = int(np.argmin(along.visibility[instant]))
-        margin = along.visibility[instant, view]
-        return f"{CONSTRAINTS[VISIBILITY].asked.format(VIEWS[view])} is {margin:.3f} of the start's {at}"
-    if constraint == IMAGE:
-        view = int(np.argmin(along.distance[instant]))
-        return f"{_border_words(along.distance[instant, view], VIEWS[view], demands)} {at}"
+    if constraint in (VISIBILITY, IMAGE):
+        best = best_views(demands, along.visibility[instant], along.distance[instant])
+        worst = best[0 if constraint == VISIBILITY else 1].min()
+        each = along.visibility if constraint == VISIBILITY else along.distance
+        name = demands.view[int(np.flatnonzero(each[instant] == worst)[0])]
+        if constraint == VISIBILITY:
+            return f"{CONSTRAINTS[VISIBILITY].asked.format(name)} is {worst:.3f} of the start's {at}"
+        return f"{_border_words(worst, name, demands)} {at}"
     if math.isnan(along.condition[instant]):
         return f"the joints cannot follow: the operators become dependent {at}"
     if constraint == JOINTS:
@@ -84,25 +85,30 @@ def _border_words(distance: float, view: str, demands: Demands) -> str:
 def minimum_of(motion: Motion) -> tuple[FloatArray, FloatArray]:
     """Smallest value (4,) of each constraint in its own unit, and the shares (4, 3) where it is."""
     along = motion.along
-    constraints = [along.visibility.min(axis=1), along.distance.min(axis=1), along.limit, along.condition]
+    best = best_views(motion.reaching.demands, along.visibility, along.distance)
+    constraints = [best[0].min(axis=1), best[1].min(axis=1), along.limit, along.condition]
     instants = [0 if np.isnan(column).all() else int(np.nanargmin(column)) for column in constraints]
     return np.array([column[i] for column, i in zip(constraints, instants, strict=True)]), motion.mu[instants]
 
 
 def sight_words(profile: str, motion: Motion) -> tuple[bool, str]:
-    """Tell whether both cameras see the face all along, and give the reason."""
-    margins = motion.along.visibility
+    """Tell whether enough cameras see the face all along, and give the reason."""
+    margins, demands = motion.along.visibility, motion.reaching.demands
+    view, V = demands.view, len(demands.view)
+    least, all_of_them = demands.least_views or V, {1: "the camera sees", 2: "both cameras see"}
+    see = all_of_them.get(V, f"all {V} cameras see") if least == V else f"{least} of {V} cameras see"
+    margins = np.where(np.argsort(np.argsort(-margins, axis=1), axis=1) < least, margins, np.inf)
     sigma = np.linspace(0.0, 1.0, len(margins))
     worst = np.unravel_index(np.argmin(margins), margins.shape)
     if margins.min() > 0.0:
         return True, (
-            f"both cameras see the face all along; minimum margin {margins.min():.3f} (1 at the start), "
-            f"{VIEWS[worst[1]]} camera at path parameter {sigma[worst[0]]:.2f}"
+            f"{see} the face all along; minimum margin {margins.min():.3f} (1 at the start), "
+            f"{view[worst[1]]} camera at path parameter {sigma[worst[0]]:.2f}"
         )
     lost = [
-        f"{VIEWS[view]} from path parameter {sigma[np.argmax(margins[:, view] <= 0)]:.2f}"
-        for view in range(2)
-        if margins[:, view].min() <= 0.0
+        f"{name} from path parameter {sigma[np.argmax(each <= 0)]:.2f}"
+        for name, each in zip(view, margins.T, strict=True)
+        if each.min() <= 0.0
     ]
     return False, (
         f"the profile {profile} turns the face away from a camera ({', '.join(lost)}): "
@@ -116,8 +122,13 @@ _MOST_NODES = 2_000
 _TOLD = 2
 
 
-def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> dict[str, Any]:
-    """Fields of a plan that a search came to, with joints (s, n) at times (s,); NaN where it found none."""
+def search_summary(
+    path: JointPath, q: FloatArray, time: FloatArray, seed: int, view: Sequence[str]
+) -> dict[str, Any]:
+    """Fields of a plan that a search came to, with joints (s, n) at times (s,); NaN where it found none.
+
+    view : names of the views.
+    """
     summary: dict[str, Any] = {
         "n_goal_configurations": path.n_goals,
         "n_goals_tried": len(path.goals),
@@ -133,7 +144,7 @@ def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) 
     summary["margins"], summary["required_margins"] = _along(path.constraints, q)
     took = float(path.timing.time[-1])
     summary["blends"] = _corners_of(path.timing) * (float(time[-1]) / took if took > 0.0 else 1.0)
-    summary["relaxed_constraints"] = tuple(_relaxed(path.constraints, {"start": q[0], "goal": q[-1]}))
+    summary["relaxed_constraints"] = tuple(_relaxed(path.constraints, {"start": q[0], "goal": q[-1]}, view))
     return summary
 
 
@@ -148,9 +159,9 @@ def _stored(trees: tuple[Tree, Tree]) -> tuple[FloatArray, IntArray]:
 
 
 def _along(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the margins and their required values, (s, 10), at joints (s, n)."""
-    margins = np.zeros((2, len(q), MARGINS))
-    margins_along_into(c, np.ascontiguousarray(q), new_trial(q.shape[1], len(c.M)), margins)
+    """Return the margins and their required values, (s, c), at joints (s, n)."""
+    margins = np.zeros((2, len(q), len(c.full)))
+    margins_along_into(c, np.ascontiguousarray(q), new_trial(c), margins)
     return margins[0], margins[1]
 
 
@@ -160,29 +171,29 @@ def _corners_of(timed: TimedPath) -> FloatArray:
     return timed.time[np.flatnonzero(curved[1:] != curved[:-1])].reshape(-1, 2)
 
 
-def _relaxed(c: Constraints, ends: Mapping[str, FloatArray]) -> Iterator[str]:
+def _relaxed(c: Constraints, ends: Mapping[str, FloatArray], view: Sequence[str]) -> Iterator[str]:
     """Yield a sentence for each end (n,), by name, whose own margins relax a constraint."""
-    asked = np.empty(MARGINS)
+    asked = np.empty_like(c.full)
     for name, q in ends.items():
         demands_into(c, q, asked)
-        if less := [_requirement(c, q, int(i), asked[i]) for i in np.flatnonzero(asked < c.full)]:
+        if less := [_requirement(c, q, int(i), asked[i], view) for i in np.flatnonzero(asked < c.full)]:
             yield f"relaxed at the {name}: {', '.join(less)}"
 
 
-def _requirement(c: Constraints, q: FloatArray, margin: int, asked: float) -> str:
-    words, view = constraint_at(margin)
+def _requirement(c: Constraints, q: FloatArray, margin: int, asked: float, view: Sequence[str]) -> str:
+    words, place = constraint_at(margin, len(view))
     if margin != JOINTS:
-        return f"{words.asked.format(VIEWS[view])} {asked:.2g} px ({c.full[margin]:g} px required)"
+        return f"{words.asked.format(view[place])} {asked:.2g} px ({c.full[margin]:g} px required)"
     i = int(np.argmin(np.minimum(q - c.limits.lower, c.limits.upper - q) / c.keep))
     slides = c.model.prismatic[i]
     full, unit = (1e3 * c.keep[i], " mm") if slides else (math.degrees(c.keep[i]), "°")
     return f"{words.asked.format(i + 1)} {asked * full:.2g}{unit} away ({full:.3g}{unit} required)"
 
 
-def reason_of(path: JointPath) -> str:
-    """Describe the path through joint space, or the reason why none was found."""
+def reason_of(path: JointPath, view: Sequence[str]) -> str:
+    """Describe the path through joint space, or why none was found; ``view`` are the names of the views."""
     if path.timing is None:
-        return _no_path_reason(path)
+        return _no_path_reason(path, view)
     g = int(np.abs(path.goals - path.corners[-1]).max(axis=1).argmin())
     corners = len(path.corners) - 2
     how = "a straight path" if corners == 0 else f"a path with {corners} waypoint{'s' * (corners != 1)}"
@@ -193,7 +204,7 @@ def reason_of(path: JointPath) -> str:
     return f"{how} in joint space leads to {goal} that show the goal{some}{blocked}"
 
 
-def _no_path_reason(path: JointPath) -> str:
+def _no_path_reason(path: JointPath, view: Sequence[str]) -> str:
     """Return the reason why no path was found."""
     if path.region:
         return f"the start is already within region {path.region}"
@@ -204,17 +215,18 @@ def _no_path_reason(path: JointPath) -> str:
         )
     if len(path.goals) == 0:
         blocked = f" and {path.blocked} within a region that is kept out of" if path.blocked else ""
+        cameras = "both cameras" if len(view) == 2 else "enough cameras"
         return (
             f"of {path.solutions} joint vectors that show the goal, whole turns apart, {path.hidden} lie "
-            f"beyond the joint limits or do not show the face to both cameras{blocked}"
+            f"beyond the joint limits or do not show the face to {cameras}{blocked}"
         )
     if not may_start(path.start_clearance):
         worst = int(path.start_clearance.argmin())
-        what = "a joint limit" if worst == JOINTS else _stopped(path, worst)
+        what = "a joint limit" if worst == JOINTS else _stopped(path, worst, view)
         return f"the start is already at or beyond {what}"
-    failed = path.failures[:MARGINS]
+    failed = path.failures[: len(path.start_clearance)]
     main_reasons = [
-        f"{_stopped(path, int(i))} ({failed[i] / failed.sum():.0%})"
+        f"{_stopped(path, int(i), view)} ({failed[i] / failed.sum():.0%})"
         for i in np.argsort(-failed, kind="stable")[:_TOLD]
         if failed[i] > 0
     ]
@@ -224,7 +236,7 @@ def _no_path_reason(path: JointPath) -> str:
     )
 
 
-def _stopped(path: JointPath, margin: int) -> str:
-    words, view = constraint_at(margin)
-    joint = int(path.failures[MARGINS:].argmax()) + 1
-    return words.stops.format(joint if margin == JOINTS else VIEWS[view])
+def _stopped(path: JointPath, margin: int, view: Sequence[str]) -> str:
+    words, place = constraint_at(margin, len(view))
+    joint = int(path.failures[len(path.start_clearance) :].argmax()) + 1
+    return words.stops.format(joint if margin == JOINTS or place >= len(view) else view[place])

@@ -6,7 +6,7 @@ A ``Scenario`` is made once from the inputs of a stage and a calibration; a plan
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -20,7 +20,9 @@ from projservo_cli.planning.margins import Demands
 from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
     CORNERS,
+    TOOL,
     VIEWS,
+    WORLD,
     Calibration,
     FloatArray,
     InputError,
@@ -47,7 +49,6 @@ from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.target import TaskImages
 
-_UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera sees
 _GUESSED = 1e-3  # weight of a marker in a fit that is predicted from others
 
 
@@ -63,6 +64,7 @@ class Scenario:
     exact: TaskImages  # start and goal without noise; predicted for a robot that is not simulated
     true_ends: Ends  # true poses of the tool; NaN if unknown
     goal_joints: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 if unknown
+    view: tuple[str, ...]  # names of the views
     noise_px: float  # of the images in the loop; at least the residual of a calibration of recorded ones
 
     @cached_property
@@ -81,6 +83,16 @@ class Scenario:
         return len(self.numbers) - self.exact.pins
 
     @property
+    def least_views(self) -> int:
+        """Number of views that are to see the whole face. Raises InputError if there are not so many."""
+        asked, V = self.inputs.trajectory.visible_views, len(self.view)
+        if asked == "all":
+            return V
+        if asked > V:
+            raise InputError(f"trajectory.visible_views: {asked}, of {V} views: set {V} or all")
+        return asked
+
+    @property
     def untested(self) -> str:
         """Return the reason why images are not tested against the calibration; empty if they are."""
         if not self.inputs.tests_images:
@@ -92,11 +104,15 @@ class Scenario:
 
     def images_for(self, law: str) -> TaskImages:
         """Start and goal as a law measures them: with the body, or point by point."""
-        return self.ends if law in BODY_LAWS else self.ends.by_points()
+        return self.ends if self.measures_body(law) else self.ends.by_points()
+
+    def measures_body(self, law: str) -> bool:
+        """Whether a law measures the face with the body; classical laws from two views do not."""
+        return law in BODY_LAWS or len(self.view) != len(VIEWS)
 
     def numbers_of(self, law: str) -> tuple[int, ...]:
         """Numbers of the markers that a law observes."""
-        return self.numbers if law in BODY_LAWS else self.numbers[: self.m]
+        return self.numbers if self.measures_body(law) else self.numbers[: self.m]
 
     @cached_property
     def model(self) -> Model:
@@ -121,13 +137,15 @@ class Scenario:
         face, units = asked.min_face_px, self.joints.units
         return Demands(
             limits=joints.limits,
-            image_size=image_sizes(size),
+            image_size=image_sizes(size, len(self.view)),
             border_px=border,
             conditioning=condition,
             keep=keep,
             min_face_px=face,
             tags=self._tags(),
             units=units,
+            view=self.view,
+            least_views=self.least_views,
         )
 
     def _tags(self) -> IntArray:
@@ -152,7 +170,7 @@ class Scenario:
 
     @property
     def goal_pixels(self) -> tuple[FloatArray, FloatArray] | None:
-        """Images (2, m, 2) that are given of the goal, px, and their deviations (2, m).
+        """Images (V, m, 2) that are given of the goal, px, and their deviations (V, m).
 
         They are of the markers of the calibration, NaN where unseen; deviations that are not given are those
         of the loop. None without such images, or a covariance to test them by.
@@ -160,9 +178,9 @@ class Scenario:
         if self.goal_images is None or self.calibration is None or not self.calibration.has_covariance:
             return None
         numbers, pixels = self.calibration.marker.tolist(), self.goal_images.pixels(self.inputs.face)
-        images = np.array([pixels.get(number, _UNSEEN) for number in numbers]).swapaxes(0, 1)
+        images = np.array([pixels.get(number, _unseen(len(self.view))) for number in numbers]).swapaxes(0, 1)
         known = [number in pixels for number in numbers]
-        sigma = np.full((2, len(numbers)), self.noise_px)
+        sigma = np.full((len(self.view), len(numbers)), self.noise_px)
         stated = np.array(self.goal_images.deviations([k for k in numbers if k in pixels], self.inputs.face))
         sigma[:, known] = np.where(np.isnan(stated), self.noise_px, stated)
         return images, sigma
@@ -177,10 +195,10 @@ class Scenario:
         m, others = self.m, self.truth.pins
         which = [others.index(self.truth.number.index(number)) for number in self.numbers[m:]]
         images = np.array([self.exact.s_start, self.exact.s_star])
-        drawn = 2 if self.goal_images is None else 1  # images that are given stay as they are
-        images[:drawn, :, :m] += sigma * generator(seed, TARGET_NOISE).standard_normal((drawn, 2, m, 2))
+        drawn, V = 2 if self.goal_images is None else 1, len(self.view)  # given images stay as they are
+        images[:drawn, :, :m] += sigma * generator(seed, TARGET_NOISE).standard_normal((drawn, V, m, 2))
         if which:
-            noise = generator(seed, PIN_TARGET_NOISE).standard_normal((drawn, 2, len(others), 2))
+            noise = generator(seed, PIN_TARGET_NOISE).standard_normal((drawn, V, len(others), 2))
             images[:drawn, :, m:] += sigma * noise[:, :, which]
         return self.exact._replace(s_start=images[0], s_star=images[1])
 
@@ -206,14 +224,14 @@ class Scenario:
         return seen_images._replace(body=seen_images.body._replace(weight=weight))
 
     def _frames(self, q: FloatArray, drawn: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Pixels (2, b, 2) in rendered frames at joints (n,), rad or m, and their deviations (2, b)."""
+        """Pixels (V, b, 2) in rendered frames at joints (n,), rad or m, and their deviations (V, b)."""
         assert self.inputs.scene is not None
         which = [self.inputs.scene.numbers.index(number) for number in self.numbers]
         s, sigma = observed_in_frames(self.inputs.scene, self.inputs.averaged_frames, q, drawn)
         return np.ascontiguousarray(s[:, which]), sigma[:, which]
 
     def _with_face(self, key: str, s: FloatArray, q: FloatArray | None) -> FloatArray:
-        """Pixels (2, b, 2) with a whole face, at joints (n,) or, for None, at those that they show.
+        """Pixels (V, b, 2) with a whole face, at joints (n,) or, for None, at those that they show.
 
         Raises WorkFailed where too little of the tool is seen.
         """
@@ -231,7 +249,7 @@ class Scenario:
                 there = predict(known, q[None])[0][:, known.indices_of(self.numbers)]
                 return np.ascontiguousarray(np.where(unseen[..., None], there, s))
         raise WorkFailed(
-            f"{key}: the {VIEWS[view]} camera does not see marker {self.numbers[k]} of the face, and too "
+            f"{key}: the {self.view[view]} camera does not see marker {self.numbers[k]} of the face, and too "
             "little else of the tool: turn it towards both cameras, or bring it nearer"
         )
 
@@ -250,27 +268,29 @@ class RunScenario(Scenario):
             return self.model
         if self.truth is not None:
             return self.truth.model
-        if self.inputs.arm is None or self.inputs.P is None:
+        P = None if self.inputs.arm is None else self.inputs.cameras_at(self.inputs.arm.q_reference)
+        if self.inputs.arm is None or P is None:
             raise InputError(
                 f"{law} is given the metric model of robot and rig: set robot and rig, or leave it out of "
                 "control.laws"
             )
-        return self.inputs.arm.model(self.inputs.P)
+        return self.inputs.arm.model(P, on_tool=self.inputs.mount == TOOL)
 
     def plant_of(self, law: str) -> Plant:
         """The simulated robot as a law sees it."""
         assert self.truth is not None
-        plant = plant_of(self.truth, self.exact.q_start, opaque=self.servo.opaque)
-        M = self.truth.of(self.numbers[self.m :]) if law in BODY_LAWS else NO_PINS
+        q_start, opaque = self.exact.q_start, self.servo.opaque
+        plant = plant_of(self.truth, q_start, opaque=opaque, least_views=self.least_views)
+        M = self.truth.of(self.numbers[self.m :]) if self.measures_body(law) else NO_PINS
         return plant._replace(pins=M)
 
     def noise_of(self, law: str, seed: int, times: int) -> FloatArray:
-        """Pixel noise (instants, 2, markers, 2) of a seed as a law observes it, px.
+        """Pixel noise (instants, V, markers, 2) of a seed as a law observes it, px.
 
         It is the same for every law; fewer instants are the first of more.
         """
         numbers = self.numbers_of(law)
-        noise = np.zeros((times, 2, len(numbers), 2))
+        noise = np.zeros((times, len(self.view), len(numbers), 2))
         sigma = self.inputs.noise_px
         if sigma > 0.0:
             for these, stream in ((slice(self.m), SERVO_NOISE), (slice(self.m, None), PIN_NOISE)):
@@ -287,8 +307,6 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
     of it is missing, naming the key to set; WorkFailed if the goal cannot be reached or seen, or the body not
     be measured with.
     """
-    if calibration is not None:
-        calibration.require_left_and_right()
     truth, face, task = inputs.truth, inputs.face, inputs.task
     if task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
@@ -305,9 +323,11 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
         observed = _observed(inputs, calibration)
     if calibration is not None and (truth is None or inputs.scene is not None):
         sigma_px = max(sigma_px, calibration.sigma_fitted_px)
+    view = calibration.view if calibration is not None else truth.view if truth is not None else VIEWS
+    _require_same_rig(inputs, calibration)
     body = NO_BODY
     pins: tuple[int, ...] = ()
-    if not _by_points(inputs.features, calibration):
+    if not _by_points(inputs.features, calibration, view):
         known = observed if calibration is None else calibration.marker.tolist()
         pins = tuple(number for number in observed if number in known and number not in face)
         body = _body(calibration or truth, (*face, *pins))
@@ -316,17 +336,53 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
     else:
         assert calibration is not None
         exact, ends, q_goal = _predicted_ends(inputs, task, calibration, joints, (*face, *pins))
-    return Scenario(
+    exact = exact._replace(body=body, view=view)
+    if len(view) != len(VIEWS):
+        near = _joints_near_goal(exact, q_goal, calibration, (*face, *pins))
+        exact = exact._replace(q_near=near)
+    found = Scenario(
         inputs=inputs,
         calibration=calibration,
         joints=joints,
         numbers=(*face, *pins),
         observed=observed,
-        exact=exact._replace(body=body),
+        exact=exact,
         true_ends=ends,
         goal_joints=np.empty((0, len(joints.types))) if q_goal is None else q_goal[None],
         noise_px=sigma_px,
+        view=view,
     )
+    return replace(found, exact=exact._replace(least_views=found.least_views))
+
+
+def _require_same_rig(inputs: PlanInputs, calibration: Calibration | None) -> None:
+    """Refuse a calibration of other views or another mount than the simulated rig has."""
+    truth = inputs.truth
+    if truth is None or calibration is None:
+        return
+    mount = TOOL if truth.on_tool else WORLD
+    if (calibration.view, calibration.mount) != (truth.view, mount):
+        raise InputError(
+            f"the calibration is of {', '.join(calibration.view)} (mount {calibration.mount}), and the rig "
+            f"has {', '.join(truth.view)} (mount {mount}): calibrate this rig"
+        )
+
+
+def _joints_near_goal(
+    images: TaskImages, q_goal: FloatArray | None, calibration: Calibration | None, numbers: Sequence[int]
+) -> FloatArray:
+    """Joints (n,) at the goal, or those that show it by the calibration, rad or m."""
+    if q_goal is not None:
+        return q_goal
+    if calibration is None:
+        raise InputError("task.goal.images needs a calibration, or left and right; give task.goal.joints")
+    q, off = joints_showing(calibration, numbers, images.s_star, images.q_start)
+    if off > NEAR_PX:
+        raise WorkFailed(
+            f"task.goal.images: no joints were found that show them; the nearest are off by {off:.3g} px "
+            f"({NEAR_PX:g}): give task.goal.images.joints"
+        )
+    return q
 
 
 def run_scenario(inputs: ServoInputs, calibration: Calibration | None = None) -> RunScenario:
@@ -362,8 +418,18 @@ def _termination(inputs: ServoInputs, found: Scenario) -> Limits:
     )
 
 
-def _by_points(features: str | None, calibration: Calibration | None) -> bool:
-    """Whether the face is measured point by point: as asked for, else where no body is calibrated well."""
+def _by_points(features: str | None, calibration: Calibration | None, view: Sequence[str]) -> bool:
+    """Whether the face is measured point by point: as asked for, else where no body is calibrated well.
+
+    Raises InputError where points are asked for and there are not two views.
+    """
+    if len(view) != len(VIEWS):
+        if features == "points":
+            raise InputError(
+                f"control.features: points are measured from two views, and there are {len(view)} "
+                f"({', '.join(view)}): leave it out, for body"
+            )
+        return False
     if features is None:
         return calibration is None or not calibration.usable  # such a body is worse than none
     return features == "points"
@@ -400,7 +466,7 @@ def _simulated_ends(
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
     def turn(q: FloatArray) -> FloatArray:
-        return turned(task.goal, robot, truth.P, q)
+        return turned(task.goal, robot, truth.cameras_at(q), q)
 
     numbers = tuple(truth.number[i] for i in truth.face), pins
     seen_images, q_goal = _task_images(task, types, numbers, center, images, turn)
@@ -418,7 +484,7 @@ def _task_images(
     """Start and goal of a task, and the joints (n,) at the goal, None for a goal by images alone.
 
     numbers : of the markers of the face and of the pins.
-    images : pixels (2, b, 2) at the joints (n,) of a key of the configuration.
+    images : pixels (V, b, 2) at the joints (n,) of a key of the configuration.
     turn : joints (n,) of a goal that is a turn from the joints (n,) of the start.
     """
     pins, given = len(numbers[1]), task.goal.joints
@@ -428,11 +494,17 @@ def _task_images(
     s_start = images(q_start, "task.start" if task.start_offset is None else "task.start_offset")
     if task.goal.images is not None:
         pixels = task.goal.images.pixels(numbers[0])
-        s_star = np.array([pixels.get(number, _UNSEEN) for number in (*numbers[0], *numbers[1])])
+        unseen = _unseen(len(s_start))
+        s_star = np.array([pixels.get(number, unseen) for number in (*numbers[0], *numbers[1])])
         s_star = np.ascontiguousarray(np.swapaxes(s_star, 0, 1))
         return TaskImages(q_start, s_start, s_star, center, pins), None
     q_goal = turn(q_from) if given is None else given.values(types)
     return TaskImages(q_start, s_start, images(q_goal, "task.goal"), center, pins), q_goal
+
+
+def _unseen(views: int) -> tuple[tuple[float, float], ...]:
+    """Pixels of a marker that no camera sees."""
+    return ((math.nan, math.nan),) * views
 
 
 def _unknown(base_tool: FloatArray) -> Ends:
@@ -444,7 +516,8 @@ def _predicted_ends(
     inputs: PlanInputs, task: TaskSettings, calibration: Calibration, joints: Joints, numbers: Sequence[int]
 ) -> tuple[TaskImages, Ends, FloatArray | None]:
     """Start and goal of a robot that is not simulated, as the calibration predicts them, as above."""
-    m, columns = len(inputs.face), calibration.indices_of(numbers)
+    m, columns, V = len(inputs.face), calibration.indices_of(numbers), len(calibration.view)
+    least = V if inputs.trajectory.visible_views == "all" else inputs.trajectory.visible_views
     taught = None if task.goal.images is None else task.goal.images.joints
     given = (task.start, "start"), (task.goal.joints, "goal.joints"), (taught, "goal.images.joints")
     for vector, key in given:
@@ -455,16 +528,17 @@ def _predicted_ends(
         if wrong := joints.limit_passed(q):
             raise InputError(f"{key}: {wrong}: choose another")
         s = predict(calibration, q[None])[0][:, columns]
-        if np.isnan(s[:, :m]).any():
-            raise WorkFailed(f"{key}: by the calibration, the face is not in front of both cameras there")
+        if np.isnan(s[:, :m]).any(axis=(1, 2)).sum() > len(s) - least:
+            raise WorkFailed(f"{key}: by the calibration, the face is not in front of the cameras there")
         return np.ascontiguousarray(s)
 
     def turn(q: FloatArray) -> FloatArray:
-        if inputs.arm is None or inputs.P is None:
+        P = inputs.cameras_at(q)
+        if inputs.arm is None or P is None:
             raise InputError(
                 "task.goal.roll_deg needs the model of the robot and its rig: give joints or images instead"
             )
-        return turned(task.goal, inputs.arm, inputs.P, q)
+        return turned(task.goal, inputs.arm, P, q)
 
     seen_images, q_goal = _task_images(
         task, joints.types, (numbers[:m], numbers[m:]), inputs.center, images, turn

@@ -106,7 +106,8 @@ class LawRun:
         limits, observed = scenario.termination, len(scenario.numbers_of(self.law))
         self.plant, q_start, noise = self.simulated()
         parts = MAX_PARTS if scenario.gains.substeps else 0
-        self.log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts)
+        V = len(scenario.view)
+        self.log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts, V)
         course = Course(self.plant, limits, q_start.copy())
         code, self.steps = run_compiled(controller.law, course, noise, controller.state, self.log)
         self.verdict, self.limited = VERDICTS[code], float(controller.state.limited[0])
@@ -228,7 +229,8 @@ class LawRun:
         # A copy: no law may write to the arrays of another.
         setup = copy.deepcopy(LawSetup(model, face, *shown, self.plan, gains, gains.period))
         factory = self.factory or plugins.find("law", self.law)
-        return PluginLaw(plugins.called("law", self.law, factory, (setup,), {}), f"law {self.law}")
+        law = plugins.called("law", self.law, factory, (setup,), {})
+        return PluginLaw(law, f"law {self.law}", scenario.least_views)
 
     @cached_property
     def summary(self) -> Summary:
@@ -261,21 +263,27 @@ class LawRun:
         simulated = scenario.truth is not None
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
         driven = self.driven
-        lost = _blind_view(log.s[:rows], WINDOW) if driven and self.verdict == "converged" else ""
+        lost = (
+            _blind_view(log.s[:rows], scenario.view, WINDOW) if driven and self.verdict == "converged" else ""
+        )
         untested = "" if driven is None else scenario.untested
         if driven is not None:  # the log has the predicted rest of the robot instead of readings
             read = _whole(driven.readings, rows)
         values = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
-        pose, goal_pose = H @ scenario.true_ends.base_tool, scenario.true_ends.goal_pose
+        moved = np.linalg.inv(H) if self.plant.model.on_tool else H
+        pose, goal_pose = moved @ scenario.true_ends.base_tool, scenario.true_ends.goal_pose
         if driven is not None and driven.truths and not simulated:
             pose, goal_pose = _reported_poses(scenario, _whole(driven.truths, rows))
             values["position_error_mm"] = MM * float(np.linalg.norm(goal_pose[:3, 3] - pose[-1, :3, 3]))
             values["rotation_error_deg"] = math.degrees(angle_between(mat(pose[-1]), mat(goal_pose)))
         numbers: dict[str, Any] = {n: None if math.isnan(values[n]) else values[n] for n in _SUMMARY_FIELDS}
+        if scenario.view != VIEWS:
+            numbers |= dict.fromkeys(("self_occluded_steps_left", "self_occluded_steps_right"))
         if simulated:
             numbers["success"] = values["success"] == 1.0
         return Trace(
             **numbers,
+            view=scenario.view,
             law=self.law,
             mode=self.mode,
             planned_s=self.planned_s,
@@ -371,7 +379,8 @@ def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
     M = known.of(numbers) if isinstance(known, Truth) else known.M[known.indices_of(numbers)]
     s, s_star = run.log.s[run.steps], scenario.images_for(run.law).s_star
     posture = Posture(scenario.model, q, M[:m], scenario.servo.lengths)
-    if not posture.known or not np.isfinite(s[:, :m]).all():
+    whole = np.isfinite(s[:, :m]).all(axis=(1, 2))
+    if not posture.known or whole.sum() < scenario.least_views:
         return {}
     used: BoolArray = np.isfinite(s + s_star)[..., 0]
     off = np.where(used[..., None], s - s_star, 0.0).ravel()
@@ -379,7 +388,7 @@ def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
     measured = (used, used & (np.arange(len(numbers)) < m))
     parts, found = [max(float(np.linalg.norm(posture.carry(M, by) @ off)) for by in measured)], {}
     if calibration is not None and run.driven is not None and run.driven.monitor is not None:
-        every = np.zeros((2, len(calibration.marker)), dtype=np.bool_)
+        every = np.zeros((len(scenario.view), len(calibration.marker)), dtype=np.bool_)
         every[:, calibration.indices_of(numbers)] = used
         found["undetected_position_error_mm"] = run.driven.monitor.undetected_mm(q, every, posture)
     if calibration is not None and (goal := scenario.goal_pixels) is not None:
@@ -460,7 +469,11 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
     obstruction = ""
     if run.driven is not None and run.verdict != "converged":
         obstruction = obstruction_of(run.driven.robot.robot)
-    blind = "" if run.verdict == "converged" else _blind_view(log.s[: steps + 1], limits.stall_periods)
+    blind = (
+        ""
+        if run.verdict == "converged"
+        else _blind_view(log.s[: steps + 1], run.scenario.view, limits.stall_periods)
+    )
     return "; ".join(filter(None, (reasons[run.verdict], blind, obstruction)))
 
 
@@ -471,9 +484,9 @@ def _apart(run: LawRun) -> str:
     return f"{text} since the goal was taught: teach it again" if seen > most else ""
 
 
-def _blind_view(s: FloatArray, window: int) -> str:
-    """Say which camera showed no marker in the last images (k, 2, m, 2), and since when; else empty."""
-    for view, name in enumerate(VIEWS):
+def _blind_view(s: FloatArray, names: Sequence[str], window: int) -> str:
+    """Say which camera showed no marker in the last images (k, V, m, 2), and since when; else empty."""
+    for view, name in enumerate(names):
         steps = np.flatnonzero(np.isfinite(s[:, view, :, 0]).any(axis=1))
         last = int(steps[-1]) if steps.size else -1
         if len(s) - last > window:
@@ -502,7 +515,7 @@ def _require_its_task(scenario: RunScenario, plan: Plan) -> None:
         what = "it has other joints or markers"
     elif (away := float(np.abs(ends.q_start - plan.q_start).max())) > _SAME_START:
         what = f"it starts {away:.3g} rad or m from task.start"
-    elif (off := float(np.abs(ends.s_star - plan.s_star).max())) > _SAME_GOAL_PX:
+    elif (off := float(np.nanmax(np.abs(ends.s_star - plan.s_star), initial=0.0))) > _SAME_GOAL_PX:
         what = f"its goal images are {off:.3g} px from those of task.goal"
     else:
         return
@@ -557,7 +570,7 @@ class LawSetup:
     ----------
     calibration : with ``predict(q)`` and ``jacobian(q)``.
     face : (k,) indices of the face markers among those of the calibration.
-    s_start, s_star : (2, k, 2) pixels of the face at the start and at the goal.
+    s_start, s_star : (V, k, 2) pixels of the face at the start and at the goal.
     plan : the planned motion.
     gains : configured gains, limits and period.
     period : control period, s.
@@ -577,17 +590,18 @@ class PluginLaw:
 
     Parameters
     ----------
-    law : pixels (2, k, 2) of the face and joint readings (n,) to joint velocities (n,), rad/s or m/s.
+    law : pixels (V, k, 2) of the face and joint readings (n,) to joint velocities (n,), rad/s or m/s.
     name : of it, for messages.
+    least_views : number of views that are to see the face.
     """
 
-    def __init__(self, law: Callable[[FloatArray, FloatArray], Any], name: str) -> None:
-        self.law, self.name = law, name
+    def __init__(self, law: Callable[[FloatArray, FloatArray], Any], name: str, least_views: int) -> None:
+        self.law, self.name, self.least_views = law, name, least_views
         self.errors = np.full(len(ERRORS), np.nan)
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
-        """Status and joint velocity of one instant; the law is asked where the whole face was seen."""
-        if np.isnan(s).any():
+        """Status and joint velocity of one instant; the law is asked where enough views show the face."""
+        if np.isfinite(s).all(axis=(1, 2)).sum() < self.least_views:
             return LOST, np.zeros_like(q)
         try:
             answer = self.law(s.copy(), q.copy())

@@ -3,10 +3,12 @@
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from projservo_cli.control.law import Gains
 from projservo_cli.display import About
 from projservo_cli.image_size import ImageSize
-from projservo_cli.records import FloatArray
+from projservo_cli.records import TOOL, FloatArray
 from projservo_cli.result_hashes import File, digest, encoded
 from projservo_cli.robots.settings import Following, JointSettings
 from projservo_cli.settings.cameras import Cameras
@@ -173,7 +175,9 @@ class PlanInputs:
     seed: int  # of the noise of start and goal
     truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
     arm: SerialArm | None  # kinematics as they are described, if they are
-    P: FloatArray | None  # (2, 3, 4) cameras as they are described, px, if they are
+    # (V, 3, 4) cameras as they are described, px, if they are: from the frame of what they are mounted on
+    P: FloatArray | None
+    mount: str  # of the cameras, world or tool
     scene: RenderedScene | None  # where cameras are rendered
     face: tuple[int, ...]  # numbers of the markers that must stay visible
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
@@ -188,6 +192,12 @@ class PlanInputs:
     trajectory: Trajectory
     # Width and height to which recorded images reach at least, px, where their size is not known.
     seen_px: ImageSize | None = None
+
+    def cameras_at(self, q: FloatArray) -> FloatArray | None:
+        """Cameras (V, 3, 4) from the base frame at joints (n,), rad or m, px; None if not described."""
+        if self.arm is None or self.P is None:
+            return None
+        return self.P @ np.linalg.inv(self.arm.pose(q)) if self.mount == TOOL else self.P
 
 
 class Contract(NamedTuple):

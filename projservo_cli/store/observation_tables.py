@@ -28,6 +28,7 @@ from projservo_cli.metric.position_error import Positions
 from projservo_cli.records import (
     FARTHEST_M,
     TWO_TURNS,
+    VIEW_NAME,
     VIEWS,
     FloatArray,
     InputError,
@@ -40,7 +41,7 @@ _MAX_JOINTS = 64  # maximum number of joints, as in a configuration
 _MAX_COLUMNS = 10_000  # maximum number of columns
 _MAX_BYTES = 1_000_000_000  # maximum size of a table, far beyond the size of a calibration
 _MAX_CELLS = 12_000_000  # maximum of poses × markers: mistyped pose numbers must not fill the memory
-_OF_VIEW = re.compile(r"u_([a-z0-9][a-z0-9_]*)")  # column of pixels u of a view; that of v follows
+_OF_VIEW = re.compile(f"u_({VIEW_NAME})")  # column of pixels u of a view; that of v follows
 _DETECTION = ("pose", "camera", "marker", "u", "v")  # columns of a list of detections
 _MOVING = "moving"  # column of the number of a motion
 _T_Q = "t_q"  # column of the time of the joint readings, s

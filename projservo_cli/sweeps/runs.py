@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli.config.inputs import servo_inputs
 from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.laws import BODY_LAWS, CODES
+from projservo_cli.laws import CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled import Course
 from projservo_cli.loop.verdicts import FAILED, RUNNING, VERDICTS
@@ -231,11 +231,13 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
         model=scenario.model,
         believed=scenario.believed_by(law),
         body=scenario.exact.body,
-        shares_task=law in BODY_LAWS,
+        shares_task=scenario.measures_body(law),
         rehearse=scenario.inputs.trajectory.rehearses,
         gains=scenario.gains,
         course=Course(scenario.plant_of(law), scenario.termination, scenario.exact.q_start),
         ends=scenario.true_ends,
+        pair=scenario.exact.pair,
+        q_near=scenario.exact.q_near,
     )
     batch = Batch(setting, len(scenario.numbers))
     found = np.empty((len(seeds), len(NUMBERS)))

@@ -1,7 +1,7 @@
 """Pose of the rigid body that the face belongs to, from all its markers.
 
 The calibration gives the structure of the markers and the displacements that the robot can make. One
-displacement of six coordinates remains, estimated from all markers that either camera sees.
+displacement of six coordinates remains, estimated from all markers that any camera sees.
 """
 
 import math
@@ -57,8 +57,8 @@ class Body(NamedTuple):
     H_hat: FloatArray  # (3, 4, 4) operators of the rotations, per rad
     turn: FloatArray  # (m, 3, 3) coordinates of Ĥ_r M in the basis D, one row a rotation
     a_inf: FloatArray  # (4,) plane at infinity
-    in_goal: BoolArray  # (2, m) whether the image of the goal has the marker
-    weight: FloatArray  # (2, m) of the residuals in a fit
+    in_goal: BoolArray  # (V, m) whether the image of the goal has the marker
+    weight: FloatArray  # (V, m) of the residuals in a fit
 
 
 class _Until(NamedTuple):
@@ -129,8 +129,8 @@ def make_body(model: Model, M: FloatArray) -> Body:
         H_hat=np.ascontiguousarray(D.T @ L @ D @ carry),
         turn=np.ascontiguousarray(np.einsum("rab,bc,kc->kra", L, D, offset)),
         a_inf=np.ascontiguousarray(model.a_inf),
-        in_goal=np.ones((2, len(M)), dtype=np.bool_),
-        weight=np.ones((2, len(M))),
+        in_goal=np.ones((len(model.P), len(M)), dtype=np.bool_),
+        weight=np.ones((len(model.P), len(M))),
     )
 
 
@@ -202,7 +202,7 @@ def _normal_equations(
     squares = 0.0
     views = 0
     D_0, D_1, D_2 = vec(body.D[0]), vec(body.D[1]), vec(body.D[2])
-    for view in range(2):
+    for view in range(P.shape[0]):
         # Rows of the camera in the frame of the body.
         p_u = apply_transposed(H, vec(P[view, 0]))
         p_v = apply_transposed(H, vec(P[view, 1]))
@@ -258,8 +258,8 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: _Until, n
 
     The markers must determine six coordinates, as three in general position do in one view.
 
-    P : (2, 3, 4) cameras.
-    s : (2, k, 2) pixels of the first k markers, NaN where unseen.
+    P : (V, 3, 4) cameras.
+    s : (V, k, 2) pixels of the first k markers, NaN where unseen.
     H : predicted displacement from the reference.
     until : ``GOAL_VIEWS``, ``ALL_VIEWS`` or ``SETTLED``.
     normal : (6, 7) workspace of the normal equations.

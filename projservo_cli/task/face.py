@@ -1,6 +1,7 @@
 """The face: its centre, its oriented plane, and the task that control laws read."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from projservo_cli.geometry import stereo
 from projservo_cli.geometry.algebra import Vec4, add, axpy, dot, meet, scale, sub, unit, vec
 from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, points_into
-from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
+from projservo_cli.records import VIEWS, FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
 from projservo_cli.task.trajectory import NO_REFERENCE, Reference
 
@@ -25,11 +26,9 @@ FOUND = 0
 # A marker cannot be triangulated.
 NO_POINT = 1
 # The markers lie on one line.
-_ONE_LINE = 2
-# The left camera sees other sides of the face at start and goal.
-_OTHER_SIDE_LEFT = 3
-# The right camera does.
-_OTHER_SIDE_RIGHT = 4
+ONE_LINE = 2
+# A camera sees other sides of the face at start and goal.
+_OTHER_SIDE = 3
 # A joint motion of the task is not unique at the start.
 NOT_UNIQUE = 5
 # The images at the start show too few markers of the body.
@@ -42,12 +41,12 @@ MISFIT_START = 8
 MISFIT_GOAL = 9
 # The face cannot be triangulated at the start.
 NOT_MEASURED = 10
-_OTHER_SIDE = (
+_SIDES = (
     "the {} camera sees one side of the face at the start and the other at the goal, by the order of its "
     "markers: move the goal, or else the start, to where that camera sees the printed side"
 )
 _UNSEEN = (
-    "the images at the {} show {{}} markers in both views together, too few to locate the body: show three "
+    "the images at the {} show {{}} markers in all views together, too few to locate the body: show three "
     "or more, not on one line"
 )
 _MISFIT = (
@@ -56,9 +55,8 @@ _MISFIT = (
 )
 _PROBLEMS = {
     NO_POINT: stereo.NO_POINT,
-    _ONE_LINE: "the face markers lie on one line: choose markers.face that span a plane",
-    _OTHER_SIDE_LEFT: _OTHER_SIDE.format("left"),
-    _OTHER_SIDE_RIGHT: _OTHER_SIDE.format("right"),
+    _OTHER_SIDE: _SIDES,
+    ONE_LINE: "the face markers lie on one line: choose markers.face that span a plane",
     NOT_UNIQUE: "the joint motion of the task is not unique at the start: the robot is near a singularity or "
     "moves the face in fewer than six directions",
     UNSEEN_START: _UNSEEN.format("start"),
@@ -72,13 +70,15 @@ _PROBLEMS = {
 class Task(NamedTuple):
     """Task of the control laws, in the frame of their model."""
 
-    s_star: FloatArray  # (2, m, 2) target pixels of the face
+    s_star: FloatArray  # (V, m, 2) target pixels of the face
     A_star: FloatArray  # (m, 4) target points, a_inf·A = 1
     order: IntArray  # (m,) markers around the face, which orients its plane
     center: int  # index of the centre marker, or ``MIDPOINT``
-    F: FloatArray  # (3, 3) fundamental matrix
-    O: FloatArray  # (2, 4) optical centres, a_inf·O = 1
-    visible: FloatArray  # (2,) sign of a·O on the visible side of the face, one a camera
+    pair: IntArray  # (2,) views from which the face is triangulated; none of one view
+    F: FloatArray  # (3, 3) fundamental matrix of the pair
+    O: FloatArray  # (V, 4) optical centres, a_inf·O = 1
+    visible: FloatArray  # (V,) sign of a·O on the visible side of the face, one a camera
+    least_views: int  # number of views that are to see the face
     body: Body = NO_BODY  # all markers of the body, to measure the face with; none for point by point
     reference: Reference = NO_REFERENCE  # plan to follow; none to regulate to the goal
 
@@ -110,7 +110,7 @@ def face_plane(A: FloatArray, order: IntArray, A_c: Vec4) -> Vec4:
 
 
 @inline
-def _order_into(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
+def order_into(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     """Order the markers around their midpoint; False if they lie on one line.
 
     Angles are in affine coordinates of the plane of the face, which preserve the order: along the longest
@@ -161,14 +161,14 @@ def _longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
 
 
 def cyclic_order(A: FloatArray) -> IntArray:
-    """Order (m,) of markers around their midpoint, as of ``_order_into``, for points (m, 4), a_inf·A = 1.
+    """Order (m,) of markers around their midpoint, as of ``order_into``, for points (m, 4), a_inf·A = 1.
 
     Raises WorkFailed if there are fewer than three points or they lie on one line.
     """
     _require_three(len(A))
     order = np.zeros(len(A), dtype=np.int64)
-    if not _order_into(A, order, np.zeros(len(A))):
-        raise WorkFailed(_PROBLEMS[_ONE_LINE])
+    if not order_into(A, order, np.zeros(len(A))):
+        raise WorkFailed(_PROBLEMS[ONE_LINE])
     return order
 
 
@@ -183,58 +183,88 @@ def task_into(
 ) -> tuple[int, int]:
     """Complete a task from images at start and goal: target points, order of the markers, visible side.
 
-    With a body ``body_task_into`` completes points and side.
+    With a body ``body_task_into`` completes points and side; without a pair of views that show the face all.
 
-    images : (2, 2, ≥m, 2) undistorted pixels at the start and at the goal, the m markers of the face first.
+    images : (2, V, ≥m, 2) undistorted pixels at the start and at the goal, the m markers of the face first.
     task : as of ``new_task``; on return complete.
     A : (m, 4) on return the face at the start.
     angle : (≥m,) workspace.
     Returns the code of a problem, ``FOUND`` if there is none, and the marker it concerns.
     """
-    lost = points_into(model.P, task.F, model.a_inf, images[0], A)
+    if task.pair.shape[0] == 0:
+        return FOUND, 0
+    lost = points_into(model.P, task.pair, task.F, model.a_inf, images[0], A)
     if lost < 0:
-        lost = points_into(model.P, task.F, model.a_inf, images[1], task.A_star)
+        lost = points_into(model.P, task.pair, task.F, model.a_inf, images[1], task.A_star)
     if lost >= 0:
         return NO_POINT, lost
-    if not _order_into(task.A_star, task.order, angle):
-        return _ONE_LINE, 0
+    if not order_into(task.A_star, task.order, angle):
+        return ONE_LINE, 0
     if task.body.M.shape[0] > 0:  # the body determines the plane better than points do edge-on
         return FOUND, 0
-    return sides_into(task, A), 0
+    return sides_into(task, A, images[0])
 
 
 @merged
-def sides_into(task: Task, A: FloatArray) -> int:
-    """Record the side of the face A (m, 4) that each camera sees at the start; a code if the goal differs."""
+def sides_into(task: Task, A: FloatArray, s: FloatArray) -> tuple[int, int]:
+    """Record the side of the face A (m, 4) that each camera sees at the start, by its images s (V, ≥m, 2).
+
+    A camera that shows none of it is told by one that does. Returns a code if more cameras than may be left
+    out see another side at the goal, and the last of them.
+    """
     a = face_plane(A, task.order, center_of(A, task.center))
     a_star = face_plane(task.A_star, task.order, center_of(task.A_star, task.center))
-    for view in range(2):
+    V = task.O.shape[0]
+    shown = 0.0
+    for view in range(V - 1, -1, -1):
+        if _shows(s, view, A.shape[0]):
+            shown = 1.0 if dot(vec(task.O[view]), a) > 0.0 else -1.0
+    count, last = V, 0
+    for view in range(V):
         O = vec(task.O[view])
         task.visible[view] = 1.0 if dot(O, a) > 0.0 else -1.0
+        if shown != 0.0 and not _shows(s, view, A.shape[0]):
+            task.visible[view] = shown
         if task.visible[view] * dot(O, a_star) <= 0.0:
-            return _OTHER_SIDE_LEFT if view == 0 else _OTHER_SIDE_RIGHT
-    return FOUND
+            count -= 1
+            last = view
+    return (FOUND, 0) if count >= task.least_views else (_OTHER_SIDE, last)
 
 
-def require_found(status: int, detail: int) -> None:
-    """Raise WorkFailed with the message of a code other than ``FOUND``."""
+@inline
+def _shows(s: FloatArray, view: int, m: int) -> bool:
+    """Whether a view of images (V, ≥m, 2) has one of the first m markers."""
+    for k in range(m):
+        if math.isfinite(s[view, k, 0]):
+            return True
+    return False
+
+
+def require_found(status: int, detail: int, view: Sequence[str] = VIEWS) -> None:
+    """Raise WorkFailed with the message of a code other than ``FOUND``; ``view`` are the names of views."""
     if status != FOUND:
-        raise WorkFailed(_PROBLEMS[status].format(detail))
+        raise WorkFailed(_PROBLEMS[status].format(view[detail] if status == _OTHER_SIDE else detail))
 
 
-def new_task(model: Model, s_star: FloatArray, center: int) -> Task:
-    """Task with pixels (2, m, 2) of the face at the goal, without target points yet.
+def new_task(
+    model: Model, s_star: FloatArray, center: int, pair: IntArray | None = None, least_views: int = 0
+) -> Task:
+    """Task with pixels (V, m, 2) of the face at the goal, without target points yet.
 
+    pair : (2,) views from which the face is triangulated, (0,) for none; None for the only two.
+    least_views : that are to see the face, 0 for all.
     Raises WorkFailed if there are fewer than three markers, or both cameras have the same centre.
     """
-    m = s_star.shape[1]
+    m, pair = s_star.shape[1], np.arange(2) if pair is None else pair
     _require_three(m)
     return Task(
         s_star=np.array(s_star, dtype=np.float64, order="C"),
         A_star=np.zeros((m, 4)),
         order=np.zeros(m, dtype=np.int64),
         center=center,
-        F=fundamental_matrix(model.P),
+        pair=pair,
+        F=fundamental_matrix(model.P[pair]) if len(pair) else np.zeros((3, 3)),
         O=optical_centers(model.P, model.a_inf),
-        visible=np.zeros(2),
+        visible=np.zeros(len(model.P)),
+        least_views=least_views or len(model.P),
     )

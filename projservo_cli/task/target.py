@@ -11,17 +11,19 @@ from projservo_cli.geometry.jit import inline
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, operators_at, project
 from projservo_cli.geometry.lens import undistort
-from projservo_cli.geometry.mechanisms import make_span, workspace
-from projservo_cli.records import FloatArray, InputError, Model, Plan, WorkFailed
+from projservo_cli.geometry.mechanisms import make_span, rows_of, workspace
+from projservo_cli.records import VIEWS, FloatArray, InputError, IntArray, Model, Plan, WorkFailed
 from projservo_cli.task.body import NO_BODY, SETTLED, Body, carry, fit_body
 from projservo_cli.task.face import (
     MISFIT_GOAL,
     MISFIT_START,
     NOT_UNIQUE,
+    ONE_LINE,
     UNSEEN_GOAL,
     UNSEEN_START,
     Task,
     new_task,
+    order_into,
     require_found,
     sides_into,
     task_into,
@@ -43,17 +45,30 @@ class TaskImages(NamedTuple):
     """Images at start and goal of a task: teaching by showing."""
 
     q_start: FloatArray  # (n,) joint readings at the start, rad or m, with the offset if there is one
-    s_start: FloatArray  # (2, b, 2) px of the face, then of its pins, at the start; NaN if unknown
-    s_star: FloatArray  # (2, b, 2) px at the goal
+    s_start: FloatArray  # (V, b, 2) px of the face, then of its pins, at the start; NaN if unknown
+    s_star: FloatArray  # (V, b, 2) px at the goal
     center: int  # index of the centre marker within the face, or ``MIDPOINT``
     pins: int = 0  # number of markers that are not on the face
     body: Body = NO_BODY  # of all markers, to measure with; none to measure point by point
+    view: tuple[str, ...] = VIEWS  # names of the views
+    least_views: int = 0  # number of views that are to see the face, 0 for all
+    # (n,) joints near those of the goal, rad or m, which predict its pose where no pair of views shows it
+    q_near: FloatArray = np.zeros(0)
+
+    @property
+    def pair(self) -> IntArray:
+        """Views (2,) that show the whole face at start and goal, the first ones; none without two."""
+        m = self.s_start.shape[1] - self.pins
+        shown = np.isfinite([self.s_start[:, :m], self.s_star[:, :m]]).all(axis=(0, 2, 3))
+        if len(self.view) == len(VIEWS):
+            return np.arange(len(VIEWS))
+        return np.flatnonzero(shown)[:2] if shown.sum() > 1 else np.arange(0)
 
     def by_points(self) -> "TaskImages":
         """Select the markers of the face, to measure it point by point."""
         m = self.s_start.shape[1] - self.pins
         s_start, s_star = (np.ascontiguousarray(s[:, :m]) for s in (self.s_start, self.s_star))
-        return TaskImages(self.q_start, s_start, s_star, self.center)
+        return self._replace(s_start=s_start, s_star=s_star, pins=0, body=NO_BODY)
 
     def task(self, model: Model) -> Task:
         """Task of laws with a model, calibrated or metric.
@@ -63,56 +78,68 @@ class TaskImages(NamedTuple):
         """
         m, n = self.s_start.shape[1] - self.pins, len(self.q_start)
         images = np.array([undistort(model.lens, s) for s in (self.s_start, self.s_star)])
-        unseen = np.zeros((2, len(self.body.M)), dtype=np.bool_)
-        task = new_task(model, self.s_star[:, :m], self.center)._replace(
+        unseen = np.zeros((len(model.P), len(self.body.M)), dtype=np.bool_)
+        task = new_task(model, self.s_star[:, :m], self.center, self.pair, self.least_views)._replace(
             body=self.body._replace(in_goal=unseen)
         )
-        require_found(*task_into(model, images, task, np.zeros((m, 4)), np.zeros(m)))
+        require_found(*task_into(model, images, task, np.zeros((m, 4)), np.zeros(m)), self.view)
         if len(self.body.M) > 0:
-            work = workspace(n, 4 * m, make_span(model, task.A_star))
+            work = workspace(n, rows_of(len(model.P), m), make_span(model, task.A_star))
             k = len(work.basis)
             A, A_t, A_r = np.zeros((3, m, 4))
             split = Split(work=work, A=A, A_t=A_t, A_r=A_r, q_hat=np.zeros((3, k)), driven=np.zeros((2, k)))
             normal = np.zeros((COORDINATES, COORDINATES + 1))
-            require_found(*body_task_into(model, self.q_start, images, task, split, normal))
+            ends = self.q_start, self.q_near
+            require_found(*body_task_into(model, ends, images, task, split, normal), self.view)
         return task
 
 
 @inline
 def body_task_into(
-    model: Model, q_start: FloatArray, images: FloatArray, task: Task, split: Split, normal: FloatArray
+    model: Model,
+    ends: tuple[FloatArray, FloatArray],
+    images: FloatArray,
+    task: Task,
+    split: Split,
+    normal: FloatArray,
 ) -> tuple[int, int]:
     """Complete the target points of a task by the whole body instead of the face alone.
 
-    The partition of the task by the triangulated face predicts the pose at the goal, which is then fitted to
-    all markers seen there.
+    The partition of the task by the triangulated face predicts the pose at the goal, or the joints near it
+    where there is no pair of views; it is then fitted to all markers seen there.
 
-    images : (2, 2, b, 2) undistorted pixels of the body at the start and at the goal, NaN if unseen.
+    ends : joints (n,) at the start, rad or m, and near the goal, (0,) with a pair of views.
+    images : (2, V, b, 2) undistorted pixels of the body at the start and at the goal, NaN if unseen.
     task : as of ``task_into``, with the body; on return with its points and its views at the goal.
     split : on return with the face at the start.
     normal : (6, 7) workspace of the fit of the body.
     Returns the code of a problem, ``FOUND`` if there is none, and the number of markers seen, once a view.
     """
-    goal = images[1]
+    goal, q_start = images[1], ends[0]
     there = fit_body(model.P, task.body, images[0], forward(model, q_start), SETTLED, normal)
     if not there.settled:
         return MISFIT_START if there.found else UNSEEN_START, there.views
     operators_at(model, q_start, split.work.H_hat)
     carry(task.body, there.H, split.A)
-    split.driven[:] = 0.0
-    parts = partition(task, split)
-    if not parts.found:
-        return NOT_UNIQUE, 0
-    turn = both_rotations(parts.H_r, parts.H_p, parts.theta_r, parts.theta_p)
-    guess = mul(mul(translation(parts.H_t, parts.tau), turn), there.H)
+    if task.pair.shape[0] > 0:
+        split.driven[:] = 0.0
+        parts = partition(task, split)
+        if not parts.found:
+            return NOT_UNIQUE, 0
+        turn = both_rotations(parts.H_r, parts.H_p, parts.theta_r, parts.theta_p)
+        guess = mul(mul(translation(parts.H_t, parts.tau), turn), there.H)
+    else:
+        guess = forward(model, ends[1])
     fit = fit_body(model.P, task.body, goal, guess, SETTLED, normal)
     if not fit.settled:
         return MISFIT_GOAL if fit.found else UNSEEN_GOAL, fit.views
     carry(task.body, fit.H, task.A_star)
-    for view in range(2):
+    if task.pair.shape[0] == 0 and not order_into(task.A_star, task.order, split.work.system.rhs):
+        return ONE_LINE, 0
+    for view in range(goal.shape[0]):
         for k in range(goal.shape[1]):
             task.body.in_goal[view, k] = math.isfinite(goal[view, k, 0]) and math.isfinite(goal[view, k, 1])
-    return sides_into(task, split.A), fit.views
+    return sides_into(task, split.A, images[0])
 
 
 def followed(model: Model, task: Task, plan: Plan, period: float, rate: float) -> Task:
@@ -153,7 +180,7 @@ def _period_times(plan: Plan, period: float) -> FloatArray:
 def _followed_at(
     model: Model, task: Task, plan: Plan, times: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Shares (k, 3), joints (k, n), points (k, m, 4) and undistorted pixels (k, 2, m, 2) at times (k,), s.
+    """Shares (k, 3), joints (k, n), points (k, m, 4) and undistorted pixels (k, V, m, 2) at times (k,), s.
 
     A joint-space path has no shares; its displacements are those of the joints.
 

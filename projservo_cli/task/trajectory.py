@@ -173,7 +173,7 @@ def reference_into(
     clock : time in periods.
     lead : 1/λ in periods.
     A : (m, 4) on return the face.
-    s : (2, m, 2) on return the undistorted target pixels.
+    s : (V, m, 2) on return the undistorted target pixels.
     q_ahead : (n,) on return the joint motion, rad or m.
     """
     i, x = _row_before(reference, clock)
@@ -183,7 +183,7 @@ def reference_into(
         for c in range(4):
             A[k, c] = _between(reference.A[:, k, c], i, x)
         vec_into(A[k], apply(H, vec(A[k])))
-        for view in range(2):
+        for view in range(s.shape[0]):
             for c in range(2):
                 here = _between(reference.s[:, view, k, c], i, x)
                 s[view, k, c] = here + lead * _between(reference.s_ahead[:, view, k, c], i, x)

@@ -45,12 +45,12 @@ def arc_minimum(c_0: float, c_s: float, c_c: float, theta: float) -> float:
 
 @merged
 def limited_translation(a: Vec4, H_t: Mat4, amount: float, delta: float, task: Task) -> float:
-    """Amplitude of a pure translation within δ τ_0 of both cameras, [RH00] section 4.2.
+    """Amplitude of a pure translation within δ τ_0 of all cameras, [RH00] section 4.2.
 
     ``amount`` ≥ 0 is the desired amplitude; the more conservative camera decides. A translated face changes
     visibility at τ_0, [RH00] eq. (11) on the optical centre.
     """
-    for view in range(2):
+    for view in range(task.O.shape[0]):
         O = vec(task.O[view])
         rate = dot(a, apply(H_t, O))
         tau_0 = dot(a, O) / rate if rate != 0.0 else 0.0
@@ -64,7 +64,7 @@ def _violations(a: Vec4, H_r: Mat4, theta: float, task: Task) -> tuple[int, floa
     """Number of cameras that lose sight of the face while it turns by θ, and the worst margin ratio."""
     lost = 0
     worst = math.inf
-    for view in range(2):
+    for view in range(task.O.shape[0]):
         sign = float(task.visible[view])
         c_0, c_s, c_c = margin_coefficients(a, H_r, vec(task.O[view]))
         start = abs(c_0 + c_c)
@@ -86,7 +86,7 @@ def choose_sense(a: Vec4, a_t: Vec4, H_r: Mat4, theta: float, task: Task, agains
     case needs no search.
     """
     visible = True
-    for view in range(2):
+    for view in range(task.O.shape[0]):
         O = vec(task.O[view])
         sign = float(task.visible[view])
         visible = visible and sign * dot(a, O) > 0.0 and sign * dot(a_t, O) > 0.0
