@@ -68,7 +68,7 @@ def plant_of(model, M, center=MIDPOINT, opaque=False) -> Plant:
     n = len(model.q_reference)
     return Plant(
         model, M, order, center, O, np.sign(O @ a), np.full((2, 2), [1280.0, 1024.0]),
-        position_limits(np.full(n, -9.0), np.full(n, 9.0)), opaque,
+        position_limits(np.full(n, -9.0), np.full(n, 9.0)), opaque, 2,
     )  # fmt: skip
 
 

@@ -15,7 +15,16 @@ from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.model_spread import Region
 from projservo_cli.planning.pose_selection import Suggestion, suggest
-from projservo_cli.records import Calibration, CrossValidation, FloatArray, IntArray, Observation, WorkFailed
+from projservo_cli.records import (
+    TOOL,
+    WORLD,
+    Calibration,
+    CrossValidation,
+    FloatArray,
+    IntArray,
+    Observation,
+    WorkFailed,
+)
 from projservo_cli.robots.settings import JointSettings
 from projservo_cli.simulation.streams import SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
@@ -61,17 +70,18 @@ def simulated(
     observation, noise_px = observed(trials, q, seed, progress=progress)
     assert trials.truth is not None
     ideal = trials.driven is None
-    left, right = map(tuple, trials.truth.image_size.astype(int).tolist())
+    sizes = tuple(map(tuple, trials.truth.image_size.astype(int).tolist()))
     return Observations.of(
         observation,
         joint_types=trials.joints.types,
-        image_size=left if left == right else (left, right),
+        image_size=sizes[0] if len({*sizes}) == 1 else sizes,
         noise_px=noise_px,
         # Where joints or images have faults, χ² of pixel noise alone decides no more than in a recording.
         joint_noise=0.0 if ideal else None,
         source="simulated",
         exact=ideal,
         seed=trials.motions.seed,
+        mount=TOOL if trials.truth.on_tool else WORLD,
     )
 
 

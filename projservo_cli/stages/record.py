@@ -185,8 +185,11 @@ def _random_pose(
             continue
         if truth is None:
             return q
-        inside = np.isfinite(truth.within(truth.images(q, truth.M))).all(axis=(0, 2))
-        if inside.mean() >= _LEAST_SEEN and truth.faces(q).all(axis=0).mean() >= _LEAST_FACING:
+        seen = np.isfinite(truth.within(truth.images(q, truth.M))).all(axis=2)
+        least = min(len(seen), 2)  # views that are to show a marker
+        inside = seen.sum(axis=0) >= least
+        facing = truth.faces(q).sum(axis=0) >= least
+        if inside.mean() >= _LEAST_SEEN and facing.mean() >= _LEAST_FACING:
             return q
     return reference
 
@@ -196,9 +199,9 @@ def noisy_observation(truth: Truth, q: FloatArray, noise_px: float, drawn: tuple
 
     drawn : seed and stream of the noise.
     """
-    noise = noise_px * generator(*drawn).standard_normal((len(q), 2, len(truth.number), 2))
+    noise = noise_px * generator(*drawn).standard_normal((len(q), len(truth.P), len(truth.number), 2))
     images = truth.within(np.stack([truth.images(row, truth.M) for row in q]) + noise)
-    return Observation(np.arange(len(q)), np.array(truth.number), q, images)
+    return Observation(np.arange(len(q)), np.array(truth.number), q, images, view=truth.view)
 
 
 class _OutdatedError(InputError):

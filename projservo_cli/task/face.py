@@ -210,7 +210,7 @@ def sides_into(task: Task, A: FloatArray, s: FloatArray) -> tuple[int, int]:
     """Record the side of the face A (m, 4) that each camera sees at the start, by its images s (V, ≥m, 2).
 
     A camera that shows none of it is told by one that does. Returns a code if more cameras than may be left
-    out see another side at the goal, and the last of them.
+    out see another side at the goal, and the first of them.
     """
     a = face_plane(A, task.order, center_of(A, task.center))
     a_star = face_plane(task.A_star, task.order, center_of(task.A_star, task.center))
@@ -219,7 +219,7 @@ def sides_into(task: Task, A: FloatArray, s: FloatArray) -> tuple[int, int]:
     for view in range(V - 1, -1, -1):
         if _shows(s, view, A.shape[0]):
             shown = 1.0 if dot(vec(task.O[view]), a) > 0.0 else -1.0
-    count, last = V, 0
+    count, first = V, -1
     for view in range(V):
         O = vec(task.O[view])
         task.visible[view] = 1.0 if dot(O, a) > 0.0 else -1.0
@@ -227,8 +227,8 @@ def sides_into(task: Task, A: FloatArray, s: FloatArray) -> tuple[int, int]:
             task.visible[view] = shown
         if task.visible[view] * dot(O, a_star) <= 0.0:
             count -= 1
-            last = view
-    return (FOUND, 0) if count >= task.least_views else (_OTHER_SIDE, last)
+            first = view if first < 0 else first
+    return (FOUND, 0) if count >= task.least_views else (_OTHER_SIDE, first)
 
 
 @inline

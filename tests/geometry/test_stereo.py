@@ -19,9 +19,8 @@ def points(rng, k=30):
 
 
 def one(P, a_inf, left, right):
-    return triangulate(
-        P, fundamental_matrix(P), a_inf, np.array(left, dtype=float), np.array(right, dtype=float)
-    )
+    s = np.array([[left], [right]], dtype=float)
+    return triangulate(P, np.arange(2), fundamental_matrix(P), a_inf, s, 0)
 
 
 def cost(P, M, s):

@@ -21,6 +21,7 @@ def reaching_of(name, model=None, border_px=20.0):
         plan.A,
         plan.a,
         plan.optical_center,
+        np.sign(plan.optical_center @ plan.a),
         plan.q_start,
     )
 

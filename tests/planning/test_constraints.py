@@ -8,9 +8,9 @@ from scipy.spatial import ConvexHull
 
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.planning.constraints import new_trial, reached, width
-from projservo_cli.planning.margins import FRONT, IMAGE, JOINTS, VISIBILITY, WIDTH
 from projservo_cli.planning.rrt_connect import margins_at, with_ends
 from projservo_cli.records import NO_SPREAD, Spread
+from tests.planning.columns import FRONT, IMAGE, JOINTS, VISIBILITY, WIDTH
 from tests.planning.joint_space_cases import case
 
 
@@ -68,7 +68,7 @@ def test_edges_are_valid_where_dense_samples_are():
     for k in range(10):
         found = case(name, k)
         c = with_ends(found.c, np.stack([found.q_start, found.q_goal]))
-        trial = new_trial(len(found.q_start), len(c.M))
+        trial = new_trial(c)
         share = reached(c, found.q_start, found.q_goal, trial)
         # Without the demands, which rise in between: at every sample before it what must hold does.
         x = np.linspace(0.0, share, 400)[:, None]
@@ -99,7 +99,7 @@ def test_start_and_goal_are_asked_for_no_more_than_they_have():
     full = found.c.full.copy()
     full[IMAGE : IMAGE + 2] = 1e4
     asked = with_ends(found.c._replace(full=full), np.stack([found.q_start, found.q_goal]))
-    trial = new_trial(6, len(asked.M))
+    trial = new_trial(asked)
     near = found.q_start + 1e-4 * (found.q_goal - found.q_start)
     assert reached(asked, found.q_start, near, trial) == 1.0
     assert reached(asked, found.q_start, found.q_goal, trial) < 1.0

@@ -8,10 +8,10 @@ from matplotlib.path import Path as Outline
 from scipy.spatial import ConvexHull
 
 from projservo_cli.planning.keep_out import keep_out_of, outside_polygon
-from projservo_cli.planning.margins import CLEAR
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at
 from projservo_cli.planning.time_parameterization import joints_at
 from projservo_cli.records import Spread
+from tests.planning.columns import CLEAR
 from tests.planning.joint_space_cases import COUNT, case
 
 
@@ -66,16 +66,16 @@ def test_the_margin_is_that_of_every_point_of_every_segment(k):
         border = np.minimum(pixels + 0.5, size - 0.5 - pixels).min(axis=-1)
         seen = np.array([outside(pixels[v], drawn[v]) for v in range(2)])
         one = np.minimum(seen, border).max(axis=0).min()
-        margin = margins_at(found.c._replace(keep_out=keep_out_of([(*drawn, False)])), q)[0][CLEAR]
+        margin = margins_at(found.c._replace(keep_out=keep_out_of([(drawn, False)])), q)[0][CLEAR]
         assert margin <= one + 1e-2
         assert margin >= one - max(1.0, 0.5 * abs(one))
         # What predictions may be off is that of these joints, not the most that it is anywhere.
         spread = Spread(*(x[None] for x in (truth.P, found.c.model.H_hat_0, found.c.M)), rest=1.0, most=9.0)
-        off = found.c._replace(keep_out=keep_out_of([(*drawn, False)]), spread=spread)
+        off = found.c._replace(keep_out=keep_out_of([(drawn, False)]), spread=spread)
         if one > 8.0:
             assert margins_at(off, q)[0][CLEAR] == pytest.approx(margin - 3.0, abs=0.3 * margin)
         both = min(outside(s[v], drawn[v]).min() for v in range(2))
-        hides = margins_at(found.c._replace(keep_out=keep_out_of([(*drawn, True)])), q)[0][CLEAR]
+        hides = margins_at(found.c._replace(keep_out=keep_out_of([(drawn, True)])), q)[0][CLEAR]
         assert hides == pytest.approx(min(both, margin))
 
 
@@ -98,7 +98,7 @@ def test_no_marker_enters_a_box_that_stands_on_the_straight_way():
         middle, (left, right) = box_of(
             found, joints_at(free.timing, np.array([0.5 * free.timing.time[-1]]))[0], 0.02
         )
-        c = found.c._replace(keep_out=keep_out_of([(left, right, False)]))
+        c = found.c._replace(keep_out=keep_out_of([((left, right), False)]))
         ends = [found.truth.images(q, found.truth.M_face) for q in (found.q_start, found.q_goal)]
         if any(
             Outline(drawn).contains_points(s[v]).any() for s in ends for v, drawn in enumerate((left, right))

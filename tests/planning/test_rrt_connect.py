@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.planning.constraints import new_trial
-from projservo_cli.planning.margins import JOINTS, VISIBILITY, WIDTH
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at
 from projservo_cli.planning.time_parameterization import ROOM, joints_at, time_parameterized
+from tests.planning.columns import JOINTS, VISIBILITY, WIDTH
 from tests.planning.joint_space_cases import COUNT, case
 
 SEARCH = SearchLimits()
@@ -46,7 +46,7 @@ def test_a_straight_way_takes_the_time_of_its_slowest_joint():
     # At constant acceleration up to the limit of speed and down again, as any textbook has it.
     found = case("paper", 0)
     for q_goal in (found.q_start + 0.02, found.q_start + np.array([0.0, 0.0, -1.0, 0.2, 0.3, 0.1])):
-        timed = time_parameterized(found.c, np.stack([found.q_start, q_goal]), new_trial(6, 4))
+        timed = time_parameterized(found.c, np.stack([found.q_start, q_goal]), new_trial(found.c))
         d, v, a = (
             np.abs(q_goal - found.q_start),
             ROOM * found.c.limits.speed,

@@ -6,7 +6,6 @@ from scipy.spatial import ConvexHull
 
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.planning.constraints import FINE_PX, constraints_of
-from projservo_cli.planning.margins import IMAGE, VISIBILITY
 from projservo_cli.planning.rrt_connect import margins_at
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.stages.motions import search_of
@@ -14,6 +13,7 @@ from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.servo import drive
 from tests.configured import calibrate, scenario_of
 from tests.known import configured
+from tests.planning.columns import IMAGE, VISIBILITY
 
 # Joint 4 alone leads from start to goal, deg, and turns the middle tag away from both cameras on the way.
 START = [135.19, -81.51, -99.29, -86.65, 116.76, 88.12]

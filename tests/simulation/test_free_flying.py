@@ -49,7 +49,16 @@ def free_flying_plant(P, M, center):
     side = np.sign(O @ np.array(face_plane(M, order, center_of(M, center))))
     endless = np.full(6, np.inf)
     return Plant(
-        model, M, order, center, O, side, np.full((2, 2), np.inf), position_limits(-endless, endless), False
+        model,
+        M,
+        order,
+        center,
+        O,
+        side,
+        np.full((2, 2), np.inf),
+        position_limits(-endless, endless),
+        False,
+        2,
     )
 
 

@@ -164,7 +164,7 @@ def true_constraints(config, truth: Truth, task: Drawn, q):
     c = constraints_of(truth.model, A, aimed, q, demands)
     return c._replace(
         full=np.r_[0.0, c.full[1:]],
-        keep_out=keep_out_of([(region.left, region.right, region.occludes) for region in task.regions]),
+        keep_out=keep_out_of([((region.left, region.right), region.occludes) for region in task.regions]),
     )
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from tqdm import tqdm
 
 from projservo_cli.planning.constraints import demands_into
-from projservo_cli.planning.margins import MARGINS
 from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at, with_ends
 from projservo_cli.planning.time_parameterization import minimum_time
 from tests.studies.common import asked_for, quantiles, task_configs, true_search, write_rows
@@ -34,7 +33,7 @@ def of_ompl(c, q_start, goals, samples, seed):
 
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(seed)
-    n, demands = len(q_start), np.zeros(MARGINS)
+    n, demands = len(q_start), np.zeros_like(c.full)
     space, bounds = base.RealVectorStateSpace(n), base.RealVectorBounds(n)
     for i in range(n):
         bounds.setLow(i, float(c.limits.lower[i] / c.limits.speed[i]))

@@ -38,9 +38,11 @@ def make_task(model, A, A_star, center=MIDPOINT):
         np.ascontiguousarray(A_star),
         order,
         center,
+        np.arange(2),
         fundamental_matrix(model.P),
         O,
         np.where(O @ a > 0, 1.0, -1.0),
+        2,
     )
 
 

@@ -62,7 +62,7 @@ def test_images_of_no_body_are_refused():
 
 
 def test_too_few_markers_at_a_place_are_told():
-    with pytest.raises(WorkFailed, match="the images at the goal show 2 markers in both views"):
+    with pytest.raises(WorkFailed, match="the images at the goal show 2 markers in all views"):
         require_found(UNSEEN_GOAL, 2)
 
 
