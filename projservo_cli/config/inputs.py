@@ -227,11 +227,12 @@ def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract
     if plant.use is None and config.disturbance == Disturbance():
         return None
     driven = _drive(config, plan.truth, files)
-    delay = None if plant.time_offset_s is None else (plant.time_offset_s.left, plant.time_offset_s.right)
     settle_s = plant.settle_s if plan.truth is None else None
     table = config.data.table if config.data is not None and plan.truth is None else ""
     identity = identity_in(table) if table and Path(table).is_file() else ""
-    return Contract(driven, config.disturbance.part(Events), plant.timeout_s, delay, settle_s, identity)
+    return Contract(
+        driven, config.disturbance.part(Events), plant.timeout_s, plant.time_offset_s, settle_s, identity
+    )
 
 
 def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:

@@ -4,12 +4,12 @@ import json
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, StrictInt, WithJsonSchema
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, StrictInt, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 from projservo_cli import plugins
 from projservo_cli.laws import LAW_SPECS, LAWS, mode_in
-from projservo_cli.settings.disturbance import of_both
+from projservo_cli.settings.disturbance import of_all
 from projservo_cli.settings.sections import Count, Finding, NotNegative, Number, Positive, Section, Whole
 
 
@@ -135,11 +135,20 @@ class Control(Section):
                 )
 
 
-class _EachView(Section):
-    """A number for each camera."""
+class EachView(Section):
+    """A number for each camera, by its name, and for those that are not named."""
 
-    left: Number = Field(description="time offset of the left camera")
-    right: Number = Field(description="time offset of the right camera")
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Number]
+
+    left: Number = Field(0.0, description="time offset of the left camera")
+    right: Number = Field(0.0, description="time offset of the right camera")
+    others: Number = Field(0.0, description="time offset of other cameras, unless they are named")
+
+    def of(self, view: str) -> float:
+        """Return the number of a camera."""
+        number: float = getattr(self, view, self.others)
+        return number
 
 
 class RenderedOptions(Section):
@@ -188,11 +197,11 @@ class PlantSettings(Section):
         "per degree",
     )
     time_offset_s: Annotated[
-        _EachView | None, BeforeValidator(of_both, json_schema_input_type=Number | _EachView | None)
+        EachView | None, BeforeValidator(of_all, json_schema_input_type=Number | EachView | None)
     ] = Field(
         None,
         description="time from the middle of an exposure to the joint readings that arrive with its "
-        "image; a number for both cameras, or {left, right}; null: estimated",
+        "image; a number for all cameras, or {left, right} or other names; null: estimated",
     )
     averaged_frames: StrictInt = Field(
         1, ge=1, le=1000, description="number of images of each pose that record averages"

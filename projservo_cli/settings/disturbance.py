@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, StrictBool
+from pydantic import BeforeValidator, ConfigDict, Field, StrictBool
 
 from projservo_cli.records import VIEWS
 from projservo_cli.settings.sections import (
@@ -20,7 +20,7 @@ from projservo_cli.settings.sections import (
 
 
 class LostMarkers(Section):
-    """Markers that both cameras lose for some steps."""
+    """Markers that all cameras lose for some steps."""
 
     from_step: Whole = Field(description="first step at which the markers are unseen")
     steps: Count | None = Field(None, description="number of steps; null: until the end of the run")
@@ -63,13 +63,13 @@ class _CameraMoved(Section):
     """A camera that moves, which shifts its image."""
 
     at_step: Whole = Field(description="first step at which the image is shifted")
-    view: Literal["left", "right"] = Field(description="the camera that moves")
+    view: str = Field(description="name of the camera that moves")
     by_px: Number | tuple[Number, Number] = Field(description="shift of its image along u, or along u and v")
 
-    def by_view(self) -> tuple[tuple[float, float], ...]:
-        """Return the shift along u and v, left and right."""
+    def shift_of(self, view: str) -> tuple[float, float]:
+        """Return the shift of the image of a view along u and v."""
         shift = self.by_px if isinstance(self.by_px, tuple) else (self.by_px, 0.0)
-        return tuple(shift if self.view == view else (0.0, 0.0) for view in VIEWS)
+        return shift if self.view == view else (0.0, 0.0)
 
 
 class _MarkerMoved(Section):
@@ -81,26 +81,35 @@ class _MarkerMoved(Section):
 
 
 class _Delays(Section):
-    """Latency of both cameras, s."""
+    """Latency of cameras by their names, s, and of those that are not named."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, NotNegative]
 
     left: NotNegative = Field(0.0, description="latency of the left camera")
     right: NotNegative = Field(0.0, description="latency of the right camera")
+    others: NotNegative = Field(0.0, description="latency of other cameras, unless they are named")
+
+    def of(self, view: str) -> float:
+        """Return the latency of a camera."""
+        latency: float = getattr(self, view, self.others)
+        return latency
 
 
-def of_both(value: Any) -> Any:
-    """One number stands for both cameras."""
-    return {"left": value, "right": value} if isinstance(value, int | float) else value
+def of_all(value: Any) -> Any:
+    """One number stands for all cameras."""
+    return dict.fromkeys((*VIEWS, "others"), value) if isinstance(value, int | float) else value
 
 
 class Faults(Section):
     """Permanent faults of the simulated robot and its cameras, which a calibration has to model too."""
 
     camera_latency_s: Annotated[
-        _Delays, BeforeValidator(of_both, json_schema_input_type=NotNegative | _Delays)
+        _Delays, BeforeValidator(of_all, json_schema_input_type=NotNegative | _Delays)
     ] = Field(
         _Delays(),
         description="time from the middle of an exposure to the joint readings that arrive with its "
-        "image, at least half the exposure; a number for both cameras, or {left, right}",
+        "image, at least half the exposure; a number for all cameras, or {left, right} or other names",
     )
     exposure_s: NotNegative = Field(0.0, description="exposure time, over which an image is averaged")
     jitter_s: NotNegative = Field(
@@ -110,7 +119,7 @@ class Faults(Section):
         None, description="frame rate of free-running cameras; null: each reading triggers an image"
     )
     frame_offset_s: Number = Field(
-        0.0, description="delay of the right camera behind the left one, with frame_rate_hz"
+        0.0, description="delay of each camera behind the one before, left to right, with frame_rate_hz"
     )
     stamps: StrictBool = Field(
         False, description="whether images carry the time of mid-exposure, each camera by its own clock"
@@ -142,11 +151,6 @@ class Faults(Section):
             yield ("frame_offset_s",), "is that of cameras that run freely: set frame_rate_hz as well"
         if self.quantize_setpoints and self.encoder_counts_per_turn is None:
             yield ("quantize_setpoints",), "takes the ticks of encoders: set encoder_counts_per_turn as well"
-
-    @property
-    def latencies_s(self) -> tuple[float, float]:
-        """Latency of the left and of the right camera."""
-        return self.camera_latency_s.left, self.camera_latency_s.right
 
 
 class Events(Section):

@@ -129,4 +129,6 @@ def described_scene(
         mjcf=mjcf,
         tip=robot.tip or "",
         options=options,
+        view=tuple(rig.cameras),
+        on_tool=rig.mount == TOOL,
     )

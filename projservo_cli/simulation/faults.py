@@ -42,7 +42,7 @@ class SimulatedRobot(NamedTuple):
 
 
 class _Eyes(Protocol):
-    """Both cameras."""
+    """The cameras of a rig."""
 
     @property
     def borders(self) -> bool:
@@ -68,7 +68,7 @@ class Points(NamedTuple):
     """Cameras that see points, with noise."""
 
     truth: Truth
-    # pixels (2, m, 2) of markers (m, 4), given at the reference, at joints (n,); NaN where unseen
+    # pixels (V, m, 2) of markers (m, 4), given at the reference, at joints (n,); NaN where unseen
     see: Callable[[FloatArray, FloatArray], FloatArray]
     borders: bool
     sigma_px: float  # noise of a coordinate of each frame
@@ -85,8 +85,11 @@ class Points(NamedTuple):
         """As of all cameras."""
         M = self.truth.M
         if moved is not None:
-            M = M.copy()
-            M[self.truth.number.index(moved[0]), :3] += self.truth.robot.base_tool[:3, :3] @ moved[1]
+            M, by = (
+                M.copy(),
+                moved[1] if self.truth.on_tool else self.truth.robot.base_tool[:3, :3] @ moved[1],
+            )
+            M[self.truth.number.index(moved[0]), :3] += by
         mean_pixels = [self.see(joints, M)[view] for joints in q]
         noise = self.sigma_px * rng.standard_normal(mean_pixels[0].shape)
         return np.asarray(np.mean(mean_pixels, axis=0) + noise), None
@@ -156,9 +159,9 @@ def robot_of(
 def observed_in_frames(
     scene: RenderedScene, frames: int, q: FloatArray, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Pixels (2, m, 2) that frames of a robot at rest at joints (n,), rad or m, show on average.
+    """Pixels (V, m, 2) that frames of a robot at rest at joints (n,), rad or m, show on average.
 
-    And their standard deviations (2, m), of which averaging takes nothing: the same view errs alike. Both are
+    And their standard deviations (V, m), of which averaging takes nothing: the same view errs alike. Both are
     NaN where most frames of a view do not show a marker.
 
     drawn : seed, and stream of its random numbers.
@@ -171,10 +174,11 @@ def _looked(
     scene: RenderedScene, frames: int, q_bytes: bytes, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
     eyes, q = Frames(rendered_model(scene)), np.frombuffer(q_bytes)[None]
-    detected = np.full((frames, 2, len(scene.numbers), 3), np.nan)
+    V = len(scene.view)
+    detected = np.full((frames, V, len(scene.numbers), 3), np.nan)
     eyes.open()
     try:
-        for k, view in np.ndindex(frames, 2):
+        for k, view in np.ndindex(frames, V):
             pixels, sigma = eyes.capture(view, q, None, generator(*drawn, view, k))
             detected[k, view] = np.column_stack([pixels, sigma])
     finally:
@@ -188,23 +192,24 @@ class FaultyRobot:
     """A simulated robot of the contract.
 
     world : the robot and its rig; faults : permanent ones; events : those of the run.
-    ``taken``: (2,) true exposure times of the last frames, s, which no robot knows.
-    ``frames``: (2, height, width) the last frames of rendered cameras; None of others.
+    ``view``: names of its views. ``taken``: (V,) true exposure times of the last frames, s, which no robot
+    knows. ``frames``: (V, height, width) the last frames of rendered cameras; None of others.
     """
 
     def __init__(self, world: World, faults: Faults, events: Events) -> None:
         self.world, self._faults, self._events = world, faults, events
         self._joints = _Joints(world, faults, events.joint_moved)
-        self._cameras = [_Camera(self._joints, world, faults, events, view) for view in range(2)]
+        self.view = world.truth.view
+        self._cameras = [_Camera(self._joints, world, faults, events, view) for view in range(len(self.view))]
         self._frozen: float | None = None
-        self.taken = np.full(2, math.nan)
+        self.taken = np.full(len(self.view), math.nan)
 
     def open(self) -> None:
         """Open the cameras, in the thread that drives."""
         self.world.eyes.open()
 
     def read(self) -> tuple[Any, ...]:
-        """Joint readings (n,), rad or m, and pixels (2, m, 2), with stamps and deviations where there are."""
+        """Joint readings (n,), rad or m, and pixels (V, m, 2), with stamps and deviations where there are."""
         now, q = self.now(), self._reading()
         frames = [camera.newest(now) for camera in self._cameras]
         self.taken[:] = [frame.middle for frame in frames]
@@ -212,7 +217,8 @@ class FaultyRobot:
         sigmas = [frame.sigma for frame in frames if frame.sigma is not None]
         if not self._faults.stamps and not sigmas:
             return q, pixels
-        stamps = (now, frames[0].stamp, frames[1].stamp) if self._faults.stamps else (None, None, None)
+        stamped = [now, *(frame.stamp for frame in frames)]
+        stamps = stamped if self._faults.stamps else [None] * len(stamped)
         return (q, pixels, *stamps, np.stack(sigmas)) if sigmas else (q, pixels, *stamps)
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
@@ -226,7 +232,7 @@ class FaultyRobot:
 
     @property
     def frames(self) -> ByteArray | None:
-        """The last frames of both cameras as they were searched, where they are rendered."""
+        """The last frames of the cameras as they were searched, where they are rendered."""
         return self.world.eyes.last if isinstance(self.world.eyes, Frames) else None
 
     def truth(self) -> FloatArray:
@@ -260,7 +266,7 @@ def full_reach(arm: SerialArm) -> float:
 
 def _tool_velocity(arm: SerialArm, q: FloatArray) -> FloatArray:
     """Velocity (n, 3) of the tool by each joint at joints (n,), m per rad or m."""
-    model = arm.model(np.zeros((2, 3, 4)))
+    model = arm.model(np.zeros((1, 3, 4)))
     return np.asarray((joint_operators(model, q) @ arm.pose(q)[:, 3])[:, :3])
 
 
@@ -391,13 +397,13 @@ class _Frame(NamedTuple):
 
 
 class _Camera:
-    """One of both cameras, which runs freely or takes a frame per reading."""
+    """One of the cameras, which runs freely or takes a frame per reading."""
 
     def __init__(self, joints: _Joints, world: World, faults: Faults, events: Events, view: int) -> None:
         self._joints, self._world, self._faults, self._events = joints, world, faults, events
         self._view, self._looks = view, 0
         # No frame is read before it was exposed whole.
-        self._delay = max(faults.latencies_s[view], 0.5 * faults.exposure_s)
+        self._delay = max(faults.camera_latency_s.of(world.truth.view[view]), 0.5 * faults.exposure_s)
         self._interval = 0.0 if faults.frame_rate_hz is None else 1.0 / faults.frame_rate_hz
         self._clock = float(world.random(view, 0).uniform(-_CLOCKS_S, _CLOCKS_S))
         self._first = float(world.random(0, 0).uniform(0.0, 1.0)) * self._interval
@@ -439,7 +445,7 @@ class _Camera:
         q = np.array([self._joints.at(t) for t in times])
         pixels, sigma = world.eyes.capture(self._view, q, moved, rng)
         if (knocked := events.camera_moved) is not None and step >= knocked.at_step:
-            pixels += knocked.by_view()[self._view]
+            pixels += knocked.shift_of(truth.view[self._view])
         if (lost := events.lost_markers) is not None and _lasts(lost, step):
             pixels[[truth.number.index(number) for number in lost.markers or truth.number]] = math.nan
         if world.eyes.borders:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import undistort
-from projservo_cli.records import CORNERS, ByteArray, FloatArray, InputError, IntArray
+from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray, InputError, IntArray
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import RenderedOptions
 from projservo_cli.settings.markers import Tag
@@ -40,8 +40,6 @@ _NEAR_M, _FAR_M = 0.01, 50.0  # what cameras see
 _WALL, _WALL_M = "far wall", 40.0  # what stands behind everything, and how far
 _FINER = 2
 """Pixels of a drawing along each of a frame: of one alone, edges are drawn up to a tenth of a pixel off."""
-CAMERAS = ("left camera", "right camera")
-"""Names of both in the model."""
 _STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
 
 
@@ -50,7 +48,7 @@ class RenderedScene:
     """Scene and settings of rendered cameras."""
 
     arm: SerialArm
-    P: FloatArray  # (2, 3, 4) cameras, px
+    P: FloatArray  # (V, 3, 4) cameras, px, from the base frame or, of those on the tool, from its frame
     size: tuple[int, int]  # width and height of the images, px
     tags: tuple[Tag, ...]
     numbers: tuple[int, ...]  # of the markers, four corners a tag
@@ -58,6 +56,8 @@ class RenderedScene:
     mjcf: File | None  # the model of the arm, with the files that it names; None for one of capsules
     tip: str  # body or site of the model that is the tool
     options: RenderedOptions
+    view: tuple[str, ...] = VIEWS  # names of the views
+    on_tool: bool = False  # whether the cameras are on the tool, and the tags stand in the base frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class RenderedModel:
     joints: IntArray  # (n,) its joints of the arm, base to tool
     plates: tuple[tuple[int, ...], ...]  # for each tag the geoms that are its plate
     margin: int  # by which drawings are wider at each side, px
-    tool: FloatArray  # (3, 3) rotation of the tool in the frame of the body that holds the tags
+    tool: FloatArray  # (3, 3) rotation of the frame of the tags in that of the body that holds them
 
     @property
     def positions(self) -> IntArray:
@@ -104,10 +104,10 @@ def _decomposed(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def lens_of(P: FloatArray, k1: float) -> FloatArray:
-    """Lenses (2, 5) of metric cameras (2, 3, 4), with k1 in units of the focal length."""
+    """Lenses (V, 5) of metric cameras (V, 3, 4), with k1 in units of the focal length."""
     K = np.array([_decomposed(camera)[0] for camera in P])
     radius = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
-    return np.column_stack([K[:, 0, 2], K[:, 1, 2], radius, np.full(2, k1), np.zeros(2)])
+    return np.column_stack([K[:, 0, 2], K[:, 1, 2], radius, np.full(len(P), k1), np.zeros(len(P))])
 
 
 @lru_cache(maxsize=4)
@@ -128,13 +128,17 @@ def rendered_model(scene: RenderedScene) -> RenderedModel:
         holder, tool = bare.nbody - 1, scene.arm.base_tool
     joints = np.array(chain_of(bare, holder, where))
     tip = next(body for body in spec.bodies if body.id == holder)
-    _add_tags(spec, tip, tool, scene.tags, finder)
-    _put_light(spec, scene.options.light, P)
+    # Tags and cameras: one on the tool, the other in the base frame.
+    body, place = (spec.worldbody, np.eye(4)) if scene.on_tool else (tip, tool)
+    _add_tags(body, spec, place, scene, finder)
+    at_reference = np.linalg.inv(scene.arm.base_tool) if scene.on_tool else np.eye(4)
+    _put_light(spec, scene.options.light, P @ at_reference)
     K, R, t = (np.array(parts) for parts in zip(*map(_decomposed, P), strict=True))
     width, height = scene.size
     margin = _margin(P, scene.options.k1, width, height)
     K_wide = K + margin * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
-    _add_cameras(spec, K_wide, R, t, (width + 2 * margin, height + 2 * margin))
+    carrier = (tip, tool) if scene.on_tool else (spec.worldbody, np.eye(4))
+    _add_cameras(spec, carrier, scene.view, (K_wide, R, t), (width + 2 * margin, height + 2 * margin))
     model = compiled(spec, where)
     rates = model.jnt_dofadr[joints]
     light = rates[model.dof_armature[rates] == 0.0]
@@ -149,7 +153,7 @@ def rendered_model(scene: RenderedScene) -> RenderedModel:
         joints=joints,
         plates=plates,
         margin=margin,
-        tool=tool[:3, :3],
+        tool=place[:3, :3],
     )
 
 
@@ -190,14 +194,23 @@ def _add_arm(spec: Any, arm: SerialArm) -> None:
             body.add_geom(type=mj.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=points[i], **sights)
 
 
+def _camera_name(view: str) -> str:
+    """Name of a camera in the model."""
+    return f"{view} camera"
+
+
 def _name(tag: Tag, side: str) -> str:
     return f"tag {tag.number} {side}"
 
 
-def _add_tags(spec: Any, tip: Any, tool: FloatArray, tags: Sequence[Tag], finder: TagFinder) -> None:
-    """Hang tags on a body of a specification; tool : (4, 4) pose of the tool in its frame, m."""
-    mj = mujoco()
-    body, origin = tip.add_body(name="tool with tags"), tool[:3, 3]
+def _add_tags(holder: Any, spec: Any, tool: FloatArray, scene: RenderedScene, finder: TagFinder) -> None:
+    """Hang tags on a body of a specification; tool : (4, 4) pose of their frame in its own, m."""
+    mj, tags = mujoco(), scene.tags
+    body, origin = holder.add_body(name="scene with tags" if scene.on_tool else "tool with tags"), tool[:3, 3]
+    if scene.on_tool:  # rods meet behind the tags
+        origin = np.mean(
+            [np.array(tag.pose)[:3, 3] - tag.size_m * np.array(tag.pose)[:3, 2] for tag in tags], 0
+        )
     spec.add_material(name="tag holder", rgba=_HOLDER, specular=0.0)
 
     def add(shape: Any, material: str, **values: Any) -> None:
@@ -233,8 +246,7 @@ def _put_light(spec: Any, light: str, P: FloatArray) -> None:
     mj = mujoco()
     for original in list(spec.lights):
         spec.delete(original)
-    head, (_, ahead) = spec.visual.headlight, roll_axis(P)
-    soft = light == "soft"
+    head, soft = spec.visual.headlight, light == "soft"
     head.active = 1
     head.ambient, head.diffuse, head.specular = (
         [0.45 if soft else 0.15] * 3,
@@ -242,8 +254,11 @@ def _put_light(spec: Any, light: str, P: FloatArray) -> None:
         [0.0] * 3,
     )
     up = np.array([0.0, 0.0, 1.0])
-    side = np.cross(ahead, up) if abs(ahead @ up) < 0.9 else np.array([0.0, 1.0, 0.0])
-    shines = -up if soft else side / np.linalg.norm(side) + 0.5 * ahead - 0.3 * up
+    shines = -up
+    if not soft:
+        _, ahead = roll_axis(P)
+        side = np.cross(ahead, up) if abs(ahead @ up) < 0.9 else np.array([0.0, 1.0, 0.0])
+        shines = side / np.linalg.norm(side) + 0.5 * ahead - 0.3 * up
     spec.worldbody.add_light(
         type=mj.mjtLightType.mjLIGHT_DIRECTIONAL,
         dir=shines / np.linalg.norm(shines),
@@ -255,7 +270,7 @@ def _put_light(spec: Any, light: str, P: FloatArray) -> None:
 
 
 def drawn_at(P: FloatArray, lens: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Return pixels (2, N, 2) of cameras (2, 3, 4) and lenses (2, 5) in drawings without lens and skew."""
+    """Return pixels (V, N, 2) of cameras (V, 3, 4) and lenses (V, 5) in drawings without lens and skew."""
     straight = undistort(lens, pixels).copy()
     for view, camera in enumerate(P):
         K, _, _ = _decomposed(camera)
@@ -268,29 +283,42 @@ def _margin(P: FloatArray, k1: float, width: int, height: int) -> int:
     """Return the margin of a drawing around the field of a lens, px."""
     u, v = np.linspace(0.0, width - 1.0, 65), np.linspace(0.0, height - 1.0, 65)
     sides = [(x, y) for x in u for y in v[[0, -1]]] + [(x, y) for x in u[[0, -1]] for y in v]
-    drawn = drawn_at(P, lens_of(P, k1), np.array([sides, sides]))
+    drawn = drawn_at(P, lens_of(P, k1), np.array([sides] * len(P)))
     if not np.isfinite(drawn).all():
         raise InputError("plant.options.k1: a lens that bends so much does not show the whole image")
     beyond = max(-float(drawn.min()), float((drawn - [width - 1.0, height - 1.0]).max()))
     return 0 if beyond <= 0.0 else math.ceil(beyond) + 2
 
 
-def _add_cameras(spec: Any, K: FloatArray, R: FloatArray, t: FloatArray, size: tuple[int, int]) -> None:
-    """Add the cameras of a rig of (2, 3, 3), (2, 3, 3), (2, 3), m, whose images have a size, px."""
-    mj = mujoco()
+def _add_cameras(
+    spec: Any,
+    carrier: tuple[Any, FloatArray],
+    view: Sequence[str],
+    cameras: tuple[FloatArray, FloatArray, FloatArray],
+    size: tuple[int, int],
+) -> None:
+    """Add the cameras of a rig, whose images have a size, px.
+
+    carrier : the body that they are on, and the pose (4, 4) of their frame in its own, m.
+    cameras : (V, 3, 3) intrinsic matrices, (V, 3, 3) rotations and (V, 3) translations, m.
+    """
+    mj, (body, pose), (K, R, t) = mujoco(), carrier, cameras
     width, height = size
     spec.add_material(name=_WALL, rgba=[0.25, 0.25, 0.25, 1.0], emission=1.0, specular=0.0)
-    for view in range(2):
-        camera = spec.worldbody.add_camera(name=CAMERAS[view], pos=-R[view].T @ t[view])
+    for name, K_v, R_v, t_v in zip(view, K, R, t, strict=True):
+        axes = pose[:3, :3] @ R_v.T
+        camera = body.add_camera(name=_camera_name(name), pos=pose[:3, 3] - axes @ t_v)
         camera.alt.type = mj.mjtOrientation.mjORIENTATION_XYAXES
-        camera.alt.xyaxes = [*R[view][0], *-R[view][1]]
+        camera.alt.xyaxes = [*axes[:, 0], *-axes[:, 1]]
         camera.resolution = size
         camera.sensor_size = [width * _SENSOR_M, height * _SENSOR_M]
-        camera.focal_pixel = [K[view, 0, 0], K[view, 1, 1]]
-        camera.principal_pixel = [0.5 * (width - 1) - K[view, 0, 2], 0.5 * (height - 1) - K[view, 1, 2]]
+        camera.focal_pixel = [K_v[0, 0], K_v[1, 1]]
+        camera.principal_pixel = [0.5 * (width - 1) - K_v[0, 2], 0.5 * (height - 1) - K_v[1, 2]]
         # A grey wall far behind: drawn in a quarter of the time of a sky.
-        wall = spec.worldbody.add_geom(type=mj.mjtGeom.mjGEOM_BOX, material=_WALL, contype=0, conaffinity=0)
-        wall.pos, wall.size = camera.pos + _WALL_M * R[view][2], [_WALL_M, _WALL_M, _PLATE_M]
+        wall = body.add_geom(
+            type=mj.mjtGeom.mjGEOM_BOX, material=_WALL, contype=0, conaffinity=0, density=0.0
+        )
+        wall.pos, wall.size = camera.pos + _WALL_M * axes[:, 2], [_WALL_M, _WALL_M, _PLATE_M]
         wall.alt.type, wall.alt.xyaxes = camera.alt.type, camera.alt.xyaxes
     spec.stat.extent = 1.0
     visual = spec.visual
@@ -300,9 +328,9 @@ def _add_cameras(spec: Any, K: FloatArray, R: FloatArray, t: FloatArray, size: t
 
 
 class Frames:
-    """Both cameras of a scene, which a thread opens, looks with and closes.
+    """The cameras of a scene, which a thread opens, looks with and closes.
 
-    ``rendered``: their scene. ``last``: (2, height, width) the last frames of both.
+    ``rendered``: their scene. ``last``: (V, height, width) the last frames of each.
     """
 
     borders = True
@@ -312,7 +340,7 @@ class Frames:
         self.rendered, self._finder, self._scene = rendered, rendered.finder, scene
         self._places = {number: i for i, number in enumerate(scene.numbers)}
         width, height = scene.size
-        self.last: ByteArray = np.zeros((2, height, width), dtype=np.uint8)
+        self.last: ByteArray = np.zeros((len(scene.P), height, width), dtype=np.uint8)
         self._maps = self._mapped(scene.P)
         self._renderer: Any = None
 
@@ -374,7 +402,7 @@ class Frames:
         self._data.qpos[self.rendered.positions] = q
         mj.mj_kinematics(self._model, self._data)
         mj.mj_camlight(self._model, self._data)
-        self._renderer.update_scene(self._data, CAMERAS[view], self._shown)
+        self._renderer.update_scene(self._data, _camera_name(self._scene.view[view]), self._shown)
         # Tags, their holder and light have no colour: green alone stands for grey.
         fine, cv = np.ascontiguousarray(self._renderer.render()[..., 1]), self._finder.cv
         if self._maps is not None:
@@ -395,10 +423,9 @@ class Frames:
         u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
         pixels = (np.stack([u, v], axis=-1).reshape(-1, 2) - offset) / _FINER
         lens = lens_of(P, self._scene.options.k1)
-        drawn = drawn_at(P, lens, np.stack([pixels, pixels]))
-        if np.array_equal(drawn[0], pixels) and np.array_equal(drawn[1], pixels):
+        drawn = drawn_at(P, lens, np.stack([pixels] * len(P)))
+        if all(np.array_equal(one, pixels) for one in drawn):
             return None
-        maps = (
-            (_FINER * (drawn + self.rendered.margin) + offset).reshape(2, height, width, 2).astype(np.float32)
-        )
+        finer = (_FINER * (drawn + self.rendered.margin) + offset).astype(np.float32)
+        maps = finer.reshape(-1, height, width, 2)
         return [(np.ascontiguousarray(both[..., 0]), np.ascontiguousarray(both[..., 1])) for both in maps]

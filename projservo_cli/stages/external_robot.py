@@ -22,6 +22,7 @@ from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
+from projservo_cli.settings.control import EachView
 from projservo_cli.settings.disturbance import Events
 from projservo_cli.simulation.analytic_plant import Plant, observe
 from projservo_cli.simulation.faults import (
@@ -248,7 +249,7 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
     )
 
 
-def _delays_of(given: tuple[float, float] | None, calibration: Calibration) -> DelayPrior:
+def _delays_of(given: EachView | None, calibration: Calibration) -> DelayPrior:
     """Return the prior of the delays of the views: given, calibrated, or wide."""
     known = NOTHING_KNOWN
     if calibration.time_offset_s is not None:
@@ -258,5 +259,6 @@ def _delays_of(given: tuple[float, float] | None, calibration: Calibration) -> D
         sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
         known = DelayPrior(calibration.time_offset_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
     if given is not None:
-        known = known._replace(mean=np.array(given), sigma=np.zeros(len(given)))
+        mean = np.array([given.of(name) for name in calibration.view])
+        known = known._replace(mean=mean, sigma=np.zeros(len(mean)))
     return known

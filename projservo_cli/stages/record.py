@@ -185,8 +185,8 @@ def _random_pose(
             continue
         if truth is None:
             return q
-        seen = np.isfinite(truth.within(truth.images(q, truth.M))).all(axis=2)
-        least = min(len(seen), 2)  # views that are to show a marker
+        seen = np.isfinite(truth.within(truth.images(q, truth.M))[..., 0])
+        least = min(len(truth.P), 2)  # views that are to show a marker
         inside = seen.sum(axis=0) >= least
         facing = truth.faces(q).sum(axis=0) >= least
         if inside.mean() >= _LEAST_SEEN and facing.mean() >= _LEAST_FACING:

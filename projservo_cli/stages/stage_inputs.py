@@ -12,7 +12,7 @@ from projservo_cli.records import TOOL, FloatArray
 from projservo_cli.result_hashes import File, digest, encoded
 from projservo_cli.robots.settings import Following, JointSettings
 from projservo_cli.settings.cameras import Cameras
-from projservo_cli.settings.control import Stop
+from projservo_cli.settings.control import EachView, Stop
 from projservo_cli.settings.disturbance import Events
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import TaskSettings, Trajectory
@@ -206,7 +206,7 @@ class Contract(NamedTuple):
     driven: Drive
     events: Events  # of a simulated robot
     timeout_s: float  # most time that an answer may take
-    time_offset_s: tuple[float, float] | None  # of the images of both cameras; None to estimate them
+    time_offset_s: EachView | None  # of the images of the cameras; None to estimate them
     settle_s: float | None  # for how long a robot of somebody's has stood still at the start
     identity: str = ""  # of the robot in the recording that the calibration is of; may be empty
 

@@ -100,7 +100,6 @@ plant:
         "4:5:": "robot.dh.convention: 'craig' is not one of them; valid: standard, modified",
         "6:19:": "robot.dh.joints.0.d: unknown key; did you mean d_m?",
         "6:29:": "robot.dh.joints.0.alpha_deg: must be a number, not true",
-        "7:1:": "rig.right: is missing",
         "8:19:": "rig.image_size_px.0: must be a whole number, not 1280.5",
         "9:21:": "rig.left.focal_px.0: must be a finite number, not inf",
         "10:9:": "noise.calibration_px: must be a number, not '0.5'",
