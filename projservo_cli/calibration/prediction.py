@@ -192,8 +192,12 @@ def errors_of(calibration: Calibration) -> Errors:
 
 def from_reference(calibration: Calibration, q: FloatArray) -> FloatArray:
     """Values (K, n) of the joints of its parameters from their reference, at readings (K, n)."""
-    away = q - calibration.q_reference
-    return np.ascontiguousarray(-away[:, ::-1]) if calibration.mount == TOOL else away
+    return in_chain_order(calibration, q - calibration.q_reference)
+
+
+def in_chain_order(calibration: Calibration, away: FloatArray) -> FloatArray:
+    """Joint values (…, n) from the reference in the order and sense of its parameters, or back from these."""
+    return np.ascontiguousarray(-away[..., ::-1]) if calibration.mount == TOOL else away
 
 
 def _in_reverse(c: Calibration) -> IntArray:

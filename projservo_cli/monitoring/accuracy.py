@@ -58,7 +58,7 @@ class Posture:
     def _moved(self, face: FloatArray, has: BoolArray, lengths: FloatArray) -> FloatArray:
         """Displacements (d, f 3), m, of the face by motions of the tool.
 
-        Where the axes of the arm leave its metric open they are those across the lines of sight (d, 2 f 2),
+        Where the axes of the arm leave its metric open they are those across the lines of sight (d, V f 2),
         by the pair of corners with the least foreshortening.
         """
         d, X = len(self._twists), metric_points(self._model, face)
@@ -66,25 +66,25 @@ class Posture:
             J, s = self._changes(face)
             span = np.linalg.norm(s[:, :, None] - s[:, None], axis=3)
             m_per_px = 1.0 / np.max(span[:, has] / lengths[has], axis=1)
-            across: FloatArray = J * (np.sqrt(0.5) * m_per_px[:, None, None, None])
+            across: FloatArray = J * (np.sqrt(1.0 / len(J)) * m_per_px[:, None, None, None])
             return np.moveaxis(across, -1, 0).reshape(d, -1)
         apart = np.linalg.norm(X[:, None] - X[None], axis=2)
         moved = [metric_points(self._model, face + face @ twist.T) for twist in self._twists]
         return np.asarray(np.median(lengths[has] / apart[has]) * (np.array(moved) - X).reshape(d, -1))
 
     def _changes(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Derivatives (2, m, 2, d) of pixels of markers (m, 4) by motions of the tool, and the pixels."""
+        """Derivatives (V, m, 2, d) of pixels of markers (m, 4) by motions of the tool, and the pixels."""
         model, prismatic = self._model, self._model.prismatic
         images = Parameters(model.P, model.H_hat_0, prismatic, M, model.lens).everywhere(self._away)
         return images.by_point[-1] @ np.moveaxis(M @ self._twists.swapaxes(1, 2), 0, -1), images.pixels
 
     def carry(self, M: FloatArray, used: BoolArray) -> FloatArray:
-        """Matrix (k, 4 m) from changes of pixels, px, to displacements of the face, mm, whose norm is rms.
+        """Matrix (k, 2 V m) from changes of pixels, px, to displacements of the face, mm, whose norm is rms.
 
-        M : (m, 4) markers at the reference; used : (2, m) those by which the tool is measured.
+        M : (m, 4) markers at the reference; used : (V, m) those by which the tool is measured.
         """
         assert self._moves is not None
-        J = np.where(used[..., None, None], self._changes(M)[0], 0.0).reshape(4 * len(M), -1)
+        J = np.where(used[..., None, None], self._changes(M)[0], 0.0).reshape(2 * used.size, -1)
         return np.asarray(self._moves.T @ np.linalg.pinv(J))
 
 
@@ -95,16 +95,17 @@ class RigidFit(NamedTuple):
     reached: bool  # whether it explains what is left where the joints show it best, too
     rms_px: float  # residual of a coordinate
     limit_px: float  # of it by chance, with the deviations of the images and of the calibration
-    seen: BoolArray  # (2, m) but for detections that are off by themselves
-    off_px: FloatArray  # (2, m) residual of each detection, px; 0 where unseen
-    shift: FloatArray  # (2,) by which the left image seems to be shifted against the right one, px
+    seen: BoolArray  # (V, m) but for detections that are off by themselves
+    off_px: FloatArray  # (V, m) residual of each detection, px; 0 where unseen
+    view: int  # whose image seems to be shifted against the others: of two the first, of more the likeliest
+    shift: FloatArray  # (2,) by which, px; nothing by one view
     covariance: FloatArray  # (2, 2) of it
     moved_px: float  # difference of the images from those at the joints, px rms a marker
     turn: float  # angle between both, rad
 
     def off_mm(self, posture: Posture, M: FloatArray) -> float:
         """Return how far off the face may be, mm, where one of the images is shifted within chance."""
-        carry = posture.carry(M, self.seen)[:, : 2 * len(M)].reshape(-1, len(M), 2).sum(axis=1)
+        carry = posture.carry(M, self.seen).reshape(-1, *self.seen.shape, 2)[:, self.view].sum(axis=1)
         may = DISTINCT**2 * np.trace(carry @ self.covariance @ carry.T)
         return float(np.sqrt(np.square(carry @ self.shift).sum() + may))
 
@@ -112,7 +113,7 @@ class RigidFit(NamedTuple):
 def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma: FloatArray) -> RigidFit:
     """Fit the pose of the tool to images, from joints (n,), rad or m.
 
-    images : (2, m, 2) px of the markers of the calibration, NaN where unseen; sigma : (2, m) deviations.
+    images : (V, m, 2) px of the markers of the calibration, NaN where unseen; sigma : (V, m) deviations.
     """
     pair, n = FramePair.at_rest(q, images, np.maximum(sigma, calibration.sigma_px)), len(q)
     errors, moved = ErrorModel(calibration, calibration.sigma_px), np.eye(4)
@@ -130,14 +131,20 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
         left[stray] = False
     rows = coordinate_rows(np.flatnonzero(left))
     P, r, r_joints = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows], by_joints.r[rows]
-    F = np.eye(2)[rows % 2] * (rows < len(at.r) // 2)[:, None]
-    covariance: FloatArray = np.asarray(np.linalg.inv(F.T @ P @ F), dtype=np.float64)
-    shift = covariance @ F.T @ P @ r
+    V, view_of, shifts = len(at.seen), rows // (2 * at.seen.shape[1]), []
+    # Of two images one is shifted against the other; a single one shows no more than another pose.
+    for view in {*range(V if V > 2 else V - 1)} & {*view_of.tolist()}:
+        F = np.eye(2)[rows % 2] * (view_of == view)[:, None]
+        covariance = np.linalg.inv(F.T @ P @ F)
+        shift = covariance @ F.T @ P @ r
+        shifts.append((float(shift @ F.T @ P @ r), view, shift, covariance))
+    none = 0.0, 0, np.zeros(2), np.zeros((2, 2))
+    chi2, view, shift, covariance = max(shifts, key=lambda found: found[0], default=none)
     joints = np.linalg.solve(_free(by_joints, by_joints.F[:, :n])[np.ix_(rows, rows)], r_joints)
     # χ² of the shift, of what is left, and of that where joints show it best, over their limits.
     bias = 2.0 * float(np.square(errors.bias_px / at.noise).ravel()[left].sum())
     freedom = np.maximum([2, len(rows) - len(errors.twists), len(rows) - n], 1)
-    squares = np.array([shift @ F.T @ P @ r, r @ P @ r, r_joints @ joints])
+    squares = np.array([chi2, r @ P @ r, r_joints @ joints])
     over, rms = squares / (_UNUSUAL * chdtri(freedom, _CHANCE) + bias), np.sqrt(np.mean(r**2))
     return RigidFit(
         agrees=bool(max(over[:2]) <= 1.0),
@@ -145,7 +152,8 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
         rms_px=float(rms),
         limit_px=float(rms / np.sqrt(max(over[1], 1e-300))),
         seen=left.reshape(at.seen.shape),
-        off_px=np.linalg.norm(at.r.reshape(2, -1, 2), axis=2),
+        off_px=np.linalg.norm(at.r.reshape(*at.seen.shape, 2), axis=2),
+        view=view,
         shift=shift,
         covariance=covariance,
         moved_px=float(np.sqrt(2.0 * np.mean(r_joints**2))),
@@ -159,14 +167,15 @@ def resting_error_mm(
     """Return how far a face at rest may be from where its joints put it, rms mm, by images that agree.
 
     The error of the images, and the shift of one of them that no test shows. None where no length is known,
-    or a view shows less than three markers.
+    or less than two views, or the only one, show three markers.
 
     q : (n,) joint readings, rad or m; face : numbers of its markers; lengths : (f, f) between them, m, NaN if
         unknown.
-    images : (2, m, 2) mean pixels of the markers of the calibration, NaN where unseen.
+    images : (V, m, 2) mean pixels of the markers of the calibration, NaN where unseen.
     """
     detected = np.isfinite(images[..., 0])
-    if not {*face} <= {*calibration.marker.tolist()} or detected.sum(axis=1).min() < _LEAST_MARKERS:
+    enough = (detected.sum(axis=1) >= _LEAST_MARKERS).sum() >= min(2, len(detected))
+    if not {*face} <= {*calibration.marker.tolist()} or not enough:
         return None
     M = calibration.M
     posture = Posture(calibration.model(), q, M[calibration.indices_of(face)], lengths)
@@ -178,7 +187,7 @@ def resting_error_mm(
 
 
 def _free(at: Residual, J: FloatArray) -> FloatArray:
-    """Covariance (4 m, 4 m) of residuals whose changes along J (4 m, k) are not known."""
+    """Covariance (2 V m, 2 V m) of residuals whose changes along J (2 V m, k) are not known."""
     S = at.R + at.B @ at.B.T
     J = J * np.repeat(at.seen.ravel(), 2)[:, None]
     J = J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
-from projservo_cli.calibration.prediction import Parameters
+from projservo_cli.calibration.prediction import Parameters, from_reference, in_chain_order
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.innovation_tests import ErrorModel, Residual, Sums
 from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
@@ -27,6 +28,8 @@ _TURNS = 12
 _FACTORS = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 0.8, 1.25, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
 # By so much a link may flex under its load, rad, which looks like a joint that slipped.
 _MOST_FLEXIBLE = np.radians(3.0)
+# Numbers of all joints, views or markers of a cause, and of some of several.
+ALL, SOME = -1, -2
 # Readings that differ by no more stand still, rad or m.
 _STILL = 1e-9
 # Most observations that are explained together.
@@ -36,22 +39,23 @@ _MAX_PAIRS = 12
 class Changed(NamedTuple):
     """Scene and joints as a cause leaves them."""
 
-    P: FloatArray  # (2, 3, 4)
-    lens: FloatArray | None  # (2, 5)
+    P: FloatArray  # (V, 3, 4)
+    lens: FloatArray | None  # (V, 5)
     M: FloatArray  # (m, 4)
-    away: FloatArray  # (K, 2, n) joints from the reference, rad or m
-    scale: FloatArray  # (2,) of images
-    shift: FloatArray  # (2, 2) px, after that
+    away: FloatArray  # (K, V, n) joints from the reference along the arm, rad or m
+    scale: FloatArray  # (V,) of images
+    shift: FloatArray  # (V, 2) px, after that
 
 
 class Cause(NamedTuple):
-    """A cause, by its kind and the joint, view or marker that it is of; −1 for all of them."""
+    """A cause, by its kind and the joint, view or marker that it is of, or ``ALL`` or ``SOME`` of them."""
 
     kind: str
     which: int
     starts: FloatArray  # (s, p) parameters that a fit starts from
     change: Callable[[Changed, FloatArray], Changed]
     markers: tuple[int, ...] = ()  # that it touches alone
+    views: tuple[int, ...] = ()  # of whose cameras it is; for an exchange the camera that each view shows
 
 
 class Explanation(NamedTuple):
@@ -63,7 +67,7 @@ class Explanation(NamedTuple):
     cost: float  # of its parameters, by their prior
     left: float  # χ² that stays
     changed_px: float  # by how much it changes images of the markers that it touches, rms
-    min_px: float  # the same in the view where that is less
+    min_px: float  # the same in the second view, or in the only one
 
     @property
     def score(self) -> float:
@@ -92,9 +96,11 @@ class Evidence:
         factor = np.sqrt(self._weights)
         self._errors = errors
         self.twists, self.directions = errors.twists, errors.directions
-        self.q_reference = errors.calibration.q_reference
+        self.q_reference, self.prismatic = errors.calibration.q_reference, errors.calibration.prismatic
         self.scene: Parameters = errors.scene
-        self.away = np.array([pair.q for pair in self.pairs]) - self.q_reference
+        q = np.array([pair.q for pair in self.pairs])
+        away = from_reference(errors.calibration, q.reshape(-1, q.shape[-1]))
+        self.away = in_chain_order(errors.calibration, away).reshape(q.shape)
         self._images = np.array([pair.images for pair in self.pairs])
         self.seen = np.array([residual.seen for residual in residuals])
         self._images[~self.seen] = 0.0
@@ -105,15 +111,15 @@ class Evidence:
         self._inverses = factor[:, None, None] * np.linalg.inv(roots)
         onset = float(self.pairs[0].t.mean())
         seconds = float(self.pairs[-1].t.mean()) - onset
-        nuisance = np.array([np.hstack([r.B, r.F[:, : 2 * n + 2]]) for r in residuals])
+        nuisance = np.array([np.hstack([r.B, r.F[:, : errors.fixed]]) for r in residuals])
         drift = slice(errors.e + n, errors.e + 2 * n)  # of joints, with time from the onset
         nuisance[..., drift] -= onset * nuisance[..., errors.e : errors.e + n]
         self._beside = self._whitened(nuisance)
         sigma_t = np.maximum(np.max([pair.sigma_t for pair in self.pairs], axis=0), 1e-6)
-        prior = np.zeros((errors.e + 2 * n + 2,) * 2)
+        prior = np.zeros((errors.e + errors.fixed,) * 2)
         prior[: errors.e, : errors.e] = np.eye(errors.e) + agreed.normal[: errors.e, : errors.e]
         prior[errors.e :, errors.e :] = errors.persistent_prior(seconds, sigma_t)
-        self._known = np.append(agreed.normal[: errors.e, -1], np.zeros(2 * n + 2))
+        self._known = np.append(agreed.normal[: errors.e, -1], np.zeros(errors.fixed))
         self._factor = cho_factor(prior + self._beside.T @ self._beside)
         self._offset = float(self._known @ cho_solve(cho_factor(prior), self._known))
         self.rows = float(2.0 * (self.seen * factor[:, None, None] ** 2).sum())
@@ -122,8 +128,8 @@ class Evidence:
             lens=self.scene.lens,
             M=self.scene.M,
             away=self.away,
-            scale=np.ones(2),
-            shift=np.zeros((2, 2)),
+            scale=np.ones(len(self.scene.P)),
+            shift=np.zeros((len(self.scene.P), 2)),
         )
         self.at_first = self._off(self.nothing)
         self.before = self._square(self._whitened(self.at_first))
@@ -131,13 +137,13 @@ class Evidence:
         self.off_px = float(np.sqrt(np.square(self.at_first).sum() / seen))  # rms of each detection
 
     def _whitened(self, rows: FloatArray) -> FloatArray:
-        """Rows (K, 4 m, …) over the root of their covariance, (K 4 m, …)."""
+        """Rows (K, 2 V m, …) over the root of their covariance, (K 2 V m, …)."""
         whitened = self._inverses @ rows.reshape(*rows.shape[:2], -1)
         return np.asarray(whitened.reshape(-1, *rows.shape[2:]))
 
     def _off(self, changed: Changed) -> FloatArray:
-        """Return the residuals (K, 4 m) of images from the prediction of a cause, px; zero if unseen."""
-        K, _, n = changed.away.shape
+        """Return the residuals (K, 2 V m) of images from the prediction of a cause, px; zero if unseen."""
+        K, V, n = changed.away.shape
         scene = Parameters(
             P=changed.P,
             H_hat=self.scene.H_hat,
@@ -145,7 +151,8 @@ class Evidence:
             M=changed.M,
             lens=changed.lens,
         )
-        s = scene.predict(changed.away.reshape(2 * K, n)).reshape(K, 2, 2, -1, 2)[:, [0, 1], [0, 1]]
+        away, own = in_chain_order(self._errors.calibration, changed.away), np.arange(V)
+        s = scene.predict(away.reshape(V * K, n)).reshape(K, V, V, -1, 2)[:, own, own]
         s = changed.scale[:, None, None] * (s + 0.5) - 0.5 + changed.shift[:, None]
         off = np.where(np.isfinite(s), self._images - s, _HIDDEN_PX)
         off[~self.seen] = 0.0
@@ -181,7 +188,8 @@ class Evidence:
         for pair, away in zip(self.pairs, changed.away, strict=True):
             images, noise = pair.images, pair.noise
             if kind == "exchanged":
-                images, noise = images[::-1], noise[::-1]
+                order = np.argsort(fit.cause.views)
+                images, noise = images[order], noise[order]
             images = (images - changed.shift[:, None] + 0.5) / changed.scale[:, None, None] - 0.5
             noise = noise / changed.scale[:, None]
             q = away + self.q_reference
@@ -225,7 +233,7 @@ class Evidence:
         return -unit * step, float(np.linalg.slogdet(normal)[1]), float(right @ step)
 
     def _touched(self, cause: Cause) -> BoolArray:
-        """Detections (K, 2, m') that a cause touches."""
+        """Detections (K, V, m') that a cause touches."""
         return self.seen[..., list(cause.markers)] if cause.markers else self.seen
 
     def _count(self, cause: Cause) -> float:
@@ -248,7 +256,7 @@ class Evidence:
             fell, theta, here, square = square - less, theta + halved, there, less
             if fell < _FALLS:
                 break
-        change = np.square(here - self.at_first).reshape(len(here), 2, -1, 2).sum(axis=-1)
+        change = np.square(here - self.at_first).reshape(*self.seen.shape, 2).sum(axis=-1)
         changed_px = float(np.sqrt(change[change > 0.0].mean())) if change.any() else 0.0
         by_view = change.sum(axis=(0, 2)) / np.maximum(self._touched(cause).sum(axis=(0, 2)), 1)
         return Explanation(
@@ -258,24 +266,41 @@ class Evidence:
             cost=cost,
             left=square,
             changed_px=changed_px,
-            min_px=float(np.sqrt(by_view.min())),
+            min_px=float(np.sqrt(np.sort(by_view)[-min(2, len(by_view))])),
         )
 
 
 def causes_of(evidence: Evidence, numbers: IntArray, centre: FloatArray | None) -> Iterator[Cause]:
     """All causes that may be named, the simplest of a kind first.
 
-    numbers : (m,) of the markers; centre : (2, 2) of the images, px; None where their size is not known.
+    numbers : (m,) of the markers; centre : (V, 2) of the images, px; None where their size is not known.
     """
-
-    def exchanged(s: Changed, _: FloatArray) -> Changed:
-        return s._replace(P=s.P[::-1], lens=None if s.lens is None else s.lens[::-1])
-
-    yield Cause("exchanged", -1, _start(0), exchanged)
+    views = len(evidence.scene.P)
+    yield from _exchanges(views)
     yield from _joint_causes(evidence)
-    yield from _image_causes(centre)
-    yield from _camera_causes(evidence.twists)
+    yield from _image_causes(views, centre)
+    yield from _camera_causes(views, evidence.twists)
     yield from _body_causes(evidence, numbers)
+
+
+def _exchanges(views: int) -> Iterator[Cause]:
+    """Causes in which two cameras take each other's place, or three in turn."""
+
+    def exchanged(s: Changed, _: FloatArray, order: list[int]) -> Changed:
+        return s._replace(P=s.P[order], lens=None if s.lens is None else s.lens[order])
+
+    for some in (some for count in (2, 3) for some in combinations(range(views), count)):
+        for turn in range(1, len(some)):
+            order = np.arange(views)
+            order[[*some]] = np.roll(some, turn)
+            shown = order.tolist()
+            yield Cause("exchanged", ALL, _start(0), partial(exchanged, order=shown), views=tuple(shown))
+
+
+def _every_and_all(views: int) -> list[tuple[int, tuple[int, ...]]]:
+    """Each view by itself, with its number, and all of several together."""
+    every: tuple[int, ...] = tuple(range(views))
+    return [*((v, (v,)) for v in every), *([(ALL, every)] if views > 1 else [])]
 
 
 def _start(parameters: int) -> FloatArray:
@@ -287,7 +312,7 @@ def _joint_causes(evidence: Evidence) -> Iterator[Cause]:
     """Causes in the joints, their readings and when these were taken."""
     q = np.array([pair.q for pair in evidence.pairs])
     velocity = np.array([pair.q_dot for pair in evidence.pairs])
-    (K, _, n), q_reference = q.shape, evidence.q_reference
+    (K, V, n), q_reference = q.shape, evidence.q_reference
 
     def mirrored(s: Changed, _: FloatArray, i: int) -> Changed:
         away = s.away.copy()
@@ -305,28 +330,29 @@ def _joint_causes(evidence: Evidence) -> Iterator[Cause]:
     def flexible(s: Changed, theta: FloatArray) -> Changed:
         return s._replace(away=s.away + theta)
 
-    def late(s: Changed, theta: FloatArray, v: int) -> Changed:
-        delays = theta if v < 0 else np.eye(2)[v] * theta
+    def late(s: Changed, theta: FloatArray, views: tuple[int, ...]) -> Changed:
+        delays = np.zeros(V)
+        delays[[*views]] = theta
         return s._replace(away=s.away - delays[:, None] * velocity)
 
     turns = np.linspace(-np.pi, np.pi, _TURNS, endpoint=False)[:, None] + np.pi / _TURNS
     for i in range(n):
         yield Cause("mirrored", i, _start(0), partial(mirrored, i=i))
-        starts = _start(1) if evidence.scene.prismatic[i] else np.concatenate([_start(1), turns])
+        starts = _start(1) if evidence.prismatic[i] else np.concatenate([_start(1), turns])
         yield Cause("slipped", i, starts, partial(slipped, i=i))
     still: BoolArray = np.ptp(q, axis=(0, 1)) <= _STILL
     if K > 1 and not still.all():
         for i in np.flatnonzero(still).tolist():
             yield Cause("frozen", i, _start(K), partial(frozen, which=slice(i, i + 1)))
     elif K > 2:
-        yield Cause("frozen", -1, _start(n * K), partial(frozen, which=slice(n)))
-    yield Cause("flexible", -1, _start(n), flexible)
-    for v in (0, 1, -1) if velocity.any() else ():
-        yield Cause("late", v, _start(2 if v < 0 else 1), partial(late, v=v))
+        yield Cause("frozen", ALL, _start(n * K), partial(frozen, which=slice(n)))
+    yield Cause("flexible", ALL, _start(n), flexible)
+    for v, views in _every_and_all(V) if velocity.any() else ():
+        yield Cause("late", v, _start(len(views)), partial(late, views=views), views=views)
 
 
-def _image_causes(centre: FloatArray | None) -> Iterator[Cause]:
-    """Causes in the images: cropped, of another size, or of another focal length."""
+def _image_causes(count: int, centre: FloatArray | None) -> Iterator[Cause]:
+    """Causes in the images of so many views: cropped, of another size, or of another focal length."""
 
     def shifted(s: Changed, theta: FloatArray, views: FloatArray) -> Changed:
         return s._replace(shift=s.shift + views[:, None] * theta)
@@ -342,15 +368,20 @@ def _image_causes(centre: FloatArray | None) -> Iterator[Cause]:
         )
         return s._replace(scale=factor, shift=about_centre)
 
-    for v, views in ((0, np.array([1.0, 0.0])), (1, np.array([0.0, 1.0])), (-1, np.ones(2))):
-        yield Cause("shifted", v, _start(2), partial(shifted, views=views))
-        yield Cause("sized", v, np.array(_FACTORS)[:, None], partial(sized, views=views))
+    for v, some in _every_and_all(count):
+        views = np.isin(np.arange(count), some).astype(np.float64)
+        yield Cause("shifted", v, _start(2), partial(shifted, views=views), views=some)
+        yield Cause("sized", v, np.array(_FACTORS)[:, None], partial(sized, views=views), views=some)
         if v >= 0:
-            yield Cause("focused", v, _start(3 if centre is None else 1), partial(focused, views=views))
+            start = _start(3 if centre is None else 1)
+            yield Cause("focused", v, start, partial(focused, views=views), views=some)
 
 
-def _camera_causes(twists: FloatArray) -> Iterator[Cause]:
-    """Causes in where the cameras stand, by rigid motions (d, 4, 4)."""
+def _camera_causes(count: int, twists: FloatArray) -> Iterator[Cause]:
+    """Causes in where so many cameras stand, by rigid motions (d, 4, 4).
+
+    Of one camera alone, motions of itself and of all cameras are the same.
+    """
     d = len(twists)
 
     def turned(s: Changed, theta: FloatArray, views: tuple[int, ...]) -> Changed:
@@ -359,21 +390,28 @@ def _camera_causes(twists: FloatArray) -> Iterator[Cause]:
             P[v] = P[v] @ expm(np.tensordot(part, twists, 1))
         return s._replace(P=P)
 
-    def both_shifted(s: Changed, theta: FloatArray) -> Changed:
-        return s._replace(shift=s.shift + theta.reshape(2, 2))
+    def each_shifted(s: Changed, theta: FloatArray, views: tuple[int, ...]) -> Changed:
+        shift = s.shift.copy()
+        shift[[*views]] += theta.reshape(-1, 2)
+        return s._replace(shift=shift)
 
     def rig(s: Changed, theta: FloatArray) -> Changed:
         return s._replace(P=s.P @ expm(np.tensordot(theta, twists, 1)))
 
-    for v in (0, 1):
-        yield Cause("camera", v, _start(d), partial(turned, views=(v,)))
-    yield Cause("cameras", -1, _start(2 * d), partial(turned, views=(0, 1)))
-    yield Cause("cameras", -1, _start(4), both_shifted)
-    yield Cause("rig", -1, _start(d), rig)
+    every = tuple(range(count))
+    for v in every:
+        yield Cause("camera", v, _start(d), partial(turned, views=(v,)), views=(v,))
+    several: list[tuple[int, ...]] = [*combinations(every, 2)] if count > 2 else []
+    for some in [*several, *([every] if count > 1 else [])]:
+        which = ALL if some == every else SOME
+        yield Cause("cameras", which, _start(len(some) * d), partial(turned, views=some), views=some)
+        yield Cause("cameras", which, _start(2 * len(some)), partial(each_shifted, views=some), views=some)
+    if count > 1:
+        yield Cause("rig", ALL, _start(d), rig, views=every)
 
 
 def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
-    """Causes on the tool: its markers, tags, and all of them."""
+    """Causes in the markers, on the tool or in the scene: each, those of a tag, and all of them."""
     twists, d = evidence.twists, len(evidence.twists)
     visible: BoolArray = np.any(evidence.seen, axis=(0, 1))
     tags = [np.flatnonzero(numbers // CORNERS == t) for t in np.unique(numbers // CORNERS)]
@@ -396,9 +434,9 @@ def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
         M[j] += evidence.directions.T @ theta * np.linalg.norm(M[j])
         return s._replace(M=M)
 
-    yield Cause("tool", -1, _start(d), partial(displaced, which=np.arange(len(numbers))))
+    yield Cause("tool", ALL, _start(d), partial(displaced, which=np.arange(len(numbers))))
     if tags:
-        yield Cause("larger", -1, _start(1), larger)
+        yield Cause("larger", ALL, _start(1), larger)
     for tag in tags if len(tags) > 1 else ():
         if visible[tag].any():
             yield Cause("tag", int(tag[0]), _start(d), partial(displaced, which=tag), tuple(tag.tolist()))
@@ -434,7 +472,8 @@ _CONTAINS = {
 
 def contains(cause: Cause, other: Cause) -> bool:
     """Whether a cause explains what another one does, with more parameters."""
-    alike = cause.which in (-1, other.which) or set(other.markers) <= set(cause.markers) != set()
+    alike = set(other.views) <= set(cause.views) if cause.views else cause.which in (ALL, other.which)
+    alike |= set(other.markers) <= set(cause.markers) != set()
     more = cause.starts.shape[1] > other.starts.shape[1]
     return alike and more and other.kind in _CONTAINS.get(cause.kind, ())
 

@@ -29,8 +29,8 @@ from projservo_cli.monitoring.innovation_tests import (
     columns_of_marker,
     is_same_view,
 )
-from projservo_cli.monitoring.messages import group_of, is_slight, sentence
-from projservo_cli.records import CORNERS, VIEWS, BoolArray, Calibration, FloatArray, IntArray
+from projservo_cli.monitoring.messages import PLACE, group_of, is_slight, sentence
+from projservo_cli.records import CORNERS, BoolArray, Calibration, FloatArray, IntArray
 
 # Markers that are tested, at most.
 _MOST_TESTED = 40
@@ -49,8 +49,9 @@ _LEFT = 0.15
 _LEAST_PART = 0.2
 # A tag that is off by less than this share of its side is neither turned by quarters nor exchanged.
 _SIDE = 0.5
-# A corner that is off by less, px, from one side of the tool may be an edge that the finder took for another.
-_LEAST_MOVED_PX = 1.0
+# A corner that is off by less, px, from one side of the tool may be an edge that the finder took for another;
+# one that a single camera watches may also be pulled by what covers its edge, by a few pixels.
+_LEAST_MOVED_PX, _LEAST_MOVED_ALONE_PX = 1.0, 8.0
 # Share of the markers that a view saw shortly before: one that sees less is covered by something.
 _COVERED = 0.5
 # Share of the detections of a view that may not be off by themselves for long: then the view is.
@@ -59,6 +60,10 @@ _MOST_FOR_LONG = 0.25
 _UNANSWERED = 0.5
 # Observations in which a hand comes or goes.
 _COMES = 10
+# Views whose agreement is evidence beside one that is covered. Of fewer all are covered where one is.
+_SUFFICE = 2
+# Causes that are named beside each other, by several views and by one, which tells fewer apart.
+_MOST_NAMED, _MOST_NAMED_BY_ONE = 2, 3
 # Observations that are remembered one by one.
 _REMEMBERED = 80
 # Chance of a false alarm of one observation alone: that of an observation among so many.
@@ -74,14 +79,15 @@ class _Kept(NamedTuple):
     residual: Residual
     view: int  # number of the view that it is of
     views: int  # views that agreed up to it
-    covered: bool  # whether something passes before a view
+    covered: bool  # whether something passes before the views
 
 
 class _Recent(NamedTuple):
     """One of the last observations, as a hand that comes or goes shows in it."""
 
-    whole: bool  # whether both views show all markers that they did, and none is off by itself
-    hidden: bool  # whether a view shows less than half of them
+    whole: BoolArray  # (V,) whether a view shows all markers that it did, and none is off by itself
+    hidden: BoolArray  # (V,) whether it shows less than half of them
+    covered: BoolArray  # (V,) whether something passes before it
     state: MemoryState  # observations that agreed before it
 
 
@@ -102,10 +108,10 @@ class ImageMonitor:
     sigma_px : pixel noise per coordinate.
     max_observations : length of the longest sequence, which sets the thresholds.
     shown : indices of the markers that images may show, None all; of many, some stand for all.
-    image_size : (2, 2) px, of each image; None or infinite where it is not known.
+    image_size : (V, 2) px, of each image; None or infinite where it is not known.
     ``fault``: the fault in words; empty without one, or while its cause is not clear.
     ``observations``: number of those that showed a marker and were tested. ``agreeing``: number of those of
-    one view in a row that agree. ``rejected``: (2, m) detections of the last observation that are off by
+    one view in a row that agree. ``rejected``: (V, m) detections of the last observation that are off by
     themselves, of all markers of the calibration. ``unanswered``: (n,) path of each set-point since the
     reading of its joint last changed, rad or m; the client of the robot sets it.
     """
@@ -118,7 +124,9 @@ class ImageMonitor:
         visible: IntArray | None = None,
         image_size: FloatArray | None = None,
     ) -> None:
-        self._all = len(calibration.M)
+        views, self._all = len(calibration.P), len(calibration.M)
+        # Views (V, V) that are covered together.
+        self._together = np.eye(views, dtype=np.bool_) | (views <= _SUFFICE)
         visible = np.arange(self._all) if visible is None else visible
         self._shown = visible[even_choice(len(visible), _MOST_TESTED)]
         self.calibration = calibration.with_markers(self._shown)
@@ -127,23 +135,23 @@ class ImageMonitor:
         self._image_size, self._sigma_px = image_size if has_size else None, sigma_px
         self._errors = ErrorModel(self.calibration, sigma_px)
         self._detector = Detector(self._errors, max_observations)
-        self._pairing = Pairing()
+        self._pairing = Pairing(views)
         self._first: FloatArray | None = None  # (n,) joints of the first observation, rad or m
         self._kept: list[_Kept] = []
         self._recent: deque[_Recent] = deque(maxlen=_COMES)
         self.observations = self._view = 0
-        self._at_view: FloatArray | None = None  # (2, m, 2) px predicted where the view began
+        self._at_view: FloatArray | None = None  # (V, m, 2) px predicted where the view began
         # Observations that disagree, the number of the first of them, and observations in a row that agree.
         self._off = self._onset = self._agreed = 0
         self._sound = 0  # observations in a row that agree by themselves
         self._before = self._detector.memory.total  # sums up to the onset
         self._unit = 1.0  # of χ², by the remainder of the best cause
-        self._asides = np.zeros((2, len(self._shown)), dtype=np.int64)  # observations in a row
+        self._asides = np.zeros((views, len(self._shown)), dtype=np.int64)  # observations in a row
         self._crowded = 0  # observations in a row of which many detections are off by themselves
         self._forgiven: list[int] = []
         self.fault, self.agreeing = "", 0
         self.unanswered = np.zeros(len(calibration.q_reference))
-        self.rejected = np.zeros((2, self._all), dtype=np.bool_)
+        self.rejected = np.zeros((views, self._all), dtype=np.bool_)
 
     @property
     def pending(self) -> bool:
@@ -166,14 +174,14 @@ class ImageMonitor:
         *,
         stated: FloatArray | None = None,
     ) -> str:
-        """Take in the newest frames of both views, and return the fault, if there is one.
+        """Take in the newest frames of all views, and return the fault, if there is one.
 
-        t : (2,) instants of both frames, s.
-        q : (2, n) joint readings then, rad or m; q_dot : (2, n) their velocities, rad/s or m/s.
-        sigma_t : (2,) standard deviation of these instants, of the delay and its jitter together, s.
-        images : (2, m, 2) raw pixels of the markers of the calibration, NaN where unseen.
-        fresh : (2,) whether the frame of a view is new; one that comes twice is no second measurement.
-        stated : (2, m) standard deviations of the pixels, px, if the finder states them.
+        t : (V,) instants of the frames, s.
+        q : (V, n) joint readings then, rad or m; q_dot : (V, n) their velocities, rad/s or m/s.
+        sigma_t : (V,) standard deviation of these instants, of the delay and its jitter together, s.
+        images : (V, m, 2) raw pixels of the markers of the calibration, NaN where unseen.
+        fresh : (V,) whether the frame of a view is new; one that comes twice is no second measurement.
+        stated : (V, m) standard deviations of the pixels, px, if the finder states them.
         """
         images, stated = images[:, self._shown], None if stated is None else stated[:, self._shown]
         detected = np.isfinite(images[..., 0])
@@ -198,18 +206,19 @@ class ImageMonitor:
     def fault_at_rest(self) -> str:
         """Return the fault that the mean of the last observations of one posture shows; empty for none."""
         # A hand that covers a part of a view may pull the corners next to it.
-        last = [tested.pair for tested in self._kept if tested.view == self._view and not tested.covered]
-        last = [pair for pair in last if np.abs(pair.q - last[-1].q).max() <= _AT_REST]
+        last = [tested for tested in self._kept if tested.view == self._view and not tested.covered]
+        last = [tested for tested in last if np.abs(tested.pair.q - last[-1].pair.q).max() <= _AT_REST]
         if not last or self.pending:
             return self.fault
-        mean = mean_image(np.array([pair.images for pair in last]))
-        q, numbers = np.mean([pair.q for pair in last], axis=(0, 1)), self.calibration.marker
+        seen = [np.where(tested.residual.seen[..., None], tested.pair.images, np.nan) for tested in last]
+        mean, numbers = mean_image(np.array(seen)), self.calibration.marker
+        q = np.mean([tested.pair.q for tested in last], axis=(0, 1))
         return detected_fault(self.calibration, q, numbers, mean, self._image_size, self._sigma_px)
 
     def undetected_mm(self, q: FloatArray, used: BoolArray, posture: Posture) -> float:
         """Return how far off the face may be at joints (n,) by what no test tells from none, mm.
 
-        used : (2, m) markers of the calibration by which a law measures it, all of them; posture : at q.
+        used : (V, m) markers of the calibration by which a law measures it, all of them; posture : at q.
         """
         if not self._kept:
             return 0.0
@@ -236,22 +245,27 @@ class ImageMonitor:
         if not lasts:
             self._view, self._at_view = self._view + 1, residual.predicted
         tested = self._detector.tested(residual)
+        hidden = self._covered(residual, tested.aside)
+        covered = bool(hidden.any() and (residual.seen.any(axis=1) & ~hidden).sum() < _SUFFICE)
+        if hidden.any() and not covered:  # what is left of a covered view is no evidence: the others are
+            residual = residual.without(residual.seen & hidden[:, None])
+            tested = self._detector.tested(residual)
         self._asides = np.where(tested.aside, self._asides + 1, self._asides * ~residual.seen)
         self.rejected[:, self._shown] = tested.aside
         self.rejected[:, self._shown[self._forgiven]] = True
         since, clean = None, residual.without(tested.aside)
         memory.learn(residual, tested.aside, tested.disagrees)
-        kept, covered = self._kept[-_REMEMBERED:], self._is_covered(residual, tested.aside)
-        self._sound = (self._sound + 1) * (not tested.disagrees)
-        # The rest of a covered view is no evidence, nor are observations between those that disagree.
+        kept, self._sound = self._kept[-_REMEMBERED:], (self._sound + 1) * (not tested.disagrees)
+        # The rest of covered views is no evidence, nor are observations between those that disagree.
         if self._sound > WINDOW * self.holds and not covered:
             memory.keep(clean, float(pair.t.mean()), not tested.aside.any())
         self._kept = [
             *kept,
             _Kept(pair=pair, residual=residual, view=self._view, views=memory.state.views, covered=covered),
         ]
-        crowd = (tested.aside.sum(axis=1) >= _MOST_FOR_LONG * residual.seen.sum(axis=1)).any()
-        self._crowded = (self._crowded + 1) * bool(crowd and not covered)
+        crowd = tested.aside.sum(axis=1) >= _MOST_FOR_LONG * residual.seen.sum(axis=1)
+        crowd &= residual.seen.any(axis=1)
+        self._crowded = (self._crowded + 1) * bool(crowd.any() and not covered)
         disagrees = tested.disagrees or self._crowd_is_fault()
         if not disagrees:
             free = [columns_of_marker(self._errors, j) for j in self._forgiven]
@@ -302,8 +316,8 @@ class ImageMonitor:
         self._crowded = 0
         return False
 
-    def _is_covered(self, residual: Residual, aside: BoolArray) -> bool:
-        """Whether a hand or so covers a view: it shows less than half of its markers, or did so just now.
+    def _covered(self, residual: Residual, aside: BoolArray) -> BoolArray:
+        """Views (V,) that a hand or so covers: they show less than half of their markers, or did just now.
 
         A hand pulls the corners next to it before it hides them, by less than one observation shows. Those in
         which it came are forgotten, and those in which it goes are not kept.
@@ -312,17 +326,18 @@ class ImageMonitor:
         peak = np.max(
             [count, *(past.residual.seen.sum(axis=1) for past in self._kept[-_REMEMBERED:])], axis=0
         )
-        hidden = bool((count < _COVERED * peak).any())
-        whole = bool((count >= peak).all() and not aside.any())
-        was = bool(self._kept) and self._kept[-1].covered
-        goes = was and not whole and any(past.hidden for past in self._recent)
-        if hidden and not was:
+        hidden = (self._together & (count < _COVERED * peak)).any(axis=1)
+        whole = (~self._together | ((count >= peak) & ~aside.any(axis=1))).all(axis=1)
+        was = self._recent[-1].covered if self._recent else np.zeros_like(hidden)
+        goes = was & ~whole & np.any([past.hidden for past in self._recent], axis=0)
+        if (comes := hidden & ~was).any():
             for past in reversed(self._recent):
-                if past.whole:
+                if past.whole[comes].all():
                     break
                 memory.return_to(past.state)
-        self._recent.append(_Recent(whole=whole, hidden=hidden, state=memory.state))
-        return hidden or goes
+        covered: BoolArray = hidden | goes
+        self._recent.append(_Recent(whole=whole, hidden=hidden, covered=covered, state=memory.state))
+        return covered
 
     def _clear(self) -> None:
         """Clear pending observations where new ones agree; name a fault that shows in motion alone."""
@@ -340,7 +355,7 @@ class ImageMonitor:
     def _since_onset(self) -> list[_Kept]:
         """Observations since the onset of the pending fault, but for the first, which may show half of it.
 
-        Frames of both views that come one after the other may make that two.
+        Frames of the views that come one after the other may make that two.
         """
         kept = self._kept[-max(1, self.observations - self._onset) :]
         return kept[1 + (self._off > _NAMED_AT[0]) :] if len(kept) >= _NAMED_AT[0] else kept
@@ -419,14 +434,15 @@ class ImageMonitor:
         if not fit.cause.markers:
             return False
         detected = self._evidence_now.seen[:, :, list(fit.cause.markers)]
-        alone = detected.all(axis=1).sum() <= 0.5 * detected.any(axis=1).sum()
-        if alone or fit.min_px >= _LEAST_MOVED_PX:
+        one = detected.shape[1] == 1
+        alone = not one and (detected.sum(axis=1) > 1).sum() <= 0.5 * detected.any(axis=1).sum()
+        if alone or fit.min_px >= (_LEAST_MOVED_ALONE_PX if one else _LEAST_MOVED_PX):
             return bool(alone)
         return self._errors.slants(np.array([tested.pair.q.mean(axis=0) for tested in kept])) < WINDOW
 
     def _judge_markers(self) -> None:
-        """Name markers that both views show off by themselves for long."""
-        in_both, in_either = self._asides.min(axis=0), self._asides.max(axis=0)
+        """Name markers that two views show off by themselves for long."""
+        in_both, in_either = np.sort([np.zeros_like(self._asides[0]), *self._asides], axis=0)[-2:]
         # What hides an edge shows in one view, and passes.
         if self.pending or not ((in_both == _NAMED_AT[0]).any() or (in_either == _TWO_AT).any()):
             return
@@ -459,15 +475,16 @@ class ImageMonitor:
         said = [fits[0], *(fit for fit in simpler if fit.left <= maximum), *_rivals(fits)[1:]]
         if len({tested.view for tested in self._since_onset()}) == 1:
             said += _as_rigid(fits)
-        names = [sentence(fit, self.calibration) for fit in said[:2]]
+        most = _MOST_NAMED_BY_ONE if len(residual.seen) == 1 else _MOST_NAMED
+        names = [sentence(fit, self.calibration) for fit in said[:most]]
         return f"{off}: {'; or '.join(names)}"
 
     def _where(self, residual: Residual) -> str:
         """Return the place of the largest residuals: a view, and a tag or marker."""
-        square = np.square(residual.r.reshape(2, -1, 2)).sum(axis=-1)
+        square = np.square(residual.r.reshape(*residual.seen.shape, 2)).sum(axis=-1)
         view, j = np.unravel_index(int(np.argmax(square)), square.shape)
         number = int(self.calibration.marker[j])
-        return f"in the {VIEWS[view]} image, at marker {number}"
+        return f"in the {self.calibration.view[view]} image, at marker {number}"
 
 
 def detected_fault(
@@ -483,18 +500,19 @@ def detected_fault(
     Tags that are off by themselves by less than ``_LEAST_MOVED_PX``, up to half of them, are no change: one
     view of the tool does not tell a tag that moved from one that is bent, or under a slant.
 
-    q : (n,) joint readings there, rad or m; images : (2, b, 2) pixels of the markers with the numbers
+    q : (n,) joint readings there, rad or m; images : (V, b, 2) pixels of the markers with the numbers
     marker (b,), NaN where unseen, those that the calibration does not know among them;
-    image_size : (2, 2) px; sigma_px : pixel noise per coordinate where that is more than the calibration's.
+    image_size : (V, 2) px; sigma_px : pixel noise per coordinate where that is more than the calibration's.
     """
     if not calibration.usable or not calibration.has_covariance:
         return ""
     pixels = at_known_markers(calibration, marker, images)
-    rest, instants, new = np.zeros((2, len(q))), np.zeros(2), np.ones(2, dtype=np.bool_)
+    V = len(calibration.P)
+    rest, instants, new = np.zeros((V, len(q))), np.zeros(V), np.ones(V, dtype=np.bool_)
 
     def fault_of(pixels: FloatArray) -> str:
         sigma = max(calibration.sigma_px, sigma_px)
-        monitor, q_views = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size), np.stack([q, q])
+        monitor, q_views = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size), np.stack([q] * V)
         monitor.observe(instants, q_views, rest, instants, pixels, new)
         for k in range(1, _NAMED_AT[0] * bool(monitor.rejected.any() and not monitor.pending)):
             monitor.observe(instants + k, q_views, rest, instants, pixels, new)
@@ -502,13 +520,13 @@ def detected_fault(
 
     expected = predict(calibration, q[None])[0]
     if misplaced := _misplaced(pixels, expected, calibration.marker):
-        return misplaced
+        return f"{misplaced} {PLACE[calibration.mount]}; put them back as they were, or recalibrate"
     fault = fault_of(pixels)
     if not fault:
         return ""
     off, tags = pixels - expected, calibration.marker // CORNERS
     for _ in range(len(np.unique(tags[np.isfinite(off).any(axis=(0, 2))])) // 2):
-        tag = _off_alone(off, calibration.marker)
+        tag = _off_alone(off[np.isfinite(off).any(axis=(1, 2))], calibration.marker)
         if not tag.any():
             break
         off, pixels = (np.where(tag[:, None], np.nan, part) for part in (off, pixels))
@@ -518,7 +536,7 @@ def detected_fault(
 
 
 def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> str:
-    """Say which tags are turned by quarters, or in each other's places, by pixels (2, m, 2); empty for none.
+    """Say which tags are turned by quarters, or in each other's places, by pixels (V, m, 2); empty for none.
 
     If most are, the tool is: its body looks alike from several sides.
     """
@@ -543,11 +561,11 @@ def _misplaced(pixels: FloatArray, expected: FloatArray, numbers: IntArray) -> s
             said.append(f"tags {tag} and {place} are exchanged")
     if not moved_to or 2 * len(moved_to) > len(tags):
         return ""
-    return f"{' and '.join(said)} on the tool; put them back as they were, or recalibrate"
+    return " and ".join(said)
 
 
 def _off_alone(off: FloatArray, numbers: IntArray) -> BoolArray:
-    """Markers (m,) of the tag that is the farthest off (2, m, 2), px; none where that is far, or most of all.
+    """Markers (m,) of the tag that is the farthest off (V, m, 2), px; none where that is far, or most of all.
 
     Errors of joints move all of them: a tag is off against the median of the others.
     """
@@ -577,19 +595,19 @@ def _rivals(fits: list[Explanation]) -> list[Explanation]:
 
 
 def _as_rigid(fits: list[Explanation]) -> list[Explanation]:
-    """Links that flex by a little, where a rigid motion of both cameras is the likeliest cause.
+    """Links that flex by a little, where a rigid motion of all cameras is the likeliest cause.
 
     In one posture deflections of six joints are any rigid motion: their parameters cost more, and show less
     in one posture than in several.
     """
-    if group_of(fits[0]) != ("rig", -1):
+    if group_of(fits[0])[0] != "rig":
         return []
     flexible = [fit for fit in fits if fit.cause.kind == "flexible" and is_slight(fit.theta)]
     return [fit for fit in flexible if fit.gain >= fits[0].gain]
 
 
 def _all_but(detections: BoolArray, marker: int) -> BoolArray:
-    """Detections (2, m) of all markers but one."""
+    """Detections (V, m) of all markers but one."""
     aside = np.ones_like(detections)
     aside[:, marker] = False
     return aside

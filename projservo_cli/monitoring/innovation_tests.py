@@ -8,9 +8,16 @@ from scipy.linalg import cho_solve, eigh, solve_triangular
 from scipy.special import chdtri
 
 from projservo_cli.calibration.detections import MIN_SIGMA, per_rad
-from projservo_cli.calibration.prediction import CAMERA, Parameters, dense_pixel_changes, parameters_from
+from projservo_cli.calibration.prediction import (
+    CAMERA,
+    Parameters,
+    dense_pixel_changes,
+    errors_of,
+    from_reference,
+    parameters_from,
+)
 from projservo_cli.monitoring.frame_pairs import FramePair
-from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
+from projservo_cli.records import TOOL, BoolArray, Calibration, FloatArray, IntArray
 
 # Observations in a row that must agree: one may be blurred, or a marker taken for another.
 WINDOW = 3
@@ -61,16 +68,16 @@ _MOST_ASIDE = 0.5
 class Residual(NamedTuple):
     """Residuals of one observation: rows by view, marker and coordinate, zero where unseen."""
 
-    seen: BoolArray  # (2, m)
-    noise: FloatArray  # (2, m) px
-    predicted: FloatArray  # (2, m, 2) px
-    r: FloatArray  # (4 m,) seen less predicted, px
-    B: FloatArray  # (4 m, e) derivatives by the errors of the calibration, in units of their deviations
-    F: FloatArray  # (4 m, f) derivatives by what may be wrong
-    R: FloatArray  # (4 m, 4 m) covariance of one observation but for the errors of the calibration, px²
+    seen: BoolArray  # (V, m)
+    noise: FloatArray  # (V, m) px
+    predicted: FloatArray  # (V, m, 2) px
+    r: FloatArray  # (2 V m,) seen less predicted, px
+    B: FloatArray  # (2 V m, e) derivatives by the errors of the calibration, in units of their deviations
+    F: FloatArray  # (2 V m, f) derivatives by what may be wrong
+    R: FloatArray  # (2 V m, 2 V m) covariance of one observation but for the errors of the calibration, px²
 
     def without(self, aside: BoolArray) -> "Residual":
-        """The same without some detections (2, m)."""
+        """The same without some detections (V, m)."""
         rows = np.repeat(~aside.ravel(), 2)
         r, B, F = (part * (rows if part.ndim == 1 else rows[:, None]) for part in (self.r, self.B, self.F))
         return self._replace(seen=self.seen & ~aside, r=r, B=B, F=F)
@@ -82,11 +89,11 @@ class Sums(NamedTuple):
     views: int  # views that they come from
     t: float  # when the last was taken, s from the first observation
     normal: FloatArray  # (c, c) of errors of the calibration, of what may be wrong, and of the residual
-    by_corner: FloatArray  # (c - 1, 4 m) its last column by coordinates that all show off by one deviation
+    by_corner: FloatArray  # (c - 1, 2 V m) its last column by coordinates that all show off by one deviation
     weight: float  # single observations that they are worth
     weight_squares: float  # Σ of its square over views
-    seen: FloatArray  # (2, m) coordinates seen of each marker
-    bias: FloatArray  # (2, m) squared errors of the model that they may have, over the noise
+    seen: FloatArray  # (V, m) coordinates seen of each marker
+    bias: FloatArray  # (V, m) squared errors of the model that they may have, over the noise
 
     def plus(self, other: "Sums", factor: float = 1.0) -> "Sums":
         """Sums and later ones times a factor."""
@@ -110,15 +117,14 @@ class ErrorModel:
         r = J δ + J_q δq + J_q q̇ δd + c + ε
 
     to first order: δ ~ N(0, Σ), errors of the calibration, the same all along; δq of the joint readings, the
-    same in both views of one instant; δd of the instant of each frame; c, errors of corners that last while
+    same in all views of one instant; δd of the instant of each frame; c, errors of corners that last while
     the view does, and ε, new in each frame, of the variance σ² together.
     """
 
     def __init__(self, calibration: Calibration, sigma_px: float) -> None:
-        calibration.require_left_and_right()
-        m, n = len(calibration.M), len(calibration.H_hat_0)
+        m, n, V = len(calibration.M), len(calibration.H_hat_0), len(calibration.P)
         self.calibration, self.scene = calibration, parameters_from(calibration)
-        self.errors, self.e = calibration.errors, calibration.sqrt_cov_shared.shape[1] + 3 * m
+        self.errors, self.e = errors_of(calibration), calibration.sqrt_cov_shared.shape[1] + 3 * m
         nonlinear = _BEYOND_FIRST_ORDER * calibration.sigma_px
         self._least = max(nonlinear, MIN_SIGMA)
         self._sigma = max(sigma_px, self._least)
@@ -132,18 +138,19 @@ class ErrorModel:
         self.directions = np.linalg.svd(calibration.a_inf[None])[2][1:]
         self.twists = rigid_motions(calibration.H_hat_0, self.directions, calibration.a_inf)
         self.cameras = [np.linalg.svd(P.reshape(1, CAMERA))[2][1:].T for P in calibration.P]
-        self.parts, self.touches, self.f = _directions_of(n, m, len(self.twists))
+        self.parts, self.touches, self.f = _directions_of(V, n, m, len(self.twists))
+        self.fixed = 2 * n + V  # columns of joints, their drift and instants, before those of cameras
         self.tool = slice(self.f - 2 * len(self.twists), self.f - len(self.twists))  # columns of its motions
-        # Squares (K, 2, m) by which corners erred while it was recorded, and where they were seen from.
+        # Squares (K, V, m) by which corners erred while it was recorded, and where they were seen from.
         self._squares = calibration.corner_squares
         if self._squares is not None and calibration.corner_q is not None:
             self._counts: BoolArray = np.isfinite(self._squares)
             self._typical = float(self._squares[self._counts].mean()) if self._counts.any() else 1.0
-            q = calibration.corner_q - calibration.q_reference
+            q = from_reference(calibration, calibration.corner_q)
             self._rays = _rays(self.scene, self.directions, q)
 
     def noise(self, seen: BoolArray, stated: FloatArray | None) -> FloatArray:
-        """Standard deviation (2, m) of pixels, px: those stated, as the calibration found them, if any."""
+        """Standard deviation (V, m) of pixels, px: those stated, as the calibration found them, if any."""
         common = np.full(seen.shape, self._sigma)
         if stated is None:
             return common
@@ -151,29 +158,30 @@ class ErrorModel:
 
     def residual(self, pair: FramePair) -> Residual:
         """Residuals of an observation and their derivatives, each view at its own joints."""
-        scene, away, views = self.scene, pair.q - self.calibration.q_reference, np.arange(2)
-        m, n, rows = len(scene.M), len(scene.H_hat), 4 * len(scene.M)
+        scene, away = self.scene, from_reference(self.calibration, pair.q)
+        (V, n), m = away.shape, len(scene.M)
+        views, rows = np.arange(V), 2 * V * m
         predicted = scene.predict(away)[views, views]
         r = pair.images - predicted
         seen = np.isfinite(r[..., 0])
         noise = pair.noise * np.sqrt(self._corner_variance(away))
         at = scene.everywhere(away)
         B = dense_pixel_changes(scene, self.errors, away, at)[views, views]
-        D = at.by_point.reshape(n + 1, 2, 2, m, 2, 4)[:, views, views]
-        Y = at.points.reshape(n + 1, 2, m, 4)
-        by_camera = at.by_camera.reshape(2, 2, m, 2, CAMERA)[views, views]
+        D = at.by_point.reshape(n + 1, V, V, m, 2, 4)[:, views, views]
+        Y = at.points.reshape(n + 1, V, m, 4)
+        by_camera = at.by_camera.reshape(V, V, m, 2, CAMERA)[views, views]
         F = self._fault_derivative(D, Y, by_camera, pair)
         for part in (r, B, F):
             part[~seen] = 0.0
         F = F.reshape(rows, -1)
-        J_q, sigma_t = F[:, :n], F[:, 2 * n : 2 * n + 2] * pair.sigma_t
-        # Errors of joints are the same in both views, but for their motion between both frames: then readings
-        # are not straight between each other, and round otherwise.
+        J_q, sigma_t = F[:, :n], F[:, 2 * n : self.fixed] * pair.sigma_t
+        # Errors of joints are the same in all views, but for their motion between frames: then readings are
+        # not straight between each other, and round otherwise.
         new = np.concatenate([J_q * self.sigma_q, sigma_t], axis=1)
-        if abs(pair.t[0] - pair.t[1]) > _AT_ONCE_S:
-            left = np.arange(rows)[:, None] < rows // 2
-            between = J_q * np.hypot(pair.curved, np.minimum(np.abs(pair.q[0] - pair.q[1]), self.sigma_q))
-            new = np.concatenate([new, between * left, between * ~left], axis=1)
+        if np.ptp(pair.t) > _AT_ONCE_S:
+            between = J_q * np.hypot(pair.curved, np.minimum(np.ptp(pair.q, axis=0), self.sigma_q))
+            view_of = np.repeat(views, 2 * m)[:, None]
+            new = np.concatenate([new, *(between * (view_of == v) for v in views)], axis=1)
         # An instant so uncertain that the arm moves on a curve: half the square of the angle.
         bend = 0.5 * np.abs(pair.q_dot).sum(axis=1).max() * (sigma_t @ pair.sigma_t)
         R = new @ new.T + np.diag(np.repeat(noise.ravel(), 2) ** 2 + bend**2)
@@ -182,14 +190,15 @@ class ErrorModel:
         )
 
     def _corner_variance(self, away: FloatArray) -> FloatArray:
-        """Variance of corners (2, m) over their noise, as detections of the calibration from near them err.
+        """Variance of corners (V, m) over their noise, as detections of the calibration from near them err.
 
         A corner that is seen from another side, or under another slant, errs otherwise.
-        away : (2, n) joints of both views from the reference.
+        away : (V, n) joints of the scene at each view, from the reference.
         """
         if self._squares is None:
-            return np.ones((2, len(self.scene.M)))
-        rays = np.stack([_rays(self.scene, self.directions, away[v : v + 1])[0, v] for v in (0, 1)])
+            return np.ones((len(away), len(self.scene.M)))
+        every = range(len(away))
+        rays = np.stack([_rays(self.scene, self.directions, away[v : v + 1])[0, v] for v in every])
         apart = 2.0 * (1.0 - np.abs(np.einsum("vmx,kwmx->vmkw", rays, self._rays)))
         near = np.exp(-0.5 * apart / _SLANT**2) * self._counts.transpose(2, 0, 1)
         squares = np.where(self._counts, self._squares, 0.0).transpose(2, 0, 1)
@@ -198,7 +207,8 @@ class ErrorModel:
 
     def slants(self, q: FloatArray) -> int:
         """Number of sides, between which corners err differently, that joints (K, n) show of the tool."""
-        rays = _rays(self.scene, self.directions, q - self.calibration.q_reference).reshape(len(q), -1, 3)
+        away = from_reference(self.calibration, q)
+        rays = _rays(self.scene, self.directions, away).reshape(len(q), -1, 3)
         sides: list[FloatArray] = []
         for ray in rays:
             apart = (2.0 * (1.0 - np.abs((ray * side).sum(axis=1)).mean()) for side in sides)
@@ -209,17 +219,18 @@ class ErrorModel:
     def _fault_derivative(
         self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, pair: FramePair
     ) -> FloatArray:
-        """Derivatives (2, m, 2, f) of pixels by what may be wrong, in the order of ``_directions_of``.
+        """Derivatives (V, m, 2, f) of pixels by what may be wrong, in the order of ``_directions_of``.
 
-        D : (n + 1, 2, m, 2, 4) by the points Y (n + 1, 2, m, 4) behind each joint; by_camera : (2, m, 2, 12).
+        D : (n + 1, V, m, 2, 4) by the points Y (n + 1, V, m, 4) behind each joint; by_camera : (V, m, 2, 12).
         """
-        n, _, m = Y[1:, ..., 0].shape
-        F, d = np.zeros((2, m, 2, self.f)), len(self.twists)
+        n, V, m = Y[1:, ..., 0].shape
+        F, d = np.zeros((V, m, 2, self.f)), len(self.twists)
         velocity = Y[:n] @ self.scene.H_hat[:, None].swapaxes(2, 3)
         J_q = np.moveaxis((D[:n] @ velocity[..., None])[..., 0], 0, -1)
+        J_q = -J_q[..., ::-1] if self.calibration.mount == TOOL else J_q
         F[..., :n], F[..., n : 2 * n] = J_q, J_q * pair.t[:, None, None, None]
-        by_marker, first = D[n] @ self.directions.T, 2 * n + 2
-        for v in (0, 1):
+        by_marker, first = D[n] @ self.directions.T, self.fixed
+        for v in range(V):
             F[v, ..., 2 * n + v] = -J_q[v] @ pair.q_dot[v]
             F[v, ..., first : first + CAMERA - 1] = by_camera[v] @ self.cameras[v]
             first += CAMERA - 1
@@ -250,7 +261,7 @@ class ErrorModel:
     def nothing(self) -> Sums:
         """Sums of no observation."""
         c = self.e + self.f + 1
-        none = np.zeros((2, len(self.calibration.M)))
+        none = np.zeros((len(self.calibration.P), len(self.calibration.M)))
         return Sums(
             views=0,
             t=0.0,
@@ -273,13 +284,13 @@ class ErrorModel:
         return bool(off @ off > chdtri(self.e, 1e-4))
 
     def persistent_prior(self, seconds: float, sigma_t: FloatArray) -> FloatArray:
-        """Information (2 n + 2, 2 n + 2) on errors of joints, their drift with time, and of instants.
+        """Information (2 n + V, 2 n + V) on errors of joints, their drift with time, and of instants.
 
         Over that time joints are off by a straight line, its middle and its slope by what lasts.
         """
         n = len(self.sigma_q)
         weight = np.diag((_LASTING * np.concatenate([self.sigma_q, self.sigma_q, sigma_t])) ** -2.0)
-        line = np.eye(2 * n + 2)
+        line = np.eye(self.fixed)
         line[:n, n : 2 * n] = 0.5 * seconds * np.eye(n)
         line[n : 2 * n, n : 2 * n] = max(seconds, LEAST_ERROR) / np.sqrt(12.0) * np.eye(n)
         return np.asarray(line.T @ weight @ line)
@@ -291,7 +302,7 @@ class MemoryState(NamedTuple):
     closed: tuple[Sums, ...]  # up to the end of each view, of the older ones fewer
     view: Sums  # observations of the view that lasts, fading
     length: float  # how many these are
-    first: FloatArray | None  # (2, m, 2) px predicted at its beginning
+    first: FloatArray | None  # (V, m, 2) px predicted at its beginning
 
     @property
     def views(self) -> int:
@@ -310,11 +321,11 @@ class Memory:
         self._before: tuple[Residual, BoolArray, bool] | None = None
         # Of differences from observation to observation, over σ²: in motion, at rest, and between views.
         self._squares, self._freedom = np.zeros(3), np.zeros(3)
-        # Of each detection (2, m) from one observation at rest to the next, px².
+        # Of each detection (V, m) from one observation at rest to the next, px².
         self._steps: deque[FloatArray] = deque(maxlen=_DIFFERENCES)
 
     def noise(self, stated: FloatArray) -> FloatArray:
-        """Standard deviations (2, m) of pixels, px: those stated, or as they tremble where that is more.
+        """Standard deviations (V, m) of pixels, px: those stated, or as they tremble where that is more.
 
         The median of differences at rest gives it: a step, such as a fault makes, does not move it.
         """
@@ -388,7 +399,7 @@ class Memory:
         """Learn the fresh error of each frame from two in a row, free of errors of joints and instants.
 
         Those at rest give it, once there are enough: a corner that moves by part of a pixel errs otherwise.
-        aside : (2, m) detections that are off by themselves, of which only the trembling counts.
+        aside : (V, m) detections that are off by themselves, of which only the trembling counts.
         disagrees : whether this observation does; a pair of which one does is skipped.
         """
         last, self._before = self._before, (now, aside, disagrees)
@@ -400,7 +411,8 @@ class Memory:
         before, n = last[0], len(self._errors.sigma_q)
         in_both = before.seen & now.seen
         rows = np.repeat((in_both & ~aside & ~last[1]).ravel(), 2)
-        weight, columns = 1.0 / np.repeat(now.noise.ravel(), 2)[:, None], [*range(n), 2 * n, 2 * n + 1]
+        weight = 1.0 / np.repeat(now.noise.ravel(), 2)[:, None]
+        columns = np.r_[:n, 2 * n : self._errors.fixed]  # of joints and instants
         off, moved = (now.r - before.r) * weight[:, 0], now.F[:, columns] * weight
         if kind == _BETWEEN_VIEWS:
             moved = np.concatenate([moved, before.F[:, columns] * weight], axis=1)
@@ -432,19 +444,19 @@ def _thinned(closed: list[Sums]) -> tuple[Sums, ...]:
 
 
 def is_same_view(before: FloatArray, now: FloatArray) -> bool:
-    """Whether predicted pixels (2, m, 2) are of one view, of which corners err alike."""
+    """Whether predicted pixels (V, m, 2) are of one view, of which corners err alike."""
     return _alike(before, now, _SAME_VIEW_PX)
 
 
 def _kind_of(before: FloatArray, now: FloatArray) -> int:
-    """Kind of the difference between two observations by their predicted pixels (2, m, 2)."""
+    """Kind of the difference between two observations by their predicted pixels (V, m, 2)."""
     if not is_same_view(before, now):
         return _BETWEEN_VIEWS
     return _AT_REST if _alike(before, now, _AT_REST_PX) else _IN_MOTION
 
 
 def _alike(before: FloatArray, now: FloatArray, within_px: float) -> bool:
-    """Whether predicted pixels (2, m, 2) are the same within so many px rms."""
+    """Whether predicted pixels (V, m, 2) are the same within so many px rms."""
     moved = np.square(now - before).sum(axis=-1)
     return bool(np.nanmean(np.append(moved, 0.0)) <= within_px**2)
 
@@ -472,7 +484,7 @@ class Tested(NamedTuple):
     """Tests of one observation."""
 
     disagrees: bool  # whether the whole of it does
-    aside: BoolArray  # (2, m) detections that are off by themselves
+    aside: BoolArray  # (V, m) detections that are off by themselves
 
 
 class Detector:
@@ -490,10 +502,10 @@ class Detector:
 
     def __init__(self, errors: ErrorModel, max_observations: int) -> None:
         self._errors, self.memory = errors, Memory(errors)
-        m = len(errors.calibration.M)
+        V, m = len(errors.calibration.P), len(errors.calibration.M)
         tail = _FALSE_ALARM / max_observations
         self._chance = _FALSE_ALARM / np.log1p(max_observations / _SOON)
-        self._most_once = np.sqrt(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail / (3 + m)))
+        self._most_once = np.sqrt(chdtri(np.maximum(np.arange(2 * V * m + 1), 1), tail / (V + 1 + m)))
         self._sizes = np.array([len(columns) for columns in errors.parts])
         self._by_size = [
             (which, np.array([errors.parts[i] for i in which]))
@@ -509,17 +521,17 @@ class Detector:
 
     def tested(self, residual: Residual) -> Tested:
         """Test χ² of each view and each marker in one observation, without detections off by themselves."""
-        errors, (_, m) = self._errors, residual.seen.shape
+        errors, (V, m) = self._errors, residual.seen.shape
         total = self.memory.total
         columns = np.concatenate([residual.B.T, total.normal[: errors.e, -1:]], axis=1)
         columns = solve_triangular(errors.root(total), columns, lower=True, check_finite=False)
         W = columns[:, :-1]
         S, r = W.T @ W + residual.R, residual.r - W.T @ columns[:, -1]
-        rows = np.arange(4 * m).reshape(2, m, 2)
-        single = self._beyond(S, r, rows.reshape(2 * m, 2), residual).reshape(2, m)
-        markers = self._beyond(S, r, rows.swapaxes(0, 1).reshape(m, 4), residual)
+        rows = np.arange(2 * V * m).reshape(V, m, 2)
+        single = self._beyond(S, r, rows.reshape(V * m, 2), residual).reshape(V, m)
+        markers = self._beyond(S, r, rows.swapaxes(0, 1).reshape(m, 2 * V), residual)
         aside = (single | (markers & ~single.any(axis=0))) & residual.seen
-        parts = (np.arange(2 * m) < m, np.arange(2 * m) >= m, np.ones(2 * m, dtype=np.bool_))
+        parts = [*np.repeat(np.eye(V, dtype=np.bool_), m, axis=1), np.ones(V * m, dtype=np.bool_)]
         off = [self._is_off(S, r, residual, aside, part) for part in parts]
         if any(off):
             aside[:] = False
@@ -528,9 +540,9 @@ class Detector:
     def _is_off(
         self, S: FloatArray, r: FloatArray, residual: Residual, aside: BoolArray, part: BoolArray
     ) -> bool:
-        """Whether a view, or both, disagree even without their worst detections, up to half, which go aside.
+        """Whether a view, or all, disagree even without their worst detections, up to half, which go aside.
 
-        part : (2 m,) its detections.
+        part : (V m,) its detections.
         """
         visible, out = residual.seen & part.reshape(aside.shape), aside.reshape(-1)
         allowed = _MOST_ASIDE * visible.sum(axis=1)
@@ -557,7 +569,7 @@ class Detector:
     ) -> Sums | None:
         """Sums before the likeliest onset of residuals beyond chance, if there is one.
 
-        count : of observations so far; sigma_t : (2,) deviation of instants, s; free : columns of markers
+        count : of observations so far; sigma_t : (V,) deviation of instants, s; free : columns of markers
         that are known to be off; thorough : test windows of all lengths, not of another one each time.
         """
         total, onsets = self.memory.total, self.memory.onsets()
@@ -591,9 +603,10 @@ class Detector:
         root = self._errors.root(total)
         along = solve_triangular(root, across[:e], lower=True, check_finite=False)
         normal = across[e:] - along.T @ along
-        nuisance = np.concatenate([np.arange(2 * n + 2), *free]).astype(np.int64)
+        fixed = self._errors.fixed
+        nuisance = np.concatenate([np.arange(fixed), *free]).astype(np.int64)
         weight = np.diag(np.maximum(minimum[nuisance], RIDGE))
-        weight[: 2 * n + 2, : 2 * n + 2] = self._errors.persistent_prior(total.t - since.t, sigma_t)
+        weight[:fixed, :fixed] = self._errors.persistent_prior(total.t - since.t, sigma_t)
         solved = np.linalg.solve(normal[np.ix_(nuisance, nuisance)] + weight, normal[nuisance])
         normal -= normal[:, nuisance] @ solved
         return _Reduced(
@@ -623,7 +636,8 @@ class Detector:
         spread, weight, memory = self._spread(since, total, reduced), total.weight - since.weight, self.memory
         share = np.minimum([_greatest(spread, reduced, parts[i]) / weight for i in beyond], 1.0)
         touched, seen = touches[beyond], (total.seen - since.seen).ravel()
-        corners = np.maximum(2.0 * touched @ (seen > 0.0), 4.0)  # coordinates of a view
+        # Coordinates of a view; of a marker at least those by two cameras, if there are two.
+        corners = np.maximum(2.0 * touched @ (seen > 0.0), 2.0 * min(2, len(total.seen)))
         worst = (1.0 - memory.fresh) * chdtri(corners, _LASTING_CORNERS) / corners * share * (touched @ seen)
         one = _one_of(since, total)
         nuisance = self._root_gains(reduced, (1.0 - one) * memory.persistent * spread)
@@ -648,22 +662,22 @@ class Detector:
         first, of a camera also since two thirds of them, since it may drift, and two deviations of that. The
         largest is returned: a fault has one cause.
 
-        carry : (k, 4 m) from changes of pixels to what is measured; at : images where it is measured.
+        carry : (k, 2 V m) from changes of pixels to what is measured; at : images where it is measured.
         Source: W. Baarda, "A testing procedure for use in geodetic networks", Delft 1968, on external
         reliability.
         """
-        total, onsets, n = self.memory.total, self.memory.onsets(), len(self._errors.sigma_q)
+        total, onsets, fixed = self.memory.total, self.memory.onsets(), self._errors.fixed
         if not onsets:
             return 0.0
         late, greatest = min(onsets, key=lambda sums: abs(sums.views - _NEARLY_WHOLE * total.views)), 0.0
-        cameras = 2 * n + 2 + 2 * (CAMERA - 1)
+        cameras = fixed + len(total.seen) * (CAMERA - 1)
         for since, end in ((onsets[0], self._errors.f), (late, cameras)):
             reduced = self._reduced(since, total, sigma_t, [])
             lasting = max(0.0, 1.0 - _one_of(since, total)) * self.memory.persistent
             lasting += (total.bias - since.bias).sum() / (total.seen - since.seen).sum()
             spread = reduced.normal[:-1, :-1] + lasting * self._spread(since, total, reduced)
             for part in self._errors.parts:
-                if not 2 * n + 2 <= part[0] < end:
+                if not fixed <= part[0] < end:
                     continue
                 size = np.sqrt(np.maximum(reduced.normal.diagonal(), _LEAST_INFORMATION))[part]
                 unit, block = np.outer(size, size), np.ix_(part, part)
@@ -730,11 +744,11 @@ def coordinate_rows(detections: IntArray) -> IntArray:
 
 
 def _rays(scene: Parameters, directions: FloatArray, q: FloatArray) -> FloatArray:
-    """Lines of sight (K, 2, m, 3) of all markers in the frame of the tool, unit vectors but for their sign.
+    """Lines of sight (K, V, m, 3) of all markers in their own frame, unit vectors but for their sign.
 
-    directions : (3, 4) of points at infinity; q : (K, n) joints from the reference.
+    directions : (3, 4) of points at infinity; q : (K, n) joints of the scene, from the reference.
     """
-    by_marker = scene.everywhere(q).by_point[-1].reshape(2, len(q), len(scene.M), 2, 4) @ directions.T
+    by_marker = scene.everywhere(q).by_point[-1].reshape(-1, len(q), len(scene.M), 2, 4) @ directions.T
     ray = np.cross(by_marker[..., 0, :], by_marker[..., 1, :])
     return np.asarray((ray / np.linalg.norm(ray, axis=-1, keepdims=True)).swapaxes(0, 1))
 
@@ -747,22 +761,22 @@ def rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) 
     return np.asarray(rows[:6][sizes[:6] > _RANK * sizes[0]].reshape(-1, 4, 4))
 
 
-def _directions_of(n: int, m: int, d: int) -> tuple[list[IntArray], FloatArray, int]:
-    """Columns of each direction of a fault, detections (h, 2 m) that each touches, and how many columns.
+def _directions_of(V: int, n: int, m: int, d: int) -> tuple[list[IntArray], FloatArray, int]:
+    """Columns of each direction of a fault, detections (h, V m) that each touches, and how many columns.
 
-    The columns are: joints, joints that go on, instants, cameras, markers, rigid motions of the tool and of
-    the rig.
+    The columns are: joints, joints that go on, instants, cameras, markers, rigid motions of all markers and
+    of all cameras.
     """
-    everything = np.ones((2, m))
-    views = [everything * (np.arange(2)[:, None] == v) for v in (0, 1)]
-    at_camera, free = 2 * n + 2, CAMERA - 1
-    at_marker = at_camera + 2 * free
+    everything = np.ones((V, m))
+    views = [everything * (np.arange(V)[:, None] == v) for v in range(V)]
+    at_camera, free = 2 * n + V, CAMERA - 1
+    at_marker = at_camera + V * free
     at_tool = at_marker + 3 * m
     directions = [*((np.array([i]), everything) for i in range(2 * n))]
     directions += [(n + np.arange(n), everything), (np.arange(n), everything)]
-    for v in (0, 1):
+    for v in range(V):
         directions += [(np.array([2 * n + v]), views[v]), (at_camera + v * free + np.arange(free), views[v])]
-    directions += [(2 * n + np.arange(2), everything)]
+    directions += [(2 * n + np.arange(V), everything)]
     for j in range(m):
         directions += [(at_marker + 3 * j + np.arange(3), everything * (np.arange(m) == j))]
     directions += [(at_tool + np.arange(d), everything), (at_tool + d + np.arange(d), everything)]
@@ -772,5 +786,5 @@ def _directions_of(n: int, m: int, d: int) -> tuple[list[IntArray], FloatArray, 
 
 def columns_of_marker(errors: ErrorModel, marker: int) -> IntArray:
     """Columns of the displacement of a marker among the directions of faults."""
-    n = len(errors.sigma_q)
-    return np.asarray(2 * n + 2 + 2 * (CAMERA - 1) + 3 * marker + np.arange(3))
+    first = errors.fixed + len(errors.calibration.P) * (CAMERA - 1)
+    return np.asarray(first + 3 * marker + np.arange(3))
