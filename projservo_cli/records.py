@@ -341,19 +341,6 @@ class ProjectiveKinematics:
         """Whether the method says how far it is off."""
         return bool(np.isfinite(self.sqrt_cov_shared).all())
 
-    def require_left_and_right(self) -> None:
-        """Raise InputError unless two fixed views are left and right, as tasks and laws take them."""
-        if self.mount != WORLD:
-            raise InputError(
-                "the cameras of the calibration are on the tool; tasks, laws and tests of images take "
-                "cameras that stand still: it serves calibrate and validate"
-            )
-        if self.view != VIEWS:
-            raise InputError(
-                f"the calibration has the views {', '.join(self.view)}; tasks, laws and tests of images take "
-                "left and right: calibrate from columns u_left, v_left, u_right, v_right"
-            )
-
     def indices_of(self, numbers: Iterable[int]) -> list[int]:
         """Return indices of markers in ``marker`` and ``M`` by their numbers; ValueError if unknown."""
         known = self.marker.tolist()

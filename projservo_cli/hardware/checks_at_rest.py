@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -11,18 +11,18 @@ import numpy as np
 from projservo_cli.detection import MIN_CELL, Corners, TagFinder, dictionaries
 from projservo_cli.hardware.camera_robot import View, exposure_of
 from projservo_cli.hardware.cameras import Camera, stable_name
-from projservo_cli.records import CORNERS, ByteArray, FloatArray, JointLimits, in_unit
+from projservo_cli.records import CORNERS, BoolArray, ByteArray, FloatArray, JointLimits, in_unit
 
 FAULT, WARNING, FINE = "fault", "warning", "fine"
 # Width of a cell, px, from which corners are good.
 _GOOD_CELL = 4.0
 # Frames a second, as a share of those asked for, below which a camera is slow; those of webcams by day, 1/s.
 _SLOW, _USUAL_HZ = 0.75, 30.0
-# Angle between the directions from which both cameras see a tag, deg: depth errors grow with its inverse.
+# Angle between the directions from which two cameras see a tag, deg: depth errors grow with its inverse.
 _MIN_ANGLE_DEG, _GOOD_ANGLE_DEG = 4.0, 10.0
 # Standard deviations of a corner by which perspective must move it to show the side of a tilt.
 _CERTAIN = 4.0
-# Markers that both cameras must see: a turn about a line through two shows in no image.
+# Markers that two cameras, or the only one, must see: a turn about a line through two shows in no image.
 MIN_SHARED = 3
 # Distance from a limit at which a joint has no room, rad.
 _ROOM = math.radians(1.0)
@@ -44,9 +44,9 @@ class RobotAtRest:
     marker: Sequence[int]  # numbers of the markers
     face: Sequence[int]  # those that must stay visible
     q: FloatArray  # (n,) mean of the joint readings, rad or m
-    s: FloatArray  # (2, m, 2) mean of the pixels, NaN where most frames do not show a marker
-    sigma: FloatArray | None  # (2, m) deviation of a corner of one frame as the detector states it, px
-    scatter: FloatArray  # (2, m) between frames, px
+    s: FloatArray  # (V, m, 2) mean of the pixels, NaN where most frames do not show a marker
+    sigma: FloatArray | None  # (V, m) deviation of a corner of one frame as the detector states it, px
+    scatter: FloatArray  # (V, m) between frames, px
     limits: JointLimits
     units: Sequence[str]  # of the joints, for messages
     views: Sequence[View] = ()  # the last one of each camera of projservo
@@ -64,7 +64,7 @@ def findings_at_rest(
     for camera, view in zip(robot.cameras, robot.views, strict=True):
         yield from _of_camera(camera)
         yield from _of_tags(camera.name, view, robot, finder, dictionary)
-    yield from _of_both(robot)
+    yield from _of_all_views(robot)
     yield from _of_joints(robot, FAULT if moves else WARNING)
 
 
@@ -157,25 +157,34 @@ def _other_dictionary(grey: ByteArray, dictionary: str) -> tuple[str, int]:
     return best, counts[best][0]
 
 
-def _of_both(robot: RobotAtRest) -> Iterator[Finding]:
-    """Markers that both cameras see, the face among them, and whether the views differ enough for depth."""
+def _of_all_views(robot: RobotAtRest) -> Iterator[Finding]:
+    """Markers that two cameras or more see, the face among them, and whether views differ enough for depth.
+
+    Of a single camera those that it sees.
+    """
     visible = np.isfinite(robot.s[..., 0])
-    shared = int(visible.all(axis=0).sum())
+    images, cameras, share, lack = {
+        1: ("image", "the camera", "shows", "does not show"),
+        2: ("both images", "both cameras", "share", "do not both show"),
+    }.get(len(visible), ("images", "the cameras", "two or more show", "fewer than two show"))
+    in_two: BoolArray = visible.sum(axis=0) >= min(2, len(visible))
+    shared = int(in_two.sum())
     if visible.any(axis=1).all() and shared < MIN_SHARED:
-        remedy = "turn the tool towards both cameras, or move them"
-        what = f"share {shared} of {len(robot.marker)} markers ({MIN_SHARED} at least)"
-        yield Finding(FAULT, "both images", what, remedy)
+        remedy = f"turn the tool towards {cameras}, or move {'it' if len(visible) == 1 else 'them'}"
+        what = f"{share} {shared} of {len(robot.marker)} markers ({MIN_SHARED} at least)"
+        yield Finding(FAULT, images, what, remedy)
     elif shared:
-        yield Finding(FINE, "both images", f"share {shared} of {len(robot.marker)} markers")
-    shared_numbers = {number for k, number in enumerate(robot.marker) if visible[:, k].all()}
+        yield Finding(FINE, images, f"{share} {shared} of {len(robot.marker)} markers")
+    shared_numbers = {number for k, number in enumerate(robot.marker) if in_two[k]}
     for number in robot.marker:
         if shared and number in robot.face and number not in shared_numbers:
-            what = f"do not both show marker {number} of the face, tag {number // CORNERS}"
-            remedy = "turn the tool towards both cameras, or name another markers.face"
-            yield Finding(WARNING, "both images", what, remedy)
+            what = f"{lack} marker {number} of the face, tag {number // CORNERS}"
+            remedy = f"turn the tool towards {cameras}, or name another markers.face"
+            yield Finding(WARNING, images, what, remedy)
             break
-    if len(robot.views) == 2:
-        angle = view_angle_deg(robot.views[0].tags, robot.views[1].tags)
+    if len(robot.views) > 1:
+        angles = [view_angle_deg(one.tags, other.tags) for one, other in combinations(robot.views, 2)]
+        angle = max(angles, key=lambda one: -math.inf if math.isnan(one) else one)
         if angle < _GOOD_ANGLE_DEG:
             what = (
                 f"the cameras see the tags from directions {angle:.1f}° apart ({_GOOD_ANGLE_DEG:g}° at least)"
@@ -183,9 +192,9 @@ def _of_both(robot: RobotAtRest) -> Iterator[Finding]:
             remedy = (
                 "move them apart, by a third of their distance from the tool: depth shows in their difference"
             )
-            yield Finding(FAULT if angle < _MIN_ANGLE_DEG else WARNING, "both cameras", what, remedy)
+            yield Finding(FAULT if angle < _MIN_ANGLE_DEG else WARNING, cameras, what, remedy)
         elif np.isfinite(angle):
-            yield Finding(FINE, "both cameras", f"see the tags from directions {angle:.0f}° apart")
+            yield Finding(FINE, cameras, f"see the tags from directions {angle:.0f}° apart")
     noise, stated = np.nanmedian(robot.scatter) if np.isfinite(robot.scatter).any() else 0.0, robot.sigma
     if (
         stated is not None
@@ -197,11 +206,11 @@ def _of_both(robot: RobotAtRest) -> Iterator[Finding]:
             f"corners scatter by {noise:.2g} px at rest, {noise / np.nanmedian(stated):.0f} times their noise"
         )
         remedy = "look for lamps that flicker, tables that shake, and autofocus"
-        yield Finding(WARNING, "both images", what, remedy)
+        yield Finding(WARNING, images, what, remedy)
 
 
 def view_angle_deg(left: Mapping[int, Corners], right: Mapping[int, Corners]) -> float:
-    """Angle between the directions from which both cameras see the tags, median over tags; NaN without one.
+    """Angle between the directions from which two cameras see the tags, median over tags; NaN without one.
 
     Tags whose perspective does not show to which side they are tilted count where there are no others; of the
     sides that fit them the nearer ones are taken.

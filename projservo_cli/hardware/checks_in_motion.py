@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 
 from projservo_cli.calibration.detections import per_rad
 from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding
-from projservo_cli.records import CORNERS, VIEWS, BoolArray, FloatArray, IntArray
+from projservo_cli.records import CORNERS, TOOL, VIEWS, WORLD, BoolArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.pacing import Steered
 
@@ -212,12 +212,17 @@ def _direction(t_q: FloatArray, q: FloatArray, t: FloatArray, passing: float) ->
     return up[at], far[at]
 
 
-def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Finding]:
-    """Findings of the strokes of all joints; numbers : of the markers."""
-    still, total = [], np.zeros((2, len(_LATENCIES)))
-    most = np.zeros(2)  # motion of each image, px
+def findings_of(
+    moved: Sequence[Strokes], numbers: Sequence[int], view: Sequence[str] = VIEWS, mount: str = WORLD
+) -> Iterator[Finding]:
+    """Findings of the strokes of all joints.
+
+    numbers : of the markers; view : names of the views; mount : of the cameras, on the tool or not.
+    """
+    still, total = [], np.zeros((len(view), len(_LATENCIES)))
+    most = np.zeros(len(view))  # motion of each image, px
     for trial in moved:
-        signals = [_signal(trial, view) for view in range(2)]
+        signals = [_signal(trial, v) for v in range(len(view))]
         fits = [_passed(trial, signal) for signal in signals]
         if trial.given_up:
             remedy = (
@@ -236,11 +241,11 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
         if span < _MOVES_PX:
             still.append(trial.joint)
         else:
-            for view, fit in enumerate(fits):
-                total[view] += 0.0 if fit is None else fit.squares
+            for v, fit in enumerate(fits):
+                total[v] += 0.0 if fit is None else fit.squares
         yield from _of_servo(trial, [fit for fit in fits if fit is not None] if span >= _MOVES_PX else [])
-    yield from _of_still(still, len(moved))
-    for name, squares, px in zip(VIEWS, total, most, strict=True):
+    yield from _of_still(still, len(moved), mount)
+    for name, squares, px in zip(view, total, most, strict=True):
         if px < _MOVES_PX <= most.max():
             what = f"its tags moved by {px:.1f} px with the joints ({_MOVES_PX:g} at least)"
             yield Finding(FAULT, f"{name} camera", what, "look whether its image is live, and of this arm")
@@ -255,7 +260,7 @@ def findings_of(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Fi
                 WARNING if remedy else FINE, f"{name} camera", f"latency {1e3 * latency:.0f} ms", remedy
             )
     if most.max() >= _MOVES_PX:
-        yield from _of_loose_tags(moved, numbers)
+        yield from _of_loose_tags(moved, numbers, mount)
 
 
 def _minimum(squares: FloatArray) -> float:
@@ -287,8 +292,8 @@ def _of_servo(moved: Strokes, fits: Sequence[_Fit]) -> Iterator[Finding]:
     yield Finding(WARNING if wide else FINE, f"joint {moved.joint + 1}", ", ".join(parts), remedy)
 
 
-def _of_still(still: Sequence[int], n: int) -> Iterator[Finding]:
-    """Joints with which no tag moves."""
+def _of_still(still: Sequence[int], n: int, mount: str) -> Iterator[Finding]:
+    """Joints with which no tag moves in the images."""
     if not still:
         return
     names = ", ".join(str(i + 1) for i in still)
@@ -296,8 +301,12 @@ def _of_still(still: Sequence[int], n: int) -> Iterator[Finding]:
     if len(still) == n:
         what, remedy = (
             "turned, and no tag moved",
-            "look whether the tags are on this arm, and that the images are live",
+            f"look whether the {'cameras' if mount == TOOL else 'tags'} are on this arm, and that the images "
+            "are live",
         )
+    elif [*still] == [*range(still[0], n)] and mount == TOOL:
+        what = f"turned, and no tag moved: the cameras sit on the link before joint {still[0] + 1}"
+        remedy = "mount them behind the last joint"
     elif [*still] == [*range(still[0], n)]:
         what = f"turned, and no tag moved: the tags sit on the link before joint {still[0] + 1}"
         remedy = "mount them behind the last joint, on the fixed part of the tool and not on a moving jaw"
@@ -306,11 +315,11 @@ def _of_still(still: Sequence[int], n: int) -> Iterator[Finding]:
     yield Finding(FAULT, where, what, remedy)
 
 
-def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator[Finding]:
+def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int], mount: str) -> Iterator[Finding]:
     """Tags that moved against the others between rests in the middle, come to from either side.
 
     Hysteresis and backlash leave small motions of the joints, which all tags follow by the images of the
-    strokes; the other tags show the motions of the joints, and the rest is motion on the tool.
+    strokes; the other tags show the motions of the joints, and the rest is motion of the tag itself.
     """
     sound = [trial for trial in moved if not trial.given_up]
     rests = [_at_rest(trial, stroke) for trial in sound for stroke in (_FROM_BELOW, _FROM_ABOVE)]
@@ -318,7 +327,7 @@ def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator
     tag = np.array(numbers) // CORNERS
     worst: dict[int, float] = {}
     for rest in rests[1:]:
-        columns = np.stack([*spans, rest - rests[0]], axis=-1)  # (2, m, 2, j + 1)
+        columns = np.stack([*spans, rest - rests[0]], axis=-1)  # (V, m, 2, j + 1)
         detected = np.isfinite(columns).all(axis=(2, 3))
         for number in sorted(set(tag.tolist())):
             own, others = detected & (tag == number), detected & (tag != number)
@@ -335,9 +344,9 @@ def _of_loose_tags(moved: Sequence[Strokes], numbers: Sequence[int]) -> Iterator
         what = f"tag {number} moved by {worst[number]:.1f} px against the others"
         yield Finding(FAULT, "tags", what, "glue it flat on a stiff part, all tags on the same one")
     elif len(rests) > 1 and len(set(tag.tolist())) > 1:
-        yield Finding(FINE, "tags", "sit fast on the tool")
+        yield Finding(FINE, "tags", f"sit fast {'in the scene' if mount == TOOL else 'on the tool'}")
 
 
 def _at_rest(moved: Strokes, stroke: int) -> FloatArray:
-    """Mean pixels (2, m, 2) at rest at the end of a stroke."""
+    """Mean pixels (V, m, 2) at rest at the end of a stroke."""
     return np.asarray(np.mean([moved.readings[k].s for k in moved.rest(stroke)], axis=0))

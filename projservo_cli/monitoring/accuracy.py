@@ -49,7 +49,9 @@ class Posture:
     """
 
     def __init__(self, model: Model, q: FloatArray, face: FloatArray, lengths: FloatArray) -> None:
-        self._model, self._away = model, (q - model.q_reference)[None]
+        self._model, way = model, -1 if model.on_tool else 1
+        self._away = (q - model.q_reference)[None, ::way]
+        self._chain = model.H_hat_0[::way], model.prismatic[::way]
         self._twists = rigid_motions(model.H_hat_0, np.linalg.svd(model.a_inf[None])[2][1:], model.a_inf)
         has: BoolArray = np.isfinite(lengths) & (lengths > 0.0)
         self.known = bool(has.any())
@@ -74,8 +76,7 @@ class Posture:
 
     def _changes(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (V, m, 2, d) of pixels of markers (m, 4) by motions of the tool, and the pixels."""
-        model, prismatic = self._model, self._model.prismatic
-        images = Parameters(model.P, model.H_hat_0, prismatic, M, model.lens).everywhere(self._away)
+        images = Parameters(self._model.P, *self._chain, M, self._model.lens).everywhere(self._away)
         return images.by_point[-1] @ np.moveaxis(M @ self._twists.swapaxes(1, 2), 0, -1), images.pixels
 
     def carry(self, M: FloatArray, used: BoolArray) -> FloatArray:

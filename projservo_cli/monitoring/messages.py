@@ -100,7 +100,7 @@ def _moved(explanation: Explanation, calibration: Calibration) -> str:
     moved = sorted(int(calibration.marker[j]) for j in explanation.cause.markers)
     listed, where = ", ".join(map(str, moved)), PLACE[calibration.mount]
     by = f"by {explanation.changed_px:.2g} px"
-    by += ", or something covers their edges" if len(calibration.view) == 1 else ""
+    by += ", or is covered in part" if len(calibration.view) == 1 else ""
     tag = moved[0] // CORNERS
     if len(moved) == CORNERS and moved[-1] // CORNERS == tag:
         return f"tag {tag} (markers {listed}) moved {where}, {by}; put it back, or recalibrate"

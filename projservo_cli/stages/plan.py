@@ -180,7 +180,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
         q = images.joints.values(calibration.joint_types)
         if fault := detected_fault(calibration, q, numbers, seen, size):
             raise WorkFailed(_CHANGED.format(fault=fault, advice="teach it again"))
-        _require_rigid(rigid_fit(calibration, q, *whole), "teach it again")
+        _require_rigid(rigid_fit(calibration, q, *whole), calibration.view, "teach it again")
         return
     stated = images.sigma_px(scenario.numbers[: scenario.m], scenario.inputs.face)
     sigma = scenario.noise_px if stated is None else stated
@@ -198,7 +198,7 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
         "take the images again, or give their deviations (sigma_left_px and sigma_right_px of "
         "task.goal.images)"
     )
-    _require_rigid(fit, advice)
+    _require_rigid(fit, calibration.view, advice)
     alone = fit.off_px * (np.isfinite(whole[0][..., 0]) & ~fit.seen)
     view, k = np.unravel_index(int(np.argmax(alone)), alone.shape)
     if alone[view, k] > near_px:
@@ -221,14 +221,15 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
 _CHANGED = "the goal was taught after a change since the calibration: {fault}; {advice}"
 
 
-def _require_rigid(fit: RigidFit, advice: str) -> None:
+def _require_rigid(fit: RigidFit, view: Sequence[str], advice: str) -> None:
     """Refuse goal images of which chance does not explain what the nearest pose of the tool leaves."""
     if not fit.agrees:
-        u, v = fit.shift
+        (u, v), others = fit.shift, f"{view[-1]} one" if len(view) == 2 else "others"
+        shifted = f", as if the {view[fit.view]} image were shifted by ({u:.2g}, {v:.2g}) px against the "
         raise WorkFailed(
             f"the goal images fit no pose of the tool: the nearest leaves {fit.rms_px:.3g} px rms a "
-            f"coordinate, their deviations explain {fit.limit_px:.3g} px, as if the left image were shifted "
-            f"by ({u:.2g}, {v:.2g}) px against the right one; {advice}"
+            f"coordinate, their deviations explain {fit.limit_px:.3g} px"
+            f"{shifted + others if len(view) > 1 else ''}; {advice}"
         )
 
 

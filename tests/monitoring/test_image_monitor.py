@@ -78,19 +78,19 @@ def arm():
 
 
 def look(test, k, q, s):
-    """What a test says of still joints (n,) and images (2, m, 2)."""
-    still, new = np.zeros((2, len(q))), np.ones(2, dtype=bool)
-    return test.observe(np.full(2, PERIOD * k), np.stack([q] * 2), still, np.zeros(2), s, new)
+    """What a test says of still joints (n,) and images (V, m, 2)."""
+    still, new = np.zeros((len(s), len(q))), np.ones(len(s), dtype=bool)
+    return test.observe(np.full(len(s), PERIOD * k), np.stack([q] * len(s)), still, np.zeros(len(s)), s, new)
 
 
 def first_alarm(arm, read, s, q_dot=None, delay_sigma=0.0, fresh=None, sigma=SIGMA, stated=None):
-    """When something is said of looks at readings (k, n) and images (k, 2, m, 2), and what."""
-    test = ImageMonitor(arm.calibration, sigma, LOOKS)
+    """When something is said of looks at readings (k, n) and images (k, V, m, 2), and what."""
+    test, V = ImageMonitor(arm.calibration, sigma, LOOKS), s.shape[1]
     for k in range(len(read)):
         speed = np.zeros(read.shape[1]) if q_dot is None else q_dot[k]
-        new = np.ones(2, dtype=bool) if fresh is None else fresh[k]
-        at_once, t = (np.stack([row] * 2) for row in (read[k], speed)), np.full(2, PERIOD * k)
-        said = test.observe(t, *at_once, np.full(2, delay_sigma), s[k], new, stated=stated)
+        new = np.ones(V, dtype=bool) if fresh is None else fresh[k]
+        at_once, t = (np.stack([row] * V) for row in (read[k], speed)), np.full(V, PERIOD * k)
+        said = test.observe(t, *at_once, np.full(V, delay_sigma), s[k], new, stated=stated)
         if said:
             return k, said
     return None, ""
