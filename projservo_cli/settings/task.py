@@ -138,7 +138,7 @@ class KeptOut(Section):
     def polygons(self, view: Sequence[str]) -> list[_Polygon | None]:
         """Its polygon in each of the views, None for none. Raises InputError for another name."""
         if unknown := [name for name in self.drawn if name not in view]:
-            raise InputError(f"trajectory.keep_out: {unknown[0]} is no view: {', '.join(view)} are")
+            raise InputError(f"trajectory.keep_out: {unknown[0]} is no view; the views are {', '.join(view)}")
         return [self.drawn.get(name) for name in view]
 
 
