@@ -145,10 +145,8 @@ def test_cameras_around_ask_for_as_many_views_as_they_have():
 
 
 def test_what_a_rig_cannot_do_is_told():
-    config, calibration, made = chain("one")
-    with pytest.raises(
-        InputError, match="control.features: points are measured from two views, and there are 1"
-    ):
+    calibration = chain("one")[1]
+    with pytest.raises(InputError, match=r"control\.features: points are measured from two views"):
         plan.run(rigged("one", "control.features=points"), calibration)
     drawn = "trajectory.keep_out=[{left: [[0, 0], [9, 0], [9, 9]]}]"
     with pytest.raises(InputError, match=r"left is no view; the views are webcam"):
