@@ -202,7 +202,8 @@ class ImageModel(Displayable, Calibration):
         between : two ends of the length: the numbers of two markers; ``tags``, the sides of all; ``cameras``,
             the distance of their centres; or ``joint``, the readings of the first prismatic joint.
         length_std_m : standard deviation of the length, m.
-        face : numbers of markers whose frame the tool has, by default all.
+        face : numbers of markers whose frame the tool has, by default all; with cameras on it, the tool is
+            the flange, whose frame is by the joints.
 
         Raises
         ------
@@ -210,8 +211,6 @@ class ImageModel(Displayable, Calibration):
             If the joints determine no metric, the images of one camera are mirrored, the length is not known,
             or the method has no covariance.
         """
-        if self.mount == TOOL:
-            raise InputError("metric: takes fixed cameras; those of this calibration are on the tool")
         if not self.has_covariance or not self.sqrt_cov_shared.size:
             raise InputError(f"metric: the method {self.method} has no covariance: use bundle_adjustment")
         return MetricModel.of(
@@ -278,16 +277,18 @@ class ImageModel(Displayable, Calibration):
 class MetricModel(Printed, Metric):
     """A calibration in metres, in the base frame of the arm: its arrays, and functions with covariances.
 
-    Arrays: ``K`` (2, 3, 3) intrinsic matrices, px; ``lens`` (2, 5) centre u, v and radius, px, then k1, k2;
-    ``poses`` (2, 4, 4) of both cameras in the base, z forward and y down, m; ``axes`` (n, 6) screws of the
+    Arrays: ``K`` (V, 3, 3) intrinsic matrices, px; ``lens`` (V, 5) centre u, v and radius, px, then k1, k2;
+    ``poses`` (V, 4, 4) of the cameras in the base, z forward and y down, m; ``axes`` (n, 6) screws of the
     joints at readings of zero, w rad and v m, per rad or m; ``markers`` (m, 3) in the tool frame, m. Of each
-    ``covariance`` (name).
+    ``covariance`` (name). With cameras on the tool, ``poses`` are in the flange, the hand-eye transformation,
+    and ``markers`` in the base.
 
     The base frame has z along joint 1 and x along z × the direction of the first joint that is not parallel
     to it, at readings of zero; its origin is on the first revolute axis, at its common normal with the first
     revolute one that is not parallel. The tool frame has its origin at the mean of the face, x from its first
-    marker to its second, and z across them and the next that is off their line. ``in_frames_of`` takes those
-    of a model instead. Covariances are those of the calibration, to first order, with those of frames and of
+    marker to its second, and z across them and the next that is off their line. The flange frame of cameras
+    on the tool is that of the base, from the last joint back. ``in_frames_of`` takes those of a model
+    instead. Covariances are those of the calibration, to first order, with those of frames and of
     the known length.
     """
 
@@ -348,14 +349,15 @@ class MetricModel(Printed, Metric):
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""
-        places, of_poses = self.poses[:, :3, 3], self.covariance("poses")[:, 3:, 3:]
+        places, of_poses = self.poses[:, :3, 3], self.covariance("poses")
         focal, of_K = self.K[:, (0, 1), (0, 1)], np.sqrt(self.covariance("K")[:, 0, 0])
         found = {"joints": self.joint_types, "markers": f"{len(self.marker)}"}
         for v, view in enumerate(self.view):
-            at, std = ", ".join(f"{x:.4g}" for x in places[v]), MM * np.sqrt(np.trace(of_poses[v]))
-            found[f"{view} camera"] = (
-                f"at ({at}) m ± {std:.2g} mm, focal length {focal[v].mean():.5g} ± {of_K[v]:.2g} px"
-            )
+            std, turn = (np.sqrt(np.trace(part)) for part in (of_poses[v, 3:, 3:], of_poses[v, :3, :3]))
+            at = f"({', '.join(f'{x:.4g}' for x in places[v])}) m ± {MM * std:.2g} mm"
+            if self.mount == TOOL:
+                at += f", {np.degrees(turn):.2g}° in the flange"
+            found[f"{view} camera"] = f"at {at}, focal length {focal[v].mean():.5g} ± {of_K[v]:.2g} px"
         distances = links(self.axes, self.prismatic, self.axes)[1]
         found["links"] = ", ".join("–" if np.isnan(d) else f"{d:.4g}" for d in distances) + " m between axes"
         return found

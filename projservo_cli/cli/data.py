@@ -367,5 +367,6 @@ def _position_errors(
     table, fit = (None if path is None else read_positions(path, types, joint_unit) for path in tables)
     assert table is not None
     # The instrument sets the scale, so any unit serves.
-    metric = ImageModel.of(calibration).metric(1.0, "cameras")
+    unit: Any = "cameras" if len(calibration.view) > 1 else calibration.marker[:2]
+    metric = ImageModel.of(calibration).metric(1.0, unit)
     return position_errors(metric, table, fit, arm_std_mm / 1e3)

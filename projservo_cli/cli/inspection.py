@@ -147,11 +147,13 @@ def _export(
     With --to csv, writes a table for each result, a column for each index of an array, and fields.csv, which
     says what every array is, in which unit.
 
-    The other kinds are in metres, by a known length: opencv both cameras for cv2.FileStorage, urdf the arm,
-    ros static transforms of the cameras, json all numbers with their covariances.
+    The other kinds are in metres, by a known length: opencv the cameras for cv2.FileStorage, urdf the arm,
+    ros static transforms of the cameras, json all numbers with their covariances. Cameras on the tool come
+    in the frame of the flange: the hand-eye transformation.
 
     With --nominal it lists the errors of zeros and axes of a model, the most significant first. With --frames
-    model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip. A model
+    model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip; cameras
+    on the tool are in that tip. A model
     that does not describe the arm, as one in which a joint turns the other way, ends in exit code 1, and so
     does a known length that contradicts its links or a prismatic joint, or puts a camera beyond 20 m.
     """
@@ -195,7 +197,7 @@ def _in_metres(
     from projservo_cli.config.inputs import joints_of
     from projservo_cli.metric.contradictions import contradictions, kinematic_words
     from projservo_cli.metric.opencv import opencv_cameras
-    from projservo_cli.records import WorkFailed
+    from projservo_cli.records import TOOL, WorkFailed
     from projservo_cli.results import ImageModel
     from projservo_cli.store import exports
 
@@ -219,13 +221,16 @@ def _in_metres(
         raise WorkFailed(f"export: {wrong}; check the known length, in m, and its ends, or the model")
     if model is not None and model[2]:
         metric = metric.in_frames_of(*model[:2])
+    if metric.mount == TOOL:
+        value["mount"] = metric.mount
+        words += [f"{view} camera {metric.summary()[f'{view} camera']}" for view in metric.view]
     if to == "opencv":
         found = opencv_cameras(metric, calibration)
         value |= {"delta_chi2": found.delta_chi2, "lens_rms_px": found.lens_rms_px}
         words.insert(0, f"cameras without skew cost Δχ² {found.skew_chi2:.3g} (2 on average)")
         if calibration.lens is not None:
             words[0] += f", OpenCV's lens {found.lens_chi2:.2g} ({found.lens_rms_px:.2g} px rms)"
-        return exports.opencv_yaml(found, config.image_size_px, metric.view), value, words
+        return exports.opencv_yaml(found, config.image_size_px, metric.view, metric.mount), value, words
     if to == "urdf":
         names = [name or f"joint_{i}" for i, name in enumerate(config.joint_names, 1)]
         names += [f"joint_{i}" for i in range(len(names) + 1, len(metric.joint_types) + 1)]
@@ -235,7 +240,10 @@ def _in_metres(
             words.append("where limits of joints are unknown, they are the readings of the trial motions")
         limits = np.where(np.isfinite(limits), limits, metric.range)
         return exports.urdf(metric, names, limits), value, words
-    return exports.static_transforms(metric) if to == "ros" else exports.to_json(metric, value), value, words
+    if to == "ros":
+        link = model[1] if model is not None and model[2] else None
+        return exports.static_transforms(metric, link or exports.FLANGE), value, words
+    return exports.to_json(metric, value), value, words
 
 
 def _ends(between: str) -> Any:

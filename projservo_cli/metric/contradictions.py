@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.metric.frame import Metric
 from projservo_cli.metric.kinematic_errors import KinematicErrors
-from projservo_cli.records import VIEWS
+from projservo_cli.records import TOOL
 
 # Deviations beyond which the links of a model contradict the known length.
 _CONTRADICTED = 4.0
@@ -33,10 +33,11 @@ def contradictions(metric: Metric, errors: KinematicErrors | None, *, measured: 
         wrong = "short" if errors.length > 0.0 else "long"
         share, std = 100.0 * abs(errors.length), 100.0 * errors.length_std
         yield f"the known length is {share:.2g} % ± {std:.1g} % too {wrong} for the links of the model"
-    poses = {f"the {view} camera": T for view, T in zip(VIEWS, metric.poses, strict=True)}
-    for what, T in {**poses, "the tool at readings of zero": metric.body.tool}.items():
+    mounted, tool = ("flange", "flange") if metric.mount == TOOL else ("base", "tool")
+    places = [(f"the {view} camera", mounted, T) for view, T in zip(metric.view, metric.poses, strict=True)]
+    for what, frame, T in (*places, (f"the {tool} at readings of zero", "base", metric.body.tool)):
         if (far := float(np.linalg.norm(T[:3, 3]))) > _FARTHEST:
-            yield f"{what} is {far:.3g} m from the base, {_FARTHEST:g} m allowed"
+            yield f"{what} is {far:.3g} m from the {frame}, {_FARTHEST:g} m allowed"
 
 
 def kinematic_words(errors: KinematicErrors, joint_types: str) -> Iterator[str]:

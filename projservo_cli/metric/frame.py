@@ -8,6 +8,9 @@ Base frame, at readings of zero: z along joint 1, x along z × the direction of 
 parallel to it. The origin is on the first revolute axis, at its common normal with the first revolute axis
 that is not parallel to it. Tool frame: origin at the mean of the face, x from its first to its second marker,
 z across the plane of the first two and the next that is off their line.
+
+Cameras on the tool are in the flange frame: the base frame of the arm as seen from its last joint back, so z
+along the last joint. Their pose there is the hand-eye transformation. The markers are points of the base.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,7 +32,16 @@ from projservo_cli.geometry.displacements import (
 )
 from projservo_cli.geometry.lens import TERMS, distort, undistort
 from projservo_cli.geometry.stereo import triangulate_points
-from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, WorkFailed, prismatic_of
+from projservo_cli.records import (
+    MM,
+    TOOL,
+    BoolArray,
+    Calibration,
+    FloatArray,
+    InputError,
+    WorkFailed,
+    prismatic_of,
+)
 
 # Step of the differences that propagate covariances, in standard deviations of the calibration.
 _STEP = 0.05
@@ -52,13 +64,13 @@ Scale = str | Sequence[int]
 
 
 class MetricParameters(NamedTuple):
-    """Cameras, arm and markers in the base frame, of one model or of many (…)."""
+    """Arm in the base frame, cameras and markers in base and tool, of one model or of many (…)."""
 
-    P: FloatArray  # (…, 2, 3, 4) cameras to undistorted pixels
-    lens: FloatArray  # (…, 2, 5) lenses
+    P: FloatArray  # (…, V, 3, 4) cameras to undistorted pixels, of the frame they are mounted in
+    lens: FloatArray  # (…, V, 5) lenses
     axes: FloatArray  # (…, n, 6) screws at readings of zero: w rad and v m, per rad or m
-    tool: FloatArray  # (…, 4, 4) pose of the tool at readings of zero, m
-    markers: FloatArray  # (…, m, 3) in the tool frame, m
+    tool: FloatArray  # (…, 4, 4) pose of the tool, or flange, at readings of zero, m
+    markers: FloatArray  # (…, m, 3) in the other frame, m
 
     def scaled(self, factor: FloatArray) -> "MetricParameters":
         """Multiply all lengths by a factor (…)."""
@@ -69,13 +81,13 @@ class MetricParameters(NamedTuple):
         return MetricParameters(P, self.lens, axes, tool, self.markers * factor[..., None, None])
 
     def intrinsics(self) -> FloatArray:
-        """Intrinsic matrices (…, 2, 3, 3), px, from K Kᵀ of the cameras."""
+        """Intrinsic matrices (…, V, 3, 3), px, from K Kᵀ of the cameras."""
         rows = self.P[..., ::-1, :3]
         K = np.linalg.cholesky(rows @ rows.swapaxes(-1, -2))[..., ::-1, ::-1]
         return np.asarray(K / K[..., 2:, 2:])
 
     def camera_poses(self) -> FloatArray:
-        """Poses (…, 2, 4, 4) of both cameras in the base frame, m."""
+        """Poses (…, V, 4, 4) of the cameras in the frame they are mounted in, m."""
         A = self.P[..., :3]
         R = np.linalg.solve(self.intrinsics(), A)
         R /= np.cbrt(np.linalg.det(R))[..., None, None]
@@ -91,7 +103,7 @@ class MetricParameters(NamedTuple):
         return np.asarray(reduce(np.matmul, factors) @ self.tool[..., None, :, :])
 
     def pixels(self, points: FloatArray) -> FloatArray:
-        """Raw pixels (…, K, 2, 2) of points (…, K, 3) of the base frame, by view."""
+        """Raw pixels (…, K, V, 2) of points (…, K, 3) of the frame of the cameras, by view."""
         m = np.einsum("...vrj,...kj->...kvr", self.P, homogeneous(points))
         return distort(self.lens[..., None, :, :], m[..., :2] / m[..., 2:])
 
@@ -257,13 +269,21 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> MetricP
     axes, to_zero = carried_screws(at_reference, c.prismatic, -c.q_reference)
     axes[:, c.prismatic, :3] = 0.0
     base = base_frame(axes, c.prismatic, base_joints(axes[0], c.prismatic))
-    tool = _tool_frame(M, face, _off_line(M[0], face))
     inverse = rigid_inverse(base)
-    P = models.P @ back[:, None] @ base[:, None]
+    # The frame on the last link, at the reference.
+    if c.mount == TOOL:
+        backward, types = axes[:, ::-1], c.prismatic[::-1]
+        flange = base_frame(backward, types, base_joints(backward[0], types))
+        hand = rigid_inverse(to_zero) @ flange
+        of_cameras, of_markers = hand, base
+    else:
+        hand = _tool_frame(M, face, _off_line(M[0], face))
+        of_cameras, of_markers = base, hand
+    P = models.P @ back[:, None] @ of_cameras[:, None]
     P /= np.linalg.norm(P[..., 2, :3], axis=-1)[..., None, None]
-    markers = (homogeneous(M) @ rigid_inverse(tool).swapaxes(-1, -2))[..., :3]
+    markers = (homogeneous(M) @ rigid_inverse(of_markers).swapaxes(-1, -2))[..., :3]
     return MetricParameters(
-        P, models.lens, in_frame(axes, c.prismatic, base), inverse @ to_zero @ tool, markers
+        P, models.lens, in_frame(axes, c.prismatic, base), inverse @ to_zero @ hand, markers
     )
 
 
@@ -339,11 +359,13 @@ def _require_squares(lengths: FloatArray, sides: Sequence[tuple[int, int]]) -> N
 class Metric:
     """A calibration in metres, in the base frame of the arm: its arrays, and functions with covariances.
 
-    Frames are those of the module ``metric.frame``. Covariances are those of the calibration, to first
-    order, with those of frames and of the known length.
+    Cameras on the tool are in the flange frame, and the markers in that of the base. Frames are those of the
+    module ``metric.frame``. Covariances are those of the calibration, to first order, with those of frames
+    and of the known length.
     """
 
     view: tuple[str, ...]  # names of the views
+    mount: str  # of the cameras, world or tool
     joint_types: str  # one letter a joint, R or P
     marker: list[int]  # (m,) numbers of the markers
     sigma_px: float  # noise of a pixel, px
@@ -401,7 +423,7 @@ class Metric:
             parts = zip(bodies, off, strict=True)
             bodies = MetricParameters(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
         moved = np.stack([c.joint_min, c.joint_min + c.excitation], axis=1)
-        return cls(c.view, c.joint_types, marker, c.sigma_px, bodies, moved, c.q_reference)
+        return cls(c.view, c.mount, c.joint_types, marker, c.sigma_px, bodies, moved, c.q_reference)
 
     @property
     def body(self) -> MetricParameters:
@@ -425,7 +447,10 @@ class Metric:
 
     @property
     def poses(self) -> FloatArray:
-        """Poses (2, 4, 4) of both cameras in the base frame: z forward, y down; m."""
+        """Poses (V, 4, 4) of the cameras in the frame they are mounted in: z forward, y down; m.
+
+        Of cameras on the tool it is the hand-eye transformation, from camera to flange.
+        """
         return self.body.camera_poses()
 
     @property
@@ -435,11 +460,16 @@ class Metric:
 
     @property
     def markers(self) -> FloatArray:
-        """Markers (m, 3) in the tool frame, m."""
+        """Markers (m, 3) in the tool frame, or in the base frame if the cameras are on the tool; m."""
         return self.body.markers
 
+    def cameras(self, q: npt.ArrayLike) -> FloatArray:
+        """Return cameras (V, 3, 4) to undistorted pixels of points of the base frame at readings (n,)."""
+        P = self.body.P
+        return P @ rigid_inverse(self.pose(q)) if self.mount == TOOL else P
+
     def pose(self, q: npt.ArrayLike) -> FloatArray:
-        """Poses of the tool in the base frame, [RH00] eq. (6).
+        """Poses of the tool, or of the flange with cameras on it, in the base frame, [RH00] eq. (6).
 
         Parameters
         ----------
@@ -499,7 +529,7 @@ class Metric:
         return MM * np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
 
     def triangulate(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Points of the base frame by their pixels in both views.
+        """Points by their pixels in both views, in the frame of the cameras: base, or flange.
 
         Parameters
         ----------
@@ -559,9 +589,9 @@ class Metric:
 
         Returns
         -------
-        Of ``K`` (2, 5, 5): fx, skew, cx, fy, cy, px; of ``lens`` (2, 2, 2): k1, k2; of ``poses`` (2, 6, 6):
-        rotation vector, rad, and position, m, in the base frame; of ``axes`` (n, 6, 6); of ``markers``
-        (m, 3, 3), m²; of ``tool`` (1, 6, 6), its pose at readings of zero.
+        Of ``K`` (V, 5, 5): fx, skew, cx, fy, cy, px; of ``lens`` (V, 2, 2): k1, k2; of ``poses`` (V, 6, 6):
+        rotation vector, rad, and position, m, in the base or the flange frame; of ``axes`` (n, 6, 6); of
+        ``markers`` (m, 3, 3), m²; of ``tool`` (1, 6, 6), its pose at readings of zero.
 
         Raises
         ------

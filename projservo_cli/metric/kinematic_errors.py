@@ -19,7 +19,16 @@ from projservo_cli.geometry.displacements import (
     screw_displacements,
 )
 from projservo_cli.metric.frame import Metric, MetricParameters, base_frame, base_joints, directions, in_frame
-from projservo_cli.records import MM, BoolArray, FloatArray, InputError, IntArray, WorkFailed, letters_of
+from projservo_cli.records import (
+    MM,
+    TOOL,
+    BoolArray,
+    FloatArray,
+    InputError,
+    IntArray,
+    WorkFailed,
+    letters_of,
+)
 
 # Errors of axes that any model has, of machining and assembly, rad and m.
 _LINK_STD = np.repeat([5e-4, 5e-4], 3)
@@ -253,7 +262,7 @@ def kinematic_errors(metric: Metric, model_axes: FloatArray) -> KinematicErrors:
 
 
 def in_model_frames(metric: Metric, model_axes: FloatArray, tip: FloatArray) -> Metric:
-    """Express a metric in the base of a model, and its tool in that of the model's tip.
+    """Express a metric in the base of a model, and its tool, or flange, in that of the model's tip.
 
     The base is where it fits the calibrated axes best; the tip is where the model has it, with the zeros that
     were found. Covariances include those of both.
@@ -265,11 +274,14 @@ def in_model_frames(metric: Metric, model_axes: FloatArray, tip: FloatArray) -> 
     base, zeros = fit.bases_and_zeros(bodies.axes)
     tips = metric.body._replace(axes=model_axes, tool=tip).tool_poses(metric.prismatic, zeros)
     axes = in_frame(bodies.axes, metric.prismatic, base)
-    to_tip = rigid_inverse(tips) @ rigid_inverse(base) @ bodies.tool
-    markers = (homogeneous(bodies.markers) @ to_tip.swapaxes(-1, -2))[..., :3]
-    return dataclasses.replace(
-        metric, bodies=MetricParameters(bodies.P @ base[:, None], bodies.lens, axes, tips, markers)
-    )
+    to_base = rigid_inverse(base)
+    to_tip = rigid_inverse(tips) @ to_base @ bodies.tool
+    if metric.mount == TOOL:
+        P, of_markers = bodies.P @ rigid_inverse(to_tip)[:, None], to_base
+    else:
+        P, of_markers = bodies.P @ base[:, None], to_tip
+    markers = (homogeneous(bodies.markers) @ of_markers.swapaxes(-1, -2))[..., :3]
+    return dataclasses.replace(metric, bodies=MetricParameters(P, bodies.lens, axes, tips, markers))
 
 
 def _length_error(r: FloatArray, J: FloatArray, across: FloatArray) -> tuple[float, float]:

@@ -20,7 +20,7 @@ class OpenCV(NamedTuple):
     """Robot and rig whose cameras are OpenCV's, and what that costs."""
 
     body: MetricParameters  # without lenses
-    distortion: FloatArray  # (2, 5) k1, k2, p1, p2, k3
+    distortion: FloatArray  # (V, 5) k1, k2, p1, p2, k3
     skew_chi2: float  # increase of the squared residuals over the squared noise, for no skew
     lens_chi2: float  # the same for its lens, all else as it is
     lens_rms_px: float  # difference between both lenses where markers were seen, px
@@ -31,7 +31,7 @@ class OpenCV(NamedTuple):
         return self.skew_chi2 + self.lens_chi2
 
     def pixels(self, points: FloatArray) -> FloatArray:
-        """Pixels (K, 2, 2) of points (K, 3) of the base frame, by view."""
+        """Pixels (K, V, 2) of points (K, 3) of the frame of the cameras, by view."""
         K, straight = self.body.intrinsics(), self.body.pixels(points)
         distorted = _terms(_normalized(K, straight)) @ self.distortion[:, :, None]
         focal = np.diagonal(K[:, :2, :2], axis1=1, axis2=2)
@@ -64,7 +64,7 @@ def opencv_cameras(metric: Metric, calibration: Calibration) -> OpenCV:
         K @ rigid_inverse(rigs)[:, :3], straight, axes, tool, metric.markers + change["markers"]
     )
     seen = _straight_detections(calibration)
-    coefficients, off = zip(*(_fitted_lens(K[v], lens[v], seen[v]) for v in (0, 1)), strict=True)
+    coefficients, off = zip(*(_fitted_lens(K[v], lens[v], seen[v]) for v in range(len(K))), strict=True)
     mean = float(np.concatenate(off).mean())  # px², of a detection
     count = 0.5 * calibration.dof
     return OpenCV(
@@ -83,7 +83,7 @@ def _straight_detections(calibration: Calibration) -> list[FloatArray]:
     seen = np.isfinite(calibration.corner_squares).swapaxes(0, 1).reshape(len(calibration.P), -1)
     pixels = predict(calibration, calibration.corner_q).swapaxes(0, 1).reshape(len(calibration.P), -1, 2)
     straight = undistort(calibration.lens, np.ascontiguousarray(pixels))
-    return [straight[v, seen[v]] for v in (0, 1)]
+    return [straight[v, seen[v]] for v in range(len(straight))]
 
 
 def _normalized(K: FloatArray, pixels: FloatArray) -> FloatArray:

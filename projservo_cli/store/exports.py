@@ -12,16 +12,21 @@ from projservo_cli.geometry.displacements import rigid_inverse
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.metric.frame import Metric
 from projservo_cli.metric.opencv import OpenCV
-from projservo_cli.records import FloatArray
+from projservo_cli.records import TOOL, VIEWS, FloatArray
 
 # Limits of a URDF joint that no calibration knows: N m or N, and rad/s or m/s.
 _EFFORT, _SPEED = 100.0, 1.0
+# Results of ``cv2.calibrateHandEye``, as its documentation names them.
+_HAND_EYE = "R_cam2gripper", "t_cam2gripper"
+# Links of the base, of the tool with markers, and of the flange with cameras.
+_BASE, _TOOL, FLANGE = "base_link", "tool", "flange"
 
 
-def opencv_yaml(found: OpenCV, size: ImageSize | None, names: Sequence[str]) -> str:
+def opencv_yaml(found: OpenCV, size: ImageSize | None, names: Sequence[str], mount: str) -> str:
     """Cameras by their names, and of two the stereo rig, for ``cv2.FileStorage``, in words of its samples.
 
-    R and T of a camera map the base frame to it; those of the rig map the first camera to the second.
+    R and T of a camera map the base frame to it; those of the rig map the first camera to the second. Cameras
+    on the tool have what ``cv2.calibrateHandEye`` returns instead, their poses in the flange.
     """
     K, poses = found.body.intrinsics(), found.body.camera_poses()
     lines = ["%YAML:1.0", "---", f"delta_chi2: {found.delta_chi2!r}"]
@@ -36,7 +41,8 @@ def opencv_yaml(found: OpenCV, size: ImageSize | None, names: Sequence[str]) -> 
     for v, view in enumerate(names):
         lines += _matrix(f"{view}_camera_matrix", K[v])
         lines += _matrix(f"{view}_distortion_coefficients", found.distortion[v : v + 1])
-        lines += _matrix(f"{view}_R", world[v, :3, :3]) + _matrix(f"{view}_T", world[v, :3, 3:])
+        (R, T), where = ("RT", world[v]) if mount != TOOL else (_HAND_EYE, poses[v])
+        lines += _matrix(f"{view}_{R}", where[:3, :3]) + _matrix(f"{view}_{T}", where[:3, 3:])
     if len(names) == 2:
         stereo = world[1] @ poses[0]
         lines += _matrix("R", stereo[:3, :3]) + _matrix("T", stereo[:3, 3:])
@@ -64,10 +70,11 @@ def _points(metric: Metric) -> FloatArray:
 def urdf(metric: Metric, names: Sequence[str], limits: FloatArray) -> str:
     """The arm, its tool and the cameras as a URDF, with limits (n, 2) of its joints, rad or m.
 
-    All link frames are parallel to the base at readings of zero.
+    All link frames are parallel to the base at readings of zero. Cameras on the tool are on the flange.
     """
     places, prismatic = _points(metric), metric.prismatic
-    links = ["base_link", *(f"link_{i + 1}" for i in range(len(places))), "tool"]
+    hand = FLANGE if metric.mount == TOOL else _TOOL
+    links = [_BASE, *(f"link_{i + 1}" for i in range(len(places))), hand]
     links += [f"camera_{view}" for view in metric.view]
     lines = ['<?xml version="1.0"?>', '<robot name="calibrated">']
     # Masses, which no camera sees, for simulators that ask for some.
@@ -87,7 +94,8 @@ def urdf(metric: Metric, names: Sequence[str], limits: FloatArray) -> str:
         last = place
     tool = metric.pose(np.zeros(len(places)))
     tool[:3, 3] -= last
-    parents = (links[len(places)], *("base_link" for _ in metric.view))
+    carrier = hand if metric.mount == TOOL else _BASE
+    parents = (links[len(places)], *(carrier for _ in metric.view))
     fixed = zip(links[len(places) + 1 :], parents, (tool, *metric.poses), strict=True)
     for link, parent, T in fixed:
         rpy = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
@@ -104,14 +112,18 @@ def _numbers(values: FloatArray) -> str:
     return " ".join(map(repr, (values + 0.0).tolist()))
 
 
-def static_transforms(metric: Metric) -> str:
-    """A launch file of ROS 2 that publishes where the cameras are in the base frame."""
+def static_transforms(metric: Metric, flange: str) -> str:
+    """A launch file of ROS 2 that publishes where the cameras are in the base frame.
+
+    flange : link that carries cameras on the tool, in whose frame they are.
+    """
+    carrier = flange if metric.mount == TOOL else _BASE
     lines = ["<launch>"]
     for view, T in zip(metric.view, metric.poses, strict=True):
         quaternion = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
         values = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), [*T[:3, 3].tolist(), *quaternion], strict=True)
         where = " ".join(f"--{name} {value!r}" for name, value in values)
-        frames = f"--frame-id base_link --child-frame-id camera_{view}"
+        frames = f"--frame-id {carrier} --child-frame-id camera_{view}"
         lines.append(f'  <node pkg="tf2_ros" exec="static_transform_publisher" args="{where} {frames}"/>')
     return "\n".join([*lines, "</launch>"]) + "\n"
 
@@ -122,5 +134,9 @@ def to_json(metric: Metric, more: Mapping[str, Any]) -> str:
     arrays = {name: getattr(metric, name).tolist() for name in names}
     covariances = {f"{name}_covariance": metric.covariance(name).tolist() for name in names}
     tool = metric.pose(np.zeros(len(metric.joint_types))).tolist()
-    about = {"joint_types": metric.joint_types, "marker": metric.marker, "tool": tool}
+    about: dict[str, Any] = {"joint_types": metric.joint_types, "marker": metric.marker, "tool": tool}
+    if metric.view != VIEWS:
+        about["view"] = metric.view
+    if metric.mount == TOOL:
+        about["mount"] = metric.mount
     return json.dumps({**about, **arrays, **covariances, **more}, indent=1, allow_nan=False) + "\n"
