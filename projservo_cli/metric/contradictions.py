@@ -33,9 +33,11 @@ def contradictions(metric: Metric, errors: KinematicErrors | None, *, measured: 
         wrong = "short" if errors.length > 0.0 else "long"
         share, std = 100.0 * abs(errors.length), 100.0 * errors.length_std
         yield f"the known length is {share:.2g} % ± {std:.1g} % too {wrong} for the links of the model"
-    mounted, tool = ("flange", "flange") if metric.mount == TOOL else ("base", "tool")
-    places = [(f"the {view} camera", mounted, T) for view, T in zip(metric.view, metric.poses, strict=True)]
-    for what, frame, T in (*places, (f"the {tool} at readings of zero", "base", metric.body.tool)):
+    places = [
+        (f"the {view} camera", metric.carrier, T) for view, T in zip(metric.view, metric.poses, strict=True)
+    ]
+    hand = "flange" if metric.mount == TOOL else "tool"
+    for what, frame, T in (*places, (f"the {hand} at readings of zero", "base", metric.body.tool)):
         if (far := float(np.linalg.norm(T[:3, 3]))) > _FARTHEST:
             yield f"{what} is {far:.3g} m from the {frame}, {_FARTHEST:g} m allowed"
 

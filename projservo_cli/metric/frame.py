@@ -463,6 +463,11 @@ class Metric:
         """Markers (m, 3) in the tool frame, or in the base frame if the cameras are on the tool; m."""
         return self.body.markers
 
+    @property
+    def carrier(self) -> str:
+        """What carries the cameras, and is their frame: ``base`` or ``flange``."""
+        return "flange" if self.mount == TOOL else "base"
+
     def cameras(self, q: npt.ArrayLike) -> FloatArray:
         """Return cameras (V, 3, 4) to undistorted pixels of points of the base frame at readings (n,)."""
         P = self.body.P

@@ -160,7 +160,8 @@ class Markers(Section):
             known = self.known or ()
             X = self.points[[known.index(number) for number in numbers]]
         elif self.tag_size_m is not None:
-            X[:, 2], X[:, :2] = 0.0, [np.multiply(self.tag_size_m, _CORNERS[k % CORNERS]) for k in numbers]
+            corners = np.reshape([_CORNERS[k % CORNERS] for k in numbers], (-1, 2))
+            X[:, 2], X[:, :2] = 0.0, self.tag_size_m * corners
             tag = np.array(numbers) // CORNERS
         found = np.linalg.norm(X[:, None] - X, axis=2)
         return np.asarray(np.where(tag[:, None] == tag, found, np.nan))

@@ -10,7 +10,7 @@ from projservo_cli.geometry.displacements import homogeneous, twists
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.image_size import image_corners
 from projservo_cli.metric.frame import Metric, links
-from projservo_cli.records import MM, VIEWS, BoolArray, FloatArray, Trace
+from projservo_cli.records import MM, TOOL, VIEWS, BoolArray, FloatArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, Fit, ReportData, registered
 from projservo_cli.simulation.analytic_plant import Plant
@@ -194,7 +194,10 @@ def metric_rows(metric: Metric, q: FloatArray) -> Iterator[dict[str, Any]]:
         yield _row(f"{view} camera, focal lengths", K[(0, 1), (0, 1)], of_K[:, v][:, [0, 3]], "px")
         yield _row(f"{view} camera, principal point", K[:2, 2], of_K[:, v][:, [2, 4]], "px")
         yield _row(
-            f"{view} camera, position in the base frame", MM * centers[v], MM * of_poses[:, v, 3:], "mm"
+            f"{view} camera, position in the {metric.carrier} frame",
+            MM * centers[v],
+            MM * of_poses[:, v, 3:],
+            "mm",
         )
     apart = centers[1] - centers[0]
     distance = np.asarray(np.linalg.norm(apart))
@@ -232,7 +235,7 @@ def _data_metric(report_data: Fit) -> Data:
     arm = report_data.calibration.model()._replace(
         H_hat_0=twists(metric.axes), q_reference=np.zeros(q.shape[1])
     )
-    pixels = report_data.observation.images
+    seen, pixels = metric.markers if metric.mount == TOOL else tools, report_data.observation.images
     low, high = np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))
     spread, axes = np.linalg.eigh(metric.pose_covariance(q)[:, 3:, 3:])
     radius = np.sqrt(chdtri(3, 1.0 - _REGION) * np.maximum(spread, 0.0))
@@ -245,7 +248,7 @@ def _data_metric(report_data: Fit) -> Data:
         "semi_axes": semi_axes,
         "factor": np.array(style.magnification(float(radius.max()), _ELLIPSOID_SIZE * extent)),
         "robot": skeleton(joint_operators(arm, q[0]), arm.prismatic, tools[0]),
-        "pyramids": _pyramids(metric.body.P, _rectangle(low, high), tools),
+        "pyramids": _pyramids(metric.cameras(q[0]), _rectangle(low, high), seen),
     }
 
 
