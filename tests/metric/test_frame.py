@@ -41,7 +41,7 @@ def calibrated(arm, frame):
         "a_inf": a_inf,
         "marker": 10 * np.arange(len(M)),
         "M": M / (M @ a_inf)[:, None],
-        "sqrt_cov_shared": np.zeros((24 + 16 * n, 1)),
+        "sqrt_cov_shared": np.zeros((arm.cameras.size + 16 * n, 1)),
         "sqrt_cov_marker": np.zeros((len(M), 4, 1)),
         "sqrt_cov_own": np.zeros((len(M), 4, 3)),
         "sigma_px": 0.5,

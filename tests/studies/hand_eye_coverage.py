@@ -9,17 +9,18 @@ flange frame of the axes and in that of the true model; the rms over the bound o
 beside those of OpenCV's hand-eye calibration, which is given true intrinsics, points and arm.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import projservo_cli as projservo
 from projservo_cli.metric.kinematic_errors import in_model_frames
 from projservo_cli.observations import Observations
 from projservo_cli.records import Observation, WorkFailed
+from projservo_cli.store.observation_tables import write_table
 from tests.calibration.bound import derivative, spread
 from tests.calibration.simulated_robot import NAMES, Robot
 from tests.samples import revolute
@@ -28,6 +29,7 @@ from tests.studies.common import in_two_processes, parser_of, rate, write_rows
 from tests.studies.metric_coverage import held, off
 
 SEED, NOISE_PX, POSES, SIZE = 503, 0.5, 40, (1280, 1024)
+SHOWN = 10_000  # draw of the recording that tests and pages take
 # Standard Denavit–Hartenberg parameters of the UR5 by its maker: a, d, m; alpha, rad.
 DH = np.array(
     [
@@ -51,8 +53,8 @@ TAGS = (
     ((0.05, 0.02, 0.10), (-0.3, 0.5, 0.2)),
 )
 SCENE = np.array([-0.45, -0.1, 0.05])  # in the base frame, m
-# Distance of the hand from the scene, m, angle from its vertical, aim beside its middle, m, and roll, rad.
-DISTANCE, TILT, AIM, ROLL = (0.42, 0.6), np.radians(40.0), 0.04, np.radians(60.0)
+# Farthest readings from the start, rad; markers that each camera of the pair sees, and their distance, m.
+REACH, LEAST, NEAREST = np.radians([40.0, 40.0, 40.0, 40.0, 40.0, 70.0]), 14, 0.25
 
 
 class Eye(NamedTuple):
@@ -82,8 +84,10 @@ RIGS = {"pair": (LEFT, RIGHT), "one": (LEFT,)}
 def link(row, angle):
     """Transformation (4, 4) of one row of the table."""
     a, d, alpha = row
-    along = pose((0.0, 0.0, angle), (0.0, 0.0, d))
-    return along @ pose((alpha, 0.0, 0.0), (a, 0.0, 0.0))
+    c, s, ca, sa = np.cos(angle), np.sin(angle), np.cos(alpha), np.sin(alpha)
+    return np.array(
+        [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]
+    )
 
 
 def flange(q):
@@ -115,33 +119,25 @@ def points():
     return np.concatenate([square @ pose(turn, t)[:3, :3].T + np.add(SCENE, t) for t, turn in TAGS])
 
 
+@cache
 def readings():
-    """Readings (POSES, 6) at which the hand looks at the scene from a cap above it."""
+    """Readings (POSES, 6) about the start at which both cameras of the pair see most of the scene."""
     rng, found = np.random.default_rng([SEED, 0]), []
     while len(found) < POSES:
-        tilt, round_ = TILT * np.sqrt(rng.uniform()), rng.uniform(-np.pi, np.pi)
-        roll = rng.uniform(-ROLL, ROLL)
-        R = Rotation.from_euler("zyz", [round_, tilt, roll - round_]) * Rotation.from_euler("x", np.pi)
-        aim = SCENE + rng.uniform(-AIM, AIM, 3)
-        wanted = pose(R.as_rotvec(), aim - R.as_matrix()[:, 2] * rng.uniform(*DISTANCE))
-
-        def left(q, wanted=wanted):
-            T = np.linalg.inv(wanted) @ flange(q)
-            return np.r_[Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]]
-
-        fit = least_squares(left, START, method="lm", xtol=1e-12, ftol=1e-12)
-        if np.abs(fit.fun).max() < 1e-6 and np.abs(fit.x - START).max() < np.pi / 2.0:
-            found.append(fit.x)
+        q = START + REACH * rng.uniform(-1.0, 1.0, 6)
+        if np.isfinite(images(RIGS["pair"], q[None])[..., 0]).sum(axis=2).min() >= LEAST:
+            found.append(q)
     return np.array(found)
 
 
 def images(eyes, q):
-    """Pixels (K, V, m, 2) by OpenCV, NaN outside the image."""
+    """Pixels (K, V, m, 2) by OpenCV, NaN outside the image and too near."""
     seen, X = np.empty((len(q), len(eyes), 4 * len(TAGS), 2)), points()
     for k, row in enumerate(q):
         for v, one in enumerate(eyes):
             T = np.linalg.inv(flange(row) @ one.X)
             seen[k, v] = cv2.projectPoints(X, cv2.Rodrigues(T[:3, :3])[0], T[:3, 3], one.K, None)[0][:, 0]
+            seen[k, v, X @ T[2, :3] + T[2, 3] < NEAREST] = np.nan
     inside = (seen >= 0.0) & (seen <= np.array(SIZE) - 1.0)
     return np.where(inside.all(axis=-1, keepdims=True), seen, np.nan)
 
@@ -151,6 +147,21 @@ def observed(eyes, q, draw):
     exact = images(eyes, q)
     noisy = exact + NOISE_PX * np.random.default_rng([SEED, 1, draw]).standard_normal(exact.shape)
     return Observation(np.arange(len(q)), np.arange(4 * len(TAGS)), q, noisy, view=NAMES[: len(eyes)])
+
+
+def write_recording(name, folder):
+    """Write the table ``hand.csv`` of a rig and a model of the arm, ``ur5.urdf``, with its link tool0."""
+    write_table(observed(RIGS[name], readings(), SHOWN), folder / "hand.csv")
+    lines, before = ['<robot name="ur5"><link name="link_0"/>'], (0.0, 0.0, 0.0)
+    for i, row in enumerate([*DH, None], 1):
+        a, d, alpha = before
+        child, kind = (f"link_{i}", "continuous") if row is not None else ("tool0", "fixed")
+        lines.append(
+            f'<link name="{child}"/><joint name="joint_{i}" type="{kind}"><parent link="link_{i - 1}"/>'
+            f'<child link="{child}"/><origin xyz="{a} 0 {d}" rpy="{alpha} 0 0"/><axis xyz="0 0 1"/></joint>'
+        )
+        before = row
+    (folder / "ur5.urdf").write_text("".join([*lines, "</robot>"]))
 
 
 def in_own_flange(cameras, axes, X, reading):

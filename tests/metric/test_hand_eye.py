@@ -1,0 +1,116 @@
+"""Cameras on the tool in metres: exact models, and images of OpenCV from the table to files of others."""
+
+import dataclasses
+import json
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from projservo_cli import store
+from projservo_cli.cli import run
+from projservo_cli.metric.kinematic_errors import in_model_frames
+from projservo_cli.results import ImageModel
+from tests.calibration.simulated_robot import around, random_robot
+from tests.calibration.test_cameras_on_the_tool import Hand
+from tests.metric.test_frame import calibrated, frame  # noqa: F401
+
+cv2 = pytest.importorskip("cv2")
+if not hasattr(cv2, "calibrateHandEye"):
+    pytest.skip("OpenCV 5 has no hand-eye calibration", allow_module_level=True)
+
+from tests.studies import hand_eye_coverage as hand  # noqa: E402
+
+TAG = ["--metric", str(hand.TAG), "--metric-std", "0.00001", "--between", "tags"]
+
+
+@pytest.mark.parametrize(("types", "views"), [("RRRRRR", 2), ("RRPRR", 1), ("PRRRRP", 3)])
+def test_exact_cameras_see_the_scene_from_a_flange_of_any_arm(types, views, frame, rng):  # noqa: F811
+    """Whatever the projective frame: pixels, distances, and the true hand-eye transformation by a model."""
+    arm = Hand(**vars(random_robot(types, rng, markers=6, views=views)))
+    length = float(np.linalg.norm(arm.markers[0] - arm.markers[1]))
+    exact = dataclasses.replace(calibrated(arm, frame), mount="tool")
+    m = exact.metric(length, (0, 10))
+    q = around(arm, 5, rng)
+    points = np.c_[m.markers, np.ones(len(m.markers))]
+    s = np.array([m.cameras(row) @ points.T for row in q])
+    np.testing.assert_allclose((s[:, :, :2] / s[:, :, 2:]).swapaxes(2, 3), arm.images(q), atol=1e-6)
+    # A model with a flange of its own: the truth, and not only up to a frame.
+    at_zero = [np.eye(4)]
+    for twist, reading in zip(arm.twists, -arm.q_reference, strict=True):
+        at_zero.append(at_zero[-1] @ expm(twist * reading))
+    axes = np.array([T @ H @ np.linalg.inv(T) for T, H in zip(at_zero, arm.twists, strict=False)])
+    axes = np.c_[axes[:, 2, 1], axes[:, 0, 2], axes[:, 1, 0], axes[:, :3, 3]]
+    flange = hand.pose((0.3, -0.2, 0.5), (0.1, 0.2, 0.3))
+    model = in_model_frames(m, axes, at_zero[-1] @ flange)
+    np.testing.assert_allclose(model.markers, arm.markers[:, :3], atol=1e-6)
+    true = [np.linalg.inv(flange) @ np.linalg.inv(camera_frame(P)) for P in arm.cameras]
+    np.testing.assert_allclose(model.poses, true, atol=1e-6)
+
+
+def camera_frame(P):
+    """Pose (4, 4) of the frame that a camera (3, 4) is given in, in that of the camera."""
+    T = np.eye(4)
+    T[:3] = np.linalg.solve(hand.hand_eye.intrinsics(P), P)
+    return T
+
+
+@pytest.fixture(scope="module", params=["pair", "one"])
+def recorded(request, tmp_path_factory):
+    """A rig, the run of its recording from the command line, and a URDF of the true arm."""
+    folder = tmp_path_factory.mktemp("hand")
+    hand.write_recording(request.param, folder)
+    told = ["--mount", "tool", "--image-size", "1280x1024", "--joints", "RRRRRR"]
+    assert run(["calibrate", "--data", str(folder / "hand.csv"), *told, "-o", str(folder / "run")]) == 0
+    return hand.RIGS[request.param], folder
+
+
+def export(folder, kind, *more):
+    out = folder / f"{kind}{len(more)}"
+    assert run(["export", str(folder / "run"), "--to", kind, "-o", str(out), *TAG, *more]) == 0
+    (file,) = out.iterdir()
+    return file
+
+
+def test_files_of_others_have_the_true_hand_eye_transformation(recorded):
+    """By a model of the arm: within its covariance, and alike in each kind of file."""
+    eyes, folder = recorded
+    model = ["--nominal", str(folder / "ur5.urdf"), "--frames", "model", "--tip", "tool0"]
+    found = json.loads(export(folder, "json", *model).read_text())
+    poses = np.array(found["poses"])
+    wrong = hand.off(poses, np.array([one.X for one in eyes]))
+    for error, C in zip(wrong, np.array(found["poses_covariance"]), strict=True):
+        assert error @ np.linalg.solve(C, error) < chi2.ppf(0.999, 6)
+        assert np.sqrt(np.trace(C[3:, 3:])) < 1e-3  # m
+    off_scene = np.linalg.norm(np.array(found["markers"]) - hand.points(), axis=1)
+    assert off_scene.max() < 3e-3  # in the base of the model, m
+    file = cv2.FileStorage(str(export(folder, "opencv", *model)), cv2.FILE_STORAGE_READ)
+    ros = ElementTree.parse(export(folder, "ros", *model)).getroot()
+    names = [node.get("args").split() for node in ros]
+    for v, view in enumerate(("left", "right")[: len(eyes)]):
+        R, t = (file.getNode(f"{view}_{part}_cam2gripper").mat() for part in "Rt")
+        # Without skew it is another estimate, by what the noise allows.
+        np.testing.assert_allclose(t.ravel(), poses[v, :3, 3], atol=1e-3)
+        np.testing.assert_allclose(R, poses[v, :3, :3], atol=2e-3)
+        args = dict(zip(names[v][::2], names[v][1::2], strict=True))
+        assert (args["--frame-id"], args["--child-frame-id"]) == ("tool0", f"camera_{view}")
+        turn = Rotation.from_quat([float(args[f"--q{axis}"]) for axis in "xyzw"]).as_matrix()
+        np.testing.assert_allclose(turn, poses[v, :3, :3], atol=1e-12)
+        np.testing.assert_allclose([float(args[f"--{axis}"]) for axis in "xyz"], poses[v, :3, 3], atol=1e-12)
+
+
+def test_mujoco_moves_the_cameras_with_the_flange(recorded):
+    mujoco = pytest.importorskip("mujoco")
+    _, folder = recorded
+    calibration = store.load(folder / "run").calibration
+    metric = ImageModel.of(calibration).metric(hand.TAG, "tags")
+    model = mujoco.MjModel.from_xml_path(str(export(folder, "urdf")))
+    data, q = mujoco.MjData(model), calibration.q_reference + 0.2
+    data.qpos[:] = q
+    mujoco.mj_kinematics(model, data)
+    camera, expected = data.body("camera_left"), metric.pose(q) @ metric.poses[0]
+    np.testing.assert_allclose(camera.xpos, expected[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(camera.xmat.reshape(3, 3), expected[:3, :3], atol=1e-9)
