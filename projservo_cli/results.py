@@ -280,7 +280,7 @@ class MetricModel(Printed, Metric):
     Arrays: ``K`` (V, 3, 3) intrinsic matrices, px; ``lens`` (V, 5) centre u, v and radius, px, then k1, k2;
     ``poses`` (V, 4, 4) of the cameras in the base, z forward and y down, m; ``axes`` (n, 6) screws of the
     joints at readings of zero, w rad and v m, per rad or m; ``markers`` (m, 3) in the tool frame, m. Of each
-    ``covariance`` (name). With cameras on the tool, ``poses`` are in the flange, the hand-eye transformation,
+    ``covariance`` (name). With cameras on the tool, ``poses`` are in the flange, the hand–eye transformation,
     and ``markers`` in the base.
 
     The base frame has z along joint 1 and x along z × the direction of the first joint that is not parallel

@@ -149,7 +149,7 @@ def _export(
 
     The other kinds are in metres, by a known length: opencv the cameras for cv2.FileStorage, urdf the arm,
     ros static transforms of the cameras, json all numbers with their covariances. Cameras on the tool come
-    in the frame of the flange: the hand-eye transformation.
+    in the frame of the flange: the hand–eye transformation.
 
     With --nominal it lists the errors of zeros and axes of a model, the most significant first. With --frames
     model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip; cameras

@@ -10,7 +10,7 @@ that is not parallel to it. Tool frame: origin at the mean of the face, x from i
 z across the plane of the first two and the next that is off their line.
 
 Cameras on the tool are in the flange frame: the base frame of the arm as seen from its last joint back, so z
-along the last joint. Their pose there is the hand-eye transformation. The markers are points of the base.
+along the last joint. Their pose there is the hand–eye transformation. The markers are points of the base.
 """
 
 from collections.abc import Callable, Sequence
@@ -449,7 +449,7 @@ class Metric:
     def poses(self) -> FloatArray:
         """Poses (V, 4, 4) of the cameras in the frame they are mounted in: z forward, y down; m.
 
-        Of cameras on the tool it is the hand-eye transformation, from camera to flange.
+        Of cameras on the tool it is the hand–eye transformation, from camera to flange.
         """
         return self.body.camera_poses()
 

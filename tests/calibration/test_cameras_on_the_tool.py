@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-import projservo_cli as projservo
 from projservo_cli.calibration import calibrate, predict, prediction_variance
 from projservo_cli.calibration.prediction import error_factor, joint_derivative
-from projservo_cli.observations import Observations
-from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.records import WorkFailed
 from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import Robot, around, random_robot, trials
 
@@ -95,12 +93,3 @@ def test_a_joint_that_does_not_move_is_named_by_its_number_along_the_arm(case):
     still = dataclasses.replace(seen, q=np.where(np.arange(q.shape[1]) == 1, q[:1], q))
     with pytest.raises(WorkFailed, match="joint 2 has no trial motion"):
         calibrate(still, arm.joint_types, source="recorded", mount="tool")
-
-
-def test_metres_say_that_cameras_stand_still(case):
-    arm, _, _, seen, _ = case
-    found = projservo.calibrate(
-        Observations.of(seen, joint_types=arm.joint_types, mount="tool"), progress=False
-    )
-    with pytest.raises(InputError, match="metric: takes fixed cameras"):
-        found.metric(0.1, (0, 1))

@@ -81,6 +81,16 @@ def put_truth(folder):
     put_sheet(folder, "ur5", "truth.json")
 
 
+def put_hand(folder):
+    """A recording by a camera on the hand of a UR5, and a model of the arm."""
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install '.[detect]'")
+    if not hasattr(cv2, "calibrateHandEye"):
+        pytest.skip("OpenCV 5 has no hand-eye calibration")
+    from tests.studies.hand_eye_coverage import write_recording
+
+    write_recording("one", folder)
+
+
 def require_gl():
     """Skip where nothing can be drawn."""
     try:
@@ -217,6 +227,7 @@ def check_paper(folder, names, read):
 
 
 HAS = {
+    "camera-on-the-hand": (put_hand,),
     "print-and-mount-tags": (put_tags,),
     "observation-tables": (put_sheet,),
     "robot-class": (put_truth,),
