@@ -367,9 +367,8 @@ class MetricModel(Printed, Metric):
         require_radians("joint readings", readings, self.joint_types)
         return readings
 
-    @staticmethod
-    def _pixels(pixels: npt.ArrayLike) -> tuple[FloatArray, BoolArray, tuple[int, ...]]:
-        return Metric._pixels(numbers_in("pixels", pixels, "(…, 2, m, 2)"))
+    def _pixels(self, pixels: npt.ArrayLike) -> tuple[FloatArray, BoolArray, tuple[int, ...]]:
+        return super()._pixels(numbers_in("pixels", pixels, f"(…, {len(self.view)}, m, 2)"))
 
 
 def _urdf_chain(urdf: str | Path, tip: str | None) -> UrdfChain:

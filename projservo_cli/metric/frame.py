@@ -16,6 +16,7 @@ along the last joint. Their pose there is the hand–eye transformation. The mar
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import combinations
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -35,6 +36,7 @@ from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import (
     MM,
     TOOL,
+    VIEWS,
     BoolArray,
     Calibration,
     FloatArray,
@@ -47,6 +49,8 @@ from projservo_cli.records import (
 _STEP = 0.05
 # Step of the differences of pixels by points, over the distance of the camera.
 _PROBE = 1e-4
+# Number of steps of Gauss and Newton after a start by two views, which third ones change by their noise.
+_REFINEMENTS = 4
 # Sine of an angle between axes, or of markers off a line, below which a frame does not rest on it: 3°.
 _PARALLEL = 0.05
 # Relative deviation of the invariant form above which the data do not determine it.
@@ -534,27 +538,38 @@ class Metric:
         return MM * np.sqrt(np.diagonal(C, axis1=-2, axis2=-1))
 
     def triangulate(self, pixels: npt.ArrayLike) -> FloatArray:
-        """Points by their pixels in both views, in the frame of the cameras: base, or flange.
+        """Points by their pixels in two views or more, in the frame of the cameras: base, or flange.
 
         Parameters
         ----------
-        pixels : (…, 2, m, 2) raw pixels, views left and right as ``predict`` has them; NaN where unseen.
+        pixels : (…, V, m, 2) raw pixels, views as ``predict`` has them; NaN where unseen.
 
         Returns
         -------
-        (…, m, 3) points, m; NaN where a view has no pixels.
+        (…, m, 3) points, m; NaN where fewer than two views have pixels.
 
         Raises
         ------
         InputError
-            For pixels of another shape.
+            For pixels of another shape, or of one camera.
         WorkFailed
             If two rays determine no finite point.
         """
-        s, in_both, shape = self._pixels(pixels)
-        points = np.full((len(in_both), 3), np.nan)
+        s, seen, shape = self._pixels(pixels)
+        points = np.full((seen.shape[1], 3), np.nan)
         a_inf = np.array([0.0, 0.0, 0.0, 1.0])
-        points[in_both] = triangulate_points(self.body.P, a_inf, undistort(self.body.lens, s))[:, :3]
+        for i, j in combinations(range(len(s)), 2):  # the first and the last view that see a point
+            at = seen[i] & seen[j] & ~seen[:i].any(axis=0) & ~seen[j + 1 :].any(axis=0)
+            if at.any():
+                pair = [i, j]
+                straight = undistort(self.body.lens[pair], np.ascontiguousarray(s[pair][:, at]))
+                points[at] = triangulate_points(self.body.P[pair], a_inf, straight)[:, :3]
+        if (more := seen.sum(axis=0) > 2).any():
+            for _ in range(_REFINEMENTS):
+                X = points[more]
+                off = np.where(seen[:, more, None], s[:, more] - self.body.pixels(X).swapaxes(0, 1), 0.0)
+                pinv = np.linalg.pinv(self._by_point(X, seen[:, more]))
+                points[more] += (pinv @ off.swapaxes(0, 1).reshape(len(X), -1, 1))[..., 0]
         return points.reshape(*shape, 3)
 
     def triangulation_covariance(self, pixels: npt.ArrayLike) -> FloatArray:
@@ -566,24 +581,29 @@ class Metric:
 
         Returns
         -------
-        (…, m, 3, 3), m²; NaN where a view has no pixels.
+        (…, m, 3, 3), m²; NaN where fewer than two views have pixels.
 
         Raises
         ------
         InputError, WorkFailed
             As for ``triangulate``.
         """
-        _, in_both, shape = self._pixels(pixels)
-        X = self.triangulate(pixels).reshape(-1, 3)[in_both]
+        _, seen, shape = self._pixels(pixels)
+        known = seen.sum(axis=0) > 1
+        X = self.triangulate(pixels).reshape(-1, 3)[known]
+        pinv = np.linalg.pinv(self._by_point(X, seen[:, known]))
+        moved = self.changes(lambda body: body.pixels(np.broadcast_to(X, (len(body.P), *X.shape))))
+        of = np.einsum("kij,ckj->cki", pinv, moved.reshape(len(moved), len(X), -1))
+        C = np.full((len(known), 3, 3), np.nan)
+        C[known] = _covariances(of) + self.sigma_px**2 * (pinv @ pinv.swapaxes(-1, -2))
+        return C.reshape(*shape, 3, 3)
+
+    def _by_point(self, X: FloatArray, seen: BoolArray) -> FloatArray:
+        """Derivative (K, 2 V, 3) of pixels by points (K, 3); zero where a view (V, K) sees none."""
         step = _PROBE * np.linalg.norm(self.poses[0, :3, 3] - X, axis=1)[:, None]
         moves = [self.body.pixels(X + step * e) - self.body.pixels(X - step * e) for e in np.eye(3)]
-        J = np.moveaxis(np.stack(moves).reshape(3, len(X), 4) / (2.0 * step), 0, -1)
-        pinv = np.linalg.pinv(J)
-        moved = self.changes(lambda body: body.pixels(np.broadcast_to(X, (len(body.P), *X.shape))))
-        of = np.einsum("kij,ckj->cki", pinv, moved.reshape(len(moved), len(X), 4))
-        C = np.full((len(in_both), 3, 3), np.nan)
-        C[in_both] = _covariances(of) + self.sigma_px**2 * (pinv @ pinv.swapaxes(-1, -2))
-        return C.reshape(*shape, 3, 3)
+        J = np.moveaxis(np.stack(moves).reshape(3, len(X), -1) / (2.0 * step), 0, -1)
+        return np.asarray(np.where(seen.T.repeat(2, axis=1)[..., None], J, 0.0))
 
     def covariance(self, name: str) -> FloatArray:
         """Covariance of an array.
@@ -659,16 +679,17 @@ class Metric:
             raise InputError(f"joint readings of shape {readings.shape}: expected {n} finite numbers each")
         return readings
 
-    @staticmethod
-    def _pixels(pixels: npt.ArrayLike) -> tuple[FloatArray, BoolArray, tuple[int, ...]]:
-        """Pixels (2, s, 2) of points that both views show, which of all (N,) they are, and all's shape."""
-        s = np.asarray(pixels, dtype=np.float64)
-        if s.ndim < 3 or s.shape[-3] != 2 or s.shape[-1] != 2:
-            raise InputError(f"pixels of shape {s.shape}: expected (…, 2, m, 2), left and right view")
-        views = np.moveaxis(s, -3, 0)
-        flat = np.ascontiguousarray(views.reshape(2, -1, 2))
-        in_both: BoolArray = np.isfinite(flat[0, :, 0]) & np.isfinite(flat[1, :, 0])
-        return flat[:, in_both], in_both, views.shape[1:-1]
+    def _pixels(self, pixels: npt.ArrayLike) -> tuple[FloatArray, BoolArray, tuple[int, ...]]:
+        """Pixels (V, N, 2) of points, which views see which (V, N), and the shape of the points."""
+        s, V = np.asarray(pixels, dtype=np.float64), len(self.view)
+        if V < 2:
+            raise InputError("triangulate: one camera determines no point: calibrate with two or more")
+        if s.ndim < 3 or s.shape[-3] != V or s.shape[-1] != 2:
+            views = "left and right view" if self.view == VIEWS else f"views {', '.join(self.view)}"
+            raise InputError(f"pixels of shape {s.shape}: expected (…, {V}, m, 2), {views}")
+        views_first = np.moveaxis(s, -3, 0)
+        flat = np.ascontiguousarray(views_first.reshape(V, -1, 2))
+        return flat, np.isfinite(flat[..., 0]), views_first.shape[1:-1]
 
 
 def _covariances(changes: FloatArray) -> FloatArray:

@@ -13,8 +13,9 @@ from scipy.stats import chi2
 from projservo_cli import store
 from projservo_cli.cli import run
 from projservo_cli.metric.kinematic_errors import in_model_frames
+from projservo_cli.records import InputError
 from projservo_cli.results import ImageModel
-from tests.calibration.simulated_robot import around, random_robot
+from tests.calibration.simulated_robot import NAMES, around, random_robot
 from tests.calibration.test_cameras_on_the_tool import Hand
 from tests.metric.test_frame import calibrated, frame  # noqa: F401
 
@@ -32,12 +33,26 @@ def test_exact_cameras_see_the_scene_from_a_flange_of_any_arm(types, views, fram
     """Whatever the projective frame: pixels, distances, and the true hand-eye transformation by a model."""
     arm = Hand(**vars(random_robot(types, rng, markers=6, views=views)))
     length = float(np.linalg.norm(arm.markers[0] - arm.markers[1]))
-    exact = dataclasses.replace(calibrated(arm, frame), mount="tool")
+    exact = dataclasses.replace(calibrated(arm, frame), mount="tool", view=NAMES[:views])
     m = exact.metric(length, (0, 10))
     q = around(arm, 5, rng)
     points = np.c_[m.markers, np.ones(len(m.markers))]
     s = np.array([m.cameras(row) @ points.T for row in q])
     np.testing.assert_allclose((s[:, :, :2] / s[:, :, 2:]).swapaxes(2, 3), arm.images(q), atol=1e-6)
+    seen = arm.images(q)
+    seen[0, 0, 2] = np.nan
+    expected = (np.linalg.inv(m.pose(q)) @ points.T).swapaxes(1, 2)[..., :3]
+    if views == 1:
+        with pytest.raises(InputError, match="one camera determines no point"):
+            m.triangulate(seen)
+    else:
+        expected[0, 2] = np.nan if views == 2 else expected[0, 2]
+        np.testing.assert_allclose(m.triangulate(seen), expected, atol=1e-6)
+        noisy = seen + 0.5 * rng.standard_normal((40, *seen.shape))
+        error = m.triangulate(noisy) - m.triangulate(seen)
+        C = m.triangulation_covariance(seen)
+        square = np.einsum("...i,...ij,...j->...", error, np.linalg.inv(C), error)
+        assert np.nanmean(square) / 3.0 == pytest.approx(1.0, abs=0.15)
     # A model with a flange of its own: the truth, and not only up to a frame.
     at_zero = [np.eye(4)]
     for twist, reading in zip(arm.twists, -arm.q_reference, strict=True):
