@@ -53,6 +53,7 @@ SIZES = {
     "limit": 2,
     "end": 2,
     "model_error_column": 4,
+    "refit_column": 3,
 }
 
 
@@ -521,6 +522,16 @@ class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
     )
     time_offset_jitter_s: FloatArray | None = _array(
         "view", "s", "standard deviation of the time offset of single images", default=None
+    )
+
+    refit: tuple[str, ...] = _scalar(
+        about="names of cameras that were fitted again, in this order", default=()
+    )
+    refit_numbers: FloatArray | None = _array(
+        "refit refit_column",
+        about="of each the number of poses, and the error of its images within the joint ranges now and "
+        "before it moved, rms px",
+        default=None,
     )
 
     def without_covariance(self) -> "Calibration":

@@ -337,7 +337,7 @@ def describe_joints(
         rest[rows] = False
         if rows.size:
             moved, required = (
-                _join_words([_format_motion(values[i], bool(prismatic[i])) for i in rows])
+                _join_words([format_motion(values[i], bool(prismatic[i])) for i in rows])
                 for values in (span, needed)
             )
             joints = f"joint{'s' * (rows.size > 1)} {_join_words([str(i) for i in numbers[rows]])}"
@@ -361,17 +361,17 @@ def require_moved(number: int, span: float, prismatic: bool, motion_px: float, s
     reach = REACH_M if prismatic else REACH_RAD
     if span < _STANDING * reach:
         advice = (
-            f"joint {number} moved only {_format_motion(span, prismatic)}: move it at least "
-            f"{_format_motion(0.5 * reach, prismatic)}"
+            f"joint {number} moved only {format_motion(span, prismatic)}: move it at least "
+            f"{format_motion(0.5 * reach, prismatic)}"
         )
         raise WorkFailed(f"too little excitation: the range of joint {number} moves {seen}; {advice}")
     raise WorkFailed(
-        f"joint {number} stands still: its readings range over {_format_motion(span, prismatic)} but "
+        f"joint {number} stands still: its readings range over {format_motion(span, prismatic)} but "
         f"move {seen}; check that it moved and that its readings are its own, or move a marker off its axis"
     )
 
 
-def _format_motion(value: float, prismatic: bool) -> str:
+def format_motion(value: float, prismatic: bool) -> str:
     """Format a joint motion in mm or degrees."""
     return f"{1e3 * value:.3g} mm" if prismatic else f"{np.degrees(value):.3g}°"
 

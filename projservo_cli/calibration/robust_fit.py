@@ -195,7 +195,7 @@ class Solution:
         gauge = problem.gauge(params)
         if problem.by_pose:
             J = problem.whitened(params, problem.dense(problem.derivative(params), self.used), self.used)
-            factor = _inverse_root(J, np.linalg.norm(J, axis=0), gauge)
+            factor = inverse_root(J, np.linalg.norm(J, axis=0), gauge)
             return Errors(factor[:s], factor[s:].reshape(m, 3, -1), np.zeros((m, 3, 3)))
         R = np.eye(s + offsets)[s:]
         squares = R.sum(axis=0)
@@ -212,7 +212,7 @@ class Solution:
             R = np.asarray(np.linalg.qr(np.vstack([R, left]), mode="r"))
         free = np.zeros((s + offsets, gauge.shape[1]))
         free[:s] = gauge[:s]
-        factor = _inverse_root(R, np.sqrt(squares), free)
+        factor = inverse_root(R, np.sqrt(squares), free)
         return Errors(factor[:s], follows @ factor, own)
 
     def _tracks(self, count: int) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
@@ -246,7 +246,7 @@ class Solution:
                 yield markers, A[..., :count], A[..., count:]
 
 
-def _inverse_root(R: FloatArray, scale: FloatArray, gauge: FloatArray) -> FloatArray:
+def inverse_root(R: FloatArray, scale: FloatArray, gauge: FloatArray) -> FloatArray:
     """L (c, c − g) with L Lᵀ = (RᵀR)⁺ across a gauge (c, g), for R (l, c), its columns in units (c,)."""
     # A parameter without influence on the residuals has no scale: it is open whatever the unit.
     scale = np.where(scale > 0.0, scale, scale.max())

@@ -69,7 +69,7 @@ def with_all_views(of_pair: Solution, whole: Detections, epipolar: ImageGeometry
                 f"{' and '.join(whole.view[i] for i in whole.pair)} cameras see too; {_LEAST} are required: "
                 "point it at the same markers, or leave this view out"
             )
-        P[v] = _resected(points[rows], whole.pixels[v, rows])
+        P[v] = resected(points[rows], whole.pixels[v, rows])
     if (lost := np.isnan(M[:, 0])).any():
         params = dataclasses.replace(params, M=Tracks(problem, params).locate(lost, epipolar.noise_px))
     solution = fit_from(problem, params, epipolar)
@@ -120,7 +120,7 @@ def _noise(solution: Solution, v: int) -> float:
     return max(float(np.median(distance)) / RAYLEIGH, 1e-9)
 
 
-def _resected(points: FloatArray, pixels: FloatArray) -> FloatArray:
+def resected(points: FloatArray, pixels: FloatArray) -> FloatArray:
     """Camera (3, 4) of points (N, 4) and their pixels (N, 2), some of them wrong: [HZ04] 7.1.
 
     The minimum median distance over random samples of six, then reweighted linear solutions.

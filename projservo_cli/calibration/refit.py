@@ -1,0 +1,481 @@
+"""Fit one camera of a calibration again, after it moved, by images at joint readings.
+
+Operators, markers and all other cameras stay. The camera minimizes residuals weighted by the noise of pixels
+and joints, x̂ = G r. Weights by the covariance of operators and markers as well would give the camera itself
+smaller errors, but larger ones to predictions, which use these operators and markers. To first order images
+are r = J x − T e + n, with errors e of the rest of the calibration and noise n: the camera errs by −G T e +
+G n, so that the covariance of old and new numbers stays that of one calibration.
+
+Joint readings are judged by generalised least squares of all views, of covariance I + T Tᵀ: G. A. F. Seber,
+A. J. Lee, "Linear Regression Analysis", 2nd ed., 2003, section 3.10.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
+from projservo_cli.calibration.checks.screening import without_placeholders
+from projservo_cli.calibration.checks.validation import of_views
+from projservo_cli.calibration.detections import (
+    MAX_JUDGED,
+    RAYLEIGH,
+    Detections,
+    cauchy_weights,
+    even_choice,
+    format_motion,
+    per_block,
+    per_rad,
+)
+from projservo_cli.calibration.epipolar import OUTLIER
+from projservo_cli.calibration.prediction import (
+    CAMERA,
+    Parameters,
+    errors_of,
+    parameters_from,
+    pixel_changes,
+    predict,
+    prediction_variance,
+)
+from projservo_cli.calibration.robust_fit import REFUSE_RATIO, inverse_root
+from projservo_cli.calibration.views import resected
+from projservo_cli.geometry.lens import TERMS, undistort
+from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.records import (
+    TOOL,
+    BoolArray,
+    Calibration,
+    Errors,
+    FloatArray,
+    InputError,
+    IntArray,
+    Observation,
+    WorkFailed,
+    apart,
+)
+
+# Minimum number of detections: a camera has 11 numbers, and as many are left to judge them.
+_LEAST = 12
+# Rounds of reweighted least squares, then rounds of the inliers alone.
+_ROUNDS, _SETTLING = 10, 5
+# Maximum share of the detections of a view that are outliers.
+_MAX_OUTLIERS = 0.4
+# Width of the Cauchy loss in robust standard deviations: 95 % efficient on normal residuals.
+_WIDTH = 2.385
+# Probability that noise alone exceeds the χ² from which the noise of a camera is taken as larger.
+_CHANCE = 1e-3
+# Error of a camera over that before it moved from which more poses are advised.
+_MORE = 1.5
+# Standard deviations from which the offset of a joint is one, or passes unnoticed below.
+_SURE = 4.0
+# Effect of an offset of a joint on images, over their noise, from which it matters.
+_MATTERS = 3.0
+# Largest offset of a joint, rad (prismatic × 0.3 m/rad), that may pass into the camera unnoticed.
+_UNNOTICED_RAD = np.radians(1.0)
+# Share of the square of a joint's effect below which the camera can move images alike.
+_ALIKE = 1e-6
+# Median distance of images from their prediction, over that expected, from which a view disagrees.
+_DISAGREES = 3.0
+# Maximum number of markers with a column each for the errors that the camera shares with them.
+_MOST_APART = 100
+# Number of poses within the joint ranges at which the error of the camera is stated.
+_POSES = 200
+# Error within the joint ranges, over the image size, above which a calibration is not usable.
+_MAX_PREDICTED = 0.01
+
+
+class ViewError(NamedTuple):
+    """Distance of the images of a view from their prediction, and the expected one, medians, px."""
+
+    view: str
+    off_px: float  # NaN without a detection
+    expected_px: float  # by noise and covariance
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether noise and covariance do not explain the distance."""
+        return self.off_px > _DISAGREES * self.expected_px
+
+    @property
+    def text(self) -> str:
+        """Distance and limit in words."""
+        limit = _DISAGREES * self.expected_px
+        return f"the {self.view} images are {self.off_px:.3g} px off ({limit:.3g} px allowed)"
+
+
+def view_errors(calibration: Calibration, observation: Observation) -> tuple[ViewError, ...]:
+    """Compare the images of each view at joint readings with their prediction.
+
+    Raises InputError if the calibration has no covariance, or readings have another number of joints.
+    """
+    images = _Images.of(calibration, observation)
+    return images.errors_of_views(parameters_from(images.calibration), errors_of(images.calibration))
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """Images at new poses, in the order of a calibration; residuals and derivatives in units of noise."""
+
+    calibration: Calibration  # of the markers seen
+    problem: LeastSquares
+    which: IntArray  # (m,) indices of these markers
+
+    @classmethod
+    def of(cls, c: Calibration, observation: Observation) -> "_Images":
+        if not c.has_covariance:
+            raise InputError(
+                f"the method {c.method} of the calibration states no covariance: calibrate by "
+                "bundle_adjustment"
+            )
+        seen, numbers = observation.at_rest, c.marker.tolist()
+        if seen.q.shape[1] != len(c.H_hat_0):
+            raise InputError(f"readings of {seen.q.shape[1]} joints, and the arm has {len(c.H_hat_0)}")
+        seen = of_views(seen, tuple(name for name in c.view if name in seen.view))
+        known, columns = np.isin(seen.marker, c.marker), [c.view.index(name) for name in seen.view]
+        shape = (len(seen.q), len(c.view), np.count_nonzero(known))
+        pixels, sigma = np.full((*shape, 2), np.nan), None
+        pixels[:, columns] = without_placeholders(seen.images)[0][:, :, known]
+        if seen.sigma is not None:
+            sigma = np.ones(shape)
+            sigma[:, columns] = seen.sigma[:, :, known]
+        some = Observation(seen.pose, seen.marker[known], seen.q, pixels, sigma=sigma, view=c.view)
+        found = Detections.of(some, c.joint_types, c.mount)
+        noise = np.full(len(c.view), max(c.sigma_px, c.sigma_fitted_px))
+        noise = noise if c.sigma_view_px is None else c.sigma_view_px
+        found = dataclasses.replace(found, weight=found.weight / noise[:, None])
+        which = np.array([numbers.index(number) for number in found.marker.tolist()], dtype=np.int64)
+        problem = LeastSquares.of(found, -c.q_reference[::-1] if c.mount == TOOL else c.q_reference)
+        tau = c.sigma_q * per_rad(found.prismatic) if c.sigma_q else None
+        return cls(c.with_markers(which), problem.with_noise(tau), which)
+
+    def by_camera(self, params: Parameters, v: int) -> FloatArray:
+        """Derivative (V, N, 2, 12 + terms) of the images by a camera and its lens; zero in other views."""
+        found = self.problem.detections
+        images = params.images(self.problem.q, found.pose_of, found.marker_of)
+        terms = params.lens_terms
+        J = np.zeros((*found.pixels.shape, CAMERA + terms))
+        J[v, ..., :CAMERA] = images.by_camera[v]
+        if images.by_lens is not None:
+            J[v, ..., CAMERA:] = images.by_lens[v][..., :terms]
+        return J * self._weight
+
+    def changes(self, params: Parameters, errors: Errors) -> tuple[FloatArray, FloatArray]:
+        """Changes (V, N, 2, r) of the images by common errors, and (V, N, 2, 3) by a marker's own."""
+        found, q = self.problem.detections, self.problem.q
+        common, own = (
+            np.zeros((*found.pixels.shape, part.shape[-1])) for part in (errors.marker, errors.own)
+        )
+        for k in range(len(q)):  # a pose at a time, to bound the memory
+            rows = np.flatnonzero(found.pose_of == k)
+            for result, part in zip((common, own), pixel_changes(params, errors, q[k : k + 1]), strict=True):
+                result[:, rows] = part[0][:, found.marker_of[rows]]
+        return common * self._weight, own * self._weight
+
+    def deviation(self, params: Parameters, errors: Errors) -> FloatArray:
+        """Expected deviation (V, N) of a coordinate from its prediction, rms of both, in units of noise."""
+        common, own = self.changes(params, errors)
+        variance = 2.0 + (common**2).sum(axis=(2, 3)) + (own**2).sum(axis=(2, 3))
+        if self.problem.tau is not None:
+            variance += ((self.problem.joint_derivative(params) * self.problem.tau) ** 2).sum(axis=(2, 3))
+        return np.asarray(np.sqrt(0.5 * variance))
+
+    def errors_of_views(self, params: Parameters, errors: Errors) -> tuple[ViewError, ...]:
+        """Distances of all views from their prediction, and the expected ones."""
+        found, result = self.problem.detections, []
+        distance = np.linalg.norm(self.problem.residual(params), axis=2) / found.weight
+        expected = RAYLEIGH * self.deviation(params, errors) / found.weight
+        for v, (name, seen) in enumerate(zip(found.view, found.seen, strict=True)):
+            off = (float(np.median(px[v, seen])) if seen.any() else np.nan for px in (distance, expected))
+            result.append(ViewError(name, *off))
+        return tuple(result)
+
+    @property
+    def _weight(self) -> FloatArray:
+        return self.problem.detections.weight[..., None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Camera:
+    """A camera as fitted: its numbers x are P, up to scale, and the terms of its lens, c together."""
+
+    images: _Images
+    v: int  # its view
+    params: Parameters
+    used: BoolArray  # (V, N) inliers, of this view alone
+    root: FloatArray  # (c, c − 1) root of the covariance of x by noise of pixels and joints
+    G: FloatArray  # (c, V, N, 2) derivative of x by the images, in units of noise
+
+
+def refit(
+    calibration: Calibration, observation: Observation, view: str, image_size: ImageSize | None = None
+) -> Calibration:
+    """Fit a camera, and its lens if the calibration has one, again by images at joint readings.
+
+    Parameters
+    ----------
+    calibration : with its covariance, of any views and either mount.
+    observation : images of its markers by the camera that moved, and perhaps by others that did not.
+    view : name of the camera that moved.
+    image_size : width and height, px; None takes the extent of the images.
+
+    Returns
+    -------
+    The calibration with the new camera, and the covariance of all its numbers together.
+
+    Raises
+    ------
+    InputError
+        If the calibration has no such view or no covariance, or the observation has not that view.
+    WorkFailed
+        If the images do not determine the camera, or do not confirm the joint readings: the number, its
+        limit, and what would.
+    """
+    for names, of in ((calibration.view, "calibration"), (observation.view, "images")):
+        if view not in names:
+            raise InputError(
+                f"no camera {view!r}: the {of} have {', '.join(names)}".replace("on have", "on has")
+            )
+    camera = _fitted(_Images.of(calibration, observation), calibration.view.index(view))
+    ratio = _require_confirmed(camera)
+    return _record(calibration, observation, camera, ratio, image_size)
+
+
+def _fitted(images: _Images, v: int) -> _Camera:
+    """Resect a camera, then minimize squared residuals, with a Cauchy loss at first.
+
+    Raises WorkFailed if the images do not determine it.
+    """
+    problem, found, c = images.problem, images.problem.detections, images.calibration
+    seen = found.seen & (np.arange(len(found.seen)) == v)[:, None]
+    poses = np.unique(found.pose_of[seen[v]]).size
+    open_ = (
+        f"{seen.sum()} detections of the {found.view[v]} camera at {poses} poses determine no camera "
+        f"({_LEAST} required, not in one plane): add poses in which several joints move, and markers"
+    )
+    if seen.sum() < _LEAST:
+        raise WorkFailed(open_)
+    params = parameters_from(c)
+    # To a frame whose plane at infinity is the last coordinate, where points have finite ones.
+    frame = np.vstack([np.linalg.svd(c.a_inf[None])[2][1:], c.a_inf])
+    points = params.moved(problem.q, found.pose_of, found.marker_of)[seen[v]] @ frame.T
+    straight = found.pixels if params.lens is None else undistort(params.lens, found.pixels)
+    P = params.P.copy()
+    P[v] = resected(points, straight[v, seen[v]]) @ frame
+    params = dataclasses.replace(params, P=P)
+    deviation = images.deviation(params, _of_others(c, v))
+    used, rows = seen, (images.problem.detections.pixels.size, -1)
+    for k in range(_ROUNDS + _SETTLING + 1):
+        residual = problem.residual(params)
+        distance = np.linalg.norm(residual, axis=2) / deviation
+        middle = max(float(np.median(distance[seen])) / RAYLEIGH, 1e-9)
+        if k < _ROUNDS:
+            weight = seen * np.sqrt(cauchy_weights((distance / (_WIDTH * middle)) ** 2))
+        elif k == _ROUNDS:
+            used = seen & (distance <= OUTLIER * max(middle, 1.0))
+            weight = used.astype(np.float64)
+            if used.sum() < max(_LEAST, (1.0 - _MAX_OUTLIERS) * seen.sum()):
+                raise WorkFailed(
+                    f"{(seen & ~used).sum()} of {seen.sum()} detections of the {found.view[v]} camera do not "
+                    f"fit ({100.0 * _MAX_OUTLIERS:g} % allowed): check the joint readings and marker numbers"
+                )
+        J = (images.by_camera(params, v) * weight[..., None, None]).reshape(rows)
+        change = (residual * weight[..., None]).reshape(rows)
+        if k >= _ROUNDS:
+            J, change = np.hsplit(problem.whitened(params, np.hstack([J, change]), used), [J.shape[1]])
+        gauge = np.zeros((J.shape[1], 1))
+        gauge[:CAMERA, 0] = params.P[v].ravel()
+        root = inverse_root(J, np.linalg.norm(J, axis=0), gauge)
+        along = J @ root
+        if not (np.linalg.norm(along, axis=0) > 0.5).all():  # else of length one
+            raise WorkFailed(open_)
+        if k < _ROUNDS + _SETTLING:
+            params = _stepped(params, v, -root @ (along.T @ change[:, 0]))
+    G = root @ problem.whitened(params, along, used).T
+    scale = 1.0 / np.sqrt(np.mean((points @ np.linalg.inv(frame).T @ params.P[v, 2]) ** 2))
+    params.P[v] *= scale
+    units = np.ones((len(root), 1))
+    units[:CAMERA] = scale
+    return _Camera(images, v, params, used, units * root, (units * G).reshape(-1, *found.pixels.shape))
+
+
+def _stepped(params: Parameters, v: int, x: FloatArray) -> Parameters:
+    """Parameters after a step (c,) of a camera and its lens."""
+    P, lens = params.P.copy(), params.lens
+    P[v] += x[:CAMERA].reshape(3, 4)
+    if lens is not None:
+        lens = lens.copy()
+        lens[v, list(TERMS[: params.lens_terms])] += x[CAMERA:]
+    return dataclasses.replace(params, P=P, lens=lens)
+
+
+def _rows(c: Calibration, v: int) -> IntArray:
+    """Rows (c,) of the numbers of a camera in the covariance of a calibration."""
+    terms, lenses = c.lens_terms, c.P.size + c.H_hat_0.size
+    return np.concatenate([v * CAMERA + np.arange(CAMERA), lenses + v * terms + np.arange(terms)])
+
+
+def _of_others(c: Calibration, v: int, errors: Errors | None = None) -> Errors:
+    """Errors of a calibration but for those of one camera."""
+    errors = errors_of(c) if errors is None else errors
+    shared = errors.shared.copy()
+    shared[_rows(c, v)] = 0.0
+    return errors._replace(shared=shared)
+
+
+def _require_confirmed(camera: _Camera) -> float:
+    """Refuse joint readings that images contradict, or that nothing confirms; the noise over that expected.
+
+    All views together have residuals r of covariance S = I + T Tᵀ and noise of joints. Across what the camera
+    can do, an offset of each joint is tested for what it is, and for what would pass unnoticed.
+    """
+    images, v, params = camera.images, camera.v, camera.params
+    problem, found, c = images.problem, images.problem.detections, images.calibration
+    name, errors = found.view[v], _of_others(c, v)
+    for one in images.errors_of_views(params, errors):
+        if one.view != name and one.disagrees:
+            raise WorkFailed(
+                f"{one.text} at these joint readings: they are wrong, or that camera moved as well; home the "
+                "joints, or calibrate again"
+            )
+    near = np.linalg.norm(problem.residual(params), axis=2) <= OUTLIER * images.deviation(params, errors)
+    mask = camera.used | (found.seen & near & (np.arange(len(found.seen)) != v)[:, None])
+    mask &= np.isin(found.marker_of, even_choice(found.marker.size, MAX_JUDGED))
+    common, own = images.changes(params, errors)
+    T = apart(
+        common, own, np.broadcast_to(found.marker_of[:, None], (*found.seen.shape, 2)), found.marker.size
+    )
+    per = per_rad(params.prismatic)
+    columns = (
+        *(images.by_camera(params, v) @ camera.root, problem.joint_derivative(params) * per),
+        *(problem.residual(params)[..., None], T),
+    )
+    stacked = np.concatenate(columns, axis=-1) * mask[..., None, None]
+    stacked = problem.whitened(params, stacked.reshape(-1, stacked.shape[-1]), mask)
+    n, k = len(per), camera.root.shape[1]
+    Y, T = np.hsplit(stacked, [k + n + 1])
+    crossed = T.T @ Y
+    gram = Y.T @ Y - crossed.T @ np.linalg.solve(np.eye(T.shape[1]) + T.T @ T, crossed)
+    left = gram[k:, k:] - gram[k:, :k] @ np.linalg.solve(gram[:k, :k], gram[:k, k:])
+    count = 2.0 * mask.sum()
+    ratio = float(np.sqrt(left[n, n] / (count - k)))
+    if ratio > REFUSE_RATIO:
+        raise WorkFailed(
+            f"the images are {ratio:.3g} times as far off as noise and covariance explain ({REFUSE_RATIO:g} "
+            "allowed): check the joint readings and the marker numbers"
+        )
+    own_square = np.diagonal(left)[:n]
+    judged = own_square > _ALIKE * np.diagonal(gram)[k : k + n]
+    square = np.where(judged, own_square, np.inf)
+    offset, deviation = -left[:n, n] / square, max(ratio, 1.0) / np.sqrt(square)
+    effect = np.abs(offset) * np.sqrt(np.diagonal(Y.T @ Y)[k : k + n] / count)
+    wrong = np.where((np.abs(offset) > _SURE * deviation) & (effect > _MATTERS), effect, 0.0)
+    i = int(np.argmax(wrong))
+    if wrong[i]:
+        off, std = (format_motion(per[i] * x, bool(params.prismatic[i])) for x in (offset[i], deviation[i]))
+        raise WorkFailed(
+            f"by the images, joint {found.numbers[i]} is {off} off its readings (± {std}), which moves images "
+            f"by {effect[i]:.3g} times their noise ({_MATTERS:g} allowed): home it, or calibrate again"
+        )
+    i, limit = int(np.argmax(deviation)), max(_UNNOTICED_RAD, 2.0 * (c.sigma_q or 0.0))
+    if (unnoticed := _SURE * deviation[i]) > limit:
+        far, least = (format_motion(per[i] * x, bool(params.prismatic[i])) for x in (unnoticed, limit))
+        raise WorkFailed(
+            f"an error of joint {found.numbers[i]} by {far} could pass into the {name} camera unnoticed "
+            f"({least} allowed): add poses that spread farther, or images of a camera that did not move"
+        )
+    significant = ratio**2 > chdtri(count - k, _CHANCE) / (count - k)
+    return ratio if significant else 1.0
+
+
+def _record(
+    c: Calibration, observation: Observation, camera: _Camera, ratio: float, image_size: ImageSize | None
+) -> Calibration:
+    """Calibration with a camera as fitted, at so many times the expected noise."""
+    images, v, which, rows = camera.images, camera.v, camera.images.which, _rows(c, camera.v)
+    found, count, errors = images.problem.detections, len(rows), _of_others(images.calibration, v)
+    common, own = images.changes(camera.params, errors)
+    by_common = -np.einsum("cvni,vnir->cr", camera.G, common, optimize=True)
+    by_own = -per_block(found.marker_of, np.einsum("cvni,vnid->ncd", camera.G, own), which.size)
+    by_own = by_own.swapaxes(0, 1).reshape(count, -1)
+    noise, marker, own_errors = ratio * camera.root, c.sqrt_cov_marker, c.sqrt_cov_own.copy()
+    apart_ = which.size <= _MOST_APART
+    if not apart_:
+        # Of many markers each hardly matters to the camera: their errors count as independent ones.
+        noise, by_own = np.linalg.qr(np.hstack([noise, by_own]).T, mode="r").T, by_own[:, :0]
+    first, more = c.sqrt_cov_shared.shape[1], by_own.shape[1] + noise.shape[1]
+    shared = np.pad(c.sqrt_cov_shared, ((0, 0), (0, more)))
+    shared[rows] = np.hstack([by_common, by_own, noise])
+    marker = np.pad(marker, ((0, 0), (0, 0), (0, more)))
+    if apart_:
+        for k, j in enumerate(which):
+            marker[j, :, first + 3 * k : first + 3 * k + 3] = own_errors[j]
+        own_errors[which] = 0.0
+    changed: dict[str, Any] = {"P": camera.params.P, "lens": camera.params.lens}
+    changed |= {"sqrt_cov_shared": shared, "sqrt_cov_marker": marker, "sqrt_cov_own": own_errors}
+    if c.model_error_bias is not None:
+        changed["model_error_bias"] = _bias(c, camera)
+    if c.corner_squares is not None and c.corner_q is not None:
+        squares = np.full((len(found.q), *c.corner_squares.shape[1:]), np.nan)
+        square = np.square(images.problem.residual(camera.params)).mean(axis=-1)
+        squares[found.pose_of, v, which[found.marker_of]] = np.where(camera.used[v], square[v], np.nan)
+        old = c.corner_squares.copy()
+        old[:, v] = np.nan
+        changed["corner_squares"] = np.concatenate([old, squares])
+        changed["corner_q"] = np.concatenate([c.corner_q, observation.at_rest.q])
+    new = dataclasses.replace(c, **changed)
+    pixels = found.pixels[v, found.seen[v]]
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    wide = 0.5 * (high - low)
+    error = [_error_px(one, v, low - wide, high + wide) for one in (new, c)]
+    size = high - low if image_size is None else image_sizes(image_size, len(c.view))[v]
+    return _judged(new, v, error, found.pose_of[camera.used[v]], _MAX_PREDICTED * float(size.max()))
+
+
+def _bias(c: Calibration, camera: _Camera) -> FloatArray:
+    """Errors of all parameters by deviations from the model: the camera errs by them in images as before."""
+    images, v, s = camera.images, camera.v, len(c.sqrt_cov_shared)
+    bias = np.array(c.model_error_bias)
+    by_marker = bias[s:].reshape(len(c.M), 4, -1)[images.which]
+    of_bias = dataclasses.replace(
+        images.calibration,
+        sqrt_cov_shared=bias[:s],
+        sqrt_cov_marker=by_marker,
+        sqrt_cov_own=by_marker[..., :0],
+    )
+    before = images.changes(parameters_from(images.calibration), errors_of(of_bias))[0]
+    change = before - images.changes(camera.params, _of_others(of_bias, v))[0]
+    bias[_rows(c, v)] = np.einsum("cvni,vnir->cr", camera.G, change, optimize=True)
+    return bias
+
+
+def _error_px(c: Calibration, v: int, low: FloatArray, high: FloatArray) -> float:
+    """Expected error of the images of a view within the joint ranges and a region, rms of distances, px."""
+    few = c.with_markers(even_choice(len(c.M), MAX_JUDGED))
+    q = c.joint_min + np.random.default_rng(0).random((_POSES, len(c.joint_min))) * c.excitation
+    pixels, variance = predict(few, q)[:, v], prediction_variance(few, q)[:, v].sum(axis=-1)
+    inside = ((pixels >= low) & (pixels <= high)).all(axis=-1)
+    inside = inside if inside.any() else np.isfinite(pixels[..., 0])
+    return float(np.sqrt(variance[inside].mean())) if inside.any() else np.inf
+
+
+def _judged(c: Calibration, v: int, error: list[float], pose_of: IntArray, limit: float) -> Calibration:
+    """Calibration with the error of its new camera, now and before, and whether it is usable."""
+    name, (now, before), poses = c.view[v], error, np.unique(pose_of).size
+    text = f"the {name} camera, fitted again from {poses} poses, errs by {now:.3g} px rms within the joint ranges"
+    usable, reason, advice = c.usable, c.reason, c.advice
+    if now > limit:
+        usable, reason = False, f"{text} ({limit:.3g} px allowed): add poses that spread farther"
+    elif now > _MORE * before:
+        advice = (f"{text}, {before:.3g} px before it moved: add poses that spread farther", *advice)
+    grown = {}
+    for field in ("predicted_rms_px", "predicted_p99_px", "predicted_recorded_px", "predicted_worst_px"):
+        if (px := getattr(c, field)) is not None:
+            grown[field] = float(np.sqrt(max(px**2 + (now**2 - before**2) / len(c.view), 0.0)))
+    numbers = np.array([[poses, now, before]])
+    numbers = numbers if c.refit_numbers is None else np.concatenate([c.refit_numbers, numbers])
+    return dataclasses.replace(
+        c, usable=usable, reason=reason, advice=advice, refit=(*c.refit, name), refit_numbers=numbers, **grown
+    )
