@@ -1,0 +1,110 @@
+"""A camera that moved, fitted again: its error over that of a whole recalibration, and its 95 % regions.
+
+    python -m tests.studies.refit [--draws 500] [-o refit.csv]
+
+Each draw is a calibration of the UR5 of the reference data at 0.5 px, from single-joint trials and twelve
+combined poses to ±30°. Then the left camera is turned by 3° and shifted by 30 mm, in random directions, and
+fitted again from 5, 10 and 20 random poses within ±45° and ±8°, by images of both cameras and of the left one
+alone; beside it the whole rig is calibrated again from all poses. Errors and regions are of left images at
+held-out poses within ±30°; the region of a pose is that of the images of all markers in both cameras.
+"""
+
+import dataclasses
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.stats import chi2
+
+from projservo_cli.calibration import calibrate, predict
+from projservo_cli.calibration.prediction import (
+    dense_pixel_changes,
+    errors_of,
+    from_reference,
+    parameters_from,
+)
+from projservo_cli.calibration.refit import refit
+from projservo_cli.records import WorkFailed
+from tests.calibration.simulated_robot import around, trials
+from tests.studies.common import in_two_processes, parser_of, write_rows
+from tests.studies.one_camera import COMBINED, FRAMES, RIGS, robot_of
+
+SEED, NOISE_PX, HELD_OUT = 506, 0.5, 20
+RANGES_DEG, POSES = (45, 8), (5, 10, 20)
+TURN_RAD, SHIFT_M = np.radians(3.0), 0.03
+LIMIT = {(45, 10): 2.0, (45, 20): 1.5}  # of the error over that of a whole recalibration
+RANK = 1e-9  # of the largest eigenvalue, below which a direction of a region is empty
+
+
+def knocked(robot, rng):
+    """The robot with its left camera turned about its centre, and shifted."""
+    K, kernel = robot.cameras[0, :, :3], np.linalg.svd(robot.cameras[0])[2][3]
+    axis, way = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    center = kernel[:3] / kernel[3] + SHIFT_M * way
+    turned = K @ expm(TURN_RAD * np.cross(np.eye(3), axis))
+    cameras = robot.cameras.copy()
+    cameras[0] = np.c_[turned, -turned @ center]
+    return dataclasses.replace(robot, cameras=cameras)
+
+
+def judged(found, robot, ahead):
+    """Mean square error of left images, px², and shares of 95 % regions of markers and of poses that hold."""
+    error = predict(found, ahead) - robot.images(ahead)
+    markers, poses = [], []
+    for q, off in zip(from_reference(found, ahead), error, strict=True):
+        F = dense_pixel_changes(parameters_from(found), errors_of(found), q[None])[0]
+        for here, change in zip(off[0], F[0], strict=True):
+            markers.append(here @ np.linalg.solve(change @ change.T, here) <= chi2.ppf(0.95, 2))
+        values, axes = np.linalg.eigh(np.einsum("ar,br->ab", *[F.reshape(off.size, -1)] * 2))
+        known = values > RANK * values[-1]
+        square = ((axes.T @ off.ravel())[known] ** 2 / values[known]).sum()
+        poses.append(square <= chi2.ppf(0.95, known.sum()))
+    return {"square": float(np.mean(error[:, 0] ** 2)), "markers": np.mean(markers), "poses": np.mean(poses)}
+
+
+def drawn(draw):
+    """Rows of the table of one draw."""
+    rng, robot = np.random.default_rng([SEED, draw]), robot_of(RIGS["ur5 combined"], 2)
+    q = np.concatenate([trials(robot, frames=FRAMES), around(robot, COMBINED, rng)])
+    moved, ahead = knocked(robot, rng), around(robot, HELD_OUT, rng, np.radians(30.0), 0.15)
+    how = {"source": "simulated", "sigma_px": NOISE_PX}
+    before, whole = (
+        calibrate(one.observe(q, NOISE_PX, rng), one.joint_types, **how) for one in (robot, moved)
+    )
+    rows = [{"draw": draw, "by": "whole", "range": 30, "poses": len(q), **judged(whole, moved, ahead)}]
+    for far in RANGES_DEG:
+        for count in POSES:
+            seen = moved.observe(around(moved, count, rng, np.radians(far), 0.15), NOISE_PX, rng)
+            alone = dataclasses.replace(seen, images=seen.images[:, :1], view=("left",))
+            for by, some in (("both", seen), ("left", alone)):
+                row = {"draw": draw, "by": by, "range": far, "poses": count, "reason": ""}
+                try:
+                    row |= judged(refit(before, some, "left"), moved, ahead)
+                except WorkFailed as error:
+                    row["reason"] = str(error)
+                rows.append(row)
+    return rows
+
+
+def main():
+    """Judge all draws, print a line a design, and write the table."""
+    asked = parser_of("refit", __doc__, [("draws", 500, "calibrations, each with all refits")]).parse_args()
+    rows = [row for some in in_two_processes(drawn, range(asked.draws), "refit") for row in some]
+    write_rows(asked.output, rows)
+    whole = np.sqrt(np.mean([row["square"] for row in rows if row["by"] == "whole"]))
+    print(f"whole recalibration: {whole:.3f} px rms of a left coordinate, {asked.draws} draws")
+    print("images by, range, poses: error over that (limit); regions of markers, of poses; refused")
+    for by, far, count in dict.fromkeys((row["by"], row["range"], row["poses"]) for row in rows):
+        some = [row for row in rows if (row["by"], row["range"], row["poses"]) == (by, far, count)]
+        done = [row for row in some if "square" in row]
+        if not done:
+            print(f"{by} ±{far}° {count}: all refused: {some[0]['reason']}")
+            continue
+        error = np.sqrt(np.mean([row["square"] for row in done])) / whole
+        markers, poses = (100.0 * np.mean([row[name] for row in done]) for name in ("markers", "poses"))
+        limit = f" ({LIMIT[far, count]:g})" if (far, count) in LIMIT and by != "whole" else ""
+        refused = f"{len(some) - len(done)} of {len(some)}"
+        print(f"{by} ±{far}° {count}: {error:.2f}{limit}; {markers:.1f} %, {poses:.1f} %; {refused}")
+
+
+if __name__ == "__main__":
+    main()
