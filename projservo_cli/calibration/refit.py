@@ -81,8 +81,10 @@ _ALIKE = 1e-6
 _DISAGREES = 3.0
 # Maximum number of markers with a column each for the errors that the camera shares with them.
 _MOST_APART = 100
+# Poses whose changes of images are computed together, to bound the memory.
+_AT_ONCE = 20
 # Number of poses within the joint ranges at which the error of the camera is stated.
-_POSES = 200
+_POSES = 60
 # Error within the joint ranges, over the image size, above which a calibration is not usable.
 _MAX_PREDICTED = 0.01
 
@@ -168,10 +170,12 @@ class _Images:
         common, own = (
             np.zeros((*found.pixels.shape, part.shape[-1])) for part in (errors.marker, errors.own)
         )
-        for k in range(len(q)):  # a pose at a time, to bound the memory
-            rows = np.flatnonzero(found.pose_of == k)
-            for result, part in zip((common, own), pixel_changes(params, errors, q[k : k + 1]), strict=True):
-                result[:, rows] = part[0][:, found.marker_of[rows]]
+        for first in range(0, len(q), _AT_ONCE):
+            rows = np.flatnonzero(found.pose_of // _AT_ONCE == first // _AT_ONCE)
+            at = found.pose_of[rows] - first, slice(None), found.marker_of[rows]
+            parts = pixel_changes(params, errors, q[first : first + _AT_ONCE])
+            for result, part in zip((common, own), parts, strict=True):
+                result[:, rows] = part[at].swapaxes(0, 1)
         return common * self._weight, own * self._weight
 
     def deviation(self, params: Parameters, errors: Errors) -> FloatArray:
@@ -376,8 +380,8 @@ def _require_confirmed(camera: _Camera) -> float:
     if wrong[i]:
         off, std = (format_motion(per[i] * x, bool(params.prismatic[i])) for x in (offset[i], deviation[i]))
         raise WorkFailed(
-            f"by the images, joint {found.numbers[i]} is {off} off its readings (± {std}), which moves images "
-            f"by {effect[i]:.3g} times their noise ({_MATTERS:g} allowed): home it, or calibrate again"
+            f"by the images, joint {found.numbers[i]} is {off} (± {std}) off its readings, which moves images by "
+            f"{effect[i]:.3g} times their noise ({_MATTERS:g} allowed): home it, or calibrate again"
         )
     i, limit = int(np.argmax(deviation)), max(_UNNOTICED_RAD, 2.0 * (c.sigma_q or 0.0))
     if (unnoticed := _SURE * deviation[i]) > limit:
@@ -464,7 +468,7 @@ def _error_px(c: Calibration, v: int, low: FloatArray, high: FloatArray) -> floa
 def _judged(c: Calibration, v: int, error: list[float], pose_of: IntArray, limit: float) -> Calibration:
     """Calibration with the error of its new camera, now and before, and whether it is usable."""
     name, (now, before), poses = c.view[v], error, np.unique(pose_of).size
-    text = f"the {name} camera, fitted again from {poses} poses, errs by {now:.3g} px rms within the joint ranges"
+    text = f"the {name} camera, fitted again from {poses} poses, errs by {now:.3g} px within the joint ranges"
     usable, reason, advice = c.usable, c.reason, c.advice
     if now > limit:
         usable, reason = False, f"{text} ({limit:.3g} px allowed): add poses that spread farther"

@@ -32,6 +32,7 @@ SEED, NOISE_PX, HELD_OUT = 506, 0.5, 20
 RANGES_DEG, POSES = (45, 8), (5, 10, 20)
 TURN_RAD, SHIFT_M = np.radians(3.0), 0.03
 LIMIT = {(45, 10): 2.0, (45, 20): 1.5}  # of the error over that of a whole recalibration
+CHI2 = chi2.ppf(0.95, np.arange(100))  # by degrees of freedom
 RANK = 1e-9  # of the largest eigenvalue, below which a direction of a region is empty
 
 
@@ -53,12 +54,16 @@ def judged(found, robot, ahead):
     for q, off in zip(from_reference(found, ahead), error, strict=True):
         F = dense_pixel_changes(parameters_from(found), errors_of(found), q[None])[0]
         for here, change in zip(off[0], F[0], strict=True):
-            markers.append(here @ np.linalg.solve(change @ change.T, here) <= chi2.ppf(0.95, 2))
+            markers.append(here @ np.linalg.solve(change @ change.T, here) <= CHI2[2])
         values, axes = np.linalg.eigh(np.einsum("ar,br->ab", *[F.reshape(off.size, -1)] * 2))
         known = values > RANK * values[-1]
         square = ((axes.T @ off.ravel())[known] ** 2 / values[known]).sum()
-        poses.append(square <= chi2.ppf(0.95, known.sum()))
-    return {"square": float(np.mean(error[:, 0] ** 2)), "markers": np.mean(markers), "poses": np.mean(poses)}
+        poses.append(square <= CHI2[known.sum()])
+    return {
+        "square": float(np.mean(error[:, 0] ** 2)),
+        "of_markers": np.mean(markers),
+        "of_poses": np.mean(poses),
+    }
 
 
 def drawn(draw):
@@ -100,7 +105,7 @@ def main():
             print(f"{by} ±{far}° {count}: all refused: {some[0]['reason']}")
             continue
         error = np.sqrt(np.mean([row["square"] for row in done])) / whole
-        markers, poses = (100.0 * np.mean([row[name] for row in done]) for name in ("markers", "poses"))
+        markers, poses = (100.0 * np.mean([row[name] for row in done]) for name in ("of_markers", "of_poses"))
         limit = f" ({LIMIT[far, count]:g})" if (far, count) in LIMIT and by != "whole" else ""
         refused = f"{len(some) - len(done)} of {len(some)}"
         print(f"{by} ±{far}° {count}: {error:.2f}{limit}; {markers:.1f} %, {poses:.1f} %; {refused}")
