@@ -22,7 +22,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.result_hashes import digest
 from projservo_cli.stages.stage_inputs import PlanInputs
-from projservo_cli.steps import STAGES, Step, inputs_of, result_of, steps_for
+from projservo_cli.steps import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
 from projservo_cli.store import SERVO, Run, save
 
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
@@ -284,7 +284,11 @@ class Chain:
             from projservo_cli.stages import calibrate
 
             require_simulated(self.config)
-            return calibrate.run(inputs, progress=progress)
+            stored, known = run.results.get("calibrate"), getattr(inputs, "before", None)
+            before = None
+            if stored is not None and known is not None and stored.key == key_of_calibration(known):
+                before = run.observation, run.calibration, run.cross_validation
+            return calibrate.run(inputs, before, progress=progress)
         if step.stage == "plan":
             from projservo_cli.stages import plan
 

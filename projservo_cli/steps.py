@@ -176,6 +176,16 @@ def inputs_of(stage: str, config: Config) -> Any:
     return _INPUTS[stage](config, None)
 
 
+def key_of_calibration(record: Any) -> str:
+    """Key of the calibration of some inputs."""
+    return _key(key_of(record), (), "", {})
+
+
+def _key(own: str, before: Sequence[str], law: str, source: Mapping[str, str]) -> str:
+    """Key of a result, by that of its inputs, those of the results before, and the hashes of its law."""
+    return own and key_of(own, before=list(before), law=law, source=dict(source))
+
+
 def _needed(inputs: _Inputs, laws: Mapping[str, _Read], stages: Sequence[str]) -> Iterator[Step]:
     """Every result of the stages with its key, each made from those before."""
     before: list[str] = []
@@ -184,8 +194,7 @@ def _needed(inputs: _Inputs, laws: Mapping[str, _Read], stages: Sequence[str]) -
         own = "" if record is None else key_of(record)
         of_files = {"": _Read(inputs.files if stage == "calibrate" else {})}
         for law, read in (laws if stage == "servo" else of_files).items():
-            more = {"before": before, "law": law, "source": dict(read.hashed)}
-            keys.append(own and key_of(own, **more))
+            keys.append(_key(own, before, law, read.hashed))
             yield Step(stage, law, keys[-1], read.inputs, note=read.note, unkeyed=read.unkeyed, record=record)
         before = keys
 

@@ -380,8 +380,8 @@ def _require_confirmed(camera: _Camera) -> float:
     if wrong[i]:
         off, std = (format_motion(per[i] * x, bool(params.prismatic[i])) for x in (offset[i], deviation[i]))
         raise WorkFailed(
-            f"by the images, joint {found.numbers[i]} is {off} (± {std}) off its readings, which moves images by "
-            f"{effect[i]:.3g} times their noise ({_MATTERS:g} allowed): home it, or calibrate again"
+            f"by the images, joint {found.numbers[i]} is {off} (± {std}) off its readings, which moves images "
+            f"by {effect[i]:.3g} times their noise ({_MATTERS:g} allowed): home it, or calibrate again"
         )
     i, limit = int(np.argmax(deviation)), max(_UNNOTICED_RAD, 2.0 * (c.sigma_q or 0.0))
     if (unnoticed := _SURE * deviation[i]) > limit:

@@ -209,6 +209,8 @@ def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Co
 
     if options.get("origin") is not None:
         return _from_sweep(options)
+    if options.get("refit") is not None:
+        return _of_refit(options)
     run = stored(options["output"]) if options["output"] else None
     if not options["config"] and run is not None and run.configuration:
         config = load_config(run.path, _overrides(options), text=run.configuration)
@@ -221,6 +223,37 @@ def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Co
     if config.data is None and (recording or table.is_file()):
         in_folder = Override(f"{table}", "data.table", str(table))
         config = load_config(config.name, [in_folder], text=to_yaml(config))
+    return config, run
+
+
+def _of_refit(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
+    """Configuration of a run with a camera fitted again, and another run that holds its calibration."""
+    from projservo_cli.config import Override, load_config, stored_yaml
+    from projservo_cli.store import Run, load, run_path, stored
+
+    flag, before = f"--refit {options['refit']}", load(options["run"])
+    if not options["data"] or not options["output"]:
+        raise click.UsageError(f"{flag}: takes --data TABLE, images by that camera, and -o, another run")
+    if run_path(options["output"]).resolve() == before.path.resolve():
+        raise click.UsageError(f"{flag}: -o {options['output']} is the run itself; name another")
+    for name in ("config", "mount", "joints", "noise_px", "lens", "init", "cross_validate", "image_size"):
+        if options[name]:
+            text = f"that of {before.path.parent} stands; leave it out"
+            raise click.UsageError(f"--{name.replace('_', '-')} and {flag}: {text}")
+    if options["refit"] not in before.calibration.view:
+        raise click.UsageError(f"{flag}: the cameras are {', '.join(before.calibration.view)}")
+    result, files = before.results["calibrate"], {"table": options["data"], "readings": options["readings"]}
+    one = {name: os.path.abspath(file) for name, file in files.items() if file}
+    one |= {"view": options["refit"], "joint_unit": options["joint_unit"]}
+    settings = load_config(before.path, text=result.configuration).calibration.model_dump(mode="json")
+    refits = Override(flag, "calibration.refits", [*settings["refits"], one])
+    sets = map(Override.parse, options["sets"])
+    config, run = (
+        load_config(before.path, [refits, *sets], text=result.configuration),
+        stored(options["output"]),
+    )
+    if run.configuration != stored_yaml(config):
+        run = Run(run.path, run.configuration, {"calibrate": result})
     return config, run
 
 

@@ -144,6 +144,12 @@ def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
         views = value["view"]
         count = "one camera" if len(views) == 1 else f"{len(views)} cameras"
         yield wrapped(f"by {count}{where}: {', '.join(views)}", "  ")
+    for one in value["refits"]:
+        yield wrapped(
+            "{view} fitted again by {poses} poses: errs by {error_px:.3g} px within the joint ranges, "
+            "{before_px:.3g} px before it moved".format_map(one),
+            "  ",
+        )
     yield from _of_suggestions(value)
 
 

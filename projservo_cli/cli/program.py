@@ -130,7 +130,8 @@ class _Group(click.Group):
         first, *rest = words
         if first in self.commands and first not in self.stages:
             return [first], rest
-        if first == "report" and len(rest) == 1 and rest[0] not in self.commands:  # of a sweep, not of a run
+        # The report of a sweep, and a calibration of which a camera is fitted again.
+        if first in ("report", "calibrate") and len(rest) == 1 and rest[0] not in self.commands:
             return [first], rest
         for word in words:
             if word not in self.commands:

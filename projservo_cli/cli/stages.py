@@ -121,6 +121,12 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
     type=click.IntRange(1, 100),
     help="Suggest N further poses to record, the most informative first; 5 without N.",
 )
+@click.argument("run", metavar="[RUN]", required=False, type=option.PATH)
+@click.option(
+    "--refit",
+    metavar="NAME",
+    help="Fit this camera of RUN, which moved, again by the images in --data; -o is another run.",
+)
 @option.of_stages
 def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Learn the projective kinematics from trial motions.
@@ -130,7 +136,15 @@ def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
 
     --cross-validate and --init become part of the configuration of the run. --suggest works on the
     calibration as it is and writes suggestions.csv into the folder of the run, for record --motions.
+
+    projservo calibrate RUN --refit NAME --data TABLE -o NEW keeps joints, markers and other cameras of RUN,
+    and fits the camera NAME, which moved, again. Exit code 1 where neither enough poses nor another camera
+    confirm the joint readings.
     """
+    if (options["run"] is None) != (options["refit"] is None):
+        raise click.UsageError(
+            "a camera is fitted again by projservo calibrate RUN --refit NAME --data TABLE -o NEW"
+        )
     return _make(console, stages, options)
 
 

@@ -42,6 +42,7 @@ from projservo_cli.stages.stage_inputs import (
     PlanInputs,
     PreflightInputs,
     RecordingInputs,
+    RefitInputs,
     ReportInputs,
     Scenery,
     ServoInputs,
@@ -62,11 +63,12 @@ _EXPECTED = {
     "init": "JSON with screws, cameras and markers",
     "mjcf": "a model of MuJoCo",
 }
+_REFIT = {"refit": "table", "refit readings": "readings"}  # kinds of the files of a refit, and their keys
 Files = Mapping[str, File]  # by their roles; read from disk if not given
 
 
-def calibration_inputs(config: Config, files: Files | None = None) -> CalibrationInputs:
-    """Return the inputs of a calibration: a table, else trials of the simulated robot."""
+def calibration_inputs(config: Config, files: Files | None = None) -> CalibrationInputs | RefitInputs:
+    """Return the inputs of a calibration: a table, else trials of the simulated robot; then its refits."""
     settings, table = config.calibration, _file(config, "table", files)
     source: Table | Trials
     if config.data is not None and table is not None:
@@ -86,7 +88,13 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         settings.cross_validate,
         settings.max_predicted_px,
     )
-    return CalibrationInputs(source, how, noise)
+    inputs: CalibrationInputs | RefitInputs = CalibrationInputs(source, how, noise)
+    for i, one in enumerate(settings.refits):
+        seen, readings = (_file(config, f"{kind} {i}", files) for kind in _REFIT)
+        assert seen is not None
+        unit = one.joint_unit or (None if config.data is None else config.data.joint_unit)
+        inputs = RefitInputs(inputs, one.view, seen, readings, unit, config.image_size_px)
+    return inputs
 
 
 def recording_inputs(config: Config) -> RecordingInputs:
@@ -294,7 +302,8 @@ def files_of(config: Config, gone: Mapping[str, str] | None = None) -> Files:
 
     gone : hashes that files had, by their paths, which stand where the files are gone.
     """
-    found = {kind: _read(config, kind, gone or {}) for kind in _EXPECTED}
+    refits = [f"{kind} {i}" for i in range(len(config.calibration.refits)) for kind in _REFIT]
+    found = {kind: _read(config, kind, gone or {}) for kind in (*_EXPECTED, *refits)}
     return {kind: file for kind, file in found.items() if file is not None}
 
 
@@ -306,16 +315,21 @@ def _file(config: Config, kind: str, files: Files | None) -> File | None:
 def _read(config: Config, kind: str, gone: Mapping[str, str]) -> File | None:
     """Read the file of a kind, if the configuration names one; an InputError where it cannot be read."""
     rendered = config.plant.rendered is not None and config.arm is not None
-    path = {
+    refits = {
+        f"{name} {i}": getattr(one, key)
+        for i, one in enumerate(config.calibration.refits)
+        for name, key in _REFIT.items()
+    }
+    paths = refits | {
         "table": config.data.table if config.data is not None else None,
         "readings": config.data.readings if config.data is not None else None,
         "init": config.calibration.init,
         "mjcf": config.arm.mjcf if config.arm is not None and rendered else None,
-    }[kind]
-    if path is None:
+    }
+    if (path := paths[kind]) is None:
         return None
     further = files_named(path) if kind == "mjcf" else ()
-    return File.of(path, _EXPECTED[kind], gone.get(path, ""), further)
+    return File.of(path, _EXPECTED.get(kind, "a table of a camera that moved"), gone.get(path, ""), further)
 
 
 # Robot, rig and markers.

@@ -51,7 +51,7 @@ NEAREST = tuple(
     CONSTRAINTS[constraint].value for constraint in OF_MOTION
 )  # smallest along the planned motion
 # Lists of what does not fit: observations, and deviations from the model.
-_LISTS = ("outliers", "suspect_joint_readings", "id_switches", "moved_images", "model_errors")
+_LISTS = ("outliers", "suspect_joint_readings", "id_switches", "moved_images", "model_errors", "refits")
 _COUNTS = ("poses_used", "markers_used")
 _NUMBERS = (
     *("rms_px", "sigma_px", "chi2_per_dof", "seconds", "predicted_rms_px", "predicted_p99_px"),
@@ -345,11 +345,20 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
     values = _scalars(calibration) | {name: getattr(calibration, name) for name in _SHORT_ARRAYS}
     del values["model_error"], values["unshown_error"]
+    of_refits = zip(
+        values.pop("refit"),
+        () if calibration.refit_numbers is None else calibration.refit_numbers.tolist(),
+        strict=True,
+    )
     order, unshown = calibration.undecided_order, calibration.unshown
     values |= {
         "order_determined": None if order is None else not order.size,
         "model_errors": [_in_words(error, calibration) for error in calibration.model_errors],
         "unshown": None if unshown is None else _in_words(unshown, calibration),
+        "refits": [
+            {"view": view, "poses": round(poses), "error_px": now, "before_px": before}
+            for view, (poses, now, before) in of_refits
+        ],
     }
     return values | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 

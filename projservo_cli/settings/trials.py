@@ -30,6 +30,21 @@ class Noise(Section):
     )
 
 
+class Refit(Section):
+    """A camera of a calibration that moved, and a table of images by which it is fitted again."""
+
+    view: str = Field(description="name of the camera")
+    table: Annotated[str, StringConstraints(min_length=1)] = Field(
+        description="path of the observation table, relative to the configuration"
+    )
+    readings: Annotated[str, StringConstraints(min_length=1)] | None = Field(
+        None, description="path of a table of joints, where table lists detections"
+    )
+    joint_unit: Literal["deg", "rad"] | None = Field(
+        None, description="unit of revolute joints; null: that of data"
+    )
+
+
 class CalibrationSettings(Section):
     """Trial motions of one joint each around a reference, and the method that evaluates them."""
 
@@ -81,8 +96,15 @@ class CalibrationSettings(Section):
         description="whether to estimate radial distortion: two coefficients a camera, and its centre",
     )
 
+    refits: tuple[Refit, ...] = Field(
+        (),
+        description="cameras that moved since, each fitted again, in this order, as calibrate --refit does",
+    )
+
     def contradictions(self) -> Iterator[Finding]:
         """Yield keys of another method."""
+        if self.refits and self.method != "bundle_adjustment":
+            yield ("refits",), f"belong to the method bundle_adjustment, not to {self.method}"
         for key in ("cross_validate", "init"):
             if getattr(self, key) is not None and self.method != "bundle_adjustment":
                 yield (key,), f"belongs to the method bundle_adjustment, not to {self.method}"

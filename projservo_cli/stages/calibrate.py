@@ -9,6 +9,7 @@ import numpy as np
 from projservo_cli.calibration import Nominal, Solution, calibrate, cross_validate
 from projservo_cli.calibration.checks.screening import screened
 from projservo_cli.calibration.checks.undecided import undecided_pairs
+from projservo_cli.calibration.refit import refit
 from projservo_cli.files import write_whole
 from projservo_cli.image_size import image_corners, image_sizes
 from projservo_cli.nominal import read_nominal
@@ -29,22 +30,56 @@ from projservo_cli.robots.settings import JointSettings
 from projservo_cli.simulation.streams import SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed
-from projservo_cli.stages.stage_inputs import CalibrationInputs, Estimation, SuggestionInputs, Table, Trials
+from projservo_cli.stages.stage_inputs import (
+    CalibrationInputs,
+    Estimation,
+    RefitInputs,
+    SuggestionInputs,
+    Table,
+    Trials,
+)
 from projservo_cli.store.observation_tables import read_detections, read_table, to_csv
+
+Calibrated = tuple[Observation, Calibration, CrossValidation | None]
 
 
 def run(
-    inputs: CalibrationInputs, *, progress: Progress = silent
-) -> tuple[Observation, Calibration, CrossValidation | None]:
-    """Calibrate from a recorded table or from simulated trial motions.
+    inputs: CalibrationInputs | RefitInputs,
+    before: Calibrated | None = None,
+    *,
+    progress: Progress = silent,
+) -> Calibrated:
+    """Calibrate from a recorded table or from simulated trial motions, or fit a camera again.
 
+    before : the result of the inputs before a refit, if at hand.
     Returns the screened observations, the calibration, and its held-out errors on request.
     """
+    if isinstance(inputs, RefitInputs):
+        return _refitted(inputs, before or run(inputs.before, progress=progress))
     source = inputs.source
     seen = recorded(source) if isinstance(source, Table) else simulated(source, progress=progress)
     if inputs.joint_noise is not None:
         seen = replace(seen, joint_noise=inputs.joint_noise)
     return estimate(seen, inputs.estimation, progress=progress)
+
+
+def _refitted(inputs: RefitInputs, before: Calibrated) -> Calibrated:
+    """Fit a camera again; the observation has its new images in the place of those before it moved."""
+    old, calibration, _ = before
+    kind, path = (calibration.joint_types, inputs.joint_unit), inputs.file.path
+    readings = inputs.readings
+    seen = read_table(path, *kind) if readings is None else read_detections(path, readings.path, *kind)
+    found, seen = refit(calibration, seen, inputs.view, inputs.image_size), seen.at_rest
+    old, v = old.at_rest, old.view.index(inputs.view)
+    images = np.full((len(old.q) + len(seen.q), *old.images.shape[1:]), np.nan)
+    images[: len(old.q)], images[: len(old.q), v] = old.images, np.nan
+    there, here = np.nonzero(old.marker[:, None] == seen.marker)
+    for k, name in enumerate(seen.view):
+        if name in old.view:
+            images[len(old.q) :, old.view.index(name), there] = seen.images[:, k, here]
+    number = np.concatenate([old.pose, old.pose.max() + 1 + np.arange(len(seen.q))])
+    whole = Observation(number, old.marker, np.concatenate([old.q, seen.q]), images, view=old.view)
+    return whole, found, None
 
 
 def recorded(table: Table) -> Observations:

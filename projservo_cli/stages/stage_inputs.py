@@ -133,6 +133,18 @@ class CalibrationInputs:
     joint_noise: float | None  # standard deviation of joint readings, rad; None for that of the source
 
 
+@dataclass(frozen=True, eq=False)
+class RefitInputs:
+    """Inputs of a calibration of which one camera is fitted again."""
+
+    before: "CalibrationInputs | RefitInputs"
+    view: str  # name of the camera
+    file: File  # table of images by it
+    readings: File | None  # table of joints beside a list of detections
+    joint_unit: str | None  # of revolute joints, deg or rad; None for rad
+    image_size: ImageSize | None  # width and height, px, of all images or of one each, if known
+
+
 class SuggestionInputs(NamedTuple):
     """Inputs of a suggestion of further poses, except observations and calibration."""
 
