@@ -364,28 +364,35 @@ def _require_confirmed(camera: _Camera) -> float:
     gram = Y.T @ Y - crossed.T @ np.linalg.solve(np.eye(T.shape[1]) + T.T @ T, crossed)
     left = gram[k:, k:] - gram[k:, :k] @ np.linalg.solve(gram[:k, :k], gram[:k, k:])
     count = 2.0 * mask.sum()
+    own_square = np.diagonal(left)[:n]
+    square = np.where(own_square > _ALIKE * np.diagonal(gram)[k : k + n], own_square, np.inf)
+    offset, gain = -left[:n, n] / square, left[:n, n] ** 2 / square
+    effect = np.abs(offset) * np.sqrt(np.diagonal(Y.T @ Y)[k : k + n] / count)
+
+    def motions(i: int, *amounts: float) -> list[str]:
+        return [format_motion(per[i] * amount, bool(params.prismatic[i])) for amount in amounts]
+
+    i = int(np.argmax(gain))
+    std = float(np.sqrt(max((left[n, n] - gain[i]) / (count - k - 1), 1.0) / square[i]))
+    if abs(offset[i]) > _SURE * std and effect[i] > _MATTERS:
+        off, uncertain = motions(i, offset[i], std)
+        raise WorkFailed(
+            f"by the images, joint {found.numbers[i]} is {off} (± {uncertain}) off its readings, which moves "
+            f"images by {effect[i]:.3g} times their noise ({_MATTERS:g} allowed): home it, or calibrate again"
+        )
     ratio = float(np.sqrt(left[n, n] / (count - k)))
     if ratio > REFUSE_RATIO:
         raise WorkFailed(
             f"the images are {ratio:.3g} times as far off as noise and covariance explain ({REFUSE_RATIO:g} "
             "allowed): check the joint readings and the marker numbers"
         )
-    own_square = np.diagonal(left)[:n]
-    judged = own_square > _ALIKE * np.diagonal(gram)[k : k + n]
-    square = np.where(judged, own_square, np.inf)
-    offset, deviation = -left[:n, n] / square, max(ratio, 1.0) / np.sqrt(square)
-    effect = np.abs(offset) * np.sqrt(np.diagonal(Y.T @ Y)[k : k + n] / count)
-    wrong = np.where((np.abs(offset) > _SURE * deviation) & (effect > _MATTERS), effect, 0.0)
-    i = int(np.argmax(wrong))
-    if wrong[i]:
-        off, std = (format_motion(per[i] * x, bool(params.prismatic[i])) for x in (offset[i], deviation[i]))
-        raise WorkFailed(
-            f"by the images, joint {found.numbers[i]} is {off} (± {std}) off its readings, which moves images "
-            f"by {effect[i]:.3g} times their noise ({_MATTERS:g} allowed): home it, or calibrate again"
-        )
-    i, limit = int(np.argmax(deviation)), max(_UNNOTICED_RAD, 2.0 * (c.sigma_q or 0.0))
-    if (unnoticed := _SURE * deviation[i]) > limit:
-        far, least = (format_motion(per[i] * x, bool(params.prismatic[i])) for x in (unnoticed, limit))
+    unnoticed, limit = (
+        _SURE * max(ratio, 1.0) / np.sqrt(square),
+        max(_UNNOTICED_RAD, 2.0 * (c.sigma_q or 0.0)),
+    )
+    i = int(np.argmax(unnoticed))
+    if unnoticed[i] > limit:
+        far, least = motions(i, unnoticed[i], limit)
         raise WorkFailed(
             f"an error of joint {found.numbers[i]} by {far} could pass into the {name} camera unnoticed "
             f"({least} allowed): add poses that spread farther, or images of a camera that did not move"
