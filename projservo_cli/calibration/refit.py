@@ -269,7 +269,7 @@ def _fitted(images: _Images, v: int) -> _Camera:
     P = params.P.copy()
     P[v] = resected(points, straight[v, seen[v]]) @ frame
     params = dataclasses.replace(params, P=P)
-    deviation = images.deviation(params, _of_others(c, v))
+    deviation = images.deviation(params, errors_of_others(c, v))
     used, rows = seen, (images.problem.detections.pixels.size, -1)
     for k in range(_ROUNDS + _SETTLING + 1):
         residual = problem.residual(params)
@@ -315,17 +315,17 @@ def _stepped(params: Parameters, v: int, x: FloatArray) -> Parameters:
     return dataclasses.replace(params, P=P, lens=lens)
 
 
-def _rows(c: Calibration, v: int) -> IntArray:
+def rows_of_camera(c: Calibration, v: int) -> IntArray:
     """Rows (c,) of the numbers of a camera in the covariance of a calibration."""
     terms, lenses = c.lens_terms, c.P.size + c.H_hat_0.size
     return np.concatenate([v * CAMERA + np.arange(CAMERA), lenses + v * terms + np.arange(terms)])
 
 
-def _of_others(c: Calibration, v: int, errors: Errors | None = None) -> Errors:
+def errors_of_others(c: Calibration, v: int, errors: Errors | None = None) -> Errors:
     """Errors of a calibration but for those of one camera."""
     errors = errors_of(c) if errors is None else errors
     shared = errors.shared.copy()
-    shared[_rows(c, v)] = 0.0
+    shared[rows_of_camera(c, v)] = 0.0
     return errors._replace(shared=shared)
 
 
@@ -337,7 +337,7 @@ def _require_confirmed(camera: _Camera) -> float:
     """
     images, v, params = camera.images, camera.v, camera.params
     problem, found, c = images.problem, images.problem.detections, images.calibration
-    name, errors = found.view[v], _of_others(c, v)
+    name, errors = found.view[v], errors_of_others(c, v)
     for one in images.errors_of_views(params, errors):
         if one.view != name and one.disagrees:
             raise WorkFailed(
@@ -405,8 +405,8 @@ def _record(
     c: Calibration, observation: Observation, camera: _Camera, ratio: float, image_size: ImageSize | None
 ) -> Calibration:
     """Calibration with a camera as fitted, at so many times the expected noise."""
-    images, v, which, rows = camera.images, camera.v, camera.images.which, _rows(c, camera.v)
-    found, count, errors = images.problem.detections, len(rows), _of_others(images.calibration, v)
+    images, v, which, rows = camera.images, camera.v, camera.images.which, rows_of_camera(c, camera.v)
+    found, count, errors = images.problem.detections, len(rows), errors_of_others(images.calibration, v)
     common, own = images.changes(camera.params, errors)
     by_common = -np.einsum("cvni,vnir->cr", camera.G, common, optimize=True)
     by_own = -per_block(found.marker_of, np.einsum("cvni,vnid->ncd", camera.G, own), which.size)
@@ -457,8 +457,8 @@ def _bias(c: Calibration, camera: _Camera) -> FloatArray:
         sqrt_cov_own=by_marker[..., :0],
     )
     before = images.changes(parameters_from(images.calibration), errors_of(of_bias))[0]
-    change = before - images.changes(camera.params, _of_others(of_bias, v))[0]
-    bias[_rows(c, v)] = np.einsum("cvni,vnir->cr", camera.G, change, optimize=True)
+    change = before - images.changes(camera.params, errors_of_others(of_bias, v))[0]
+    bias[rows_of_camera(c, v)] = np.einsum("cvni,vnir->cr", camera.G, change, optimize=True)
     return bias
 
 

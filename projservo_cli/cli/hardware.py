@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from projservo_cli.records import FloatArray
     from projservo_cli.robots.contract import PluginRobot
     from projservo_cli.stages.doctor import Checked
+    from projservo_cli.store import Run
 
 _SIZE_MM = 30.0  # of tags: what webcams at arm's length see with 25 px and more
 _BODIES = ("roof", "plate")
@@ -163,15 +164,35 @@ def doctor(
         )
         pictures = [] if checked.seen is None else _pictures(settings, checked.seen)
         write_whole(output, preflight_page(settings.name, checked.findings, pictures))
+    refit = _refit(checked, stored, config, output)
     value = {
         "page": output.resolve(),
         "works": checked.works,
         "findings": [finding._asdict() for finding in checked.findings],
+        "refit": refit,
     }
-    console.report(value, [*_table(checked), f"page: {output}"])
+    console.report(value, [*_table(checked), f"page: {output}", *(refit["commands"] if refit else ())])
     if stored is not None and checked.refuted is not None:
         _note_refuted(stored.path, checked.refuted)
     return 0 if checked.works else FAILED
+
+
+def _refit(checked: "Checked", stored: "Run | None", config: str, output: Path) -> dict[str, Any] | None:
+    """Write the poses from which a camera that moved is fitted again; their file and the commands."""
+    from projservo_cli.files import write_whole
+    from projservo_cli.store.observation_tables import to_csv
+
+    if checked.refit is None or stored is None:
+        return None
+    view, found = checked.refit
+    path, run = output.with_name("refit_poses.csv"), stored.path.parent
+    write_whole(path, to_csv({f"q{i}": column for i, column in enumerate(found.q.T, 1)}))
+    alone = "--set calibration.frames_per_joint=0 --set calibration.random_poses=0"
+    commands = [
+        f"projservo record -c {config} {alone} --motions {path} --output refit.csv",
+        f"projservo calibrate {run} --refit {view} --data refit.csv -o {run}_refit",
+    ]
+    return {"view": view, "poses": path.resolve(), "count": len(found.q), "commands": commands}
 
 
 def _note_refuted(path: Path, refuted: str) -> None:

@@ -11,6 +11,7 @@ from projservo_cli.calibration.prediction import (
     from_reference,
     parameters_from,
 )
+from projservo_cli.calibration.refit import errors_of_others, rows_of_camera
 from projservo_cli.planning.model_spread import Region, drawn_poses
 from projservo_cli.records import (
     Calibration,
@@ -25,6 +26,10 @@ _CANDIDATES, _TARGETS = 300, 150
 _BATCHES = 20
 # Markers that both views must see at a pose that determines the joints.
 _LEAST_SEEN = 3
+# Poses to choose from for a camera that moved, and the most that are chosen.
+_REFIT_CANDIDATES, _MOST_POSES = 150, 30
+# Error of a camera that is fitted again, over that before it moved, at which poses are enough.
+_ENOUGH = 1.5
 # Markers that suggestions are judged by, at most.
 _MOST_SHOWN = 25
 # A prediction that errs by more than this share of the image does not say what will be seen.
@@ -105,6 +110,70 @@ def suggest(
             )
         )
     return tuple(suggestions)
+
+
+@dataclass(frozen=True, eq=False)
+class RefitPoses:
+    """Poses for a camera that moved, in the order of choice."""
+
+    q: FloatArray  # (k, n) joint readings, rad or m
+    error_px: float  # of its images in the region after a refit from them, rms of distances
+    before_px: float  # of its images before it moved
+
+
+def refit_poses(calibration: Calibration, v: int, region: Region, rng: np.random.Generator) -> RefitPoses:
+    """Poses from which a camera that moved is fitted again nearly as well as it was.
+
+    Greedily the ones after which its images err least over the region: by the camera's errors from noise, and
+    by those of operators and markers that it follows, −G T e as in ``calibration.refit``. The poses that it
+    sees are those from where it was.
+
+    v : its index; region : of the poses, with the border of each image.
+    Raises WorkFailed if no pose of the region shows the markers to it, and to another camera if there is one.
+    """
+    few = calibration.with_markers(even_choice(len(calibration.M), _MOST_SHOWN))
+    scene, others, seen, poses = parameters_from(few), np.arange(len(few.view)) != v, [], []
+    for q, in_view in drawn_poses(few, region, _BATCHES, rng):
+        shown = in_view.sum(axis=2) >= _LEAST_SEEN
+        good = np.flatnonzero(shown[:, v] & (shown[:, others].any(axis=1) | ~others.any()))
+        good = good[: _REFIT_CANDIDATES - len(poses)]
+        poses, seen = [*poses, *q[good]], [*seen, *in_view[good, v]]
+        if len(poses) == _REFIT_CANDIDATES:
+            break
+    if not poses:
+        raise WorkFailed(
+            f"no pose shows {_LEAST_SEEN} markers to the {few.view[v]} camera: look for poses by hand"
+        )
+    q, mask = np.array(poses), np.array(seen)[..., None, None]
+    away, sigma, K = from_reference(few, q), max(few.sigma_px, few.sigma_fitted_px), len(poses)
+    J = scene.derivative(away)[0][:, v][..., rows_of_camera(few, v)] * mask
+    T, whole = (
+        dense_pixel_changes(scene, errors, away)[:, v] * mask
+        for errors in (errors_of_others(few, v), errors_of(few))
+    )
+    scale = np.maximum(np.sqrt((J**2).sum(axis=(0, 1, 2))), 1e-12)
+    J, T, count = (J / scale).reshape(K, -1, len(scale)), T.reshape(K, -1, T.shape[-1]), mask.sum()
+    A, B = J.swapaxes(1, 2) @ J, J.swapaxes(1, 2) @ T
+    gauge = np.zeros(len(scale))
+    gauge[: few.P[v].size] = few.P[v].ravel()
+    N, X = np.outer(scale * gauge, scale * gauge), np.zeros(B.shape[1:])
+    N, before = N / np.trace(N) + 1e-9 * np.eye(len(N)), float((whole**2).sum() / count)
+    chosen: list[int] = []
+    while len(chosen) < min(_MOST_POSES, K):
+        inverse = np.linalg.inv(N + A)
+        G = inverse @ (X + B)
+        error = (
+            (T**2).sum()
+            - 2.0 * (G * B.sum(axis=0)).sum(axis=(1, 2))
+            + (G * (A.sum(axis=0) @ G)).sum(axis=(1, 2))
+        )
+        error = (error + sigma**2 * (inverse * A.sum(axis=0)).sum(axis=(1, 2))) / count
+        error[chosen] = np.inf
+        best = int(np.argmin(error))
+        N, X, chosen = N + A[best], X + B[best], [*chosen, best]
+        if error[best] <= _ENOUGH**2 * before:
+            break
+    return RefitPoses(q[chosen], float(np.sqrt(error[best])), float(np.sqrt(before)))
 
 
 def _visible_poses(

@@ -7,16 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 
+from projservo_cli.calibration.refit import view_errors
 from projservo_cli.detection import DICTIONARY, TagFinder
 from projservo_cli.hardware.camera_robot import CameraRobot, View
 from projservo_cli.hardware.cameras import Camera
 from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding, RobotAtRest, findings_at_rest
 from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
-from projservo_cli.image_size import ImageSize, image_sizes
+from projservo_cli.image_size import ImageSize, image_corners, image_sizes
 from projservo_cli.monitoring.accuracy import resting_error_mm
 from projservo_cli.monitoring.frame_pairs import at_known_markers, mean_image
 from projservo_cli.monitoring.image_monitor import detected_fault
-from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.planning.model_spread import Region
+from projservo_cli.planning.pose_selection import RefitPoses, refit_poses
+from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages import Progress, silent
@@ -34,6 +37,7 @@ class Checked(NamedTuple):
     findings: tuple[Finding, ...]
     seen: RobotAtRest | None  # None where robot or cameras did not open
     moved: tuple[Strokes, ...]  # of the joints that were moved
+    refit: tuple[str, RefitPoses] | None = None  # camera that moved, and poses to fit it again from
 
     @property
     def works(self) -> bool:
@@ -67,7 +71,7 @@ def check(
     bounds = inputs.driven.following.bounds(joints)
     robot = plugin_robot(inputs.driven.robot, bounds, joints.types, inputs.numbers)
     findings: list[Finding] = []
-    at_rest, moved = None, list[Strokes]()
+    at_rest, moved, mend = None, list[Strokes](), None
     try:
         with at_rest_after(robot):
             if watch is not None:
@@ -77,7 +81,9 @@ def check(
                 at_rest, TagFinder(dictionary), dictionary, moves=confirmed is not None
             )
             if calibration is not None:
-                findings.append(calibration_finding(calibration, at_rest, robot.image_size, inputs.lengths))
+                found = calibration_finding(calibration, at_rest, robot.image_size, inputs.lengths)
+                found, mend = with_refit(found, calibration, at_rest, robot.image_size)
+                findings.append(found)
             works = all(finding.level != FAULT for finding in findings)
             if confirmed is not None and not works:
                 findings.append(
@@ -91,7 +97,7 @@ def check(
             raise
         what, _, remedy = str(error).partition(": look ")
         findings.append(Finding(FAULT, "robot and cameras", what, f"look {remedy}" if remedy else ""))
-    return Checked(tuple(findings), at_rest, tuple(moved))
+    return Checked(tuple(findings), at_rest, tuple(moved), mend)
 
 
 def _move_joints(robot: PluginRobot, moved: list[Strokes], progress: Progress) -> Iterator[Finding]:
@@ -164,3 +170,32 @@ def calibration_finding(
     mm = resting_error_mm(calibration, at_rest.q, at_rest.face, lengths, images)
     within = "" if mm is None else f", which show the tool within {mm:.2g} mm of where its joints put it"
     return Finding(FINE, _CALIBRATION, f"agrees with the images{within}")
+
+
+def with_refit(
+    finding: Finding, calibration: Calibration, at_rest: RobotAtRest, image_size: ImageSize | None
+) -> tuple[Finding, tuple[str, RefitPoses] | None]:
+    """Add to a fault how far each view is off; where one camera alone is, poses to fit it again from."""
+    if finding.level != FAULT or len(at_rest.s) != len(calibration.view):
+        return finding, None
+    marker = np.array(at_rest.marker, dtype=np.int64)
+    look = Observation(np.zeros(1, np.int64), marker, at_rest.q[None], at_rest.s[None], view=calibration.view)
+    views = [one for one in view_errors(calibration, look) if np.isfinite(one.off_px)]
+    finding = finding._replace(text=f"{finding.text}; {', '.join(one.text for one in views)}")
+    moved = [one.view for one in views if one.disagrees]
+    # A joint that slipped, a tag that moved and exchanged cameras show in other views too, if there are any.
+    if len(moved) != 1 or len(views) < len(calibration.view):
+        return finding, None
+    size = image_size or [view.frame.grey.shape[::-1] for view in at_rest.views] or None
+    corners = image_corners(image_sizes(size, len(calibration.view)))
+    low = calibration.joint_min
+    region, v = Region(low, low + calibration.excitation, corners), calibration.view.index(moved[0])
+    try:
+        poses = refit_poses(calibration, v, region, np.random.default_rng(0))
+    except WorkFailed:
+        return finding, None
+    again = (
+        f"put the {moved[0]} camera back, or fit it again from {len(poses.q)} poses, after which it errs by "
+        f"{poses.error_px:.2g} px ({poses.before_px:.2g} px before it moved)"
+    )
+    return finding._replace(remedy=again), (moved[0], poses)

@@ -19,7 +19,7 @@ from projservo_cli.files import working_in
 from projservo_cli.hardware.checks_at_rest import FAULT, FINE, Finding
 from projservo_cli.report.live_page import LivePage
 from projservo_cli.stages import calibrate
-from projservo_cli.stages.doctor import Checked, calibration_finding
+from projservo_cli.stages.doctor import Checked, calibration_finding, with_refit
 from projservo_cli.store import load
 from tests.conftest import ROOT
 from tests.hardware.arms_in_motion import Faults, Rail, findings
@@ -196,6 +196,25 @@ def test_a_calibrated_run_tells_what_changed_since(calibrated, change, words):
     unknown = calibration_finding(calibrated, seen, (640, 480), np.full((4, 4), np.nan))
     assert unknown.level == finding.level
     assert "mm" not in unknown.text
+
+
+@pytest.mark.parametrize("slipped", [False, True])
+def test_a_camera_that_moved_is_named_with_the_poses_that_mend_it(calibrated, slipped):
+    q, off = calibrated.q_reference, np.zeros(len(calibrated.q_reference))
+    off[1] = np.radians(3.0 * slipped)
+    s = predict(calibrated, (q + off)[None])[0]
+    s[1] += 0.0 if slipped else 12.0
+    seen = SimpleNamespace(q=q, s=s, marker=calibrated.marker.tolist(), face=(0, 1, 2, 3), views=())
+    fault = calibration_finding(calibrated, seen, (640, 480), np.full((4, 4), np.nan))
+    finding, mend = with_refit(fault, calibrated, seen, (640, 480))
+    assert finding.text.startswith(f"{fault.text}; the left images are ")
+    assert (mend is None) == slipped
+    if mend is not None:
+        view, poses = mend
+        assert view == "right"
+        assert "the right images are 17 px off (0." in finding.text
+        assert f"put the right camera back, or fit it again from {len(poses.q)} poses" in finding.remedy
+        assert poses.before_px < poses.error_px <= 1.5 * poses.before_px
 
 
 def _with_noise(s, px):
