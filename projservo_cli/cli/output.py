@@ -140,7 +140,7 @@ def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     else:
         yield from _in_detail(value)
     where = " on the tool" if value["mount"] == "tool" else ""
-    if where or value["view"] != ["left", "right"]:
+    if where or list(value["view"]) != ["left", "right"]:
         views = value["view"]
         count = "one camera" if len(views) == 1 else f"{len(views)} cameras"
         yield wrapped(f"by {count}{where}: {', '.join(views)}", "  ")

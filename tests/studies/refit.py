@@ -1,11 +1,11 @@
 """A camera that moved, fitted again: its error over that of a whole recalibration, and its 95 % regions.
 
-    python -m tests.studies.refit [--draws 500] [-o refit.csv]
+    python -m tests.studies.refit [--calibrations 100] [-o refit.csv]
 
-Each draw is a calibration of the UR5 of the reference data at 0.5 px, from single-joint trials and twelve
-combined poses to ±30°. Then the left camera is turned by 3° and shifted by 30 mm, in random directions, and
-fitted again from 5, 10 and 20 random poses within ±45° and ±8°; beside it the whole rig is calibrated again
-from all poses. Errors and regions are of left images at held-out poses within ±30°; the region of a pose is
+Each calibration of the UR5 of the reference data is at 0.5 px, from single-joint trials and twelve combined
+poses to ±30°, and has five draws. In each the left camera is turned by 3° and shifted by 30 mm, in random
+directions, and fitted again from 5, 10 and 20 random poses within ±45° and ±8°; once the whole rig is
+calibrated again from all poses. Errors and regions are of left images at held-out poses within ±30°; the region of a pose is
 that of the images of all markers in both cameras. Images of the right camera confirm the joint readings; how
 often those of the left one alone do is counted.
 """
@@ -26,12 +26,14 @@ from projservo_cli.calibration.prediction import (
 from projservo_cli.calibration.refit import refit
 from projservo_cli.records import WorkFailed
 from tests.calibration.simulated_robot import around, trials
-from tests.studies.common import in_two_processes, parser_of, write_rows
+from tests.studies.common import in_two_processes, parser_of, written
 from tests.studies.one_camera import COMBINED, FRAMES, RIGS, robot_of
 
 SEED, NOISE_PX, HELD_OUT = 506, 0.5, 20
 RANGES_DEG, POSES = (45, 8), (5, 10, 20)
 TURN_RAD, SHIFT_M = np.radians(3.0), 0.03
+EACH = 5  # draws of a calibration
+COLUMNS = ("calibration", "draw", "range", "poses", "refused", "square", "of_markers", "of_poses")
 LIMIT = {(45, 10): 2.0, (45, 20): 1.5}  # of the error over that of a whole recalibration
 CHI2 = chi2.ppf(0.95, np.arange(100))  # by degrees of freedom
 RANK = 1e-9  # of the largest eigenvalue, below which a direction of a region is empty
@@ -76,41 +78,48 @@ def refusal(before, seen):
     return ""
 
 
-def drawn(draw):
-    """Rows of the table of one draw."""
-    rng, robot = np.random.default_rng([SEED, draw]), robot_of(RIGS["ur5 combined"], 2)
-    q = np.concatenate([trials(robot, frames=FRAMES), around(robot, COMBINED, rng)])
-    moved, ahead = knocked(robot, rng), around(robot, HELD_OUT, rng, np.radians(30.0), 0.15)
-    how = {"source": "simulated", "sigma_px": NOISE_PX}
-    before, whole = (
-        calibrate(one.observe(q, NOISE_PX, rng), one.joint_types, **how) for one in (robot, moved)
+def drawn(number):
+    """Rows of the table of one calibration: its draws, and one of a whole recalibration."""
+    rng, robot = np.random.default_rng([SEED, number]), robot_of(RIGS["ur5 combined"], 2)
+    q, how = (
+        np.concatenate([trials(robot, frames=FRAMES), around(robot, COMBINED, rng)]),
+        {"source": "simulated", "sigma_px": NOISE_PX},
     )
-    rows = [{"draw": draw, "by": "whole", "range": 30, "poses": len(q), **judged(whole, moved, ahead)}]
-    for far in RANGES_DEG:
-        for count in POSES:
-            seen = moved.observe(around(moved, count, rng, np.radians(far), 0.15), NOISE_PX, rng)
-            alone = dataclasses.replace(seen, images=seen.images[:, :1], view=("left",))
-            row = {"draw": draw, "by": "refit", "range": far, "poses": count}
-            rows.append(
-                row | judged(refit(before, seen, "left"), moved, ahead) | {"refused": refusal(before, alone)}
-            )
+    before, rows = calibrate(robot.observe(q, NOISE_PX, rng), robot.joint_types, **how), []
+    for draw in range(EACH):
+        moved, ahead = knocked(robot, rng), around(robot, HELD_OUT, rng, np.radians(30.0), 0.15)
+        if not draw:
+            whole = calibrate(moved.observe(q, NOISE_PX, rng), robot.joint_types, **how)
+            rows.append(row_of(number, draw, 30, len(q), "") | judged(whole, moved, ahead))
+        for far in RANGES_DEG:
+            for count in POSES:
+                seen = moved.observe(around(moved, count, rng, np.radians(far), 0.15), NOISE_PX, rng)
+                alone = dataclasses.replace(seen, images=seen.images[:, :1], view=("left",))
+                refused = "" if draw else refusal(before, alone)
+                row = row_of(number, draw, far, count, refused)
+                rows.append(row | judged(refit(before, seen, "left"), moved, ahead))
     return rows
+
+
+def row_of(*values):
+    """What a row of the table is of."""
+    return dict(zip(COLUMNS, values, strict=False))
 
 
 def main():
     """Judge all draws, print a line a design, and write the table."""
-    asked = parser_of("refit", __doc__, [("draws", 500, "calibrations, each with all refits")]).parse_args()
-    rows = [row for some in in_two_processes(drawn, range(asked.draws), "refit") for row in some]
-    write_rows(asked.output, rows)
-    whole = np.sqrt(np.mean([row["square"] for row in rows if row["by"] == "whole"]))
-    print(f"whole recalibration: {whole:.3f} px rms of a left coordinate, {asked.draws} draws")
+    asked = parser_of("refit", __doc__, [("calibrations", 100, f"with {EACH} draws each")]).parse_args()
+    rows = written(asked.output, COLUMNS, in_two_processes(drawn, range(asked.calibrations), "refit"))
+    whole = np.sqrt(np.mean([row["square"] for row in rows if row["range"] == 30]))
+    print(f"whole recalibration: {whole:.3f} px rms of a left coordinate, {asked.calibrations} draws")
     print("range, poses: error over that (limit); regions of markers, of poses (93 to 97 %); refused alone")
     for far, count in dict.fromkeys((row["range"], row["poses"]) for row in rows):
         some = [row for row in rows if (row["range"], row["poses"]) == (far, count)]
         error = np.sqrt(np.mean([row["square"] for row in some])) / whole
         markers, poses = (100.0 * np.mean([row[name] for row in some]) for name in ("of_markers", "of_poses"))
         limit = f" ({LIMIT[far, count]:g})" if (far, count) in LIMIT else ""
-        alone = f"{sum(bool(row.get('refused')) for row in some)} of {len(some)}"
+        first = [row["refused"] for row in some if not row["draw"]]
+        alone = f"{sum(map(bool, first))} of {len(first)}"
         print(f"±{far}° {count}: {error:.2f}{limit}; {markers:.1f} %, {poses:.1f} %; {alone}")
 
 
