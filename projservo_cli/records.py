@@ -54,6 +54,7 @@ SIZES = {
     "end": 2,
     "model_error_column": 4,
     "refit_column": 3,
+    "joint_curve_column": 7,
 }
 
 
@@ -123,6 +124,24 @@ def position_limits(lower: FloatArray, upper: FloatArray) -> JointLimits:
     """Limits (n,) of the positions of joints, rad or m, alone."""
     endless = np.full(len(lower), math.inf)
     return JointLimits(lower=lower, upper=upper, speed=endless, acceleration=endless)
+
+
+class JointCurve(NamedTuple):
+    """True joints less readings as a sum of terms c φ(x), all zero at the reference: c (T,) is ``terms[:, 3]``.
+
+    φ is x, x², x³, sin x, 1 − cos x of a reading x from the reference, or the torque of a weight at the tool
+    about the joint that it moves, less that at the reference. That needs an arm as it was before the fit: its
+    own errors times a deflection are of second order.
+    """
+
+    terms: FloatArray  # (T, 4) index of φ in ``BASIS``, moved joint and joint read, both from 0, and c, rad or m
+    # (n + 1, 4, 4) twists of that arm, and a motion with the weight in its last column and with gravity along
+    # x; (0, 4, 4) without torques
+    arm: FloatArray
+
+
+BASIS = ("linear", "square", "cube", "sine", "versine", "torque")
+NO_CURVE = JointCurve(np.zeros((0, 4)), np.zeros((0, 4, 4)))
 
 
 class Model(NamedTuple):
@@ -293,11 +312,24 @@ class ProjectiveKinematics:
         about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2",
         default=None,
     )
+    joint_curve: FloatArray | None = _array(
+        "joint_curve_row joint_curve_column",
+        about="terms of true joints less readings, if fitted: index into BASIS, joint moved and joint read "
+        "from 1, coefficient and its standard deviation in rad or m, typical error at left-out poses in px "
+        "without and with it",
+        default=None,
+    )
+    joint_curve_arm: FloatArray | None = _array(
+        "joint_curve_motion row coordinate",
+        about="twists of the arm by which torques are known, and a motion with the weight in its last column "
+        "and gravity along x",
+        default=None,
+    )
     # The covariance of all these, as ``Errors`` says; of a method without one they are not finite.
     sqrt_cov_shared: FloatArray = _array(
         "parameter error",
         about="square root of the covariance of P.ravel(), H_hat_0.ravel() and, if estimated, k1, k2 and "
-        "image centre u, v of both lenses, up to the gauge",
+        "image centre u, v of both lenses and coefficients of joint_curve, up to the gauge",
     )
     sqrt_cov_marker: FloatArray = _array(
         "marker coordinate error", about="square root of the covariance of M by the same errors"
@@ -335,7 +367,16 @@ class ProjectiveKinematics:
         """Number of estimated terms of each lens: 0, k1 and k2, or those and the image centre u, v."""
         if self.lens is None:
             return 0
-        return (len(self.sqrt_cov_shared) - self.P.size - self.H_hat_0.size) // len(self.P)
+        of_curve = 0 if self.joint_curve is None else len(self.joint_curve)
+        return (len(self.sqrt_cov_shared) - self.P.size - self.H_hat_0.size - of_curve) // len(self.P)
+
+    @property
+    def curve(self) -> JointCurve | None:
+        """True joints by readings, in the order of the arm; None where they are equal."""
+        if self.joint_curve is None:
+            return None
+        terms = self.joint_curve[:, :4] - [0.0, 1.0, 1.0, 0.0]
+        return JointCurve(terms, NO_CURVE.arm if self.joint_curve_arm is None else self.joint_curve_arm)
 
     @property
     def has_covariance(self) -> bool:

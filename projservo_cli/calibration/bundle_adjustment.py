@@ -66,7 +66,7 @@ def moved_operators(params: Parameters) -> list[FloatArray]:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Detections to fit and the order of the parameters: both cameras, joints, the lenses, then markers.
+    """Detections to fit and the order of the parameters: cameras, joints, lenses, curve, then markers.
 
     Residuals and derivatives are weighted, so all have the noise of a pixel of weight one. The derivative of
     the images is compact: (V, N, 2, c) for each detection by the c parameters it depends on, the last three
@@ -83,29 +83,39 @@ class LeastSquares:
     columns: IntArray  # (2, c - 3) parameters that all detections of a view depend on
     # (n,) noise of joint readings over that of pixels, rad/px or m/px; None where readings are exact
     tau: FloatArray | None = None
+    curve_terms: int = 0  # number of terms of the curve of the joints
 
     @classmethod
-    def of(cls, detections: Detections, q_reference: FloatArray, lens_terms: int = 0) -> "LeastSquares":
+    def of(
+        cls, detections: Detections, q_reference: FloatArray, lens_terms: int = 0, curve_terms: int = 0
+    ) -> "LeastSquares":
         """Problem of fitting detections about the reference joints (n,), rad or m.
 
-        12 parameters a camera, 4 a revolute and 2 a prismatic joint, 3 a marker, ``lens_terms`` a lens.
+        12 parameters a camera, 4 a revolute and 2 a prismatic joint, 3 a marker, ``lens_terms`` a lens, and
+        ``curve_terms``.
         """
         V = len(detections.seen)
         joint = V * CAMERA + np.concatenate([[0], np.cumsum(np.where(detections.prismatic, 2, 4))])
         count = lens_terms
-        shared = int(joint[-1]) + V * count
+        shared = int(joint[-1]) + V * count + curve_terms
         view = np.arange(V)[:, None]
         parts = (
             view * CAMERA + np.arange(CAMERA),
             np.broadcast_to(np.arange(joint[0], joint[-1]), (V, joint[-1] - joint[0])),
             joint[-1] + view * count + np.arange(count),
+            np.broadcast_to(np.arange(shared - curve_terms, shared), (V, curve_terms)),
         )
         columns = np.concatenate(parts, axis=1)
         q = detections.q - q_reference
-        return cls(detections, q, q_reference, joint, shared, shared + 3 * detections.marker.size, columns)
+        size = shared + 3 * detections.marker.size
+        return cls(detections, q, q_reference, joint, shared, size, columns, None, curve_terms)
+
+    def alike(self, detections: Detections) -> "LeastSquares":
+        """Problem of the same parameters but for the markers, of other detections, without noise of joints."""
+        return LeastSquares.of(detections, self.q_reference, self.lens_terms, self.curve_terms)
 
     def joints(self, params: Parameters) -> FloatArray:
-        """Joint values (K, n) from the reference, rad or m, with the offsets if joint readings have noise."""
+        """Readings (K, n) from the reference, rad or m, with the offsets if joint readings have noise."""
         return self.q if self.tau is None or params.offsets is None else self.q + params.offsets
 
     def strain(self, params: Parameters) -> FloatArray:
@@ -121,7 +131,7 @@ class LeastSquares:
     @property
     def lens_terms(self) -> int:
         """Number of parameters of each lens."""
-        return int(self.shared - self.joint[-1]) // len(self.detections.seen)
+        return int(self.shared - self.curve_terms - self.joint[-1]) // len(self.detections.seen)
 
     @property
     def by_pose(self) -> bool:
@@ -134,8 +144,7 @@ class LeastSquares:
 
     def of_markers(self, keep: BoolArray) -> "LeastSquares":
         """Select markers (m,)."""
-        smaller = LeastSquares.of(self.detections.of_markers(keep), self.q_reference, self.lens_terms)
-        return smaller.with_noise(self.tau)
+        return self.alike(self.detections.of_markers(keep)).with_noise(self.tau)
 
     def pixels(self, params: Parameters) -> tuple[FloatArray, FloatArray]:
         """Predicted pixels (V, N, 2) of every observation and their depths (V, N)."""
@@ -158,7 +167,8 @@ class LeastSquares:
         D_i (B Y_i − E_i B Y_{i+1}), where D_i E_i is D_{i+1}.
         """
         detections, q = self.detections, self.joints(params)
-        _, Y, by_camera, D, by_lens = params.images(q, detections.pose_of, detections.marker_of)
+        images = params.images(q, detections.pose_of, detections.marker_of)
+        _, Y, by_camera, D, by_lens, _ = images
         blocks = [by_camera]
         for i, B in enumerate(_generators(params)):
             turn = B.transpose(2, 1, 0).reshape(4, -1)
@@ -166,6 +176,8 @@ class LeastSquares:
             blocks.append(near - far)
         if by_lens is not None:
             blocks.append(by_lens[..., : self.lens_terms])
+        if self.curve_terms:
+            blocks.append(params.by_curve(images, q[detections.pose_of]))
         blocks.append(D[-1][..., :3])
         return np.concatenate(blocks, axis=3) * detections.weight[..., None, None]
 
@@ -198,12 +210,16 @@ class LeastSquares:
         if lens is not None:
             lens = lens.copy()
             terms = list(TERMS[: self.lens_terms])
-            lens[:, terms] += x[self.joint[-1] : self.shared].reshape(len(lens), -1)
+            lens[:, terms] += x[self.joint[-1] : self.shared - self.curve_terms].reshape(len(lens), -1)
+        curve = params.curve
+        if curve is not None:
+            step = np.pad(x[self.shared - self.curve_terms : self.shared, None], ((0, 0), (3, 0)))
+            curve = curve._replace(terms=curve.terms + step)
         offsets = params.offsets
         if self.tau is not None and further.size:
             offsets = (0.0 if offsets is None else offsets) + self.tau * further.reshape(self.q.shape)
         P = params.P + x[: params.P.size].reshape(-1, 3, 4)
-        return Parameters(P, H_hat, params.prismatic, M, lens, offsets, self.lens_terms)
+        return Parameters(P, H_hat, params.prismatic, M, lens, offsets, self.lens_terms, curve)
 
     def gauge(self, params: Parameters) -> FloatArray:
         """Unit directions (size, g) of the parameters that change no image.

@@ -68,7 +68,8 @@ def _undistorted(frame: ImageFrame) -> FloatArray:
 
 def _cleared_columns(solution: Solution, params: Parameters, terms: int) -> FloatArray:
     """Changes of the images by the last two terms of the lenses (4, 2, N, 2), orthogonal to all others."""
-    exact = LeastSquares.of(solution.problem.detections, solution.problem.q_reference, terms)
+    there = solution.problem
+    exact = LeastSquares.of(there.detections, there.q_reference, terms, there.curve_terms)
     problem = exact.with_noise(solution.problem.tau)
     J = problem.whitened(params, problem.dense(problem.derivative(params), solution.used), solution.used)
     J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)

@@ -354,7 +354,8 @@ def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tupl
             return ()
         return (f"lens distortion would explain {100.0 * share:.0f} % of the squared residuals: try --lens",)
     k, terms = calibration.lens[:, K1:].ravel(), calibration.lens_terms
-    of_lenses = calibration.sqrt_cov_shared[-len(calibration.lens) * terms :]
+    first = calibration.P.size + calibration.H_hat_0.size
+    of_lenses = calibration.sqrt_cov_shared[first : first + len(calibration.lens) * terms]
     of_lenses = of_lenses.reshape(-1, terms, of_lenses.shape[-1])[:, :LENS].reshape(k.size, -1)
     statistic = k @ np.linalg.solve(of_lenses @ of_lenses.T, k)
     if statistic < chdtri(k.size, _NO_LENS_TAIL):

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.displacements import displacements, sine_and_versine
+from projservo_cli.geometry.joint_curve import backwards, basis, slopes, true_joints
 from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible
 from projservo_cli.records import (
     TOOL,
@@ -20,6 +21,7 @@ from projservo_cli.records import (
     FloatArray,
     InputError,
     IntArray,
+    JointCurve,
     apart,
 )
 
@@ -79,16 +81,22 @@ class Images(NamedTuple):
     by_camera: FloatArray  # (V, N, 2, 12)
     by_point: FloatArray  # (n + 1, 2, N, 2, 4) by ``points``, for fixed joints before it
     by_lens: FloatArray | None  # (V, N, 2, 4) by the ``TERMS`` of a lens, if there is one
+    slopes: FloatArray | None  # (N, n, n) derivatives of true joints by readings, where they differ
 
-    def by_joint(self, H_hat: FloatArray) -> FloatArray:
+    def by_true_joint(self, H_hat: FloatArray) -> FloatArray:
         """Derivative (V, N, 2, n) by the joints of operators (n, 4, 4), [RH00] eqs. (7), (19)."""
         velocity = self.points[:-1] @ H_hat.swapaxes(1, 2)
         return np.asarray(np.einsum("ivNrc,iNc->vNri", self.by_point[:-1], velocity))
 
+    def by_joint(self, H_hat: FloatArray) -> FloatArray:
+        """Derivative (V, N, 2, n) by the readings of joints of operators (n, 4, 4)."""
+        by_joint = self.by_true_joint(H_hat)
+        return by_joint if self.slopes is None else np.asarray(by_joint @ self.slopes)
+
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Fitted parameters of rig, robot and markers in one frame; joint values from the reference, rad or m."""
+    """Fitted parameters of rig, robot and markers in one frame; readings from the reference, rad or m."""
 
     P: FloatArray  # (V, 3, 4) cameras to pixels
     H_hat: FloatArray  # (n, 4, 4) operators at the reference
@@ -98,19 +106,31 @@ class Parameters:
     # (K, n) true joints less their readings at the poses of a problem, rad or m; None if they are exact
     offsets: FloatArray | None = None
     lens_terms: int = 0  # number of estimated ``TERMS`` of each lens: 0, k1 and k2, or those and the centre
+    curve: JointCurve | None = None  # of true joints by readings, None where they are equal
+
+    def turned(self, q: FloatArray) -> FloatArray:
+        """True joints (K, n) at readings (K, n), both from the reference."""
+        return q if self.curve is None else true_joints(self.curve, self.prismatic, q)
+
+    def by_curve(self, images: Images, q: FloatArray) -> FloatArray:
+        """Derivative (V, N, 2, T) of images, with readings (N, n), by the coefficients of the curve."""
+        if self.curve is None:
+            return images.by_camera[..., :0]
+        moved = images.by_true_joint(self.H_hat)[..., self.curve.terms[:, 1].astype(np.int64)]
+        return np.asarray(moved * basis(self.curve, self.prismatic, q)[:, None])
 
     def predict(self, q: FloatArray) -> FloatArray:
         """Pixels (K, V, m, 2) of all markers at joints (K, n), [RH00] eqs. (1), (6).
 
         NaN for a point behind the camera, or beyond the radius at which its lens model folds back.
         """
-        m = image_points(self.P, moved_points(displacements(self.H_hat, self.prismatic, q), self.M)[0])
+        m = image_points(self.P, moved_points(displacements(self.H_hat, self.prismatic, self.turned(q)), self.M)[0])
         pixels: FloatArray = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
         return pixels if self.lens is None else distort_visible(self.lens[:, None], pixels)
 
     def motion(self, q: FloatArray) -> FloatArray:
         """Displacements (K, 4, 4) by all joints together at joints (K, n), [RH00] eq. (6)."""
-        return reduce(np.matmul, displacements(self.H_hat, self.prismatic, q))
+        return reduce(np.matmul, displacements(self.H_hat, self.prismatic, self.turned(q)))
 
     def moved(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> FloatArray:
         """Points (N, 4) of observations after the motion of all joints."""
@@ -118,7 +138,7 @@ class Parameters:
 
     def images(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> Images:
         """Images (N,) of markers at rows of q (K, n), with derivatives by [RH00] eq. (6)."""
-        E = displacements(self.H_hat, self.prismatic, q)[:, pose_of]
+        E = displacements(self.H_hat, self.prismatic, self.turned(q))[:, pose_of]
         Y = moved_points(E, self.M[marker_of][:, None])[:, :, 0]
         pixels, G, by_lens = projection_derivative(self.P, self.lens, Y[0])
         D = np.empty((len(Y), *pixels.shape, 4))
@@ -126,7 +146,8 @@ class Parameters:
         for i, by_joint in enumerate(E):
             D[i + 1] = D[i] @ by_joint
         by_camera = (G[..., None] * Y[0][:, None, None, :]).reshape(*pixels.shape, CAMERA)
-        return Images(pixels, Y, by_camera, D, by_lens)
+        bent = None if self.curve is None else slopes(self.curve, self.prismatic, q)[pose_of]
+        return Images(pixels, Y, by_camera, D, by_lens, bent)
 
     def everywhere(self, q: FloatArray) -> Images:
         """Images of all markers at joints (K, n), pose by pose, with derivatives."""
@@ -136,8 +157,8 @@ class Parameters:
     def derivative(self, q: FloatArray, images: Images | None = None) -> tuple[FloatArray, FloatArray]:
         """Derivatives of all markers' pixels by P, H_hat (ravelled), and by the marker's own coordinates.
 
-        Of shapes (K, V, m, 2, 12 V + 16 n), with more columns for the ``lens_terms`` of both views, and
-        (K, V, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so
+        Of shapes (K, V, m, 2, 12 V + 16 n), with more columns for the ``lens_terms`` of both views and the
+        terms of the curve, and (K, V, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so
         dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of ``everywhere``, if known.
         """
         (K, n), m = q.shape, len(self.M)
@@ -145,12 +166,14 @@ class Parameters:
         images = self.everywhere(q) if images is None else images
         V, joints, terms = len(self.P), self.P.size, self.lens_terms
         lenses = joints + 16 * n
-        J = np.zeros((V, K * m, 2, lenses + V * terms))
+        by_curve = self.by_curve(images, q[pose_of])
+        J = np.zeros((V, K * m, 2, lenses + V * terms + by_curve.shape[-1]))
+        J[..., lenses + V * terms :] = by_curve
         for v in range(V):
             J[v, ..., v * CAMERA : (v + 1) * CAMERA] = images.by_camera[v]
             if images.by_lens is not None:
                 J[v, ..., lenses + v * terms : lenses + (v + 1) * terms] = images.by_lens[v][..., :terms]
-        parts = sine_and_versine(self.prismatic, q)
+        parts = sine_and_versine(self.prismatic, self.turned(q))
         sine, versine = (part[pose_of].T[..., None, None, None] for part in parts)
         for i, (s, c, H) in enumerate(zip(sine, versine, self.H_hat, strict=True)):
             D, Y = images.by_point[i], images.points[i + 1]
@@ -163,11 +186,11 @@ class Parameters:
     def gauge(self) -> FloatArray:
         """Orthonormal directions (12 V + 16 n + 4 m, 16 + V) of P, H_hat, M that change no image.
 
-        They change the frame and the scales of both cameras; rows of zeros for the lenses precede M.
+        They change the frame and the scales of both cameras; rows of zeros for lenses and curve precede M.
         """
         Z = np.eye(16).reshape(16, 1, 4, 4)
         V = len(self.P)
-        lenses = np.zeros((16, V * self.lens_terms))
+        lenses = np.zeros((16, V * self.lens_terms + (0 if self.curve is None else len(self.curve.terms))))
         parts = -(self.P @ Z), Z @ self.H_hat - self.H_hat @ Z, lenses, self.M @ Z.swapaxes(2, 3)
         frame = np.hstack([part.reshape(16, -1) for part in parts])
         cameras = np.zeros((V, frame.shape[1]))
@@ -179,7 +202,10 @@ class Parameters:
 def parameters_from(calibration: Calibration) -> Parameters:
     """Parameters of a calibration record; of cameras on the tool, those of the chain of the scene."""
     c, way = calibration, -1 if calibration.mount == TOOL else 1
-    return Parameters(c.P, c.H_hat_0[::way], c.prismatic[::way], c.M, c.lens, lens_terms=c.lens_terms)
+    prismatic, terms, curve = c.prismatic[::way], c.lens_terms, c.curve
+    if curve is not None and c.mount == TOOL:
+        curve = backwards(curve, len(prismatic))
+    return Parameters(c.P, c.H_hat_0[::way], prismatic, c.M, c.lens, lens_terms=terms, curve=curve)
 
 
 def errors_of(calibration: Calibration) -> Errors:
@@ -209,7 +235,8 @@ def _in_reverse(c: Calibration) -> IntArray:
 
 def along_the_arm(c: Calibration) -> Calibration:
     """Return the record of cameras on the tool, with joints in the order and sense of the readings."""
-    rows, bias = _in_reverse(c), c.model_error_bias
+    rows, bias, values = _in_reverse(c), c.model_error_bias, c.joint_curve
+    curve = None if c.curve is None else backwards(c.curve, len(c.prismatic)).terms + [0.0, 1.0, 1.0, 0.0]
     if bias is not None:
         bias = np.concatenate([bias[rows], bias[len(rows) :]])
     per_joint: dict[str, Any] = {name: np.ascontiguousarray(getattr(c, name)[::-1]) for name in _PER_JOINT}
@@ -221,6 +248,7 @@ def along_the_arm(c: Calibration) -> Calibration:
         joint_min=np.ascontiguousarray(-(c.joint_min + c.excitation)[::-1]),
         corner_q=None if c.corner_q is None else np.ascontiguousarray(-c.corner_q[:, ::-1]),
         sqrt_cov_shared=c.sqrt_cov_shared[rows],
+        joint_curve=None if curve is None or values is None else np.hstack([curve, values[:, 4:]]),
         model_error_bias=bias,
     )
 

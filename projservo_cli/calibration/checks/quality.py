@@ -101,7 +101,7 @@ class _Uncertainty:
             q = 0.5 * (q + q_reference)
             inside = self.in_region(q)
         detections = self.problem.detections.everywhere(q, self.which)
-        there = LeastSquares.of(detections, q_reference, self.problem.lens_terms)
+        there = self.problem.alike(detections)
         common, own = there.predicted(self.params, self.errors)
         inside = inside.swapaxes(1, 2).reshape(len(inside), -1)  # observations are in the order of markers
         marker = np.nonzero(inside)[1] // len(q)

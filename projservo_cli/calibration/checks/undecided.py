@@ -68,8 +68,10 @@ def undecided_pairs(solution: Solution, sigma_px: float) -> IntArray:
 
 def _change(problem: LeastSquares, params: Parameters, order: Sequence[int]) -> FloatArray:
     """Change (V, N, 2) of the images, px, if the joints come in another order, their operators with them."""
-    at, there, q = list(order), problem.detections, problem.joints(params)
-    other = dataclasses.replace(params, H_hat=params.H_hat[at], prismatic=params.prismatic[at], offsets=None)
+    at, there, q = list(order), problem.detections, params.turned(problem.joints(params))
+    other = dataclasses.replace(
+        params, H_hat=params.H_hat[at], prismatic=params.prismatic[at], offsets=None, curve=None
+    )
     there = dataclasses.replace(there, q=q[:, at], prismatic=there.prismatic[at])
     reordered = LeastSquares.of(there, np.zeros(len(at)), params.lens is not None)
     return np.asarray(reordered.pixels(other)[0] - problem.pixels(params)[0])

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.checks.quality import UNDETERMINED_NOISE
 from projservo_cli.calibration.checks.screening import without_placeholders
 from projservo_cli.calibration.detections import (
@@ -193,12 +192,11 @@ def _held_out_residuals(
     Returns the detections (V, N) predicted, seen minus predicted (V, N, 2) and its deviation (V, N, 2), px.
     Raises WorkFailed if the other poses do not determine the robot.
     """
-    whole, q_reference = solution.problem.detections, solution.problem.q_reference
+    whole = solution.problem.detections
     training = whole.of_poses(~held_out)
     known = training.count_of(training.seen) >= _MIN_READINGS
-    lens = solution.problem.lens_terms
     tau = solution.problem.tau
-    problem = LeastSquares.of(training.of_markers(known), q_reference, lens).with_noise(tau)
+    problem = solution.problem.alike(training.of_markers(known)).with_noise(tau)
     require_motion(problem.detections)
     params = dataclasses.replace(solution.params, M=solution.params.M[known])
     found = fit_inliers(problem, params, solution.sigma_px)
@@ -207,7 +205,7 @@ def _held_out_residuals(
     found, kept = found.determined()
     known[known] = kept
     place = held_out[whole.pose_of] & known[whole.marker_of]
-    test = LeastSquares.of(whole.of_poses(held_out).of_markers(known), q_reference, lens)
+    test = solution.problem.alike(whole.of_poses(held_out).of_markers(known))
     left, weight = test.residual(found.params), test.detections.weight[..., None]
     variance = sum((part**2).sum(axis=-1) for part in test.predicted(found.params, found.errors()))
     # A direction that the other poses leave open keeps its value of the whole fit.
