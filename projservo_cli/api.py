@@ -177,6 +177,7 @@ def calibrate(
     cross_validate: int | None = None,
     joint_noise_deg: float | None = None,
     max_predicted_px: float | None = None,
+    joint_model: str | Sequence[str] | None = None,
     noise_px: float | None = None,
     seed: int | None = None,
     progress: Progress | bool = True,
@@ -197,6 +198,8 @@ def calibrate(
         that of the observations, else estimated.
     max_predicted_px : error of predictions by deviations of arm and rig from the model, px, above which the
         calibration is not usable; by default 1 % of the image size.
+    joint_model : curves of the joints to fit: ``auto`` for those that the images show, or of ``scale``,
+        ``quadratic``, ``cubic``, ``harmonic``, ``coupling`` and ``sag``, of all or of one: ``scale:2``.
     noise_px : standard deviation of a coordinate, px; by default that of the observations, else estimated.
     seed : of the random starts; by default that of the observations.
     progress : called as ``progress(what, done, total)``; True for a bar in a terminal, False for none.
@@ -221,6 +224,7 @@ def calibrate(
         "calibration.cross_validate": cross_validate,
         "calibration.joint_noise_deg": joint_noise_deg,
         "calibration.max_predicted_px": max_predicted_px,
+        "calibration.joint_model": joint_model,
         "data.noise_px": noise_px,
         "calibration.seed": seed,
     }
@@ -235,7 +239,12 @@ def calibrate(
         seen = replace(seen, seed=settings.seed)
     file = None if settings.init is None else File.of(settings.init, "JSON with screws, cameras and markers")
     asked = Estimation(
-        settings.method, settings.lens, file, settings.cross_validate, settings.max_predicted_px
+        settings.method,
+        settings.lens,
+        file,
+        settings.cross_validate,
+        settings.max_predicted_px,
+        settings.joint_model,
     )
     with Listener(progress) as listener:
         screened, calibration, held_out = calibrating.estimate(seen, asked, progress=listener.progress)

@@ -127,20 +127,21 @@ def position_limits(lower: FloatArray, upper: FloatArray) -> JointLimits:
 
 
 class JointCurve(NamedTuple):
-    """True joints less readings as a sum of terms c φ(x), all zero at the reference: c (T,) is ``terms[:, 3]``.
+    """True joints less readings as a sum of terms c φ(x), all zero at the reference.
 
     φ is x, x², x³, sin x, 1 − cos x of a reading x from the reference, or the torque of a weight at the tool
     about the joint that it moves, less that at the reference. That needs an arm as it was before the fit: its
     own errors times a deflection are of second order.
     """
 
-    terms: FloatArray  # (T, 4) index of φ in ``BASIS``, moved joint and joint read, both from 0, and c, rad or m
+    terms: FloatArray  # (T, 4) index of φ in ``BASIS``, joint moved and joint read from 0, and c, rad or m
     # (n + 1, 4, 4) twists of that arm, and a motion with the weight in its last column and with gravity along
     # x; (0, 4, 4) without torques
     arm: FloatArray
 
 
 BASIS = ("linear", "square", "cube", "sine", "versine", "torque")
+FROM_ONE = np.array([0.0, 1.0, 1.0, 0.0])  # adds to terms what numbers joints from 1
 NO_CURVE = JointCurve(np.zeros((0, 4)), np.zeros((0, 4, 4)))
 
 
@@ -375,7 +376,7 @@ class ProjectiveKinematics:
         """True joints by readings, in the order of the arm; None where they are equal."""
         if self.joint_curve is None:
             return None
-        terms = self.joint_curve[:, :4] - [0.0, 1.0, 1.0, 0.0]
+        terms = self.joint_curve[:, :4] - FROM_ONE
         return JointCurve(terms, NO_CURVE.arm if self.joint_curve_arm is None else self.joint_curve_arm)
 
     @property

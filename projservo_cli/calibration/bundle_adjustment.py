@@ -111,7 +111,7 @@ class LeastSquares:
         return cls(detections, q, q_reference, joint, shared, size, columns, None, curve_terms)
 
     def alike(self, detections: Detections) -> "LeastSquares":
-        """Problem of the same parameters but for the markers, of other detections, without noise of joints."""
+        """Problem of the same parameters but for markers, of other detections, without noise of joints."""
         return LeastSquares.of(detections, self.q_reference, self.lens_terms, self.curve_terms)
 
     def joints(self, params: Parameters) -> FloatArray:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from numbers import Real
 from typing import Any
@@ -36,6 +36,7 @@ from projservo_cli.calibration.checks.undecided import require_poses
 from projservo_cli.calibration.detections import Detections, require_images, require_motion
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, ImageGeometry
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
+from projservo_cli.calibration.joint_model import AUTO, Hypothesis, fit_joint_model, hypotheses_of
 from projservo_cli.calibration.lens_estimation import fit_lens, share_explained, undistorted
 from projservo_cli.calibration.prediction import LENS, along_the_arm
 from projservo_cli.calibration.projective import Projective, closed_form_operators
@@ -53,12 +54,14 @@ from projservo_cli.calibration.views import with_all_views, with_best_pair, with
 from projservo_cli.geometry.lens import K1
 from projservo_cli.image_size import ImageSize, border_distance, image_sizes
 from projservo_cli.records import (
+    FROM_ONE,
     TOOL,
     WORLD,
     Calibration,
     Errors,
     FloatArray,
     InputError,
+    JointCurve,
     Observation,
     letters_of,
 )
@@ -106,6 +109,7 @@ def calibrate(
     joint_noise: float | None = 0.0,
     max_predicted_px: float | None = None,
     mount: str = WORLD,
+    joint_model: str | Sequence[str] | None = None,
     fitted: Callable[[Solution, float], None] | None = None,
     progress: Progress = lambda what, done, total: None,
 ) -> Calibration:
@@ -130,6 +134,9 @@ def calibrate(
     max_predicted_px : error of predictions by deviations from the model, px, above which the calibration is
         not usable; None takes 1 % of the image size.
     mount : ``world`` for cameras that watch the tool, ``tool`` for cameras on it that watch the scene.
+    joint_model : curves of the joints that ``bundle_adjustment`` fits: ``auto`` for those that the images
+        show, or some of ``scale``, ``quadratic``, ``cubic``, ``harmonic``, ``coupling`` and ``sag``, of all
+        joints or of one, as ``scale:2``; None where joints are as they read.
     fitted : called with the solution of ``bundle_adjustment`` and its noise, px.
     progress : called with the current task of ``bundle_adjustment``, how much of it is done, and its total.
 
@@ -165,6 +172,9 @@ def calibrate(
         raise InputError(
             f"calibration method {method!r} estimates no lens: choose bundle_adjustment, or calibrate without"
         )
+    curves = None if joint_model == AUTO else hypotheses_of(joint_model or (), joint_types, mount)
+    if (curves is None or curves) and method != "bundle_adjustment":
+        raise InputError(f"calibration method {method!r} fits no joint model: choose bundle_adjustment")
     begin = time.perf_counter()
     solution = None
     # The matrices are small: a second thread costs more than it gives.
@@ -194,7 +204,8 @@ def calibrate(
             problem = LeastSquares.of(detections, detections.reference())
             search = Search(problem, epipolar, of_pair, rng, progress, joint_noise)
             limit = _MAX_PREDICTED * float(frame.size.max()) if max_predicted_px is None else max_predicted_px
-            solution, expected, result = _maximum_likelihood(search, whole, frame, expect, lens, init, limit)
+            asked = lens, init, curves
+            solution, expected, result = _maximum_likelihood(search, whole, frame, expect, asked, limit)
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
             fitted(solution, expected.noise_px(solution))
@@ -253,16 +264,16 @@ def _maximum_likelihood(
     whole: Detections,
     frame: ImageFrame,
     expect: Callable[[ImageGeometry], Expected],
-    lens: bool,
-    init: Nominal | None,
+    asked: tuple[bool, Nominal | None, list[Hypothesis] | None],
     limit_px: float,
 ) -> tuple[Solution, Expected, Calibration]:
     """Maximum-likelihood solution, its expected noise and its record.
 
-    start : search by the pair of views; whole, frame : detections and images of all views.
+    start : search by the pair of views; whole, frame : detections and images of all views; asked : whether to
+        estimate lenses, a start, and curves of the joints, None for those that the data show.
     Raises Misfit, naming the joint at fault if one explains it.
     """
-    search, epipolar = start, start.epipolar
+    search, epipolar, (lens, init, curves), curved = start, start.epipolar, asked, None
     expected = expect(epipolar)
     try:
         solution, note = solve(start, expected, init)
@@ -277,6 +288,10 @@ def _maximum_likelihood(
         expected = expect(epipolar)
         if lens:
             expected.require_scale()
+        if curves is None or curves:
+            search.progress("calibration, joint model", 0, 1)
+            curved = fit_joint_model(solution, curves, expected, epipolar)
+            solution = solution if curved is None else curved.solution
         solution = fit_joint_noise(solution, expected, search.joint_noise)
         result = _refined(solution, epipolar, expected, frame, limit_px)
     except Misfit as refused:
@@ -295,6 +310,8 @@ def _maximum_likelihood(
     if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
         cause = joint_at_fault(start, _DOUBTFUL_SHARE * solution.sigma_px)
     advice = tuple(filter(None, (cause, *result.advice[:1], _worst_view(result), *result.advice[1:], note)))
+    if curved is not None and result.joint_curve is not None:
+        result = dataclasses.replace(result, joint_curve=np.hstack([result.joint_curve[:, :5], curved.gains]))
     return solution, expected, dataclasses.replace(result, advice=advice[:_MAX_ADVICE])
 
 
@@ -473,6 +490,7 @@ def _record(
         sigma_q_interval=None if joint_noise is None else joint_noise.interval,
         encoder_counts=joint_noise is not None and joint_noise.ticks,
         model_px=float(np.sqrt(over)),
+        **_curve_fields(params.curve, off),
         **({} if check is None else _model_fields(result, solution, check)),
     )
 
@@ -497,6 +515,15 @@ def _noise_of_views(solution: Solution) -> FloatArray | None:
     count = np.maximum(solution.used.sum(axis=1), 1)
     free = solution.dof / (2.0 * count.sum())
     return np.asarray(np.sqrt((squares.sum(axis=2) * solution.used).sum(axis=1) / (2.0 * count * free)))
+
+
+def _curve_fields(curve: JointCurve | None, off: Errors) -> dict[str, Any]:
+    """Fields of the record on the curve of the joints, without its gains."""
+    if curve is None:
+        return {}
+    deviation = np.linalg.norm(off.shared[-len(curve.terms) :], axis=1)
+    rows = [curve.terms + FROM_ONE, deviation[:, None], np.full((len(deviation), 2), np.nan)]
+    return {"joint_curve": np.hstack(rows), "joint_curve_arm": curve.arm if len(curve.arm) else None}
 
 
 def _model_fields(result: Projective, solution: Solution, check: ModelCheck) -> dict[str, Any]:

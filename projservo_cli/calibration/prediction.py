@@ -14,6 +14,7 @@ from projservo_cli.geometry.displacements import displacements, sine_and_versine
 from projservo_cli.geometry.joint_curve import backwards, basis, slopes, true_joints
 from projservo_cli.geometry.lens import distort, distort_derivative, distort_visible
 from projservo_cli.records import (
+    FROM_ONE,
     TOOL,
     BoolArray,
     Calibration,
@@ -124,7 +125,8 @@ class Parameters:
 
         NaN for a point behind the camera, or beyond the radius at which its lens model folds back.
         """
-        m = image_points(self.P, moved_points(displacements(self.H_hat, self.prismatic, self.turned(q)), self.M)[0])
+        E = displacements(self.H_hat, self.prismatic, self.turned(q))
+        m = image_points(self.P, moved_points(E, self.M)[0])
         pixels: FloatArray = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
         return pixels if self.lens is None else distort_visible(self.lens[:, None], pixels)
 
@@ -158,8 +160,8 @@ class Parameters:
         """Derivatives of all markers' pixels by P, H_hat (ravelled), and by the marker's own coordinates.
 
         Of shapes (K, V, m, 2, 12 V + 16 n), with more columns for the ``lens_terms`` of both views and the
-        terms of the curve, and (K, V, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so
-        dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of ``everywhere``, if known.
+        terms of the curve, and (K, V, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4),
+        (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of ``everywhere``, if known.
         """
         (K, n), m = q.shape, len(self.M)
         pose_of = np.repeat(np.arange(K), m)
@@ -236,7 +238,7 @@ def _in_reverse(c: Calibration) -> IntArray:
 def along_the_arm(c: Calibration) -> Calibration:
     """Return the record of cameras on the tool, with joints in the order and sense of the readings."""
     rows, bias, values = _in_reverse(c), c.model_error_bias, c.joint_curve
-    curve = None if c.curve is None else backwards(c.curve, len(c.prismatic)).terms + [0.0, 1.0, 1.0, 0.0]
+    curve = None if c.curve is None else backwards(c.curve, len(c.prismatic)).terms + FROM_ONE
     if bias is not None:
         bias = np.concatenate([bias[rows], bias[len(rows) :]])
     per_joint: dict[str, Any] = {name: np.ascontiguousarray(getattr(c, name)[::-1]) for name in _PER_JOINT}

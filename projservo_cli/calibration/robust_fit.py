@@ -535,10 +535,22 @@ def left_out_px(solution: Solution) -> float:
     """Typical error of images at the joint readings of a pose, by a fit without this pose to first order, px.
 
     The geometric mean over poses of the median distance, rejected detections included, so that it compares
-    fits that reject different ones. Residuals of detections that count grow by the leverage of their pose:
-    (I − U Uᵀ)⁻¹, with U Uᵀ the projection on what the parameters can do.
+    fits that reject different ones.
     """
     few = solution.thinned(MAX_JUDGED)
+    error, seen = left_out_errors(few), few.problem.detections.seen
+    pose_of = np.broadcast_to(few.problem.detections.pose_of, seen.shape)[seen]
+    group = np.unique(pose_of, return_inverse=True)[1]
+    distance = np.linalg.norm(error[seen], axis=1)
+    return float(np.exp(np.mean(np.log(medians(distance[:, None], group) + 1e-12))))
+
+
+def left_out_errors(few: Solution) -> FloatArray:
+    """Errors (V, N, 2) of images at the joint readings of a pose, by a fit without it to first order, px.
+
+    Residuals of detections that count grow by the leverage of their pose: (I − U Uᵀ)⁻¹, with U Uᵀ the
+    projection on what the parameters can do. For few markers.
+    """
     problem, params, detections, used = few.problem, few.params, few.problem.detections, few.used
     raw = problem.with_noise(None).residual(params)
     U = problem.whitened(params, problem.dense(problem.derivative(params), used), used) @ few.errors().dense()
@@ -551,10 +563,7 @@ def left_out_px(solution: Solution) -> float:
     if problem.tau is not None:
         left = JointErrors(problem, params, used, problem.tau).coloured(left[:, None])[:, 0]
     error = np.where(used[..., None], left.reshape(raw.shape), raw) / detections.weight[..., None]
-    seen = detections.seen
-    group = np.unique(np.broadcast_to(detections.pose_of, seen.shape)[seen], return_inverse=True)[1]
-    distance = np.linalg.norm(error[seen], axis=1)
-    return float(np.exp(np.mean(np.log(medians(distance[:, None], group) + 1e-12))))
+    return np.asarray(error)
 
 
 def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[Solution, str]:

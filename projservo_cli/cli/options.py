@@ -52,6 +52,7 @@ _KEYS = {  # that options stand for
     "init": "calibration.init",
     "cross_validate": "calibration.cross_validate",
     "lens": "calibration.lens",
+    "joint_model": "calibration.joint_model",
 }
 
 # Options that each command describes for itself.
@@ -131,6 +132,12 @@ _OF_STAGES = (
     ),
     click.option(
         "--lens", is_flag=True, help="Estimate radial lens distortion, and its centre where it shows."
+    ),
+    click.option(
+        "--joint-model",
+        metavar="auto|LIST",
+        help="Fit curves of the joints: those that the images show, or of scale, quadratic, cubic, harmonic, "
+        "coupling, sag, such as scale:2,sag.",
     ),
     click.option(
         "--image-size",
@@ -299,6 +306,8 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
             continue
         flag = f"--{name.replace('_', '-')}" + ("" if given is True else f" {given}")
         value = os.path.abspath(given) if name in ("data", "readings", "init") else given
+        if name == "joint_model" and given != "auto":
+            value = given.split(",")
         found.append(Override(flag, key, value))
     if (size := options.get("image_size")) is not None:  # such as 1280x1024,1280x960
         flag, sizes = f"--image-size {size}", [_SIZE.fullmatch(one) for one in size.split(",")]

@@ -87,6 +87,7 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         _file(config, "init", files),
         settings.cross_validate,
         settings.max_predicted_px,
+        settings.joint_model,
     )
     inputs: CalibrationInputs | RefitInputs = CalibrationInputs(source, how, noise)
     for i, one in enumerate(settings.refits):

@@ -95,6 +95,11 @@ class CalibrationSettings(Section):
         False,
         description="whether to estimate radial distortion: two coefficients a camera, and its centre",
     )
+    joint_model: Literal["auto"] | tuple[str, ...] | None = Field(
+        None,
+        description="curves of joints to fit: auto, or a list of scale, quadratic, cubic, harmonic, coupling "
+        "and sag, of all joints or of one, as scale:2 or coupling:4-5; null: joints are as they read",
+    )
 
     refits: tuple[Refit, ...] = Field(
         (),

@@ -151,6 +151,7 @@ def estimate(
             joint_noise=seen.joint_noise,
             max_predicted_px=asked.max_predicted_px,
             mount=seen.mount,
+            joint_model=asked.joint_model,
             fitted=judge,
             progress=progress,
         )

@@ -122,6 +122,7 @@ class Estimation:
     init: File | None = None  # JSON of a robot and rig that are tried first as a start
     cross_validate: int | None = None  # parts into which poses are divided to predict each from the others
     max_predicted_px: float | None = None  # error by deviations from the model that is accepted, px
+    joint_model: str | tuple[str, ...] | None = None  # auto, or curves of joints to fit
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,342 @@
+"""Joints that are not ideal: curves of readings, coupling and deflection, fitted with all else.
+
+Each hypothesis adds terms to the curve of true joints by readings: scale x, quadratic x and x², cubic also
+x³, harmonic sin x and 1 − cos x, coupling by another reading, and sag, a deflection of each revolute joint
+that follows the torque of a weight at the tool. Automatic choice takes one by one what the score tests name,
+and what explains the images about as well. It keeps the hypothesis that predicts left-out poses best, if by
+more than chance, and stops where none does.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
+from projservo_cli.calibration.checks.quality import check_model
+from projservo_cli.calibration.detections import MAX_JUDGED, per_rad
+from projservo_cli.calibration.epipolar import ImageGeometry
+from projservo_cli.calibration.robust_fit import Expected, Solution, fit_from, left_out_errors, left_out_px
+from projservo_cli.geometry.joint_curve import basis, slopes, torques
+from projservo_cli.records import (
+    BASIS,
+    NO_CURVE,
+    TOOL,
+    FloatArray,
+    InputError,
+    JointCurve,
+    ModelError,
+    WorkFailed,
+)
+
+# Functions of each kind; those of a coupling read another joint.
+_FUNCTIONS = {
+    "scale": ("linear",),
+    "quadratic": ("linear", "square"),
+    "cubic": ("linear", "square", "cube"),
+    "harmonic": ("sine", "versine"),
+    "coupling": ("linear",),
+    "sag": ("torque",),
+}
+KINDS = tuple(_FUNCTIONS)
+AUTO = "auto"
+# Standard deviations of chance by which squared errors at left-out poses must fall: 95 %, one-sided, since
+# what is tried is significant by the score tests already.
+_SURE = 1.64
+# Maximum number of hypotheses that are chosen.
+_MAX_CHOSEN = 6
+# Maximum deviation, rad (prismatic × 0.3 m/rad), of a joint within its range by a term that is determined.
+_OPEN = np.radians(5.0)
+# Deviations from zero below which a term of one joint of many is left out, and deflection, rad by the largest
+# torque, beyond that of any joint.
+_APART, _BENDS = 2.0, np.radians(5.0)
+# Minimum determinant of the derivatives of true joints by readings, within the recorded poses.
+_FOLDS = 0.2
+# Rounds of the search for the direction of gravity, and the usual deflection, rad, which keeps it finite.
+_ROUNDS, _USUAL_SAG = 20, np.radians(0.5)
+
+
+_Term = tuple[int, int, int]  # index of the function, joint moved and joint read
+
+
+class Hypothesis(NamedTuple):
+    """A kind of curve, and its joint from 1, none for all; of a coupling the one read, then the one moved."""
+
+    kind: str
+    joints: tuple[int, ...]
+
+    @property
+    def words(self) -> str:
+        """Name as it is asked for, such as scale:2 or coupling:4-5."""
+        return ":".join(filter(None, (self.kind, "-".join(map(str, self.joints)))))
+
+
+def hypotheses_of(asked: str | Iterable[str], joint_types: str, mount: str) -> list[Hypothesis]:
+    """Return the hypotheses of words such as scale, scale:2, coupling:4-5 or sag, for joints R or P.
+
+    Raises InputError naming a word that none has, or what no image shows.
+    """
+    found, n = list[Hypothesis](), len(joint_types)
+    asked = asked.split(",") if isinstance(asked, str) else asked
+    slides = [i for i, kind in enumerate(joint_types, 1) if kind.upper() == "P"]
+    for word in asked:
+        kind, _, which = word.partition(":")
+        if kind not in _FUNCTIONS or (which and kind == "sag"):
+            raise InputError(f"joint model {word!r}: choose auto, or of {', '.join(KINDS)}, such as scale:2")
+        try:
+            joints = tuple(int(number) for number in which.split("-") if number)
+        except ValueError:
+            joints = (0,)
+        count = 2 if kind == "coupling" else 1
+        if any(not 1 <= j <= n for j in joints) or (joints and len(set(joints)) != count):
+            example = "coupling:1-2, joint read and joint moved" if count == 2 else f"{kind}:1"
+            raise InputError(f"joint model {word!r}: joints are 1 to {n}; write {kind}, or {example}")
+        if kind == "sag" and mount == TOOL:
+            raise InputError(
+                "joint model 'sag': no image shows the weight at a tool with cameras; leave it out"
+            )
+        if kind == "scale" and slides and joints == (slides[0],):
+            raise InputError(
+                f"joint model {word!r}: images do not show the scale of prismatic joint {slides[0]}, which "
+                "sets that of the frame: leave it out; metric --scale takes it from a known length"
+            )
+        if kind == "harmonic" and set(joints) & set(slides):
+            raise InputError(f"joint model {word!r}: prismatic joint {joints[0]} has no turn; leave it out")
+        pairs = [(i, j) for i in range(1, n + 1) for j in range(1, n + 1) if i != j]
+        found += [Hypothesis(kind, one) for one in (pairs if kind == "coupling" and not joints else [joints])]
+    return list(dict.fromkeys(found))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class JointModelFit:
+    """A fit with a curve of the joints."""
+
+    solution: Solution
+    gains: FloatArray  # (T, 2) typical error at left-out poses, px, without and with each term
+
+
+def fit_joint_model(
+    start: Solution, asked: Sequence[Hypothesis] | None, expected: Expected, epipolar: ImageGeometry
+) -> JointModelFit | None:
+    """Fit the curve of the hypotheses asked for, or for None of those that the data show.
+
+    None if they show none. Raises WorkFailed naming a hypothesis that the data do not determine.
+    """
+    exact = start
+    if start.problem.tau is not None:
+        params = dataclasses.replace(start.params, offsets=None)
+        again = fit_from(start.problem.with_noise(None), params, epipolar)
+        exact = dataclasses.replace(start, joint_noise=None) if again is None else again
+    search = _Search(exact, epipolar)
+    chosen = search.automatic(expected) if asked is None else list(asked)
+    if not chosen:
+        return None
+    found = search.with_curve(chosen)
+    if found is not None and asked is None:
+        found = search.pruned(found, chosen)
+    if found is None:
+        names = ", ".join(one.words for one in chosen)
+        raise WorkFailed(f"no fit with the joint model {names} explains the images: leave some of it out")
+    if asked is not None:
+        search.require_known(found, chosen)
+    if found.params.curve is None:
+        return None
+    before = search.gains
+    now = left_out_px(found)
+    owners = _terms(chosen, exact)
+    without = {key: before.get(one, left_out_px(exact)) for one in chosen for key in owners[one]}
+    return JointModelFit(found, np.array([[without[key], now] for key in _keys(found.params.curve)]))
+
+
+def _keys(curve: JointCurve) -> list[_Term]:
+    """Terms of a curve without their coefficients."""
+    return [(f, i, by) for f, i, by in curve.terms[:, :3].astype(int).tolist()]
+
+
+def _deviations(found: Solution) -> FloatArray:
+    """Standard deviations (T,) of the coefficients of a curve."""
+    rows = slice(found.problem.shared - found.problem.curve_terms, found.problem.shared)
+    return np.asarray(found.sigma_px * np.linalg.norm(found.errors().shared[rows], axis=1))
+
+
+def _terms(chosen: Iterable[Hypothesis], solution: Solution) -> dict[Hypothesis, list[_Term]]:
+    """Terms of each hypothesis, its joints in the order of a fit."""
+    prismatic, numbers = solution.params.prismatic, solution.problem.detections.numbers.tolist()
+    found = {}
+    for one in chosen:
+        joints, functions = [numbers.index(j) for j in one.joints], _FUNCTIONS[one.kind]
+        pairs = [(joints[-1], joints[0])] if joints else [(i, i) for i in range(len(numbers))]
+        if one.kind in ("harmonic", "sag"):
+            pairs = [(i, by) for i, by in pairs if not prismatic[i]]
+        # The first prismatic joint of the arm sets the scale of the frame.
+        first = min((number for number, slides in zip(numbers, prismatic, strict=True) if slides), default=0)
+        unknown = [(BASIS.index("linear"), i, i) for i, number in enumerate(numbers) if number == first]
+        terms = [(BASIS.index(f), i, by) for f in functions for i, by in pairs]
+        found[one] = [term for term in terms if term not in unknown]
+    return found
+
+
+class _Search:
+    """Fits with curves, from one without."""
+
+    def __init__(self, exact: Solution, epipolar: ImageGeometry) -> None:
+        self.exact, self.epipolar = exact, epipolar
+        self.gains = dict[Hypothesis, float]()  # typical error at left-out poses without each of those chosen
+
+    def with_curve(
+        self, chosen: Sequence[Hypothesis], near: Solution | None = None, but: Sequence[_Term] = ()
+    ) -> Solution | None:
+        """Fit with the curve of some hypotheses, but for some terms, from a fit near it.
+
+        None if none is found, or joints fold.
+        """
+        near = near or self.exact
+        before = near.params.curve or NO_CURVE
+        known = dict(zip(_keys(before), before.terms[:, 3].tolist(), strict=True))
+        every = (key for terms in _terms(chosen, near).values() for key in terms if key not in but)
+        keys = list(dict.fromkeys(every))
+        terms = np.array([[*key, known.get(key, 0.0)] for key in keys]).reshape(-1, 4)
+        arm = before.arm
+        if any(one.kind == "sag" for one in chosen) and not len(arm):
+            arm = _arm(near)
+        problem, detections = near.problem, near.problem.detections
+        bent = LeastSquares.of(detections, problem.q_reference, problem.lens_terms, len(terms))
+        params = dataclasses.replace(near.params, curve=JointCurve(terms, arm), offsets=None)
+        found = fit_from(bent, params, self.epipolar)
+        if found is None or found.params.curve is None:
+            return None
+        F = slopes(found.params.curve, found.params.prismatic, bent.q[np.unique(detections.pose_of)])
+        return None if np.linalg.det(F).min() < _FOLDS else found
+
+    def automatic(self, expected: Expected) -> list[Hypothesis]:
+        """Choose hypotheses that the score tests name while left-out poses are predicted better."""
+        chosen, best, refused = list[Hypothesis](), self.exact, set[Hypothesis]()
+        while len(chosen) < _MAX_CHOSEN:
+            named = [one for one in self._named(best, expected) if one not in refused and one not in chosen]
+            trials = [(one, self.with_curve([*chosen, one], best)) for one in named]
+            better = [(_gain(best, fit), one, fit) for one, fit in trials if fit is not None]
+            better = [trial for trial in better if trial[0][1] > _SURE]
+            refused.update(named)
+            if not better:
+                break
+            _, one, fit = max(better, key=lambda trial: trial[0][0])
+            self.gains[one], best = left_out_px(best), fit
+            refused.discard(one)
+            chosen.append(one)
+        for one in chosen[:-1]:  # a later one may say all that it did
+            others = [other for other in chosen if other != one]
+            fewer = self.with_curve(others)
+            if fewer is not None and _gain(fewer, best)[1] <= _SURE:
+                chosen, best = others, fewer
+        return chosen
+
+    def _named(self, solution: Solution, expected: Expected) -> list[Hypothesis]:
+        """Hypotheses that the score tests of a fit name, and those that explain the images about as well."""
+        check = check_model(solution, solution.errors(), expected.noise_px(solution))
+        found = list[Hypothesis]()
+        for error in check.errors:
+            others = [ModelError.of(code, [0.0, 0.0, 0.0, np.nan]) for code in error.others]
+            for one in (error, *others):
+                if one.kind == "sag":
+                    found += [] if solution.problem.detections.mount == TOOL else [Hypothesis("sag", ())]
+                elif one.kind in _FUNCTIONS:
+                    several = one.kind == "scale" and len(one.joints) > 1
+                    found.append(Hypothesis(one.kind, () if several else one.joints))
+        return list(dict.fromkeys(found))
+
+    def pruned(self, found: Solution, chosen: Sequence[Hypothesis]) -> Solution:
+        """Fit without terms of hypotheses of all joints that differ from zero by chance, or bend too far."""
+        curve, deviation = found.params.curve, _deviations(found)
+        assert curve is not None
+        size, groups = np.abs(curve.terms[:, 3]), [one for one in chosen if not one.joints]
+        weak = (size < _APART * deviation) | ((curve.terms[:, 0] == BASIS.index("torque")) & (size > _BENDS))
+        own = {key for keys in _terms(groups, found).values() for key in keys}
+        but = [key for key, out in zip(_keys(curve), weak, strict=True) if out and key in own]
+        fewer = self.with_curve(chosen, found, but) if 0 < len(but) < len(size) else None
+        return fewer or found
+
+    def require_known(self, found: Solution, chosen: Sequence[Hypothesis]) -> None:
+        """Refuse a curve with a term that the data leave open, by the motion of its joint in its range."""
+        curve, params, problem = found.params.curve, found.params, found.problem
+        assert curve is not None
+        deviation = _deviations(found)
+        most = np.abs(basis(curve, params.prismatic, problem.q)).max(axis=0)
+        joint = curve.terms[:, 1].astype(int)
+        off = deviation * most / per_rad(params.prismatic)[joint]
+        t = int(np.argmax(off))
+        if off[t] <= _OPEN:
+            return
+        key = _keys(curve)[t]
+        name = next(one.words for one, keys in _terms(chosen, found).items() if key in keys)
+        number = problem.detections.numbers[joint[t]]
+        raise WorkFailed(
+            f"joint model {name}: the data do not determine it, joint {number} may be off by "
+            f"{np.degrees(off[t]):.2g}°, more than {np.degrees(_OPEN):.2g}° within its range: leave it out, "
+            "or record more poses in which the joint moves farther"
+        )
+
+
+def _gain(before: Solution, after: Solution) -> tuple[float, float]:
+    """Decrease of squared errors at left-out poses, px², and that over its deviation by chance.
+
+    By detections that count in both fits. The squares of errors e + δ exceed those of e by 2 e·δ + δ², where
+    e is noise if the later fit is right: sums of 2 e·δ over poses have mean zero, and show their deviation.
+    """
+    before, after = before.thinned(MAX_JUDGED), after.thinned(MAX_JUDGED)
+    first, e = left_out_errors(before), left_out_errors(after)
+    both = (before.used & after.used)[..., None]
+    gain = (both * (first**2 - e**2)).sum()
+    by_chance = after.problem.at_poses((both * 2.0 * e * (first - e)).sum(axis=(0, 2)))
+    return float(gain), float(gain / max(float(np.linalg.norm(by_chance)), 1e-300))
+
+
+def _arm(solution: Solution) -> FloatArray:
+    """Arm by which torques are known (n + 1, 4, 4): twists, and a motion to the weight, gravity along its x.
+
+    Gravity is the direction g of the deflections s_i g · load_i that explain most of the residuals, with a
+    stiffness of each joint; both alternate, from each axis.
+    """
+    few = solution.thinned(MAX_JUDGED)
+    problem, params, used = few.problem, few.params, few.used
+    center = np.append(params.M[:, :3].mean(axis=0), 1.0)
+    x = np.vstack([problem.q, np.zeros((1, problem.q.shape[1]))])
+    loads = torques(params.H_hat, params.prismatic, center, x)
+    loads = loads[:-1] - loads[-1]
+    loads /= np.maximum(np.linalg.norm(loads, axis=2).max(), 1e-12)
+    turning = np.flatnonzero(~params.prismatic)
+    G = (
+        problem.joint_derivative(params)[..., turning, None]
+        * loads[problem.detections.pose_of][:, None, turning]
+    )
+    columns = np.where(used[..., None, None, None], G, 0.0).reshape(2 * used.size, -1)
+    rows = np.hstack([columns, few.raw.reshape(-1, 1)])
+    U = problem.dense(problem.derivative(params), used) @ few.errors().dense()
+    R = np.linalg.qr(rows - U @ (U.T @ rows), mode="r")
+    Z, r = R[:, :-1].reshape(len(R), -1, 3), -R[:, -1]
+    best = np.inf, np.eye(3)[2]
+    for g in np.eye(3):
+        for _ in range(_ROUNDS):
+            s = _ridge(Z @ g, r, few.sigma_px / _USUAL_SAG)
+            g = _ridge(np.einsum("lis,i->ls", Z, s), r, 0.0)
+            g = g / max(float(np.linalg.norm(g)), 1e-300)
+        left = float(np.square(r - Z @ g @ s).sum())
+        best = min(best, (left, g), key=lambda one: one[0])
+    g = best[1]
+    motion = np.eye(4)
+    motion[:3, 0], motion[:, 3] = g, center
+    motion[:3, 1] = np.cross(g, np.eye(3)[np.argmin(np.abs(g))])
+    motion[:3, 1] /= np.linalg.norm(motion[:3, 1])
+    motion[:3, 2] = np.cross(g, motion[:3, 1])
+    size = np.linalg.norm(torques(params.H_hat, params.prismatic, center, x), axis=2).max()
+    # Shrunk to an arm of torques up to one, so that coefficients are deflections in rad.
+    twists = params.H_hat.copy()
+    twists[:, :3, 3] /= size
+    motion[:3, 3] /= size
+    return np.concatenate([twists, motion[None]])
+
+
+def _ridge(Z: FloatArray, r: FloatArray, weight: float) -> FloatArray:
+    """Least-squares amplitudes (d,) of columns (L, d), shrunk by a weight."""
+    A = Z.T @ Z
+    return np.asarray(np.linalg.solve(A + (weight**2 + 1e-9 * np.trace(A)) * np.eye(len(A)), Z.T @ r))
