@@ -163,6 +163,7 @@ class Model(NamedTuple):
     lens: FloatArray = NO_LENS
     # whether the cameras are on the tool: the joints then move the scene, the last one first
     on_tool: bool = False
+    curve: JointCurve = NO_CURVE  # true joints by readings
 
 
 class Spread(NamedTuple):
@@ -356,6 +357,7 @@ class ProjectiveKinematics:
             a_inf=self.a_inf,
             lens=no_lenses(len(self.P)) if self.lens is None else self.lens,
             on_tool=on_tool,
+            curve=self.curve or NO_CURVE,
         )
 
     @property

@@ -1,15 +1,18 @@
 """True joints by readings: curves of gears and encoders, coupling, deflection under a weight at the tool."""
 
+import math
 from functools import reduce
 
 import numpy as np
 
-from projservo_cli.geometry.displacements import displacements
-from projservo_cli.records import BASIS, BoolArray, FloatArray, JointCurve
+from projservo_cli.geometry.algebra import apply, dot, mat
+from projservo_cli.geometry.displacements import displacements, rotation, translation
+from projservo_cli.geometry.jit import inline, internal
+from projservo_cli.records import BASIS, BoolArray, FloatArray, JointCurve, Model
 
 # Step of the differences by which a curve is differentiated, rad or m: third derivatives leave 1e-11 of it.
 _STEP = 1e-5
-_TORQUE = BASIS.index("torque")
+_LINEAR, _SQUARE, _CUBE, _SINE, _VERSINE, _TORQUE = range(len(BASIS))
 _EVEN = [BASIS.index("square"), BASIS.index("versine")]
 
 
@@ -17,7 +20,7 @@ def basis(curve: JointCurve, prismatic: BoolArray, x: FloatArray) -> FloatArray:
     """Return φ (K, T) of each term at readings (K, n) from the reference, rad or m."""
     kind, joint, by = curve.terms[:, :3].astype(np.int64).T
     x_by, values = x[:, by], np.zeros((len(x), len(kind)))
-    for index, phi in enumerate((x_by, x_by**2, x_by**3, np.sin(x_by), 1.0 - np.cos(x_by))):
+    for index, phi in enumerate((x_by, x_by**2, x_by**3, np.sin(x_by), 2.0 * np.sin(0.5 * x_by) ** 2)):
         values = np.where(kind == index, phi, values)
     if (kind == _TORQUE).any():
         weight, twists = curve.arm[-1][:, 3], curve.arm[:-1]
@@ -63,3 +66,82 @@ def torques(H_hat: FloatArray, prismatic: BoolArray, weight: FloatArray, q: Floa
         behind = np.linalg.solve(H_bar, truncated[-1] @ weight[:, None])
         loads[:, i] = (H_bar @ (H_hat[i] @ behind))[:, :3, 0]
     return loads
+
+
+@inline
+def _reading(model: Model, q: FloatArray, ahead: FloatArray, share: float, i: int) -> float:
+    """Reading of joint i from the reference, interpolated by a share from joints q (n,) to those ahead."""
+    return (1.0 - share) * float(q[i]) + share * float(ahead[i]) - float(model.q_reference[i])
+
+
+@internal
+def _torque(
+    model: Model, q: FloatArray, ahead: FloatArray, share: float, i: int, j: int, step: float, moved: float
+) -> float:
+    """Torque about joint i with joint j a step farther, and all readings times ``moved``."""
+    curve = model.curve
+    n = q.shape[0]
+    motion = curve.arm[n]
+    v = (float(motion[0, 3]), float(motion[1, 3]), float(motion[2, 3]), float(motion[3, 3]))
+    for k in range(n - 1, -1, -1):
+        twist = mat(curve.arm[k])
+        amount = moved * _reading(model, q, ahead, share, k)
+        if k == j:
+            amount += step
+        v = apply(translation(twist, amount), v) if model.prismatic[k] else apply(rotation(twist, amount), v)
+        if k == i:
+            v = apply(twist, v)
+    return dot((float(motion[0, 0]), float(motion[1, 0]), float(motion[2, 0]), 0.0), v)
+
+
+@internal
+def bend(model: Model, q: FloatArray, ahead: FloatArray, share: float, i: int) -> float:
+    """True joint i less its reading, interpolated by a share from joints q (n,) to those ahead, rad or m."""
+    terms = model.curve.terms
+    total = 0.0
+    for t in range(terms.shape[0]):
+        if int(terms[t, 1]) != i:
+            continue
+        kind = int(terms[t, 0])
+        x = _reading(model, q, ahead, share, int(terms[t, 2]))
+        value = x
+        if kind == _SQUARE:
+            value = x * x
+        elif kind == _CUBE:
+            value = x * x * x
+        elif kind == _SINE:
+            value = math.sin(x)
+        elif kind == _VERSINE:
+            half = math.sin(0.5 * x)
+            value = 2.0 * half * half
+        elif kind == _TORQUE:
+            value = _torque(model, q, ahead, share, i, -1, 0.0, 1.0)
+            value -= _torque(model, q, ahead, share, i, -1, 0.0, 0.0)
+        total += float(terms[t, 3]) * value
+    return total
+
+
+@internal
+def slope(model: Model, q: FloatArray, i: int, j: int) -> float:
+    """Derivative of true joint i by the reading of joint j, at joints q (n,)."""
+    terms = model.curve.terms
+    total = 1.0 if i == j else 0.0
+    for t in range(terms.shape[0]):
+        kind = int(terms[t, 0])
+        if int(terms[t, 1]) != i or (int(terms[t, 2]) != j and kind != _TORQUE):
+            continue
+        x = _reading(model, q, q, 0.0, j)
+        value = 1.0
+        if kind == _SQUARE:
+            value = 2.0 * x
+        elif kind == _CUBE:
+            value = 3.0 * x * x
+        elif kind == _SINE:
+            value = math.cos(x)
+        elif kind == _VERSINE:
+            value = math.sin(x)
+        elif kind == _TORQUE:
+            farther = _torque(model, q, q, 0.0, i, j, _STEP, 1.0)
+            value = (farther - _torque(model, q, q, 0.0, i, j, -_STEP, 1.0)) / (2.0 * _STEP)
+        total += float(terms[t, 3]) * value
+    return total

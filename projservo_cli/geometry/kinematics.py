@@ -4,9 +4,21 @@ import math
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import IDENTITY, Mat4, Vec4, as_array, mat, mat_into, mul, vec
+from projservo_cli.geometry.algebra import (
+    IDENTITY,
+    Mat4,
+    Vec4,
+    as_array,
+    combine,
+    mat,
+    mat_into,
+    mul,
+    multiple,
+    vec,
+)
 from projservo_cli.geometry.displacements import rotation, rotation_and_inverse, translation
 from projservo_cli.geometry.jit import inline, internal, merged, njit
+from projservo_cli.geometry.joint_curve import bend, slope
 from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.image_size import BEHIND
 from projservo_cli.records import FloatArray, JointLimits, Model
@@ -26,13 +38,22 @@ def _in_order(model: Model, j: int) -> int:
     return model.q_reference.shape[0] - 1 - j if model.on_tool else j
 
 
+@inline
+def _true(model: Model, q: FloatArray, i: int) -> float:
+    """Value of joint i from the reference, of which its reading may differ, rad or m."""
+    amount = float(q[i]) - float(model.q_reference[i])
+    if model.curve.terms.shape[0] > 0:
+        amount += bend(model, q, q, 0.0, i)
+    return amount
+
+
 @njit
 def forward(model: Model, q: FloatArray) -> Mat4:
     """Forward kinematics, the product of exponentials of [RH00] eq. (6), q rad or m."""
     H = IDENTITY
     for j in range(q.shape[0]):
         i = _in_order(model, j)
-        amount = float(q[i]) - float(model.q_reference[i])
+        amount = _true(model, q, i)
         H = mul(H, _joint_displacement(mat(model.H_hat_0[i]), model.prismatic[i], amount))
     return H
 
@@ -43,7 +64,7 @@ def backward(model: Model, q: FloatArray) -> Mat4:
     H = IDENTITY
     for j in range(q.shape[0]):
         i = _in_order(model, j)
-        amount = float(q[i]) - float(model.q_reference[i])
+        amount = _true(model, q, i)
         H = mul(_joint_displacement(mat(model.H_hat_0[i]), model.prismatic[i], -amount), H)
     return H
 
@@ -55,6 +76,8 @@ def forward_between(model: Model, q: FloatArray, i: int, x: float) -> Mat4:
     for j in range(q.shape[1]):
         l = _in_order(model, j)
         amount = (1.0 - x) * float(q[i, l]) + x * float(q[i + 1, l]) - float(model.q_reference[l])
+        if model.curve.terms.shape[0] > 0:
+            amount += bend(model, q[i], q[i + 1], x, l)
         H = mul(H, _joint_displacement(mat(model.H_hat_0[l]), model.prismatic[l], amount))
     return H
 
@@ -64,7 +87,8 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
     """Joint operators at q, [RH00] eq. (19) with the truncated product H̄_i of (6); returns the whole product.
 
     Ĥ_i(q) = H̄_i Ĥ_i⁰ H̄_i⁻¹ undoes the joint, moves it about its reference and redoes it. The joint's own
-    factor of H̄_i commutes with Ĥ_i⁰ and is omitted.
+    factor of H̄_i commutes with Ĥ_i⁰ and is omitted. By readings that joints do not follow they are sums of
+    these over joints, weighted with the derivatives of the curve.
     """
     n = q.shape[0]
     H = IDENTITY
@@ -72,8 +96,14 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
     for j in range(n):
         i = _in_order(model, j)
         operator = mat(model.H_hat_0[i])
-        mat_into(H_hat[i], mul(mul(H, operator), H_inverse))
-        amount = float(q[i]) - float(model.q_reference[i])
+        moved = mul(mul(H, operator), H_inverse)
+        if model.curve.terms.shape[0] > 0:
+            for l in range(n):  # a reading moves all joints that bend by it
+                before = multiple(0.0, operator) if j == 0 else mat(H_hat[l])
+                mat_into(H_hat[l], combine(1.0, before, slope(model, q, i, l), moved))
+        else:
+            mat_into(H_hat[i], moved)
+        amount = _true(model, q, i)
         if j == n - 1:
             H = mul(H, _joint_displacement(operator, model.prismatic[i], amount))
         elif model.prismatic[i]:

@@ -257,6 +257,7 @@ def twin_of(c: Constraints, j: int) -> Model:
         a_inf=m.a_inf,
         lens=m.lens,
         on_tool=m.on_tool,
+        curve=m.curve,
     )
 
 

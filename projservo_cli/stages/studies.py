@@ -71,6 +71,7 @@ def projective_twin(model: Model) -> Model:
         model.q_reference,
         model.a_inf @ H_PE,
         model.lens,
+        curve=model.curve,
     )
 
 

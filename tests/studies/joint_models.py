@@ -6,8 +6,8 @@
 Tables are those of ``faulty_arms``, at 0.3 px, calibrated with joint_model auto and without. The error of a
 run is that of its predictions at random poses within the ranges of the joints, rms of marker and view. The
 bound is that of Cramér and Rao for a model with the very parameters of the fault: a gear of one joint or of
-each, sine and cosine of one, one coupling, a deflection of each joint under the true load. Sound tables come in
-each design. Ratios are of root mean squares over seeds: with auto over the bound, and over that without.
+each, sine and cosine of one, one coupling, a deflection of each joint under the true load. Sound tables come
+in each design. Ratios are of root mean squares over seeds: with auto over the bound, and over that without.
 """
 
 import os
