@@ -9,7 +9,7 @@ more than chance, and stops where none does.
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from projservo_cli.records import (
     BASIS,
     NO_CURVE,
     TOOL,
+    Calibration,
     FloatArray,
     InputError,
     JointCurve,
@@ -40,6 +41,14 @@ _FUNCTIONS = {
     "sag": ("torque",),
 }
 KINDS = tuple(_FUNCTIONS)
+_ARGUMENTS = {
+    "linear": "reading {}",
+    "square": "square of reading {}",
+    "cube": "cube of reading {}",
+    "sine": "sine of reading {}",
+    "versine": "1 − cosine of reading {}",
+    "torque": "torque, of which the largest is 1",
+}
 AUTO = "auto"
 # Standard deviations of chance by which squared errors at left-out poses must fall: 95 %, one-sided, since
 # what is tried is significant by the score tests already.
@@ -174,6 +183,25 @@ def _terms(chosen: Iterable[Hypothesis], solution: Solution) -> dict[Hypothesis,
         unknown = [(BASIS.index("linear"), i, i) for i, number in enumerate(numbers) if number == first]
         terms = [(BASIS.index(f), i, by) for f in functions for i, by in pairs]
         found[one] = [term for term in terms if term not in unknown]
+    return found
+
+
+def describe_curve(calibration: Calibration) -> list[dict[str, Any]]:
+    """Return the terms of a curve, none without: function, joints from 1, coefficient, deviation, words.
+
+    And typical errors at left-out poses, px, without the hypothesis that a term belongs to, and with all.
+    """
+    found, rows = [], [] if calibration.joint_curve is None else calibration.joint_curve.tolist()
+    for index, moved, read, c, deviation, before, after in rows:
+        function, slides = BASIS[int(index)], bool(calibration.prismatic[int(moved) - 1])
+        factor, unit = (1e3, " mm") if slides else (float(np.degrees(1.0)), "°")
+        if function in ("linear", "square", "cube"):
+            factor, unit = (100.0, " %") if function == "linear" else (1.0, "")
+        argument = _ARGUMENTS[function].format(int(read))
+        text = f"joint {int(moved)}: {factor * c:.2g}{unit} ± {factor * deviation:.1g}{unit} × {argument}"
+        numbers = {"joint": int(moved), "by": int(read), "coefficient": c, "deviation": deviation}
+        errors = {"left_out_without_px": before, "left_out_px": after}
+        found.append({"function": function, **numbers, **errors, "text": text})
     return found
 
 

@@ -132,7 +132,13 @@ def _of_recording(value: dict[str, Any], _: bool) -> Iterator[str]:
 def _of_calibration(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     px, bound = (_number(value[f"predicted_{name}_px"]) for name in ("rms", "p99"))
     sound = value["usable"] and value["reason"].endswith(_SOUND) and all(map(_OF_NOISE, value["advice"]))
-    asked = detailed or value["lens"] or value.get("cross_validation") or len(value["joints"]) == 1
+    asked = (
+        detailed
+        or value["lens"]
+        or value.get("joint_model")
+        or value.get("cross_validation")
+        or len(value["joints"]) == 1
+    )
     if sound and value["predicted_rms_px"] is not None and not asked:
         yield f"calibrate: usable: predicts images to {px} px rms, 99 % below {bound}; more: -v"
         if value["time_offset_s"] is not None:
@@ -175,6 +181,12 @@ def _in_detail(value: dict[str, Any]) -> Iterator[str]:
         yield (
             f"  lens {view}: k1 {terms['k1']:.3g}, k2 {terms['k2']:.3g} at {terms['radius_px']:.4g} px from "
             f"({terms['center_px'][0]:.4g}, {terms['center_px'][1]:.4g})"
+        )
+    for term in value.get("joint_model", ()):
+        yield wrapped(f"joint model: {term['text']}", "  ")
+    for term in value.get("joint_model", ())[:1]:
+        yield "  left-out poses: {left_out_without_px:.3g} px without, {left_out_px:.3g} px with it".format_map(
+            term
         )
     if value["sigma_q"] is not None:
         yield wrapped(f"joint readings: {_joint_noise(value)}", "  ")

@@ -31,6 +31,7 @@ from projservo_cli.geometry.displacements import (
     screws,
     twists,
 )
+from projservo_cli.geometry.joint_curve import true_joints
 from projservo_cli.geometry.lens import TERMS, distort, undistort
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import (
@@ -41,6 +42,7 @@ from projservo_cli.records import (
     Calibration,
     FloatArray,
     InputError,
+    JointCurve,
     WorkFailed,
     prismatic_of,
 )
@@ -248,8 +250,9 @@ class _Projective(NamedTuple):
         """The calibration, then pairs off by plus and minus a step of each column of the factor."""
         steps = _STEP * np.concatenate([np.zeros((len(factor), 1)), factor, -factor], axis=1).T
         n, B = len(c.H_hat_0), len(steps)
-        edges = np.cumsum([c.P.size, 16 * n, len(c.P) * c.lens_terms])
-        P, H_hat, k, M = np.split(steps, edges, axis=1)
+        of_curve = 0 if c.curve is None else len(c.curve.terms)
+        edges = np.cumsum([c.P.size, 16 * n, len(c.P) * c.lens_terms, of_curve])
+        P, H_hat, k, _, M = np.split(steps, edges, axis=1)
         lenses = np.tile(lens, (B, 1, 1))
         if c.lens is not None:
             lenses[..., list(TERMS[: c.lens_terms])] += k.reshape(B, len(c.P), -1)
@@ -376,6 +379,7 @@ class Metric:
     bodies: MetricParameters  # the model, then pairs off by plus and minus a step of each independent error
     range: FloatArray  # (n, 2) readings in the data, rad or m
     q_reference: FloatArray  # (n,) readings of the reference, rad or m
+    curve: JointCurve | None  # true joints by readings; frames at readings of zero are those of true zeros
 
     @classmethod
     def of(
@@ -427,7 +431,8 @@ class Metric:
             parts = zip(bodies, off, strict=True)
             bodies = MetricParameters(*(np.concatenate([b[:cut], o[:1], b[cut:], o[1:]]) for b, o in parts))
         moved = np.stack([c.joint_min, c.joint_min + c.excitation], axis=1)
-        return cls(c.view, c.mount, c.joint_types, marker, c.sigma_px, bodies, moved, c.q_reference)
+        moved_by = c.q_reference, c.curve
+        return cls(c.view, c.mount, c.joint_types, marker, c.sigma_px, bodies, moved, *moved_by)
 
     @property
     def body(self) -> MetricParameters:
@@ -677,7 +682,10 @@ class Metric:
         n = len(self.joint_types)
         if readings.ndim == 0 or readings.shape[-1] != n or not np.isfinite(readings).all():
             raise InputError(f"joint readings of shape {readings.shape}: expected {n} finite numbers each")
-        return readings
+        if self.curve is None:
+            return readings
+        away = (readings - self.q_reference).reshape(-1, n)
+        return self.q_reference + true_joints(self.curve, self.prismatic, away).reshape(readings.shape)
 
     def _pixels(self, pixels: npt.ArrayLike) -> tuple[FloatArray, BoolArray, tuple[int, ...]]:
         """Pixels (V, N, 2) of points, which views see which (V, N), and the shape of the points."""

@@ -76,7 +76,8 @@ class Posture:
 
     def _changes(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (V, m, 2, d) of pixels of markers (m, 4) by motions of the tool, and the pixels."""
-        images = Parameters(self._model.P, *self._chain, M, self._model.lens).everywhere(self._away)
+        scene = Parameters(self._model.P, *self._chain, M, self._model.lens, curve=self._model.curve)
+        images = scene.everywhere(self._away)
         return images.by_point[-1] @ np.moveaxis(M @ self._twists.swapaxes(1, 2), 0, -1), images.pixels
 
     def carry(self, M: FloatArray, used: BoolArray) -> FloatArray:

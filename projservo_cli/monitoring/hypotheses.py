@@ -150,6 +150,7 @@ class Evidence:
             prismatic=self.scene.prismatic,
             M=changed.M,
             lens=changed.lens,
+            curve=self.scene.curve,
         )
         away, own = in_chain_order(self._errors.calibration, changed.away), np.arange(V)
         s = scene.predict(away.reshape(V * K, n)).reshape(K, V, V, -1, 2)[:, own, own]

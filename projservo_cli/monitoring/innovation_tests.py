@@ -170,7 +170,7 @@ class ErrorModel:
         D = at.by_point.reshape(n + 1, V, V, m, 2, 4)[:, views, views]
         Y = at.points.reshape(n + 1, V, m, 4)
         by_camera = at.by_camera.reshape(V, V, m, 2, CAMERA)[views, views]
-        F = self._fault_derivative(D, Y, by_camera, pair)
+        F = self._fault_derivative(D, Y, by_camera, pair, at.slopes)
         for part in (r, B, F):
             part[~seen] = 0.0
         F = F.reshape(rows, -1)
@@ -217,16 +217,24 @@ class ErrorModel:
         return len(sides)
 
     def _fault_derivative(
-        self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, pair: FramePair
+        self,
+        D: FloatArray,
+        Y: FloatArray,
+        by_camera: FloatArray,
+        pair: FramePair,
+        slopes: FloatArray | None,
     ) -> FloatArray:
         """Derivatives (V, m, 2, f) of pixels by what may be wrong, in the order of ``_directions_of``.
 
-        D : (n + 1, V, m, 2, 4) by the points Y (n + 1, V, m, 4) behind each joint; by_camera : (V, m, 2, 12).
+        D : (n + 1, V, m, 2, 4) by the points Y (n + 1, V, m, 4) behind each joint; by_camera : (V, m, 2, 12);
+        slopes : (V m, n, n) of true joints by readings, None where they are equal.
         """
         n, V, m = Y[1:, ..., 0].shape
         F, d = np.zeros((V, m, 2, self.f)), len(self.twists)
         velocity = Y[:n] @ self.scene.H_hat[:, None].swapaxes(2, 3)
         J_q = np.moveaxis((D[:n] @ velocity[..., None])[..., 0], 0, -1)
+        if slopes is not None:
+            J_q = J_q @ slopes.reshape(V, m, n, n)
         J_q = -J_q[..., ::-1] if self.calibration.mount == TOOL else J_q
         F[..., :n], F[..., n : 2 * n] = J_q, J_q * pair.t[:, None, None, None]
         by_marker, first = D[n] @ self.directions.T, self.fixed

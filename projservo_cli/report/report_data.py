@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration.checks.model_error import describe
+from projservo_cli.calibration.joint_model import describe_curve
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.metric.frame import Metric
@@ -360,6 +361,8 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
             for view, (poses, now, before) in of_refits
         ],
     }
+    if calibration.joint_curve is not None:
+        values["joint_model"] = describe_curve(calibration)
     return values | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 
 

@@ -12,7 +12,7 @@ from projservo_cli.geometry.displacements import rigid_inverse
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.metric.frame import Metric
 from projservo_cli.metric.opencv import OpenCV
-from projservo_cli.records import TOOL, VIEWS, FloatArray
+from projservo_cli.records import TOOL, VIEWS, FloatArray, InputError
 
 # Limits of a URDF joint that no calibration knows: N m or N, and rad/s or m/s.
 _EFFORT, _SPEED = 100.0, 1.0
@@ -71,7 +71,9 @@ def urdf(metric: Metric, names: Sequence[str], limits: FloatArray) -> str:
     """The arm, its tool and the cameras as a URDF, with limits (n, 2) of its joints, rad or m.
 
     All link frames are parallel to the base at readings of zero. Cameras on the tool are on the flange.
+    Raises InputError for joints that do not turn as they read.
     """
+    _require_ideal(metric, "URDF")
     places, prismatic = _points(metric), metric.prismatic
     hand = FLANGE if metric.mount == TOOL else _TOOL
     links = [_BASE, *(f"link_{i + 1}" for i in range(len(places))), hand]
@@ -108,6 +110,15 @@ def urdf(metric: Metric, names: Sequence[str], limits: FloatArray) -> str:
     return "\n".join([*lines, "</robot>"]) + "\n"
 
 
+def _require_ideal(metric: Metric, kind: str) -> None:
+    if metric.curve is not None:
+        joints = ", ".join(map(str, np.unique(metric.curve.terms[:, 1].astype(int) + 1)))
+        raise InputError(
+            f"export: joints {joints} of the calibration turn by a curve of their readings, which a {kind} "
+            "file does not hold: take poses from metric.pose in Python, or calibrate without joint_model"
+        )
+
+
 def _numbers(values: FloatArray) -> str:
     return " ".join(map(repr, (values + 0.0).tolist()))
 
@@ -129,7 +140,11 @@ def static_transforms(metric: Metric, flange: str) -> str:
 
 
 def to_json(metric: Metric, more: Mapping[str, Any]) -> str:
-    """All numbers of the metric, with their covariances, as JSON; lengths in m, angles in rad."""
+    """All numbers of the metric, with their covariances, as JSON; lengths in m, angles in rad.
+
+    Raises InputError for joints that do not turn as they read.
+    """
+    _require_ideal(metric, "JSON")
     names = ("K", "lens", "poses", "axes", "markers")
     arrays = {name: getattr(metric, name).tolist() for name in names}
     covariances = {f"{name}_covariance": metric.covariance(name).tolist() for name in names}

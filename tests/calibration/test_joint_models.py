@@ -1,4 +1,4 @@
-"""Curves of joints: one function everywhere, gauge freedoms refused, faults recovered with their deviations."""
+"""Curves of joints: one function everywhere, gauge freedoms refused, faults recovered."""
 
 import numpy as np
 import pytest
