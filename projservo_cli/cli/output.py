@@ -185,9 +185,8 @@ def _in_detail(value: dict[str, Any]) -> Iterator[str]:
     for term in value.get("joint_model", ()):
         yield wrapped(f"joint model: {term['text']}", "  ")
     for term in value.get("joint_model", ())[:1]:
-        yield "  left-out poses: {left_out_without_px:.3g} px without, {left_out_px:.3g} px with it".format_map(
-            term
-        )
+        errors = _number(term["left_out_without_px"]), _number(term["left_out_px"])
+        yield "  left-out poses: {} px without, {} px with it".format(*errors)
     if value["sigma_q"] is not None:
         yield wrapped(f"joint readings: {_joint_noise(value)}", "  ")
     if value["time_offset_s"] is not None:
