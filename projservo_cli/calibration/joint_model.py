@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
-from projservo_cli.calibration.checks.quality import check_model
+from projservo_cli.calibration.checks.model_error import suspected
 from projservo_cli.calibration.detections import MAX_JUDGED, per_rad
 from projservo_cli.calibration.epipolar import ImageGeometry
-from projservo_cli.calibration.robust_fit import Expected, Solution, fit_from, left_out_errors, left_out_px
+from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_errors, left_out_px
 from projservo_cli.geometry.joint_curve import basis, slopes, torques
 from projservo_cli.records import (
     BASIS,
@@ -27,7 +27,6 @@ from projservo_cli.records import (
     FloatArray,
     InputError,
     JointCurve,
-    ModelError,
     WorkFailed,
 )
 
@@ -50,11 +49,10 @@ _ARGUMENTS = {
     "torque": "torque, of which the largest is 1",
 }
 AUTO = "auto"
-# Standard deviations of chance by which squared errors at left-out poses must fall: 95 %, one-sided, since
-# what is tried is significant by the score tests already.
-_SURE = 1.64
-# Maximum number of hypotheses that are chosen.
-_MAX_CHOSEN = 6
+# Standard deviations of chance by which squared errors at left-out poses must fall.
+_SURE = 2.0
+# Maximum numbers of hypotheses that are chosen, and of those that are tried for each.
+_MAX_CHOSEN, _TRIED = 6, 4
 # Maximum deviation, rad (prismatic × 0.3 m/rad), of a joint within its range by a term that is determined.
 _OPEN = np.radians(5.0)
 # Deviations from zero below which a term of one joint of many is left out, and deflection, rad by the largest
@@ -126,7 +124,7 @@ class JointModelFit:
 
 
 def fit_joint_model(
-    start: Solution, asked: Sequence[Hypothesis] | None, expected: Expected, epipolar: ImageGeometry
+    start: Solution, asked: Sequence[Hypothesis] | None, epipolar: ImageGeometry
 ) -> JointModelFit | None:
     """Fit the curve of the hypotheses asked for, or for None of those that the data show.
 
@@ -138,12 +136,13 @@ def fit_joint_model(
         again = fit_from(start.problem.with_noise(None), params, epipolar)
         exact = dataclasses.replace(start, joint_noise=None) if again is None else again
     search = _Search(exact, epipolar)
-    chosen = search.automatic(expected) if asked is None else list(asked)
-    if not chosen:
-        return None
-    found = search.with_curve(chosen)
-    if found is not None and asked is None:
-        found = search.pruned(found, chosen)
+    if asked is None:
+        chosen, best = search.automatic()
+        if not chosen:
+            return None
+        found: Solution | None = search.pruned(best, chosen)
+    else:
+        chosen, found = list(asked), search.with_curve(asked)
     if found is None:
         names = ", ".join(one.words for one in chosen)
         raise WorkFailed(f"no fit with the joint model {names} explains the images: leave some of it out")
@@ -237,40 +236,35 @@ class _Search:
         F = slopes(found.params.curve, found.params.prismatic, bent.q[np.unique(detections.pose_of)])
         return None if np.linalg.det(F).min() < _FOLDS else found
 
-    def automatic(self, expected: Expected) -> list[Hypothesis]:
-        """Choose hypotheses that the score tests name while left-out poses are predicted better."""
+    def automatic(self) -> tuple[list[Hypothesis], Solution]:
+        """Choose hypotheses that score tests name while left-out poses err less; and their fit."""
         chosen, best, refused = list[Hypothesis](), self.exact, set[Hypothesis]()
         while len(chosen) < _MAX_CHOSEN:
-            named = [one for one in self._named(best, expected) if one not in refused and one not in chosen]
+            named = [one for one in self._named(best) if one not in refused and one not in chosen][:_TRIED]
             trials = [(one, self.with_curve([*chosen, one], best)) for one in named]
             better = [(_gain(best, fit), one, fit) for one, fit in trials if fit is not None]
             better = [trial for trial in better if trial[0][1] > _SURE]
-            refused.update(named)
             if not better:
                 break
+            refused.update(set(named) - {one for _, one, _ in better})
             _, one, fit = max(better, key=lambda trial: trial[0][0])
             self.gains[one], best = left_out_px(best), fit
-            refused.discard(one)
             chosen.append(one)
         for one in chosen[:-1]:  # a later one may say all that it did
             others = [other for other in chosen if other != one]
             fewer = self.with_curve(others)
             if fewer is not None and _gain(fewer, best)[1] <= _SURE:
                 chosen, best = others, fewer
-        return chosen
+        return chosen, best
 
-    def _named(self, solution: Solution, expected: Expected) -> list[Hypothesis]:
-        """Hypotheses that the score tests of a fit name, and those that explain the images about as well."""
-        check = check_model(solution, solution.errors(), expected.noise_px(solution))
+    def _named(self, solution: Solution) -> list[Hypothesis]:
+        """Hypotheses by which score tests of a fit explain images better than none, likeliest first."""
         found = list[Hypothesis]()
-        for error in check.errors:
-            others = [ModelError.of(code, [0.0, 0.0, 0.0, np.nan]) for code in error.others]
-            for one in (error, *others):
-                if one.kind == "sag":
-                    found += [] if solution.problem.detections.mount == TOOL else [Hypothesis("sag", ())]
-                elif one.kind in _FUNCTIONS:
-                    several = one.kind == "scale" and len(one.joints) > 1
-                    found.append(Hypothesis(one.kind, () if several else one.joints))
+        for kind, joints in suspected(solution.thinned(MAX_JUDGED)):
+            if kind == "sag":
+                found += [] if solution.problem.detections.mount == TOOL else [Hypothesis("sag", ())]
+            elif kind in _FUNCTIONS:
+                found.append(Hypothesis(kind, () if kind == "scale" and len(joints) > 1 else joints))
         return list(dict.fromkeys(found))
 
     def pruned(self, found: Solution, chosen: Sequence[Hypothesis]) -> Solution:

@@ -290,7 +290,7 @@ def _maximum_likelihood(
             expected.require_scale()
         if curves is None or curves:
             search.progress("calibration, joint model", 0, 1)
-            curved = fit_joint_model(solution, curves, expected, epipolar)
+            curved = fit_joint_model(solution, curves, epipolar)
             solution = solution if curved is None else curved.solution
         solution = fit_joint_noise(solution, expected, search.joint_noise)
         result = _refined(solution, epipolar, expected, frame, limit_px)

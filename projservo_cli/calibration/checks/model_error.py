@@ -508,6 +508,25 @@ def examine(
     return ModelCheck(named, total, noise_px, float(factor), at_recorded, unshown, bias)
 
 
+def suspected(few: Solution) -> list[tuple[str, tuple[int, ...]]]:
+    """Return kinds and joints, from 1, of nuisances that explain images better than none, likeliest first.
+
+    Those that significance selects, each with others about as likely, come before the rest. For few markers.
+    """
+    tests = _Tests(few, few.errors(), _nuisances(few.problem, few.params, _Extent.of(few)))
+    chosen, found = tests.select(), list[_Choice]()
+    for own in chosen:
+        tests.choose([other for other in chosen if other != own])
+        better = tests.candidates()
+        least = min((criterion for criterion, one, _ in better if one.number == own.number), default=-np.inf)
+        found += [one for criterion, one, _ in better if criterion < least + _UNDECIDED]
+    tests.choose(chosen)
+    found += [one for _, one, _ in tests.candidates()]
+    nuisances = [tests.nuisances[one.number] for one in found]
+    named = [(one.kind, tuple(int(tests.numbers[i]) for i in one.joints)) for one in nuisances]
+    return list(dict.fromkeys(named))
+
+
 def stepped(solution: Solution, onset: int) -> ModelError | None:
     """Return what moved at a pose, by its row, of a recording that no single fit describes, or None.
 
