@@ -9,6 +9,7 @@ from scipy.linalg import expm
 from scipy.special import chdtri
 
 from projservo_cli.calibration.prediction import Parameters, predict
+from projservo_cli.geometry.joint_curve import backwards
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.monitoring.frame_pairs import FramePair
 from projservo_cli.monitoring.innovation_tests import (
@@ -49,9 +50,11 @@ class Posture:
     """
 
     def __init__(self, model: Model, q: FloatArray, face: FloatArray, lengths: FloatArray) -> None:
-        self._model, way = model, -1 if model.on_tool else 1
-        self._away = (q - model.q_reference)[None, ::way]
-        self._chain = model.H_hat_0[::way], model.prismatic[::way]
+        away, H_hat, prismatic, curve = q - model.q_reference, model.H_hat_0, model.prismatic, model.curve
+        if model.on_tool:  # the chain of the scene
+            away, H_hat, prismatic = -away[::-1], -H_hat[::-1], prismatic[::-1]
+            curve = backwards(curve, len(q))
+        self._model, self._away, self._chain, self._curve = model, away[None], (H_hat, prismatic), curve
         self._twists = rigid_motions(model.H_hat_0, np.linalg.svd(model.a_inf[None])[2][1:], model.a_inf)
         has: BoolArray = np.isfinite(lengths) & (lengths > 0.0)
         self.known = bool(has.any())
@@ -76,7 +79,7 @@ class Posture:
 
     def _changes(self, M: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (V, m, 2, d) of pixels of markers (m, 4) by motions of the tool, and the pixels."""
-        scene = Parameters(self._model.P, *self._chain, M, self._model.lens, curve=self._model.curve)
+        scene = Parameters(self._model.P, *self._chain, M, self._model.lens, curve=self._curve)
         images = scene.everywhere(self._away)
         return images.by_point[-1] @ np.moveaxis(M @ self._twists.swapaxes(1, 2), 0, -1), images.pixels
 
