@@ -470,6 +470,11 @@ class Rejections:
         about="rejected images that a camera shows that moved: pose, index of the view",
         default=None,
     )
+    turned_images: IntArray | None = _array(
+        "turned_row turned_column",
+        about="images of a board, numbered from another end and turned right: pose, index of the view",
+        default=None,
+    )
     placeholders: int = _scalar(about="number of detections that stood for unseen markers", default=0)
     unseen_poses: IntArray | None = _array("unseen_pose", about="poses that no camera saw", default=None)
     circular_joints: IntArray | None = _array(

@@ -267,7 +267,7 @@ def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray) -> 
     H, off = np.zeros((len(images), 3, 3)), np.full(len(images), np.inf)
     for k in others:
         both = seen[k] & seen[first]
-        H[k] = _moved_plane(images[first, both], images[k, both])
+        H[k] = moved_plane(images[first, both], images[k, both])
         moved = homogeneous(images[first, both]) @ H[k].T
         left = moved[:, :2] / moved[:, 2:] - images[k, both]
         off[k] = np.median(np.linalg.norm(left, axis=1)) / max(float(extent[k]), 1e-9)
@@ -297,7 +297,7 @@ def _planes(ray: FloatArray) -> FloatArray:
     return np.asarray(planes)
 
 
-def _moved_plane(a: FloatArray, b: FloatArray) -> FloatArray:
+def moved_plane(a: FloatArray, b: FloatArray) -> FloatArray:
     """Homography (3, 3) of pixels (N, 2) to others of the same markers, four or more: [HZ04] 4.1."""
     T, U = similarity(a), similarity(b)
     H = planar_homography(homogeneous(a) @ T.T, homogeneous(b) @ U.T)

@@ -52,7 +52,10 @@ NEAREST = tuple(
     CONSTRAINTS[constraint].value for constraint in OF_MOTION
 )  # smallest along the planned motion
 # Lists of what does not fit: observations, and deviations from the model.
-_LISTS = ("outliers", "suspect_joint_readings", "id_switches", "moved_images", "model_errors", "refits")
+_LISTS = (
+    *("outliers", "suspect_joint_readings", "id_switches", "moved_images", "turned_images"),
+    *("model_errors", "refits"),
+)
 _COUNTS = ("poses_used", "markers_used")
 _NUMBERS = (
     *("rms_px", "sigma_px", "chi2_per_dof", "seconds", "predicted_rms_px", "predicted_p99_px"),
@@ -391,10 +394,10 @@ def findings(calibration: Calibration) -> dict[str, Any]:
     """Single observations that do not fit, and how many do, as plain lists for people and JSON.
 
     calibration : the record.
-    Returns ``outliers``, ``suspect_joint_readings``, ``id_switches``, ``moved_images``, ``poses_used``,
-    ``markers_used``, and ``rejected`` by kind: counts of ``observations`` and of ``id_switches``, numbers of
-    the ``tracks`` (markers) that are rejected as a whole by reason, of the ``poses`` and of ``unseen_poses``,
-    and the count of ``placeholders``.
+    Returns ``outliers``, ``suspect_joint_readings``, ``id_switches``, ``moved_images``, ``turned_images``,
+    ``poses_used``, ``markers_used``, and ``rejected`` by kind: counts of ``observations`` and of
+    ``id_switches``, numbers of the ``tracks`` (markers) that are rejected as a whole by reason, of the
+    ``poses`` and of ``unseen_poses``, and the count of ``placeholders``.
     """
 
     def rows(name: str) -> list[Any]:
@@ -413,6 +416,7 @@ def findings(calibration: Calibration) -> dict[str, Any]:
         "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
         "id_switches": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
         "moved_images": [{"pose": p, "view": view[v]} for p, v in rows("moved_images")],
+        "turned_images": [{"pose": p, "view": view[v]} for p, v in rows("turned_images")],
         "poses_used": calibration.poses_used,
         "markers_used": calibration.markers_used,
         "rejected": {

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli.calibration import Nominal, Solution, calibrate, cross_validate
+from projservo_cli.calibration.checks.board_numbering import BoardNumbering
 from projservo_cli.calibration.checks.screening import screened
 from projservo_cli.calibration.checks.undecided import undecided_pairs
 from projservo_cli.calibration.refit import refit
@@ -125,11 +126,14 @@ def estimate(
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Return the screened observations, the calibration, and its held-out errors on request."""
     screening = screened(seen.record, seen.joint_types)
+    board = BoardNumbering.by_joints(screening.observation, seen.joint_types)
     held_out: list[CrossValidation] = []
     order: list[IntArray] = []
 
     def judge(solution: Solution, noise_px: float) -> None:
         """Test the order of the joints, and cross-validate, while the solution is at hand."""
+        held_out.clear()
+        order.clear()
         if seen.source == "recorded" and not seen.order_stated:  # a simulated arm knows its order
             order.append(undecided_pairs(solution, noise_px))
         if asked.cross_validate is not None:
@@ -137,9 +141,10 @@ def estimate(
             found = cross_validate(solution, noise_px, asked.cross_validate, seen.seed, on_progress)
             held_out.append(found)
 
-    try:
-        calibration = calibrate(
-            screening.observation,
+    def fitted_to(observation: Observation) -> Calibration:
+        """Calibrate from observations with the inputs that are asked for."""
+        return calibrate(
+            observation,
             seen.joint_types,
             method=asked.method,
             sigma_px=seen.noise_px,
@@ -155,8 +160,15 @@ def estimate(
             fitted=judge,
             progress=progress,
         )
+
+    try:
+        if board.turn.any() and not board.decided.all():  # a fit to the others decides on the rest
+            board.turn_by(fitted_to(board.of_decided))
+        calibration = fitted_to(board.observation)
+        while board.turn_by(calibration):
+            calibration = fitted_to(board.observation)
     except WorkFailed as error:
-        raise type(error)("; ".join((str(error), *screening.advice))) from error
+        raise type(error)("; ".join((str(error), *screening.advice, *board.advice))) from error
     calibration = replace(
         calibration,
         source=seen.source,
@@ -164,9 +176,10 @@ def estimate(
         unseen_poses=screening.unseen,
         circular_joints=screening.circular,
         undecided_order=order[0] if order else None,
+        turned_images=board.images,
     )
-    advice = filter(None, (*calibration.advice, calibration.order_advice, *screening.advice))
-    return screening.observation, replace(calibration, advice=tuple(advice)), next(iter(held_out), None)
+    advice = filter(None, (*calibration.advice, calibration.order_advice, *screening.advice, *board.advice))
+    return board.observation, replace(calibration, advice=tuple(advice)), next(iter(held_out), None)
 
 
 # The range of the recorded readings is widened at each end by this share of itself; for a robot

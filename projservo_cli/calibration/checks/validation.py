@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
+from projservo_cli.calibration.checks.board_numbering import BoardNumbering
 from projservo_cli.calibration.checks.quality import UNDETERMINED_NOISE
 from projservo_cli.calibration.checks.screening import without_placeholders
 from projservo_cli.calibration.detections import (
@@ -250,6 +251,9 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     observation = of_views(observation.at_rest, calibration.view)
     images, advice = without_placeholders(observation.images)
     observation = replace(observation, images=images)
+    board = BoardNumbering.of(observation)
+    board.turn_by(calibration)
+    observation, advice = board.observation, (*advice, *board.advice)
     known = np.isin(observation.marker, calibration.marker)
     numbers = calibration.marker.tolist()
     order = [numbers.index(number) for number in observation.marker[known].tolist()]
