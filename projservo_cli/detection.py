@@ -1,10 +1,11 @@
-"""Marker detection in stereo images: ArUco and AprilTag corners to a fraction of a pixel.
+"""Marker detection in images: corners of ArUco and AprilTag tags, and of boards, to a fraction of a pixel.
 
 It pairs images with joint readings, finds tags by OpenCV, refines their corners, and collects all images.
 """
 
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from projservo_cli.records import (
+    CORNERS,
     BoolArray,
     ByteArray,
     FloatArray,
@@ -130,6 +132,22 @@ def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
 
 # Share of the mean grey value by which those of the four pixels of a cell of a Bayer mosaic differ at least.
 _MOSAIC = 0.04
+# Kinds of boards, and their minimum rows and columns.
+BOARDS, LEAST_ROWS = ("chessboard", "charuco"), 3
+# Share of a square that a tag takes up on a ChArUco board: what OpenCV draws; the edges decide on corners.
+_TAG_SHARE = 0.75
+# Minimum number of corners of a board in an image, for the directions of its edges.
+_LEAST_CORNERS = 6
+# Distance from a corner up to which pixels count, in squares, and at most, px.
+_REACH, _MAX_REACH_SADDLE = 0.6, 10.0
+# That from the edges on a ChArUco board, in squares, within the margin of its tags, and at least, px.
+_CROSS, _MIN_CROSS = 0.1, 1.5
+# Minimum side of a square to fit edges, px, and deviation of a corner of OpenCV in a smaller one, px.
+_MIN_SQUARE, _UNREFINED_SADDLE = 5.0, 0.3
+# Steps of the fit of a corner, and error of its model, px.
+_SADDLE_STEPS, _SADDLE_FLOOR = 12, 0.001
+# Rms residual, in contrasts, and distance from the guess, in squares, above which a corner is rejected.
+_MISFIT, _FAR_SADDLE = 0.25, 0.3
 # Minimum width of a cell, px, to fit edges of a tag, whose border is one cell wide.
 MIN_CELL = 2.3
 # Minimum length of a side to fit, px.
@@ -158,8 +176,6 @@ _STEPS = (6, 3)
 _FAR = (2.0, 0.05)
 # Number of parameters of an edge.
 _EDGE = 6
-# Made once: it takes a tenth of the time of a small fit.
-_IDENTITY = np.eye(_EDGE)
 # Standard deviation of the height of the arc that a lens makes of a side, px.
 _BOW = 0.01
 # Minimum noise of grey values.
@@ -278,15 +294,23 @@ def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tu
         """Normal matrices, gradients and sums of squares."""
         r, J = _edge_model(x, strips)
         flat = r.reshape(len(r), -1, 1)
-        A = J @ J.swapaxes(1, 2) + stiff[:, :, None] * _IDENTITY
+        A = J @ J.swapaxes(1, 2) + stiff[:, :, None] * np.eye(_EDGE)
         cost = (r * r).sum(axis=(1, 2)) + (stiff * x * x).sum(axis=1)
         return A, (J @ flat)[..., 0] + stiff * x, cost
 
+    return _minimized(x, equations, steps)
+
+
+def _minimized(
+    x: FloatArray, equations: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]], steps: int
+) -> tuple[FloatArray, FloatArray]:
+    """Parameters (S, p) of least squares by Levenberg–Marquardt steps, the fifth a blur; normal matrices."""
+    identity = np.eye(x.shape[1])
     A, g, cost = equations(x)
     damping = np.full(len(x), 1e-3)
     for _ in range(steps):
         ridge = damping[:, None] * np.diagonal(A, axis1=1, axis2=2) + 1e-9
-        step = np.linalg.solve(A + ridge[:, :, None] * _IDENTITY, g[..., None])[..., 0]
+        step = np.linalg.solve(A + ridge[:, :, None] * identity, g[..., None])[..., 0]
         moved = x - step
         moved[:, 4] = np.clip(np.abs(moved[:, 4]), _MIN_BLUR, _MAX_BLUR)
         new = equations(moved)
@@ -465,33 +489,25 @@ def _unrefined(cell: FloatArray, blur: FloatArray) -> FloatArray:
     return np.asarray(_UNREFINED * np.sqrt(np.where(np.isfinite(blur), blur, typical)) * cell**_BY_CELL)
 
 
-class TagFinder:
-    """Detector of the tags of one dictionary.
+class Finder(ABC):
+    """Detector of what carries the markers: tags, or a board.
 
-    dictionary : name of OpenCV, with or without ``DICT_``, any case: ``4X4_50``, ``APRILTAG_36H11``.
-    ``cv``: the module of OpenCV. ``cells``: along a side of a tag, its border included.
-    Raises InputError if OpenCV is not installed or has no such dictionary.
+    ``cv``: the module of OpenCV. ``corners``: number k of markers of each; corner i of tag t is k t + i.
+    Raises InputError if OpenCV is not installed.
     """
 
-    def __init__(self, dictionary: str) -> None:
-        self.cv = opencv()
-        aruco = self.cv.aruco
-        known = dictionaries()
-        name = known.get(dictionary.upper().removeprefix("DICT_"))
-        if name is None:
-            raise InputError(f"--dictionary {dictionary}: unknown; valid: {', '.join(sorted(known))}")
-        self._tags = tags = aruco.getPredefinedDictionary(getattr(aruco, name))
-        parameters = aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-        # Shaded tags before brighter ground need windows of more sizes, and less contrast.
-        parameters.adaptiveThreshWinSizeStep, parameters.adaptiveThreshConstant = 4, 5
-        self._detector = aruco.ArucoDetector(tags, parameters)
-        self.cells = int(tags.markerSize) + _BORDER
+    corners: int
+    nothing: str  # what is in no image, with the remedy
 
-    @property
-    def known(self) -> int:
-        """Number of tags in the dictionary."""
-        return len(self._tags.bytesList)
+    def __init__(self) -> None:
+        self.cv = opencv()
+
+    @abstractmethod
+    def find(self, image: FloatArray) -> tuple[dict[int, Corners], tuple[int, ...]]:
+        """Corners (k, …) of each tag in an image, and the numbers of tags that occur more than once.
+
+        image : (height, width) grey values from 0 to 255.
+        """
 
     def read(self, path: Path) -> FloatArray:
         """Read grey values (height, width) of an image, ignoring its orientation tag.
@@ -511,6 +527,32 @@ class TagFinder:
             flags = self.cv.IMREAD_GRAYSCALE | self.cv.IMREAD_IGNORE_ORIENTATION
             image = self.cv.imdecode(content, flags)
         return np.asarray(image, dtype=np.float64)
+
+
+class TagFinder(Finder):
+    """Detector of the tags of one dictionary.
+
+    dictionary : name of OpenCV, with or without ``DICT_``, any case: ``4X4_50``, ``APRILTAG_36H11``.
+    ``cells``: along a side of a tag, its border included.
+    Raises InputError if OpenCV is not installed or has no such dictionary.
+    """
+
+    corners = CORNERS
+    nothing = (
+        "no tag in any of {count} images: check that --dictionary is that of your tags, and that a bright "
+        "margin of one cell surrounds each"
+    )
+
+    def __init__(self, dictionary: str) -> None:
+        super().__init__()
+        self._tags = tags = _dictionary(dictionary)
+        self._detector = self.cv.aruco.ArucoDetector(tags, _parameters())
+        self.cells = int(tags.markerSize) + _BORDER
+
+    @property
+    def known(self) -> int:
+        """Number of tags in the dictionary."""
+        return len(self._tags.bytesList)
 
     def picture(self, number: int, cell_px: int) -> ByteArray:
         """Grey values of a tag with a bright margin of one cell, in cells of ``cell_px``.
@@ -542,6 +584,224 @@ class TagFinder:
         return {number: tag for number, tag in tags.items() if number not in ambiguous}, tuple(
             sorted(ambiguous)
         )
+
+
+class Board(NamedTuple):
+    """A board of chessboard or ChArUco corners, counted as OpenCV does."""
+
+    kind: str  # chessboard or charuco
+    rows: int  # of inner corners of a chessboard, of squares of a ChArUco board
+    columns: int
+
+    @classmethod
+    def of(cls, text: str) -> "Board":
+        """Read such as ``chessboard:9x7``, 9 columns and 7 rows. Raises InputError for anything else."""
+        parts = re.fullmatch(rf"({'|'.join(BOARDS)}):(\d{{1,3}})x(\d{{1,3}})", text)
+        if parts is None or min(int(parts[2]), int(parts[3])) < LEAST_ROWS:
+            raise InputError(
+                f"--board {text}: write kind:columnsxrows, of {LEAST_ROWS} or more, such as chessboard:9x7 "
+                "(inner corners) or charuco:11x8 (squares)"
+            )
+        return cls(parts[1], int(parts[3]), int(parts[2]))
+
+    def __str__(self) -> str:
+        """Kind, columns and rows."""
+        return f"{self.kind}:{self.columns}x{self.rows}"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of inner corners, which are the markers."""
+        less = int(self.kind == "charuco")
+        return self.rows - less, self.columns - less
+
+    @property
+    def places(self) -> FloatArray:
+        """Places (N, 2) of the corners on the board, in squares."""
+        return np.indices(self.shape)[::-1].reshape(2, -1).T.astype(np.float64)
+
+
+class BoardFinder(Finder):
+    """Detector of one board, which is tag 0.
+
+    dictionary : of the tags on a ChArUco board.
+    Raises InputError if OpenCV is not installed, has no such dictionary, or the board more tags than it.
+    """
+
+    def __init__(self, board: Board, dictionary: str) -> None:
+        super().__init__()
+        self.board, self.corners = board, math.prod(board.shape)
+        self.nothing = (
+            f"no {board} in any of {{count}} images: check its kind and that it is counted in inner corners "
+            "(chessboard) or squares (charuco), columns before rows, and show all of a chessboard"
+        )
+        self._detectors = []
+        if board.kind == "charuco":
+            tags, needed = _dictionary(dictionary), board.rows * board.columns // 2
+            if needed > len(tags.bytesList):
+                raise InputError(
+                    f"a board {board} has {needed} tags, and dictionary {dictionary} {len(tags.bytesList)}: "
+                    "set the dictionary that it was printed with"
+                )
+            for legacy in (False, True):  # boards of even rows printed before OpenCV 4.6 begin otherwise
+                printed = self.cv.aruco.CharucoBoard((board.columns, board.rows), 1.0, _TAG_SHARE, tags)
+                printed.setLegacyPattern(legacy)
+                aruco = self.cv.aruco
+                self._detectors.append(
+                    aruco.CharucoDetector(printed, aruco.CharucoParameters(), _parameters())
+                )
+
+    def find(self, image: FloatArray) -> tuple[dict[int, Corners], tuple[int, ...]]:
+        """Corners (N, …) of the board in an image as tag 0, NaN where unseen; none without it.
+
+        image : (height, width) grey values from 0 to 255.
+        """
+        guess = self._guess(image.astype(np.uint8))
+        known = np.isfinite(guess[:, 0])
+        if known.sum() < _LEAST_CORNERS:
+            return {}, ()
+        H = self.cv.findHomography(self.board.places[known], guess[known])[0]
+        if H is None:
+            return {}, ()
+        steps = [
+            self._moved(H, self.board.places + step) - self._moved(H, self.board.places) for step in np.eye(2)
+        ]
+        corners = _refine_saddles(image, guess, *steps, _CROSS if self._detectors else np.inf)
+        return ({0: corners}, ()) if np.isfinite(corners.sigma).any() else ({}, ())
+
+    def _guess(self, grey: ByteArray) -> FloatArray:
+        """Corners (N, 2) as of OpenCV, px, NaN where unseen."""
+        guess, (rows, columns) = np.full((self.corners, 2), np.nan), self.board.shape
+        if not self._detectors:
+            found, corners = self.cv.findChessboardCornersSB(
+                grey, (columns, rows), flags=self.cv.CALIB_CB_EXHAUSTIVE
+            )
+            return np.reshape(corners, (-1, 2)).astype(np.float64) if found else guess
+        for detector in self._detectors:
+            corners, numbers = detector.detectBoard(grey)[:2]
+            if numbers is not None and len(numbers) > np.isfinite(guess[:, 0]).sum():
+                guess[:] = np.nan
+                guess[np.ravel(numbers)] = np.reshape(corners, (-1, 2))
+        return guess
+
+    @staticmethod
+    def _moved(H: FloatArray, places: FloatArray) -> FloatArray:
+        moved = np.c_[places, np.ones(len(places))] @ H.T
+        return np.asarray(moved[:, :2] / moved[:, 2:])
+
+
+def _refine_saddles(
+    image: FloatArray, guess: FloatArray, along: FloatArray, down: FloatArray, cross: float
+) -> Corners:
+    """Refine corners at which four squares meet: two crossing edges of one blur.
+
+    The grey value is b + a (2 Φ(z_1) − 1)(2 Φ(z_2) − 1), z the distance from either edge over the blur. A
+    corner is rejected if an edge is occluded or the crossing is far from the guess.
+
+    image : (height, width) grey values.
+    guess : (N, 2) corners, px, NaN where unseen.
+    along, down : (N, 2) steps to the next corners, px.
+    cross : distance from the edges up to which pixels count, in squares.
+    """
+    N = len(guess)
+    pixels, sigma, clean = np.full((N, 2), np.nan), np.full(N, np.nan), np.zeros(N, dtype=np.bool_)
+    area = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
+    spacing = area / np.maximum(np.linalg.norm(along, axis=1), np.linalg.norm(down, axis=1))
+    reach = np.minimum(_REACH * spacing, _MAX_REACH_SADDLE)
+    middle = np.rint(guess)
+    height, width = image.shape
+    seen = np.isfinite(guess[:, 0])
+    inside = seen & (np.nan_to_num(middle - reach[:, None], nan=-1.0) >= 0.0).all(axis=1)
+    inside &= (np.nan_to_num(middle + reach[:, None]) <= [width - 1, height - 1]).all(axis=1)
+    pixels[seen], sigma[seen] = guess[seen], _UNREFINED_SADDLE
+    at = np.flatnonzero(inside & (spacing > _MIN_SQUARE))
+    if not at.size:
+        return Corners(pixels, sigma, clean)
+    half = int(reach[at].max())
+    dv, du = np.indices((2 * half + 1, 2 * half + 1)).reshape(2, 1, -1) - half
+    u, v = middle[at, :1] + du, middle[at, 1:] + dv
+    weight = (du**2 + dv**2 <= reach[at, None] ** 2).astype(np.float64)
+    rows, columns = np.clip(v, 0, height - 1).astype(int), np.clip(u, 0, width - 1).astype(int)
+    grey, u, v = image[rows, columns], u - guess[at, :1], v - guess[at, 1:]
+    angles = np.stack([np.arctan2(step[at, 1], step[at, 0]) for step in (along, down)], axis=1)
+    zero, one = np.zeros((len(at), 2)), np.ones((len(at), 2))
+    x = np.concatenate([zero, zero, one[:, :1], angles], axis=1)
+    if np.isfinite(cross):
+        off = [np.abs(u * np.sin(a) - v * np.cos(a)) for a in (angles[:, :1], angles[:, 1:])]
+        weight *= np.fmin(*off) <= np.maximum(cross * spacing[at, None], _MIN_CROSS)
+    # Both grey levels by the product of the edges as they are guessed.
+    product = _saddle_model(x + np.eye(7)[1], u, v, grey, weight)[1][:, 1]
+    count = weight.sum(axis=1)
+    x[:, 0] = (weight * grey).sum(axis=1) / count
+    x[:, 1] = (product * (grey - x[:, :1])).sum(axis=1) / np.maximum((product**2).sum(axis=1), 1e-9)
+
+    def equations(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Normal matrices, gradients and sums of squares."""
+        r, J = _saddle_model(x, u, v, grey, weight)
+        return J @ J.swapaxes(1, 2) + 1e-9 * np.eye(7), (J @ r[..., None])[..., 0], (r * r).sum(axis=1)
+
+    x, A = _minimized(x, equations, _SADDLE_STEPS)
+    square = (_saddle_model(x, u, v, grey, weight)[0] ** 2).sum(axis=1) / np.maximum(count - 7.0, 1.0)
+    C = np.linalg.inv(A)[:, [2, 3], [2, 3]].mean(axis=1) * square
+    contrast, moved = np.abs(x[:, 1]), np.linalg.norm(x[:, 2:4], axis=1)
+    good = (count > 7.0) & (np.sqrt(square) < _MISFIT * contrast) & (moved < _FAR_SADDLE * spacing[at])
+    pixels[at] = np.where(good[:, None], guess[at] + x[:, 2:4], np.nan)
+    sigma[at] = np.where(good, np.sqrt(C + _SADDLE_FLOOR**2), np.nan)
+    clean[at] = good
+    return Corners(pixels, sigma, clean)
+
+
+def _saddle_model(
+    x: FloatArray, u: FloatArray, v: FloatArray, grey: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted residual (Q, P) of saddles x = (b, a, u_0, v_0, σ, α, β) (Q, 7), and derivative (Q, 7, P)."""
+    b, a, u_0, v_0, sigma, *angles = x.T[:, :, None]
+    du, dv = u - u_0, v - v_0
+    g, slope, normal, z = [], [], [], []
+    for angle in angles:
+        c, s = np.cos(angle), np.sin(angle)
+        normal.append((-s, c, -(c * du + s * dv)))  # of u, v, and by the angle
+        z.append((c * dv - s * du) / sigma)
+        g.append(2.0 * ndtr(z[-1]) - 1.0)
+        slope.append(np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z[-1] ** 2) / sigma)
+    by = [a * slope[0] * g[1], a * slope[1] * g[0]]
+    J = np.stack(
+        [
+            np.ones_like(du),
+            g[0] * g[1],
+            -(by[0] * normal[0][0] + by[1] * normal[1][0]),
+            -(by[0] * normal[0][1] + by[1] * normal[1][1]),
+            -(by[0] * z[0] + by[1] * z[1]),
+            by[0] * normal[0][2],
+            by[1] * normal[1][2],
+        ],
+        axis=1,
+    )
+    return weight * (b + a * g[0] * g[1] - grey), J * weight[:, None]
+
+
+def finder_of(board: Board | None, dictionary: str | None) -> Finder:
+    """Detector of a board, or of tags where there is none; of the tags of ``DICTIONARY`` without a name."""
+    name = dictionary or DICTIONARY
+    return TagFinder(name) if board is None else BoardFinder(board, name)
+
+
+def _dictionary(name: str) -> Any:
+    """Return a dictionary of OpenCV; an InputError lists the valid names."""
+    known, aruco = dictionaries(), opencv().aruco
+    given = known.get(name.upper().removeprefix("DICT_"))
+    if given is None:
+        raise InputError(f"--dictionary {name}: unknown; valid: {', '.join(sorted(known))}")
+    return aruco.getPredefinedDictionary(getattr(aruco, given))
+
+
+def _parameters() -> Any:
+    """Parameters of the detector of tags."""
+    aruco = opencv().aruco
+    parameters = aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+    # Shaded tags before brighter ground need windows of more sizes, and less contrast.
+    parameters.adaptiveThreshWinSizeStep, parameters.adaptiveThreshConstant = 4, 5
+    return parameters
 
 
 def dictionaries() -> dict[str, str]:
@@ -580,7 +840,7 @@ class _Findings:
 def observe_tags(
     pairs: Sequence[tuple[int, Path, Path]],
     q: FloatArray,
-    finder: TagFinder,
+    finder: Finder,
     points: str,
     progress: Callable[[str, int, int], None],
 ) -> tuple[Observation, _Findings]:
@@ -588,7 +848,7 @@ def observe_tags(
 
     pairs : number and both images of each pose.
     q : (K, n) joint readings of the poses.
-    finder : of the tags.
+    finder : of the tags, or of the board, which is tag 0.
     points : ``corners``: corner k of tag t is marker 4 t + k; ``centers``: tag t is marker t.
     progress : called after each pose.
     Raises InputError if an image cannot be read, or has another size than earlier ones of the same camera;
@@ -614,11 +874,8 @@ def observe_tags(
                 findings.images[k, view, number] = np.column_stack(tag[:2]) if in_corners else _center(tag)
         progress("detect", k + 1, len(pairs))
     if not findings.images:
-        raise WorkFailed(
-            f"no tag in any of {2 * len(pairs)} images: check that --dictionary is that of your tags, and "
-            "that a bright margin of one cell surrounds each"
-        )
-    numbers, each = findings.tags, 4 if points == "corners" else 1
+        raise WorkFailed(finder.nothing.format(count=2 * len(pairs)))
+    numbers, each = findings.tags, finder.corners if points == "corners" else 1
     values = np.full((len(pairs), 2, len(numbers), each, 3), np.nan)
     for (k, view, number), pixels in findings.images.items():
         values[k, view, numbers.index(number)] = pixels

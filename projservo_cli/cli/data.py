@@ -164,6 +164,11 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
     help="The tags, such as 4X4_50, ARUCO_ORIGINAL, APRILTAG_36H11.",
 )
 @click.option(
+    "--board",
+    metavar="KIND:CxR",
+    help="A board instead of tags: chessboard:9x7 (inner corners) or charuco:11x8 (squares).",
+)
+@click.option(
     "--points",
     type=click.Choice(["corners", "centers"]),
     default="corners",
@@ -180,10 +185,11 @@ def _detect(
     output: Path,
     joints_csv: str,
     dictionary: str,
+    board: str | None,
     points: str,
     force: bool,
 ) -> None:
-    """Find ArUco or AprilTag markers in images and write a table.
+    """Find ArUco or AprilTag markers, or a board, in images and write a table.
 
     Finds tags in the images of two folders (or quoted patterns such as 'left/*.png'), with corners to a
     fraction of a pixel and how certain each is, and writes an observation table for calibrate --data. Needs
@@ -196,15 +202,19 @@ def _detect(
 
     With --points corners, corner k of tag t is marker 4 t + k, in the order of the dictionary: top left, top
     right, bottom right, bottom left. With --points centers, tag t is marker t, at the crossing of its
-    diagonals. Readings are copied as they are: say --joint-unit deg on calibrate where they are degrees.
+    diagonals. With --board the markers are its inner corners, numbered row by row as OpenCV does; a
+    chessboard of two odd or two even sides looks the same turned by 180°, and calibrate turns its numbering
+    right. Readings are copied as they are: say --joint-unit deg on calibrate where they are degrees.
     """
     import numpy as np
 
-    from projservo_cli.detection import TagFinder, hidden_images, observe_tags, pair_images
+    from projservo_cli.detection import Board, finder_of, hidden_images, observe_tags, pair_images
     from projservo_cli.store.observation_tables import read_joint_list, write_table
 
     option.require_new(output, force=force)
-    finder = TagFinder(dictionary)
+    if board is not None and points == "centers":
+        raise click.UsageError("--points centers: is of tags; a board has corners: leave out one of both")
+    finder = finder_of(None if board is None else Board.of(board), dictionary)
     joints = read_joint_list(joints_csv, joint_unit="rad")  # as they are, whatever their unit
     pairs = pair_images(left, right, joints, joints_csv)
     hidden = [file for side in (left, right) for file in hidden_images(side)]
@@ -218,7 +228,8 @@ def _detect(
     value = {
         "table": output.resolve(),
         "poses": len(observation.pose),
-        "tags": found.tags,
+        "board": board,
+        "tags": found.tags if board is None else [],
         "markers": len(observation.marker),
         "both": int((in_left & in_right).sum()),
         "left_only": int((in_left & ~in_right).sum()),
@@ -230,11 +241,13 @@ def _detect(
         "hidden_files": len(hidden),
     }
     words = (
-        f"detect: {{poses}} poses, {len(found.tags)} tags, {{markers}} markers",
+        f"detect: {{poses}} poses, {board or f'{len(found.tags)} tags'}, {{markers}} markers",
         "  markers seen by both cameras {both}, left only {left_only}, right only {right_only}, "
         "by none {unseen}",
         "  {unrefined} points without clean edges: less certain, or rejected if occluded",
-        "  rejected: {ambiguous} tags twice in an image; images without a tag: {empty_images}",
+        "  rejected: {ambiguous} tags twice in an image; images without a tag: {empty_images}"
+        if board is None
+        else "  images without the board: {empty_images}",
     )
     console.report(value, [*(text.format_map(value) for text in words), f"table: {output}"])
 

@@ -1,0 +1,150 @@
+"""Chessboards and ChArUco boards in rendered images: corners, numbers, deviations, and tables that calibrate."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from projservo_cli.detection import Board, BoardFinder
+from projservo_cli.store.observation_tables import read_table
+from tests.calibration.simulated_robot import Robot, around, random_robot, trials
+from tests.detection.test_detection import joints, write
+
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install '.[detect]'")
+
+SIZE, CELL, FACTOR = (640, 480), 60, 6  # px; samples a square of the picture and a pixel
+SQUARE_M = 0.025
+DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+
+
+def picture(board):
+    """Grey values of a board with a margin of one square, and its corners (N, 2) in samples, row by row."""
+    if board.kind == "charuco":
+        printed = cv2.aruco.CharucoBoard((board.columns, board.rows), 1.0, 0.7, DICTIONARY)
+        size = [CELL * (n + 2) for n in (board.columns, board.rows)]
+        grey, first = printed.generateImage(size, marginSize=CELL), 2
+    else:
+        squares = np.indices((board.rows + 1, board.columns + 1)).sum(axis=0) % 2
+        grey = np.pad(np.kron(255 * squares, np.ones((CELL, CELL))), CELL, constant_values=255).astype(
+            np.uint8
+        )
+        first = 2
+    return grey, CELL * (board.places + first) - 0.5
+
+
+def drawn(board, H, blur, noise, rng, size=SIZE):
+    """Image of a board whose corners, in squares from its middle, a homography (3, 3) takes to pixels; these."""
+    grey, corners = picture(board)
+    middle = board.places.mean(axis=0)
+    places = np.diag([1.0 / CELL, 1.0 / CELL, 1.0])
+    places[:2, 2] = board.places[0] - middle - corners[0] / CELL
+    fine = np.array([[FACTOR, 0.0, (FACTOR - 1) / 2], [0.0, FACTOR, (FACTOR - 1) / 2], [0.0, 0.0, 1.0]])
+    large = (size[0] * FACTOR, size[1] * FACTOR)
+    image = cv2.warpPerspective(grey, fine @ H @ places, large, borderValue=200)
+    image = image.reshape(size[1], FACTOR, size[0], FACTOR).mean(axis=(1, 3))
+    image = 20 + 0.8 * cv2.GaussianBlur(image, (0, 0), blur) + noise * rng.standard_normal(image.shape)
+    true = np.c_[board.places - middle, np.ones(len(corners))] @ H.T
+    return np.clip(np.round(image), 0, 255).astype(np.uint8), true[:, :2] / true[:, 2:]
+
+
+def view_of(rng, side):
+    """Homography of squares to pixels: of any turn, tilted by up to 60°, squares of so many px."""
+    turn, tilt = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.5, 1.0)
+    c, s = np.cos(turn), np.sin(turn)
+    H = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.diag([side, tilt * side, 1.0])
+    H[2, :2] = rng.uniform(-0.03, 0.03, 2)
+    return np.array([[1.0, 0.0, 320.0], [0.0, 1.0, 240.0], [0.0, 0.0, 1.0]]) @ H
+
+
+@pytest.mark.parametrize(
+    ("kind", "side"), [("chessboard:9x6", 15.0), ("chessboard:9x7", 15.0), ("charuco:7x6", 30.0)]
+)
+def test_corners_err_as_they_say_and_have_their_numbers(rng, kind, side):
+    board = Board.of(kind)
+    finder, error, sigma = BoardFinder(board, "4X4_250"), [], []
+    for _ in range(12):
+        H = view_of(rng, side * rng.uniform(1.0, 2.0))
+        image, true = drawn(board, H, rng.uniform(0.5, 1.2), rng.uniform(1.0, 4.0), rng)
+        found = finder.find(image.astype(float))[0]
+        if not found:
+            continue
+        corners = found[0]
+        if kind == "chessboard:9x7" and np.linalg.norm(corners.pixels[0] - true[0]) > side:
+            true = true[::-1]  # it looks the same turned
+        known = np.isfinite(corners.sigma)
+        assert corners.clean[known].all()
+        error.append((corners.pixels - true)[known])
+        sigma.append(corners.sigma[known])
+    assert len(error) > 8
+    error, sigma = np.concatenate(error), np.concatenate(sigma)
+    assert np.sqrt(np.mean(error**2)) < 0.03  # OpenCV alone: 0.1 to 0.25
+    assert np.abs(error.mean(axis=0)).max() < 0.003
+    assert 0.7 < np.sqrt(np.mean(error**2) / np.mean(sigma**2)) < 1.3
+    for part in np.array_split(np.argsort(sigma), 2):
+        assert 0.7 < np.sqrt(np.mean(error[part] ** 2) / np.mean(sigma[part] ** 2)) < 1.3
+
+
+def test_a_covered_corner_is_rejected_and_a_small_board_is_less_certain(rng):
+    board = Board.of("charuco:7x6")
+    image, true = drawn(board, view_of(rng, 45.0), 0.8, 2.0, rng)
+    u, v = np.rint(true[7]).astype(int)
+    image[v - 3 : v + 12, u - 3 : u + 12] = 128
+    corners = BoardFinder(board, "4X4_250").find(image.astype(float))[0][0]
+    assert (
+        not np.isfinite(corners.sigma[7])
+        or np.linalg.norm(corners.pixels[7] - true[7]) < 4 * corners.sigma[7]
+    )
+    assert np.isfinite(corners.sigma).sum() > 20
+
+
+def test_images_of_a_symmetric_board_calibrate_a_robot(projservo, monkeypatch, tmp_path):
+    """Any turn of the board before two cameras; the table is turned right, and predicts other images."""
+    monkeypatch.chdir(tmp_path)
+    rng, board = np.random.default_rng(3), Board.of("chessboard:7x5")
+    arm = random_robot("RRRR", rng)
+    places = SQUARE_M * (board.places - board.places.mean(axis=0))
+    markers = np.c_[places, np.zeros(len(places)), np.ones(len(places))]
+    arm = Robot(**(vars(arm) | {"markers": markers}))
+    q = np.concatenate([trials(arm, frames=3), around(arm, 12, rng)])
+    depth = arm.projected(q)[:, :, 2]
+    assert depth.min() > 0.5
+    for k, row in enumerate(arm.images(q)):
+        for side, pixels in zip(("left", "right"), row, strict=True):
+            H = cv2.findHomography(board.places - board.places.mean(axis=0), pixels)[0]
+            image, true = drawn(board, H, 0.8, 2.0, rng, size=(1280, 1024))
+            np.testing.assert_allclose(true, pixels, atol=1e-6)
+            write(f"{side}/{k}.png", image)
+    joints("pose,q1,q2,q3,q4", *(",".join(map(repr, [k, *row.tolist()])) for k, row in enumerate(q)))
+    command = ["detect", "left", "right", "--joints-csv", "q.csv", "--board", str(board), "-o", "t.csv"]
+    answer = projservo(*command, "--json")
+    assert answer.code == 0, answer.err
+    assert (answer.json["board"], answer.json["tags"], answer.json["markers"]) == ("chessboard:7x5", [], 35)
+    table = read_table("t.csv")
+    seen = np.isfinite(table.images[..., 0]).all(axis=2)
+    assert seen.mean() > 0.5
+    answer = projservo("calibrate", "--data", "t.csv", "-o", "out", "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["sigma_px"] < 0.03
+    assert {"pose", "view"} == set(answer.json["turned_images"][0])
+
+
+REFUSED = {
+    "--board circles:9x7": "write kind:columnsxrows",
+    "--board chessboard:9x2": "of 3 or more",
+    "--board charuco:20x20": "has 200 tags, and dictionary 4X4_50 50",
+    "--board charuco:7x5 --dictionary 3X3": "--dictionary 3X3: unknown; valid: 4X4_100",
+    "--board chessboard:9x7 --points centers": "is of tags; a board has corners",
+    "--board chessboard:9x7": "no chessboard:9x7 in any of 2 images",
+}
+
+
+@pytest.mark.parametrize("options", REFUSED)
+def test_boards_that_are_not_there(projservo, monkeypatch, tmp_path, options):
+    monkeypatch.chdir(tmp_path)
+    for side in ("l", "r"):
+        write(f"{side}/0.png", np.full((60, 80), 99, dtype=np.uint8))
+    joints("q1", "1")
+    answer = projservo("detect", "l", "r", "--joints-csv", "q.csv", "-o", "t.csv", "-q", *options.split())
+    assert (answer.code, answer.err.count("\n")) == (1 if "any of" in REFUSED[options] else 2, 1), answer.err
+    assert REFUSED[options] in answer.err
+    assert not Path("t.csv").exists()
