@@ -509,6 +509,10 @@ class Finder(ABC):
         image : (height, width) grey values from 0 to 255.
         """
 
+    def like(self, tags: dict[int, Corners], before: dict[int, Corners] | None) -> dict[int, Corners]:
+        """Return tags numbered as in the frame before, where a board looks the same from several ends."""
+        return tags
+
     def read(self, path: Path) -> FloatArray:
         """Read grey values (height, width) of an image, ignoring its orientation tag.
 
@@ -615,6 +619,11 @@ class Board(NamedTuple):
         return self.rows - less, self.columns - less
 
     @property
+    def symmetric(self) -> bool:
+        """Whether it looks the same turned by half a turn."""
+        return self.kind == "chessboard" and (self.rows + self.columns) % 2 == 0
+
+    @property
     def places(self) -> FloatArray:
         """Places (N, 2) of the corners on the board, in squares."""
         return np.indices(self.shape)[::-1].reshape(2, -1).T.astype(np.float64)
@@ -667,6 +676,16 @@ class BoardFinder(Finder):
         ]
         corners = _refine_saddles(image, guess, *steps, _CROSS if self._detectors else np.inf)
         return ({0: corners}, ()) if np.isfinite(corners.sigma).any() else ({}, ())
+
+    def like(self, tags: dict[int, Corners], before: dict[int, Corners] | None) -> dict[int, Corners]:
+        """Return the board numbered from the end that moved least since the frame before."""
+        if not tags or not before or not self.board.symmetric:
+            return tags
+        index = np.arange(self.corners).reshape(self.board.shape)
+        step = 1 if self.board.rows == self.board.columns else 2
+        ends = [Corners(*(part[np.rot90(index, k).ravel()] for part in tags[0])) for k in range(0, 4, step)]
+        far = [np.nanmedian(np.linalg.norm(end.pixels - before[0].pixels, axis=1)) for end in ends]
+        return {0: ends[int(np.argmin(far))]}
 
     def _guess(self, grey: ByteArray) -> FloatArray:
         """Corners (N, 2) as of OpenCV, px, NaN where unseen."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.control.law import Gains
+from projservo_cli.detection import Board
 from projservo_cli.display import About
 from projservo_cli.records import CORNERS, InputError
 from projservo_cli.result_hashes import File
@@ -112,7 +113,7 @@ def recording_inputs(config: Config) -> RecordingInputs:
         numbers=numbers,
         face=markers.front or (),
         dictionary=_dictionary(config),
-        tagged=config.cameras is not None
+        tagged=(config.cameras is not None and markers.board is None)
         or (markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None),
         max_steady_state_error_deg=plant.max_steady_state_error_deg,
     )
@@ -121,6 +122,7 @@ def recording_inputs(config: Config) -> RecordingInputs:
 def teach_inputs(config: Config) -> TeachInputs:
     """Return the inputs of teaching a pose."""
     numbers = _numbers(config, "teach")
+    _require_one_numbering(config, "teach")
     driven = _drive(config, truth_of(config) if config.plant.simulated else None)
     noise, settle_s = config.noise.servo_px, config.plant.settle_s
     return TeachInputs(driven, joints_of(config), numbers, noise, settle_s, config.seed)
@@ -142,6 +144,7 @@ def preflight_inputs(config: Config) -> PreflightInputs:
         face=face,
         lengths=config.markers.lengths(face),
         dictionary=_dictionary(config),
+        board=_board(config),
     )
 
 
@@ -156,8 +159,26 @@ def _numbers(config: Config, command: str) -> tuple[int, ...]:
 def _dictionary(config: Config) -> str | None:
     """Dictionary of the tags: that of the options of a robot's class, else that of the markers."""
     markers = config.markers
-    given = config.plant.options.get("dictionary", None if markers is None else markers.dictionary)
+    own = None if markers is None else (markers.board or markers).dictionary
+    given = config.plant.options.get("dictionary", own)
     return None if given is None else str(given)
+
+
+def _board(config: Config) -> Board | None:
+    """Board whose corners are the markers; None without one."""
+    board = None if config.markers is None else config.markers.board
+    return None if board is None else board.pattern
+
+
+def _require_one_numbering(config: Config, command: str) -> None:
+    """Refuse a board on the tool of which an image may number the corners from another end than the goal."""
+    board = _board(config)
+    if board is not None and board.symmetric and config.cameras is not None:
+        raise InputError(
+            f"markers.board: a {board} looks the same turned by 180°, so that images of {command} may number "
+            "its corners from either end: take one with an odd and an even side, or charuco (record and "
+            "calibrate turn its numbering right)"
+        )
 
 
 def suggestion_inputs(config: Config) -> SuggestionInputs:
@@ -202,6 +223,7 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
     """Return the inputs of the run of a law."""
     plan, control, plant = plan_inputs(config, files), config.control, config.plant
     assert config.markers is not None
+    _require_one_numbering(config, "servo")
     # A robot that is not simulated is never driven beyond a limit.
     at_limit = not plant.simulated or plant.joint_limits == "stop"
     return ServoInputs(
@@ -419,9 +441,10 @@ def _drive(
 def _own(config: Config) -> OwnRobot:
     """The robot of somebody's."""
     plant, markers = config.plant, config.markers
-    dictionary = markers.dictionary if markers is not None else None
+    dictionary = (markers.board or markers).dictionary if markers is not None else None
     size, options = config.image_size_px, dict(plant.options)
-    return OwnRobot(plant.use or "", options, dictionary, plant.timeout_s, plant.open_s, size, config.cameras)
+    times = plant.timeout_s, plant.open_s
+    return OwnRobot(plant.use or "", options, dictionary, *times, size, config.cameras, _board(config))
 
 
 # Trials.

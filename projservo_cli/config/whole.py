@@ -151,8 +151,11 @@ def _cameras(plant: PlantSettings, markers: Markers | None, cameras: Cameras | N
             ("cameras",),
             "are those of a robot that is not simulated: set plant.use to its class, or leave them out",
         )
-    if markers is None or (markers.tags is None and markers.numbers is None):
-        yield ("cameras",), "find tags: set markers.tags, or markers.numbers of their corners (4 t + k)"
+    if markers is None or (markers.tags, markers.numbers, markers.board) == (None, None, None):
+        yield (
+            ("cameras",),
+            "find tags: set markers.tags, markers.numbers of their corners (4 t + k), or markers.board",
+        )
 
 
 def _same_mount(rig: Rig | None, data: Data | None) -> Iterator[Finding]:

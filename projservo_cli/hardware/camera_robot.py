@@ -8,9 +8,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from projservo_cli.detection import Corners, TagFinder
+from projservo_cli.detection import Corners, Finder
 from projservo_cli.hardware.cameras import Camera, Frame
-from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray, WorkFailed
+from projservo_cli.records import VIEWS, ByteArray, FloatArray, WorkFailed
 from projservo_cli.settings.cameras import Cameras
 
 # Mean grey value, of 255, below which an image is dark, and share of clipped pixels that is too much.
@@ -59,11 +59,11 @@ class View(NamedTuple):
 class CameraRobot:
     """A robot of the contract: joints of an arm, and corners of tags in the newest frame of each camera.
 
-    numbers : of the markers, of which 4 t to 4 t + 3 are the corners of tag t.
+    numbers : of the markers, of which 4 t to 4 t + 3 are the corners of tag t; all are those of a board.
     ``views`` are those of the last reading, None before.
     """
 
-    def __init__(self, arm: Arm, stereo: Cameras, finder: TagFinder, numbers: Sequence[int]) -> None:
+    def __init__(self, arm: Arm, stereo: Cameras, finder: Finder, numbers: Sequence[int]) -> None:
         self.arm, self.finder, self._numbers = arm, finder, np.array(numbers, dtype=np.int64)
         for name in ("now", "truth", "release", "hold", "health", "identity"):
             if callable(method := getattr(arm, name, None)):
@@ -101,9 +101,10 @@ class CameraRobot:
         """Find tags in the newest frame of a view, unless that was done before."""
         frame, last = self.cameras[view].newest(), self.views[view]
         if last is None or last.frame.serial != frame.serial:
-            last = View(frame, *self.finder.find(frame.grey.astype(np.float64)))
+            tags, repeated = self.finder.find(frame.grey.astype(np.float64))
+            last = View(frame, self.finder.like(tags, None if last is None else last.tags), repeated)
             self.views[view] = last
-            if not last.tags.keys() & {*(self._numbers // CORNERS).tolist()}:
+            if not last.tags.keys() & {*(self._numbers // self.finder.corners).tolist()}:
                 self._blind[view] += 1
                 if self._blind[view] <= _MIRRORS:
                     self._require_not_mirrored(view, frame.grey)
@@ -112,7 +113,7 @@ class CameraRobot:
     def _require_not_mirrored(self, view: int, grey: ByteArray) -> None:
         """Raise WorkFailed for an image (height, width) without tags whose mirror image shows them."""
         tags = self.finder.find(grey[:, ::-1].astype(np.float64))[0].keys()
-        if mirrored := tags & {*(self._numbers // CORNERS).tolist()}:
+        if mirrored := tags & {*(self._numbers // self.finder.corners).tolist()}:
             tags_shown = f"tag{'s' * (len(mirrored) > 1)} {', '.join(map(str, sorted(mirrored)))}"
             raise WorkFailed(
                 f"the {VIEWS[view]} camera's image is mirrored: it shows no tag, its mirror image "
@@ -123,8 +124,11 @@ class CameraRobot:
         """Pixels (m, 2) of all markers and their deviations (m,); NaN where unseen or rejected."""
         pixels, sigma = np.full((len(self._numbers), 2), np.nan), np.full(len(self._numbers), np.nan)
         for k, number in enumerate(self._numbers.tolist()):
-            if (tag := view.tags.get(number // CORNERS)) is not None:
-                pixels[k], sigma[k] = tag.pixels[number % CORNERS], tag.sigma[number % CORNERS]
+            if (tag := view.tags.get(number // self.finder.corners)) is not None:
+                pixels[k], sigma[k] = (
+                    tag.pixels[number % self.finder.corners],
+                    tag.sigma[number % self.finder.corners],
+                )
         pixels[np.isnan(sigma)] = np.nan
         sigma[np.isnan(pixels[:, 0])] = np.nan
         return pixels, sigma

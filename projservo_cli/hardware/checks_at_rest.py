@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.detection import MIN_CELL, Corners, TagFinder, dictionaries
+from projservo_cli.detection import MIN_CELL, BoardFinder, Corners, Finder, TagFinder, dictionaries
 from projservo_cli.hardware.camera_robot import View, exposure_of
 from projservo_cli.hardware.cameras import Camera, stable_name
 from projservo_cli.records import CORNERS, BoolArray, ByteArray, FloatArray, JointLimits, in_unit
@@ -55,7 +55,7 @@ class RobotAtRest:
 
 
 def findings_at_rest(
-    robot: RobotAtRest, finder: TagFinder, dictionary: str, *, moves: bool = False
+    robot: RobotAtRest, finder: Finder, dictionary: str, *, moves: bool = False
 ) -> Iterator[Finding]:
     """All findings at rest.
 
@@ -63,7 +63,10 @@ def findings_at_rest(
     """
     for camera, view in zip(robot.cameras, robot.views, strict=True):
         yield from _of_camera(camera)
-        yield from _of_tags(camera.name, view, robot, finder, dictionary)
+        if isinstance(finder, TagFinder):
+            yield from _of_tags(camera.name, view, robot, finder, dictionary)
+        elif isinstance(finder, BoardFinder):
+            yield _of_board(camera.name, view, finder)
     yield from _of_all_views(robot)
     yield from _of_joints(robot, FAULT if moves else WARNING)
 
@@ -136,6 +139,17 @@ def _of_tags(
         what = f"tag {smallest} is {width[smallest]:.0f} px wide, {cell:.1f} px a cell ({limit:g} at least)"
         yield Finding(level, where, what, "print larger tags, move the camera nearer, or raise its size_px")
     yield Finding(FINE, where, text)
+
+
+def _of_board(name: str, view: View, finder: BoardFinder) -> Finding:
+    """The board in the image of a camera: how many of its corners, how certain."""
+    if not view.tags:
+        what, _, remedy = finder.nothing.format(count=1).partition(": ")
+        return Finding(FAULT, f"{name} image", f"there is {what.replace('any of 1 images', 'it')}", remedy)
+    sigma = view.tags[0].sigma
+    known = sigma[np.isfinite(sigma)]
+    text = f"{finder.board} with {known.size} of {finder.corners} corners, to {np.median(known):.2g} px"
+    return Finding(FINE, f"{name} image", text)
 
 
 def _width(tag: Corners) -> float:
@@ -217,7 +231,8 @@ def view_angle_deg(left: Mapping[int, Corners], right: Mapping[int, Corners]) ->
     """
     sure, unsure = list[float](), list[float]()
     for number in left.keys() & right.keys():
-        if not np.isfinite([left[number].sigma, right[number].sigma]).all():
+        sigma = np.array([left[number].sigma, right[number].sigma])
+        if sigma.shape[1] != CORNERS or not np.isfinite(sigma).all():
             continue
         towards = [_directions(view[number].pixels, view[number].sigma) for view in (left, right)]
         cosine = max(float(np.clip(a @ b, -1.0, 1.0)) for a, b in product(*towards))

@@ -1,13 +1,14 @@
-"""Points fixed to the tool, and tags whose corners they are."""
+"""Points fixed to the tool, and tags or a board whose corners they are."""
 
 import math
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, PlainValidator, StringConstraints, WithJsonSchema
+from pydantic import Field, PlainValidator, Strict, StringConstraints, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.detection import LEAST_ROWS, Board
 from projservo_cli.records import CORNERS, FloatArray
 from projservo_cli.settings.sections import Finding, Matrix44, Positive, Section, Vector3, Whole, not_rigid
 
@@ -40,6 +41,32 @@ class Tag(Section):
         """Its corners (4, 3) in the frame of the tool, m, in the order in which they are detected."""
         T = np.array(self.pose)
         return np.asarray(self.size_m * np.array(_CORNERS) @ T[:3, :2].T + T[:3, 3])
+
+
+_Side = Annotated[int, Strict(), Field(ge=LEAST_ROWS, le=1000)]
+_Dictionary = Annotated[str, StringConstraints(min_length=1)]
+
+
+class BoardSettings(Section):
+    """A board on the tool, or in the scene of cameras on the tool, whose inner corners are the markers."""
+
+    kind: Literal["chessboard", "charuco"] = Field(description="pattern of the board")
+    rows: _Side = Field(description="rows of inner corners of a chessboard, of squares of a ChArUco board")
+    columns: _Side = Field(description="columns, counted likewise")
+    size_m: Positive | None = Field(None, description="side of a square; null if unknown")
+    dictionary: _Dictionary | None = Field(
+        None, description="of the tags on a ChArUco board by its OpenCV name; null: 4X4_50"
+    )
+
+    @property
+    def pattern(self) -> Board:
+        """The board as it is detected."""
+        return Board(self.kind, self.rows, self.columns)
+
+    def contradictions(self) -> Iterator[Finding]:
+        """A dictionary of tags on a board without."""
+        if self.kind == "chessboard" and self.dictionary is not None:
+            yield ("dictionary",), "is of the tags on a board of kind charuco, and a chessboard has none"
 
 
 def _tag(number: int, size_m: float, R: Rotation, t: Sequence[float]) -> Tag:
@@ -99,7 +126,10 @@ class Markers(Section):
         None,
         description="side of the black square of each tag; null: 0.06 for a roof or a plate",
     )
-    dictionary: Annotated[str, StringConstraints(min_length=1)] | None = Field(
+    board: BoardSettings | None = Field(
+        None, description="board whose inner corners are the markers, numbered row by row as OpenCV does"
+    )
+    dictionary: _Dictionary | None = Field(
         None,
         description="tag dictionary by its OpenCV name; null: 4X4_50; passed to a robot class that "
         "accepts it",
@@ -136,6 +166,8 @@ class Markers(Section):
     @property
     def known(self) -> tuple[int, ...] | None:
         """Numbers of all markers, in the order of ``points``; None if a table has them."""
+        if self.board is not None:
+            return tuple(range(len(self.board.pattern.places)))
         if self.tags is not None:
             return tuple(CORNERS * tag.number + k for tag in self.all_tags for k in range(CORNERS))
         if self.numbers is None and self.positions_m is not None:
@@ -144,7 +176,13 @@ class Markers(Section):
 
     @property
     def front(self) -> tuple[int, ...] | None:
-        """Numbers of the face: those given, else of the tag that looks most where all of them look."""
+        """Numbers of the face: those given, else of the tag that looks most where all of them look.
+
+        Of a board, the outermost corners.
+        """
+        if self.face is None and self.board is not None:
+            rows, columns = self.board.pattern.shape
+            return (0, columns - 1, rows * columns - 1, (rows - 1) * columns)
         if self.face is not None or self.tags is None:
             return self.face
         normals, known = self.normals, self.known
@@ -159,6 +197,8 @@ class Markers(Section):
         if self.points is not None:
             known = self.known or ()
             X = self.points[[known.index(number) for number in numbers]]
+        elif self.board is not None and self.board.size_m is not None:
+            X[:, 2], X[:, :2] = 0.0, self.board.size_m * self.board.pattern.places[[*numbers]]
         elif self.tag_size_m is not None:
             corners = np.reshape([_CORNERS[k % CORNERS] for k in numbers], (-1, 2))
             X[:, 2], X[:, :2] = 0.0, self.tag_size_m * corners
@@ -171,6 +211,11 @@ class Markers(Section):
         for key in ("positions_m", "numbers") if self.tags is not None else ():
             if getattr(self, key) is not None:
                 yield (key,), "tags is set as well, whose corners are the markers; keep one"
+        for key in ("positions_m", "numbers", "tags", "tag_size_m") if self.board is not None else ():
+            if getattr(self, key) is not None:
+                yield (key,), "board is set as well, whose corners are the markers; keep one"
+        if self.board is not None and self.dictionary is not None:
+            yield ("dictionary",), "is of tags: that of the board is board.dictionary"
         numbers = [tag.number for tag in self.all_tags]
         if len(set(numbers)) < len(numbers):
             yield ("tags",), "the number of a tag stands here twice"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.refit import view_errors
-from projservo_cli.detection import DICTIONARY, TagFinder
+from projservo_cli.detection import DICTIONARY, finder_of
 from projservo_cli.hardware.camera_robot import CameraRobot, View
 from projservo_cli.hardware.cameras import Camera
 from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding, RobotAtRest, findings_at_rest
@@ -78,7 +78,7 @@ def check(
                 watch(robot)
             at_rest = _seen(robot, inputs, progress)
             findings += findings_at_rest(
-                at_rest, TagFinder(dictionary), dictionary, moves=confirmed is not None
+                at_rest, finder_of(inputs.board, dictionary), dictionary, moves=confirmed is not None
             )
             if calibration is not None:
                 found = calibration_finding(calibration, at_rest, robot.image_size, inputs.lengths)

@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli import plugins
 from projservo_cli.calibration import predict
-from projservo_cli.detection import DICTIONARY, TagFinder
+from projservo_cli.detection import finder_of
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot
 from projservo_cli.image_size import image_sizes
@@ -84,8 +84,8 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds) -> Robot:
                 f"plant {own.target}: has read(), which brings pixels, and cameras are configured as well: "
                 "write joints() in its place, or leave cameras out"
             )
-        return CameraRobot(arm, own.cameras, TagFinder(own.dictionary or DICTIONARY), numbers)
-    if own.dictionary is not None:
+        return CameraRobot(arm, own.cameras, finder_of(own.board, own.dictionary), numbers)
+    if own.dictionary is not None and own.board is None:
         if not plugins.takes("plant", own.target, "dictionary"):
             raise InputError(
                 f"markers.dictionary: is without effect: plant.use {own.target} takes no argument "

@@ -112,7 +112,8 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
         i, j = np.unravel_index(int(np.argmax(apart)), apart.shape)
         length_m, between = float(apart[i, j]), (known.numbers[at[i]], known.numbers[at[j]])
     elif not calibration.prismatic.any():
-        return None, "no length on the tool is known: set markers.positions_m or markers.tag_size_m"
+        keys = "markers.positions_m, markers.tag_size_m or markers.board.size_m"
+        return None, f"no length on the tool is known: set {keys}"
     face = [number for number in known.face if number in calibration.marker]
     try:
         return ImageModel.of(calibration).metric(length_m, between, face=face or None), ""

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.control.law import Gains
+from projservo_cli.detection import Board
 from projservo_cli.display import About
 from projservo_cli.image_size import ImageSize
 from projservo_cli.records import TOOL, FloatArray
@@ -32,6 +33,7 @@ class OwnRobot(NamedTuple):
     open_s: float  # most time that opening may take
     image_size: ImageSize | None  # width and height of its images, px, if known
     cameras: Cameras | None = None  # of an arm that reads joints alone
+    board: Board | None = None  # whose corners these show; None for tags
 
 
 class Drive(NamedTuple):
@@ -178,6 +180,7 @@ class PreflightInputs:
     face: tuple[int, ...]  # numbers of the markers that must stay visible; may be empty
     lengths: FloatArray  # (f, f) distances between these, m; NaN if unknown
     dictionary: str | None  # of the tags; None if not configured
+    board: Board | None = None  # whose corners are the markers; None for tags
 
 
 @dataclass(frozen=True, eq=False)

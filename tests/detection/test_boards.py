@@ -1,4 +1,4 @@
-"""Chessboards and ChArUco boards in rendered images: corners, numbers, deviations, and tables that calibrate."""
+"""Chessboards and ChArUco boards in rendered images: corners, numbers, deviations, and a calibration."""
 
 from pathlib import Path
 
@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from projservo_cli.detection import Board, BoardFinder
-from projservo_cli.store.observation_tables import read_table
-from tests.calibration.simulated_robot import Robot, around, random_robot, trials
+from tests.calibration.simulated_robot import Robot, around, random_robot
 from tests.detection.test_detection import joints, write
+from tests.samples import revolute
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install '.[detect]'")
 
-SIZE, CELL, FACTOR = (640, 480), 60, 6  # px; samples a square of the picture and a pixel
+SIZE, CELL, FACTOR = (640, 480), 60, 4  # px; samples a square of the picture and a pixel
 SQUARE_M = 0.025
 DICTIONARY = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
 
@@ -33,7 +33,7 @@ def picture(board):
 
 
 def drawn(board, H, blur, noise, rng, size=SIZE):
-    """Image of a board whose corners, in squares from its middle, a homography (3, 3) takes to pixels; these."""
+    """Image of a board, of which a homography takes squares from its middle to pixels, and its corners."""
     grey, corners = picture(board)
     middle = board.places.mean(axis=0)
     places = np.diag([1.0 / CELL, 1.0 / CELL, 1.0])
@@ -61,21 +61,22 @@ def view_of(rng, side):
 )
 def test_corners_err_as_they_say_and_have_their_numbers(rng, kind, side):
     board = Board.of(kind)
-    finder, error, sigma = BoardFinder(board, "4X4_250"), [], []
-    for _ in range(12):
+    finder, error, sigma, ends = BoardFinder(board, "4X4_250"), [], [], set()
+    for _ in range(10):
         H = view_of(rng, side * rng.uniform(1.0, 2.0))
         image, true = drawn(board, H, rng.uniform(0.5, 1.2), rng.uniform(1.0, 4.0), rng)
         found = finder.find(image.astype(float))[0]
         if not found:
             continue
         corners = found[0]
-        if kind == "chessboard:9x7" and np.linalg.norm(corners.pixels[0] - true[0]) > side:
-            true = true[::-1]  # it looks the same turned
+        ends.add(end := int(np.linalg.norm(corners.pixels - true, axis=1).max() > side))
+        true = true[::-1] if end else true
         known = np.isfinite(corners.sigma)
         assert corners.clean[known].all()
         error.append((corners.pixels - true)[known])
         sigma.append(corners.sigma[known])
-    assert len(error) > 8
+    assert len(error) > 6
+    assert len(ends) == 1 + (kind == "chessboard:9x7")  # which looks the same turned
     error, sigma = np.concatenate(error), np.concatenate(sigma)
     assert np.sqrt(np.mean(error**2)) < 0.03  # OpenCV alone: 0.1 to 0.25
     assert np.abs(error.mean(axis=0)).max() < 0.003
@@ -98,34 +99,32 @@ def test_a_covered_corner_is_rejected_and_a_small_board_is_less_certain(rng):
 
 
 def test_images_of_a_symmetric_board_calibrate_a_robot(projservo, monkeypatch, tmp_path):
-    """Any turn of the board before two cameras; the table is turned right, and predicts other images."""
+    """Its first joint turns the board before the cameras, which number it from either end."""
     monkeypatch.chdir(tmp_path)
     rng, board = np.random.default_rng(3), Board.of("chessboard:7x5")
-    arm = random_robot("RRRR", rng)
-    places = SQUARE_M * (board.places - board.places.mean(axis=0))
-    markers = np.c_[places, np.zeros(len(places)), np.ones(len(places))]
-    arm = Robot(**(vars(arm) | {"markers": markers}))
-    q = np.concatenate([trials(arm, frames=3), around(arm, 12, rng)])
-    depth = arm.projected(q)[:, :, 2]
-    assert depth.min() > 0.5
+    places = board.places - board.places.mean(axis=0)
+    arm = vars(random_robot("RRR", rng))
+    body = np.c_[SQUARE_M * places, np.zeros(len(places)), np.ones(len(places))]
+    twists = np.array([revolute((0.1, 0.0, 0.0), (0.1, 0.2, 1.0)), *arm["twists"][1:]])
+    half = np.diag([0.5, 0.5, 1.0]) @ arm["cameras"]
+    arm = Robot(**(arm | {"markers": body, "twists": twists, "cameras": half}))
+    q = around(arm, 14, rng, angle=0.4)
+    q[:, 0] += np.linspace(-1.2, 1.6, len(q))
     for k, row in enumerate(arm.images(q)):
         for side, pixels in zip(("left", "right"), row, strict=True):
-            H = cv2.findHomography(board.places - board.places.mean(axis=0), pixels)[0]
-            image, true = drawn(board, H, 0.8, 2.0, rng, size=(1280, 1024))
+            H = cv2.findHomography(places, pixels)[0]
+            image, true = drawn(board, H, 0.8, 2.0, rng)
             np.testing.assert_allclose(true, pixels, atol=1e-6)
             write(f"{side}/{k}.png", image)
-    joints("pose,q1,q2,q3,q4", *(",".join(map(repr, [k, *row.tolist()])) for k, row in enumerate(q)))
+    joints("pose,q1,q2,q3", *(",".join(map(repr, [k, *row.tolist()])) for k, row in enumerate(q)))
     command = ["detect", "left", "right", "--joints-csv", "q.csv", "--board", str(board), "-o", "t.csv"]
     answer = projservo(*command, "--json")
     assert answer.code == 0, answer.err
     assert (answer.json["board"], answer.json["tags"], answer.json["markers"]) == ("chessboard:7x5", [], 35)
-    table = read_table("t.csv")
-    seen = np.isfinite(table.images[..., 0]).all(axis=2)
-    assert seen.mean() > 0.5
     answer = projservo("calibrate", "--data", "t.csv", "-o", "out", "--json")
     assert answer.code == 0, answer.err
     assert answer.json["sigma_px"] < 0.03
-    assert {"pose", "view"} == set(answer.json["turned_images"][0])
+    assert len(answer.json["turned_images"]) > 3
 
 
 REFUSED = {
