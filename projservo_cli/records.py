@@ -7,8 +7,8 @@ knows how it is stored.
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -70,6 +70,24 @@ def _array(dims: str, units: str = "1", about: str = "", **default: Any) -> Any:
 def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
     """Declare a scalar or text field with its unit and meaning."""
     return field(metadata={"units": units, "about": about}, **default)
+
+
+def _by_view(about: str, **default: Any) -> Any:
+    """Declare a tuple of numbers, one a view; files and JSON have each by itself, with the name of its view."""
+    return field(metadata={"units": "1", "about": about, "by_view": True}, **default)
+
+
+def scalars_of(record: Any) -> dict[str, Any]:
+    """All fields of a record but its arrays, by their names in files and JSON."""
+    found: dict[str, Any] = {}
+    for entry in fields(record):
+        value = getattr(record, entry.name)
+        if "by_view" in entry.metadata:
+            names = (f"{entry.name}_{view}" for view in record.view)
+            found |= zip(names, value, strict=True)
+        elif "dims" not in entry.metadata:
+            found[entry.name] = value
+    return found
 
 
 class InputError(ValueError):
@@ -839,8 +857,7 @@ class RunMetrics:
         "unknown",
         default=None,
     )
-    self_occluded_steps_left: int = _scalar(about="times at which the left camera is behind the face")
-    self_occluded_steps_right: int = _scalar(about="times at which the right camera is behind the face")
+    self_occluded_steps: tuple[int, ...] = _by_view("times at which this camera is behind the face")
     center_deviation_mm: float | None = _scalar(
         "mm", "maximum distance of the centre from the line, between samples too"
     )
@@ -861,6 +878,16 @@ class RunMetrics:
     limit_joint: int = _scalar(
         about="the joint, from 0, that passed its limit first or stopped the run, -1 for none"
     )
+
+    if not TYPE_CHECKING:  # names of views are not known before a run
+
+        def __getattr__(self, name: str) -> int:
+            """Number of one view, such as ``self_occluded_steps_left``, by its name in files and JSON."""
+            if name.startswith("self_occluded_steps_"):
+                numbers = scalars_of(self)
+                if name in numbers:
+                    return numbers[name]
+            raise AttributeError(f"{type(self).__name__} has no {name}")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

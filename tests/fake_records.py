@@ -21,7 +21,8 @@ def fake(kind: type, seed: int = 0, sizes: dict[str, int] | None = None, **given
     if "joint_types" in hints:
         given.setdefault("joint_types", "R" * extent["joint"])
     if "view" in hints:
-        given.setdefault("view", VIEWS)
+        extent["view"] = len(given.setdefault("view", VIEWS))
+    extent["margin_kind"] = 2 + 4 * extent["view"]
     if "mount" in hints:
         given.setdefault("mount", WORLD)
     for field in dataclasses.fields(kind):
@@ -30,6 +31,8 @@ def fake(kind: type, seed: int = 0, sizes: dict[str, int] | None = None, **given
             values[field.name] = given[field.name]
         elif type(None) in typing.get_args(hint):
             values[field.name] = None
+        elif "by_view" in field.metadata:
+            values[field.name] = tuple(range(extent["view"]))
         elif "dims" in field.metadata:
             values[field.name] = _array(
                 rng, str(hint), [extent.get(dim, 3) for dim in field.metadata["dims"]]
@@ -39,6 +42,25 @@ def fake(kind: type, seed: int = 0, sizes: dict[str, int] | None = None, **given
         else:
             values[field.name] = ()
     return kind(**values)
+
+
+def seen_by(record: Any, names: tuple[str, ...]) -> Any:
+    """A record of two views as cameras of other names had it: the first and the second in turn."""
+    chosen, values = [v % 2 for v in range(len(names))], {"view": names}
+    for field in dataclasses.fields(record):
+        value, dims = getattr(record, field.name), field.metadata.get("dims", ())
+        if value is not None and "view" in dims:
+            values[field.name] = np.take(value, chosen, axis=dims.index("view"))
+        elif value is not None and "margin_kind" in dims:  # one, four of each view, one
+            pairs = np.take(value[:, 1:-1].reshape(len(value), 4, 2), chosen, axis=2)
+            values[field.name] = np.c_[value[:, :1], pairs.reshape(len(value), -1), value[:, -1:]]
+        elif "by_view" in field.metadata:
+            values[field.name] = tuple(value[v] for v in chosen)
+    if getattr(record, "frame_jpeg", None) is not None:
+        files = np.split(record.frame_jpeg, np.cumsum(record.frame_size)[:-1])
+        kept = [files[2 * k + v] for k in range(len(record.frame_size)) for v in chosen]
+        values["frame_jpeg"] = np.concatenate(kept)
+    return dataclasses.replace(record, **values)
 
 
 def _array(rng: np.random.Generator, hint: str, shape: list[int]) -> Any:

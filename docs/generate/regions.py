@@ -45,9 +45,11 @@ def fields(record: type, *, arrays: bool) -> Iterator[tuple[str, ...]]:
     for field in sorted(dataclasses.fields(record), key=lambda field: field.name not in own):
         about, dims = field.metadata, field.metadata.get("dims")
         if arrays == (dims is not None):
-            what = plain(hints[field.name]) if dims is None else text(", ".join(dims))
+            hint = typing.get_args(hints[field.name])[0] if "by_view" in about else hints[field.name]
+            what = plain(hint) if dims is None else text(", ".join(dims))
             units = text(about["units"]) if arrays or "number" in what else ""
-            yield f"`{field.name}`", what, units, text(about["about"])
+            name = f"{field.name}_<view>" if "by_view" in about else field.name
+            yield f"`{name}`", what, units, text(about["about"])
 
 
 def plain(hint: Any) -> str:

@@ -162,7 +162,7 @@ def doctor(
             watch=(lambda robot: _watch(console, settings, robot)) if watch else None,
             progress=console.progress,
         )
-        pictures = [] if checked.seen is None else _pictures(settings, checked.seen)
+        pictures = {} if checked.seen is None else _pictures(settings, checked.seen)
         write_whole(output, preflight_page(settings.name, checked.findings, pictures))
     refit = _refit(checked, stored, config, output)
     value = {
@@ -233,11 +233,12 @@ def _goal_pixels(settings: "Config") -> "list[FloatArray]":
     return [np.array([at or (np.nan, np.nan) for at in side or ()]).reshape(-1, 2) for side in sides]
 
 
-def _pictures(settings: "Config", seen: "RobotAtRest") -> list[bytes]:
+def _pictures(settings: "Config", seen: "RobotAtRest") -> dict[str, bytes]:
+    from projservo_cli.records import VIEWS
     from projservo_cli.report.live_page import annotated
 
-    both = zip(seen.views, seen.s, _goal_pixels(settings), strict=False)
-    return [annotated(view.frame.grey, seen.marker, s, goal) for view, s, goal in both]
+    each = zip(VIEWS, seen.views, seen.s, _goal_pixels(settings), strict=False)
+    return {name: annotated(view.frame.grey, seen.marker, s, goal) for name, view, s, goal in each}
 
 
 def _watch(console: Console, settings: "Config", robot: "PluginRobot") -> None:
@@ -247,7 +248,7 @@ def _watch(console: Console, settings: "Config", robot: "PluginRobot") -> None:
     from projservo_cli.records import VIEWS
     from projservo_cli.report.live_page import LivePage, annotated
 
-    live, goal = LivePage(settings.name), _goal_pixels(settings)
+    live, goal = LivePage(settings.name, VIEWS), _goal_pixels(settings)
     assert settings.markers is not None
     console.say(f"watch: open {live.url} in a browser; Ctrl-C ends it")
     try:

@@ -12,6 +12,7 @@ import click
 
 from projservo_cli.passwords import masked
 from projservo_cli.progress import Listener
+from projservo_cli.records import VIEWS
 
 _UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _NOTES = {  # on runs, and their reasons
@@ -341,18 +342,20 @@ def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
     if not known:
         keys = "image_error_px", "estimated_position_error_mm", ""
         words, units = ("image", "within", ""), ("px", "mm", "")
+    views = next((trace["view"] for trace in value["laws"]), VIEWS)
     errors = "true errors" if known else "image errors"
-    yield f"servo: {errors} at the end, self-occluded steps left/right"
+    yield f"servo: {errors} at the end, self-occluded steps {'/'.join(views)}"
     first, second, last = words
     yield f"{'':<42}{first:>9}{second:>9}{last:>19}".rstrip()
     first, second, last = units
     yield f"  {'law':<20}{'verdict':<15}{'steps':>5}{first:>9}{second:>9}{'occluded':>9}{last:>10}".rstrip()
     for trace in value["laws"]:
         first, second, last = (_number(trace[key]) if key else "" for key in keys)
+        hidden, *others = (trace[f"self_occluded_steps_{view}"] for view in trace["view"])
         yield (
             f"  {run_name(trace['law'], trace['mode']):<20}{trace['verdict']:<15}{trace['steps']:>5}"
             f"{first:>9}{second:>9}"
-            f"{trace['self_occluded_steps_left']:>5}/{trace['self_occluded_steps_right']:<3}{last:>10}"
+            f"{hidden:>5}{''.join(f'/{steps}' for steps in others):<4}{last:>10}"
         ).rstrip()
     for name, said in _NOTES.items():
         for reason in dict.fromkeys(trace[name] for trace in value["laws"] if trace[name]):

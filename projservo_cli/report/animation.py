@@ -1,4 +1,4 @@
-"""Runs that move: the 3D view, one page of HTML that needs no network, and the animation of both images.
+"""Runs that move: the 3D view, one page of HTML that needs no network, and the animation of the images.
 
 The view is drawn by plotly and has a time slider; the animation has a column a law.
 """
@@ -20,7 +20,7 @@ from projservo_cli.report.figures.images import frames_of, near_pixels, with_hal
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
 from projservo_cli.report.figures.scene import goal_displacement, plant_pyramids, skeleton
 from projservo_cli.report.html import html_page
-from projservo_cli.report.report_data import PAGE_FILE, VIEWS, title
+from projservo_cli.report.report_data import PAGE_FILE, title
 from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.task.face import center_of
@@ -41,18 +41,16 @@ const far = Math.min(3, Math.max(1, 1050 / plot.clientWidth));
 const {x, y, z} = plot.layout.scene.camera.eye;
 Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}});
 """
-_CAMERAS = tuple(line["color"] for line in style.VIEW_LINES)
 _SEEN, _HIDDEN = style.SKY, style.VERMILION
 _KEY = (
     ("robot, face at the start", style.BLACK),
     ("face", _SEEN),
     ("face, hidden from a camera", _HIDDEN),
     ("markers", style.GREY),
-    ("left camera", _CAMERAS[0]),
-    ("right camera", _CAMERAS[1]),
     ("goal, planned path of the centre", style.PURPLE),
     ("driven path of the centre", style.GREEN),
 )
+_CAMERAS_AT = 4  # place of the cameras in this key
 _TREES = (("search tree from the start", "#9cc9e8"), ("search tree from the goals", "#dcb4cd"))
 _AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
 _PLAYING = _AT_ONCE | {"frame": {"duration": FRAME_MS, "redraw": True}, "fromcurrent": True}
@@ -63,7 +61,7 @@ class _Driven(NamedTuple):
 
     verdict: str
     seconds: FloatArray  # (k,)
-    hidden: BoolArray  # (k, 2) whether the face is hidden from each camera
+    hidden: BoolArray  # (k, V) whether the face is hidden from each camera
     path: FloatArray  # (t, 3) centre of the face at every instant of the run
     robot: FloatArray  # (k, j, 3) from its base to the tool
     face: FloatArray  # (k, m, 3) in cyclic order
@@ -73,7 +71,8 @@ class _Driven(NamedTuple):
 class _Motion(NamedTuple):
     """Static parts of the view, in m in the base frame, and the runs by name."""
 
-    cameras: FloatArray  # (2, 5, 3) optical centre and image corners of both viewing pyramids
+    view: tuple[str, ...]  # names of the views
+    cameras: FloatArray  # (V, 5, 3) optical centre and image corners of the viewing pyramids
     start: FloatArray  # (m, 3) corners of the face
     goal: FloatArray | None  # the same, None where only images of the goal are known
     planned: FloatArray  # (s, 3) centre of the face along the joints of the plan, as far as they follow it
@@ -95,7 +94,7 @@ def motion_of(
     runs = {name: _driven(robot, plant, markers, trace) for name, trace in traces.items()}
     edges = () if plan.tree_q is None else tree_edges(plan)
     trees = tuple(with_gaps(_centers(plant, q.reshape(-1, q.shape[-1]))) for q in edges)
-    return _Motion(plant_pyramids(plant, start), start, goal, planned, trees, runs)
+    return _Motion(plan.view, plant_pyramids(plant, start), start, goal, planned, trees, runs)
 
 
 def _sample_times(q: FloatArray) -> IntArray:
@@ -150,7 +149,8 @@ def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
         div_id="scene",
         post_script=_NEARER,
     )
-    key = _KEY + (_TREES if motion.trees else ())
+    cameras = [(line["label"], line["color"]) for line in style.view_lines(motion.view)]
+    key = [*_KEY[:_CAMERAS_AT], *cameras, *_KEY[_CAMERAS_AT:], *(_TREES if motion.trees else ())]
     text = html_page("view.html", name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=key)
     write_whole(path, text)
 
@@ -177,7 +177,10 @@ def _figure(motion: _Motion) -> Any:
             {"label": "▶ play", "method": "animate", "args": [names, _PLAYING]},
             {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
         ]
-        changed: dict[str, Any] = {"sliders": [_slider(run, names)], "updatemenus[1].buttons": buttons}
+        changed: dict[str, Any] = {
+            "sliders": [_slider(run, names, motion.view)],
+            "updatemenus[1].buttons": buttons,
+        }
         changed |= {f"scene.{axis}axis.range": limits for axis, limits in _extent(motion, run).items()}
         menu.append({"label": title(name), "method": "update", "args": [{"visible": visible}, changed]})
     first: dict[str, Any] = menu[0]["args"][1]
@@ -225,12 +228,12 @@ def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
     return {name: reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
 
 
-def _slider(run: _Driven, names: list[str]) -> dict[str, Any]:
+def _slider(run: _Driven, names: list[str], views: tuple[str, ...]) -> dict[str, Any]:
     """A step for each instant; its label stands above the slider."""
     steps = []
     for name, seconds, hidden in zip(names, run.seconds, run.hidden, strict=True):
-        views = " and ".join(view for view, behind in zip(VIEWS, hidden, strict=True) if behind)
-        label = f"{seconds:.2f} s" + (f", hidden from {views}" if views else "")
+        blind = " and ".join(name for name, behind in zip(views, hidden, strict=True) if behind)
+        label = f"{seconds:.2f} s" + (f", hidden from {blind}" if blind else "")
         label += f", {run.verdict}" if name == names[-1] else ""
         steps.append({"label": label, "method": "animate", "args": [[name], _AT_ONCE], "value": name})
     return {
@@ -245,10 +248,10 @@ def _slider(run: _Driven, names: list[str]) -> dict[str, Any]:
 
 
 def _still(go: Any, motion: _Motion) -> Iterator[Any]:
-    for pyramid, name, color in zip(motion.cameras, VIEWS, _CAMERAS, strict=True):
+    for pyramid, camera in zip(motion.cameras, style.view_lines(motion.view), strict=True):
         apex, corners = pyramid[:1], style.closed(pyramid[1:])
         edges = np.concatenate([np.concatenate([corner[None], apex, corner[None]]) for corner in corners])
-        yield _line(go, edges, f"{name} camera", color, width=3)
+        yield _line(go, edges, camera["label"], camera["color"], width=3)
     yield _line(go, style.closed(motion.start), "face at the start", style.BLACK, width=3)
     if motion.goal is not None:
         yield _line(go, style.closed(motion.goal), "face at the goal", style.PURPLE, width=4)
@@ -310,11 +313,12 @@ def write_animation(
     direct = [name for name in traces if name in BODY_LAWS]
     pair = [*direct[:1], *(name for name in traces if name in POINT_LAWS)]
     columns = {name: traces[name] for name in (pair if len(pair) > 1 else [*traces])[:_MOST_COLUMNS]}
-    extent = image_sizes(size).max(axis=0)
+    sizes = image_sizes(size, len(next(iter(traces.values())).view))
     if size is None:
-        extent = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
+        seen = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
+        sizes = np.broadcast_to(seen, sizes.shape)
     images = []
-    for pixels in _frames(columns, order, extent):
+    for pixels in _frames(columns, order, sizes):
         images.append(Image.fromarray(pixels))
         progress("animation", len(images), FRAMES)
     # The last frame has all colours; one palette for all keeps what does not move the same.
@@ -329,7 +333,7 @@ def write_animation(
         first.save(temporary, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
 
 
-def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> Iterator[Any]:
+def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> Iterator[Any]:
     """Draw one frame after another, a column a run; yields the pixels (height, width, 3) of each.
 
     They go from the start to the end of the longest run that converged, if any did.
@@ -337,6 +341,7 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
     ends = [run.period * run.steps for run in traces.values() if run.verdict == "converged"]
     end = max(ends or [run.period * run.steps for run in traces.values()])
     every = [t[:, :, order].reshape(-1, 2) for run in traces.values() for t in (run.s, run.s_star[None])]
+    size, views = sizes.max(axis=0), len(sizes)
     near = near_pixels(np.concatenate(every), size)
     films = {name: frames_of(run, width=_FILM_WIDTH) for name, run in traces.items()}
     margin = 0.06
@@ -346,23 +351,23 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
     columns: list[list[_Panel]] = []
 
     def draw(runs: Mapping[str, Trace], figure: "style.Figure") -> None:
-        axes = figure.subplots(2, len(runs), squeeze=False, sharex=True, sharey=True)
+        axes = figure.subplots(views, len(runs), squeeze=False, sharex=True, sharey=True)
         for column, (name, run) in zip(axes.T, runs.items(), strict=True):
-            for view, (panel, camera) in enumerate(zip(column, VIEWS, strict=True)):
+            for view, (panel, camera) in enumerate(zip(column, run.view, strict=True)):
                 style.start_and_goal(panel, run.s[0, view, order], run.s_star[view, order], fill=False)
                 style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near, margin)
                 panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
-                panel.set_xlabel("u (px)" if view else "")
-            views = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
-            columns.append([_Panel(*view) for view in views])
+                panel.set_xlabel("u (px)" if view == views - 1 else "")
+            parts = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
+            columns.append([_Panel(*part) for part in parts])
             if (film := films[name]) is not None and run.frame_index is not None:
-                for panel, frames in zip(columns[-1], film.swapaxes(0, 1), strict=True):
-                    panel.over(frames, run.frame_index, size)
+                for panel, frames, extent in zip(columns[-1], film, sizes, strict=True):
+                    panel.over(frames, run.frame_index, extent)
         style.legend_below(figure, 4 if len(runs) > 2 else 2)
         figure.suptitle("time 00.00 s", fontsize=9)
 
     with style.styled():
-        figure = style.drawn(draw, traces, 2.0 * _PANEL * style.aspect(near) + 1.6, width)
+        figure = style.drawn(draw, traces, views * _PANEL * style.aspect(near) + 1.6, width)
         for seconds in np.linspace(0.0, end, FRAMES):
             figure.suptitle(f"time {seconds:.2f} s", fontsize=9)
             for column, (name, run) in zip(columns, traces.items(), strict=True):

@@ -1,7 +1,7 @@
 """Claims of the paper about its method against the runs; no verdict is fixed beforehand."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +38,17 @@ class _Claim(NamedTuple):
 def _listed(values: FloatArray) -> str:
     """Numbers as a list in words, three digits each, large ones whole."""
     return ", ".join(f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in np.atleast_1d(values))
+
+
+def _joined(words: Iterable[object]) -> str:
+    """Words in a list with an "and" before the last."""
+    *first, last = map(str, words)
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _cameras(views: int, two: str, more: str) -> str:
+    """Cameras of a rig of so many views, with a word for two and another for more."""
+    return "the camera" if views == 1 else f"{two if views == 2 else more} camera{'s' * (two == 'both')}"
 
 
 # A curve follows an exponential where each step's factor is within this share of 1 - gain·period, over enough
@@ -318,13 +329,13 @@ def _classical(report_data: ReportData) -> Iterator[_Claim]:
 
 
 def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
-    left, right = trace.self_occluded_steps_left, trace.self_occluded_steps_right
+    hidden, cameras = trace.self_occluded_steps, _joined(trace.view)
     yield _Claim(
         f"{title_of(law)}: runs through self-occlusion, then converges",
         "section 6, Fig. 4",
-        f"{left} and {right} self-occluded steps in the left and right camera; {trace.verdict}",
-        "steps in both cameras, verdict converged",
-        left > 0 and right > 0 and trace.verdict == "converged",
+        f"{_joined(hidden)} self-occluded steps in the {cameras} camera; {trace.verdict}",
+        f"steps in {_cameras(len(hidden), 'both', 'all')}, verdict converged",
+        min(hidden) > 0 and trace.verdict == "converged",
     )
     stretch = plateau_stretch(trace.convergence_error, window)
     measured = "none"
@@ -348,7 +359,7 @@ def _planned(report_data: ReportData) -> _Claim:
         "The planned trajectory avoids self-occlusion",
         "sections 4.3 and 6, Figs. 5 and 6",
         f"minimum margin {plan.margin.min():.3f} (1 at the start); ends {miss:.2g} px from the goal images",
-        "margin positive in both cameras all along",
+        f"margin positive in {_cameras(len(plan.view), 'both', 'all')} all along",
         bool(plan.margin.min() > 0),
     )
 
@@ -358,15 +369,16 @@ def _direct(report_data: ReportData) -> Iterator[_Claim]:
     traces = {law: report_data.traces[law] for law in DIRECT if law in report_data.traces}
     if traces:
         counts = [
-            f"{title_of(law)} {trace.self_occluded_steps_left} left, {trace.self_occluded_steps_right} right"
-            for law, trace in traces.items()
+            f"{title_of(law)} "
+            + ", ".join(f"{n} {view}" for n, view in zip(t.self_occluded_steps, t.view, strict=True))
+            for law, t in traces.items()
         ]
-        total = sum(t.self_occluded_steps_left + t.self_occluded_steps_right for t in traces.values())
+        total = sum(sum(trace.self_occluded_steps) for trace in traces.values())
         yield _Claim(
             "No self-occlusion under direct control",
             "sections 4.2 and 7",
             f"self-occluded steps: {'; '.join(counts)}",
-            "no step in either camera",
+            f"no step in {_cameras(len(report_data.view), 'either', 'any')}",
             total == 0,
         )
     if len(traces) == len(DIRECT):
@@ -384,8 +396,8 @@ def _direct(report_data: ReportData) -> Iterator[_Claim]:
         yield _Claim(
             "The centre moves horizontally in the images: its ordinate stays constant",
             "section 6, Fig. 11",
-            f"ordinate varies by {variation[0]:.1f} and {variation[1]:.1f} px while the abscissa travels "
-            f"{travel[0]:.0f} and {travel[1]:.0f} px (left, right)",
+            f"ordinate varies by {_joined(f'{v:.1f}' for v in variation)} px while the abscissa travels "
+            f"{_joined(f'{u:.0f}' for u in travel)} px ({', '.join(report_data.view)})",
             f"variation at most {_LEVEL_SHARE:.0%} of the travel",
             bool((variation <= _LEVEL_SHARE * travel).all()),
         )

@@ -1,8 +1,8 @@
-"""Pages of both images: of a preflight, of a recording, and live in a browser of this machine."""
+"""Pages of the images: of a preflight, of a recording, and live in a browser of this machine."""
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from projservo_cli.detection import opencv
 from projservo_cli.hardware.checks_at_rest import Finding
-from projservo_cli.records import CORNERS, VIEWS, ByteArray, FloatArray
+from projservo_cli.records import CORNERS, ByteArray, FloatArray
 from projservo_cli.report.html import embedded, html_page
 
 # Grey values are drawn over in BGR: found tags, and the goal.
@@ -40,31 +40,31 @@ def annotated(grey: ByteArray, marker: Sequence[int], pixels: FloatArray, goal: 
     return bytes(cv.imencode(".jpg", image, [cv.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
 
 
-def preflight_page(name: str, findings: Sequence[Finding], pictures: Sequence[bytes]) -> str:
-    """One file of HTML with the findings of a preflight and both pictures, JPEG."""
+def preflight_page(name: str, findings: Sequence[Finding], pictures: Mapping[str, bytes]) -> str:
+    """One file of HTML with the findings of a preflight and the pictures, JPEG, by views."""
     title = f"Preflight of {name}"
     return html_page("cameras.html", title=title, images=_within(pictures), findings=findings)
 
 
-def recording_page(name: str, done: str, pictures: Sequence[bytes], *, whole: bool) -> str:
+def recording_page(name: str, done: str, pictures: Mapping[str, bytes], *, whole: bool) -> str:
     """One file of HTML that shows how far a recording is, and loads itself again until it is whole."""
     title = f"Recording {name}"
     return html_page("cameras.html", title=title, images=_within(pictures), text=done, reloads=not whole)
 
 
-def _within(pictures: Sequence[bytes]) -> dict[str, str]:
-    """Addresses of the pictures, JPEG, of both views within a page."""
-    return {view: embedded(picture, "image/jpeg") for view, picture in zip(VIEWS, pictures, strict=False)}
+def _within(pictures: Mapping[str, bytes]) -> dict[str, str]:
+    """Addresses of the pictures, JPEG, of the views within a page."""
+    return {view: embedded(picture, "image/jpeg") for view, picture in pictures.items()}
 
 
 class LivePage:
-    """Both images on a page that this machine alone can open, at ``url``, until it is closed.
+    """The images on a page that this machine alone can open, at ``url``, until it is closed.
 
-    name : of the configuration. port : 0 for any that is free.
+    name : of the configuration. views : their names. port : 0 for any that is free.
     """
 
-    def __init__(self, name: str, port: int = 0) -> None:
-        images = {view: f"/{view}.mjpg" for view in VIEWS}
+    def __init__(self, name: str, views: Sequence[str], port: int = 0) -> None:
+        images = {view: f"/{view}.mjpg" for view in views}
         title, note = f"Live images of {name}", "Ctrl-C in the terminal ends it."
         text = html_page("cameras.html", title=title, images=images, text=note)
         self.pictures: dict[str, bytes] = {}
@@ -76,8 +76,8 @@ class LivePage:
             def do_GET(self) -> None:
                 """Answer a browser."""
                 view = self.path.strip("/").removesuffix(".mjpg")
-                self.send_response(200 if self.path == "/" or view in VIEWS else 404)
-                if view not in VIEWS:
+                self.send_response(200 if self.path == "/" or view in views else 404)
+                if view not in views:
                     self.send_header("Content-Type", "text/html; charset=utf-8")
                     self.end_headers()
                     self.wfile.write(text.encode() if self.path == "/" else b"not found")

@@ -26,7 +26,6 @@ from projservo_cli.report.report_data import (
     ANIMATION_FILE,
     PAGE_FILE,
     VIEW_FILE,
-    VIEWS,
     FigureSpec,
     stage_object,
     title,
@@ -226,7 +225,7 @@ def _visibility(plan: Plan) -> dict[str, Any]:
             "theta_0": np.degrees(plan.theta_0[v]).tolist(),
             "sense_margins": plan.sense_margin[:, v].tolist(),
         }
-        for v, name in enumerate(VIEWS)
+        for v, name in enumerate(plan.view)
     ]
     return {"views": views, "senses": np.degrees(plan.sense).tolist()}
 
@@ -238,6 +237,7 @@ def _law(trace: dict[str, Any], about: About) -> dict[str, Any]:
         "words": _law_words(trace),
         "converged": trace["verdict"] == "converged",
         "must": must_converge(trace["law"], about.required),
+        "hidden": tuple(trace[f"self_occluded_steps_{view}"] for view in trace["view"]),
     }
 
 

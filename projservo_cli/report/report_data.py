@@ -4,7 +4,6 @@ Terminal output, JSON and the page use the plain values; figures and claims are 
 run, the truth behind it, and numbers read off both.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,6 +30,7 @@ from projservo_cli.records import (
     Observation,
     Plan,
     Trace,
+    scalars_of,
 )
 from projservo_cli.report import style
 from projservo_cli.settings.task import Trajectory
@@ -69,7 +69,6 @@ _SHORT_ARRAYS = (
 )
 
 DIRECT = ("direct_three", "direct_two")
-VIEWS = ("left", "right")
 
 
 def title(name: str) -> str:
@@ -104,6 +103,11 @@ class Fit:
     held_out: CrossValidation | None = field(default=None, kw_only=True)  # its cross-validation, if any
     metric: Metric | None = field(default=None, kw_only=True)  # in metres; None where it cannot be had
     no_metric: str = field(default="", kw_only=True)  # why not
+
+    @property
+    def view(self) -> tuple[str, ...]:
+        """Names of the views."""
+        return self.calibration.view
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +166,7 @@ class ReportData(Fit):
         return np.asarray(np.linalg.norm(trace.center - self.goal_center(trace), axis=1))
 
     def center_image(self, trace: Trace) -> FloatArray:
-        """Pixels (k, 2, 2) of the true centre in both views."""
+        """Pixels (k, V, 2) of the true centre in the views."""
         points = np.c_[trace.center, np.ones(len(trace.center))]
         return project(self.plant.model.P, points).swapaxes(0, 1)
 
@@ -302,10 +306,10 @@ def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequen
     if stage == "plan":
         return path | _plan(run)
     if stage == "servo":
-        return path | {"laws": [_scalars(run.traces[law]) for law in laws]}
+        return path | {"laws": [scalars_of(run.traces[law]) for law in laws]}
     page = run.path.parent / PAGE_FILE
     report = run.results["report"].records[""]
-    return path | {"page": page.resolve() if page.is_file() else None} | _scalars(report)
+    return path | {"page": page.resolve() if page.is_file() else None} | scalars_of(report)
 
 
 def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str]) -> dict[str, Any]:
@@ -316,14 +320,8 @@ def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
         return failure | {"usable": False, "lens": None, "rejected": None, "unshown": None} | numbers | lists
     if stage == "servo":
-        return failure | {"laws": [_scalars(run.traces[law]) for law in laws]}
+        return failure | {"laws": [scalars_of(run.traces[law]) for law in laws]}
     return failure | {"feasible": False} if stage == "plan" else failure
-
-
-def _scalars(record: Any) -> dict[str, Any]:
-    """All fields of a record but its arrays."""
-    fields = [field.name for field in dataclasses.fields(record) if "dims" not in field.metadata]
-    return {name: getattr(record, name) for name in fields}
 
 
 def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
@@ -346,8 +344,8 @@ def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:
             view: {"center_px": [u, v], "radius_px": r, "k1": k1, "k2": k2}
             for view, (u, v, r, k1, k2) in terms
         }
-    held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
-    values = _scalars(calibration) | {name: getattr(calibration, name) for name in _SHORT_ARRAYS}
+    held_out = {"cross_validation": scalars_of(run.cross_validation)} if run.cross_validation else {}
+    values = scalars_of(calibration) | {name: getattr(calibration, name) for name in _SHORT_ARRAYS}
     del values["model_error"], values["unshown_error"]
     of_refits = zip(
         values.pop("refit"),
@@ -376,7 +374,7 @@ def _in_words(error: ModelError, calibration: Calibration) -> dict[str, Any]:
 
 def _plan(run: Run) -> dict[str, Any]:
     """Plain values of a plan, angles in deg, and the smallest margins along it."""
-    plan, values = run.plan, _scalars(run.plan)
+    plan, values = run.plan, scalars_of(run.plan)
     angles = {f"{name}_deg": math.degrees(values.pop(name)) for name in ("theta_r", "theta_p", "theta_s")}
     nearest = zip(NEAREST, plan.min_margin, plan.min_margin_mu, strict=True)
     return (

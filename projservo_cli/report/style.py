@@ -18,6 +18,7 @@ from projservo_cli.records import BoolArray, FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
     from matplotlib.figure import Figure as Figure
+    from matplotlib.gridspec import GridSpec
 
 FORMATS = ("svg", "pdf", "png")
 WIDTH = 6.9  # inches across both columns of a page
@@ -29,6 +30,7 @@ IMAGE = "image"  # label of axes that show pixels
 # M. Okabe, K. Ito, "Color Universal Design", 2008; ordered so that neighbours differ in lightness.
 BLACK, ORANGE, BLUE, SKY = "#000000", "#E69F00", "#0072B2", "#56B4E9"
 VERMILION, GREEN, PURPLE = "#D55E00", "#009E73", "#CC79A7"
+BROWN, VIOLET = "#7F4F24", "#5E3C99"  # of further cameras: the others have their meaning in the same figures
 GREY, PALE = "#999999", "#DDDDDD"
 SOLID, NO_LINE = "-", "none"
 DASHED, DOTTED, DASH_DOTTED = (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5))
@@ -62,15 +64,18 @@ def patch(color: str, label: str = "", **more: Any) -> LineStyle:
     return {"facecolor": color, "label": label} | more
 
 
-# The face at the start and at the goal, the views and the laws look the same in every figure.
+# The face at the start and at the goal, and the laws look the same in every figure.
 START, GOAL = line(BLACK, width=1.4, label="start"), line(BLUE, DASHED, label="goal")
-VIEW_LINES = (line(BLUE, label="left camera"), line(ORANGE, DASHED, label="right camera"))
 LAW_LINES = {
     "direct_three": line(GREEN, width=1.2),
     "direct_two": line(PURPLE, DASHED, 1.2),
     "stacked": line(VERMILION, DASHED, 1.1),
 }
 HIDDEN = line(ORANGE, width=4.0, label="face hidden from this camera", alpha=0.6, solid_capstyle="butt")
+# Colour and dashes of the views, the same in every figure; from the fifth view on they come again.
+_VIEWS: tuple[tuple[str, Any], ...] = (
+    *((BLUE, SOLID), (ORANGE, DASHED), (BROWN, DASH_DOTTED), (VIOLET, (0, (3, 1, 1, 1, 1, 1)))),
+)
 _FIRST_MARKER = 3.0  # size of the dot on the first marker of a face, points
 
 _RC: Any = {
@@ -209,6 +214,29 @@ def curve(index: int, label: str = "", *, marker: bool = False) -> LineStyle:
     thin: LineStyle = {"linewidth": 0.7} if again else {}
     hollow: LineStyle = {"markerfacecolor": "white"} if again and marker else {}
     return line(color, dash, marker=symbol if marker else "", label=label, **thin, **hollow)
+
+
+def view_lines(names: Iterable[str]) -> list[LineStyle]:
+    """A style for each of the views, which names its camera."""
+    return [line(*_VIEWS[v % len(_VIEWS)], label=f"{name} camera") for v, name in enumerate(names)]
+
+
+def separator(views: int) -> str:
+    """Text between a camera and what else a title says: panels of more than two in a row are narrow."""
+    return "\n" if views > 2 else ", "
+
+
+def images_above(figure: "Figure", views: int, heights: Sequence[float]) -> tuple["GridSpec", list[Any]]:
+    """A grid whose first row holds images side by side, with their cells, and whose others have two halves."""
+    grid = figure.add_gridspec(len(heights), int(np.lcm(2, views)), height_ratios=heights)
+    columns = np.split(np.arange(grid.ncols), views)
+    return grid, [grid[0, int(part[0]) : int(part[-1]) + 1] for part in columns]
+
+
+def name_first_ordinate(panels: Sequence["Axes"]) -> None:
+    """Leave the name of the ordinate to the first of more than two panels, which stand closer."""
+    for panel in panels[1:] if len(panels) > 2 else ():
+        panel.set_ylabel("")
 
 
 def zero_line(axes: "Axes") -> None:

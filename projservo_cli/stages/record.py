@@ -329,7 +329,8 @@ def _show(recording: _Recording, robot: PluginRobot) -> None:
         for grey, s in zip(robot.frames, last.s, strict=True)
     ]
     done = f"{len(recording.done)} of {len(recording.targets)} poses; {recording.note(robot.bounds.units)}"
-    text = recording_page(recording.path.name, done, pictures, whole=not recording.pending)
+    by_view = dict(zip(VIEWS, pictures, strict=True))
+    text = recording_page(recording.path.name, done, by_view, whole=not recording.pending)
     write_whole(recording.path.with_suffix(".html"), text)
 
 

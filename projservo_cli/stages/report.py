@@ -13,7 +13,7 @@ from projservo_cli import provenance
 from projservo_cli.files import replacing, require_inside, write_whole
 from projservo_cli.image_size import ImageSize
 from projservo_cli.metric.frame import Metric, Scale
-from projservo_cli.records import Calibration, InputError, Report, Trace, WorkFailed
+from projservo_cli.records import VIEWS, Calibration, InputError, Report, Trace, WorkFailed
 from projservo_cli.report import style
 from projservo_cli.report.animation import motion_of, write_animation, write_view
 from projservo_cli.report.claims import claims_of
@@ -181,6 +181,8 @@ def draw_all(
                 left_out.append({"what": f"{spec.name}, in part", "reason": partial})
             data = spec.data(report_data)
             numbers = {name: array for name, array in data.items() if array.dtype != np.uint8}
+            if tuple(data.get("view", VIEWS)) == VIEWS:  # which need no names
+                numbers.pop("view", None)
             contents = {_NUMBERS: to_csv(numbers).encode(), **style.contents(spec.drawn(data), formats)}
         for kind in {*style.FORMATS, _NUMBERS} - {*contents}:
             (folder / f"{spec.name}.{kind}").unlink(missing_ok=True)

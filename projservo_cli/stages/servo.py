@@ -276,14 +276,14 @@ class LawRun:
             pose, goal_pose = _reported_poses(scenario, _whole(driven.truths, rows))
             values["position_error_mm"] = MM * float(np.linalg.norm(goal_pose[:3, 3] - pose[-1, :3, 3]))
             values["rotation_error_deg"] = math.degrees(angle_between(mat(pose[-1]), mat(goal_pose)))
+        hidden = log.hidden[:rows] > 0.5
         numbers: dict[str, Any] = {n: None if math.isnan(values[n]) else values[n] for n in _SUMMARY_FIELDS}
-        if scenario.view != VIEWS:
-            numbers |= dict.fromkeys(("self_occluded_steps_left", "self_occluded_steps_right"))
         if simulated:
             numbers["success"] = values["success"] == 1.0
         return Trace(
             **numbers,
             view=scenario.view,
+            self_occluded_steps=tuple(hidden.sum(axis=0).tolist()),
             law=self.law,
             mode=self.mode,
             planned_s=self.planned_s,
@@ -313,7 +313,7 @@ class LawRun:
             views_used=views,
             q_dot=log.q_dot[:steps],
             speed_factor=log.factor[:steps],
-            self_occluded=log.hidden[:rows] > 0.5,
+            self_occluded=hidden,
             pose=pose,
             goal_pose=goal_pose,
             center=center if simulated else np.full_like(center, np.nan),

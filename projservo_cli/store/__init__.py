@@ -31,6 +31,7 @@ from pydantic import TypeAdapter, ValidationError
 from projservo_cli.files import replacing
 from projservo_cli.records import (
     SIZES,
+    VIEWS,
     Calibration,
     CrossValidation,
     InputError,
@@ -38,6 +39,7 @@ from projservo_cli.records import (
     Plan,
     Report,
     Trace,
+    scalars_of,
 )
 
 if typing.TYPE_CHECKING:
@@ -341,8 +343,9 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
         if value is not None and "dims" in field.metadata:
             arrays[field] = np.asarray(value)
             _require_sizes(field.name, field.metadata["dims"], arrays[field].shape, sizes)
-        elif value is not None:
-            group.attrs[field.name] = as_attribute(value)
+    for name, scalar in scalars_of(record).items():
+        if scalar is not None:
+            group.attrs[name] = as_attribute(scalar)
     group.dimensions.update({dim: sizes[dim] for field in arrays for dim in field.metadata["dims"]})
     for field, value in arrays.items():
         boolean = value.dtype == np.bool_
@@ -394,18 +397,24 @@ def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
     if attribute(group, "record", str) != kind.__name__:
         raise ValueError(f"{group.name} is no {kind.__name__}")
     hints, own = typing.get_type_hints(kind), dict(sizes)
+    views = attribute(group, "view", list) if "view" in group.attrs else VIEWS
     values: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
         name, dims, hint = field.name, field.metadata.get("dims"), hints[field.name]
         optional = type(None) in typing.get_args(hint)
         inner = typing.get_args(hint)[0] if optional else hint
-        if name not in (group.attrs if dims is None else group) and (optional or _has_default(field)):
+        if "by_view" in field.metadata:
+            each, names = typing.get_args(hint)[0], (f"{name}_{view}" for view in views)
+            values[name] = tuple(_value(one, attribute(group, one), each) for one in names)
+        elif name not in (group.attrs if dims is None else group) and (optional or _has_default(field)):
             values[name] = field.default if _has_default(field) else None
         elif dims is None:
             values[name] = _value(name, attribute(group, name), inner)
         else:
             values[name] = _array(_member(group, name), dims, inner, own)
     _require_names(group, {*values, *own})
+    if "view" in values and len(values["view"]) != own.get("view", len(values["view"])):
+        raise ValueError(f"{group.name} has arrays of {own['view']} views, named {', '.join(views)}")
     if "joint" in own:
         sizes["joint"] = own["joint"]
     if "joint_types" in values and not re.fullmatch(f"[RP]{{{own['joint']}}}", values["joint_types"]):

@@ -207,7 +207,8 @@ class SweepTable:
         if name == "law" and name not in self.names:  # where an axis of another name sets it
             return np.full(self.rows, "all")
         if name == "self_occluded":
-            return (self["self_occluded_steps_left"] > 0) | (self["self_occluded_steps_right"] > 0)
+            hidden = [self[name] > 0 for name in self.names if name.startswith("self_occluded_steps_")]
+            return np.any(hidden, axis=0)
         if name == "left_image":
             return self["first_outside_image"] >= 0
         if name == "path_length_ratio":

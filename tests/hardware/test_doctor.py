@@ -335,7 +335,7 @@ def test_a_camera_that_repeats_one_frame_is_named(rail, tmp_path, frozen, where,
 
 
 def test_a_live_page_serves_both_images_to_this_machine_alone():
-    page = LivePage("arm <1>")
+    page = LivePage("arm <1>", ("left", "right"))
     assert page.url.startswith("http://127.0.0.1:")
     page.pictures["left"] = b"JPEG-1"
     with urllib.request.urlopen(page.url, timeout=5) as answer:

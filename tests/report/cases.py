@@ -14,8 +14,8 @@ from projservo_cli.report.report_data import ReportData
 from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.stages import studies
 from projservo_cli.stages.report import in_metres
-from tests.configured import record
-from tests.fake_records import fake
+from tests.configured import record, truth_of
+from tests.fake_records import fake, seen_by
 from tests.known import configured, driven, known_scenario, planned
 
 SHORT = 4
@@ -74,6 +74,40 @@ def case(name="paper", steps=SHORT, whole=False):
             trajectory=scenario.inputs.trajectory,
             metric=metric,
         ),
+    )
+
+
+@lru_cache
+def seen(names, name="paper"):
+    """The material of a task seen by cameras of other names: the left and the right one in turn."""
+    config, _, material = case(name)
+    chosen = [v % 2 for v in range(len(names))]
+
+    def of(model):
+        return model._replace(P=model.P[chosen], lens=model.lens[chosen])
+
+    def traced(runs):
+        return {key: seen_by(trace, names) for key, trace in runs.items()}
+
+    plant, studied, model = material.plant, material.studies, of(material.calibrated)
+    plant = plant._replace(
+        model=of(plant.model),
+        **{field: getattr(plant, field)[chosen] for field in ("O", "visible", "image_size")},
+    )
+    calibration = known(config, truth_of(config), model, material.observation.q)
+    calibration = replace(calibration, view=names)
+    metric, no_metric = in_metres(calibration, report_inputs(config).lengths)
+    return replace(
+        material,
+        calibration=calibration,
+        observation=seen_by(material.observation, names),
+        calibrated=model,
+        plant=plant,
+        plan=seen_by(material.plan, names),
+        traces=traced(material.traces),
+        studies=replace(studied, **{of: traced(getattr(studied, of)) for of in ("sweep", "own", "rate")}),
+        metric=metric,
+        no_metric=no_metric,
     )
 
 

@@ -49,7 +49,7 @@ def of_calibration(
 
 
 def of_plan(plan: Plan, scene: Any) -> "Figure":
-    """Draw figure 16: the motion in both images, its joints and its margins over time.
+    """Draw figure 16: the motion in the images, its joints and its margins over time.
 
     scene : has ``model``, ``limits``, ``image_size`` and ``trajectory``.
     """
@@ -69,7 +69,7 @@ def of_plan(plan: Plan, scene: Any) -> "Figure":
 
 
 def of_trace(trace: Trace, markers: tuple[int, ...]) -> "Figure":
-    """Draw figure 11, without the centre of the face: errors of its markers in both images over time."""
+    """Draw figure 11, without the centre of the face: errors of its markers in the images over time."""
     data = {
         "t_s": trace.period * np.arange(len(trace.s)),
         "e": trace.s - trace.s_star,

@@ -201,21 +201,19 @@ def _expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
     _data,
     height=7.8,
     task=False,
-    alt="Residuals as arrows in both images; their histogram with the noise model; rms residual "
+    alt="Residuals as arrows in the images; their histogram with the noise model; rms residual "
     "of each pose over its predicted error; range of each joint; eigenvalues of the information "
     "matrix.",
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
-    """Residuals over both images; their histogram and error of each pose; excitation and information."""
+    """Residuals over the images; their histogram and error of each pose; excitation and information."""
     views = [name.removeprefix("seen_") for name in data if name.startswith("seen_")]
     grid = figure.add_gridspec(3, 2, height_ratios=(1.15, 1.0, 0.9))
     images = grid[0, :].subgridspec(1, len(views))
-    many = len(views) > 2
-    for v, view in enumerate(views):
-        axes = figure.add_subplot(images[0, v])
-        _arrows(axes, data, view, "\n" if many else ", ")
-        if many and v:  # panels stand closer
-            axes.set_ylabel("")
+    cameras = [figure.add_subplot(images[0, v]) for v in range(len(views))]
+    for axes, view in zip(cameras, views, strict=True):
+        _arrows(axes, data, view, style.separator(len(views)))
+    style.name_first_ordinate(cameras)
     panels = [[figure.add_subplot(grid[i, j]) for j in (0, 1)] for i in (1, 2)]
     _histogram(panels[0][0], data)
     _poses(panels[0][1], data)

@@ -1,4 +1,4 @@
-"""Figs. 4, 7 and 11 of [RH00], the overview and frames: paths and errors of the markers in both images."""
+"""Figs. 4, 7 and 11 of [RH00], the overview and frames: paths and errors of the markers in the images."""
 
 import io
 
@@ -11,7 +11,6 @@ from projservo_cli.records import ByteArray, FloatArray, IntArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import (
     DIRECT,
-    VIEWS,
     Data,
     Driven,
     ReportData,
@@ -23,7 +22,7 @@ from projservo_cli.task.face import cyclic_order
 
 _OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
 _NEAR_BORDER = 0.42  # distance from the middle, as a share of the image, from which its border shows
-_PANEL_WIDTH = 2.9  # inches, of one of two panels side by side
+_PANELS_WIDTH, _PANEL_WIDTH = 5.8, 3.6  # inches, of all panels side by side, and of one at most
 _PATH = style.line(style.BLACK, width=0.9, label="path of a marker")
 _PLATEAU = style.line(style.VERMILION, width=2.0, marker="s", label="plateau of the image error")
 _STOPPED = style.dots(style.BLACK, "x", "end of the run", markersize=4)
@@ -45,7 +44,12 @@ def _data_classical(report_data: ReportData) -> Data:
                 f"plateau_{law}": np.array(stretch if stretch is not None else (-1, -1)),
                 f"verdict_{law}": np.array(f"{trace.verdict}, {trace.steps} steps"),
             }
-    return result
+    return result | {"view": np.array(report_data.view)}
+
+
+def _panel_width(views: int) -> float:
+    """Width in inches by which the height of one of V panels side by side is chosen."""
+    return min(_PANELS_WIDTH / views, _PANEL_WIDTH)
 
 
 @registered(
@@ -62,14 +66,17 @@ def _data_classical(report_data: ReportData) -> Data:
 def _draw_classical(data: Data, figure: "style.Figure") -> None:
     """One row a law, one column a camera."""
     laws, size = [law for law in POINT_LAWS if f"s_{law}" in data], data["image_size"]
+    names = data["view"]
     drawn = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
-    near = [[near_pixels(s[:, view], size[view]) for view in range(2)] for s in drawn]
-    heights = [_PANEL_WIDTH * style.aspect(np.concatenate(pixels)) for pixels in near]
-    figure.set_figheight(sum(heights) + 0.62 * len(laws) + 0.45)
-    axes = figure.subplots(len(laws), 2, squeeze=False, height_ratios=heights)
+    near = [[near_pixels(s[:, view], size[view]) for view in range(len(names))] for s in drawn]
+    heights = [_panel_width(len(names)) * style.aspect(np.concatenate(pixels)) for pixels in near]
+    # Of two cameras the second has a name of its own; else each has, below that of the law.
+    titles = 0.62 if len(names) == 2 else 0.78
+    figure.set_figheight(sum(heights) + titles * len(laws) + 0.45)
+    axes = figure.subplots(len(laws), len(names), squeeze=False, height_ratios=heights)
     for row, law, pixels in zip(axes, laws, near, strict=True):
         first, last = data[f"plateau_{law}"]
-        for view, (panel, name) in enumerate(zip(row, VIEWS, strict=True)):
+        for view, (panel, name) in enumerate(zip(row, names, strict=True)):
             s = data[f"s_{law}"][:, view]
             style.paths(panel, s, style.HIDDEN, mask=data[f"hidden_{law}"][:, view])
             style.paths(panel, s, _PATH)
@@ -77,9 +84,13 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
                 style.paths(panel, s[first : last + 1], _PLATEAU | {"markevery": [0]})
             panel.plot(*s[-1].T, **_STOPPED)
             style.start_and_goal(panel, s[0], data[f"s_star_{law}"][view])
-            heading = f"{name} camera" if view else f"{title_of(law)}: {data[f'verdict_{law}']}"
+            heading = f"{name} camera"
+            if not view:
+                below = "" if len(names) == 2 else f"\n{heading}"
+                heading = f"{title_of(law)}: {data[f'verdict_{law}']}{below}"
             style.image_axes(panel, heading, pixels[view])
             border(panel, size[view], pixels[view])
+        style.name_first_ordinate(row)
     style.legend_below(figure, 4)
 
 
@@ -100,7 +111,8 @@ def _data_direct(report_data: ReportData) -> Data:
     """Image paths of both direct laws."""
     order = report_data.plant.order
     result: Data = {f"s_{law}": report_data.traces[law].s[:, :, order] for law in DIRECT}
-    return result | {"s_star": report_data.traces[DIRECT[0]].s_star[:, order]}
+    s_star = report_data.traces[DIRECT[0]].s_star[:, order]
+    return result | {"s_star": s_star, "view": np.array(report_data.view)}
 
 
 @registered(
@@ -109,18 +121,21 @@ def _data_direct(report_data: ReportData) -> Data:
     "Fig. 7, section 6",
     _data_direct,
     laws=DIRECT,
-    alt="Paths of the markers in both camera images under directTHREE and directTWO.",
+    alt="Paths of the markers in the camera images under directTHREE and directTWO.",
 )
 def _draw_direct(data: Data, figure: "style.Figure") -> None:
     """Both laws over one another, one panel a camera."""
     runs = np.concatenate([data[f"s_{law}"] for law in DIRECT])
-    figure.set_figheight(_PANEL_WIDTH * style.aspect(runs) + 1.05)
-    for view, (panel, name) in enumerate(zip(figure.subplots(1, 2), VIEWS, strict=True)):
+    names = data["view"]
+    figure.set_figheight(_panel_width(len(names)) * style.aspect(runs) + 1.05)
+    panels = figure.subplots(1, len(names), squeeze=False)[0]
+    for view, (panel, name) in enumerate(zip(panels, names, strict=True)):
         goal = data["s_star"][view]
         for law in DIRECT:
             style.paths(panel, data[f"s_{law}"][:, view], style.LAW_LINES[law] | {"label": title_of(law)})
         style.start_and_goal(panel, runs[0, view], goal)
         style.image_axes(panel, f"{name} camera", np.concatenate([goal[None], runs[:, view]]))
+    style.name_first_ordinate(panels)
     style.legend_below(figure, 4)
 
 
@@ -134,6 +149,7 @@ def _data_errors(report_data: ReportData) -> Data:
         "center_e": report_data.center_image(trace) - project(report_data.plant.model.P, goal[None])[:, 0],
         "law": np.array(title_of(trace.law)),
         "marker": np.array(report_data.numbers),
+        "view": np.array(trace.view),
     }
 
 
@@ -157,15 +173,16 @@ _COORDINATES = (
 )
 def _draw_errors(data: Data, figure: "style.Figure") -> None:
     """One panel a camera; u solid, v dashed, the centre thick, if it is known."""
-    axes, t, numbers = figure.subplots(1, 2, sharey=True), data["t_s"], data["marker"]
-    for view, (panel, name) in enumerate(zip(axes, VIEWS, strict=True)):
+    t, numbers, names = data["t_s"], data["marker"], data["view"]
+    axes = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    for view, (panel, name) in enumerate(zip(axes, names, strict=True)):
         for k, number in enumerate(numbers):
             every = {"markevery": (k * len(t) // 60, max(1, len(t) // 12))}
             line = style.curve(k, f"marker {number}", marker=True) | _MARKER | every
             _coordinates(panel, t, data["e"][:, view, k], line)
         if "center_e" in data:
             _coordinates(panel, t, data["center_e"][:, view], _CENTER_ERROR | {"label": "centre"})
-        panel.set(title=f"{name} camera, {data['law']}", xlabel="time (s)")
+        panel.set(title=f"{name} camera{style.separator(len(names))}{data['law']}", xlabel="time (s)")
     axes[0].set_ylabel("image error $s - s_*$ (px)")
     style.legend_below(figure, min(len(numbers) + 3, 8), _COORDINATES)
 
@@ -210,21 +227,22 @@ def _data_overview(report_data: ReportData) -> Data:
             f"image_error_{law}": trace.image_error,
             f"verdict_{law}": np.array(f"{title_of(law)}: {end}"),
         }
-    return result
+    return result | {"view": np.array(report_data.view)}
 
 
 @registered(
     "fig00_overview",
-    "One run at a glance: the classical and the direct law in both images, and their errors",
+    "One run at a glance: the classical and the direct law in the images, and their errors",
     "not in the paper",
     _data_overview,
     laws=_OVERVIEW_LAWS,
-    alt="Left: paths of the markers in both camera images, from the face at the start to the goal, "
+    alt="Left: paths of the markers in the camera images, from the face at the start to the goal, "
     "for directTHREE and the stacked law, with the stretches in which the face is hidden. "
     "Right: control errors of directTHREE and image errors of both laws over time.",
 )
 def _draw_overview(data: Data, figure: "style.Figure") -> None:
-    """Left the images of both cameras, right the errors."""
+    """Left the images of the cameras, right the errors."""
+    names = data["view"]
     pixels = [
         np.concatenate(
             [
@@ -233,13 +251,19 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
                 *(data[f"s_{law}"][:, view].reshape(-1, 2) for law in _OVERVIEW_LAWS),
             ]
         )
-        for view in range(2)
+        for view in range(len(names))
     ]
-    aspect = style.aspect(np.concatenate(pixels), *_ASPECTS)
-    figure.set_figheight(2.0 * _IMAGE_WIDTH * aspect + 1.75 + _LEGEND_ROOM / 72.0)
-    axes = figure.subplots(2, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
+    aspect, rows = style.aspect(np.concatenate(pixels), *_ASPECTS), max(2, len(names))
+    figure.set_figheight(rows * _IMAGE_WIDTH * aspect + 1.75 + 0.6 * (rows - 2) + _LEGEND_ROOM / 72.0)
+    grid = figure.add_gridspec(rows, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
+    cells = [grid[:, 0]] if len(names) == 1 else [grid[view, 0] for view in range(rows)]
+    images = [figure.add_subplot(cells[0])]
+    errors = [figure.add_subplot(grid[0, 1])]
+    images += [figure.add_subplot(cell) for cell in cells[1:2]]
+    errors += [figure.add_subplot(grid[1:, 1])]
+    images += [figure.add_subplot(cell) for cell in cells[2:]]
     lines = {law: style.LAW_LINES[law] | {"label": str(data[f"verdict_{law}"])} for law in _OVERVIEW_LAWS}
-    for view, (panel, name) in enumerate(zip(axes[:, 0], VIEWS, strict=True)):
+    for view, (panel, name) in enumerate(zip(images, names, strict=True)):
         for law, line in reversed(lines.items()):
             s = data[f"s_{law}"][:, view]
             style.paths(panel, s, style.HIDDEN, mask=data[f"hidden_{law}"][:, view])
@@ -247,14 +271,14 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
         panel.plot(*data["center"][:, view].T, **_CENTER)
         style.start_and_goal(panel, data[f"s_{DIRECT[0]}"][0, view], data["s_star"][view])
         style.image_axes(panel, f"{name} camera", pixels[view])
-    _control_errors(axes[0, 1], data)
+    _control_errors(errors[0], data)
     for law, line in lines.items():
         e, hidden = data[f"image_error_{law}"], data[f"hidden_{law}"].any(axis=1)
         t = data["period_s"] * np.arange(len(e))
-        axes[1, 1].plot(t, np.where(hidden, e, np.nan), **style.HIDDEN)
-        axes[1, 1].plot(t, e, **line)
-    style.log_scale(axes[1, 1])
-    axes[1, 1].set(title="image errors, both laws", ylabel="rms (px)", xlabel="time (s)")
+        errors[1].plot(t, np.where(hidden, e, np.nan), **style.HIDDEN)
+        errors[1].plot(t, e, **line)
+    style.log_scale(errors[1])
+    errors[1].set(title="image errors, both laws", ylabel="rms (px)", xlabel="time (s)")
     style.legend_below(figure, 2)
 
 
@@ -280,8 +304,10 @@ _FACE = style.line(style.GREEN, width=1.2, label="face")
 _DRIVEN = style.line(style.VERMILION, width=0.9, label="path of a marker")
 
 
-def frames_of(trace: Trace, selected: IntArray | None = None, width: int | None = None) -> ByteArray | None:
-    """Frames (k, 2, height, width) of a run, of those kept the ones shown (k,); None where none are kept.
+def frames_of(
+    trace: Trace, selected: IntArray | None = None, width: int | None = None
+) -> list[ByteArray] | None:
+    """Frames (k, height, width) of each view of a run, of those kept the selected (k,); None without any.
 
     width : px that they need not exceed, at which they are read faster and smaller.
     """
@@ -289,17 +315,18 @@ def frames_of(trace: Trace, selected: IntArray | None = None, width: int | None 
 
     if trace.frame_jpeg is None or trace.frame_size is None:
         return None
-    ends = np.cumsum(trace.frame_size).reshape(-1, 2)
-    pairs = []
-    for k in np.arange(len(ends)) if selected is None else selected:
-        pair = []
-        for end, size in zip(ends[k], trace.frame_size[k], strict=True):
+    ends = np.cumsum(trace.frame_size).reshape(trace.frame_size.shape)
+    films = []
+    for ends_of_view, sizes in zip(ends.T, trace.frame_size.T, strict=True):
+        film = []
+        for k in np.arange(len(sizes)) if selected is None else selected:
+            end, size = ends_of_view[k], sizes[k]
             image = Image.open(io.BytesIO(trace.frame_jpeg[end - size : end].tobytes()), formats=["JPEG"])
             if width is not None and image.width > width:
                 image.draft("L", (width, width * image.height // image.width))
-            pair.append(np.asarray(image.convert("L")))
-        pairs.append(pair)
-    return np.array(pairs)
+            film.append(np.asarray(image.convert("L")))
+        films.append(np.array(film))
+    return films
 
 
 def _data_frames(report_data: Driven | ReportData) -> Data:
@@ -324,7 +351,8 @@ def _data_frames(report_data: Driven | ReportData) -> Data:
         "found": trace.frame_s[selected],
         "s": trace.s[:, :, order],
         "s_star": trace.s_star[:, order],
-        "frames": frames,
+        **{f"frames_{view}": film for view, film in enumerate(frames)},
+        "view": np.array(trace.view),
     }
 
 
@@ -338,7 +366,7 @@ def with_halo(axes: "style.Axes") -> None:
 
 @registered(
     "fig17_frames",
-    "Images of both cameras at the start, in the middle and at the end",
+    "Images of the cameras at the start, in the middle and at the end",
     "not in the paper",
     _data_frames,
     frames=True,
@@ -347,10 +375,14 @@ def with_halo(axes: "style.Axes") -> None:
 )
 def _draw_frames(data: Data, figure: "style.Figure") -> None:
     """A row a camera, a column a moment."""
-    height, width = data["frames"].shape[2:]
-    figure.set_figheight(2.0 * style.WIDTH / 3.0 * height / width + 1.1)
-    for (view, i), panel in np.ndenumerate(figure.subplots(2, 3)):
-        panel.imshow(data["frames"][i, view], cmap="gray", vmin=0, vmax=255)
+    names = data["view"]
+    sizes = np.array([data[f"frames_{view}"].shape[1:] for view in range(len(names))])
+    heights = style.WIDTH / 3.0 * sizes[:, 0] / sizes[:, 1]
+    figure.set_figheight(float(heights.sum()) + 1.1 + 0.4 * (len(names) - 2))
+    panels = figure.subplots(len(names), 3, squeeze=False, height_ratios=heights)
+    for (view, i), panel in np.ndenumerate(panels):
+        height, width = sizes[view]
+        panel.imshow(data[f"frames_{view}"][i], cmap="gray", vmin=0, vmax=255)
         s = data["s"][: data["instant"][i] + 1, view]
         style.paths(panel, s, _DRIVEN)
         style.face(panel, s[-1], _FACE)
@@ -360,5 +392,5 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
         panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
         seconds = data["instant"][i] * float(data["period_s"])
         run = f"{data['run']}\n" if not (view or i) else ""
-        panel.set_title(f"{run}{VIEWS[view]} camera, {_MOMENTS[i]}, {seconds:.2f} s")
+        panel.set_title(f"{run}{names[view]} camera, {_MOMENTS[i]}, {seconds:.2f} s")
     style.legend_below(figure, 4)

@@ -1,24 +1,25 @@
-"""Figure 16: the planned motion in both images, its joints and its margins over time, and search trees."""
+"""Figure 16: the planned motion in the images, its joints and its margins over time, and search trees."""
 
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.image_size import BEHIND
-from projservo_cli.planning.margins import CLEAR, CONSTRAINTS, IMAGE, WIDTH
 from projservo_cli.records import FloatArray, Plan
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import border, near_pixels
-from projservo_cli.report.report_data import VIEWS, Data, ReportData, joint_kinds, joint_units, registered
+from projservo_cli.report.report_data import Data, ReportData, joint_kinds, joint_units, registered
 
 PIECES = 4  # of each edge of a tree, which is no straight line in an image
-_IMAGE_WIDTH, _ROW = 2.9, 1.5  # inches: of an image, and the height of a row of curves
+_IMAGES_WIDTH, _ROW = 5.8, 1.5  # inches: of all images, and the height of a row of curves
 _HIGHEST = 0.8  # height of an image over its width, at most
 _STRIP = 0.085  # of the time, that the range of a joint takes next to the curves
 _NEAR, _NEAR_PX = 1.0, 10.0  # margins and distances up to which a scale to ten times as much is linear
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")  # as text, which takes a tenth of formulas
-_SIDES = (style.SOLID, (0, (4, 1.5)))  # of what both cameras have
+# Dashes of what each camera has; dotted is what is required.
+_SIDES: tuple[Any, ...] = (style.SOLID, (0, (4, 1.5)), style.DASH_DOTTED, (0, (3, 1, 1, 1, 1, 1)))
 _PATH = style.line(style.GREY, width=0.8, label="path of a marker")
 _CENTER = style.line(style.GREEN, width=1.6, label="path of the centre")
 _CORNER = style.dots(style.VERMILION, "|", "a rounded corner begins, ends", markersize=8.0)
@@ -68,16 +69,16 @@ def _data(report_data: ReportData) -> Data:
         **_distances(plan, report_data.trajectory.border_px),
     }
     for i, region in enumerate(report_data.trajectory.keep_out):
-        for view, polygon in ((0, region.left), (1, region.right)):
-            if polygon is not None:
-                result[f"kept_out_{VIEWS[view]}_{i}"] = np.array(polygon)
+        for view in plan.view:
+            if (polygon := getattr(region, view, None)) is not None:
+                result[f"kept_out_{view}_{i}"] = np.array(polygon)
     if plan.tree_q is not None:
         result["nodes"] = np.array([len(plan.tree_q), plan.tree_nodes])
         M = np.linalg.solve(forward_kinematics(model, plan.q_start), plan.A_c)
         for name, edges in zip(_TREES, tree_edges(plan), strict=True):
             points = np.array([forward_kinematics(model, q) @ M for q in edges.reshape(-1, edges.shape[-1])])
             result[f"tree_{name}"] = with_gaps(np.moveaxis(project(model.P, points, model.lens), 0, 1))
-    return result
+    return result | {"view": np.array(plan.view)}
 
 
 def _distances(plan: Plan, border_px: float) -> Data:
@@ -86,12 +87,12 @@ def _distances(plan: Plan, border_px: float) -> Data:
         distance = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
         return {"border_px": distance, "border_px_asked": np.full_like(distance, border_px)}
     distances: Data = {}
-    for i, count in ((IMAGE, 2), (WIDTH, 2), (CLEAR, 1)):
-        name = CONSTRAINTS[i].value
-        if np.isfinite(plan.margins[:, i]).all():
-            distances[name], distances[f"{name}_asked"] = (
-                x[:, i : i + count] for x in (plan.margins, plan.required_margins)
-            )
+    views = len(plan.view)  # four margins have each view, between those of the joints and of regions
+    width, border, clear = (np.arange(k, k + views) for k in (1 + 2 * views, 1 + 3 * views, 1 + 4 * views))
+    for name, columns in (("border_px", border), ("width_px", width), ("clear_px", clear[:1])):
+        if np.isfinite(plan.margins[:, columns[0]]).all():
+            distances[name] = plan.margins[:, columns]
+            distances[f"{name}_asked"] = plan.required_margins[:, columns]
     return distances
 
 
@@ -118,7 +119,7 @@ def with_gaps(points: FloatArray) -> FloatArray:
 
 @registered(
     "fig16_way",
-    "The planned motion in both images, its joints and its margins over time",
+    "The planned motion in the images, its joints and its margins over time",
     "not in the paper, after section 4",
     _data,
     alt="Above, for each camera, the paths of the markers and of the centre of the face, regions that are "
@@ -127,27 +128,32 @@ def with_gaps(points: FloatArray) -> FloatArray:
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """Above the images; below left the joints, by kind, right the constraints."""
-    kinds = joint_kinds(data["prismatic"])
-    visible = [_visible(data, view) for view in range(2)]
-    image = _IMAGE_WIDTH * style.aspect(np.concatenate(visible), upper=_HIGHEST)
+    kinds, names = joint_kinds(data["prismatic"]), data["view"].tolist()
+    visible = [_visible(data, view) for view in range(len(names))]
+    image = _IMAGES_WIDTH / max(2, len(names)) * style.aspect(np.concatenate(visible), upper=_HIGHEST)
     figure.set_figheight(image + 2.0 * _ROW + 1.9)
-    grid = figure.add_gridspec(3, 2, height_ratios=[image, _ROW, _ROW])
-    for view in range(2):
-        _image(figure.add_subplot(grid[0, view]), data, view, visible[view])
-    cells = (grid[1:, 0],) if len(kinds) == 1 else (grid[1, 0], grid[2, 0])
+    grid, places = style.images_above(figure, len(names), [image, _ROW, _ROW])
+    images = [figure.add_subplot(place) for place in places]
+    for view, panel in enumerate(images):
+        _image(panel, data, view, visible[view])
+    style.name_first_ordinate(images)
+    half = grid.ncols // 2
+    cells = (grid[1:, :half],) if len(kinds) == 1 else (grid[1, :half], grid[2, :half])
     for cell, (chosen, unit) in zip(cells, kinds, strict=True):
         _joints(figure.add_subplot(cell), data, chosen, unit)
-    shares, distances = figure.add_subplot(grid[1, 1]), figure.add_subplot(grid[2, 1])
+    shares, distances = figure.add_subplot(grid[1, half:]), figure.add_subplot(grid[2, half:])
     _constraints(shares, data, _SHARES, _NEAR)
     _constraints(distances, data, _DISTANCES, _NEAR_PX)
     shares.set(ylabel="margin (1)", xlabel="")
     shares.tick_params(labelbottom=False)
     distances.set_ylabel("distance (px)")
     notes = [
-        style.line(style.GREY, _SIDES[0], label="left camera, or both"),
-        style.line(style.GREY, _SIDES[1], label="right camera"),
-        _REQUIRED,
+        style.line(style.GREY, dash, label=f"{name} camera")
+        for name, dash in zip(names, cycle(_SIDES), strict=False)
     ]
+    if len(names) > 1:
+        notes[0]["label"] += ", or both" if len(names) == 2 else ", or all"
+    notes.append(_REQUIRED)
     if "nodes" in data and data["nodes"][0] < data["nodes"][1]:
         stored = "{} of {} joint vectors of trees".format(*data["nodes"])
         notes.append(style.line(style.GREY, style.NO_LINE, label=stored))
@@ -156,7 +162,8 @@ def _draw(data: Data, figure: "style.Figure") -> None:
 
 def _kept_out(data: Data, view: int) -> list[FloatArray]:
     """Regions (k, 2) of one image that are kept out of."""
-    return [data[name] for name in data if name.startswith(f"kept_out_{VIEWS[view]}")]
+    regions = f"kept_out_{data['view'][view]}"
+    return [data[name] for name in data if name.rpartition("_")[0] == regions]
 
 
 def _visible(data: Data, view: int) -> FloatArray:
@@ -180,7 +187,8 @@ def _image(axes: "style.Axes", data: Data, view: int, visible: FloatArray) -> No
     if (ends := data["corner_s"].ravel()).size:
         axes.plot(*(np.interp(ends, _time(data)[0], column) for column in center.T), **_CORNER)
     style.start_and_goal(axes, s[0], data["s_star"][view])
-    style.image_axes(axes, f"{VIEWS[view]} camera, {data['name']}", visible)
+    names = data["view"]
+    style.image_axes(axes, f"{names[view]} camera{style.separator(len(names))}{data['name']}", visible)
     border(axes, data["image_size"][view], visible)
 
 
@@ -216,7 +224,7 @@ def _joints(axes: "style.Axes", data: Data, chosen: list[int], unit: str) -> Non
 
 
 def _constraints(axes: "style.Axes", data: Data, lines: dict[str, style.LineStyle], near: float) -> None:
-    """Draw constraints over time, solid for the left camera or both, and their required values, dotted.
+    """Draw constraints over time, solid for the first camera or all, and their required values, dotted.
 
     near : value up to which the scale is linear if they grow beyond ten times as much.
     """
@@ -224,7 +232,7 @@ def _constraints(axes: "style.Axes", data: Data, lines: dict[str, style.LineStyl
     style.zero_line(axes)
     for key, line in lines.items():
         if key in data:
-            for column, dash in zip(data[key].T, _SIDES, strict=False):
+            for column, dash in zip(data[key].T, cycle(_SIDES), strict=False):
                 axes.plot(t, column, **line | {"linestyle": dash})
         if f"{key}_asked" in data:
             axes.plot(t, data[f"{key}_asked"], **_REQUIRED | {"color": line["color"], "label": ""})

@@ -12,7 +12,7 @@ from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.image_size import border_distance
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.report_data import VIEWS, Data, ReportData, registered
+from projservo_cli.report.report_data import Data, ReportData, registered
 from projservo_cli.simulation.arm import METRIC_A_INF, roll_axis
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.trajectory import trajectory_displacement
@@ -39,7 +39,7 @@ def _turned(H_hat: FloatArray, angles: FloatArray, points: FloatArray) -> FloatA
 
 
 def _data_partition(report_data: ReportData) -> Data:
-    """Images in the left camera of the face, its targets and the paths of the three parts.
+    """Images in the first camera of the face, its targets and the paths of the three parts.
 
     A_t is the goal less the translation, A_r the goal less both translation and rotation onto the
     plane, [RH00] eqs. (12), (16); all come from the calibration and the images.
@@ -76,7 +76,7 @@ def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
     "Fig. 1, section 4.1",
     _data_partition,
     height=3.0,
-    alt="Three panels in the left image: the face moved along a straight line, turned onto the "
+    alt="Three panels in the image of the first camera: the face moved along a straight line, turned onto the "
     "target plane, and turned within it.",
 )
 def _draw_partition(data: Data, figure: "style.Figure") -> None:
@@ -103,7 +103,7 @@ def _draw_partition(data: Data, figure: "style.Figure") -> None:
 
 
 def _data_visibility(report_data: ReportData) -> Data:
-    """Margins a·O of both cameras over τ and θ_r, their zeros, and the images along both senses.
+    """Margins a·O of the cameras over τ and θ_r, their zeros, and the images along both senses.
 
     Margins are relative to the start, so 1 is the face as first seen and 0 a face seen edge-on.
     """
@@ -114,7 +114,7 @@ def _data_visibility(report_data: ReportData) -> Data:
     images = [project(model.P, _turned(plan.H_hat[1], arc, face), model.lens).swapaxes(0, 1) for arc in arcs]
     # As the plane is turned, so the optical centre may be turned back.
     margin = [_turned(plan.H_hat[1], -arc, O) @ plan.a / start for arc in arcs]
-    tau_0 = plan.tau_0 / plan.tau if plan.tau > 0 else np.full(2, np.nan)
+    tau_0 = plan.tau_0 / plan.tau if plan.tau > 0 else np.full(len(plan.tau_0), np.nan)
     finite = tau_0[np.isfinite(tau_0)]
     reach = np.concatenate([[-0.2, 1.2], 1.1 * finite[np.abs(finite) < 5]])
     share = np.linspace(reach.min(), reach.max(), 101)
@@ -127,6 +127,7 @@ def _data_visibility(report_data: ReportData) -> Data:
         "theta_margin": np.stack(margin),
         "theta_0_deg": np.degrees(plan.theta_0),
         "images": np.stack(images),
+        "view": np.array(report_data.view),
     }
 
 
@@ -141,12 +142,13 @@ def _data_visibility(report_data: ReportData) -> Data:
 )
 def _draw_visibility(data: Data, figure: "style.Figure") -> None:
     """Per camera: the images along both senses of θ_r, and the margin over θ_r and over τ."""
-    panels = figure.subplots(3, 2, height_ratios=[1.9, 1.0, 0.9])
+    names = data["view"]
+    panels = figure.subplots(3, len(names), squeeze=False, height_ratios=[1.9, 1.0, 0.9])
     senses = [
         line | {"label": rf"sense $\theta_r$ = {_signed(angle)}°"}
         for line, angle in zip(_SENSES, data["theta_deg"][:, -1], strict=True)
     ]
-    for view, (name, (image, turned, moved)) in enumerate(zip(VIEWS, panels.T, strict=True)):
+    for view, (name, (image, turned, moved)) in enumerate(zip(names, panels.T, strict=True)):
         images, margins = data["images"][:, :, view], data["theta_margin"][..., view]
         style.face(image, images[0, 0], style.START | {"label": "face at the start"}, fill=True)
         for s, margin, line in zip(images, margins, senses, strict=True):
@@ -156,6 +158,8 @@ def _draw_visibility(data: Data, figure: "style.Figure") -> None:
         style.image_axes(image, f"{name} camera", images)
         _angle(turned, data["theta_deg"], margins, senses, data["theta_0_deg"][view])
         _translation(moved, data["tau_share"], data["tau_margin"][:, view], data["tau_0_share"][view])
+    for row in panels:
+        style.name_first_ordinate(row)
     style.legend_below(figure, 3, [_END])
 
 
@@ -209,6 +213,7 @@ _NODES = 81
 _TURNS = 41  # shares μ_p tried at each μ_t, μ_r
 _TICKS = 11  # points at equal steps of σ on the path
 _WIDE = 4.0  # margins beyond are drawn in powers of ten
+_LEVELS = [0.25, 0.5, 0.75, *(c * 2.0**k for k in range(12) for c in (1.0, 1.5))]  # of contours of a margin
 LABEL = 0.05  # room that the number on a contour needs, in shares
 _SIGMA, _SHARE = r"path parameter $\sigma$ (1)", r"share $\mu$ (1)"
 _SHARES = (  # equal shares lie on one another: the wider shows beneath
@@ -258,20 +263,26 @@ def _rendered(
     points that a third camera can see.
     """
     plan, P = report_data.plan, report_data.plant.model.P
-    points = np.array([triangulate_points(P, METRIC_A_INF, row) for row in s[:, :, cyclic_order(plan.A)]])
+    s = s[:, :, cyclic_order(plan.A)]
+    if len(P) == 1:  # which determines no points, and looks from the centre itself
+        faces = s[:, 0]
+    else:
+        points = np.array([triangulate_points(P, METRIC_A_INF, row) for row in s])
+        faces = project(middle_camera(P, report_data.plant.image_size.mean(axis=0))[None], points)[0]
     return {
         "sigma": plan.path_parameter,
         "mu": mu,
         "margin": margin,
-        "faces": project(middle_camera(P, report_data.plant.image_size.mean(axis=0))[None], points)[0],
+        "faces": faces,
         "profile": np.array(profile.replace("_", " ")),
+        "view": np.array(report_data.view),
     }
 
 
 def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
-    """Camera (3, 4) midway between metric cameras (2, 3, 4), looking along the roll axis of the rig, px.
+    """Camera (3, 4) amid metric cameras (V, 3, 4), looking along the roll axis of the rig, px.
 
-    Its focal length is the mean of both, its principal point the middle of the image.
+    Its focal length is their mean, its principal point the middle of the image.
     """
     center, z = roll_axis(P)
     Q = (
@@ -295,7 +306,7 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
     "Fig. 5, section 6",
     _data_linear,
     alt="The face at several moments of the planned motion, seen from between the cameras; next to "
-    "it the shares of translation and rotations that are done and the visibility margin of both "
+    "it the shares of translation and rotations that are done and the visibility margin of the "
     "cameras.",
 )
 @registered(
@@ -319,7 +330,7 @@ def _draw_planned(data: Data, figure: "style.Figure") -> None:
         shares.tick_params(labelbottom=False)
     # A path through joint space has no shares.
     margins = figure.add_subplot(grid[1, 1] if shares else grid[:, 1], sharex=shares)
-    _columns(margins, sigma, data["margin"], style.VIEW_LINES)
+    _columns(margins, sigma, data["margin"], style.view_lines(data["view"]))
     style.zero_line(margins)
     margins.set(xlabel=_SIGMA, ylabel=_MARGIN)
     style.legend_below(figure, 6, [style.dots(style.BLACK, "o", "first marker of the face")])
@@ -349,7 +360,7 @@ def _columns(axes: "style.Axes", x: FloatArray, values: FloatArray, lines: Itera
 
 
 def _data_path(report_data: ReportData) -> Data:
-    """Margins of both cameras over the unit square, the border distance at the best μ_p, and the path."""
+    """Margins of the cameras over the unit square, the border distance at the best μ_p, and the path."""
     plan = report_data.plan
     mu = np.linspace(0.0, 1.0, _NODES)
     O = plan.optical_center
@@ -365,13 +376,14 @@ def _data_path(report_data: ReportData) -> Data:
         "mu": plan.mu,
         "along": np.stack([*along, plan.reciprocal_condition / plan.reciprocal_condition[0]], axis=1),
         "profile": np.array(plan.profile.replace("_", " ")),
+        "view": np.array(report_data.view),
     }
 
 
 def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
     """Least distance of a marker from the border of each image, px, where μ_p is best for both.
 
-    It is (2, k, k) over the shares mu (k,) of t and of r, negative outside.
+    It is (V, k, k) over the shares mu (k,) of t and of r, negative outside.
     """
     plan, P, lens = report_data.plan, report_data.calibrated.P, report_data.calibrated.lens
     turns = np.linspace(0.0, 1.0, _TURNS)
@@ -382,10 +394,10 @@ def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
     moved = M @ plan.H_hat[0].T
     depth = np.sign(np.einsum("vc,mc->vm", P[:, 2], plan.A))[:, :, None, None]
     size = report_data.plant.image_size[:, None, None, None]
-    result = np.empty((2, len(mu), len(mu)))
+    result = np.empty((len(P), len(mu), len(mu)))
     for i, share in enumerate(mu):
         points = (M + share * plan.tau * moved).reshape(-1, 4)
-        m = (points @ P.swapaxes(1, 2)).reshape(2, *M.shape[:3], 3)
+        m = (points @ P.swapaxes(1, 2)).reshape(len(P), *M.shape[:3], 3)
         pixels = distort_visible(lens[:, None, None, None], m[..., :2] / m[..., 2:])
         lowest = border_distance(pixels, size).min(axis=1)
         front = (m[..., 2] * depth > 0.0).all(axis=1)
@@ -405,11 +417,15 @@ def _border_distance(report_data: ReportData, mu: FloatArray) -> FloatArray:
 )
 def _draw_path(data: Data, figure: "style.Figure") -> None:
     """Above the map of each camera with the path, below the shares and the margins along it."""
-    axes = figure.subplots(2, 2, height_ratios=[1.5, 1.0])
-    for view, name in enumerate(VIEWS):
-        _map(axes[0, view], data, view)
-        axes[0, view].set_title(f"{name} camera, {data['profile']} profile")
-    shares, margins = axes[1]
+    names = data["view"]
+    grid, cells = style.images_above(figure, len(names), [1.5, 1.0])
+    maps = [figure.add_subplot(cell) for cell in cells]
+    for view, (panel, name) in enumerate(zip(maps, names, strict=True)):
+        _map(panel, data, view)
+        panel.set_title(f"{name} camera{style.separator(len(names))}{data['profile']} profile")
+    style.name_first_ordinate(maps)
+    half = grid.ncols // 2
+    shares, margins = (figure.add_subplot(cell) for cell in (grid[1, :half], grid[1, half:]))
     _columns(shares, data["sigma"], data["mu"], _SHARES)
     _columns(margins, data["sigma"], data["along"], _MARGINS)
     shares.set(xlabel=_SIGMA, ylabel=_SHARE)
@@ -433,8 +449,7 @@ def _map(axes: "style.Axes", data: Data, view: int) -> None:
         if finite.min() < 0.0 < finite.max():
             axes.contour(share, share, finite.T, levels=[0.0], colors=[style.BLACK], linewidths=0.6)
     faint: Any = {"colors": [style.BLACK], "linewidths": 0.4, "linestyles": "dotted"}
-    levels = [0.25, 0.5, 0.75, 1.0, 1.5, 2.0]
-    contours = axes.contour(share, share, data["margin"][view].T, levels=levels, **faint)
+    contours = axes.contour(share, share, data["margin"][view].T, levels=_LEVELS, **faint)
     lines = np.concatenate([data["mu"][:, :2], np.repeat(share[:, None], 2, axis=1)])
     axes.clabel(contours, fmt="%g", fontsize=6.5, manual=_clear(contours.allsegs, lines))
     axes.plot([0.0, 1.0], [0.0, 1.0], color=style.BLACK, linewidth=0.5)

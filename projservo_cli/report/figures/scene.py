@@ -1,6 +1,7 @@
 """Fig. 3 of [RH00], robot, rig and face; and arm, cameras and the tool's uncertainty to scale, in metres."""
 
 from collections.abc import Iterator, Mapping
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from projservo_cli.geometry.displacements import homogeneous, twists
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.image_size import image_corners
 from projservo_cli.metric.frame import Metric, links
-from projservo_cli.records import MM, TOOL, VIEWS, BoolArray, FloatArray, Trace
+from projservo_cli.records import MM, TOOL, BoolArray, FloatArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, Fit, ReportData, registered
 from projservo_cli.simulation.analytic_plant import Plant
@@ -19,7 +20,7 @@ from projservo_cli.task.face import center_of
 
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
 _ROBOT = style.line(style.BLACK, width=2.0, marker="o", markersize=4)
-_GOAL = style.line(style.PURPLE, (0, (3, 1)), 1.6, label="face at the goal")  # blue is the left camera
+_GOAL = style.line(style.PURPLE, (0, (3, 1)), 1.6, label="face at the goal")  # blue is the first camera
 _LINE = style.line(style.GREY, style.DOTTED, label="straight line of the centre")
 
 
@@ -34,7 +35,7 @@ def _data(report_data: ReportData) -> Data:
         "face_start": (face @ start.T)[:, :3],
     }
     visible = plant_pyramids(plant, result["face_start"])
-    result |= {"cameras": visible[:, 0], "pyramids": visible}
+    result |= {"cameras": visible[:, 0], "pyramids": visible, "view": np.array(report_data.view)}
     if (goal := goal_displacement(robot, report_data.traces)) is not None:
         result["face_goal"] = (face @ goal.T)[:, :3]
         centers = [center_of(plant.M @ H.T, plant.center)[:3] for H in (start, goal)]
@@ -66,14 +67,14 @@ def skeleton(H_hat: FloatArray, prismatic: BoolArray, tool: FloatArray) -> Float
 
 
 def plant_pyramids(plant: Plant, face: FloatArray) -> FloatArray:
-    """Pyramids (2, 5, 3) of the whole images of a plant, by ``_pyramids``."""
+    """Pyramids (V, 5, 3) of the whole images of a plant, by ``_pyramids``."""
     return _pyramids(plant.model.P, _rectangle(*np.moveaxis(image_corners(plant.image_size), -2, 0)), face)
 
 
 def _pyramids(P: FloatArray, corners: FloatArray, face: FloatArray) -> FloatArray:
-    """Optical centre and image corners (2, 5, 3) of metric cameras P (2, 3, 4), m.
+    """Optical centre and image corners (V, 5, 3) of metric cameras P (V, 3, 4), m.
 
-    corners : (2, 4, 2) pixels. They are drawn at a depth in front of the camera that goes by the distance of
+    corners : (V, 4, 2) pixels. They are drawn at a depth in front of the camera that goes by the distance of
     a face (m, 3).
     """
     centers = np.stack([camera_center(camera) for camera in P])[:, None]
@@ -84,10 +85,9 @@ def _pyramids(P: FloatArray, corners: FloatArray, face: FloatArray) -> FloatArra
 
 
 def _rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Corners (2, 4, 2) of the images of both views between pixels low and high (2, 2) or (2,)."""
+    """Corners (V, 4, 2) of the images of the views between pixels low and high (V, 2)."""
     share = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    low, high = (np.broadcast_to(end, (2, 2))[:, None] for end in (low, high))
-    return np.asarray(low + share * (high - low))
+    return np.asarray(low[:, None] + share * (high - low)[:, None])
 
 
 @registered(
@@ -96,12 +96,12 @@ def _rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
     "Fig. 3, section 6",
     _data,
     height=4.4,
-    alt="The robot's arm at the start in three dimensions, both cameras, the face at the start and "
+    alt="The robot's arm at the start in three dimensions, the cameras, the face at the start and "
     "at the goal, and the straight line of its centre between them.",
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """One view in perspective with equal scales."""
-    axes = _space(figure, data["pyramids"])
+    axes = _space(figure, data)
     axes.plot(*data["robot"].T, **_ROBOT, label="robot at the start")
     axes.plot(*style.closed(data["face_start"]).T, **style.START | {"label": "face at the start"})
     visible = [data["robot"], data["face_start"]]
@@ -112,12 +112,12 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     _show(axes, figure, data["pyramids"], np.concatenate(visible))
 
 
-def _space(figure: "style.Figure", rig: FloatArray) -> Any:
-    """Axes in three dimensions with the pyramids (2, 5, 3) of both cameras."""
+def _space(figure: "style.Figure", data: Data) -> Any:
+    """Axes in three dimensions with the pyramids of the cameras."""
     axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
     axes.patch.set_visible(False)
     axes.computed_zorder = False
-    for (center, *corners), line in zip(rig, style.VIEW_LINES, strict=True):
+    for (center, *corners), line in zip(data["pyramids"], style.view_lines(data["view"]), strict=True):
         edges = line | {"linestyle": style.SOLID, "linewidth": 1.0}
         axes.plot(*style.closed(np.stack(corners)).T, **edges)
         for corner in corners:
@@ -189,7 +189,7 @@ def chosen_poses(metric: Metric, fit: Fit) -> FloatArray:
 def metric_rows(metric: Metric, q: FloatArray) -> Iterator[dict[str, Any]]:
     """Yield quantities in metres with their standard deviations; the tool at readings q (k, n)."""
     of_K, of_poses, centers = metric.deviations("K"), metric.deviations("poses"), metric.poses[:, :3, 3]
-    for v, view in enumerate(VIEWS):
+    for v, view in enumerate(metric.view):
         K = metric.K[v]
         yield _row(f"{view} camera, focal lengths", K[(0, 1), (0, 1)], of_K[:, v][:, [0, 3]], "px")
         yield _row(f"{view} camera, principal point", K[:2, 2], of_K[:, v][:, [2, 4]], "px")
@@ -199,10 +199,12 @@ def metric_rows(metric: Metric, q: FloatArray) -> Iterator[dict[str, Any]]:
             MM * of_poses[:, v, 3:],
             "mm",
         )
-    apart = centers[1] - centers[0]
-    distance = np.asarray(np.linalg.norm(apart))
-    between = (of_poses[:, 1, 3:] - of_poses[:, 0, 3:]) @ (apart / distance)
-    yield _row("distance of the cameras", MM * distance, MM * between[:, None], "mm")
+    for u, v in combinations(range(len(centers)), 2):
+        apart = centers[v] - centers[u]
+        distance = np.asarray(np.linalg.norm(apart))
+        between = (of_poses[:, v, 3:] - of_poses[:, u, 3:]) @ (apart / distance)
+        pair = f", {metric.view[u]} and {metric.view[v]}" if len(centers) > 2 else ""
+        yield _row(f"distance of the cameras{pair}", MM * distance, MM * between[:, None], "mm")
     axes, prismatic = metric.axes, metric.prismatic
     angle, length = links(axes, prismatic, axes)
     changes = metric.changes(lambda body: np.stack(links(body.axes, prismatic, axes), axis=-1))
@@ -249,6 +251,7 @@ def _data_metric(report_data: Fit) -> Data:
         "factor": np.array(style.magnification(float(radius.max()), _ELLIPSOID_SIZE * extent)),
         "robot": skeleton(joint_operators(arm, q[0]), arm.prismatic, tools[0]),
         "pyramids": _pyramids(metric.cameras(q[0]), _rectangle(low, high), seen),
+        "view": np.array(metric.view),
     }
 
 
@@ -260,12 +263,12 @@ def _data_metric(report_data: Fit) -> Data:
     height=4.4,
     task=False,
     metric=True,
-    alt="The arm at one pose in three dimensions, both cameras with pyramids over the pixels in which "
+    alt="The arm at one pose in three dimensions, the cameras with pyramids over the pixels in which "
     "markers were seen, and ellipsoids of the tool's position at five poses, magnified.",
 )
 def _draw_metric(data: Data, figure: "style.Figure") -> None:
     """One view in perspective; regions as three ellipses each."""
-    axes = _space(figure, data["pyramids"])
+    axes = _space(figure, data)
     axes.plot(*data["robot"].T, **_ROBOT, label="arm at one pose")
     largest = MM * float(np.linalg.norm(data["semi_axes"], axis=2).max())
     region = f"95 % region of the tool, {float(data['factor']):,g} times (at most {largest:.3g} mm)"
