@@ -73,7 +73,7 @@ def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
 
 
 def _by_view(about: str, **default: Any) -> Any:
-    """Declare a tuple of numbers, one a view; files and JSON have each by itself, with the name of its view."""
+    """Declare a tuple of numbers, one a view; files and JSON have each by its name and that of its view."""
     return field(metadata={"units": "1", "about": about, "by_view": True}, **default)
 
 

@@ -190,7 +190,10 @@ def contents(figure: "Figure", formats: Sequence[str]) -> dict[str, bytes]:
 
 
 def legend_below(figure: "Figure", columns: int, more: Iterable[LineStyle] = ()) -> None:
-    """Put one legend for the whole figure below all axes: each name once, as first drawn, then more."""
+    """Put one legend for the whole figure below all axes: each name once, as first drawn, then more.
+
+    columns : as many of them as fit.
+    """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -201,7 +204,11 @@ def legend_below(figure: "Figure", columns: int, more: Iterable[LineStyle] = ())
                 handles.setdefault(label, handle)
     for extra in more:
         handles[extra["label"]] = Patch(**extra) if "facecolor" in extra else Line2D([], [], **extra)
-    figure.legend([*handles.values()], [*handles], loc="lower center", ncols=columns)
+    for ncols in range(columns, 0, -1):
+        legend = figure.legend([*handles.values()], [*handles], loc="lower center", ncols=ncols)
+        if ncols == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            return
+        legend.remove()
 
 
 def curve(index: int, label: str = "", *, marker: bool = False) -> LineStyle:
@@ -227,7 +234,7 @@ def separator(views: int) -> str:
 
 
 def images_above(figure: "Figure", views: int, heights: Sequence[float]) -> tuple["GridSpec", list[Any]]:
-    """A grid whose first row holds images side by side, with their cells, and whose others have two halves."""
+    """A grid whose first row holds images side by side, and its others two halves; cells of the images."""
     grid = figure.add_gridspec(len(heights), int(np.lcm(2, views)), height_ratios=heights)
     columns = np.split(np.arange(grid.ncols), views)
     return grid, [grid[0, int(part[0]) : int(part[-1]) + 1] for part in columns]
@@ -283,6 +290,11 @@ def log_scale(axes: "Axes") -> None:
         FuncFormatter(lambda value, _: power_of_ten(round(float(np.log10(value)))))
     )
     axes.yaxis.set_minor_formatter(FuncFormatter(between))
+
+
+def positive(values: FloatArray) -> FloatArray:
+    """Values with NaN in place of those that a logarithmic scale has no place for."""
+    return np.where(values > 0.0, values, np.nan)
 
 
 def near_zero_scale(axes: "Axes", near: float) -> None:

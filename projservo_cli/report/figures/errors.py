@@ -23,6 +23,7 @@ _TRANSLATION = {
     "tau": style.line(style.VERMILION, style.DASHED, label=_KERNEL + "projective"),
     "tau_metric": style.line(style.BLACK, style.DOTTED, label=_KERNEL + "Euclidean"),
 }
+_HIDES = 3.0  # times the step of the slower half of the joints, beyond which a step hides theirs
 _LIMIT = style.line(style.GREY, width=0.8)
 _WAYS = (("free", False), ("limited", True))  # without and with the limit of the joint speed
 
@@ -73,7 +74,8 @@ def _draw_two(data: Data, figure: "style.Figure") -> None:
     for panel, start in zip(axes[:, 1], (100.0, float(data["theta_s_deg_free"][0])), strict=True):
         style.log_scale(panel)
         panel.set_ylim(max(start, 1e-3) * _DECADES, max(start, 1e-3) * 3.0)
-    thin = style.line(style.BLACK) | _FAINT | {"label": r"thin: $\tau$ of the unit-norm kernel (8)"}
+    said = "unit-norm kernel (8), whose scale jumps near a singularity of the arm"
+    thin = style.line(style.BLACK) | _FAINT | {"label": rf"thin: $\tau$ of the {said}"}
     style.legend_below(figure, 3, [thin])
 
 
@@ -121,7 +123,7 @@ def _draw_three(data: Data, figure: "style.Figure") -> None:
     for name, line in _TRANSLATION.items():
         translation.plot(t_metric if name == "tau_metric" else t, data[name], **line)
         if name in ("tau_affine", "tau"):
-            off.plot(t, np.abs(data[name] - data["distance"]), **line)
+            off.plot(t, style.positive(np.abs(data[name] - data["distance"])), **line)
     _rotations(rotation, difference, data)
     for panel, lowest in ((off, 1e-4), (difference, 1e-15)):
         style.log_scale(panel)
@@ -146,7 +148,22 @@ def _rotations(rotation: "style.Axes", difference: "style.Axes", data: Data) -> 
         rotation.plot(t_metric, data[f"{name}_deg_metric"], **euclidean)
         for kind, dash in (("calibrated", style.SOLID), ("true", style.DOTTED)):
             curve = data[f"{name}_difference_deg_{kind}"]
-            difference.plot(t_common[: len(curve)], curve, color=color, linestyle=dash)
+            shown = style.positive(curve)
+            difference.plot(t_common[: len(curve)], shown, color=color, linestyle=dash)
+
+
+def _enlarge(axes: "style.Axes", t: FloatArray, steps: FloatArray, chosen: list[int]) -> None:
+    """Draw steps (k, n) of the chosen joints enlarged too, where fast ones hide the slower half of them."""
+    largest = np.sort(np.abs(steps[:, chosen]).max(axis=0, initial=0.0))
+    half = 1.15 * float(largest[(len(largest) - 1) // 2])
+    if not 0.0 < _HIDES * half < float(largest[-1]):
+        return
+    inset = axes.inset_axes((0.52, 0.56, 0.45, 0.38))
+    for i in chosen:
+        inset.plot(t, steps[:, i], **style.curve(i))
+    inset.set(xlim=axes.get_xlim(), ylim=(-half, half))
+    inset.tick_params(labelsize=6.5)
+    inset.text(0.97, 0.93, "enlarged", ha="right", va="top", fontsize=6.5, transform=inset.transAxes)
 
 
 def _data_joints(report_data: ReportData) -> Data:
@@ -188,6 +205,8 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
             if limited and unit == "deg":
                 for bound in (-limit, limit):
                     panel_below.axhline(bound, **_LIMIT)
+            if not limited:
+                _enlarge(panel_below, t[:-1], data[f"step_{name}"], chosen)
         joints[0].set_ylabel(f"joint ({unit})")
         steps[0].set_ylabel(f"step ({unit} per period)")
         limits = [panel.get_ylim() for panel in joints]  # both sides are to be compared

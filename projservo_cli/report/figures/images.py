@@ -297,6 +297,7 @@ def _control_errors(axes: "style.Axes", data: Data) -> None:
 
 
 # Frames.
+_SHORT_NAME = 5  # characters of the name of a camera that leave room for a moment in one line
 _MOMENTS = ("start", "in the middle", "end")
 _HALO = 1.2  # points, by which lines over a frame are wider in white
 _FOUND = style.dots(style.ORANGE, "+", "markers found", markersize=4.0)
@@ -378,7 +379,7 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
     names = data["view"]
     sizes = np.array([data[f"frames_{view}"].shape[1:] for view in range(len(names))])
     heights = style.WIDTH / 3.0 * sizes[:, 0] / sizes[:, 1]
-    figure.set_figheight(float(heights.sum()) + 1.1 + 0.4 * (len(names) - 2))
+    figure.set_figheight(float(heights.sum()) + 1.1 + 0.4 * max(0, len(names) - 2))
     panels = figure.subplots(len(names), 3, squeeze=False, height_ratios=heights)
     for (view, i), panel in np.ndenumerate(panels):
         height, width = sizes[view]
@@ -392,5 +393,6 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
         panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
         seconds = data["instant"][i] * float(data["period_s"])
         run = f"{data['run']}\n" if not (view or i) else ""
-        panel.set_title(f"{run}{names[view]} camera, {_MOMENTS[i]}, {seconds:.2f} s")
+        apart = ", " if len(names[view]) <= _SHORT_NAME else "\n"
+        panel.set_title(f"{run}{names[view]} camera{apart}{_MOMENTS[i]}, {seconds:.2f} s")
     style.legend_below(figure, 4)

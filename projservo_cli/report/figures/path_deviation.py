@@ -18,7 +18,6 @@ from projservo_cli.report.report_data import (
     title,
 )
 
-_LEAST_SHARE = 0.05  # of the largest deviation of the best run, below which no curve is drawn
 _PATH_POINTS = 400
 _WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
 _WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a fraction of the smallest
@@ -117,13 +116,11 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     for (path_axes, gain_axes), deviation, law in zip(axes, data["path_deviation_mm"], DIRECT, strict=True):
         paths = [data[f"path_mm_{law}_{i}"] for i in range(len(lines))]
-        lower = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
         for path, line in zip(paths, lines, strict=True):
-            path_axes.plot(path[:, 0], np.maximum(path[:, 1], lower), **line)
+            path_axes.plot(*path.T, **line)
         path_axes.set(title=f"{title_of(law)}: path of the centre, calibrated operators")
         path_axes.set(xlabel=_ALONG, ylabel=_OFF)
-        style.log_scale(path_axes)
-        path_axes.set_ylim(bottom=lower)
+        path_axes.set_ylim(bottom=0.0)
         for (operators, limited), line in _MAXIMA.items():
             label = f"{_OPERATORS[operators]}, {limit if limited else 'no limit'}"
             size = 4.5 if operators else 3.0  # an empty marker shows around a full one
@@ -186,11 +183,13 @@ def _draw_modes(data: Data, figure: "style.Figure") -> None:
     """Draw the distance of the centre from its line over the distance along it, one curve per run."""
     axes = figure.subplots()
     runs = {str(name): data[f"path_mm_{name}"] for name in data["names"]}
-    for i, (name, path) in enumerate(runs.items()):
-        axes.plot(*path.T, **style.curve(i, title(name)))
-    axes.set(title="path of the centre", xlabel=_ALONG, ylabel=_OFF)
     upper = [float(path[:, 1].max()) for path in runs.values()]
-    if min(upper) > 0.0 and max(upper) > _WIDE * min(upper):
+    wide = min(upper) > 0.0 and max(upper) > _WIDE * min(upper)
+    for i, (name, path) in enumerate(runs.items()):
+        off = style.positive(path[:, 1]) if wide else path[:, 1]
+        axes.plot(path[:, 0], off, **style.curve(i, title(name)))
+    axes.set(title="path of the centre", xlabel=_ALONG, ylabel=_OFF)
+    if wide:
         style.log_scale(axes)
         axes.set_ylim(bottom=_LEAST_OF_MODES * min(upper))
     style.legend_below(figure, 2)

@@ -76,7 +76,7 @@ def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
     "Fig. 1, section 4.1",
     _data_partition,
     height=3.0,
-    alt="Three panels in the image of the first camera: the face moved along a straight line, turned onto the "
+    alt="Three panels in the first image: the face moved along a straight line, turned onto the "
     "target plane, and turned within it.",
 )
 def _draw_partition(data: Data, figure: "style.Figure") -> None:
@@ -160,6 +160,10 @@ def _draw_visibility(data: Data, figure: "style.Figure") -> None:
         _translation(moved, data["tau_share"], data["tau_margin"][:, view], data["tau_0_share"][view])
     for row in panels:
         style.name_first_ordinate(row)
+    if len(names) > 2:  # panels are narrow
+        for turned, moved in panels[1:].T:
+            turned.set_title(turned.get_title().replace(" and ", ", "))
+            moved.set_xlabel(r"share of $\tau$ (1)")
     style.legend_below(figure, 3, [_END])
 
 
@@ -319,7 +323,8 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
 )
 def _draw_planned(data: Data, figure: "style.Figure") -> None:
     """Left the faces from dark to light along the path, right the shares and the margins."""
-    figure.set_figheight(max(4.2 * style.aspect(data["faces"]) + 1.0, 3.0))
+    rows = 0.2 * (len(data["view"]) > 2)  # of the legend
+    figure.set_figheight(max(4.2 * style.aspect(data["faces"]) + 1.0, 3.0) + rows)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.7, 1])
     _faces(figure.add_subplot(grid[:, 0]), data)
     sigma, shares = data["sigma"], None

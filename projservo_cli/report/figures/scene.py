@@ -15,12 +15,14 @@ from projservo_cli.records import MM, TOOL, BoolArray, FloatArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, Fit, ReportData, registered
 from projservo_cli.simulation.analytic_plant import Plant
-from projservo_cli.simulation.arm import SerialArm, camera_center
+from projservo_cli.simulation.arm import SerialArm, camera_center, roll_axis
 from projservo_cli.task.face import center_of
 
 _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
 _ROBOT = style.line(style.BLACK, width=2.0, marker="o", markersize=4)
 _GOAL = style.line(style.PURPLE, (0, (3, 1)), 1.6, label="face at the goal")  # blue is the first camera
+_AT_GOAL = style.line(style.PURPLE, width=1.2, marker="o", markersize=3, label="robot at the goal", alpha=0.6)
+_ROLL_AXIS = style.line(style.GREEN, style.DASH_DOTTED, 0.9, label="roll axis of the rig")
 _LINE = style.line(style.GREY, style.DOTTED, label="straight line of the centre")
 
 
@@ -36,6 +38,15 @@ def _data(report_data: ReportData) -> Data:
     }
     visible = plant_pyramids(plant, result["face_start"])
     result |= {"cameras": visible[:, 0], "pyramids": visible, "view": np.array(report_data.view)}
+    # From the middle of the rig to where it passes the face, which a task rolls about it.
+    point, direction = roll_axis(plant.model.P)
+    far = float((result["face_start"].mean(axis=0) - point) @ direction)
+    result["roll_axis"] = np.stack([point, point + 1.1 * far * direction])
+    q_goal = report_data.plan.q[-1]
+    if np.isfinite(q_goal).all():
+        tool = (forward_kinematics(plant.model, q_goal) @ robot.base_tool)[:3, 3]
+        operators = joint_operators(plant.model, q_goal)
+        result["robot_goal"] = skeleton(operators, robot.prismatic, tool)
     if (goal := goal_displacement(robot, report_data.traces)) is not None:
         result["face_goal"] = (face @ goal.T)[:, :3]
         centers = [center_of(plant.M @ H.T, plant.center)[:3] for H in (start, goal)]
@@ -96,15 +107,19 @@ def _rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
     "Fig. 3, section 6",
     _data,
     height=4.4,
-    alt="The robot's arm at the start in three dimensions, the cameras, the face at the start and "
-    "at the goal, and the straight line of its centre between them.",
+    alt="The robot's arm at the start and at the goal in three dimensions, the cameras and their roll axis, "
+    "the face at the start and at the goal, and the straight line of its centre between them.",
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """One view in perspective with equal scales."""
     axes = _space(figure, data)
+    axes.plot(*data["roll_axis"].T, **_ROLL_AXIS)
+    visible = [data["robot"], data["face_start"], data["roll_axis"]]
+    if "robot_goal" in data:
+        axes.plot(*data["robot_goal"].T, **_AT_GOAL)
+        visible.append(data["robot_goal"])
     axes.plot(*data["robot"].T, **_ROBOT, label="robot at the start")
     axes.plot(*style.closed(data["face_start"]).T, **style.START | {"label": "face at the start"})
-    visible = [data["robot"], data["face_start"]]
     if "face_goal" in data:
         axes.plot(*style.closed(data["face_goal"]).T, **_GOAL)
         axes.plot(*data["line"].T, **_LINE)
