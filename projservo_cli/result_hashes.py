@@ -61,8 +61,9 @@ def _fields(record: Any) -> dict[str, Any]:
     """Values of a dataclass, a named tuple or a section by their names; none of other values."""
     if dataclasses.is_dataclass(record):
         return {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
-    names = getattr(record, "_fields", ()) or getattr(type(record), "model_fields", ())
-    return {name: getattr(record, name) for name in names}
+    if hasattr(type(record), "model_fields"):
+        return dict(record)  # with keys that are names of views
+    return {name: getattr(record, name) for name in getattr(record, "_fields", ())}
 
 
 def _canonical(value: Any) -> Any:

@@ -551,7 +551,7 @@ def _translated(model: type[BaseModel], errors: Sequence[ErrorDetails]) -> Itera
 def _phrase(model: type[BaseModel], error: ErrorDetails) -> str:
     kind, path, given = error["type"], error["loc"], error["input"]
     context = error.get("ctx", {})
-    if kind == "extra_forbidden":
+    if kind == "extra_forbidden" or (kind == "model_type" and path and _takes_views(model, path)):
         if path == ("law",):  # else it would have been spelt out
             both = isinstance(given, str)
             return "control.laws is set as well; keep one" if both else "must be the name of one law"
@@ -578,12 +578,25 @@ def _nearest(word: object, valid: Sequence[str]) -> str:
     return f"did you mean {close[0]}?" if close else f"valid: {', '.join(valid)}"
 
 
+def _takes_views(model: type[BaseModel], path: _Path) -> bool:
+    """Whether the last key of a path is taken for the name of a view."""
+    above = _model_at(model, path[:-1])
+    return above.model_config.get("extra") == "allow" and path[-1] not in above.model_fields
+
+
 def _keys_at(model: type[BaseModel], path: _Path) -> list[str]:
     """Keys that the mapping at ``path`` may have."""
+    return sorted(_model_at(model, path).model_fields)
+
+
+def _model_at(model: type[BaseModel], path: _Path) -> type[BaseModel]:
+    """Return the model of the mapping at ``path``."""
     for step in path:
         if step in model.model_fields:  # else a position in a list, or any key of a mapping
             model = next(_models(model.model_fields[str(step)].annotation), model)
-    return sorted(model.model_fields)
+        elif isinstance(step, str):
+            model = next(_models(model.__annotations__.get("__pydantic_extra__")), model)
+    return model
 
 
 def _models(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -601,7 +614,7 @@ def _without_unset(value: Any) -> Any:
         return {
             key: _without_unset(inner)
             for key, inner in value
-            if inner is not None or fields[key].default is not None
+            if inner is not None or (key in fields and fields[key].default is not None)
         }
     return [_without_unset(inner) for inner in value] if isinstance(value, tuple) else value
 

@@ -2,6 +2,7 @@
 
 import inspect
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Self, cast
 
@@ -18,7 +19,7 @@ from projservo_cli.settings.disturbance import Disturbance
 from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.robot import Rig, RobotSettings, like_degrees
 from projservo_cli.settings.sections import Finding, JointVector, Root, Whole
-from projservo_cli.settings.task import TaskSettings, Trajectory
+from projservo_cli.settings.task import TaskSettings, Trajectory, sigma_key
 from projservo_cli.settings.trials import CalibrationSettings, Data, Noise
 
 
@@ -103,14 +104,19 @@ def _goal_images(task: TaskSettings | None, markers: Markers | None) -> Iterator
     yield from markers.unknown(images.markers or (), *path, "markers")
     if len(set(numbers)) < len(numbers):
         yield (*path, "markers"), "a number stands here twice"
-    for key in ("left", "right", "sigma_left_px", "sigma_right_px"):
-        given = getattr(images, key)
+    counts = Counter[int]()  # of cameras that see each marker
+    for key in (*images.view, *map(sigma_key, images.view)):
+        given = images.side(key)
         if given is not None and len(given) != len(numbers):
             yield (*path, key), f"{len(given)} entries for {len(numbers)} markers"
-        elif key in ("left", "right"):
-            seen = [number for number, pixel in zip(numbers, given, strict=True) if pixel is not None]
-            for number in [number for number in markers.front if number not in seen][:1]:
-                yield (*path, key), f"marker {number} of the face is not seen; show the whole face"
+        elif key in images.view:
+            counts.update(number for number, at in zip(numbers, given or (), strict=True) if at is not None)
+    enough = min(2, len(images.view))
+    for key in images.view:
+        pixels = dict(zip(numbers, images.side(key) or (), strict=False))
+        whole = len(pixels) == len(numbers) == len(images.side(key) or ())
+        for number in [k for k in markers.front if whole and counts[k] < enough and pixels[k] is None][:1]:
+            yield (*path, key), f"marker {number} of the face is not seen; show the whole face"
 
 
 def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator[Finding]:
@@ -354,6 +360,7 @@ class Settings(Printed, Root):
         if self.data is not None and self.data.image_size_px is not None:
             return cast(ImageSize, self.data.image_size_px)
         if self.cameras is not None:
-            left, right = self.cameras.left.size_px, self.cameras.right.size_px
-            return None if left is None or right is None else left if left == right else (left, right)
+            sizes = [one.size_px for one in self.cameras.sources.values()]
+            known = tuple(size for size in sizes if size is not None)
+            return None if len(known) < len(sizes) else known[0] if len({*known}) == 1 else known
         return cast(ImageSize, self.rig.image_size_px) if self.rig is not None else None

@@ -1,6 +1,7 @@
-"""A robot of the contract made of an arm that reads joints alone, two cameras, and the detector of tags."""
+"""A robot of the contract made of an arm that reads joints alone, cameras, and the detector of tags."""
 
 import math
+import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -10,7 +11,7 @@ import numpy as np
 
 from projservo_cli.detection import Corners, Finder
 from projservo_cli.hardware.cameras import Camera, Frame
-from projservo_cli.records import VIEWS, ByteArray, FloatArray, WorkFailed
+from projservo_cli.records import ByteArray, FloatArray, WorkFailed
 from projservo_cli.settings.cameras import Cameras
 
 # Mean grey value, of 255, below which an image is dark, and share of clipped pixels that is too much.
@@ -60,46 +61,73 @@ class CameraRobot:
     """A robot of the contract: joints of an arm, and corners of tags in the newest frame of each camera.
 
     numbers : of the markers, of which 4 t to 4 t + 3 are the corners of tag t; all are those of a board.
-    ``views`` are those of the last reading, None before.
+    whole : whether the loss of one camera is that of the robot; else it goes on with the others.
+    ``view``: names of the cameras. ``views`` are those of the last frames, None before.
     """
 
-    def __init__(self, arm: Arm, stereo: Cameras, finder: Finder, numbers: Sequence[int]) -> None:
+    def __init__(
+        self, arm: Arm, rig: Cameras, finder: Finder, numbers: Sequence[int], *, whole: bool = True
+    ) -> None:
         self.arm, self.finder, self._numbers = arm, finder, np.array(numbers, dtype=np.int64)
         for name in ("now", "truth", "release", "hold", "health", "identity"):
             if callable(method := getattr(arm, name, None)):
                 setattr(self, name, method)
         now: Callable[[], float] = getattr(arm, "now", time.monotonic)
-        sources = zip(VIEWS, (stereo.left, stereo.right), strict=True)
         self.cameras = [
-            Camera(view, settings, stereo.max_age_s, stereo.reconnect_s, now) for view, settings in sources
+            Camera(view, settings, rig.max_age_s, rig.reconnect_s, now)
+            for view, settings in rig.sources.items()
         ]
-        self.views: list[View | None] = [None, None]
-        self._begun, self._blind = False, [0, 0]
+        self.view = tuple(camera.name for camera in self.cameras)
+        self.views: list[View | None] = [None for _ in self.view]
+        self._begun, self._blind = False, [0 for _ in self.view]
+        self._whole, self._lost = whole, set[int]()  # views whose cameras give nothing any more
 
     def open(self) -> None:
-        """Connect to both cameras, and then to the arm."""
-        with ThreadPoolExecutor(2) as pool:
+        """Connect to all cameras, and then to the arm."""
+        with ThreadPoolExecutor(len(self.cameras)) as pool:
             for opened in [pool.submit(camera.open) for camera in self.cameras]:
                 opened.result()
         self._begun = True
         self.arm.open()
 
-    def read(self) -> tuple[Any, FloatArray, float | None, float, float, FloatArray]:
+    def read(self) -> tuple[Any, ...]:
         """Readings of the joints, corners of the tags, their stamps and standard deviations."""
         q, t_q = self.arm.joints()
-        views = [self._looked(view) for view in range(2)]
+        views = [self._looked(view) for view in range(len(self.view))]
         pixels, sigma = (np.stack(sides) for sides in zip(*map(self._corners, views), strict=True))
-        return q, pixels, t_q, views[0].frame.t, views[1].frame.t, sigma
+        return q, pixels, t_q, *(None if view is None else view.frame.t for view in views), sigma
 
     @property
     def frames(self) -> ByteArray | None:
-        """Both frames (2, height, width) of the last reading; None if their sizes differ."""
+        """Last frames (V, height, width) of the cameras; None if their sizes differ."""
         grey = [view.frame.grey for view in self.views if view is not None]
-        return np.stack(grey) if len(grey) == 2 and grey[0].shape == grey[1].shape else None
+        alike = len(grey) == len(self.views) and len({one.shape for one in grey}) == 1
+        return np.stack(grey) if alike else None
 
-    def _looked(self, view: int) -> View:
-        """Find tags in the newest frame of a view, unless that was done before."""
-        frame, last = self.cameras[view].newest(), self.views[view]
+    def _newest(self, view: int) -> Frame | None:
+        """Newest frame of a view; None while its camera is lost and others are not.
+
+        A camera is waited for when it is lost, and not again.
+        """
+        camera = self.cameras[view]
+        if view in self._lost and not camera.runs:
+            return None
+        try:
+            frame = camera.newest()
+        except WorkFailed as error:
+            if self._whole or len(self._lost) == len(self.view) - 1:
+                raise
+            self._lost.add(view)
+            print(f"{error}; going on without it", file=sys.stderr)
+            return None
+        self._lost.discard(view)
+        return frame
+
+    def _looked(self, view: int) -> View | None:
+        """Find tags in the newest frame of a view, unless that was done before; None where it is lost."""
+        frame, last = self._newest(view), self.views[view]
+        if frame is None:
+            return None
         if last is None or last.frame.serial != frame.serial:
             tags, repeated = self.finder.find(frame.grey.astype(np.float64))
             last = View(frame, self.finder.like(tags, None if last is None else last.tags), repeated)
@@ -116,15 +144,16 @@ class CameraRobot:
         if mirrored := tags & {*(self._numbers // self.finder.corners).tolist()}:
             tags_shown = f"tag{'s' * (len(mirrored) > 1)} {', '.join(map(str, sorted(mirrored)))}"
             raise WorkFailed(
-                f"the {VIEWS[view]} camera's image is mirrored: it shows no tag, its mirror image "
-                f"{tags_shown}; switch off mirror or flip of the {VIEWS[view]} camera"
+                f"the {self.view[view]} camera's image is mirrored: it shows no tag, its mirror image "
+                f"{tags_shown}; switch off mirror or flip of the {self.view[view]} camera"
             )
 
-    def _corners(self, view: View) -> tuple[FloatArray, FloatArray]:
-        """Pixels (m, 2) of all markers and their deviations (m,); NaN where unseen or rejected."""
+    def _corners(self, view: View | None) -> tuple[FloatArray, FloatArray]:
+        """Pixels (m, 2) of all markers and their deviations (m,); NaN where unseen, rejected or lost."""
         pixels, sigma = np.full((len(self._numbers), 2), np.nan), np.full(len(self._numbers), np.nan)
+        tags = {} if view is None else view.tags
         for k, number in enumerate(self._numbers.tolist()):
-            if (tag := view.tags.get(number // self.finder.corners)) is not None:
+            if (tag := tags.get(number // self.finder.corners)) is not None:
                 pixels[k], sigma[k] = (
                     tag.pixels[number % self.finder.corners],
                     tag.sigma[number % self.finder.corners],
@@ -145,12 +174,12 @@ class CameraRobot:
             self._end_cameras()
 
     def close(self) -> None:
-        """Let go of the arm, and of both cameras in any case."""
+        """Let go of the arm, and of all cameras in any case."""
         try:
             if self._begun:
                 self.arm.close()
         finally:
-            self._end_cameras()  # both, before either is waited for
+            self._end_cameras()  # all, before any is waited for
             for camera in self.cameras:
                 camera.close()
 
@@ -160,7 +189,7 @@ class CameraRobot:
 
     def remarks(self) -> list[str]:
         """Return the faults of the last frames, in words: dark, clipped or blurred ones."""
-        visible = [(name, view) for name, view in zip(VIEWS, self.views, strict=True) if view is not None]
+        visible = [(name, view) for name, view in zip(self.view, self.views, strict=True) if view is not None]
         return [
             f"the {name} image {what}"
             for name, view in visible

@@ -56,7 +56,7 @@ _GIVES_PICTURES = 0x1 | 0x1000
 class Camera:
     """A camera that is always grabbed.
 
-    name : of it, ``left`` or ``right``. now : clock of the stamps, s.
+    name : of it, such as ``left``. now : clock of the stamps, s.
     ``remarks``: what its driver would not do, in words.
     """
 
@@ -129,6 +129,12 @@ class Camera:
                 )
             with self._came:
                 self._came.wait(0.01)
+
+    @property
+    def runs(self) -> bool:
+        """Whether its newest frame is new enough."""
+        frame = self._frame
+        return frame is not None and not self._refused and self._now() - frame.t <= self._max_age_s
 
     @property
     def rate_hz(self) -> float:

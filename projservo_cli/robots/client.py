@@ -16,8 +16,8 @@ from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW
-from projservo_cli.records import VIEWS, BoolArray, FloatArray, IntArray, WorkFailed
-from projservo_cli.robots.contract import PluginRobot
+from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
+from projservo_cli.robots.contract import PluginRobot, Reading
 from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.robots.latency import DelayPrior, Delays, squares_by_joints
 from projservo_cli.robots.pacing import Steered
@@ -38,7 +38,7 @@ _LASTS = 60
 class Known(NamedTuple):
     """Knowledge of a robot and its images before it moves."""
 
-    # pixels (k, 2, m, 2) of the markers of the calibration at joints (k, n), rad or m
+    # pixels (k, V, m, 2) of the markers of the calibration at joints (k, n), rad or m
     predicted: Callable[[FloatArray], FloatArray]
     visible: IntArray  # (k,) markers of the loop, by their places in the observations, the face first
     order: IntArray  # (m,) index there of each marker of the calibration, −1 where it is not observed
@@ -62,9 +62,9 @@ class DrivenRobot:
     monitor : of the raw images against the calibration; None tests nothing.
     ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
     of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
-    the images no longer agree with the calibration, or what failed; else empty. ``weight``: (2, k) of the
+    the images no longer agree with the calibration, or what failed; else empty. ``weight``: (V, k) of the
     pixels shown in a fit, where the robot states their deviations. Of each observation since ``begin``:
-    ``delays`` of both views as followed, (2,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot
+    ``delays`` of all views as followed, (V,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot
     that knows them, joints (n,) or the pose (4, 4) of its tool; ``film`` of its frames.
     """
 
@@ -76,15 +76,18 @@ class DrivenRobot:
         self.known, self.monitor = known, monitor
         self.markers = len(known.visible)
         self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.visible])
-        self._instants = Delays(known.predicted, known.delays, known.sigma_px, known.timeout_s, known.sigma_q)
-        self._carried = np.zeros((2, self.markers, 2))
+        self._instants = Delays(
+            robot.view, known.predicted, known.delays, known.sigma_px, known.timeout_s, known.sigma_q
+        )
+        V = len(robot.view)
+        self._carried = np.zeros((V, self.markers, 2))
         self.q = np.zeros(len(plant.limits.lower))
         self.H = np.eye(4)
-        self.hidden = np.zeros(2)
+        self.hidden = np.zeros(V)
         self.disturbance = ""
         self.weight: FloatArray | None = None
         self._stale = 0  # looks in a row without a new frame while the arm is held
-        self._dark = np.zeros(2, dtype=np.int64)  # looks in a row that show no marker of the calibration
+        self._dark = np.zeros(V, dtype=np.int64)  # looks in a row that show no marker of the calibration
         self.begin()
 
     def begin(self) -> None:
@@ -102,7 +105,8 @@ class DrivenRobot:
         H = forward(self.plant.model, self.q)
         self.H = as_array(H)
         M = np.zeros_like(self.plant.M)
-        observe(self.plant, H, M, np.zeros((2, len(M) + len(self.plant.pins), 2)), self.hidden)
+        s = np.zeros((len(self.hidden), len(M) + len(self.plant.pins), 2))
+        observe(self.plant, H, M, s, self.hidden)
         if self.robot.frames is not None:
             self.film.show(len(self.readings), self.steered.reading.s, self.robot.frames)
         self.readings.append(read)
@@ -110,10 +114,10 @@ class DrivenRobot:
         return self.steered.set_point.at_rest
 
     def observe(self) -> FloatArray:
-        """Pixels (2, k, 2) of the markers shown as they will be at rest, NaN where unseen; all are tested."""
+        """Pixels (V, k, 2) of the markers shown as they will be at rest, NaN where unseen; all are tested."""
         reading, history, order = self.steered.reading, self.steered.history, self.known.order
         if self.monitor is not None:
-            _require_apart(self.robot.name, reading.s)
+            _require_apart(self.robot.name, reading)
         images = np.where((order < 0)[:, None], np.nan, reading.s[:, order])
         self._dark = np.where(np.isfinite(images[..., 0]).any(axis=1), 0, self._dark + 1)
         visible, stated = self.known.visible, None
@@ -135,14 +139,14 @@ class DrivenRobot:
             self._leave_out(self.monitor.rejected[:, self._place], stated is None)
         q = self.steered.set_point.at_rest
         there, *then = self.known.predicted(np.stack([q, *q_then]))[:, :, self._place]
-        for view in range(2):
+        for view in range(len(then)):
             carries = not np.array_equal(q, q_then[view])
             self._carried[view] = there[view] - then[view][view] if carries else 0.0
         self.delays.append(self._instants.mean)
         return np.ascontiguousarray(reading.s[:, visible]) + self._carried
 
     def _leave_out(self, rejected: BoolArray, alike: bool) -> None:
-        """Leave sightings (2, k) that are off by themselves out of the fit of the law.
+        """Leave sightings (V, k) that are off by themselves out of the fit of the law.
 
         alike : all others weigh the same.
         """
@@ -196,11 +200,15 @@ class DrivenRobot:
         """
         if held:
             self._held_while(lambda: bool(max(self._dark) >= WINDOW), _LASTS)
-        dark = [view for view, looks in zip(VIEWS, self._dark, strict=True) if looks >= WINDOW]
-        if len(dark) < least:
+        views = self.robot.view
+        dark = [view for view, looks in zip(views, self._dark, strict=True) if looks >= WINDOW]
+        if len(dark) < min(least, len(views)):
             return ""
-        which = f"the {dark[0]} camera shows no" if len(dark) == 1 else "neither camera shows a"
-        return f"{which} marker of the calibration"
+        if len(dark) == 1:
+            return f"the {dark[0]} camera shows no marker of the calibration"
+        none = "neither" if len(views) == 2 else "no"
+        which = f"{none} camera" if len(dark) == len(views) else f"none of the cameras {', '.join(dark)}"
+        return f"{which} shows a marker of the calibration"
 
     def at_rest(self, *, held: bool = False) -> str:
         """Return the fault that images show by the test of one posture, that of ``doctor``; else empty.
@@ -266,9 +274,9 @@ class DrivenRobot:
         self.robot.stop()
 
 
-def _require_apart(name: str, s: FloatArray) -> None:
-    """Raise WorkFailed for images (2, k, 2) with several markers at one pixel, as zeros for unseen ones."""
-    for view, pixels in zip(VIEWS, s, strict=True):
+def _require_apart(name: str, reading: Reading) -> None:
+    """Raise WorkFailed for images with several markers at one pixel, as zeros for unseen ones."""
+    for view, pixels in zip(reading.view, reading.s, strict=True):
         at, count = np.unique(pixels[np.isfinite(pixels[:, 0])], axis=0, return_counts=True)
         if (count >= _AT_ONE_PIXEL).any():
             u, v = at[np.argmax(count)]
@@ -279,7 +287,7 @@ def _require_apart(name: str, s: FloatArray) -> None:
 
 
 def weights(sigma: FloatArray, s: FloatArray) -> FloatArray:
-    """Weights (2, k) of pixels (2, k, 2) of deviations (2, k) in a fit: the rms of those seen over each."""
+    """Weights (V, k) of pixels (V, k, 2) of deviations (V, k) in a fit: the rms of those seen over each."""
     detected = np.isfinite(s[..., 0])
     weight = np.ones(detected.shape)
     if detected.any():

@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple, Protocol
@@ -17,6 +17,7 @@ from projservo_cli.calibration.time_offset import is_repeated_frame, time_unit
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
+    VIEWS,
     ByteArray,
     FloatArray,
     InputError,
@@ -41,18 +42,18 @@ class Reading(NamedTuple):
     """One look at a robot, checked."""
 
     q: FloatArray  # (n,) rad or m
-    s: FloatArray  # (2, m, 2) px, NaN in both coordinates where unseen
+    s: FloatArray  # (V, m, 2) px, NaN in both coordinates where unseen
     t_q: float  # when the joints were read, s: the robot's stamp, else its clock just before it was asked
-    t_view: FloatArray  # (2,) stamps of both frames, s, by whatever clock; NaN where there are none
-    sigma_px: FloatArray | None  # (2, m) standard deviation of each corner, px; None where none is stated
+    t_view: FloatArray  # (V,) stamps of the frames, s, by whatever clock; NaN where there are none
+    sigma_px: FloatArray | None  # (V, m) standard deviation of each corner, px; None where none is stated
+    view: tuple[str, ...] = VIEWS  # names of the views
 
-    def new_views(self, before: "Reading | None") -> tuple[bool, bool]:
+    def new_views(self, before: "Reading | None") -> list[bool]:
         """Whether each view has another frame than in the reading before."""
         if before is None:
-            return True, True
+            return [True] * len(self.s)
         frames_of_views = zip(self.t_view, self.s, before.t_view, before.s, strict=True)
-        left, right = (not is_repeated_frame(*frames) for frames in frames_of_views)
-        return left, right
+        return [not is_repeated_frame(*frames) for frames in frames_of_views]
 
 
 class Bounds(NamedTuple):
@@ -82,7 +83,9 @@ class Bounds(NamedTuple):
 
 
 class Robot(Protocol):
-    """A robot with its two cameras.
+    """A robot with its cameras.
+
+    A class whose cameras are others than left and right names them in ``view``, such as ``("top",)``.
 
     A class may also have ``now() -> float``, its clock, s, without which ``time.monotonic`` is taken;
     ``release()`` and ``hold()``, which let go of the arm, so that somebody can move it for ``projservo
@@ -90,7 +93,7 @@ class Robot(Protocol):
     something else, such as after homing, and without which no recording holds; ``remarks() -> list[str]``,
     faults of its last images, such as darkness; and, if it is a simulator, ``truth()``, the pose
     (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's time passes
-    in ``command`` alone, which moves it to ``due``. And ``frames``, both images (2, height, width) of its
+    in ``command`` alone, which moves it to ``due``. And ``frames``, the images (V, height, width) of its
     last reading in grey, uint8, or None: a run keeps some, which the report shows. A class that takes an
     argument ``limits`` is given those of its joints, ``JointLimits``.
     """
@@ -102,9 +105,11 @@ class Robot(Protocol):
         """Look once.
 
         Returns ``q, pixels``, perhaps ``t_q, t_left, t_right`` and ``sigma_px`` after them, each of which may
-        be None: joints (n,), rad or m; pixels (2, m, 2) of all markers in both views, NaN where unseen; when
-        the joints were read, s, by the robot's clock; stamps of both images, s, by any clock; standard
-        deviations (2, m) of the pixels.
+        be None: joints (n,), rad or m; pixels (V, m, 2) of all markers in each of V views, NaN where unseen;
+        when the joints were read, s, by the robot's clock; a stamp of each of the V images, s, by any clock;
+        standard deviations (V, m) of the pixels. Or ``q, pixels`` and perhaps ``t_q`` with a mapping from
+        names of views to pixels (m, 2), or to a tuple of pixels, stamp and perhaps deviations (m,): a view
+        that is missing there, or None, is lost in this reading.
         """
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
@@ -131,6 +136,8 @@ class PluginRobot:
     bounds : of its commands; they give the number of joints, too.
     timeout_s, open_s : most time an answer may take, s, and opening it.
     image_size : width and height of its frames, px; None for any.
+    view : names of the views that readings are to have, in this order; None for those of the robot.
+    Raises InputError where the robot has none of such a name.
     All methods raise ``WorkFailed`` where the robot fails, is late or answers nonsense. Calls are made in one
     separate thread, so that the loop goes on if one never returns.
     """
@@ -144,18 +151,29 @@ class PluginRobot:
         timeout_s: float,
         open_s: float,
         image_size: ImageSize | None = None,
+        view: Sequence[str] | None = None,
     ) -> None:
         self.robot, self.name, self.bounds, self.image_size = robot, name, bounds, image_size
+        self._views: tuple[str, ...] = tuple(getattr(robot, "view", VIEWS))  # in the order of its answers
+        if isinstance(getattr(robot, "view", ()), str) or not 0 < len({*self._views}) == len(self._views):
+            raise InputError(f"{name}: view is {getattr(robot, 'view', ())!r}: expected names, each once")
+        self.view = self._views if view is None else tuple(view)
+        if missing := [one for one in self.view if one not in self._views]:
+            raise InputError(
+                f"{name}: has the cameras {', '.join(self._views)}, and none named {missing[0]}, as in the "
+                "recording: name them as there, or record again"
+            )
+        self._rows = [self._views.index(one) for one in self.view]
         self.timeout_s, self.open_s = timeout_s, open_s
         self._joints, self._markers = len(bounds.limits.speed), markers
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
         self._began = 0.0, 0.0  # what its clock showed first, and when, as below
         self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
         self._last: Reading | None = None
-        # The clock and the stamps (3,) first read, s, and how many readings in a row have whole ones.
+        # The clock and the stamps (1 + V,) first read, s, and how many readings in a row have whole ones.
         self._stamps: tuple[float, FloatArray, IntArray] | None = None
         self._earlier: Reading | None = None  # the one before the last
-        self.frames: ByteArray | None = None  # (2, height, width) last seen, where the robot has them
+        self.frames: ByteArray | None = None  # (V, height, width) last seen, where the robot has them
         self._sent: FloatArray | None = None  # the last set-point (n,)
         self._due = -math.inf  # when it is to be there, s
         self._orders: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
@@ -180,13 +198,14 @@ class PluginRobot:
         if frames is not None and not (
             isinstance(frames, np.ndarray)
             and frames.dtype == np.uint8
-            and frames.shape[:1] == (2,)
+            and frames.shape[:1] == (len(self._views),)
             and frames.ndim == 3
             and frames.size
         ):
-            raise WorkFailed(f"{self.name}: frames must be an array (2, height, width) of uint8, or None")
-        self.frames = None if frames is None else frames.copy()
-        sizes = image_sizes(self.image_size)
+            expected = f"({len(self._views)}, height, width)"
+            raise WorkFailed(f"{self.name}: frames must be an array {expected} of uint8, or None")
+        self.frames = None if frames is None else frames[self._rows]
+        sizes = image_sizes(self.image_size, len(self._views))
         if frames is not None and np.isfinite(sizes).all() and (sizes != frames.shape[:0:-1]).any():
             shown = " x ".join(map(str, frames.shape[:0:-1]))
             asked = " and ".join(dict.fromkeys(f"{width:.0f} x {height:.0f}" for width, height in sizes))
@@ -371,19 +390,25 @@ class PluginRobot:
 
     def _checked(self, before: float, answer: Any) -> Reading:
         """Copy the answer of read(); ``before`` is the time of the clock then, s."""
-        if not isinstance(answer, tuple) or not 2 <= len(answer) <= 6:
+        V, views = len(self._views), ", ".join(f"t_{view}" for view in self._views)
+        by_name = isinstance(answer, tuple) and len(answer) > 1 and isinstance(answer[1], Mapping)
+        if not isinstance(answer, tuple) or not 2 <= len(answer) <= (3 if by_name else 4 + V):
+            after = "t_q" if by_name else f"t_q, {views} and sigma_px"
             raise WorkFailed(
-                f"{self.name}: read() gave {type(answer).__name__}: expected (q, pixels), perhaps with t_q, "
-                "t_left, t_right and sigma_px after them"
+                f"{self.name}: read() gave {type(answer).__name__}: expected (q, pixels), perhaps with "
+                f"{after} after them"
             )
-        q, pixels, *stamps, sigma = list(answer) + [None] * (6 - len(answer))
+        q, pixels, *stamps, sigma = list(answer) + [None] * (4 + V - len(answer))
+        if by_name:
+            pixels, stamps[1:], sigma = self._by_name(pixels)
         q = self._numbers("read() gave q", q, (self._joints,), finite=True)
-        s = self._numbers("read() gave pixels", pixels, (2, self._markers, 2))
+        s = self._numbers("read() gave pixels", pixels, (V, self._markers, 2))[self._rows]
         if np.isinf(s).any():
             raise WorkFailed(f"{self.name}: read() gave an infinite pixel: NaN stands for unseen")
         s[np.isnan(s).any(axis=2)] = np.nan
-        times = np.full(3, np.nan)
-        for i, name in enumerate(("t_q", "t_left", "t_right")):
+        stamps = [stamps[0], *(stamps[1 + view] for view in self._rows)]
+        times = np.full(len(stamps), np.nan)
+        for i, name in enumerate(("t_q", *(f"t_{view}" for view in self.view))):
             if stamps[i] is not None:
                 times[i] = self._numbers(f"read() gave {name}", stamps[i], (), finite=True)
             last = -math.inf if self._last is None else (self._last.t_q, *self._last.t_view)[i]
@@ -392,21 +417,47 @@ class PluginRobot:
                 raise WorkFailed(f"{self.name}: {what}: one clock must stamp all of them")
         self._require_seconds(before, times)
         if sigma is not None:
-            sigma = self._numbers("read() gave sigma_px", sigma, (2, self._markers))
+            sigma = self._numbers("read() gave sigma_px", sigma, (V, self._markers))[self._rows]
             stated = sigma[np.isfinite(s[..., 0])]
             if not ((stated > 0.0) & (stated < math.inf)).all():
                 raise WorkFailed(f"{self.name}: read() gave a sigma_px that is no positive number")
-        return Reading(
-            q=q, s=s, t_q=before if np.isnan(times[0]) else float(times[0]), t_view=times[1:], sigma_px=sigma
-        )
+        t_q = before if np.isnan(times[0]) else float(times[0])
+        return Reading(q=q, s=s, t_q=t_q, t_view=times[1:], sigma_px=sigma, view=self.view)
+
+    def _by_name(self, views: Mapping[Any, Any]) -> tuple[list[Any], list[Any], list[Any] | None]:
+        """Pixels (m, 2), stamps and deviations (m,) of all views, from a mapping; NaN of a lost one."""
+        if unknown := [name for name in views if name not in self._views]:
+            raise WorkFailed(
+                f"{self.name}: read() gave a view {unknown[0]!r}, where its cameras are "
+                f"{', '.join(self._views)}: name all of them in the class, view = {(*views,)}"
+            )
+        pixels, stamps, sigma, stated = [], list[Any](), [], list[bool]()
+        for name in self._views:
+            given: Any = views.get(name)
+            # A tuple of pixels, stamp and deviations; one of rows u, v is pixels alone.
+            several = isinstance(given, tuple) and 2 <= len(given) <= 3 and np.ndim(given[0]) != 1
+            s, t, deviation = (*given, None)[:3] if several else (given, None, None)
+            stamps.append(t)
+            unseen = np.full((self._markers, 2), np.nan)
+            shape = (self._markers, 2)
+            pixels.append(unseen if s is None else self._numbers(f"read() gave {name} pixels", s, shape))
+            if s is not None:
+                stated.append(deviation is not None)
+            what = f"read() gave sigma_px of {name}"
+            known = None if deviation is None else self._numbers(what, deviation, shape[:1])
+            sigma.append(unseen[:, 0] if known is None else known)
+        if any(stated) and not all(stated):
+            raise WorkFailed(f"{self.name}: read() gave deviations of some views: give those of all or none")
+        return pixels, stamps, sigma if any(stated) else None
 
     def _require_seconds(self, clock: float, times: FloatArray) -> None:
-        """Refuse stamps t_q, t_left, t_right that go on as in another unit than s, or in whole seconds."""
+        """Refuse stamps of joints and views that go on as in another unit than s, or in whole seconds."""
         if self._stamps is None:
-            self._stamps = clock, times, np.ones(3, dtype=np.int64)
+            self._stamps = clock, times, np.ones(len(times), dtype=np.int64)
         begun, first, whole = self._stamps
         np.multiply(whole + 1, (times == np.rint(times)) & (times != 0.0), out=whole)
-        for name, t, since, count in zip(("t_q", "t_left", "t_right"), times, first, whole, strict=True):
+        names = "t_q", *(f"t_{view}" for view in self.view)
+        for name, t, since, count in zip(names, times, first, whole, strict=True):
             # A clock of its own may jump by a second or two, when it is set.
             unit = time_unit(max(t - since - 2.0, 1e-9) / (clock - begun)) if clock - begun > 2e-3 else ""
             if unit:

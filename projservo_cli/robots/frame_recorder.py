@@ -8,16 +8,16 @@ from PIL import Image
 
 from projservo_cli.records import ByteArray, FloatArray
 
-MOST_FRAMES = 60  # pairs of a run that are kept
+MOST_FRAMES = 60  # instants of a run that are kept
 _QUALITY = 85  # of JPEG
 
 
 class _Shot(NamedTuple):
-    """A pair of frames that is kept."""
+    """The frames of an instant that is kept, one a view."""
 
     instant: int
-    s: FloatArray  # (2, m, 2) px, its detections
-    jpeg: tuple[bytes, bytes]
+    s: FloatArray  # (V, m, 2) px, its detections
+    jpeg: tuple[bytes, ...]
 
 
 class FrameRecorder:
@@ -29,7 +29,7 @@ class FrameRecorder:
         self._last: tuple[int, FloatArray, ByteArray] | None = None
 
     def show(self, instant: int, s: FloatArray, frames: ByteArray) -> None:
-        """Take the frames (2, height, width) of an instant, and the pixels (2, m, 2) that were found."""
+        """Take the frames (V, height, width) of an instant, and the pixels (V, m, 2) that were found."""
         self._last = instant, s, frames
         if instant % self._every == 0 and len(self._kept) == MOST_FRAMES - 1:
             self._kept, self._every = self._kept[::2], 2 * self._every
@@ -53,9 +53,9 @@ class FrameRecorder:
         }
 
 
-def _as_jpeg(frames: ByteArray) -> tuple[bytes, bytes]:
-    """Both frames (2, height, width) as files."""
-    files = io.BytesIO(), io.BytesIO()
+def _as_jpeg(frames: ByteArray) -> tuple[bytes, ...]:
+    """Frames (V, height, width) as files."""
+    files = [io.BytesIO() for _ in frames]
     for file, frame in zip(files, frames, strict=True):
         Image.fromarray(frame).save(file, "JPEG", quality=_QUALITY)
-    return files[0].getvalue(), files[1].getvalue()
+    return tuple(file.getvalue() for file in files)

@@ -6,13 +6,13 @@ where it has one, which may be of another clock or of its arrival, else of the r
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration.time_offset import is_repeated_frame
-from projservo_cli.records import VIEWS, BoolArray, FloatArray, WorkFailed
+from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 # Deviation of an unknown delay, and of a single frame where no calibration gives it, s.
 UNKNOWN_S, _JITTER_S = 0.3, 0.012
@@ -73,42 +73,45 @@ class History:
 
 
 class DelayPrior(NamedTuple):
-    """Knowledge of the delays of both views before the first image."""
+    """Knowledge of the delays of all views before the first image."""
 
-    mean: FloatArray  # (2,) s
-    sigma: FloatArray  # (2,) s, of the mean; 0 where it is given and not followed
-    jitter: FloatArray  # (2,) s, deviation of single frames
+    mean: FloatArray  # (V,) s
+    sigma: FloatArray  # (V,) s, of the mean; 0 where it is given and not followed
+    jitter: FloatArray  # (V,) s, deviation of single frames
 
-
-NOTHING_KNOWN = DelayPrior(np.zeros(2), np.full(2, UNKNOWN_S), np.full(2, _JITTER_S))
+    @classmethod
+    def unknown(cls, views: int) -> "DelayPrior":
+        """Return the prior of a number of views of which nothing is known."""
+        return cls(np.zeros(views), np.full(views, UNKNOWN_S), np.full(views, _JITTER_S))
 
 
 class _Frames(NamedTuple):
     """Instants of the images of an observation."""
 
-    t: FloatArray  # (2,) s, by the clock of the readings
-    sigma: FloatArray  # (2,) s, how well that was known before the images were looked at
-    fresh: BoolArray  # (2,) whether the image is another one than before
+    t: FloatArray  # (V,) s, by the clock of the readings
+    sigma: FloatArray  # (V,) s, how well that was known before the images were looked at
+    fresh: BoolArray  # (V,) whether the image is another one than before
 
 
 def squares_by_joints(
     predicted: Callable[[FloatArray], FloatArray], q: FloatArray, sigma_q: FloatArray
 ) -> FloatArray:
-    """Variances (2, m, 2) of pixels, px², by deviations (n,) of the readings at joints (n,), rad or m."""
+    """Variances (V, m, 2) of pixels, px², by deviations (n,) of the readings at joints (n,), rad or m."""
     s = predicted(np.concatenate([q[None], q + np.diag(sigma_q)]))
     return np.asarray(np.square(s[1:] - s[0]).sum(axis=0))
 
 
 class Delays:
-    """The delays of both views, and the instants of frames.
+    """The delays of all views, and the instants of frames.
 
-    predicted : pixels (k, 2, m, 2) at joints (k, n).
+    view : names of the views; predicted : pixels (k, V, m, 2) at joints (k, n).
     prior : of the delays; sigma_px : pixel noise; timeout_s : longest that an image may stand still, s.
     sigma_q : (n,) deviation of the joint readings, rad or m; 0 where none shows.
     """
 
     def __init__(
         self,
+        view: Sequence[str],
         predicted: Callable[[FloatArray], FloatArray],
         prior: DelayPrior,
         sigma_px: float,
@@ -116,17 +119,19 @@ class Delays:
         sigma_q: FloatArray,
     ) -> None:
         self._predicted, self._sigma_q, self._error_px = predicted, sigma_q, math.hypot(sigma_px, _MODEL_PX)
-        self._views = [_View(view, predicted, prior, self._error_px, timeout_s) for view in range(2)]
+        self._views = [
+            _View(name, v, predicted, prior, self._error_px, timeout_s) for v, name in enumerate(view)
+        ]
 
     @property
     def mean(self) -> FloatArray:
-        """Delays (2,) as followed, s: of images from their readings, or from their stamps."""
+        """Delays (V,) as followed, s: of images from their readings, or from their stamps."""
         return np.array([view.mean for view in self._views])
 
     def update(self, t_view: FloatArray, images: FloatArray, history: History) -> _Frames:
-        """Instants of both images of an observation.
+        """Instants of the images of an observation.
 
-        t_view : (2,) s, stamps, NaN where there are none; images : (2, m, 2) px, NaN where unseen.
+        t_view : (V,) s, stamps, NaN where there are none; images : (V, m, 2) px, NaN where unseen.
         history : of the readings, that of this observation the last.
         Raises WorkFailed if the clock of a camera jumped, or its image stands still while the joints move.
         """
@@ -162,13 +167,15 @@ class _View:
 
     def __init__(
         self,
+        name: str,
         view: int,
         predicted: Callable[[FloatArray], FloatArray],
         prior: DelayPrior,
         error_px: float,
         timeout_s: float,
     ) -> None:
-        self._view, self._predicted, self.error_px, self._timeout_s = view, predicted, error_px, timeout_s
+        self._name, self._view, self._predicted = name, view, predicted
+        self.error_px, self._timeout_s = error_px, timeout_s
         mean, sigma, jitter = (float(both[view]) for both in prior)
         self.mean, self._variance, self._jitter, self._follows = mean, sigma**2, jitter, sigma > 0.0
         blur = np.exp(-0.5 * (np.subtract.outer(_DELAYS, _DELAYS) / jitter) ** 2)
@@ -221,7 +228,7 @@ class _View:
         slack = _AHEAD_S + _GATE * sigma
         if not -slack <= age <= self._timeout_s + slack:
             raise WorkFailed(
-                f"the stamp of a {VIEWS[self._view]} image makes it {age:.3g} s old: the clock that stamps "
+                f"the stamp of a {self._name} image makes it {age:.3g} s old: the clock that stamps "
                 "it jumped, or images come that late"
             )
 
@@ -236,7 +243,7 @@ class _View:
             self._moved_at = now
         if now - self._moved_at > self._timeout_s:
             raise WorkFailed(
-                f"the {VIEWS[self._view]} image has stood still for {now - self._moved_at:.3g} s while the "
+                f"the {self._name} image has stood still for {now - self._moved_at:.3g} s while the "
                 "joints moved: look whether its camera still runs"
             )
 

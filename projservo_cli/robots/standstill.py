@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from projservo_cli.records import VIEWS, FloatArray, IntArray, WorkFailed
+from projservo_cli.records import FloatArray, IntArray, WorkFailed
 from projservo_cli.robots.contract import Reading
 
 # Drift of a joint, rad or m, and of an image, px rms, within which both count as still.
@@ -37,10 +37,10 @@ def averaged(
     """Return the mean of readings of a robot at rest, with a number of frames of each view, each once.
 
     Frames are weighted by their deviations, if they have any. Markers that most of the frames of a view do
-    not show are NaN. Returns the mean; sums (2, m) of the squares by which pixels are off it, px²; how many
-    frames (2, m) show a marker, 0 where it is NaN.
+    not show are NaN. Returns the mean; sums (V, m) of the squares by which pixels are off it, px²; how many
+    frames (V, m) show a marker, 0 where it is NaN.
     """
-    readings, frames = [reading], [[_frame(reading, view)] for view in (0, 1)]
+    readings, frames = [reading], [[_frame(reading, view)] for view in range(len(reading.s))]
     for _ in range(_WAITED * wanted):
         if min(map(len, frames)) >= wanted:
             break
@@ -48,7 +48,7 @@ def averaged(
         for view, new in enumerate(readings[-1].new_views(readings[-2])):
             if new and len(frames[view]) < wanted:
                 frames[view].append(_frame(readings[-1], view))
-    s, sigma, squares, count = (np.stack(both) for both in zip(*map(_mean, frames), strict=True))
+    s, sigma, squares, count = (np.stack(each) for each in zip(*map(_mean, frames), strict=True))
     q = readings[0].q + np.mean([seen.q - readings[0].q for seen in readings], axis=0)
     stated = reading.sigma_px if reading.sigma_px is None or len(readings) == 1 else sigma
     return readings[-1]._replace(q=q, s=s, sigma_px=stated), squares, count
@@ -95,7 +95,7 @@ class Standstill:
         self.seconds = seconds
         self._since = math.inf
         self._q: _Rows = deque()
-        self._s: tuple[_Rows, _Rows] = deque(), deque()
+        self._s: list[_Rows] = []  # one for each view, from the first reading on
         self._last: Reading | None = None
         self.moving = ""  # message on the part that moves
 
@@ -111,6 +111,7 @@ class Standstill:
     def all(self, reading: Reading) -> bool:
         """Whether joints and images have stood still up to the next reading."""
         still = self.joints(reading)
+        self._s = self._s or [deque() for _ in reading.s]
         new = reading.new_views(self._last)
         self._last = reading
         for view, rows in enumerate(self._s):
@@ -119,7 +120,7 @@ class Standstill:
                 continue  # the same image all the time
             square, variance = _drift(frames[:, np.isfinite(frames).all(axis=0)])
             if square.size and square.mean() > max(_STILL_PX**2, 2.0 * variance.mean()):
-                self.moving = self.moving or f"the {VIEWS[view]} image"
+                self.moving = self.moving or f"the {reading.view[view]} image"
             still = still and len(rows) >= _LEAST
         return still and not self.moving
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import Field, Strict, StrictInt, StrictStr, StringConstraints
 
-from projservo_cli.settings.sections import Count, Finding, NotNegative, Positive, Section
+from projservo_cli.settings.sections import ByView, Count, Finding, NotNegative, Positive, Section
 
 
 class Source(Section):
@@ -45,20 +45,35 @@ def device_of(source: int | str) -> Path | None:
     return path.resolve() if re.fullmatch(r"video\d+", path.resolve().name) else path
 
 
-class Cameras(Section):
-    """Both cameras, of an arm whose class has joints() in place of read(); projservo finds the tags."""
+class Cameras(ByView):
+    """Cameras by name, of an arm whose class has joints() in place of read(); projservo finds the tags.
 
-    left: Source = Field(description="the left camera")
-    right: Source = Field(description="the right camera")
+    A pair is ``left`` and ``right``; any number of others have names of their own, such as ``top``.
+    """
+
+    __pydantic_extra__: dict[str, Source]
+    left: Source | None = Field(None, description="the left camera; others have their names in its place")
+    right: Source | None = Field(None, description="the right camera")
     max_age_s: Positive = Field(0.3, description="how old a frame may be, from its stamp")
     reconnect_s: Positive = Field(
         1.5, description="within which a lost camera must give frames again; the arm holds meanwhile"
     )
 
     def contradictions(self) -> Iterator[Finding]:
-        """One camera twice, or no time to reconnect."""
-        left, right = (device_of(one.source) or one.source for one in (self.left, self.right))
-        if left == right:
-            yield ("right", "source"), f"is {left}, that of the left camera as well: name the other one"
+        """No camera, one twice, a name that is none, or no time to reconnect."""
+        yield from super().contradictions()
+        if not self.sources:
+            yield (), "name one camera or more, such as left and right, each with its source"
+        names: dict[int | str | Path, str] = {}
+        for name, one in self.sources.items():
+            where = device_of(one.source) or one.source
+            if (other := names.setdefault(where, name)) != name:
+                what = f"is {where}, that of the {other} camera as well: name the other one"
+                yield (name, "source"), what
         if self.reconnect_s < self.max_age_s:
             yield ("reconnect_s",), f"must not be below max_age_s, {self.max_age_s:g}"
+
+    @property
+    def sources(self) -> dict[str, Source]:
+        """Return the cameras by name: left and right first, others in the order in which they are written."""
+        return {name: one for name, one in self if isinstance(one, Source)}

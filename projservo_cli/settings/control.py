@@ -4,13 +4,23 @@ import json
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, StrictInt, WithJsonSchema
+from pydantic import AfterValidator, BeforeValidator, Field, StrictInt, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 from projservo_cli import plugins
 from projservo_cli.laws import LAW_SPECS, LAWS, mode_in
+from projservo_cli.records import InputError
 from projservo_cli.settings.disturbance import of_all
-from projservo_cli.settings.sections import Count, Finding, NotNegative, Number, Positive, Section, Whole
+from projservo_cli.settings.sections import (
+    ByView,
+    Count,
+    Finding,
+    NotNegative,
+    Number,
+    Positive,
+    Section,
+    Whole,
+)
 
 
 def _law(name: str) -> str:
@@ -135,19 +145,20 @@ class Control(Section):
                 )
 
 
-class EachView(Section):
+class EachView(ByView):
     """A number for each camera, by its name, and for those that are not named."""
 
-    model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Number]
-
-    left: Number = Field(0.0, description="time offset of the left camera")
-    right: Number = Field(0.0, description="time offset of the right camera")
-    others: Number = Field(0.0, description="time offset of other cameras, unless they are named")
+    left: Number | None = Field(None, description="time offset of the left camera; others by their names")
+    right: Number | None = Field(None, description="time offset of the right camera")
+    others: Number | None = Field(None, description="time offset of cameras that are not named")
 
     def of(self, view: str) -> float:
-        """Return the number of a camera."""
-        number: float = getattr(self, view, self.others)
+        """Return the number of a camera. Raises InputError where there is none."""
+        number: float | None = getattr(self, view, None)
+        number = self.others if number is None else number
+        if number is None:
+            raise InputError(f"plant.time_offset_s: names no {view}: give its number, or others")
         return number
 
 

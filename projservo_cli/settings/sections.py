@@ -74,6 +74,22 @@ class Section(BaseModel):
         return cast(_Part, kind.model_construct(**{name: getattr(self, name) for name in kind.model_fields}))
 
 
+# Name of a view in tables and configurations; q alone is the name of joint readings: t_q is their time.
+_VIEW = re.compile(r"(?!q$)[a-z0-9][a-z0-9_]*")
+
+
+class ByView(Section):
+    """A section whose further keys are names of views like ``left`` and ``right``."""
+
+    model_config = ConfigDict(extra="allow")
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Yield names that no column of a table can have."""
+        for name in self.model_extra or ():
+            if not _VIEW.fullmatch(name):
+                yield (name,), "is no name of a camera: take small letters and digits, such as top or cam_2"
+
+
 class Root(Section):
     """A configuration as a whole, of which all contradictions are found at once.
 
@@ -104,7 +120,7 @@ _LARGEST = (
 def _of_another_unit(key: str, value: Any) -> str:
     """Tell that a length or a time looks like one in another unit; empty if not."""
     most, unit = next(((most, unit) for name, most, unit in _LARGEST if name.fullmatch(key)), (math.inf, ""))
-    each = list(vars(value).values()) if isinstance(value, Section) else value
+    each = [inner for _, inner in value] if isinstance(value, Section) else value
     largest = max((abs(x) for x in np.ravel(each) if isinstance(x, float)), default=0.0) if unit else 0.0
     return (
         f"{largest:g} is more than {most:g}: it looks like {unit}; divide by 1000" if largest > most else ""
@@ -119,7 +135,7 @@ def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...
             yield here, what
         if isinstance(part, Section):
             yield from ((here + at, what) for at, what in part.contradictions())
-            yield from _contradictions({**vars(part), **(part.model_extra or {})}.items(), here)
+            yield from _contradictions(part, here)
         elif isinstance(part, dict):
             yield from _contradictions(part.items(), here)
         elif isinstance(part, tuple) and part and isinstance(part[0], Section):

@@ -1,14 +1,16 @@
 """The task, the motion to its goal, and regions of the images that the motion keeps out of."""
 
 import math
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, StrictBool, StrictInt
+from pydantic import Field, StrictBool, StrictInt, WithJsonSchema, WrapValidator
 
-from projservo_cli.records import InputError
+from projservo_cli.records import VIEWS, InputError
 from projservo_cli.settings.sections import (
+    ByView,
     Count,
     Finding,
     JointVector,
@@ -33,14 +35,44 @@ _Pixels = tuple[Vector2 | None, ...]
 _Deviations = tuple[NotNegative | None, ...]
 
 
-class GoalImages(Section):
-    """Pixels of the face, and of further markers, at the goal, with their standard deviations."""
+_OF_SIGMA = re.compile(r"sigma_(.+)_px")  # key of the standard deviations of a view
+
+
+def sigma_key(view: str) -> str:
+    """Return the key of the standard deviations of a view."""
+    return f"sigma_{view}_px"
+
+
+def _pixels_or_deviations(value: Any, pixels: Callable[[Any], _Pixels]) -> _Pixels | _Deviations:
+    """Entries under the name of a view, or numbers under the key of its deviations."""
+    if not isinstance(value, (list, tuple)) or all(x is None or isinstance(x, (list, tuple)) for x in value):
+        return pixels(value)
+    for x in value:
+        if isinstance(x, bool) or not (x is None or (isinstance(x, int | float) and 0.0 <= x < math.inf)):
+            raise ValueError("must be a list of [u, v], or of deviations of at least 0")
+    return tuple(None if x is None else float(x) for x in value)
+
+
+class GoalImages(ByView):
+    """Pixels of the face, and of further markers, at the goal, with their standard deviations.
+
+    Cameras of other names have pixels under these, and deviations under ``sigma_NAME_px``.
+    """
+
+    __pydantic_extra__: dict[
+        str,
+        Annotated[_Pixels, WrapValidator(_pixels_or_deviations), WithJsonSchema({"type": "array"})],
+    ]
 
     markers: Annotated[tuple[Whole, ...], Field(min_length=1)] | None = Field(
         None, description="numbers of the markers; null: markers.face"
     )
-    left: _Pixels = Field(description="u and v of each marker in the left image, px; null: unseen")
-    right: _Pixels = Field(description="u and v of each marker in the right image, px; null: unseen")
+    left: _Pixels | None = Field(
+        None, description="u and v of each marker in the left image, px; null: unseen; others by their names"
+    )
+    right: _Pixels | None = Field(
+        None, description="u and v of each marker in the right image, px; null: unseen"
+    )
     sigma_left_px: _Deviations | None = Field(
         None, description="standard deviation of each marker in the left image; null: noise.servo_px"
     )
@@ -51,22 +83,50 @@ class GoalImages(Section):
         None, description="joint readings at the goal, from which task.start takes them if it names the file"
     )
 
-    def pixels(self, face: Sequence[int]) -> dict[int, tuple[Vector2, Vector2]]:
-        """Left and right pixel of each marker, NaN where unseen; ``face`` are numbers of its markers."""
-        unseen = math.nan, math.nan
-        each = zip(self.markers or face, self.left, self.right, strict=True)
-        return {number: (left or unseen, right or unseen) for number, left, right in each}
+    def contradictions(self) -> Iterator[Finding]:
+        """Yield images of no camera, and keys that are neither names of cameras nor of deviations."""
+        yield from super().contradictions()
+        if not self.view:
+            yield (), "give left, right or other cameras by their names: the pixels of the markers there"
+        for key, value in (self.model_extra or {}).items():
+            named, numbers = _OF_SIGMA.fullmatch(key), any(isinstance(entry, float) for entry in value)
+            if named is None and numbers:
+                yield (key,), "unknown key; pixels are [u, v] a marker, deviations stand under sigma_NAME_px"
+            elif named is not None and any(isinstance(entry, tuple) for entry in value):
+                yield (key,), "must be a list of standard deviations, a number a marker"
+            elif named is not None and named[1] not in self.view:
+                yield (key,), f"there are no pixels of {named[1]}"
 
-    def deviations(self, numbers: Sequence[int], face: Sequence[int]) -> list[list[float]]:
-        """Standard deviation of markers in the left and in the right image, px; NaN if unknown."""
+    @property
+    def view(self) -> tuple[str, ...]:
+        """Names of the cameras: left and right first, others in the order in which they are written."""
+        further = [key for key in self.model_extra or {} if not _OF_SIGMA.fullmatch(key)]
+        return (*self.given(*VIEWS), *further)
+
+    def side(self, key: str) -> tuple[Any, ...] | None:
+        """Return the entries under the name of a camera, or under the key of its deviations; None without."""
+        side: tuple[Any, ...] | None = getattr(self, key, None)
+        return side
+
+    def pixels(self, face: Sequence[int], view: Sequence[str]) -> dict[int, tuple[Vector2, ...]]:
+        """Pixel of each marker in some views, NaN where unseen; ``face`` are numbers of its markers."""
+        own, unseen = list(self.markers or face), (math.nan, math.nan)
+        sides = [self.side(name) or (None,) * len(own) for name in view]
+        each = zip(own, *sides, strict=True)
+        return {number: tuple(at or unseen for at in pixels) for number, *pixels in each}
+
+    def deviations(
+        self, numbers: Sequence[int], face: Sequence[int], view: Sequence[str]
+    ) -> list[list[float]]:
+        """Standard deviation of markers in the images of some views, px; NaN if unknown."""
         own = list(self.markers or face)
-        sides = [side or (None,) * len(own) for side in (self.sigma_left_px, self.sigma_right_px)]
+        sides = [self.side(sigma_key(name)) or (None,) * len(own) for name in view]
         known = [dict(zip(own, side, strict=True)) for side in sides]
         return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in known]
 
     def sigma_px(self, numbers: Sequence[int], face: Sequence[int]) -> float | None:
         """Standard deviation of a coordinate of markers of some numbers, rms; None if unknown."""
-        known = [sigma**2 for side in self.deviations(numbers, face) for sigma in side]
+        known = [sigma**2 for side in self.deviations(numbers, face, self.view) for sigma in side]
         return None if any(map(math.isnan, known)) else math.sqrt(sum(known) / len(known))
 
 
@@ -108,10 +168,9 @@ class TaskSettings(Section):
 _Polygon = Annotated[tuple[Vector2, ...], Field(min_length=3, max_length=200)]
 
 
-class KeptOut(Section):
+class KeptOut(ByView):
     """Region that an obstacle covers in the images, by their names: simple polygons, convex or not, px."""
 
-    model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _Polygon | None]
 
     left: _Polygon | None = Field(None, description="corners u and v in the left image, px; null: none")
@@ -123,6 +182,7 @@ class KeptOut(Section):
 
     def contradictions(self) -> Iterator[Finding]:
         """No polygon, or one that is none."""
+        yield from super().contradictions()
         if not self.drawn:
             yield (), "give left, right or both: the corners of the region that the obstacle covers there"
         for name, corners in self.drawn.items():

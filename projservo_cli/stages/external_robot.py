@@ -18,7 +18,7 @@ from projservo_cli.passwords import MASK
 from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
-from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior
+from projservo_cli.robots.latency import DelayPrior
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
@@ -42,11 +42,18 @@ _LEAST_JITTER_S, _INTERVAL = 0.002, 3.92
 
 
 def plugin_robot(
-    own: OwnRobot, bounds: Bounds, types: str, numbers: Sequence[int], given: Robot | None = None
+    own: OwnRobot,
+    bounds: Bounds,
+    types: str,
+    numbers: Sequence[int],
+    given: Robot | None = None,
+    view: Sequence[str] | None = None,
 ) -> PluginRobot:
     """Make a robot of somebody's, unless it is given; an InputError where a joint has no speed limit.
 
     types : one letter a joint, R or P; numbers : of the markers that the robot observes.
+    view : names of the views of readings, which go on where a camera is lost; None for all of the robot's,
+        none of which may be lost.
     """
     limited = np.isfinite(bounds.limits.speed)
     for kind, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
@@ -55,19 +62,21 @@ def plugin_robot(
                 f"plant {own.target}: a robot that is not simulated needs a limit: set control.{key}"
             )
     robot, name, timeout_s = (
-        _made(own, numbers, bounds) if given is None else given,
+        _made(own, numbers, bounds, whole=view is None) if given is None else given,
         f"plant {plugins.short_name(own.target)}",
         own.timeout_s,
     )
     if own.cameras is not None:  # a reading waits for a camera that reconnects
         timeout_s += own.cameras.reconnect_s
-    return PluginRobot(robot, name, len(numbers), bounds, timeout_s, own.open_s, own.image_size)
+    return PluginRobot(robot, name, len(numbers), bounds, timeout_s, own.open_s, own.image_size, view)
 
 
-def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds) -> Robot:
+def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds, *, whole: bool) -> Robot:
     """Make an object of the class of a robot, with its options, and cameras where it brings none.
 
     A class that takes an argument ``limits`` is given those of its joints.
+
+    whole : whether none of these cameras may be lost.
     """
     options = dict(own.options)
     if MASK in repr((options, own.cameras)):
@@ -84,7 +93,8 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds) -> Robot:
                 f"plant {own.target}: has read(), which brings pixels, and cameras are configured as well: "
                 "write joints() in its place, or leave cameras out"
             )
-        return CameraRobot(arm, own.cameras, finder_of(own.board, own.dictionary), numbers)
+        finder = finder_of(own.board, own.dictionary)
+        return CameraRobot(arm, own.cameras, finder, numbers, whole=whole)
     if own.dictionary is not None and own.board is None:
         if not plugins.takes("plant", own.target, "dictionary"):
             raise InputError(
@@ -204,7 +214,7 @@ def connected_robot(scenario: RunScenario, law: str, given: Robot | None = None)
     driven = contract.driven
     if isinstance(driven.robot, OwnRobot):
         plant, bounds = _believed_plant(scenario, calibration), driven.following.bounds(joints)
-        robot = plugin_robot(driven.robot, bounds, joints.types, scenario.observed, given)
+        robot = plugin_robot(driven.robot, bounds, joints.types, scenario.observed, given, calibration.view)
     else:
         plant = scenario.plant_of(law)
         robot = simulated_robot(driven, joints, _in_the_loop(scenario, driven.robot, contract.events))
@@ -250,8 +260,9 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
 
 
 def _delays_of(given: EachView | None, calibration: Calibration) -> DelayPrior:
-    """Return the prior of the delays of the views: given, calibrated, or wide."""
-    known = NOTHING_KNOWN
+    """Return the prior of the delays of all views: given, calibrated, or wide."""
+    view = calibration.view
+    known = DelayPrior.unknown(len(view))
     if calibration.time_offset_s is not None:
         interval, jitter = calibration.time_offset_interval_s, calibration.time_offset_jitter_s
         assert interval is not None
@@ -259,6 +270,6 @@ def _delays_of(given: EachView | None, calibration: Calibration) -> DelayPrior:
         sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
         known = DelayPrior(calibration.time_offset_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
     if given is not None:
-        mean = np.array([given.of(name) for name in calibration.view])
-        known = known._replace(mean=mean, sigma=np.zeros(len(mean)))
+        mean = np.array([given.of(name) for name in view])
+        known = known._replace(mean=mean, sigma=np.zeros(len(view)))
     return known

@@ -171,10 +171,8 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     images = task.goal.images if task is not None else None
     if images is None or (whole := scenario.goal_pixels) is None:
         return
-    pixels, size = (
-        images.pixels(scenario.inputs.face),
-        image_sizes(scenario.inputs.image_size, len(scenario.view)),
-    )
+    view, face = calibration.view, scenario.inputs.face
+    pixels, size = images.pixels(face, view), image_sizes(scenario.inputs.image_size, len(view))
     numbers, seen = np.array([*pixels]), np.swapaxes(np.array([*pixels.values()]), 0, 1)
     if images.joints is not None:
         q = images.joints.values(calibration.joint_types)
@@ -200,11 +198,11 @@ def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     )
     _require_rigid(fit, calibration.view, advice)
     alone = fit.off_px * (np.isfinite(whole[0][..., 0]) & ~fit.seen)
-    view, k = np.unravel_index(int(np.argmax(alone)), alone.shape)
-    if alone[view, k] > near_px:
+    v, k = np.unravel_index(int(np.argmax(alone)), alone.shape)
+    if alone[v, k] > near_px:
         raise WorkFailed(
-            f"the goal images fit no pose of the arm: marker {calibration.marker[k]} is {alone[view, k]:.3g} "
-            f"px off in the {scenario.view[view]} one, {near_px:.3g} px are allowed; {check}"
+            f"the goal images fit no pose of the arm: marker {calibration.marker[k]} is {alone[v, k]:.3g} "
+            f"px off in the {calibration.view[v]} one, {near_px:.3g} px are allowed; {check}"
         )
     if enough and (fault := detected_fault(calibration, q, numbers, seen, size, sigma)):
         raise WorkFailed(_CHANGED.format(fault=fault, advice=advice))

@@ -19,6 +19,7 @@ from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.records import (
     CORNERS,
     VIEWS,
+    BoolArray,
     FloatArray,
     InputError,
     IntArray,
@@ -62,6 +63,7 @@ class _Recording:
     motion_readings: dict[int, list[Reading]] = field(default_factory=dict)
     found: int = 0  # how many of them an earlier call recorded
     identity: str = ""  # of the robot that recorded them
+    view: tuple[str, ...] = VIEWS  # names of its views
     why: str = "none yet"  # why there is something to record; empty where there is nothing
     commands: int = 0  # steps sent to the robot
     # Sum of the squares by which pixels of one pose are off their mean, px², and its degrees of freedom.
@@ -85,10 +87,10 @@ class _Recording:
         if not self.done:
             return ""
         last = self.done[max(self.done)]
-        left, right = np.isfinite(last.s[..., 0]).sum(axis=1).tolist()
+        seen = "|".join(map(str, np.isfinite(last.s[..., 0]).sum(axis=1).tolist()))
         off = np.array([np.abs(one.q - self.targets[pose]) for pose, one in self.done.items()]).max(axis=0)
         i = int(off.argmax())
-        return f"markers {left}|{right}, joint {i + 1} {in_unit(off[i], units[i] if units else 'rad', 2)} off"
+        return f"markers {seen}, joint {i + 1} {in_unit(off[i], units[i] if units else 'rad', 2)} off"
 
     @property
     def spread_px(self) -> float | None:
@@ -133,6 +135,7 @@ class _Recording:
             marker=self.marker,
             q=np.array([reading.q for reading in rows]),
             images=np.array([reading.s for reading in rows]),
+            view=self.view,
             moving=np.array(moving, dtype=np.int64) if in_motion else None,
             t_q=np.array([reading.t_q for reading in rows]) if timed else None,
             t_view=np.array([reading.t_view for reading in rows]) if timed else None,
@@ -199,8 +202,8 @@ def noisy_observation(truth: Truth, q: FloatArray, noise_px: float, drawn: tuple
 
     drawn : seed and stream of the noise.
     """
-    noise = noise_px * generator(*drawn).standard_normal((len(q), len(truth.P), len(truth.number), 2))
-    images = truth.within(np.stack([truth.images(row, truth.M) for row in q]) + noise)
+    exact = np.stack([truth.images(row, truth.M) for row in q])
+    images = truth.within(exact + noise_px * generator(*drawn).standard_normal(exact.shape))
     return Observation(np.arange(len(q)), np.array(truth.number), q, images, view=truth.view)
 
 
@@ -259,10 +262,12 @@ def _resumed(empty: _Recording, maximum: FloatArray) -> _Recording:
     nobody = np.full(len(table.pose), np.nan)
     moving = np.zeros(len(nobody), dtype=np.int64) if table.moving is None else table.moving
     t_q = nobody if table.t_q is None else table.t_q
-    t_view = np.stack([nobody, nobody], axis=1) if table.t_view is None else table.t_view
+    unstamped = np.full(table.images.shape[:2], np.nan)
+    t_view = unstamped if table.t_view is None else table.t_view
+    recording.view = table.view
     for k, pose in enumerate(table.pose.tolist()):
         sigma = None if table.sigma is None else table.sigma[k][:, column]
-        reading = Reading(table.q[k], table.images[k][:, column], t_q[k], t_view[k], sigma)
+        reading = Reading(table.q[k], table.images[k][:, column], t_q[k], t_view[k], sigma, table.view)
         if moving[k] > 0:
             recording.motion_readings.setdefault(int(moving[k]), []).append(reading)
             continue
@@ -301,6 +306,7 @@ def record_poses(
     try:
         with nullcontext() if robot is None else at_rest_after(robot):
             if robot is not None:
+                _require_same_views(recording, robot)
                 robot.require_identity(recording.identity)
                 recording.identity = robot.identity()
             for _ in poses:
@@ -319,8 +325,19 @@ def record_poses(
                 _show(recording, robot)
 
 
+def _require_same_views(recording: _Recording, robot: PluginRobot) -> None:
+    """Take over the names of a robot's views; an InputError where a table has been begun with others."""
+    if recording.found and recording.view != robot.view:
+        raise InputError(
+            f"{recording.path}: was begun with the cameras {', '.join(recording.view)}, not "
+            f"{', '.join(robot.view)}: name them likewise, in this order, or start again with --force "
+            "(force=True)"
+        )
+    recording.view = robot.view
+
+
 def _show(recording: _Recording, robot: PluginRobot) -> None:
-    """Write a page next to the table: how far it is, and both images of the last pose with the tags."""
+    """Write a page next to the table: how far it is, and the images of the last pose with the tags."""
     last = recording.done[max(recording.done)]
     nothing = np.empty((0, 2))
     assert robot.frames is not None
@@ -365,6 +382,7 @@ def observed(
     robot = _robot_of(trials, recording, drawn)
     if robot is None or trials.driven is None:
         return noisy_observation(truth, targets, sigma_px, drawn), sigma_px or None
+    recording.view = robot.view
     with at_rest_after(robot):
         for _ in _recorded(robot, trials, recording):
             progress("trial motions", len(recording.done), len(recording.targets))
@@ -379,8 +397,26 @@ def _simulated(trials: Trials, recording: _Recording, drawn: tuple[int, int]) ->
     assert trials.truth is not None
     seen = noisy_observation(trials.truth, recording.targets, trials.noise_px, drawn)
     for pose in recording.pending:
-        recording.done[pose] = Reading(seen.q[pose], seen.images[pose], np.nan, np.full(2, np.nan), None)
+        recording.done[pose] = Reading(
+            seen.q[pose], seen.images[pose], np.nan, np.full(len(seen.view), np.nan), None
+        )
         yield pose
+
+
+def shared_markers(s: FloatArray) -> BoolArray:
+    """Tell which markers (…, m) of pixels (…, V, m, 2) two views or more see; of one view, which it sees."""
+    seen: BoolArray = np.isfinite(s[..., 0]).sum(axis=-2) >= min(2, s.shape[-3])
+    return seen
+
+
+def all_of(views: Sequence[str]) -> str:
+    """Name all cameras in a message."""
+    return {1: f"the {views[0]} camera", 2: "both cameras"}.get(len(views), "the cameras")
+
+
+def sharing(views: Sequence[str]) -> str:
+    """Begin a message on what two cameras see together, or one by itself."""
+    return {1: f"the {views[0]} camera sees", 2: "both cameras see"}.get(len(views), "two cameras see")
 
 
 @dataclass(frozen=True, eq=False)
@@ -419,48 +455,52 @@ class _Sight:
             raise WorkFailed(f"record: {wrong}, or {remedy}; then start again with --force (force=True)")
 
     def _faceless(self) -> str:
-        """Tell which marker of the face no pose shows to both cameras so far; empty where there is none."""
+        """Tell which marker of the face no pose shows to two cameras so far; empty where there is none.
+
+        One camera shows it by itself.
+        """
         face, done = self.inputs.face, self.recording.done
-        shared = np.any([np.isfinite(one.s[..., 0]).all(axis=0) for one in done.values()], axis=0)
+        shared = np.any([shared_markers(one.s) for one in done.values()], axis=0)
         lost = [k for k in self.recording.marker[~shared].tolist() if k in face]
         if not lost:
             return ""
         return (
-            f"both cameras see marker {lost[0]} of the face, markers.face {[*face]}, at "
+            f"{sharing(self.recording.view)} marker {lost[0]} of the face, markers.face {[*face]}, at "
             f"none of {len(done)} poses: turn the face towards them"
         )
 
     def _wrong(self, s: FloatArray, where: str) -> str:
-        """Tell why looks (k, 2, m, 2) are of no use; empty where they are."""
-        seen, given = np.isfinite(s[..., 0]), self.inputs.dictionary
+        """Tell why looks (k, V, m, 2) are of no use; empty where they are."""
+        seen, given, views = np.isfinite(s[..., 0]), self.inputs.dictionary, self.recording.view
         blind, total = ~seen.any(axis=(0, 2)), seen.shape[2]
         if blind.all():
             of = f", which is {given} here" if given else ""
             return (
-                f"neither camera sees one of the {total} markers {where}: look whether they stand before "
-                f"both cameras, at light and focus, and whether the dictionary of the tags is right{of}"
+                f"{'neither' if len(views) == 2 else 'no'} camera sees one of the {total} markers {where}: "
+                f"look whether they stand before {all_of(views)}, at light and focus, and whether the "
+                f"dictionary of the tags is right{of}"
             )
         cells = cells_of(given or DICTIONARY)
-        for view, side in zip(VIEWS, self._widths(s), strict=True):
+        for view, side in zip(views, self._widths(s), strict=True):
             if side < MIN_CELL * cells:
                 return (
                     f"tags are {side:.3g} px wide in the {view} image {where}, {side / cells:.2g} px a cell "
                     f"({MIN_CELL:g} at least): take larger tags, nearer cameras, or more pixels"
                 )
         if blind.any():
-            view, other = (VIEWS[i] for i in np.argsort(~blind))
+            most = int(seen.sum(axis=(0, 2)).argmax())
             count = int(seen.sum(axis=2).max())
             return (
-                f"the {view} camera sees none of the {total} markers {where}, the {other} one {count}: turn "
-                "it towards them, and look at its light and focus"
+                f"the {views[int(blind.argmax())]} camera sees none of the {total} markers {where}, the "
+                f"{views[most]} one {count}: turn it towards them, and look at its light and focus"
             )
         often = -(-len(s) // 2)
-        shared = int((seen.all(axis=1).sum(axis=0) >= often).sum())
+        shared = int((shared_markers(s).sum(axis=0) >= often).sum())
         if shared < MIN_SHARED:
             half = "" if len(s) == 1 else ", half of them or more"
             return (
-                f"both cameras see only {shared} of the {total} markers {where}{half} ({MIN_SHARED} at "
-                "least): turn the tool towards both cameras, and remove what occludes it"
+                f"{sharing(views)} only {shared} of the {total} markers {where}{half} ({MIN_SHARED} at "
+                f"least): turn the tool towards {all_of(views)}, and remove what occludes it"
             )
         return ""
 
@@ -474,14 +514,14 @@ class _Sight:
         order = np.argsort(number)
         corners = number[order].reshape(-1, CORNERS) if len(number) % CORNERS == 0 else np.ones((1, CORNERS))
         if (corners != corners[:, :1] + range(CORNERS)).any() or (corners[:, 0] % CORNERS).any():
-            return [math.inf, math.inf]
-        tags = s[:, :, order.reshape(-1, CORNERS)]  # (k, 2, tags, 4, 2)
+            return [math.inf] * s.shape[1]
+        tags = s[:, :, order.reshape(-1, CORNERS)]  # (k, V, tags, 4, 2)
         side = np.roll(tags, -1, axis=3) - tags
         after = np.roll(side, -1, axis=3)
         turn = side[..., 0] * after[..., 1] - side[..., 1] * after[..., 0]
         turn = turn[np.isfinite(turn).all(axis=-1)]
         if not self.inputs.tagged and (len(corners) < 2 or not ((turn > 0.0).all() or (turn < 0.0).all())):
-            return [math.inf, math.inf]
+            return [math.inf] * s.shape[1]
         length = np.linalg.norm(side, axis=-1)
         return [np.nanmax(one) if np.isfinite(one).any() else math.inf for one in np.moveaxis(length, 1, 0)]
 

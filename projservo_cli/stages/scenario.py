@@ -177,11 +177,13 @@ class Scenario:
         """
         if self.goal_images is None or self.calibration is None or not self.calibration.has_covariance:
             return None
-        numbers, pixels = self.calibration.marker.tolist(), self.goal_images.pixels(self.inputs.face)
-        images = np.array([pixels.get(number, _unseen(len(self.view))) for number in numbers]).swapaxes(0, 1)
+        numbers, given = self.calibration.marker.tolist(), self.goal_images
+        pixels, unseen = given.pixels(self.inputs.face, self.view), _unseen(len(self.view))
+        images = np.array([pixels.get(number, unseen) for number in numbers]).swapaxes(0, 1)
         known = [number in pixels for number in numbers]
         sigma = np.full((len(self.view), len(numbers)), self.noise_px)
-        stated = np.array(self.goal_images.deviations([k for k in numbers if k in pixels], self.inputs.face))
+        told = [number for number in numbers if number in pixels]
+        stated = np.array(given.deviations(told, self.inputs.face, self.view))
         sigma[:, known] = np.where(np.isnan(stated), self.noise_px, stated)
         return images, sigma
 
@@ -213,7 +215,7 @@ class Scenario:
         if given is None:
             goal, there = self._frames(self.goal_joints[0], (seed, GOAL_FRAMES))
         else:
-            goal, there = seen_images.s_star, np.array(given.deviations(numbers, self.inputs.face))
+            goal, there = seen_images.s_star, np.array(given.deviations(numbers, self.inputs.face, VIEWS))
         sigma = np.fmax(sigma, there)
         start = self._with_face("task.start", start, seen_images.q_start)
         seen_images = seen_images._replace(s_start=start, s_star=self._with_face("task.goal", goal, None))
@@ -469,7 +471,7 @@ def _simulated_ends(
         return turned(task.goal, robot, truth.cameras_at(q), q)
 
     numbers = tuple(truth.number[i] for i in truth.face), pins
-    seen_images, q_goal = _task_images(task, types, numbers, center, images, turn)
+    seen_images, q_goal = _task_images(task, types, numbers, (center, truth.view), images, turn)
     return seen_images, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal), q_goal
 
 
@@ -477,23 +479,24 @@ def _task_images(
     task: TaskSettings,
     types: str,
     numbers: tuple[Sequence[int], Sequence[int]],
-    center: int,
+    how: tuple[int, tuple[str, ...]],
     images: Callable[[FloatArray, str], FloatArray],
     turn: Callable[[FloatArray], FloatArray],
 ) -> tuple[TaskImages, FloatArray | None]:
     """Start and goal of a task, and the joints (n,) at the goal, None for a goal by images alone.
 
     numbers : of the markers of the face and of the pins.
+    how : position of the centre marker within the face, or ``MIDPOINT``; names of the views.
     images : pixels (V, b, 2) at the joints (n,) of a key of the configuration.
     turn : joints (n,) of a goal that is a turn from the joints (n,) of the start.
     """
-    pins, given = len(numbers[1]), task.goal.joints
+    pins, given, (center, view) = len(numbers[1]), task.goal.joints, how
     q_start = q_from = task.start.values(types)
     if task.start_offset is not None:
         q_start = q_from + task.start_offset.values(types)
     s_start = images(q_start, "task.start" if task.start_offset is None else "task.start_offset")
     if task.goal.images is not None:
-        pixels = task.goal.images.pixels(numbers[0])
+        pixels = task.goal.images.pixels(numbers[0], view)
         unseen = _unseen(len(s_start))
         s_star = np.array([pixels.get(number, unseen) for number in (*numbers[0], *numbers[1])])
         s_star = np.ascontiguousarray(np.swapaxes(s_star, 0, 1))
@@ -541,6 +544,6 @@ def _predicted_ends(
         return turned(task.goal, inputs.arm, P, q)
 
     seen_images, q_goal = _task_images(
-        task, joints.types, (numbers[:m], numbers[m:]), inputs.center, images, turn
+        task, joints.types, (numbers[:m], numbers[m:]), (inputs.center, calibration.view), images, turn
     )
     return seen_images, _unknown(np.full((4, 4), np.nan)), q_goal

@@ -27,7 +27,6 @@ from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
     MM,
-    VIEWS,
     BoolArray,
     Calibration,
     FloatArray,

@@ -1,4 +1,4 @@
-"""Teach: what both cameras see where somebody has moved the robot to, as a goal or as a start."""
+"""Teach: what the cameras see where somebody has moved the robot to, as a goal or as a start."""
 
 import math
 import time
@@ -11,16 +11,17 @@ import numpy as np
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.display import require_radians
 from projservo_cli.hardware.checks_at_rest import MIN_SHARED
-from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import at_rest, averaged
 from projservo_cli.settings.sections import JointVector
-from projservo_cli.settings.task import Goal, GoalImages, TaskSettings
+from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, sigma_key
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
 from projservo_cli.simulation.streams import TAUGHT_NOISE, generator
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.external_robot import plugin_robot, simulated_robot, takes_limits
+from projservo_cli.stages.record import all_of, shared_markers, sharing
 from projservo_cli.stages.stage_inputs import OwnRobot, PlanInputs, TeachInputs
 
 _FAR = 4.0  # standard deviations that a marker may be off
@@ -36,45 +37,39 @@ class _Taught:
 
     marker: IntArray  # (m,) numbers of the markers
     q: FloatArray  # (n,) mean of the joint readings, rad or m
-    s: FloatArray  # (2, m, 2) mean of the pixels, NaN where most frames do not show a marker
-    sigma: FloatArray  # (2, m) standard deviation of a coordinate of that mean, px; NaN if unknown
-    frames: IntArray  # (2,) how many there were of each view
+    view: tuple[str, ...]  # names of the views
+    s: FloatArray  # (V, m, 2) mean of the pixels, NaN where most frames do not show a marker
+    sigma: FloatArray  # (V, m) standard deviation of a coordinate of that mean, px; NaN if unknown
+    frames: IntArray  # (V,) how many there were of each view
     moved: FloatArray | None  # (n,) by how much joints moved when they were held again; None if never
     bounds: Bounds  # of the robot, with the units of its joints
 
     @property
     def shared(self) -> int:
-        """Number of markers that both cameras see."""
-        return int(np.isfinite(self.s[..., 0]).all(axis=0).sum())
+        """Number of markers that two cameras or more see; of one camera, that it sees."""
+        return int(shared_markers(self.s).sum())
 
     @property
     def unseen(self) -> list[tuple[int, str]]:
         """Markers that a camera does not see, and which."""
         return [
-            (int(self.marker[k]), VIEWS[view]) for view, k in np.argwhere(np.isnan(self.s[..., 0])).tolist()
+            (int(self.marker[k]), self.view[v]) for v, k in np.argwhere(np.isnan(self.s[..., 0])).tolist()
         ]
 
     @property
     def images(self) -> GoalImages:
         """Return the images as the goal of a task."""
-        left, right = (
-            tuple(None if math.isnan(u) else (u, v) for u, v in pixels.round(_DIGITS).tolist())
-            for pixels in self.s
-        )
-        sigma = [
-            tuple(None if math.isnan(x) else x for x in side.round(_DIGITS).tolist())
+        pixels = {
+            name: tuple(None if math.isnan(u) else (u, v) for u, v in side.round(_DIGITS).tolist())
+            for name, side in zip(self.view, self.s, strict=True)
+        }
+        sigma = {
+            sigma_key(name): tuple(None if math.isnan(x) else x for x in side.round(_DIGITS).tolist())
+            for name, side in zip(self.view, self.sigma, strict=True)
             if np.isfinite(side).any()
-            else None
-            for side in self.sigma
-        ]
-        return GoalImages(
-            markers=tuple(self.marker.tolist()),
-            left=left,
-            right=right,
-            sigma_left_px=sigma[0],
-            sigma_right_px=sigma[1],
-            joints=JointVector(joints=self.q.tolist(), unit="rad"),
-        )
+        }
+        numbers, joints = tuple(self.marker.tolist()), JointVector(joints=self.q.tolist(), unit="rad")
+        return GoalImages.model_validate({"markers": numbers, **pixels, **sigma, "joints": joints})
 
     def as_goal(self) -> dict[str, Any]:
         """Return the section ``task.goal`` of a configuration."""
@@ -84,7 +79,7 @@ class _Taught:
 class _Checked(NamedTuple):
     """Comparison of a taught pose with a calibration."""
 
-    off_px: FloatArray  # (2, m) error of markers against the joints that reach it, else those read
+    off_px: FloatArray  # (V, m) error of markers against the joints that reach it, else those read
     far: list[tuple[int, str, float]]  # markers beyond what noise explains, which view, how far, px
     reached: bool
     reason: str  # whether joints reach it, in words
@@ -136,6 +131,7 @@ def teach(
     return _Taught(
         marker=np.array(inputs.numbers, dtype=np.int64),
         q=mean.q,
+        view=robot.view,
         s=mean.s,
         sigma=np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan),
         frames=count.max(axis=1),
@@ -217,6 +213,13 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
 
     inputs : of a plan from anywhere; taught : with the whole face.
     """
+    if missing := [name for name in calibration.view if name not in taught.view]:
+        raise InputError(
+            f"teach: the calibration has a camera {missing[0]}, the robot {', '.join(taught.view)}: name the "
+            "cameras as in the recording"
+        )
+    views = [taught.view.index(name) for name in calibration.view]
+    s, sigma = taught.s[views], taught.sigma[views]
     joints = inputs.joints.joints(calibration.joint_types, calibration)
     within = np.clip(taught.q, joints.limits.lower, joints.limits.upper)
     start = JointVector(joints=within.tolist(), unit="rad")
@@ -224,10 +227,10 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
     # No path is searched for joints whose limits are not known: the arm stands at the goal as it is.
     profile = "joint_space" if np.isfinite(limits).all() else "linear"
     border = inputs.trajectory.border_px + 1.0  # beyond what the goal shows, where the size is not known
-    left, right = np.ceil(np.nanmax(taught.s, axis=1) + border).astype(int).tolist()
+    seen_px = np.ceil(np.nanmax(s, axis=1) + border).astype(int).tolist()
     asked = replace(
         inputs,
-        seen_px=(tuple(left), tuple(right)),
+        seen_px=tuple((width, height) for width, height in seen_px),
         task=TaskSettings(start=start, goal=Goal(images=taught.images)),
         trajectory=inputs.trajectory.model_copy(update={"profile": profile, "keep_out": ()}),
     )
@@ -239,32 +242,34 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
         reached, reason, q = False, str(error), taught.q
     numbers = taught.marker.tolist()
     known_to_both = np.flatnonzero(np.isin(numbers, calibration.marker))
-    off = np.full(taught.sigma.shape, np.nan)
+    off = np.full(sigma.shape, np.nan)
     expected = predict(calibration, q[None])[0][:, calibration.indices_of(taught.marker[known_to_both])]
-    off[:, known_to_both] = np.linalg.norm(taught.s[:, known_to_both] - expected, axis=2)
-    noise = np.maximum(np.nan_to_num(taught.sigma), calibration.sigma_px)
+    off[:, known_to_both] = np.linalg.norm(s[:, known_to_both] - expected, axis=2)
+    noise = np.maximum(np.nan_to_num(sigma), calibration.sigma_px)
     far = [
-        (numbers[k], VIEWS[view], float(off[view, k]))
+        (numbers[k], calibration.view[view], float(off[view, k]))
         for view, k in np.argwhere(off > _FAR * math.sqrt(2.0) * noise).tolist()
     ]
     return _Checked(off, far, reached, reason)
 
 
 def require_start(taught: _Taught) -> None:
-    """Refuse a start from which nothing can be recorded, since both cameras see too little; a WorkFailed."""
+    """Refuse a start from which nothing can be recorded, since cameras see too little; a WorkFailed."""
     if taught.shared < MIN_SHARED:
-        count, (left, right) = len(taught.marker), np.isfinite(taught.s[..., 0]).sum(axis=1)
+        counts = zip(taught.view, np.isfinite(taught.s[..., 0]).sum(axis=1), strict=True)
+        seen = "" if len(taught.view) == 1 else "; " + ", ".join(f"{name} {count}" for name, count in counts)
         raise WorkFailed(
-            f"teach: both cameras see {taught.shared} of {count} markers ({MIN_SHARED} at least; "
-            f"left {left}, right {right}): turn the tool towards both cameras, and look at light and focus"
+            f"teach: {sharing(taught.view)} {taught.shared} of {len(taught.marker)} markers ({MIN_SHARED} at "
+            f"least{seen}): turn the tool towards {all_of(taught.view)}, and look at light and focus"
         )
 
 
 def require_face(face: Sequence[int], taught: _Taught) -> None:
-    """Refuse what does not show the whole face to both cameras, with a WorkFailed."""
-    if unseen := [(number, side) for number, side in taught.unseen if number in face]:
+    """Refuse what does not show the whole face to two cameras, or to one alone, with a WorkFailed."""
+    shared = {*taught.marker[shared_markers(taught.s)].tolist()}
+    if unseen := [(number, side) for number, side in taught.unseen if number in {*face} - shared]:
         number, side = unseen[0]
         raise WorkFailed(
             f"teach: the {side} camera does not see marker {number} of the face, markers.face {[*face]}: "
-            "turn the face towards both cameras"
+            f"turn the face towards {all_of(taught.view)}"
         )

@@ -9,7 +9,7 @@ from projservo_cli.loop.stall_monitor import StallMonitor
 from projservo_cli.loop.verdicts import CONVERGED, FOLLOWING_ERROR, NO_PROGRESS, RUNNING, WAITING, new_log
 from projservo_cli.records import JointLimits
 from projservo_cli.robots.contract import Bounds
-from projservo_cli.robots.latency import NOTHING_KNOWN
+from projservo_cli.robots.latency import DelayPrior
 from tests.scene import limits
 
 PERIOD, TICK = 0.1, 1.5e-3
@@ -21,7 +21,7 @@ class Robot:
     """Readings, set-points and what is carried, as a test says."""
 
     def __init__(self):
-        self.known = SimpleNamespace(delays=NOTHING_KNOWN, sigma_q=np.full(2, TICK / 12**0.5))
+        self.known = SimpleNamespace(delays=DelayPrior.unknown(2), sigma_q=np.full(2, TICK / 12**0.5))
         self.robot = SimpleNamespace(bounds=BOUNDS)
         point = SimpleNamespace(short=np.zeros(2, dtype=bool))
         self.steered = SimpleNamespace(reading=None, target=None, set_point=point)

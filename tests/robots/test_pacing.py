@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.records import JointLimits, WorkFailed
+from projservo_cli.records import VIEWS, JointLimits, WorkFailed
 from projservo_cli.robots.contract import Bounds
-from projservo_cli.robots.latency import NOTHING_KNOWN, Delays, History
+from projservo_cli.robots.latency import DelayPrior, Delays, History
 from projservo_cli.robots.pacing import SetPoint
 
 PERIOD = 0.04
@@ -95,7 +95,7 @@ def looks(delays, late, steps=60, stamped=None, noise=NOISE, first=-4):
 @pytest.mark.parametrize("late", [(0.0, 0.0), (0.04, 0.12), (0.3, 0.25)])
 @pytest.mark.parametrize("clock", [None, 0.003, 5e4])
 def test_an_unknown_delay_is_found_as_soon_as_joints_move(late, clock):
-    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT)
+    delays = Delays(VIEWS, predicted, DelayPrior.unknown(2), NOISE, 1.0, EXACT)
     off = looks(delays, late, stamped=clock)
     assert np.abs(off[20:]).max() < 0.01
     if clock is None:
@@ -105,7 +105,7 @@ def test_an_unknown_delay_is_found_as_soon_as_joints_move(late, clock):
 @pytest.mark.parametrize("late", [0.0, 0.08])
 def test_play_in_the_joints_is_no_delay(late):
     """While joints go through it readings move and images do not; by 12 px here, 24 times the noise."""
-    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, np.full(2, PLAY / np.sqrt(12.0)))
+    delays = Delays(VIEWS, predicted, DelayPrior.unknown(2), NOISE, 1.0, np.full(2, PLAY / np.sqrt(12.0)))
     history, rng, links, off = History(), np.random.default_rng(4), [np.zeros(2)], []
     for k in range(-10, 60):
         now = k * PERIOD
@@ -123,7 +123,7 @@ def test_play_in_the_joints_is_no_delay(late):
 
 
 def test_a_delay_that_changes_is_followed():
-    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT)
+    delays = Delays(VIEWS, predicted, DelayPrior.unknown(2), NOISE, 1.0, EXACT)
     history, rng = History(), np.random.default_rng(3)
     for k in range(120):
         now, late = k * PERIOD, 0.05 if k < 50 else 0.2
@@ -134,7 +134,7 @@ def test_a_delay_that_changes_is_followed():
 
 
 def test_an_image_that_comes_twice_keeps_its_instant():
-    delays = Delays(predicted, NOTHING_KNOWN._replace(sigma=np.zeros(2)), NOISE, 1.0, EXACT)
+    delays = Delays(VIEWS, predicted, DelayPrior.unknown(2)._replace(sigma=np.zeros(2)), NOISE, 1.0, EXACT)
     history, unstamped = History(), np.full(2, np.nan)
     history.add(0.0, motion(0.0))
     s = predicted(motion(0.0)[None])[0]
@@ -148,7 +148,7 @@ def test_an_image_that_comes_twice_keeps_its_instant():
 
 
 def test_a_camera_that_stands_still_while_joints_move_is_named():
-    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT)
+    delays = Delays(VIEWS, predicted, DelayPrior.unknown(2), NOISE, 1.0, EXACT)
     history, rng = History(), np.random.default_rng(0)
     still = predicted(np.zeros((1, 2)))[0, 1]
 
