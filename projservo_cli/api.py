@@ -144,7 +144,7 @@ def record(
     joints = given.trials.joints.joints()
     if motions is not None:
         rows = _rows_of(motions, len(joints.types))
-        further = JointList(np.arange(len(rows)), rows, numbered=False, left=None, right=None)
+        further = JointList(np.arange(len(rows)), rows, numbered=False)
     table = None if path is None else Path(path)
     with ExitStack() as stack:
         listener = stack.enter_context(Listener(progress))
@@ -165,6 +165,7 @@ def record(
         joint_types=asked.joint_types,
         image_size=asked.image_size_px,
         seed=given.trials.motions.seed,
+        mount=given.mount,
     )
 
 

@@ -6,7 +6,7 @@ It pairs images with joint readings, finds tags by OpenCV, refines their corners
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,27 +40,30 @@ def cells_of(dictionary: str) -> int:
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 
 
-def pair_images(left: str, right: str, joints: JointList, where: str) -> list[tuple[int, Path, Path]]:
-    """Pair images with poses: number and both images of every pose.
+def pair_images(
+    sources: Mapping[str, str], joints: JointList, where: str
+) -> list[tuple[int, *tuple[Path, ...]]]:
+    """Pair images with poses: number and the images of every pose, one of each view.
 
-    left, right : a folder, or a pattern such as ``left/*.png``.
+    sources : by the name of each view, a folder, or a pattern such as ``left/*.png``.
     joints : the poses. Images are found by their names in the list, else by the pose number at the end of
         their names, else in the order of their names.
     where : file of the poses, for messages.
     Raises InputError if there are no images, or that of a pose is missing or ambiguous.
     """
     poses = joints.pose.tolist()
-    if joints.left is not None and joints.right is not None:
-        sides = [_named(left, joints.left, where), _named(right, joints.right, where)]
+    columns = f"column{'s' * (len(sources) > 1)} {' and '.join(sources)}"
+    if joints.images is not None:
+        sides = [_named(side, joints.images[name], where) for name, side in sources.items()]
     elif joints.numbered:
-        sides = [_by_number(side, poses, where) for side in (left, right)]
+        sides = [_by_number(side, poses, where, columns) for side in sources.values()]
     else:
-        sides = [_images(left), _images(right)]
-        for side, files in zip((left, right), sides, strict=True):
+        sides = [_images(side) for side in sources.values()]
+        for side, files in zip(sources.values(), sides, strict=True):
             if len(files) != len(poses):
                 raise InputError(
                     f"{side}: {len(files)} images for the {len(poses)} rows of {where}; name the images in "
-                    "columns left and right, or number the rows in a column pose"
+                    f"{columns}, or number the rows in a column pose"
                 )
     return list(zip(poses, *sides, strict=True))
 
@@ -115,7 +118,7 @@ def _named(source: str, names: Sequence[str], where: str) -> list[Path]:
     return files
 
 
-def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
+def _by_number(source: str, poses: list[int], where: str, columns: str) -> list[Path]:
     files, chosen = _images(source), []
     for pose in poses:
         fitting = [file for file in files if [*map(int, re.findall(r"\d+", file.stem))][-1:] == [pose]]
@@ -123,8 +126,8 @@ def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
             names = ", ".join(file.name for file in fitting)
             ending = f"the names of {names} end" if fitting else "no image has a name that ends"
             raise InputError(
-                f"{source}: {ending} in {pose}, the pose of {where}; name the images in columns left and "
-                "right, or leave the column pose out to take them in the order of their names"
+                f"{source}: {ending} in {pose}, the pose of {where}; name the images in {columns}, "
+                "or leave the column pose out to take them in the order of their names"
             )
         chosen += fitting
     return chosen
@@ -857,21 +860,22 @@ class _Findings:
 
 
 def observe_tags(
-    pairs: Sequence[tuple[int, Path, Path]],
+    pairs: Sequence[tuple[int, *tuple[Path, ...]]],
+    cameras: Sequence[str],
     q: FloatArray,
     finder: Finder,
     points: str,
     progress: Callable[[str, int, int], None],
 ) -> tuple[Observation, _Findings]:
-    """Find tags in pairs of images.
+    """Find tags in images.
 
-    pairs : number and both images of each pose.
+    pairs : number and images of each pose, one of each camera; cameras : their names.
     q : (K, n) joint readings of the poses.
     finder : of the tags, or of the board, which is tag 0.
     points : ``corners``: corner k of tag t is marker 4 t + k; ``centers``: tag t is marker t.
     progress : called after each pose.
     Raises InputError if an image cannot be read, or has another size than earlier ones of the same camera;
-    WorkFailed if there is no tag in any image, or none that both views saw at a pose.
+    WorkFailed if there is no tag in any image, or none that two views saw at a pose.
     """
     findings = _Findings()
     shapes: dict[int, tuple[int, ...]] = {}
@@ -893,17 +897,21 @@ def observe_tags(
                 findings.images[k, view, number] = np.column_stack(tag[:2]) if in_corners else _center(tag)
         progress("detect", k + 1, len(pairs))
     if not findings.images:
-        raise WorkFailed(finder.nothing.format(count=2 * len(pairs)))
+        raise WorkFailed(finder.nothing.format(count=len(cameras) * len(pairs)))
     numbers, each = findings.tags, finder.corners if points == "corners" else 1
-    values = np.full((len(pairs), 2, len(numbers), each, 3), np.nan)
+    values = np.full((len(pairs), len(cameras), len(numbers), each, 3), np.nan)
     for (k, view, number), pixels in findings.images.items():
         values[k, view, numbers.index(number)] = pixels
     marker = (each * np.array(numbers, dtype=np.int64)[:, None] + np.arange(each)).ravel()
     pose = np.array([number for number, *_ in pairs], dtype=np.int64)
-    values = values.reshape(len(pairs), 2, len(marker), 3)
-    observation = Observation(pose, marker, q, values[..., :2], sigma=values[..., 2])
-    if not np.isfinite(observation.images[..., 0]).all(axis=1).any():
-        raise WorkFailed("no tag was seen by both cameras at the same pose: check the pairing of the images")
+    values = values.reshape(len(pairs), len(cameras), len(marker), 3)
+    images, sigma = values[..., :2], values[..., 2]
+    observation = Observation(pose, marker, q, images, sigma=sigma, view=tuple(cameras))
+    if len(cameras) > 1 and (np.isfinite(images[..., 0]).sum(axis=1) < 2).all():
+        both = "both" if len(cameras) == 2 else "two"
+        raise WorkFailed(
+            f"no tag was seen by {both} cameras at the same pose: check the pairing of the images"
+        )
     return observation, findings
 
 

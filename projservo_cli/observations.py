@@ -1,4 +1,4 @@
-"""Observations of a robot by two cameras, with all inputs of a calibration besides the pixels."""
+"""Observations of a robot by cameras, with all inputs of a calibration besides the pixels."""
 
 import dataclasses
 import io
@@ -12,23 +12,32 @@ import numpy.typing as npt
 from projservo_cli.calibration.pipeline import require_size_and_noise
 from projservo_cli.display import Displayable, checked_array, numbers_in, pandas
 from projservo_cli.image_size import ImageSize
-from projservo_cli.records import WORLD, InputError, Observation
-from projservo_cli.store.observation_tables import in_radians, or_empty, read_table, table_text, to_csv
+from projservo_cli.records import TOOL, VIEWS, WORLD, InputError, Observation
+from projservo_cli.settings.sections import is_view
+from projservo_cli.store.observation_tables import (
+    in_radians,
+    mount_in,
+    or_empty,
+    read_table,
+    table_text,
+    to_csv,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Observations(Displayable, Observation):
-    """Stereo images of markers at a sequence of poses, and their properties.
+    """Images of markers at a sequence of poses, and their properties.
 
     Attributes
     ----------
     pose : (K,) numbers of the poses.
     marker : (m,) numbers of the markers.
     q : (K, n) joint readings, rad or m.
-    images : (K, 2, m, 2) pixels, left and right, NaN where unseen.
+    images : (K, V, m, 2) pixels in each view, NaN where unseen.
+    view : names of the V views.
     moving, t_q, t_view, sigma : as in [the run file]; None where unknown.
     joint_types : one letter a joint, R or P.
-    image_size : width and height, px, of both images or of one each; None where unknown.
+    image_size : width and height, px, of all images or of one each; None where unknown.
     noise_px : standard deviation of a coordinate, px; None to estimate it.
     joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad); None to estimate it.
     source : ``simulated`` or ``recorded``.
@@ -65,6 +74,8 @@ class Observations(Displayable, Observation):
         q: npt.ArrayLike,
         pixels: npt.ArrayLike,
         *,
+        view: Sequence[str] | None = None,
+        mount: str = WORLD,
         joint_types: str | Sequence[str] | None = None,
         joint_unit: str | None = None,
         marker: Sequence[int] | None = None,
@@ -78,23 +89,31 @@ class Observations(Displayable, Observation):
         Parameters
         ----------
         q : (K, n) joint readings, rad or m unless ``joint_unit`` says deg.
-        pixels : (K, 2, m, 2) raw pixels u, v of each marker in the left and the right image, NaN or masked
-            where unseen.
+        pixels : (K, V, m, 2) raw pixels u, v of each marker in each of V images, NaN or masked where unseen.
+        view : (V,) names of the views, such as ``("top",)``; by default left and right.
+        mount : ``world`` for cameras that watch the tool, ``tool`` for cameras on it.
         joint_types : one letter a joint, R or P; by default all R.
         joint_unit : ``deg`` or ``rad`` of revolute joints; by default rad, and readings beyond two turns are
             refused as a mistaken unit.
         marker, pose : (m,) and (K,) numbers; by default from 0.
-        sigma : (K, 2, m) standard deviations of a coordinate, px.
-        image_size : width and height, px, of both images or of one each; by default the extent of the pixels.
+        sigma : (K, V, m) standard deviations of a coordinate, px.
+        image_size : width and height, px, of all images or of one each; by default the extent of the pixels.
         noise_px : standard deviation of a coordinate, px, if it is common to all; by default estimated.
 
         Raises
         ------
         InputError
-            When an array has another shape, readings are not finite or look like degrees, or an image size
-            or a noise is none.
+            When an array has another shape, readings are not finite or look like degrees, or a name of a
+            view, a mount, an image size or a noise is none.
         """
-        images = checked_array("pixels", pixels, (None, 2, None, 2), "(K, 2, m, 2)")
+        names = VIEWS if view is None else tuple(view)
+        if isinstance(view, str) or not all(map(is_view, names)) or not 0 < len({*names}) == len(names):
+            raise InputError(f"view: {view!r}: expected names of small letters and digits, each once")
+        if mount not in (WORLD, TOOL):
+            raise InputError(f"mount: {mount!r}: expected {WORLD} or {TOOL}")
+        V = len(names)
+        named = "" if view is not None else "; name the views of others: view=(...)"
+        images = checked_array("pixels", pixels, (None, V, None, 2), f"(K, {V}, m, 2){named}")
         readings = checked_array("q", q, (len(images), None), f"({len(images)}, n), a row for each pose")
         if not np.isfinite(readings).all():
             raise InputError("q: holds a number that is not finite; leave such poses out")
@@ -104,10 +123,10 @@ class Observations(Displayable, Observation):
         readings = in_radians("q", types, numbers[1], readings, joint_unit, "joint_unit={!r}")
         wrong = np.isinf(images).any(axis=-1) | (np.isnan(images).sum(axis=-1) == 1)
         if wrong.any():
-            k, view, j = np.argwhere(wrong)[0]
-            u, v = images[k, view, j]
+            k, i, j = np.argwhere(wrong)[0]
+            u, v = images[k, i, j]
             raise InputError(
-                f"pixels: marker {j} at pose {k}, view {view} is at ({u:g}, {v:g}): give two finite "
+                f"pixels: marker {j} at pose {k}, view {i} is at ({u:g}, {v:g}): give two finite "
                 "numbers, or NaN for both"
             )
         stated = None
@@ -119,9 +138,10 @@ class Observations(Displayable, Observation):
         images = np.where(np.isfinite(images).all(axis=-1, keepdims=True), images, np.nan)[:, :, order]
         stated = None if stated is None else np.ascontiguousarray(stated[:, :, order])
         record = Observation(
-            numbers[1], numbers[0][order], readings, np.ascontiguousarray(images), sigma=stated
+            numbers[1], numbers[0][order], readings, np.ascontiguousarray(images), sigma=stated, view=names
         )
-        return cls.of(record, joint_types=types, image_size=image_size, noise_px=noise_px)
+        known = {"joint_types": types, "image_size": image_size, "noise_px": noise_px, "mount": mount}
+        return cls.of(record, **known)
 
     @classmethod
     def from_frame(
@@ -150,14 +170,17 @@ class Observations(Displayable, Observation):
         """
         types = _types_of(joint_types)
         if isinstance(table, (str, Path)):
-            observation = read_table(table, types, joint_unit)
+            observation, mount = read_table(table, types, joint_unit), mount_in(table)
         else:
-            observation = read_table("table", types, joint_unit, frame=_text_of(table))
-        return cls.of(observation, joint_types=types, image_size=image_size, noise_px=noise_px)
+            text = _text_of(table)
+            observation = read_table("table", types, joint_unit, frame=text)
+            mount = mount_in("table", text)
+        known = {"joint_types": types, "image_size": image_size, "noise_px": noise_px, "mount": mount}
+        return cls.of(observation, **known)
 
     def to_frame(self) -> Any:
         """Return the observation table as a pandas table; an InputError without pandas."""
-        return pandas().read_csv(io.StringIO(table_text(self)))
+        return pandas().read_csv(io.StringIO(table_text(self, mount=self.mount)))
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""

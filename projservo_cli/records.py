@@ -1017,6 +1017,4 @@ class JointList:
     pose: IntArray  # (K,) numbers; 0, 1 … where the file has none
     q: FloatArray  # (K, n) readings, rad or m
     numbered: bool  # whether the file has pose numbers
-    # left, right: names of the images of each pose; None where the file has none
-    left: tuple[str, ...] | None
-    right: tuple[str, ...] | None
+    images: dict[str, tuple[str, ...]] | None = None  # of each view, the names of its images at each pose

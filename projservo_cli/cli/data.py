@@ -65,6 +65,7 @@ def _teach(
     from projservo_cli.records import InputError, WorkFailed
     from projservo_cli.settings.sections import JointVector
     from projservo_cli.stages import teach as stage
+    from projservo_cli.stages.record import sharing
 
     output = output or Path("start.yaml" if start else "goal.yaml")
     option.require_new(output, force=force)
@@ -103,8 +104,8 @@ def _teach(
     _print_taught(console, output, taught, check, setting)
     if start and taught.unseen:
         console.say(
-            "teach: a recording starts with these markers unseen: turn the tool until both cameras see all "
-            "tags, and teach again with --force"
+            "teach: a recording starts with these markers unseen: turn the tool until "
+            f"{sharing(taught.view)} all tags, and teach again with --force"
         )
     if check is not None and not check.reached:
         raise WorkFailed(f"{output}: by the calibration, {check.reason}")
@@ -124,11 +125,13 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
         "moved": taught.moved,
     }
     value |= dict.fromkeys(("off_px", "far", "reached", "reason")) if check is None else check._asdict()
-    left, right = taught.frames
     certain = f", to {np.nanmax(taught.sigma):.3g} px" if np.isfinite(taught.sigma).any() else ""
     known, shared = len(taught.marker), taught.shared
-    count = f"{known} markers" if shared == known else f"{shared} of {known} markers in both views,"
-    words = [f"teach: {count} from {left} images left and {right} right{certain}"]
+    where = {1: "", 2: " in both views,"}.get(len(taught.view), " in two views,")
+    count = f"{known} markers" if shared == known else f"{shared} of {known} markers{where}"
+    images = [f"{frames} {name}" for frames, name in zip(taught.frames, taught.view, strict=True)]
+    images[0] = f"{taught.frames[0]} images {taught.view[0]}"
+    words = [f"teach: {count} from {' and '.join(images)}{certain}"]
     if taught.moved is not None:
         i = int(np.abs(taught.moved).argmax())
         words.append(
@@ -146,8 +149,7 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
 @main.command(
     "detect", epilog="Example: projservo detect images/left images/right --joints-csv q.csv --output tags.csv"
 )
-@click.argument("left")
-@click.argument("right")
+@click.argument("images", nargs=-1, required=True, metavar="LEFT RIGHT | NAME=IMAGES...")
 @option.output(metavar="TABLE", help="Observation table to write (CSV).", required=True)
 @click.option(
     "--joints-csv",
@@ -180,8 +182,7 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
 def _detect(
     console: Console,
     *,
-    left: str,
-    right: str,
+    images: tuple[str, ...],
     output: Path,
     joints_csv: str,
     dictionary: str,
@@ -195,10 +196,12 @@ def _detect(
     fraction of a pixel and how certain each is, and writes an observation table for calibrate --data. Needs
     OpenCV: pip install '.[detect]'.
 
-    The list of joint readings (--joints-csv) says which images belong together. With columns left and right,
-    these are the names of the two images. With a column pose, images are those whose name ends in that
-    number. With neither, both folders are taken in the order of their names, one image a row; image_2 comes
-    before image_10.
+    Other rigs name their cameras, one or more: top=images/top, or left=a right=b top=c.
+
+    The list of joint readings (--joints-csv) says which images belong together. With columns left and right
+    (or other names), these are the names of the images. With a column pose, images are those whose name ends
+    in that number. With neither, all folders are taken in the order of their names, one image a row; image_2
+    comes before image_10.
 
     With --points corners, corner k of tag t is marker 4 t + k, in the order of the dictionary: top left, top
     right, bottom right, bottom left. With --points centers, tag t is marker t, at the crossing of its
@@ -215,41 +218,63 @@ def _detect(
     if board is not None and points == "centers":
         raise click.UsageError("--points centers: is of tags; a board has corners: leave out one of both")
     finder = finder_of(None if board is None else Board.of(board), dictionary)
-    joints = read_joint_list(joints_csv, joint_unit="rad")  # as they are, whatever their unit
-    pairs = pair_images(left, right, joints, joints_csv)
-    hidden = [file for side in (left, right) for file in hidden_images(side)]
+    sources = _sources(images)
+    # Readings as they are, whatever their unit.
+    joints = read_joint_list(joints_csv, joint_unit="rad", view=tuple(sources))
+    pairs = pair_images(sources, joints, joints_csv)
+    hidden = [file for side in sources.values() for file in hidden_images(side)]
     if hidden:
         console.say(
             f"detect: {len(hidden)} hidden files such as {hidden[0]} are no images, and were left out"
         )
-    observation, found = observe_tags(pairs, joints.q, finder, points, console.progress)
+    observation, found = observe_tags(pairs, tuple(sources), joints.q, finder, points, console.progress)
     write_table(observation, output)
-    in_left, in_right = np.moveaxis(np.isfinite(observation.images[..., 0]), 1, 0)
+    seen, whole = np.isfinite(observation.images[..., 0]), "both" if len(sources) == 2 else "all"
+    alone = {name: int((seen[:, v] & (seen.sum(axis=1) == 1)).sum()) for v, name in enumerate(sources)}
+    unseen = int((~seen.any(axis=1)).sum())
     value = {
         "table": output.resolve(),
         "poses": len(observation.pose),
         "board": board,
         "tags": found.tags if board is None else [],
         "markers": len(observation.marker),
-        "both": int((in_left & in_right).sum()),
-        "left_only": int((in_left & ~in_right).sum()),
-        "right_only": int((~in_left & in_right).sum()),
-        "unseen": int((~in_left & ~in_right).sum()),
+        whole: int(seen.all(axis=1).sum()),
+        **{f"{name}_only": count for name, count in alone.items()},
+        "unseen": unseen,
         "ambiguous": found.ambiguous,
         "unrefined": found.unrefined,
         "empty_images": found.empty,
         "hidden_files": len(hidden),
     }
+    only = ", ".join(f"{name} only {count}" for name, count in alone.items())
     words = (
         f"detect: {{poses}} poses, {board or f'{len(found.tags)} tags'}, {{markers}} markers",
-        "  markers seen by both cameras {both}, left only {left_only}, right only {right_only}, "
-        "by none {unseen}",
+        f"  markers seen by {whole} cameras {value[whole]}, {only}, by none {unseen}",
         "  {unrefined} points without clean edges: less certain, or rejected if occluded",
         "  rejected: {ambiguous} tags twice in an image; images without a tag: {empty_images}"
         if board is None
         else "  images without the board: {empty_images}",
     )
     console.report(value, [*(text.format_map(value) for text in words), f"table: {output}"])
+
+
+def _sources(images: tuple[str, ...]) -> dict[str, str]:
+    """Folders or patterns of the images by the names of the cameras; a UsageError where these are none."""
+    from projservo_cli.records import VIEWS
+    from projservo_cli.settings.sections import is_view
+
+    named = [image.partition("=")[::2] for image in images]
+    if len(images) == 2 and not all(is_view(name) and rest for name, rest in named):
+        return dict(zip(VIEWS, images, strict=True))
+    for image, (name, rest) in zip(images, named, strict=True):
+        if not (is_view(name) and rest):
+            raise click.UsageError(
+                f"{image}: give the images of left and right, or NAME=IMAGES of each camera, such as "
+                "top=images/top: names have small letters, digits and _"
+            )
+    if len({name for name, _ in named}) < len(named):
+        raise click.UsageError("two cameras have one name: name each once")
+    return dict(named)
 
 
 @main.command("validate", epilog="Example: projservo validate results/mine --data validation.csv")

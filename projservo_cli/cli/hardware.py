@@ -1,6 +1,6 @@
 """Commands for hardware of people: ``tags``, and ``doctor`` for a robot with its cameras."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -224,40 +224,38 @@ def _table(checked: "Checked") -> Iterator[str]:
     yield "doctor: ready to record" if checked.works else mend
 
 
-def _goal_pixels(settings: "Config") -> "list[FloatArray]":
-    """Pixels (g, 2) of the taught goal in both images; none where there is none."""
+def _goal_pixels(settings: "Config", view: Sequence[str]) -> "list[FloatArray]":
+    """Pixels (g, 2) of the taught goal in the images of some views; none where there is none."""
     import numpy as np
 
     images = None if settings.task is None else settings.task.goal.images
-    sides = (None, None) if images is None else (images.left, images.right)
+    sides = [None if images is None else images.side(name) for name in view]
     return [np.array([at or (np.nan, np.nan) for at in side or ()]).reshape(-1, 2) for side in sides]
 
 
 def _pictures(settings: "Config", seen: "RobotAtRest") -> dict[str, bytes]:
-    from projservo_cli.records import VIEWS
     from projservo_cli.report.live_page import annotated
 
-    each = zip(VIEWS, seen.views, seen.s, _goal_pixels(settings), strict=False)
+    names = [camera.name for camera in seen.cameras]
+    each = zip(names, seen.views, seen.s, _goal_pixels(settings, names), strict=False)
     return {name: annotated(view.frame.grey, seen.marker, s, goal) for name, view, s, goal in each}
 
 
 def _watch(console: Console, settings: "Config", robot: "PluginRobot") -> None:
-    """Serve both images until Ctrl-C."""
+    """Serve the images until Ctrl-C."""
     import time
 
-    from projservo_cli.records import VIEWS
     from projservo_cli.report.live_page import LivePage, annotated
 
-    live, goal = LivePage(settings.name, VIEWS), _goal_pixels(settings)
+    live, goals = LivePage(settings.name, robot.view), _goal_pixels(settings, robot.view)
     assert settings.markers is not None
     console.say(f"watch: open {live.url} in a browser; Ctrl-C ends it")
     try:
         while True:
             s = robot.read().s
-            for view, grey in zip(range(2), () if robot.frames is None else robot.frames, strict=False):
-                live.pictures[VIEWS[view]] = annotated(
-                    grey, settings.markers.known or (), s[view], goal[view]
-                )
+            frames = () if robot.frames is None else robot.frames
+            for name, grey, pixels, goal in zip(robot.view, frames, s, goals, strict=False):
+                live.pictures[name] = annotated(grey, settings.markers.known or (), pixels, goal)
             time.sleep(robot.bounds.period)
     except KeyboardInterrupt:
         console.say("watch: ended")

@@ -115,6 +115,7 @@ def recording_inputs(config: Config) -> RecordingInputs:
         dictionary=_dictionary(config),
         tagged=(config.cameras is not None and markers.board is None)
         or (markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None),
+        mount=config.mount,
         max_steady_state_error_deg=plant.max_steady_state_error_deg,
     )
 

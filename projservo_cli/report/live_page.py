@@ -1,4 +1,4 @@
-"""Pages of the images: of a preflight, of a recording, and live in a browser of this machine."""
+"""Pages of images: of a preflight, of a recording, and live in a browser of this machine."""
 
 import threading
 import time
@@ -41,7 +41,7 @@ def annotated(grey: ByteArray, marker: Sequence[int], pixels: FloatArray, goal: 
 
 
 def preflight_page(name: str, findings: Sequence[Finding], pictures: Mapping[str, bytes]) -> str:
-    """One file of HTML with the findings of a preflight and the pictures, JPEG, by views."""
+    """One file of HTML with the findings of a preflight and a picture of each view, JPEG."""
     title = f"Preflight of {name}"
     return html_page("cameras.html", title=title, images=_within(pictures), findings=findings)
 
@@ -53,18 +53,18 @@ def recording_page(name: str, done: str, pictures: Mapping[str, bytes], *, whole
 
 
 def _within(pictures: Mapping[str, bytes]) -> dict[str, str]:
-    """Addresses of the pictures, JPEG, of the views within a page."""
+    """Addresses of the pictures, JPEG, of all views within a page."""
     return {view: embedded(picture, "image/jpeg") for view, picture in pictures.items()}
 
 
 class LivePage:
-    """The images on a page that this machine alone can open, at ``url``, until it is closed.
+    """The images of all views on a page that this machine alone can open, at ``url``, until it is closed.
 
-    name : of the configuration. views : their names. port : 0 for any that is free.
+    name : of the configuration. view : names of the views. port : 0 for any that is free.
     """
 
-    def __init__(self, name: str, views: Sequence[str], port: int = 0) -> None:
-        images = {view: f"/{view}.mjpg" for view in views}
+    def __init__(self, name: str, view: Sequence[str], port: int = 0) -> None:
+        images = {name: f"/{name}.mjpg" for name in view}
         title, note = f"Live images of {name}", "Ctrl-C in the terminal ends it."
         text = html_page("cameras.html", title=title, images=images, text=note)
         self.pictures: dict[str, bytes] = {}
@@ -75,16 +75,16 @@ class LivePage:
 
             def do_GET(self) -> None:
                 """Answer a browser."""
-                view = self.path.strip("/").removesuffix(".mjpg")
-                self.send_response(200 if self.path == "/" or view in views else 404)
-                if view not in views:
+                asked = self.path.strip("/").removesuffix(".mjpg")
+                self.send_response(200 if self.path == "/" or asked in view else 404)
+                if asked not in view:
                     self.send_header("Content-Type", "text/html; charset=utf-8")
                     self.end_headers()
                     self.wfile.write(text.encode() if self.path == "/" else b"not found")
                     return
                 self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
                 self.end_headers()
-                live.stream(view, self.wfile.write)
+                live.stream(asked, self.wfile.write)
 
             def log_message(self, *_: Any) -> None:
                 """Keep the terminal quiet."""

@@ -78,6 +78,11 @@ class Section(BaseModel):
 _VIEW = re.compile(r"(?!q$)[a-z0-9][a-z0-9_]*")
 
 
+def is_view(name: str) -> bool:
+    """Whether a camera may have a name."""
+    return _VIEW.fullmatch(name) is not None
+
+
 class ByView(Section):
     """A section whose further keys are names of views like ``left`` and ``right``."""
 
@@ -86,7 +91,7 @@ class ByView(Section):
     def contradictions(self) -> Iterator[Finding]:
         """Yield names that no column of a table can have."""
         for name in self.model_extra or ():
-            if not _VIEW.fullmatch(name):
+            if not is_view(name):
                 yield (name,), "is no name of a camera: take small letters and digits, such as top or cam_2"
 
 

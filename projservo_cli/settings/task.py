@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, StrictBool, StrictInt, WithJsonSchema, WrapValidator
+from pydantic import Field, PlainSerializer, StrictBool, StrictInt, WithJsonSchema, WrapValidator
 
 from projservo_cli.records import VIEWS, InputError
 from projservo_cli.settings.sections import (
@@ -53,17 +53,21 @@ def _pixels_or_deviations(value: Any, pixels: Callable[[Any], _Pixels]) -> _Pixe
     return tuple(None if x is None else float(x) for x in value)
 
 
+_OfView = Annotated[
+    _Pixels,
+    WrapValidator(_pixels_or_deviations),
+    PlainSerializer(lambda entries: entries, return_type=Any),
+    WithJsonSchema({"type": "array"}),
+]
+
+
 class GoalImages(ByView):
     """Pixels of the face, and of further markers, at the goal, with their standard deviations.
 
     Cameras of other names have pixels under these, and deviations under ``sigma_NAME_px``.
     """
 
-    __pydantic_extra__: dict[
-        str,
-        Annotated[_Pixels, WrapValidator(_pixels_or_deviations), WithJsonSchema({"type": "array"})],
-    ]
-
+    __pydantic_extra__: dict[str, _OfView]
     markers: Annotated[tuple[Whole, ...], Field(min_length=1)] | None = Field(
         None, description="numbers of the markers; null: markers.face"
     )

@@ -132,8 +132,9 @@ class Data(Section):
         "else all R",
     )
     mount: Literal["world", "tool"] | None = Field(
-        "world",
-        description="world: cameras stand still and watch the tool; tool: they are on it and watch the scene",
+        None,
+        description="world: cameras stand still and watch the tool; tool: they are on it and watch the "
+        "scene; null: as the table states, else world",
     )
     joint_unit: Literal["deg", "rad"] | None = Field(
         None,

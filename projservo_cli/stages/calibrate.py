@@ -39,7 +39,7 @@ from projservo_cli.stages.stage_inputs import (
     Table,
     Trials,
 )
-from projservo_cli.store.observation_tables import read_detections, read_table, to_csv
+from projservo_cli.store.observation_tables import mount_in, read_detections, read_table, to_csv
 
 Calibrated = tuple[Observation, Calibration, CrossValidation | None]
 
@@ -94,7 +94,7 @@ def recorded(table: Table) -> Observations:
         image_size=table.image_size,
         noise_px=table.noise_px,
         seed=table.seed,
-        mount=table.mount,
+        mount=table.mount or mount_in(table.file.path),
         order_stated=table.order_stated,
     )
 

@@ -121,7 +121,7 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Ro
         time.sleep(period)
         readings.append(robot.read())
         progress("look", len(readings), wanted)
-    (left, scatter_left), (right, scatter_right) = (_mean(readings, view) for view in range(2))
+    s, scatter = zip(*(_mean(readings, view) for view in range(len(robot.view))), strict=True)
     own, cameras, views = robot.robot, list[Camera](), list[View]()
     if isinstance(own, CameraRobot):
         cameras, views = own.cameras, [view for view in own.views if view is not None]
@@ -129,9 +129,9 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Ro
         marker=inputs.numbers,
         face=inputs.face,
         q=np.mean([look.q for look in readings], axis=0),
-        s=np.stack([left, right]),
+        s=np.stack(s),
         sigma=readings[-1].sigma_px,
-        scatter=np.stack([scatter_left, scatter_right]),
+        scatter=np.stack(scatter),
         limits=robot.bounds.limits,
         units=robot.bounds.units,
         views=views,

@@ -19,6 +19,7 @@ from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.records import (
     CORNERS,
     VIEWS,
+    WORLD,
     BoolArray,
     FloatArray,
     InputError,
@@ -64,6 +65,7 @@ class _Recording:
     found: int = 0  # how many of them an earlier call recorded
     identity: str = ""  # of the robot that recorded them
     view: tuple[str, ...] = VIEWS  # names of its views
+    mount: str = WORLD  # of its cameras
     why: str = "none yet"  # why there is something to record; empty where there is nothing
     commands: int = 0  # steps sent to the robot
     # Sum of the squares by which pixels of one pose are off their mean, px², and its degrees of freedom.
@@ -115,7 +117,8 @@ class _Recording:
 
     def save(self) -> None:
         """Write all that is done; the file appears whole or not at all."""
-        write_table(self.observation(), self.path, recording=self.key, identity=self.identity)
+        how = {"recording": self.key, "identity": self.identity, "mount": self.mount}
+        write_table(self.observation(), self.path, **how)
 
     def observation(self) -> Observation:
         """All poses that are done, in their order.
@@ -232,7 +235,8 @@ def new_recording(
             if wrong := joints.limit_passed(q):
                 raise InputError(f"motions: pose {pose}: {wrong}: choose another")
         targets = np.vstack([targets, motions.q])
-    recording = _Recording(path or Path(), key, targets, np.array(inputs.numbers, dtype=np.int64))
+    numbers = np.array(inputs.numbers, dtype=np.int64)
+    recording = _Recording(path or Path(), key, targets, numbers, mount=inputs.mount)
     if path is None:
         return recording
     if path.exists() and force:
@@ -346,8 +350,8 @@ def _show(recording: _Recording, robot: PluginRobot) -> None:
         for grey, s in zip(robot.frames, last.s, strict=True)
     ]
     done = f"{len(recording.done)} of {len(recording.targets)} poses; {recording.note(robot.bounds.units)}"
-    by_view = dict(zip(VIEWS, pictures, strict=True))
-    text = recording_page(recording.path.name, done, by_view, whole=not recording.pending)
+    images = dict(zip(recording.view, pictures, strict=True))
+    text = recording_page(recording.path.name, done, images, whole=not recording.pending)
     write_whole(recording.path.with_suffix(".html"), text)
 
 

@@ -78,6 +78,7 @@ class RecordingInputs:
     face: tuple[int, ...]  # numbers of the markers that must stay visible; may be empty
     dictionary: str | None  # of the tags; None if not configured
     tagged: bool  # whether markers are corners of tags
+    mount: str  # of the cameras, world or tool
     max_steady_state_error_deg: float  # how far a joint at rest may stay from its set-point
 
     @property
@@ -111,7 +112,7 @@ class Table(NamedTuple):
     image_size: ImageSize | None  # width and height, px, of both images or of one each, if known
     noise_px: float | None  # standard deviation of a coordinate; None to estimate it
     seed: int  # of random starts
-    mount: str  # of the cameras, world or tool
+    mount: str | None  # of the cameras, world or tool; None for what the table states
     order_stated: bool  # whether somebody stated the order of the joints
 
 

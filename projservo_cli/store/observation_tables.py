@@ -27,9 +27,11 @@ from projservo_cli.files import lines_of, write_whole
 from projservo_cli.metric.position_error import Positions
 from projservo_cli.records import (
     FARTHEST_M,
+    TOOL,
     TWO_TURNS,
     VIEW_NAME,
     VIEWS,
+    WORLD,
     FloatArray,
     InputError,
     IntArray,
@@ -47,6 +49,7 @@ _MOVING = "moving"  # column of the number of a motion
 _T_Q = "t_q"  # column of the time of the joint readings, s
 _IDENTITY = " of "  # in that column, before the identity of the robot
 _XYZ = ("x", "y", "z")  # columns of a position, m
+_MOUNT = "mount"  # column of the mount of the cameras
 _RECORDING = "recording"  # column of the recording that a row belongs to
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
 _INTEGER = re.compile(r"([+-]?[0-9]{1,18})(\.0*)?")
@@ -192,16 +195,20 @@ def read_detections(
 
 
 def read_joint_list(
-    path: Path | str, joint_types: str | None = None, joint_unit: str | None = None
+    path: Path | str,
+    joint_types: str | None = None,
+    joint_unit: str | None = None,
+    view: Sequence[str] = VIEWS,
 ) -> JointList:
     """Read a list of joint readings, one pose a row: columns ``q1 … qN``, optionally ``pose, left, right``.
 
+    view : names of the views, which columns with names of their images have; by default left and right.
     joint_types : as for an observation table.
     joint_unit : ``deg`` or ``rad`` as for an observation table; with ``rad`` readings stay as they are.
     Raises InputError ``file:line: message`` if the file cannot be read or a row is not valid.
     """
-    sheet = _Sheet(path, [], joint_types, optional=["pose", "left", "right"])
-    sheet.has_all(("left", "right"))
+    sheet = _Sheet(path, [], joint_types, optional=["pose", *view], unread=view)
+    named = sheet.has_all(view)
     lines: dict[int, int] = {}
     readings, names = [], []
     for row in sheet.rows():
@@ -209,14 +216,17 @@ def read_joint_list(
         if lines.setdefault(pose, row.line) != row.line:
             raise InputError(f"{row.where}: pose {pose} is already in {sheet.named(lines[pose])}")
         readings.append([row.number(name) for name in sheet.joints])
-        names.append([row[side] for side in ("left", "right") if side in sheet.columns])
+        names.append([row[side] for side in view if named])
         if "" in names[-1]:
-            raise InputError(f"{row.where}: an image has no name; name both, or drop the row")
+            raise InputError(
+                f"{row.where}: an image has no name; name {'both' if len(view) == 2 else 'all'}, or drop the "
+                "row"
+            )
     sheet.require(readings, "a pose")
     poses = np.array([*lines], dtype=np.int64)
     q = sheet.in_radians(poses, np.array(readings), joint_unit)
-    left, right = zip(*names, strict=True) if names[0] else (None, None)
-    return JointList(pose=poses, q=q, numbered="pose" in sheet.columns, left=left, right=right)
+    images = dict(zip(view, zip(*names, strict=True), strict=True)) if named else None
+    return JointList(pose=poses, q=q, numbered="pose" in sheet.columns, images=images)
 
 
 def read_positions(path: Path | str, joint_types: str, joint_unit: str | None = None) -> Positions:
@@ -254,6 +264,18 @@ def identity_in(path: Path | str) -> str:
     return (_recording(path) or "").partition(_IDENTITY)[2]
 
 
+def mount_in(path: Path | str, frame: str | None = None) -> str:
+    """Mount of the cameras, world or tool, as the first row of a table states it; world where none does.
+
+    frame : text of a frame that is in no file, which ``path`` then only names.
+    """
+    row = next(_Sheet(path, [], optional=[_MOUNT], joints=False, frame=frame).rows(), _Row())
+    mount = (row.get(_MOUNT) or WORLD).lower()
+    if mount not in (WORLD, TOOL):
+        raise InputError(f"{row.where}: {_MOUNT} is {row[_MOUNT]!r}; expected {WORLD} or {TOOL}")
+    return mount
+
+
 def _recording(path: Path | str) -> str | None:
     """Return the common recording of all rows of a table; None for none or several."""
     sheet = _Sheet(path, [], optional=[_RECORDING])
@@ -262,17 +284,24 @@ def _recording(path: Path | str) -> str | None:
 
 
 def write_table(
-    observation: Observation, path: Path | str, *, recording: str = "", identity: str = ""
+    observation: Observation,
+    path: Path | str,
+    *,
+    recording: str = "",
+    identity: str = "",
+    mount: str = WORLD,
 ) -> None:
     """Write an observation table, as ``table_text`` has it."""
-    write_whole(Path(path), table_text(observation, recording=recording, identity=identity))
+    write_whole(Path(path), table_text(observation, recording=recording, identity=identity, mount=mount))
 
 
-def table_text(observation: Observation, *, recording: str = "", identity: str = "") -> str:
+def table_text(
+    observation: Observation, *, recording: str = "", identity: str = "", mount: str = WORLD
+) -> str:
     """Return the observation table that ``read_table`` reads back to the last bit.
 
     Every marker of every pose has a row, with empty cells if unseen. ``recording`` fills a further column,
-    with the ``identity`` of the robot.
+    with the ``identity`` of the robot, and so does the ``mount`` of cameras on the tool.
     """
     K, m = len(observation.pose), len(observation.marker)
     columns = {"pose": np.repeat(observation.pose, m), "marker": np.tile(observation.marker, K)}
@@ -289,6 +318,8 @@ def table_text(observation: Observation, *, recording: str = "", identity: str =
     for name, values in moments.items():
         if values is not None:
             columns[name] = or_empty(np.repeat(values, m))
+    if mount != WORLD:
+        columns[_MOUNT] = np.full(K * m, mount)
     if recording:
         columns[_RECORDING] = np.full(K * m, recording + (_IDENTITY + identity if identity else ""))
     return to_csv(columns)
@@ -445,6 +476,7 @@ class _Sheet:
         frame: str | None = None,
         seen: bool = False,
         joints: bool = True,
+        unread: Sequence[str] = (),
     ) -> None:
         self.file, self._of_frame = str(path), frame is not None
         of_file = lines_of(path, "a table as UTF-8 CSV", _MAX_BYTES)
@@ -464,11 +496,11 @@ class _Sheet:
         self.views = _views_in(names) if seen else ()
         needed = [*needed, *_columns_of(self.views)]
         optional = [*optional, *(f"{what}_{view}" for view in self.views for what in ("sigma", "t"))]
-        self._blank = {*_columns_of(self.views), *optional} - {_MOVING, _RECORDING, "left", "right", "pose"}
+        self._blank = {*_columns_of(self.views), *optional} - {_MOVING, _RECORDING, *unread, "pose"}
         wanted = [*needed, *self.joints, *(name for name in optional if name in names)]
         if wrong := self._wrong(names, needed, wanted, joint_types, joints):
             raise InputError(f"{self._place(1 + self._skipped)}: {wrong}")
-        self._width, self._numeric = len(names), {*wanted} - {"left", "right", "camera", _RECORDING}
+        self._width, self._numeric = len(names), {*wanted} - {*unread, "camera", _RECORDING, _MOUNT}
         self.columns = {name: names.index(name) for name in wanted}
         self._joint_types = joint_types or "R" * len(self.joints)
 

@@ -78,16 +78,16 @@ def motion(t):
     return np.stack([1.0 - np.cos(2.0 * t), np.sin(1.3 * t) * np.sin(0.4 * t)], axis=-1)
 
 
-def looks(delays, late, steps=60, stamped=None, noise=NOISE, first=-4):
-    """What comes of looking at a motion with images so late (2,); errors of the instants, s."""
+def looks(delays, late, steps=60, stamped=None, noise=NOISE, first=-4, views=(0, 1)):
+    """What comes of looking at a motion with images of views so late (V,); errors of the instants, s."""
     rng, history, off = np.random.default_rng(1), History(), []
     for k in range(first, steps):
         now = k * PERIOD
         history.add(now, motion(now))
         taken = now - np.asarray(late)
-        s = np.stack([predicted(motion(t)[None])[0, view] for view, t in enumerate(taken)])
+        s = np.stack([predicted(motion(t)[None])[0, view] for view, t in zip(views, taken, strict=True)])
         s += noise * rng.standard_normal(s.shape)
-        stamps = np.full(2, np.nan) if stamped is None else taken + stamped
+        stamps = np.full(len(views), np.nan) if stamped is None else taken + stamped
         off.append(delays.update(stamps, s, history).t - taken)
     return np.array(off)
 
