@@ -355,11 +355,6 @@ class Settings(Printed, Root):
         return self.markers.front
 
     @property
-    def mount(self) -> str:
-        """Mount of the cameras, world or tool."""
-        return WORLD if self.data is None or self.data.mount is None else self.data.mount
-
-    @property
     def image_size_px(self) -> ImageSize | None:
         """Width and height of both images, or those of each, if they are known."""
         if self.data is not None and self.data.image_size_px is not None:

@@ -173,6 +173,27 @@ def test_images_and_readings_belong_together(projservo, monkeypatch, name):
     assert read == images.split()
 
 
+@pytest.mark.parametrize("view", [("top",), ("top", "left", "low")])
+def test_images_of_any_cameras_are_found_by_their_names(projservo, view):
+    put([f"{name}/{k}.png" for name in view for k in range(2)])
+    joints(f"q1,{','.join(view)}", *(",".join([f"{k}", *[f"{1 - k}.png"] * len(view)]) for k in range(2)))
+    sources = [f"{name}={name}" for name in view]
+    answer = projservo("detect", *sources, "--joints-csv", "q.csv", "-o", "t.csv", "--json")
+    assert answer.code == 0, answer.err
+    table = read_table("t.csv")
+    assert table.view == view
+    assert (answer.json["all"], answer.json["unseen"]) == (8, 0)
+    assert [answer.json[f"{name}_only"] for name in view] == [8 if len(view) == 1 else 0] * len(view)
+    np.testing.assert_array_equal(table.images, table.images[:1, :1].repeat(2, 0).repeat(len(view), 1))
+    for wrong, message in [
+        (["top"], "give the images of left and right, or NAME=IMAGES of each camera"),
+        ([sources[0], sources[0]], "two cameras have one name"),
+        (["top=top", "Low 2=top", "low=top"], "Low 2=top: give the images"),
+    ]:
+        answer = projservo("detect", *wrong, "--joints-csv", "q.csv", "-o", "w.csv")
+        assert (answer.code, message in answer.err) == (2, True)
+
+
 REFUSED = {
     "two of one number": (["q1,pose", "1,1"], 2, "the names of a1.png, c1.png end in 1"),
     "too few images": (["q1", "1", "2", "3"], 2, "l: 2 images for the 3 rows of q.csv"),

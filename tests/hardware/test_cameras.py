@@ -160,3 +160,36 @@ def test_an_arm_without_pixels_becomes_a_robot_that_sees_tags(stream):
     assert (np.isfinite(sigma) == np.isfinite(pixels[..., 0])).all()
     assert robot.frames.shape == (2, 240, 320)
     assert robot.remarks() == []
+
+
+def test_a_run_goes_on_with_the_cameras_that_are_left_and_a_lost_one_comes_back(stream, capsys):
+    streams = [stream(lambda: SEEN) for _ in range(3)]
+    sources = dict(zip(("left", "right", "top"), ({"source": one.url} for one in streams), strict=True))
+    rig = Stereo.model_validate(sources | {"max_age_s": 0.4, "reconnect_s": 0.8})
+    robot = CameraRobot(Arm(), rig, TagFinder("4X4_50"), range(4), whole=False)
+
+    def seen():
+        return np.isfinite(robot.read()[1]).all(axis=(1, 2)).tolist()
+
+    robot.open()
+    try:
+        assert (robot.view, seen()) == (("left", "right", "top"), [True] * 3)
+        streams[1].paused.set()
+        time.sleep(0.5)
+        assert seen() == [True, False, True]
+        begun = time.monotonic()
+        assert seen() == [True, False, True]
+        assert time.monotonic() - begun < 0.5  # it is waited for once
+        assert "the right camera" in (told := capsys.readouterr().err)
+        assert told.count("\n") == 1
+        streams[1].paused.clear()
+        until = time.monotonic() + 10.0
+        while seen() != [True] * 3:
+            assert time.monotonic() < until
+        for one in streams:
+            one.paused.set()
+        with pytest.raises(WorkFailed, match=r"camera .*no frame for"):
+            time.sleep(1.0) or seen()
+    finally:
+        robot.stop()
+        robot.close()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import yaml
 
-from projservo_cli.records import JointLimits, Observation, WorkFailed
+from projservo_cli.records import VIEWS, JointLimits, Observation, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, at_rest_after
-from projservo_cli.store.observation_tables import identity_in, recording_of, write_table
+from projservo_cli.store.observation_tables import identity_in, read_table, recording_of, write_table
 from tests.hardware.still import Quiet
 from tests.hardware.streams import Stream, picture
 from tests.hardware.test_doctor import CONFIGURATION
@@ -30,8 +30,8 @@ class Walking(Quiet):
         self.q, self.time = target.copy(), due
 
 
-@pytest.fixture
-def recording(tmp_path, monkeypatch):
+@pytest.fixture(params=[("left", "right"), ("top",)])
+def recording(request, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     images = picture(at=(60.0, 80.0)), picture(at=(80.0, 90.0))
     streams = [Stream(lambda image=image: image) for image in images]
@@ -46,15 +46,17 @@ def recording(tmp_path, monkeypatch):
         "frames_per_joint": 2,
         "random_poses": 1,
     }
-    config["cameras"]["max_age_s"] = config["cameras"]["reconnect_s"] = 10.0  # its clock is none of the wall
-    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    sources = {name: config["cameras"].pop(side) for name, side in zip(request.param, VIEWS, strict=False)}
+    config["cameras"] = {"max_age_s": 10.0, "reconnect_s": 10.0} | sources  # its clock is none of the wall
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
     yield tmp_path
     for stream in streams:
         stream.close()
 
 
 def test_a_recording_notes_its_worst_joint_and_shows_the_last_images(projservo, recording, monkeypatch):
-    notes = []
+    view = tuple(yaml.safe_load((recording / "arm.yaml").read_text(encoding="utf-8"))["cameras"])[2:]
+    seen, notes = "|".join(["4"] * len(view)), []
     monkeypatch.setattr(
         "projservo_cli.cli.output.Console.progress",
         lambda self, what, done, total, note="": notes.append((what, done, total, note)),
@@ -62,10 +64,11 @@ def test_a_recording_notes_its_worst_joint_and_shows_the_last_images(projservo, 
     answer = projservo("record", "-c", "arm.yaml", "-o", "arm.csv", "--json")
     assert answer.code == 0, answer.err
     assert [note[:3] for note in notes] == [("record", k, 6) for k in range(1, 7)]
-    assert notes[-1][3] == "markers 4|4, joint 2 0.1 deg off"
+    assert notes[-1][3] == f"markers {seen}, joint 2 0.1 deg off"
+    assert read_table("arm.csv").view == view
     page = (recording / "arm.html").read_text(encoding="utf-8")
-    assert "6 of 6 poses; markers 4|4, joint 2 0.1 deg off" in page
-    assert page.count("data:image/jpeg;base64,") == 2
+    assert f"6 of 6 poses; markers {seen}, joint 2 0.1 deg off" in page
+    assert page.count("data:image/jpeg;base64,") == len(view)
     assert 'http-equiv="refresh"' not in page
 
 

@@ -179,7 +179,7 @@ def test_a_rig_of_any_names_is_recorded_continued_and_calibrated(tmp_path, monke
     with pytest.raises(InputError, match=rf"was begun with the cameras {', '.join(view)}, not left, right"):
         record(configuration(tmp_path, VIEWS), path=path, progress=False)
     again = record(configuration(tmp_path, view), path=path, progress=False)
-    assert (again.view, len(again.pose)) == (view, len(seen.pose))
+    assert (again.view, len(again.at_rest.pose)) == (view, len(seen.at_rest.pose))
 
 
 def test_the_mount_stands_in_the_table_and_calibrate_takes_it_from_there(tmp_path, monkeypatch):

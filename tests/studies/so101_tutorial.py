@@ -94,14 +94,19 @@ def benched(folder, monkeypatch, rate=RATE, rate_hz=15.0):
         yield types.SimpleNamespace(arm=arm, bus=bus, cameras=cameras, script=script, folder=folder)
 
 
-def configure(bench, shorter):
-    """Put the streams of the emulator, and what makes its recording short, into arm.yaml."""
+def configure(bench, shorter, *, alone=False):
+    """Put the streams of the emulator, and what makes its recording short, into arm.yaml.
+
+    alone : whether there is one camera, ``top``.
+    """
     file = bench.folder / "arm.yaml"
     text = file.read_text()
     for before, after in shorter.items():
         assert before in text
         text = text.replace(before, after)
     text = text.replace("source: 0", f"source: '{bench.cameras.left}'")
+    if alone:
+        text = re.sub(r"  right: .*\n", "", text).replace("  left: ", "  top: ")
     file.write_text(text.replace("source: 2", f"source: '{bench.cameras.right}'"))
 
 
@@ -148,6 +153,30 @@ def test_ten_commands_lead_from_an_empty_folder_to_the_taught_goal(bench, capsys
     off = np.degrees(np.abs(bench.reached - bench.taught))
     assert off.max() < 1.5, off  # of 1° of hysteresis and 2° of sag; joints make up for each other
     _homed_since(bench, capsys)
+
+
+def test_one_webcam_is_enough_to_record_teach_and_calibrate(bench, capsys):
+    arm = bench.arm
+    for words, acts in (
+        (["init", "--arm", "so101", "arm.yaml"], []),
+        (["limits", "-c", "arm.yaml"], [None, by_hand(arm, *through_all())]),
+        (["teach", "--start", "-c", "arm.yaml"], [None, by_hand(arm, START), None]),
+        (["teach", "-c", "arm.yaml"], [None, by_hand(arm, GOAL), None]),
+        (["record", "calibrate", "-c", "arm.yaml", "-o", "run"], []),
+        (["teach", "run", "-c", "arm.yaml", "-o", "again.yaml"], [None, by_hand(arm, GOAL), None]),
+    ):
+        bench.script[:] = acts
+        assert run(words) == 0, f"{words}: {''.join(capsys.readouterr())}"
+        told = capsys.readouterr().out
+        with capsys.disabled():
+            print(told, flush=True)
+        if words[0] == "init":
+            more = SHORTER | {"frames_per_joint: 6": "frames_per_joint: 4\n  random_poses: 12"}
+            configure(bench, more, alone=True)
+        if words[0] == "record":
+            assert "calibrate: usable" in told
+            assert "by one camera: top" in told
+    assert "u_top,v_top,sigma_top" in (bench.folder / "trials.csv").read_text().splitlines()[0]
 
 
 def _homed_since(bench, capsys):
