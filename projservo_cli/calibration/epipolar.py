@@ -70,6 +70,7 @@ class ImageGeometry(ABC):
     core: "Core"  # the same noise, robust against many wrong correspondences, and its interval
 
     origin: ClassVar[str]  # of the noise, for messages
+    shown: ClassVar[str]  # who shows it, likewise
 
     @property
     def noise_px(self) -> float:
@@ -100,7 +101,7 @@ class Epipolar(ImageGeometry):
     inlier: BoolArray  # (N,) whether a correspondence used agrees with F
     parallax_px: float  # median distance of the second view from a homography of the first
 
-    origin = "that the epipolar geometry shows"
+    origin, shown = "that the epipolar geometry shows", "both views show"
 
     @classmethod
     def of(cls, detections: Detections, rng: np.random.Generator) -> "Epipolar":

@@ -194,7 +194,7 @@ def calibrate(
         expect = partial(Expected.of, sigma_px=sigma_px, source=source, stated_px=detections.stated_px)
         expected = expect(epipolar)
         if not lens:  # else after its estimation, since it bends the epipolar lines
-            expected.require_scale()
+            expected.require_scale(detections.view)
         require_images(whole, max(epipolar.sigma_px, expected.sigma_px))
         if method == "closed_form":
             if not isinstance(epipolar, Epipolar):
@@ -287,7 +287,7 @@ def _maximum_likelihood(
             solution, epipolar = with_own_noise(solution, epipolar)
         expected = expect(epipolar)
         if lens:
-            expected.require_scale()
+            expected.require_scale(whole.view)
         if curves is None or curves:
             search.progress("calibration, joint model", 0, 1)
             curved = fit_joint_model(solution, curves, epipolar)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -268,6 +268,7 @@ class Expected:
     error: float  # its relative standard error, zero if given
     scale: float | None = None  # true over stated deviations, if the images determine it
     scale_interval: FloatArray | None = None  # (2,) of 95 %
+    shown: str = ""  # who shows it, for messages
 
     @classmethod
     def of(
@@ -289,10 +290,10 @@ class Expected:
         if low <= 1.0 <= high:
             return cls(stated_px, False, origin, _STATED_ERROR, 1.0, interval)
         scale = epipolar.core.sigma_px / stated_px
-        origin = f"{origin}, times {scale:.3g} (95 %: {low:.3g} to {high:.3g}) as both views show"
-        return cls(scale * stated_px, False, origin, _STATED_ERROR, scale, interval)
+        origin = f"{origin}, times {scale:.3g} (95 %: {low:.3g} to {high:.3g}) as {epipolar.shown}"
+        return cls(scale * stated_px, False, origin, _STATED_ERROR, scale, interval, epipolar.shown)
 
-    def require_scale(self) -> None:
+    def require_scale(self, view: Sequence[str]) -> None:
         """Refuse stated deviations that are wrong by more than a detector can explain.
 
         Raises WorkFailed with the factor and its limits.
@@ -302,10 +303,10 @@ class Expected:
         low, high = self.scale_interval
         if high < _MIN_SCALE or low > _MAX_SCALE:
             raise WorkFailed(
-                f"the stated deviations of the markers are wrong: both views show {self.scale:.3g} "
-                f"times the noise of sigma_left and sigma_right (95 %: {low:.3g} to {high:.3g}; "
-                f"{_MIN_SCALE:g} to {_MAX_SCALE:g} times allowed); multiply both columns by "
-                f"{self.scale:.3g}, or remove them"
+                f"the stated deviations of the markers are wrong: {self.shown} {self.scale:.3g} "
+                f"times the noise of {' and '.join(f'sigma_{name}' for name in view)} (95 %: {low:.3g} to "
+                f"{high:.3g}; {_MIN_SCALE:g} to {_MAX_SCALE:g} times allowed); multiply "
+                f"{'both columns' if len(view) == 2 else 'all of them'} by {self.scale:.3g}, or remove them"
             )
 
     def ratio(self, solution: Solution) -> float:

@@ -75,7 +75,7 @@ class _Body(NamedTuple):
     focal: FloatArray  # (2,) of u and v, px
     middle: FloatArray  # (2,) px
     cost: float  # of the fit
-    residual: FloatArray  # (N, 2) px
+    residual: FloatArray  # (N, 2) px, weighted
 
     @property
     def start(self) -> _Start:
@@ -99,7 +99,7 @@ class RigidBody(ImageGeometry):
     marker: IntArray  # (m,) numbers of the markers in the fit
     dof: int
 
-    origin = "that a rigid body shows"
+    origin, shown = "that a rigid body shows", "a rigid body shows"
 
     @classmethod
     def of(cls, detections: Detections, frame: ImageFrame) -> "RigidBody":
@@ -107,11 +107,11 @@ class RigidBody(ImageGeometry):
 
         Raises WorkFailed with too few poses of four markers, or if no rigid body explains the images.
         """
-        pose, marker, images = _chosen(detections)
+        pose, marker, images, weight = _chosen(detections)
         focals, middle = float(frame.size[0]) * np.array(_FOCALS), frame.center[0]
         starts = _flat_starts(images, focals, middle) or _deep_starts(images, focals, middle)
-        rough = _all_fitted(images, starts, middle, _ROUGHLY)[:_FEW]
-        bodies = _all_fitted(images, [body.start for body in rough], middle, _EVALUATIONS)
+        rough = _all_fitted(images, weight, starts, middle, _ROUGHLY)[:_FEW]
+        bodies = _all_fitted(images, weight, [body.start for body in rough], middle, _EVALUATIONS)
         if not bodies:
             raise WorkFailed(
                 f"no rigid body explains the images of the {detections.view[0]} camera: check marker numbers"
@@ -170,9 +170,11 @@ class RigidBody(ImageGeometry):
         return found
 
 
-def _chosen(detections: Detections) -> tuple[IntArray, IntArray, FloatArray]:
-    """Rows of poses (K,), indices of markers (m,), and their images (K, m, 2), NaN if unseen."""
-    images = detections.dense()[0]
+def _chosen(detections: Detections) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Rows of poses (K,), indices of markers (m,), images (K, m, 2), NaN if unseen, and weights (K, m)."""
+    images, seen = detections.dense()[0], detections.seen[0]
+    weight = np.ones(images.shape[:2])
+    weight[detections.pose_of[seen], detections.marker_of[seen]] = detections.weight[0, seen]
     often = np.isfinite(images[..., 0]).sum(axis=0)
     marker = np.sort(np.argsort(-often, kind="stable")[:_MARKERS])
     marker = marker[often[marker] >= _LEAST_POSES]
@@ -184,7 +186,8 @@ def _chosen(detections: Detections) -> tuple[IntArray, IntArray, FloatArray]:
             f"poses: {_LEAST_POSES} are required; show more markers, or add the images of a second camera"
         )
     pose = pose[even_choice(pose.size, _POSES)]
-    return pose, marker, images[np.ix_(pose, marker)]
+    which = np.ix_(pose, marker)
+    return pose, marker, images[which], weight[which]
 
 
 def _factorised(images: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -325,18 +328,27 @@ def _flat_start(
 
 
 def _all_fitted(
-    images: FloatArray, starts: Sequence[_Start], middle: FloatArray, evaluations: int
+    images: FloatArray,
+    weight: FloatArray,
+    starts: Sequence[_Start],
+    middle: FloatArray,
+    evaluations: int,
 ) -> list[_Body]:
     """Fits from starts that keep the body in front of the camera, best first."""
-    found = [_fitted(images, start, middle, evaluations) for start in starts]
+    found = [_fitted(images, weight, start, middle, evaluations) for start in starts]
     return sorted((body for body in found if body is not None), key=lambda body: body.cost)
 
 
-def _fitted(images: FloatArray, start: _Start, middle: FloatArray, evaluations: int) -> _Body | None:
-    """Fit body, poses and camera to images (K, m, 2) under a Cauchy loss; None if points fall behind it."""
+def _fitted(
+    images: FloatArray, weight: FloatArray, start: _Start, middle: FloatArray, evaluations: int
+) -> _Body | None:
+    """Fit body, poses and camera to images (K, m, 2) under a Cauchy loss; None if points fall behind it.
+
+    weight : (K, m) of the residuals.
+    """
     R, t, X, focal = start
     k, j = np.nonzero(np.isfinite(images[..., 0]))
-    seen, (K, m), N = images[k, j], images.shape[:2], len(k)
+    seen, (K, m), N, w = images[k, j], images.shape[:2], len(k), weight[k, j][:, None]
     unit = float(np.linalg.norm(t, axis=1).mean())
     ends = np.cumsum([_INTRINSICS, 3 * K, 3 * K])
     prior = np.array([0.0, 1.0 / _ASPECT, 1.0 / _MIDDLE, 1.0 / _MIDDLE])
@@ -351,8 +363,8 @@ def _fitted(images: FloatArray, start: _Start, middle: FloatArray, evaluations: 
         return f, E, turned, Y, f * Y[:, :2] / Y[:, 2:] + middle + focal * g[2:]
 
     def residual(x: FloatArray) -> FloatArray:
-        """Predicted minus seen pixels, then the priors of the camera."""
-        return np.concatenate([(placed(x)[-1] - seen).ravel(), prior * x[:_INTRINSICS]])
+        """Weighted predicted minus seen pixels, then the priors of the camera."""
+        return np.concatenate([(w * (placed(x)[-1] - seen)).ravel(), prior * x[:_INTRINSICS]])
 
     columns = [
         np.broadcast_to(np.arange(_INTRINSICS), (N, _INTRINSICS)),
@@ -375,7 +387,7 @@ def _fitted(images: FloatArray, start: _Start, middle: FloatArray, evaluations: 
         by_camera[:, 1, 1] = by_camera[:, 1, 0]
         by_camera[:, 0, 2] = by_camera[:, 1, 3] = focal
         by_turn = -D @ cross_matrix(turned) @ _left_jacobian(x[ends[0] : ends[1]].reshape(K, 3))[k]
-        blocks = np.concatenate([by_camera, by_turn, D, D @ E[k]], axis=2)
+        blocks = w[..., None] * np.concatenate([by_camera, by_turn, D, D @ E[k]], axis=2)
         return csr_array(
             (np.concatenate([blocks.ravel(), prior]), (rows, where)), shape=(2 * N + _INTRINSICS, len(x))
         )
@@ -405,7 +417,7 @@ def _fitted(images: FloatArray, start: _Start, middle: FloatArray, evaluations: 
     if not np.isfinite(pixels).all() or (Y[:, 2] <= 0.0).any():
         return None
     places, shape = x[ends[1] : ends[2]].reshape(K, 3), x[ends[2] :].reshape(m, 3)
-    off = pixels - seen
+    off = w * (pixels - seen)
     cost = float(np.median(np.linalg.norm(off, axis=1)))
     return _Body(E, places, shape, f, middle + focal * x[2:_INTRINSICS], cost, off)
 

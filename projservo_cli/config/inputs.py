@@ -77,7 +77,8 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         size = config.image_size_px
         stated = data.joint_order == "stated"
         readings, kind = _file(config, "readings", files), (config.joint_types, data.joint_unit)
-        source = Table(table, readings, *kind, size, data.noise_px, _seed(config), config.mount, stated)
+        mount = data.mount or (None if config.rig is None else config.rig.mount)
+        source = Table(table, readings, *kind, size, data.noise_px, _seed(config), mount, stated)
     else:
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
         source = _trials(config, _truth(config, face=False), files, speed_scale=1.0)

@@ -94,6 +94,18 @@ def test_one_camera_is_enough(types, flat):
     assert np.mean(squares) == pytest.approx(0.25 * bound.mean_square(), rel=chance + 0.05)
 
 
+def test_one_camera_believes_deviations_of_its_markers_that_are_true():
+    rng = np.random.default_rng(6)
+    robot = random_robot("RRRRR", rng, markers=10, views=1)
+    q = np.concatenate([trials(robot, frames=6), around(robot, 12, rng)])
+    seen = robot.observe(q, 0.0, rng)
+    sigma = np.exp(rng.uniform(np.log(0.03), np.log(3.0), seen.images.shape[:3]))
+    noisy = seen.images + sigma[..., None] * rng.standard_normal(seen.images.shape)
+    found = calibrate(dataclasses.replace(seen, images=noisy, sigma=sigma), "RRRRR", source="recorded")
+    assert found.usable
+    assert found.sigma_scale == pytest.approx(1.0, abs=0.1)
+
+
 @pytest.mark.parametrize(("data", "types", "rms_px"), [("ur5", "RRRRRR", 0.40), ("stanford", "RRPRRR", 0.46)])
 def test_left_images_alone_of_data_of_others(shared_data, data, types, rms_px):
     trained, held_out = (

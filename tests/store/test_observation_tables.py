@@ -78,9 +78,9 @@ LIST = ["pose,q1,q2,left,right", "7,1,90,a.png,b.png", "3,2,-90,c.png,d.png"]
 def test_a_list_of_joints_has_numbers_and_images_or_not(tmp_path):
     joints = read_joint_list(written(tmp_path, *LIST), joint_unit="rad")
     assert (joints.pose.tolist(), joints.q.tolist()) == ([7, 3], [[1, 90], [2, -90]])
-    assert (joints.left, joints.right) == (("a.png", "c.png"), ("b.png", "d.png"))
+    assert joints.images == {"left": ("a.png", "c.png"), "right": ("b.png", "d.png")}
     plain = read_joint_list(written(tmp_path, "q2,q1", "90,1", "", "-90,2"), "PR", "deg")
-    assert (plain.pose.tolist(), plain.numbered, plain.left) == ([0, 1], False, None)
+    assert (plain.pose.tolist(), plain.numbered, plain.images) == ([0, 1], False, None)
     np.testing.assert_allclose(plain.q, [[1, np.pi / 2], [2, -np.pi / 2]], rtol=1e-15)
 
 
