@@ -4,10 +4,11 @@ import math
 from collections.abc import Iterator
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, ConfigDict, Field, StrictBool
+from pydantic import BeforeValidator, Field, StrictBool
 
 from projservo_cli.records import VIEWS
 from projservo_cli.settings.sections import (
+    ByView,
     Count,
     Finding,
     NotNegative,
@@ -80,10 +81,9 @@ class _MarkerMoved(Section):
     by_m: Vector3 = Field(description="displacement in the frame of the tool")
 
 
-class _Delays(Section):
+class _Delays(ByView):
     """Latency of cameras by their names, s, and of those that are not named."""
 
-    model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, NotNegative]
 
     left: NotNegative = Field(0.0, description="latency of the left camera")

@@ -1,15 +1,15 @@
 """The robot and its rig, in metric terms: the truth of a simulation."""
 
 import math
-import re
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, StringConstraints
+from pydantic import Field, StringConstraints
 
-from projservo_cli.records import TWO_TURNS, VIEW_NAME, VIEWS
+from projservo_cli.records import TWO_TURNS, VIEWS
 from projservo_cli.settings.sections import (
+    ByView,
     Finding,
     JointVector,
     Matrix34,
@@ -237,10 +237,9 @@ class Camera(Section):
                 yield ("up",), "must not be zero or along the line of sight"
 
 
-class Rig(Section):
+class Rig(ByView):
     """Cameras by their names, which watch the robot, or are on its tool and watch the scene."""
 
-    model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, Camera]
 
     image_size_px: Sizes = Field(description="width and height of all images, or those of each")
@@ -258,11 +257,9 @@ class Rig(Section):
 
     def contradictions(self) -> Iterator[Finding]:
         """No camera, a name that no column can have, or sizes of other numbers of images."""
+        yield from super().contradictions()
         names = [*self.cameras]
         if not names:
             yield (), "has no camera: give one or more by their names, such as left and right"
-        for name in names:
-            if not re.fullmatch(VIEW_NAME, name):
-                yield (name,), "is no name of a camera: give small letters, digits and underscores"
         if np.ndim(self.image_size_px) > 1 and len(self.image_size_px) != len(names):
             yield ("image_size_px",), f"{len(self.image_size_px)} sizes for {len(names)} cameras"

@@ -18,7 +18,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from projservo_cli.records import FARTHEST_M, FloatArray
+from projservo_cli.records import FARTHEST_M, VIEW_NAME, FloatArray
 
 Number = Annotated[float, Strict()]
 Vector2 = tuple[Number, Number]
@@ -74,13 +74,9 @@ class Section(BaseModel):
         return cast(_Part, kind.model_construct(**{name: getattr(self, name) for name in kind.model_fields}))
 
 
-# Name of a view in tables and configurations; q alone is the name of joint readings: t_q is their time.
-_VIEW = re.compile(r"(?!q$)[a-z0-9][a-z0-9_]*")
-
-
 def is_view(name: str) -> bool:
     """Whether a camera may have a name."""
-    return _VIEW.fullmatch(name) is not None
+    return re.fullmatch(VIEW_NAME, name) is not None
 
 
 class ByView(Section):

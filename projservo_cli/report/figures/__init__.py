@@ -72,6 +72,7 @@ def of_trace(trace: Trace, markers: tuple[int, ...]) -> "Figure":
     """Draw figure 11, without the centre of the face: errors of its markers in the images over time."""
     data = {
         "t_s": trace.period * np.arange(len(trace.s)),
+        "view": np.array(trace.view),
         "e": trace.s - trace.s_star,
         "law": np.array(title(trace.law)),
         "marker": np.array(markers or range(trace.s.shape[2])),
