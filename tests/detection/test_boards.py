@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from projservo_cli.detection import Board, BoardFinder
+from projservo_cli.detection import Board, BoardFinder, finder_of
+from projservo_cli.settings.markers import BoardSettings, Markers
 from tests.calibration.simulated_robot import Robot, around, random_robot
 from tests.detection.test_detection import joints, write
 from tests.samples import revolute
@@ -147,3 +148,43 @@ def test_boards_that_are_not_there(projservo, monkeypatch, tmp_path, options):
     assert (answer.code, answer.err.count("\n")) == (1 if "any of" in REFUSED[options] else 2, 1), answer.err
     assert REFUSED[options] in answer.err
     assert not Path("t.csv").exists()
+
+
+def test_a_configured_board_is_found_in_frames_and_gives_a_length(rng):
+    markers = Markers(board=BoardSettings(kind="chessboard", rows=5, columns=7, size_m=0.03))
+    assert (len(markers.known), markers.front) == (35, (0, 6, 34, 28))
+    assert markers.lengths((0, 6, 34))[0] == pytest.approx([0.0, 0.18, 0.03 * np.hypot(4, 6)])
+    board = markers.board.pattern
+    finder = finder_of(board, None)
+    H = view_of(rng, 35.0)
+    first = finder.find(drawn(board, H, 0.8, 2.0, rng)[0].astype(float))[0]
+    turned = finder.like({0: type(first[0])(*(part[::-1] for part in first[0]))}, first)  # from the other end
+    np.testing.assert_array_equal(turned[0].pixels, first[0].pixels)
+
+
+CONTRADICTED = {
+    "markers: {board: {kind: chessboard, rows: 7, columns: 9, dictionary: 4X4_50}}": "a chessboard has none",
+    "markers: {board: {kind: chessboard, rows: 2, columns: 9}}": "greater than or equal to 3",
+    "markers: {board: {kind: circles, rows: 7, columns: 9}}": "chessboard",
+    "markers: {tags: roof, board: {kind: charuco, rows: 7, columns: 9}}": "keep one",
+}
+
+
+@pytest.mark.parametrize("text", CONTRADICTED)
+def test_boards_that_contradict_themselves(projservo, tmp_path, text):
+    (tmp_path / "c.yaml").write_text(text)
+    answer = projservo("calibrate", "-c", str(tmp_path / "c.yaml"), "-o", str(tmp_path / "o"))
+    assert (answer.code, answer.err.count("\n")) == (2, 1), answer.err
+    assert CONTRADICTED[text] in answer.err
+
+
+def test_goals_of_a_board_that_looks_the_same_turned_are_refused(projservo, tmp_path):
+    (tmp_path / "c.yaml").write_text(
+        "robot: {limits: {joints: [[-90, 90], [-90, 90]], unit: deg}}\n"
+        "plant: {use: tests.hardware.test_cameras:Arm}\n"
+        "cameras: {left: {source: 0}, right: {source: 1}}\n"
+        "markers: {board: {kind: chessboard, rows: 7, columns: 9}}\n"
+    )
+    answer = projservo("teach", "-c", str(tmp_path / "c.yaml"), "-o", str(tmp_path / "goal.yaml"))
+    assert (answer.code, answer.err.count("\n")) == (2, 1), answer.err
+    assert "a chessboard:9x7 looks the same turned by 180°" in answer.err
