@@ -5,9 +5,9 @@
 Each calibration of the UR5 of the reference data is at 0.5 px, from single-joint trials and twelve combined
 poses to ±30°, and has five draws. In each the left camera is turned by 3° and shifted by 30 mm, in random
 directions, and fitted again from 5, 10 and 20 random poses within ±45° and ±8°; once the whole rig is
-calibrated again from all poses. Errors and regions are of left images at held-out poses within ±30°; the region of a pose is
-that of the images of all markers in both cameras. Images of the right camera confirm the joint readings; how
-often those of the left one alone do is counted.
+calibrated again from all poses. Errors and regions are of left images at held-out poses within ±30°; the
+region of a pose is that of the images of all markers in both cameras. Images of the right camera confirm the
+joint readings; how often those of the left one alone do is counted.
 """
 
 import dataclasses
