@@ -51,6 +51,8 @@ _ARGUMENTS = {
 AUTO = "auto"
 # Standard deviations of chance by which squared errors at left-out poses must fall.
 _SURE = 2.0
+# Share of the largest decrease from which a hypothesis of fewer terms is preferred.
+_AS_MUCH = 0.95
 # Maximum numbers of hypotheses that are chosen, and of those that are tried for each.
 _MAX_CHOSEN, _TRIED = 6, 4
 # Maximum deviation, rad (prismatic × 0.3 m/rad), of a joint within its range by a term that is determined.
@@ -247,7 +249,9 @@ class _Search:
             if not better:
                 break
             refused.update(set(named) - {one for _, one, _ in better})
-            _, one, fit = max(better, key=lambda trial: trial[0][0])
+            most = max(gain for (gain, _), _, _ in better)
+            alike = [trial for trial in better if trial[0][0] >= _AS_MUCH * most]
+            _, one, fit = min(alike, key=lambda trial: (trial[2].problem.curve_terms, -trial[0][0]))
             self.gains[one], best = left_out_px(best), fit
             chosen.append(one)
         for one in chosen[:-1]:  # a later one may say all that it did

@@ -1,8 +1,15 @@
 """Curves of joints: one function everywhere, gauge freedoms refused, faults recovered."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from projservo_cli.calibration import calibrate, predict, prediction_variance
+from projservo_cli.calibration.bundle_adjustment import LeastSquares
+from projservo_cli.calibration.detections import Detections
+from projservo_cli.calibration.joint_model import describe_curve, hypotheses_of
+from projservo_cli.calibration.prediction import Parameters, error_factor, joint_derivative
 from projservo_cli.geometry.displacements import twists
 from projservo_cli.geometry.joint_curve import backwards, slopes, true_joints
 from projservo_cli.geometry.kinematics import (
@@ -11,9 +18,12 @@ from projservo_cli.geometry.kinematics import (
     forward_kinematics,
     joint_operators,
 )
-from projservo_cli.records import BASIS, JointCurve, Model
+from projservo_cli.metric.frame import Metric
+from projservo_cli.records import BASIS, NO_CURVE, InputError, JointCurve, Model, WorkFailed
+from tests.calibration.simulated_robot import around, random_robot, trials
+from tests.calibration.test_cameras_on_the_tool import Hand
 
-IMAGE = (1280, 960)
+SIGMA = 0.3
 N = 5
 
 
@@ -45,7 +55,7 @@ def test_kernels_and_vectors_are_one_function(seed):
     q_reference, q = rng.uniform(-1.0, 1.0, (2, N))
     bent, ideal = (
         model_of(H_hat, prismatic, curve, q_reference),
-        model_of(H_hat, prismatic, JointCurve(curve.terms[:0], curve.arm[:0]), q_reference),
+        model_of(H_hat, prismatic, NO_CURVE, q_reference),
     )
 
     def true(q):
@@ -76,3 +86,119 @@ def test_backwards_is_the_same_curve_of_the_reversed_chain(seed):
     x = rng.uniform(-1.0, 1.0, (4, N))
     there = true_joints(backwards(curve, N), prismatic[::-1], -x[:, ::-1])
     np.testing.assert_allclose(-there[:, ::-1], true_joints(curve, prismatic, x), atol=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_derivatives_agree_with_central_differences(seed):
+    rng = np.random.default_rng(seed)
+    robot = random_robot("RRPRR", rng, markers=4)
+    curve = some_arm(rng)[2]
+    readings = Detections.of(robot.observe(around(robot, 4, rng), 0.0, rng), robot.joint_types)
+    problem = LeastSquares.of(readings, robot.q_reference, 0, len(curve.terms))
+    scene = Parameters(robot.cameras, robot.twists, readings.prismatic, robot.markers, curve=curve)
+    analytic = problem.dense(problem.derivative(scene), readings.seen)
+    for k in range(problem.shared - len(curve.terms), problem.shared):
+        step = 1e-5 * (np.arange(problem.size) == k)
+        ahead, behind = (problem.residual(problem.retract(scene, sign * step)) for sign in (1.0, -1.0))
+        np.testing.assert_allclose((ahead - behind).ravel() / 2e-5, analytic[:, k], atol=1e-3)
+    by_joint = problem.joint_derivative(scene)
+    for i, step in enumerate(1e-5 * np.eye(N)):
+        ahead, behind = (
+            dataclasses.replace(problem, q=problem.q + sign * step).pixels(scene)[0] for sign in (1.0, -1.0)
+        )
+        np.testing.assert_allclose((ahead - behind) / 2e-5, by_joint[..., i], atol=2e-3)
+
+
+def bent(robot, q):
+    """True joints (K, n) at readings: a gear of the third, and one that turns the fifth."""
+    theta = q.copy()
+    theta[:, 2] += -0.03 * (q[:, 2] - robot.q_reference[2])
+    theta[:, 4] += 0.05 * (q[:, 3] - robot.q_reference[3])
+    return theta
+
+
+@pytest.fixture(scope="module", params=["world", "tool"])
+def case(request):
+    """Arm, poses to predict, its images, and calibrations without a curve, by choice, and as asked for."""
+    rng = np.random.default_rng(8)
+    robot = random_robot("RRRRR", rng, markers=9)
+    robot = robot if request.param == "world" else Hand(**vars(robot))
+    q, ahead = np.concatenate([trials(robot, frames=5), around(robot, 20, rng)]), around(robot, 60, rng)
+    seen = dataclasses.replace(robot.observe(bent(robot, q), SIGMA, rng), q=q)
+    asked = (None, "auto", ("scale:3", "coupling:4-5"))
+    found = [
+        calibrate(seen, "RRRRR", source="recorded", mount=request.param, joint_model=one) for one in asked
+    ]
+    return robot, ahead, robot.images(bent(robot, ahead)), found
+
+
+def test_the_curve_is_found_with_its_deviation_and_predicts(case):
+    _, ahead, truth, (plain, auto, asked) = case
+    off = [float(np.sqrt(np.mean((predict(one, ahead) - truth) ** 2))) for one in (plain, auto, asked)]
+    assert off[1] < 0.25 * off[0]
+    assert off[2] < 0.25 * off[0]
+    for found in (auto, asked):
+        terms = {tuple(row[:3].astype(int).tolist()): row[3:5] for row in found.joint_curve}
+        for key, value in (((0, 3, 3), -0.03), ((0, 5, 4), 0.05)):
+            coefficient, deviation = terms[key]
+            assert abs(coefficient - value) < 4.0 * deviation < 0.02
+        assert (found.joint_curve[:, 5] > found.joint_curve[:, 6]).all()
+        assert len(describe_curve(found)) == len(found.joint_curve)
+    # What is stated is what is true, and derivatives are by readings.
+    stated = float(np.sqrt(prediction_variance(asked, ahead).mean()))
+    assert 0.5 < off[2] / stated < 1.6
+    ends = [predict(asked, ahead[:1] + sign * 1e-6 * np.eye(N)[3]) for sign in (1.0, -1.0)]
+    J = joint_derivative(asked, ahead[:1])[..., 3]
+    np.testing.assert_allclose((ends[0] - ends[1]) / 2e-6, J, atol=1e-5 * np.abs(J).max())
+
+
+def test_model_and_metric_follow_the_curve(case):
+    """The kernels' model carries markers to the images that are predicted; poses in metres move alike."""
+    robot, ahead, _, (_, _, asked) = case
+    model = asked.model()
+    A = asked.M @ forward_kinematics(model, ahead[0]).T
+    images = A @ np.swapaxes(model.P, 1, 2)
+    np.testing.assert_allclose(images[..., :2] / images[..., 2:], predict(asked, ahead[:1])[0], atol=1e-8)
+    if asked.mount == "world":
+        metric = Metric.of(asked, error_factor(asked), length_m=1.0, between=asked.marker[:2].tolist())
+        true = dataclasses.replace(metric, curve=None)
+        there = bent(robot, ahead[:3])
+        # Zeros of the joints are those of the reference of the calibration, which is a pose of the recording.
+        there += (asked.q_reference - bent(robot, asked.q_reference[None]))[0]
+        np.testing.assert_allclose(metric.pose(ahead[:3]), true.pose(there), atol=2e-3)
+
+
+def test_sound_joints_get_no_curve_and_no_field():
+    rng = np.random.default_rng(5)
+    robot = random_robot("RRRR", rng, markers=8)
+    seen = robot.observe(np.concatenate([trials(robot, frames=5), around(robot, 12, rng)]), SIGMA, rng)
+    plain, auto = (calibrate(seen, "RRRR", source="recorded", joint_model=one) for one in (None, "auto"))
+    assert auto.joint_curve is None
+    assert auto.joint_curve_arm is None
+    np.testing.assert_array_equal(plain.P, auto.P)
+
+
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [
+        ("scale:3", "prismatic joint 3"),
+        ("harmonic:3", "no turn"),
+        ("coupling:2", "coupling:1-2"),
+        ("scale:9", "joints are 1 to 5"),
+        ("gear", "choose auto"),
+    ],
+)
+def test_gauge_and_mistakes_are_refused_by_name(word, says):
+    with pytest.raises(InputError, match=says):
+        hypotheses_of([word], "RRPRR", "world")
+    with pytest.raises(InputError, match="weight"):
+        hypotheses_of("sag", "RRRRR", "tool")
+
+
+def test_what_the_data_leave_open_is_refused_by_name():
+    """A cubic and a harmonic of one joint within two degrees are one curve."""
+    rng = np.random.default_rng(5)
+    robot = random_robot("RRRR", rng, markers=8)
+    q = robot.q_reference + rng.uniform(-0.5, 0.5, (40, 4)) * [1.0, 1.0, 0.03, 1.0]
+    with pytest.raises(WorkFailed, match="joint 3 may be off"):
+        calibrate(robot.observe(q, SIGMA, rng), "RRRR", joint_model=("cubic:3", "harmonic:3"))
