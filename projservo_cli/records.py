@@ -337,7 +337,7 @@ class ProjectiveKinematics:
         "joint_curve_row joint_curve_column",
         about="terms of true joints less readings, if fitted: index into BASIS, joint moved and joint read "
         "from 1, coefficient and its standard deviation in rad or m, typical error at left-out poses in px "
-        "without and with it",
+        "without and with it; their errors are the last rows of sqrt_cov_shared",
         default=None,
     )
     joint_curve_arm: FloatArray | None = _array(
@@ -350,7 +350,7 @@ class ProjectiveKinematics:
     sqrt_cov_shared: FloatArray = _array(
         "parameter error",
         about="square root of the covariance of P.ravel(), H_hat_0.ravel() and, if estimated, k1, k2 and "
-        "image centre u, v of both lenses and coefficients of joint_curve, up to the gauge",
+        "image centre u, v of both lenses, up to the gauge",
     )
     sqrt_cov_marker: FloatArray = _array(
         "marker coordinate error", about="square root of the covariance of M by the same errors"
