@@ -11,14 +11,20 @@ import numpy as np
 from markupsafe import Markup
 
 from projservo_cli.files import replacing, write_whole
-from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import frames_of, near_pixels, with_halo
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
-from projservo_cli.report.figures.scene import goal_displacement, plant_pyramids, skeleton
+from projservo_cli.report.figures.scene import (
+    displaced,
+    edges_of,
+    goal_displacement,
+    plant_pyramids,
+    standing,
+)
 from projservo_cli.report.html import html_page
 from projservo_cli.report.report_data import PAGE_FILE, title
 from projservo_cli.simulation.analytic_plant import Plant
@@ -47,8 +53,8 @@ _KEY = (
     ("face", _SEEN),
     ("face, hidden from a camera", _HIDDEN),
     ("markers", style.GREY),
-    ("goal, planned path of the centre", style.PURPLE),
-    ("driven path of the centre", style.GREEN),
+    ("goal, planned path of the {}", style.PURPLE),
+    ("driven path of the {}", style.GREEN),
 )
 _CAMERAS_AT = 4  # place of the cameras in this key
 _TREES = (("search tree from the start", "#9cc9e8"), ("search tree from the goals", "#dcb4cd"))
@@ -62,20 +68,23 @@ class _Driven(NamedTuple):
     verdict: str
     seconds: FloatArray  # (k,)
     hidden: BoolArray  # (k, V) whether the face is hidden from each camera
-    path: FloatArray  # (t, 3) centre of the face at every instant of the run
+    path: FloatArray  # (t, 3) centre of what moves, face or cameras, at every instant of the run
     robot: FloatArray  # (k, j, 3) from its base to the tool
     face: FloatArray  # (k, m, 3) in cyclic order
     markers: FloatArray  # (k, p, 3)
+    cameras: FloatArray  # (k, V, 5, 3) optical centre and image corners of the viewing pyramids
 
 
 class _Motion(NamedTuple):
     """Static parts of the view, in m in the base frame, and the runs by name."""
 
     view: tuple[str, ...]  # names of the views
-    cameras: FloatArray  # (V, 5, 3) optical centre and image corners of the viewing pyramids
+    on_tool: bool  # whether the cameras move, and the face stands still
+    cameras: FloatArray  # (V, 5, 3) optical centre and image corners of the viewing pyramids at the start
     start: FloatArray  # (m, 3) corners of the face
-    goal: FloatArray | None  # the same, None where only images of the goal are known
-    planned: FloatArray  # (s, 3) centre of the face along the joints of the plan, as far as they follow it
+    # (e, 3) line around it, or along the pyramids, at the goal; None where only images of it are known
+    goal: FloatArray | None
+    planned: FloatArray  # (s, 3) centre of what moves along the joints of the plan, as far as they follow it
     trees: tuple[
         FloatArray, ...
     ]  # (e, 3) centre of the face along the edges of each search tree, NaN between
@@ -87,14 +96,20 @@ def motion_of(
 ) -> _Motion:
     """Return the view of runs with at least one step; ``markers`` (p, 4) at the robot's reference, m."""
     face = plant.M[plant.order]
-    start = (face @ forward_kinematics(plant.model, plan.q_start).T)[:, :3]
-    displacement = goal_displacement(robot, traces)
-    goal = None if displacement is None else (face @ displacement.T)[:, :3]
+    _, of_face, of_rig = standing(robot, plant, plan.q_start)
+    start = (face @ of_face.T)[:, :3]
+    rig, goal = plant_pyramids(plant, start), None
+    if (displacement := goal_displacement(robot, traces)) is not None:
+        gap = np.full((1, 3), np.nan)
+        at_goal = [np.concatenate([edges_of(camera), gap]) for camera in displaced(rig, displacement)]
+        around = style.closed((face @ displacement.T)[:, :3])
+        goal = np.concatenate(at_goal) if plant.model.on_tool else around
     planned = _centers(plant, plan.q[np.isfinite(plan.q).all(axis=1)])
-    runs = {name: _driven(robot, plant, markers, trace) for name, trace in traces.items()}
+    runs = {name: _driven(robot, plant, markers, rig, trace) for name, trace in traces.items()}
     edges = () if plan.tree_q is None else tree_edges(plan)
     trees = tuple(with_gaps(_centers(plant, q.reshape(-1, q.shape[-1]))) for q in edges)
-    return _Motion(plan.view, plant_pyramids(plant, start), start, goal, planned, trees, runs)
+    cameras = displaced(rig, of_rig)
+    return _Motion(plan.view, plant.model.on_tool, cameras, start, goal, planned, trees, runs)
 
 
 def _sample_times(q: FloatArray) -> IntArray:
@@ -111,12 +126,12 @@ def _sample_times(q: FloatArray) -> IntArray:
     return np.unique(np.minimum(np.searchsorted(done, marks), len(q) - 1))
 
 
-def _driven(robot: SerialArm, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
+def _driven(robot: SerialArm, plant: Plant, markers: FloatArray, rig: FloatArray, trace: Trace) -> _Driven:
     instants, positions = _sample_times(trace.q), []
     for q in trace.q[instants]:
-        H = forward_kinematics(plant.model, q)
-        polyline = skeleton(joint_operators(plant.model, q), robot.prismatic, (H @ robot.base_tool)[:3, 3])
-        positions.append((polyline, (plant.M[plant.order] @ H.T)[:, :3], (markers @ H.T)[:, :3]))
+        polyline, H, of_rig = standing(robot, plant, q)
+        face, points = ((M @ H.T)[:, :3] for M in (plant.M[plant.order], markers))
+        positions.append((polyline, face, points, displaced(rig, of_rig)))
     moved = (np.stack(kind) for kind in zip(*positions, strict=True))
     verdict, path = f"{trace.verdict}, {trace.steps} steps", _centers(plant, trace.q)
     return _Driven(
@@ -125,8 +140,11 @@ def _driven(robot: SerialArm, plant: Plant, markers: FloatArray, trace: Trace) -
 
 
 def _centers(plant: Plant, q: FloatArray) -> FloatArray:
-    """Centre of the face (k, 3) at joints (k, n), m."""
+    """Centre (k, 3) of the face, or of the cameras if they move, at joints (k, n), m."""
     H = (forward_kinematics(plant.model, joints) for joints in q)
+    if plant.model.on_tool:
+        middle = plant.O.mean(axis=0)
+        return np.array([np.linalg.solve(moved, middle)[:3] for moved in H]).reshape(-1, 3)
     return np.array([center_of(plant.M @ moved.T, plant.center)[:3] for moved in H]).reshape(-1, 3)
 
 
@@ -150,21 +168,24 @@ def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
         post_script=_NEARER,
     )
     cameras = [(line["label"], line["color"]) for line in style.view_lines(motion.view)]
-    key = [*_KEY[:_CAMERAS_AT], *cameras, *_KEY[_CAMERAS_AT:], *(_TREES if motion.trees else ())]
+    what = "middle of the cameras" if motion.on_tool else "centre"
+    words = [(text.format(what), color) for text, color in _KEY]
+    key = [*words[:_CAMERAS_AT], *cameras, *words[_CAMERAS_AT:], *(_TREES if motion.trees else ())]
     text = html_page("view.html", name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=key)
     write_whole(path, text)
 
 
 def _figure(motion: _Motion) -> Any:
-    """The view as a figure of plotly: what stands still, then four traces a run, and a frame an instant."""
+    """The view as a figure of plotly: what stands still, then the traces of each run, a frame an instant."""
     go = plotly()
     menu: list[dict[str, Any]] = []
     traces, frames = [*_still(go, motion)], []
     still = len(traces)
     for number, (name, run) in enumerate(motion.runs.items()):
-        moving = [_moving(go, run, k) for k in range(len(run.seconds))]
+        moving = [_moving(go, motion, run, k) for k in range(len(run.seconds))]
         names = [f"{name}/{k}" for k in range(len(moving))]
-        positions = [len(traces) + k for k in range(3)]
+        parts_of_run = len(moving[0]) + 1
+        positions = [len(traces) + k for k in range(parts_of_run - 1)]
         frames += [
             go.Frame(name=frame, data=parts, traces=positions)
             for frame, parts in zip(names, moving, strict=True)
@@ -172,7 +193,8 @@ def _figure(motion: _Motion) -> Any:
         for trace in (*moving[0], _line(go, run.path, "driven path", style.GREEN, width=5)):
             trace.visible = number == 0  # a list of all runs chooses another
             traces.append(trace)
-        visible = [True] * still + [k // 4 == number for k in range(4 * len(motion.runs))]
+        of_runs = np.arange(len(motion.runs)).repeat(parts_of_run)
+        visible = [True] * still + (of_runs == number).tolist()
         buttons = [
             {"label": "▶ play", "method": "animate", "args": [names, _PLAYING]},
             {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
@@ -218,11 +240,10 @@ def _scene(motion: _Motion, reach: Mapping[str, list[float]]) -> dict[str, Any]:
 
 def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
     """Range of each coordinate that a run keeps to, so that the scene stands still while the robot moves."""
-    points = [motion.cameras, motion.start, run.robot, run.markers, run.path, motion.planned]
-    points += [] if motion.goal is None else [motion.goal]
-    points += [tree[np.isfinite(tree[:, 0])] for tree in motion.trees]
+    points = [motion.cameras, motion.start, run.robot, run.markers, run.path, run.cameras, motion.planned]
+    points += [*([] if motion.goal is None else [motion.goal]), *motion.trees]
     corners = np.concatenate([part.reshape(-1, 3) for part in points])
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low, high = np.nanmin(corners, axis=0), np.nanmax(corners, axis=0)
     pad = _PAD * float((high - low).max())
     ranges = np.round(np.stack([low - pad, high + pad], axis=1), _DIGITS)
     return {name: reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
@@ -248,13 +269,11 @@ def _slider(run: _Driven, names: list[str], views: tuple[str, ...]) -> dict[str,
 
 
 def _still(go: Any, motion: _Motion) -> Iterator[Any]:
-    for pyramid, camera in zip(motion.cameras, style.view_lines(motion.view), strict=True):
-        apex, corners = pyramid[:1], style.closed(pyramid[1:])
-        edges = np.concatenate([np.concatenate([corner[None], apex, corner[None]]) for corner in corners])
-        yield _line(go, edges, camera["label"], camera["color"], width=3)
+    if not motion.on_tool:
+        yield from _cameras(go, motion, motion.cameras)
     yield _line(go, style.closed(motion.start), "face at the start", style.BLACK, width=3)
     if motion.goal is not None:
-        yield _line(go, style.closed(motion.goal), "face at the goal", style.PURPLE, width=4)
+        yield _line(go, motion.goal, "goal", style.PURPLE, width=4)
     for points, (name, color) in zip(motion.trees, _TREES, strict=False):
         yield _line(go, points, name, color, width=1)
     if len(motion.planned):
@@ -263,8 +282,14 @@ def _still(go: Any, motion: _Motion) -> Iterator[Any]:
         yield _line(go, motion.planned[dots], "planned path", style.PURPLE)
 
 
-def _moving(go: Any, run: _Driven, k: int) -> tuple[Any, Any, Any]:
-    """SerialArm, face and markers at one of the instants."""
+def _cameras(go: Any, motion: _Motion, pyramids: FloatArray) -> Iterator[Any]:
+    """The pyramids (V, 5, 3) of all cameras."""
+    for pyramid, camera in zip(pyramids, style.view_lines(motion.view), strict=True):
+        yield _line(go, edges_of(pyramid), camera["label"], camera["color"], width=3)
+
+
+def _moving(go: Any, motion: _Motion, run: _Driven, k: int) -> list[Any]:
+    """Robot, face and markers, and cameras on the tool, at one of the instants."""
     robot = _line(go, run.robot[k], "robot", style.BLACK, width=9)
     robot.update(mode="lines+markers", marker={"size": 5, "color": style.BLACK})
     fan = np.arange(1, run.face.shape[1] - 1)
@@ -272,7 +297,8 @@ def _moving(go: Any, run: _Driven, k: int) -> tuple[Any, Any, Any]:
     color = _HIDDEN if run.hidden[k].any() else _SEEN
     line_style = {"color": color, "flatshading": True, "name": "face", "hoverinfo": "name"}
     face = go.Mesh3d(**_coordinates(run.face[k]), **triangles, **line_style)
-    return robot, face, _line(go, run.markers[k], "markers", style.GREY)
+    cameras = _cameras(go, motion, run.cameras[k]) if motion.on_tool else ()
+    return [robot, face, _line(go, run.markers[k], "markers", style.GREY), *cameras]
 
 
 def _line(go: Any, points: FloatArray, name: str, color: str, width: float | None = None) -> Any:

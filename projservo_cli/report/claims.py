@@ -246,7 +246,9 @@ def _joints(report_data: ReportData, trace: Trace) -> _Claim:
     line = distance / max(float(np.linalg.norm(distance)), np.finfo(float).tiny)
     H_hat = joint_operators(report_data.plant.model, trace.q[0])
     joint_step = trace.q[1] - trace.q[0]
-    parts = _second_order_drift(H_hat, joint_step, np.append(trace.center[0], 1.0), line)
+    order = slice(None, None, -1 if report_data.plant.model.on_tool else 1)
+    center = np.append(trace.center[0], 1.0)
+    parts = _second_order_drift(H_hat[order], joint_step[order], center, line)[order]
     first = 1e3 * along_line(trace.center[1:2], trace.center[0], trace.center[0] + line)[1][0]
     ranking = np.argsort(-np.abs(parts))
     shares = ", ".join(f"q{i + 1} {1e3 * parts[i]:+.2f}" for i in ranking)

@@ -158,8 +158,11 @@ class ReportData(Fit):
         return np.asarray(M.mean(axis=0) if self.plant.center < 0 else M[self.plant.center])
 
     def goal_center(self, trace: Trace) -> FloatArray:
-        """True centre (3,) of the face at the goal, m; NaN where the goal pose is unknown."""
-        return np.asarray((trace.goal_pose @ np.linalg.solve(self.robot.base_tool, self.middle))[:3])
+        """True centre (3,) of the face before the cameras at the goal, m; NaN where its pose is unknown."""
+        before, after = self.robot.base_tool, trace.goal_pose
+        if self.plant.model.on_tool:  # from which the face moves the other way
+            before, after = after, before
+        return np.asarray((after @ np.linalg.solve(before, self.middle))[:3])
 
     def center_distance(self, trace: Trace) -> FloatArray:
         """True distance (k,) of the centre from its goal, m."""

@@ -6,16 +6,20 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from projservo_cli.cli.output import words_of
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import CrossValidation
-from projservo_cli.report.report_data import PAGE_FILE
+from projservo_cli.report.animation import write_animation
+from projservo_cli.report.claims import claims_of
+from projservo_cli.report.report_data import PAGE_FILE, stage_object
 from projservo_cli.store import Result
 from projservo_cli.store.observation_tables import to_csv
 from tests.configured import compared, page_of
 from tests.fake_records import fake
-from tests.report.cases import SPECS, case
-from tests.report.conftest import SOME, read, words
+from tests.report.cases import SPECS, case, seen
+from tests.report.conftest import SOME, read, stored, words
 
 
 @pytest.fixture(scope="session")
@@ -49,6 +53,30 @@ def test_the_page_loads_nothing_and_runs_nothing(page, run):
     (style,) = page.all("style")
     assert "url(" not in style.text
     assert "@import" not in style.text
+
+
+@pytest.mark.parametrize("names", [("hand",), ("left", "right", "ceiling")])
+def test_page_and_words_name_the_cameras(tmp_path, run, names):
+    material = seen(names)
+    with_names = stored(tmp_path, material=material)
+    results = with_names.results | {"report": run.results["report"]}
+    with_names = dataclasses.replace(with_names, results=results)
+    text = words(shown(with_names).text)
+    for name in names:
+        assert f"hidden {name}" in text
+    assert "hidden right" not in text or "right" in names
+    laws = stage_object("servo", with_names, (), [*material.traces])
+    head, *_, last = words_of("servo", laws)
+    assert head.endswith(f"self-occluded steps {'/'.join(names)}")
+    assert "/".join("0" for _ in names) in last
+    for claim in claims_of(material, np.zeros(0), np.zeros(0)):
+        assert ("both" in claim.criterion) <= (len(names) == 2)
+    film = tmp_path / "film.gif"
+    some = {name: material.traces[name] for name in ("direct_three", "stacked")}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("projservo_cli.report.animation.FRAMES", 2)
+        write_animation(film, some, material.plant.order, None, lambda *_: None)
+    assert Image.open(film).height > 250 * len(names)
 
 
 def test_every_figure_has_a_text_a_caption_and_its_numbers(page, run):

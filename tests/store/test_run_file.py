@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from projservo_cli import store
-from projservo_cli.records import InputError, Plan
+from projservo_cli.records import InputError, Plan, Trace
+from projservo_cli.results import RunTrace
 from projservo_cli.store import save_record
 from tests.fake_records import fake
 from tests.store.deceit import EDITS, HEADS, edited, head, resealed
@@ -62,6 +63,33 @@ def test_everything_comes_back(tmp_path):
     assert_same(back.plan, run.plan)
     assert back.cross_validation.rms_px == 0.5
     assert list(back.traces) == ["stacked", "direct_three"]
+
+
+@pytest.mark.parametrize("names", [("hand",), ("left", "right"), ("top", "left", "door")])
+def test_plans_and_runs_of_any_views_come_back_with_counts_by_name(tmp_path, names):
+    trace = fake(Trace, 1, view=names)
+    made = {"plan": result(**{"": fake(Plan, 2, view=names)}), "servo/exact": result(**{"": trace})}
+    store.save(store.Run(tmp_path / "run.h5", "", made))
+    back = store.load(tmp_path)
+    assert_same(back.plan, made["plan"].records[""])
+    assert_same(back.traces["exact"], trace)
+    with h5py.File(tmp_path / "run.h5") as file:
+        attributes = file["servo/exact"].attrs
+        stored = {name: attributes[f"self_occluded_steps_{name}"].item() for name in names}
+    assert stored == {name: getattr(trace, f"self_occluded_steps_{name}") for name in names}
+    assert [*stored.values()] == [*trace.self_occluded_steps]
+    with pytest.raises(AttributeError, match="Trace has no self_occluded_steps_roof"):
+        getattr(trace, "self_occluded_steps_roof")  # noqa: B009
+    xarray = pytest.importorskip("xarray")
+    labelled = RunTrace.of(back.traces["exact"]).to_xarray()
+    assert labelled["view"].values.tolist() == [*names]
+    xarray.testing.assert_equal(labelled["s"].sel(view=names[-1]), labelled["s"][:, -1])
+
+
+def test_names_and_arrays_of_views_must_be_as_many(tmp_path):
+    trace = dataclasses.replace(fake(Trace), view=("left",), self_occluded_steps=(1,))
+    store.save(store.Run(tmp_path / "run.h5", "", {"servo/exact": result(**{"": trace})}))
+    assert "arrays of 2 views, named left" in refused(tmp_path)
 
 
 def test_xarray_shows_dimensions_units_and_coordinates(path):

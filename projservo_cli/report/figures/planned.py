@@ -1,6 +1,7 @@
 """Figs. 1, 2, 5 and 6 of [RH00]: the parts of the task and the planned motions, with their visibility."""
 
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.lens import distort_visible
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.image_size import border_distance
-from projservo_cli.records import FloatArray
+from projservo_cli.records import FloatArray, WorkFailed
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, ReportData, registered
 from projservo_cli.simulation.arm import METRIC_A_INF, roll_axis
@@ -213,6 +214,7 @@ def _signed(value: float, decimals: int = 1) -> str:
 
 STEEP = 0.35  # share of the path at which the steep profile has done the translation
 _FACES = 9
+_MIDDLE = "rig's centre"
 _NODES = 81
 _TURNS = 41  # shares μ_p tried at each μ_t, μ_r
 _TICKS = 11  # points at equal steps of σ on the path
@@ -268,17 +270,21 @@ def _rendered(
     """
     plan, P = report_data.plan, report_data.plant.model.P
     s = s[:, :, cyclic_order(plan.A)]
-    if len(P) == 1:  # which determines no points, and looks from the centre itself
-        faces = s[:, 0]
-    else:
-        points = np.array([triangulate_points(P, METRIC_A_INF, row) for row in s])
-        faces = project(middle_camera(P, report_data.plant.image_size.mean(axis=0))[None], points)[0]
+    # One camera determines no points; from amid cameras all around not all of them are in front.
+    faces, where = s[:, 0], f"{report_data.view[0]} camera"
+    with suppress(WorkFailed):
+        if len(P) > 1:
+            camera = middle_camera(P, report_data.plant.image_size.mean(axis=0))
+            points = np.array([triangulate_points(P, METRIC_A_INF, row) for row in s])
+            if (points @ camera[2] > 0.0).all():
+                faces, where = project(camera[None], points)[0], _MIDDLE
     return {
         "sigma": plan.path_parameter,
         "mu": mu,
         "margin": margin,
         "faces": faces,
         "profile": np.array(profile.replace("_", " ")),
+        **({} if where == _MIDDLE else {"from": np.array(where)}),
         "view": np.array(report_data.view),
     }
 
@@ -351,7 +357,7 @@ def _faces(axes: "style.Axes", data: Data) -> None:
     for j in visible:
         width = 1.8 if j in (visible[0], visible[-1]) else 1.0
         style.face(axes, faces[j], style.line(colormaps["cividis"](0.82 * sigma[j]), width=width))
-    style.image_axes(axes, f"from the rig's centre, {data['profile']}", faces)
+    style.image_axes(axes, f"from the {data.get('from', _MIDDLE)}, {data['profile']}", faces)
     place: Any = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "va": "bottom"}
     paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
     for corners, label in ((faces[0], "start"), (faces[-1], "goal")):

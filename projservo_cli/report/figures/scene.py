@@ -1,6 +1,7 @@
 """Fig. 3 of [RH00], robot, rig and face; and arm, cameras and the tool's uncertainty to scale, in metres."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from itertools import combinations
 from typing import Any
 
@@ -11,7 +12,7 @@ from projservo_cli.geometry.displacements import homogeneous, twists
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.image_size import image_corners
 from projservo_cli.metric.frame import Metric, links
-from projservo_cli.records import MM, TOOL, BoolArray, FloatArray, Trace
+from projservo_cli.records import MM, TOOL, BoolArray, FloatArray, Trace, WorkFailed
 from projservo_cli.report import style
 from projservo_cli.report.report_data import Data, Fit, ReportData, registered
 from projservo_cli.simulation.analytic_plant import Plant
@@ -22,31 +23,32 @@ _PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the dista
 _ROBOT = style.line(style.BLACK, width=2.0, marker="o", markersize=4)
 _GOAL = style.line(style.PURPLE, (0, (3, 1)), 1.6, label="face at the goal")  # blue is the first camera
 _AT_GOAL = style.line(style.PURPLE, width=1.2, marker="o", markersize=3, label="robot at the goal", alpha=0.6)
+_RIG_AT_GOAL = style.line(style.PURPLE, width=0.8, label="cameras at the goal")
+_FACE = "face at the start", "face"  # of cameras that stand still, and of those on the tool
 _ROLL_AXIS = style.line(style.GREEN, style.DASH_DOTTED, 0.9, label="roll axis of the rig")
 _LINE = style.line(style.GREY, style.DOTTED, label="straight line of the centre")
 
 
 def _data(report_data: ReportData) -> Data:
     """Joints, faces and cameras in metres; the robot at the start as a polyline through its axes."""
-    plant, robot, q = report_data.plant, report_data.robot, report_data.plan.q_start
-    start = forward_kinematics(plant.model, q)
+    plant, robot, q_goal = report_data.plant, report_data.robot, report_data.plan.q[-1]
+    polyline, start, of_rig = standing(robot, plant, report_data.plan.q_start)
     face = plant.M[plant.order]
-    tool = (start @ robot.base_tool)[:3, 3]
-    result: Data = {
-        "robot": skeleton(joint_operators(plant.model, q), robot.prismatic, tool),
-        "face_start": (face @ start.T)[:, :3],
-    }
-    visible = plant_pyramids(plant, result["face_start"])
+    result: Data = {"robot": polyline, "face_start": (face @ start.T)[:, :3]}
+    rig = plant_pyramids(plant, result["face_start"])
+    visible = displaced(rig, of_rig)
     result |= {"cameras": visible[:, 0], "pyramids": visible, "view": np.array(report_data.view)}
-    # From the middle of the rig to where it passes the face, which a task rolls about it.
-    point, direction = roll_axis(plant.model.P)
-    far = float((result["face_start"].mean(axis=0) - point) @ direction)
-    result["roll_axis"] = np.stack([point, point + 1.1 * far * direction])
-    q_goal = report_data.plan.q[-1]
+    with suppress(WorkFailed):  # cameras all around have none
+        # From the middle of the rig to where it passes the face, which a task rolls about it.
+        point, direction = roll_axis(plant.model.P @ np.linalg.inv(of_rig))
+        far = float((result["face_start"].mean(axis=0) - point) @ direction)
+        result["roll_axis"] = np.stack([point, point + 1.1 * far * direction])
     if np.isfinite(q_goal).all():
-        tool = (forward_kinematics(plant.model, q_goal) @ robot.base_tool)[:3, 3]
-        operators = joint_operators(plant.model, q_goal)
-        result["robot_goal"] = skeleton(operators, robot.prismatic, tool)
+        result["robot_goal"], _, of_rig = standing(robot, plant, q_goal)
+        if plant.model.on_tool:
+            result["pyramids_goal"] = displaced(rig, of_rig)
+    if plant.model.on_tool:  # the face stands still
+        return result
     if (goal := goal_displacement(robot, report_data.traces)) is not None:
         result["face_goal"] = (face @ goal.T)[:, :3]
         centers = [center_of(plant.M @ H.T, plant.center)[:3] for H in (start, goal)]
@@ -54,8 +56,25 @@ def _data(report_data: ReportData) -> Data:
     return result
 
 
+def standing(robot: SerialArm, plant: Plant, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Polyline (k, 3) of the robot at joints q (n,), m, and displacements of the face and of the cameras.
+
+    From the reference one of both has moved with the tool: in the base frame the other stands still.
+    """
+    arm = robot.model(plant.model.P)
+    moved, still = forward_kinematics(arm, q), np.eye(4)
+    tool = (moved @ robot.base_tool)[:3, 3]
+    polyline = skeleton(joint_operators(arm, q), robot.prismatic, tool)
+    return polyline, *((still, moved) if plant.model.on_tool else (moved, still))
+
+
+def displaced(points: FloatArray, H: FloatArray) -> FloatArray:
+    """Points (…, 3) after a displacement (4, 4)."""
+    return points @ H[:3, :3].T + H[:3, 3]
+
+
 def goal_displacement(robot: SerialArm, traces: Mapping[str, Trace]) -> FloatArray | None:
-    """Displacement (4, 4) of the markers from the reference to the goal; None where only images are known."""
+    """Displacement (4, 4) of the tool from the reference to the goal; None where only images are known."""
     poses = (trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all())
     pose = next(poses, None)
     return None if pose is None else np.asarray(pose @ np.linalg.inv(robot.base_tool))
@@ -112,14 +131,17 @@ def _rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
 )
 def _draw(data: Data, figure: "style.Figure") -> None:
     """One view in perspective with equal scales."""
-    axes = _space(figure, data)
-    axes.plot(*data["roll_axis"].T, **_ROLL_AXIS)
-    visible = [data["robot"], data["face_start"], data["roll_axis"]]
-    if "robot_goal" in data:
-        axes.plot(*data["robot_goal"].T, **_AT_GOAL)
-        visible.append(data["robot_goal"])
+    axes, on_tool = _space(figure, data), "pyramids_goal" in data
+    visible = [data["robot"], data["face_start"]]
+    for name, line in (("roll_axis", _ROLL_AXIS), ("robot_goal", _AT_GOAL)):
+        if name in data:
+            axes.plot(*data[name].T, **line)
+            visible.append(data[name])
+    for camera in data.get("pyramids_goal", ()):
+        axes.plot(*edges_of(camera).T, **_RIG_AT_GOAL)
+        visible.append(camera)
     axes.plot(*data["robot"].T, **_ROBOT, label="robot at the start")
-    axes.plot(*style.closed(data["face_start"]).T, **style.START | {"label": "face at the start"})
+    axes.plot(*style.closed(data["face_start"]).T, **style.START | {"label": _FACE[on_tool]})
     if "face_goal" in data:
         axes.plot(*style.closed(data["face_goal"]).T, **_GOAL)
         axes.plot(*data["line"].T, **_LINE)
@@ -132,12 +154,15 @@ def _space(figure: "style.Figure", data: Data) -> Any:
     axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
     axes.patch.set_visible(False)
     axes.computed_zorder = False
-    for (center, *corners), line in zip(data["pyramids"], style.view_lines(data["view"]), strict=True):
-        edges = line | {"linestyle": style.SOLID, "linewidth": 1.0}
-        axes.plot(*style.closed(np.stack(corners)).T, **edges)
-        for corner in corners:
-            axes.plot(*np.stack([center, corner]).T, **edges)
+    for camera, line in zip(data["pyramids"], style.view_lines(data["view"]), strict=True):
+        axes.plot(*edges_of(camera).T, **line | {"linestyle": style.SOLID, "linewidth": 1.0})
     return axes
+
+
+def edges_of(pyramid: FloatArray) -> FloatArray:
+    """One line (k, 3) along all edges of the pyramid (5, 3) of a camera."""
+    apex, corners = pyramid[:1], style.closed(pyramid[1:])
+    return np.concatenate([np.concatenate([corner[None], apex, corner[None]]) for corner in corners])
 
 
 def _show(axes: Any, figure: "style.Figure", rig: FloatArray, points: FloatArray) -> None:
