@@ -104,8 +104,8 @@ def _doctor(
     With -c it opens robot and cameras, moves nothing, and writes a table and a page with both pictures: frame
     rates, exposure, sharpness, tags, joints, limits, each finding with its remedy. With a calibration in RUN,
     by default that of the configuration's name in results, it says whether images still agree. Where one
-    camera moved, it writes refit_poses.csv, the poses to fit it again from. --move
-    measures latency, hysteresis, sag, and whether tags sit fast. Exit code 1 where a recording would fail.
+    camera moved, it writes refit_poses.csv, the poses to fit it again from. --move measures latency,
+    hysteresis, sag, and whether tags sit fast. Exit code 1 where a recording would fail.
     """
     if config is not None:
         from projservo_cli.cli.hardware import doctor
