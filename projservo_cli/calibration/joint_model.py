@@ -338,7 +338,7 @@ def _arm(solution: Solution) -> FloatArray:
     columns = np.where(used[..., None, None, None], G, 0.0).reshape(2 * used.size, -1)
     rows = np.hstack([columns, few.raw.reshape(-1, 1)])
     U = problem.dense(problem.derivative(params), used) @ few.errors().dense()
-    R = np.linalg.qr(rows - U @ (U.T @ rows), mode="r")
+    R = np.asarray(np.linalg.qr(rows - U @ (U.T @ rows), mode="r"))
     Z, r = R[:, :-1].reshape(len(R), -1, 3), -R[:, -1]
     best = np.inf, np.eye(3)[2]
     for g in np.eye(3):
