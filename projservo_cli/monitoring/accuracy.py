@@ -129,14 +129,15 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
         errors = ErrorModel(replace(calibration, M=calibration.M @ moved.T), calibration.sigma_px)
         at = errors.residual(pair)
     free, left = _free(at, at.F[:, errors.tool]), at.seen.ravel().copy()
-    for _ in range(int(_ALONE * left.sum())):
+    V, view_of = len(at.seen), np.arange(len(at.r)) // (2 * at.seen.shape[1])
+    for _ in range(int(_ALONE * min(1.0, 2.0 / V) * left.sum())):  # no more than half of a view
         limit = _UNUSUAL * chdtri(2, _CHANCE / left.sum())
         if (stray := farthest_alone(free, at.r, np.flatnonzero(left), limit)) is None:
             break
         left[stray] = False
     rows = coordinate_rows(np.flatnonzero(left))
     P, r, r_joints = np.linalg.inv(free[np.ix_(rows, rows)]), at.r[rows], by_joints.r[rows]
-    V, view_of, shifts = len(at.seen), rows // (2 * at.seen.shape[1]), []
+    view_of, shifts = view_of[rows], []
     # Of two images one is shifted against the other; a single one shows no more than another pose.
     for view in {*range(V if V > 2 else V - 1)} & {*view_of.tolist()}:
         F = np.eye(2)[rows % 2] * (view_of == view)[:, None]

@@ -443,8 +443,10 @@ class ImageMonitor:
     def _judge_markers(self) -> None:
         """Name markers that two views show off by themselves for long."""
         in_both, in_either = np.sort([np.zeros_like(self._asides[0]), *self._asides], axis=0)[-2:]
-        # What hides an edge shows in one view, and passes.
-        if self.pending or not ((in_both == _NAMED_AT[0]).any() or (in_either == _TWO_AT).any()):
+        # What hides an edge shows in one view, and passes; one camera is believed after a hand has passed.
+        long = in_either >= (_NAMED_AT[-1] if len(self._asides) == 1 else np.inf)
+        due = (in_both == _NAMED_AT[0]) | (in_either == _TWO_AT) | (long & (in_either == _NAMED_AT[-1]))
+        if self.pending or not due.any():
             return
         before, moved = self._detector.memory.total, []
         for j in np.flatnonzero(in_either).tolist():
@@ -456,7 +458,7 @@ class ImageMonitor:
             if not fits:
                 continue
             best, views = fits[0], len({tested.view for tested in kept})
-            lasts = (in_both[j] or views >= WINDOW) and not self._is_edge(best, kept)
+            lasts = (in_both[j] or views >= WINDOW or long[j]) and not self._is_edge(best, kept)
             if lasts and best.score > _CLEAR and self._explains(best):
                 moved.append(best)
         if moved:
@@ -514,7 +516,8 @@ def detected_fault(
         sigma = max(calibration.sigma_px, sigma_px)
         monitor, q_views = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size), np.stack([q] * V)
         monitor.observe(instants, q_views, rest, instants, pixels, new)
-        for k in range(1, _NAMED_AT[0] * bool(monitor.rejected.any() and not monitor.pending)):
+        enough = _NAMED_AT[-1 if V == 1 else 0]
+        for k in range(1, enough * bool(monitor.rejected.any() and not monitor.pending)):
             monitor.observe(instants + k, q_views, rest, instants, pixels, new)
         return monitor.give_up()
 
