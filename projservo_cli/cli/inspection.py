@@ -152,10 +152,10 @@ def _export(
     in the frame of the flange: the hand–eye transformation.
 
     With --nominal it lists the errors of zeros and axes of a model, the most significant first. With --frames
-    model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip; cameras
-    on the tool are in that tip. A model
-    that does not describe the arm, as one in which a joint turns the other way, ends in exit code 1, and so
-    does a known length that contradicts its links or a prismatic joint, or puts a camera beyond 20 m.
+    model, the cameras are in the base of that model, such as a robot's own, and the tool is its tip. Cameras
+    on the tool are in that tip. A model that does not describe the arm, as one in which a joint turns the
+    other way, ends in exit code 1, and so does a known length that contradicts its links or a prismatic
+    joint, or puts a camera beyond 20 m.
     """
     from projservo_cli.store import load
 

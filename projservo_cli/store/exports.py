@@ -152,6 +152,4 @@ def to_json(metric: Metric, more: Mapping[str, Any]) -> str:
     about: dict[str, Any] = {"joint_types": metric.joint_types, "marker": metric.marker, "tool": tool}
     if metric.view != VIEWS:
         about["view"] = metric.view
-    if metric.mount == TOOL:
-        about["mount"] = metric.mount
     return json.dumps({**about, **arrays, **covariances, **more}, indent=1, allow_nan=False) + "\n"
