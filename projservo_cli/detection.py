@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
+from projservo_cli.calibration.checks.board_numbering import numberings
 from projservo_cli.records import (
     CORNERS,
     BoolArray,
@@ -147,8 +148,8 @@ _REACH, _MAX_REACH_SADDLE = 0.6, 10.0
 _CROSS, _MIN_CROSS = 0.1, 1.5
 # Minimum side of a square to fit edges, px, and deviation of a corner of OpenCV in a smaller one, px.
 _MIN_SQUARE, _UNREFINED_SADDLE = 5.0, 0.3
-# Steps of the fit of a corner, and error of its model, px.
-_SADDLE_STEPS, _SADDLE_FLOOR = 12, 0.001
+# Number of parameters of a corner, steps of their fit, and error of the model, px.
+_SADDLE, _SADDLE_STEPS, _SADDLE_FLOOR = 7, 12, 0.001
 # Rms residual, in contrasts, and distance from the guess, in squares, above which a corner is rejected.
 _MISFIT, _FAR_SADDLE = 0.25, 0.3
 # Minimum width of a cell, px, to fit edges of a tag, whose border is one cell wide.
@@ -667,53 +668,46 @@ class BoardFinder(Finder):
 
         image : (height, width) grey values from 0 to 255.
         """
-        guess = self._guess(image.astype(np.uint8))
+        guess, places = self._guess(image.astype(np.uint8)), self.board.places
         known = np.isfinite(guess[:, 0])
-        if known.sum() < _LEAST_CORNERS:
-            return {}, ()
-        H = self.cv.findHomography(self.board.places[known], guess[known])[0]
+        H = None
+        if known.sum() >= _LEAST_CORNERS:
+            H = self.cv.findHomography(places[known], guess[known])[0]
         if H is None:
             return {}, ()
-        steps = [
-            self._moved(H, self.board.places + step) - self._moved(H, self.board.places) for step in np.eye(2)
-        ]
-        corners = _refine_saddles(image, guess, *steps, _CROSS if self._detectors else np.inf)
-        return ({0: corners}, ()) if np.isfinite(corners.sigma).any() else ({}, ())
+        here, *there = (
+            self.cv.perspectiveTransform((places + step)[None], H)[0] for step in ((0, 0), (1, 0), (0, 1))
+        )
+        return {
+            0: _refine_saddles(image, guess, np.stack(there) - here, _CROSS if self._detectors else np.inf)
+        }, ()
 
     def like(self, tags: dict[int, Corners], before: dict[int, Corners] | None) -> dict[int, Corners]:
         """Return the board numbered from the end that moved least since the frame before."""
         if not tags or not before or not self.board.symmetric:
             return tags
-        index = np.arange(self.corners).reshape(self.board.shape)
-        step = 1 if self.board.rows == self.board.columns else 2
-        ends = [Corners(*(part[np.rot90(index, k).ravel()] for part in tags[0])) for k in range(0, 4, step)]
+        found = tags[0]
+        ends = [
+            Corners(found.pixels[k], found.sigma[k], found.clean[k]) for k in numberings(*self.board.shape)
+        ]
         far = [np.nanmedian(np.linalg.norm(end.pixels - before[0].pixels, axis=1)) for end in ends]
         return {0: ends[int(np.argmin(far))]}
 
     def _guess(self, grey: ByteArray) -> FloatArray:
         """Corners (N, 2) as of OpenCV, px, NaN where unseen."""
-        guess, (rows, columns) = np.full((self.corners, 2), np.nan), self.board.shape
+        guess = np.full((self.corners, 2), np.nan)
         if not self._detectors:
-            found, corners = self.cv.findChessboardCornersSB(
-                grey, (columns, rows), flags=self.cv.CALIB_CB_EXHAUSTIVE
-            )
-            return np.reshape(corners, (-1, 2)).astype(np.float64) if found else guess
-        for detector in self._detectors:
-            corners, numbers = detector.detectBoard(grey)[:2]
-            if numbers is not None and len(numbers) > np.isfinite(guess[:, 0]).sum():
-                guess[:] = np.nan
-                guess[np.ravel(numbers)] = np.reshape(corners, (-1, 2))
+            size, exhaustive = self.board.shape[::-1], self.cv.CALIB_CB_EXHAUSTIVE
+            found, corners = self.cv.findChessboardCornersSB(grey, size, flags=exhaustive)
+            return corners.reshape(-1, 2).astype(np.float64) if found else guess
+        found = [detector.detectBoard(grey)[:2] for detector in self._detectors]
+        corners, numbers = max(found, key=lambda one: 0 if one[1] is None else len(one[1]))
+        if numbers is not None:
+            guess[np.ravel(numbers)] = np.reshape(corners, (-1, 2))
         return guess
 
-    @staticmethod
-    def _moved(H: FloatArray, places: FloatArray) -> FloatArray:
-        moved = np.c_[places, np.ones(len(places))] @ H.T
-        return np.asarray(moved[:, :2] / moved[:, 2:])
 
-
-def _refine_saddles(
-    image: FloatArray, guess: FloatArray, along: FloatArray, down: FloatArray, cross: float
-) -> Corners:
+def _refine_saddles(image: FloatArray, guess: FloatArray, steps: FloatArray, cross: float) -> Corners:
     """Refine corners at which four squares meet: two crossing edges of one blur.
 
     The grey value is b + a (2 Φ(z_1) − 1)(2 Φ(z_2) − 1), z the distance from either edge over the blur. A
@@ -721,55 +715,50 @@ def _refine_saddles(
 
     image : (height, width) grey values.
     guess : (N, 2) corners, px, NaN where unseen.
-    along, down : (N, 2) steps to the next corners, px.
+    steps : (2, N, 2) to the next corners along a row and a column, px.
     cross : distance from the edges up to which pixels count, in squares.
     """
-    N = len(guess)
-    pixels, sigma, clean = np.full((N, 2), np.nan), np.full(N, np.nan), np.zeros(N, dtype=np.bool_)
-    area = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0])
-    spacing = area / np.maximum(np.linalg.norm(along, axis=1), np.linalg.norm(down, axis=1))
-    reach = np.minimum(_REACH * spacing, _MAX_REACH_SADDLE)
-    middle = np.rint(guess)
-    height, width = image.shape
-    seen = np.isfinite(guess[:, 0])
-    inside = seen & (np.nan_to_num(middle - reach[:, None], nan=-1.0) >= 0.0).all(axis=1)
-    inside &= (np.nan_to_num(middle + reach[:, None]) <= [width - 1, height - 1]).all(axis=1)
-    pixels[seen], sigma[seen] = guess[seen], _UNREFINED_SADDLE
-    at = np.flatnonzero(inside & (spacing > _MIN_SQUARE))
+    seen, (height, width) = np.isfinite(guess[:, 0]), image.shape
+    length = np.linalg.norm(steps, axis=2)
+    side = np.abs(steps[0, :, 0] * steps[1, :, 1] - steps[0, :, 1] * steps[1, :, 0]) / length.max(axis=0)
+    reach = np.minimum(_REACH * side, _MAX_REACH_SADDLE)[:, None]
+    middle = np.rint(np.where(seen[:, None], guess, -1.0))
+    inside = ((middle >= reach) & (middle + reach <= [width - 1, height - 1])).all(axis=1)
+    at = np.flatnonzero(seen & inside & (side > _MIN_SQUARE))
+    found = Corners(
+        guess.copy(), np.where(seen, _UNREFINED_SADDLE, np.nan), np.zeros(len(guess), dtype=np.bool_)
+    )
     if not at.size:
-        return Corners(pixels, sigma, clean)
+        return found
     half = int(reach[at].max())
     dv, du = np.indices((2 * half + 1, 2 * half + 1)).reshape(2, 1, -1) - half
-    u, v = middle[at, :1] + du, middle[at, 1:] + dv
-    weight = (du**2 + dv**2 <= reach[at, None] ** 2).astype(np.float64)
-    rows, columns = np.clip(v, 0, height - 1).astype(int), np.clip(u, 0, width - 1).astype(int)
-    grey, u, v = image[rows, columns], u - guess[at, :1], v - guess[at, 1:]
-    angles = np.stack([np.arctan2(step[at, 1], step[at, 0]) for step in (along, down)], axis=1)
-    zero, one = np.zeros((len(at), 2)), np.ones((len(at), 2))
-    x = np.concatenate([zero, zero, one[:, :1], angles], axis=1)
-    if np.isfinite(cross):
-        off = [np.abs(u * np.sin(a) - v * np.cos(a)) for a in (angles[:, :1], angles[:, 1:])]
-        weight *= np.fmin(*off) <= np.maximum(cross * spacing[at, None], _MIN_CROSS)
+    rows, columns = (middle[at, k, None].astype(int) + shift for k, shift in ((1, dv), (0, du)))
+    grey = image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+    u, v = columns - guess[at, :1], rows - guess[at, 1:]
+    angles = np.arctan2(steps[:, at, 1], steps[:, at, 0])
+    off = np.abs(u * np.sin(angles[..., None]) - v * np.cos(angles[..., None])).min(axis=0)
+    near = off <= np.maximum(cross * side[at, None], _MIN_CROSS)
+    weight = ((du**2 + dv**2 <= reach[at] ** 2) & near).astype(np.float64)
+    x = np.zeros((len(at), _SADDLE))
+    x[:, 4], x[:, 5:], count = 1.0, angles.T, weight.sum(axis=1)
     # Both grey levels by the product of the edges as they are guessed.
-    product = _saddle_model(x + np.eye(7)[1], u, v, grey, weight)[1][:, 1]
-    count = weight.sum(axis=1)
+    product = _saddle_model(x, u, v, grey, weight)[1][:, 1]
     x[:, 0] = (weight * grey).sum(axis=1) / count
     x[:, 1] = (product * (grey - x[:, :1])).sum(axis=1) / np.maximum((product**2).sum(axis=1), 1e-9)
 
     def equations(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal matrices, gradients and sums of squares."""
         r, J = _saddle_model(x, u, v, grey, weight)
-        return J @ J.swapaxes(1, 2) + 1e-9 * np.eye(7), (J @ r[..., None])[..., 0], (r * r).sum(axis=1)
+        return J @ J.swapaxes(1, 2) + 1e-9 * np.eye(_SADDLE), (J @ r[..., None])[..., 0], (r * r).sum(axis=1)
 
     x, A = _minimized(x, equations, _SADDLE_STEPS)
-    square = (_saddle_model(x, u, v, grey, weight)[0] ** 2).sum(axis=1) / np.maximum(count - 7.0, 1.0)
-    C = np.linalg.inv(A)[:, [2, 3], [2, 3]].mean(axis=1) * square
-    contrast, moved = np.abs(x[:, 1]), np.linalg.norm(x[:, 2:4], axis=1)
-    good = (count > 7.0) & (np.sqrt(square) < _MISFIT * contrast) & (moved < _FAR_SADDLE * spacing[at])
-    pixels[at] = np.where(good[:, None], guess[at] + x[:, 2:4], np.nan)
-    sigma[at] = np.where(good, np.sqrt(C + _SADDLE_FLOOR**2), np.nan)
-    clean[at] = good
-    return Corners(pixels, sigma, clean)
+    square = equations(x)[2] / np.maximum(count - _SADDLE, 1.0)
+    variance = np.linalg.inv(A)[:, [2, 3], [2, 3]].mean(axis=1) * square + _SADDLE_FLOOR**2
+    good = (count > _SADDLE) & (np.sqrt(square) < _MISFIT * np.abs(x[:, 1]))
+    good &= np.linalg.norm(x[:, 2:4], axis=1) < _FAR_SADDLE * side[at]
+    found.pixels[at] += np.where(good[:, None], x[:, 2:4], np.nan)
+    found.sigma[at], found.clean[at] = np.where(good, np.sqrt(variance), np.nan), good
+    return found
 
 
 def _saddle_model(
@@ -777,28 +766,19 @@ def _saddle_model(
 ) -> tuple[FloatArray, FloatArray]:
     """Weighted residual (Q, P) of saddles x = (b, a, u_0, v_0, σ, α, β) (Q, 7), and derivative (Q, 7, P)."""
     b, a, u_0, v_0, sigma, *angles = x.T[:, :, None]
-    du, dv = u - u_0, v - v_0
-    g, slope, normal, z = [], [], [], []
+    du, dv, edges = u - u_0, v - v_0, []
     for angle in angles:
         c, s = np.cos(angle), np.sin(angle)
-        normal.append((-s, c, -(c * du + s * dv)))  # of u, v, and by the angle
-        z.append((c * dv - s * du) / sigma)
-        g.append(2.0 * ndtr(z[-1]) - 1.0)
-        slope.append(np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z[-1] ** 2) / sigma)
-    by = [a * slope[0] * g[1], a * slope[1] * g[0]]
-    J = np.stack(
-        [
-            np.ones_like(du),
-            g[0] * g[1],
-            -(by[0] * normal[0][0] + by[1] * normal[1][0]),
-            -(by[0] * normal[0][1] + by[1] * normal[1][1]),
-            -(by[0] * z[0] + by[1] * z[1]),
-            by[0] * normal[0][2],
-            by[1] * normal[1][2],
-        ],
-        axis=1,
-    )
-    return weight * (b + a * g[0] * g[1] - grey), J * weight[:, None]
+        z = (c * dv - s * du) / sigma
+        bell = np.sqrt(2.0 / np.pi) * np.exp(-0.5 * z * z) / sigma
+        # The edge, and its derivatives by u_0, v_0, σ and its angle.
+        edges.append(
+            (2.0 * ndtr(z) - 1.0, bell * np.stack(np.broadcast_arrays(s, -c, -z, -(s * dv + c * du))))
+        )
+    (g, dg), (h, dh) = edges
+    dg, dh = a * h * dg, a * g * dh
+    J = np.stack([np.ones_like(g), g * h, *(dg[:3] + dh[:3]), dg[3], dh[3]], axis=1)
+    return weight * (b + a * g * h - grey), J * weight[:, None]
 
 
 def finder_of(board: Board | None, dictionary: str | None) -> Finder:

@@ -63,7 +63,7 @@ def view_of(rng, side):
 def test_corners_err_as_they_say_and_have_their_numbers(rng, kind, side):
     board = Board.of(kind)
     finder, error, sigma, ends = BoardFinder(board, "4X4_250"), [], [], set()
-    for _ in range(10):
+    for _ in range(8):
         H = view_of(rng, side * rng.uniform(1.0, 2.0))
         image, true = drawn(board, H, rng.uniform(0.5, 1.2), rng.uniform(1.0, 4.0), rng)
         found = finder.find(image.astype(float))[0]
@@ -76,7 +76,7 @@ def test_corners_err_as_they_say_and_have_their_numbers(rng, kind, side):
         assert corners.clean[known].all()
         error.append((corners.pixels - true)[known])
         sigma.append(corners.sigma[known])
-    assert len(error) > 6
+    assert len(error) > 4
     assert len(ends) == 1 + (kind == "chessboard:9x7")  # which looks the same turned
     error, sigma = np.concatenate(error), np.concatenate(sigma)
     assert np.sqrt(np.mean(error**2)) < 0.03  # OpenCV alone: 0.1 to 0.25
@@ -163,28 +163,21 @@ def test_a_configured_board_is_found_in_frames_and_gives_a_length(rng):
 
 
 CONTRADICTED = {
-    "markers: {board: {kind: chessboard, rows: 7, columns: 9, dictionary: 4X4_50}}": "a chessboard has none",
-    "markers: {board: {kind: chessboard, rows: 2, columns: 9}}": "greater than or equal to 3",
-    "markers: {board: {kind: circles, rows: 7, columns: 9}}": "chessboard",
-    "markers: {tags: roof, board: {kind: charuco, rows: 7, columns: 9}}": "keep one",
+    "{kind: chessboard, rows: 7, columns: 9, dictionary: 4X4_50}": "a chessboard has none",
+    "{kind: chessboard, rows: 2, columns: 9}": "markers.board.rows: must be at least 3, not 2",
+    "{kind: charuco, rows: 7, columns: 9}, tags: roof": "board is set as well, whose corners are the markers",
+    "{kind: chessboard, rows: 7, columns: 9}": "a chessboard:9x7 looks the same turned by 180°",
 }
 
 
 @pytest.mark.parametrize("text", CONTRADICTED)
-def test_boards_that_contradict_themselves(projservo, tmp_path, text):
-    (tmp_path / "c.yaml").write_text(text)
-    answer = projservo("calibrate", "-c", str(tmp_path / "c.yaml"), "-o", str(tmp_path / "o"))
-    assert (answer.code, answer.err.count("\n")) == (2, 1), answer.err
-    assert CONTRADICTED[text] in answer.err
-
-
-def test_goals_of_a_board_that_looks_the_same_turned_are_refused(projservo, tmp_path):
+def test_configured_boards_that_serve_no_goal(projservo, tmp_path, text):
     (tmp_path / "c.yaml").write_text(
         "robot: {limits: {joints: [[-90, 90], [-90, 90]], unit: deg}}\n"
-        "plant: {use: tests.hardware.test_cameras:Arm}\n"
-        "cameras: {left: {source: 0}, right: {source: 1}}\n"
-        "markers: {board: {kind: chessboard, rows: 7, columns: 9}}\n"
+        "plant: {use: 'tests.hardware.test_cameras:Arm'}\ndata: {table: t.csv}\n"
+        "control: {joint_speed_limit_deg_s: 20}\n"
+        f"cameras: {{left: {{source: 0}}, right: {{source: 1}}}}\nmarkers: {{board: {text}}}\n"
     )
     answer = projservo("teach", "-c", str(tmp_path / "c.yaml"), "-o", str(tmp_path / "goal.yaml"))
     assert (answer.code, answer.err.count("\n")) == (2, 1), answer.err
-    assert "a chessboard:9x7 looks the same turned by 180°" in answer.err
+    assert CONTRADICTED[text] in answer.err

@@ -35,6 +35,12 @@ _MAX_LOOKS = 2
 _DECIDED = 0.25
 
 
+def numberings(rows: int, columns: int) -> IntArray:
+    """Indices (g, N) of the corners of a board by each numbering of it turned, the first as it is."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    return np.stack([np.rot90(index, k).ravel() for k in range(0, 4, 1 if rows == columns else 2)])
+
+
 @dataclass(frozen=True, eq=False)
 class _Grid:
     """Corners numbered row by row."""
@@ -60,16 +66,14 @@ class _Grid:
         return None
 
     @property
+    def numberings(self) -> IntArray:
+        """Indices (g, N) of the corners by each numbering."""
+        return numberings(self.rows, self.columns)
+
+    @property
     def places(self) -> FloatArray:
         """Places (N, 2) of the corners on the board, in cells."""
         return np.indices((self.rows, self.columns))[::-1].reshape(2, -1).T.astype(np.float64)
-
-    @property
-    def numberings(self) -> IntArray:
-        """Indices (g, N) of the corners by each numbering of the turned board, the first as it is."""
-        index = np.arange(self.rows * self.columns).reshape(self.rows, self.columns)
-        step = 1 if self.rows == self.columns else 2
-        return np.stack([np.rot90(index, k).ravel() for k in range(0, 4, step)])
 
     def _off(self, image: FloatArray) -> float:
         """Largest distance of corners (N, 2) from a plane grid, over the median cell."""
