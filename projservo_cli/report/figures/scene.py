@@ -275,7 +275,7 @@ def _data_metric(report_data: Fit) -> Data:
     q = chosen_poses(metric, report_data)
     tools = metric.pose(q)[:, :3, 3]
     arm = report_data.calibration.model()._replace(
-        H_hat_0=twists(metric.axes), q_reference=np.zeros(q.shape[1])
+        H_hat_0=twists(metric.axes), q_reference=np.zeros(q.shape[1]), on_tool=False
     )
     seen, pixels = metric.markers if metric.mount == TOOL else tools, report_data.observation.images
     low, high = np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))
