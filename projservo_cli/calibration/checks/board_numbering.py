@@ -137,7 +137,7 @@ class BoardNumbering:
         """The observations in images on which neighbours decide."""
         found = self.observation
         found = replace(found, images=np.where(self.decided[..., None, None], found.images, np.nan))
-        return found.rows(self.decided.any(axis=1))
+        return found.rows(np.asarray(self.decided.any(axis=1)))
 
     def turn_by(self, calibration: Calibration) -> bool:
         """Turn images that fit a calibration far better so; whether there were any, at ever fewer looks."""
@@ -158,7 +158,7 @@ class BoardNumbering:
         """Say how many images were turned; empty for none."""
         if self.grid is None or not self.turn.any():
             return ()
-        seen = np.isfinite(self.given.images[..., 0]).any(axis=2)
+        seen = np.asarray(np.isfinite(self.given.images[..., 0]).any(axis=2))
         each = ", ".join(
             f"{name} {np.count_nonzero(self.turn[:, v])} of {np.count_nonzero(seen[:, v])}"
             for v, name in enumerate(self.given.view)
@@ -176,14 +176,12 @@ def _proven_turns(grid: _Grid, observation: Observation, joint_types: str) -> tu
     K, V = observation.images.shape[:2]
     turns = np.array([letter.upper() == "R" for letter in joint_types])
     step = np.abs(np.angle(np.exp(1j * (observation.q[:, None] - observation.q)[..., turns]))).sum(axis=-1)
-    turn = np.zeros((K, V), dtype=np.int64)
-    largest = []
+    turn, largest, g = np.zeros((K, V), dtype=np.int64), list[BoolArray](), len(grid.numberings)
     for v in range(V):
         turn[:, v], of_largest = _turns_of_view(grid, observation.images[:, v], step)
         largest.append(of_largest)
-    g = len(grid.numberings)
-    some = [0, grid.columns - 1, grid.rows * grid.columns - 1, grid.columns * (grid.rows - 1)]
-    few = np.isin(np.arange(grid.rows * grid.columns), [*some, grid.columns * (grid.rows // 2) + 1])
+    corners = [0, grid.columns - 1, (grid.rows - 1) * grid.columns, grid.rows * grid.columns - 1]
+    few = observation.marker[[*corners, grid.columns * (grid.rows // 2) + 1]]
     for v in range(1, V):
         both, noise = largest[0] & largest[v], np.full(g, np.inf)
         for k in range(g):
@@ -191,14 +189,11 @@ def _proven_turns(grid: _Grid, observation: Observation, joint_types: str) -> tu
                 break
             there = turn.copy()
             there[:, v] = (there[:, v] + k) % g
-            pairs = BoardNumbering(observation, grid, there, there >= 0).observation.rows(both)
-            pairs = replace(pairs, marker=pairs.marker[few], images=pairs.images[:, :, few], sigma=None)
-            pairs = replace(pairs, moving=None, t_q=None, t_view=None)
+            alike = BoardNumbering(observation, grid, there, there >= 0).observation.rows(both)
             with suppress(WorkFailed):
-                found = Epipolar.of(
-                    Detections.of(pairs, joint_types).of_views([0, v]), np.random.default_rng(0)
-                )
-                noise[k] = found.sigma_px
+                pair = Detections.of(alike, joint_types).of_views([0, v])
+                pair = pair.of_markers(np.isin(pair.marker, few))
+                noise[k] = Epipolar.of(pair, np.random.default_rng(0)).sigma_px
         if noise.min() < _DECIDED * noise[0]:
             turn[largest[v], v] = (turn[largest[v], v] + int(np.argmin(noise))) % g
     # No image shows which end is the first: that of most.
