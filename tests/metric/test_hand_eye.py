@@ -117,6 +117,21 @@ def test_files_of_others_have_the_true_hand_eye_transformation(recorded):
         np.testing.assert_allclose([float(args[f"--{axis}"]) for axis in "xyz"], poses[v, :3, 3], atol=1e-12)
 
 
+def test_positions_of_the_flange_are_those_of_the_arm(recorded, capsys):
+    """Of a point of it, as a laser tracker would measure them, also with one camera."""
+    _, folder = recorded
+    q = hand.readings()
+    xyz = [(hand.flange(row) @ [0.02, 0.05, 0.1, 1.0])[:3] for row in q]
+    names = ",".join(["pose", *(f"q{i}" for i in range(1, 7)), *"xyz"])
+    table = folder / "positions.csv"
+    np.savetxt(table, np.c_[np.arange(len(q)), q, xyz], ["%d"] + ["%.9f"] * 9, ",", header=names, comments="")
+    capsys.readouterr()
+    assert run(["validate", str(folder / "run"), "--metric", str(table), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["rms_mm"] < 1.0
+    assert 0.1 < found["mahalanobis"] < 5.0
+
+
 def test_mujoco_moves_the_cameras_with_the_flange(recorded):
     mujoco = pytest.importorskip("mujoco")
     _, folder = recorded
