@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import h5py
 import numpy as np
 import pytest
 
@@ -20,6 +21,7 @@ from projservo_cli.geometry.kinematics import (
 )
 from projservo_cli.metric.frame import Metric
 from projservo_cli.records import BASIS, NO_CURVE, InputError, JointCurve, Model, WorkFailed
+from projservo_cli.store import Result, Run, load, save
 from tests.calibration.simulated_robot import around, random_robot, trials
 from tests.calibration.test_cameras_on_the_tool import Hand
 
@@ -166,6 +168,19 @@ def test_model_and_metric_follow_the_curve(case):
         # Zeros of the joints are those of the reference of the calibration, which is a pose of the recording.
         there += (asked.q_reference - bent(robot, asked.q_reference[None]))[0]
         np.testing.assert_allclose(metric.pose(ahead[:3]), true.pose(there), atol=2e-3)
+
+
+def test_files_hold_the_curve_where_one_is_fitted(case, tmp_path):
+    _, ahead, _, (plain, auto, _) = case
+    for found in (plain, auto):
+        result = Result("key", "", {}, {}, {"calibration": found})
+        save(Run(tmp_path / "run.h5", "", {"calibrate": result}))
+        read = load(tmp_path / "run.h5").calibration
+        np.testing.assert_array_equal(predict(read, ahead), predict(found, ahead))
+        with h5py.File(tmp_path / "run.h5") as file:
+            names = []
+            file.visit(names.append)
+        assert any("joint_curve" in name for name in names) == (found is auto)
 
 
 def test_sound_joints_get_no_curve_and_no_field():
