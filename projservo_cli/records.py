@@ -56,6 +56,7 @@ SIZES = {
     "model_error_column": 4,
     "refit_column": 3,
     "joint_curve_column": 7,
+    "joint_curve_part": 5,
 }
 
 
@@ -148,20 +149,20 @@ def position_limits(lower: FloatArray, upper: FloatArray) -> JointLimits:
 class JointCurve(NamedTuple):
     """True joints less readings as a sum of terms c φ(x), all zero at the reference.
 
-    φ is x, x², x³, sin x, 1 − cos x of a reading x from the reference, or the torque of a weight at the tool
-    about the joint that it moves, less that at the reference. That needs an arm as it was before the fit: its
+    φ is x, x², x³, sin x, 1 − cos x of a reading x from the reference, or the torque of weights behind the
+    joint that it moves, less that at the reference. That needs an arm as it was before the fit: its
     own errors times a deflection are of second order.
     """
 
     terms: FloatArray  # (T, 4) index of φ in ``BASIS``, joint moved and joint read from 0, and c, rad or m
-    # (n + 1, 4, 4) twists of that arm, and a motion with the weight in its last column and with gravity along
-    # x; (0, 4, 4) without torques
+    # (n + 1, 5, 4) of each joint its twist over a weight on its axis, at last gravity in the first row over
+    # the weight at the tool; their largest torque is 1; (0, 5, 4) without torques
     arm: FloatArray
 
 
 BASIS = ("linear", "square", "cube", "sine", "versine", "torque")
 FROM_ONE = np.array([0.0, 1.0, 1.0, 0.0])  # adds to terms what numbers joints from 1
-NO_CURVE = JointCurve(np.zeros((0, 4)), np.zeros((0, 4, 4)))
+NO_CURVE = JointCurve(np.zeros((0, 4)), np.zeros((0, 5, 4)))
 
 
 class Model(NamedTuple):
@@ -341,9 +342,9 @@ class ProjectiveKinematics:
         default=None,
     )
     joint_curve_arm: FloatArray | None = _array(
-        "joint_curve_motion row coordinate",
-        about="twists of the arm by which torques are known, and a motion with the weight in its last column "
-        "and gravity along x",
+        "joint_curve_motion joint_curve_part coordinate",
+        about="arm by which torques are known: of each joint its twist over a weight on its axis, at last "
+        "gravity in the first row over the weight at the tool",
         default=None,
     )
     # The covariance of all these, as ``Errors`` says; of a method without one they are not finite.

@@ -2,9 +2,9 @@
 
 Each hypothesis adds terms to the curve of true joints by readings: scale x, quadratic x and x², cubic also
 x³, harmonic sin x and 1 − cos x, coupling by another reading, and sag, a deflection of each revolute joint
-that follows the torque of a weight at the tool. Automatic choice takes one by one what the score tests name,
-and what explains the images about as well. It keeps the hypothesis that predicts left-out poses best, if by
-more than chance, and stops where none does.
+that follows the torque of weights at the tool, or along the arm. Automatic choice takes one by one what the
+score tests name, and what explains the images about as well. It keeps the hypothesis that predicts left-out
+poses best, if by more than chance, and stops where none does.
 """
 
 import dataclasses
@@ -226,17 +226,20 @@ class _Search:
         every = (key for terms in _terms(chosen, near).values() for key in terms if key not in but)
         keys = list(dict.fromkeys(every))
         terms = np.array([[*key, known.get(key, 0.0)] for key in keys]).reshape(-1, 4)
-        arm = before.arm
-        if any(one.kind == "sag" for one in chosen) and not len(arm):
-            arm = _arm(near)
+        arms = [before.arm]
+        if any(one.kind == "sag" for one in chosen) and not len(before.arm):
+            arms = [_arm(near, spread) for spread in (False, True)]
         problem, detections = near.problem, near.problem.detections
         bent = LeastSquares.of(detections, problem.q_reference, problem.lens_terms, len(terms))
-        params = dataclasses.replace(near.params, curve=JointCurve(terms, arm), offsets=None)
-        found = fit_from(bent, params, self.epipolar)
-        if found is None or found.params.curve is None:
-            return None
-        F = slopes(found.params.curve, found.params.prismatic, bent.q[np.unique(detections.pose_of)])
-        return None if np.linalg.det(F).min() < _FOLDS else found
+        fits = list[Solution]()
+        for arm in arms:
+            params = dataclasses.replace(near.params, curve=JointCurve(terms, arm), offsets=None)
+            found = fit_from(bent, params, self.epipolar)
+            if found is None or found.params.curve is None:
+                continue
+            F = slopes(found.params.curve, found.params.prismatic, bent.q[np.unique(detections.pose_of)])
+            fits += [found] if np.linalg.det(F).min() >= _FOLDS else []
+        return min(fits, key=left_out_px) if len(fits) > 1 else next(iter(fits), None)
 
     def automatic(self) -> tuple[list[Hypothesis], Solution]:
         """Choose hypotheses that score tests name while left-out poses err less; and their fit."""
@@ -317,24 +320,26 @@ def _gain(before: Solution, after: Solution) -> tuple[float, float]:
     return float(gain), float(gain / max(float(np.linalg.norm(by_chance)), 1e-300))
 
 
-def _arm(solution: Solution) -> FloatArray:
-    """Arm by which torques are known (n + 1, 4, 4): twists, and a motion to the weight, gravity along its x.
+def _arm(solution: Solution, spread: bool) -> FloatArray:
+    """Arm by which torques are known (n + 1, 5, 4), with a weight at the tool, or as much at each joint.
 
-    Gravity is the direction g of the deflections s_i g · load_i that explain most of the residuals, with a
-    stiffness of each joint; both alternate, from each axis.
+    That of a joint is where its axis is nearest to the tool. Gravity is the direction g of the deflections
+    s_i g · load_i that explain most of the residuals, with a stiffness of each joint; both alternate, from
+    each axis.
     """
     few = solution.thinned(MAX_JUDGED)
     problem, params, used = few.problem, few.params, few.used
     center = np.append(params.M[:, :3].mean(axis=0), 1.0)
+    velocity = params.H_hat @ center
+    on_axis = center + (params.H_hat @ velocity[..., None])[..., 0]
+    weights = np.vstack([on_axis * (spread & ~params.prismatic)[:, None], center])
     x = np.vstack([problem.q, np.zeros((1, problem.q.shape[1]))])
-    loads = torques(params.H_hat, params.prismatic, center, x)
-    loads = loads[:-1] - loads[-1]
-    loads /= np.maximum(np.linalg.norm(loads, axis=2).max(), 1e-12)
+    loads = torques(params.H_hat, params.prismatic, weights, x)
+    weights /= np.linalg.norm(loads, axis=2).max()
+    loads = (loads[:-1] - loads[-1]) / np.linalg.norm(loads, axis=2).max()
     turning = np.flatnonzero(~params.prismatic)
-    G = (
-        problem.joint_derivative(params)[..., turning, None]
-        * loads[problem.detections.pose_of][:, None, turning]
-    )
+    at_pose = loads[problem.detections.pose_of][:, None, turning]
+    G = problem.joint_derivative(params)[..., turning, None] * at_pose
     columns = np.where(used[..., None, None, None], G, 0.0).reshape(2 * used.size, -1)
     rows = np.hstack([columns, few.raw.reshape(-1, 1)])
     U = problem.dense(problem.derivative(params), used) @ few.errors().dense()
@@ -348,18 +353,9 @@ def _arm(solution: Solution) -> FloatArray:
             g = g / max(float(np.linalg.norm(g)), 1e-300)
         left = float(np.square(r - Z @ g @ s).sum())
         best = min(best, (left, g), key=lambda one: one[0])
-    g = best[1]
-    motion = np.eye(4)
-    motion[:3, 0], motion[:, 3] = g, center
-    motion[:3, 1] = np.cross(g, np.eye(3)[np.argmin(np.abs(g))])
-    motion[:3, 1] /= np.linalg.norm(motion[:3, 1])
-    motion[:3, 2] = np.cross(g, motion[:3, 1])
-    size = np.linalg.norm(torques(params.H_hat, params.prismatic, center, x), axis=2).max()
-    # Shrunk to an arm of torques up to one, so that coefficients are deflections in rad.
-    twists = params.H_hat.copy()
-    twists[:, :3, 3] /= size
-    motion[:3, 3] /= size
-    return np.concatenate([twists, motion[None]])
+    arm = np.zeros((len(weights), 5, 4))
+    arm[:-1, :4], arm[:, 4], arm[-1, 0, :3] = params.H_hat, weights, best[1]
+    return arm
 
 
 def _ridge(Z: FloatArray, r: FloatArray, weight: float) -> FloatArray:

@@ -1,11 +1,11 @@
-"""True joints by readings: curves of gears and encoders, coupling, deflection under a weight at the tool."""
+"""True joints by readings: curves of gears and encoders, coupling, deflection under weights."""
 
 import math
-from functools import reduce
+from itertools import accumulate
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import apply, dot, mat
+from projservo_cli.geometry.algebra import add, apply, dot, mat, vec
 from projservo_cli.geometry.displacements import displacements, rotation, translation
 from projservo_cli.geometry.jit import inline, internal
 from projservo_cli.records import BASIS, BoolArray, FloatArray, JointCurve, Model
@@ -23,9 +23,8 @@ def basis(curve: JointCurve, prismatic: BoolArray, x: FloatArray) -> FloatArray:
     for index, phi in enumerate((x_by, x_by**2, x_by**3, np.sin(x_by), 2.0 * np.sin(0.5 * x_by) ** 2)):
         values = np.where(kind == index, phi, values)
     if (kind == _TORQUE).any():
-        weight, twists = curve.arm[-1][:, 3], curve.arm[:-1]
-        there = torques(twists, prismatic, weight, np.vstack([x, np.zeros((1, x.shape[1]))]))
-        down = (there[:-1] - there[-1]) @ curve.arm[-1][:3, 0]
+        there = torques(curve.arm[:-1, :4], prismatic, curve.arm[:, 4], np.vstack([x, 0.0 * x[:1]]))
+        down = (there[:-1] - there[-1]) @ curve.arm[-1, 0, :3]
         values = np.where(kind == _TORQUE, down[:, joint], values)
     return np.asarray(values)
 
@@ -52,19 +51,19 @@ def backwards(curve: JointCurve, n: int) -> JointCurve:
     return JointCurve(terms, curve.arm)
 
 
-def torques(H_hat: FloatArray, prismatic: BoolArray, weight: FloatArray, q: FloatArray) -> FloatArray:
-    """Return torques (K, n, 3) of a weight (4,) about each joint by the components of gravity.
+def torques(twists: FloatArray, prismatic: BoolArray, weights: FloatArray, q: FloatArray) -> FloatArray:
+    """Return torques (K, n, 3) about each joint by the components of gravity.
 
-    The torque of joint i is the velocity of the weight under it, H̄_i Ĥ_i H̄_i⁻¹ applied to the weight, along
-    gravity. For twists (n, 4, 4) and joints (K, n) from the reference, rad or m.
+    The torque of joint i is the velocity of all weights under it, H̄_i Ĥ_i H̄_i⁻¹ applied to them, along
+    gravity. For twists (n, 4, 4), a weight on each axis and at the tool (n + 1, 4), each a point times its
+    mass, and joints (K, n) from the reference, rad or m.
     """
-    joints, loads = np.arange(q.shape[1]), np.empty((*q.shape, 3))
-    truncated = [
-        reduce(np.matmul, displacements(H_hat, prismatic, np.where(joints <= i, q, 0.0))) for i in joints
-    ]
-    for i, H_bar in enumerate(truncated):
-        behind = np.linalg.solve(H_bar, truncated[-1] @ weight[:, None])
-        loads[:, i] = (H_bar @ (H_hat[i] @ behind))[:, :3, 0]
+    E, n = displacements(twists, prismatic, q), q.shape[1]
+    before = list(accumulate(E, np.matmul, initial=np.broadcast_to(np.eye(4), E.shape[1:])))
+    loads, behind = np.empty((*q.shape, 3)), np.broadcast_to(weights[n], (len(q), 4))
+    for i in range(n - 1, -1, -1):
+        behind = (E[i] @ behind[..., None])[..., 0] + weights[i]
+        loads[:, i] = (before[i] @ (behind @ twists[i].T)[..., None])[:, :3, 0]
     return loads
 
 
@@ -79,19 +78,20 @@ def _torque(
     model: Model, q: FloatArray, ahead: FloatArray, share: float, i: int, j: int, step: float, moved: float
 ) -> float:
     """Torque about joint i with joint j a step farther, and all readings times ``moved``."""
-    curve = model.curve
+    arm = model.curve.arm
     n = q.shape[0]
-    motion = curve.arm[n]
-    v = (float(motion[0, 3]), float(motion[1, 3]), float(motion[2, 3]), float(motion[3, 3]))
+    v = vec(arm[n, 4])
     for k in range(n - 1, -1, -1):
-        twist = mat(curve.arm[k])
+        twist = mat(arm[k])
         amount = moved * _reading(model, q, ahead, share, k)
         if k == j:
             amount += step
         v = apply(translation(twist, amount), v) if model.prismatic[k] else apply(rotation(twist, amount), v)
         if k == i:
-            v = apply(twist, v)
-    return dot((float(motion[0, 0]), float(motion[1, 0]), float(motion[2, 0]), 0.0), v)
+            v = apply(twist, add(v, vec(arm[k, 4])))
+        elif k > i:
+            v = add(v, vec(arm[k, 4]))
+    return dot((float(arm[n, 0, 0]), float(arm[n, 0, 1]), float(arm[n, 0, 2]), 0.0), v)
 
 
 @internal

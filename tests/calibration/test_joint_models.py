@@ -36,8 +36,11 @@ def some_arm(rng, types="RRPRR"):
     axes[:, :3] /= np.linalg.norm(axes[:, :3], axis=1, keepdims=True)
     axes[:, 3:] -= axes[:, :3] * (axes[:, :3] * axes[:, 3:]).sum(axis=1, keepdims=True)
     axes[prismatic, :3] = 0.0
-    arm = np.concatenate([twists(axes), np.eye(4)[None]])
-    arm[-1][:3, 3] = rng.normal(size=3)
+    arm = rng.normal(size=(len(types) + 1, 5, 4))
+    arm[:-1, :4] = twists(axes)
+    # A weight is on the axis of its joint.
+    arm[:-1, 4, 3] = 1.0
+    arm[:-1, 4, :3] = np.cross(axes[:, :3], axes[:, 3:])
     joints = rng.integers(0, len(types), (3 * len(BASIS), 2))
     terms = np.column_stack([np.tile(np.arange(len(BASIS)), 3), joints, rng.normal(0.0, 0.05, len(joints))])
     return twists(axes), prismatic, JointCurve(terms, arm)

@@ -15,7 +15,7 @@ Biometrika 73, 1986).
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -28,7 +28,6 @@ from projservo_cli.calibration.detections import SAME_READING, Detections, per_r
 from projservo_cli.calibration.prediction import LENS, Images, Parameters
 from projservo_cli.calibration.robust_fit import Solution
 from projservo_cli.geometry.displacements import cross_matrix
-from projservo_cli.geometry.joint_curve import torques
 from projservo_cli.records import CORNERS, BoolArray, Errors, FloatArray, IntArray, ModelError
 
 # Probability of chance above which no nuisance is found.
@@ -224,10 +223,16 @@ def image_motions(x: FloatArray) -> FloatArray:
 def _loads(params: Parameters, q: FloatArray) -> FloatArray:
     """Return torques (K, n, 3) of a weight at the tool about each joint by the components of gravity.
 
-    A deflection follows them. The largest one of each joint has length one.
+    The torque of joint i is the velocity of the weight under it, H̄_i Ĥ_i H̄_i⁻¹ applied to the weight, along
+    gravity; a deflection follows it. The largest one of each joint has length one.
     """
-    center = np.append(params.M[:, :3].mean(axis=0), 1.0)
-    loads = torques(params.H_hat, params.prismatic, center, params.turned(q))
+    center, joints = np.append(params.M[:, :3].mean(axis=0), 1.0), np.arange(q.shape[1])
+    q, ideal = params.turned(q), replace(params, curve=None)
+    truncated = [ideal.motion(np.where(joints <= i, q, 0.0)) for i in joints]
+    loads = np.empty((*q.shape, 3))
+    for i, H_bar in enumerate(truncated):
+        behind = np.linalg.solve(H_bar, truncated[-1] @ center[:, None])
+        loads[:, i] = (H_bar @ (params.H_hat[i] @ behind))[:, :3, 0]
     return np.asarray(loads / np.maximum(np.linalg.norm(loads, axis=2).max(axis=0), 1e-12)[:, None])
 
 
