@@ -263,7 +263,7 @@ def plan(
         described, the calibration predicts start and goal.
     calibration : of the same robot and rig.
     q_start : (n,) joint readings at the start, rad or m; by default ``task.start``.
-    goal : (n,) joint readings, (2, m, 2) pixels of ``markers.face`` in the left and the right image, or what
+    goal : (n,) joint readings, (V, m, 2) pixels of ``markers.face`` in the views of the calibration, or what
         ``projservo teach`` wrote, a path or a mapping; by default ``task.goal``.
 
     Returns
@@ -279,7 +279,7 @@ def plan(
         When the task cannot be measured or split: which marker, and why.
     """
     _require_config("plan", config, calibration)
-    asked = _with_task(config, calibration.joint_types, q_start, goal)
+    asked = _with_task(config, calibration, q_start, goal)
     _say_compilation()
     described = asked.arm is not None and asked.rig is not None
     described = described and asked.markers is not None and asked.markers.points is not None
@@ -337,7 +337,7 @@ def servo(
     else:
         factory, name, of_name = law, plugins.class_name(law), REGULATE
     if isinstance(plan, MotionPlan):
-        config = _with_task(config, calibration.joint_types, *plan.asked)
+        config = _with_task(config, calibration, *plan.asked)
     asked = config.replace({"control.mode": [of_name if mode is None else mode]})
     (name,) = run_names((name,), asked.control.mode)
     if robot is not None:
@@ -499,8 +499,9 @@ def _with_robot(config: Config, robot: Any) -> Config:
     return config.model_copy(update={"plant": plant})
 
 
-def _with_task(config: Config, joint_types: str, q_start: npt.ArrayLike | None, goal: Any) -> Config:
+def _with_task(config: Config, calibration: Calibration, q_start: npt.ArrayLike | None, goal: Any) -> Config:
     """The configuration with another start (n,) or goal."""
+    joint_types = calibration.joint_types
     changes, n = [], len(joint_types)
     if q_start is not None:
         start = checked_array("q_start", q_start, (n,), f"({n},), rad or m", finite=True)
@@ -509,25 +510,26 @@ def _with_task(config: Config, joint_types: str, q_start: npt.ArrayLike | None, 
         changes += [Override("plan: q_start", "task.start", of_joints)]
         changes += [Override("plan: q_start", "task.start_offset", None)]
     if goal is not None:
-        changes += [Override("plan: goal", "task.goal", _goal(config, joint_types, goal))]
+        changes += [Override("plan: goal", "task.goal", _goal(config, calibration, goal))]
     return load_config(config.name, changes, text=to_yaml(config)) if changes else config
 
 
-def _goal(config: Config, joint_types: str, goal: Any) -> Any:
+def _goal(config: Config, calibration: Calibration, goal: Any) -> Any:
     """A goal as a configuration has it."""
-    n = len(joint_types)
+    joint_types, view = calibration.joint_types, calibration.view
+    n, V = len(joint_types), len(view)
     if isinstance(goal, (str, Path)):
         return str(Path(goal).resolve())
     if isinstance(goal, Mapping):
         return dict(goal)
     m = len(config.face_numbers)
-    shape = f"({n},) joint readings, or (2, {m}, 2) pixels of markers.face"
+    shape = f"({n},) joint readings, or ({V}, {m}, 2) pixels of markers.face"
     if numbers_in("goal", goal, shape).ndim == 1:
         joints = checked_array("goal", goal, (n,), f"({n},) joint readings, rad or m", finite=True)
         require_radians("goal", joints, joint_types)
         return {"joints": {"joints": joints.tolist(), "unit": "rad"}}
-    left, right = checked_array("goal", goal, (2, m, 2), shape, finite=True).tolist()
-    return {"images": {"left": left, "right": right}}
+    pixels = checked_array("goal", goal, (V, m, 2), shape, finite=True).tolist()
+    return {"images": dict(zip(view, pixels, strict=True))}
 
 
 def _law_of_sweep(law: str | type, workers: int) -> str:

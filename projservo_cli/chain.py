@@ -388,5 +388,5 @@ def _bounded(inputs: PlanInputs, run: Run) -> PlanInputs:
     """Return the inputs of a plan with the border of images of an unknown size: what the recording shows."""
     if inputs.image_size is not None:
         return inputs
-    (left, right) = np.ceil(np.nanmax(run.observation.images, axis=(0, 2)) + 0.5).astype(int).tolist()
-    return replace(inputs, seen_px=(tuple(left), tuple(right)))
+    seen = np.ceil(np.nanmax(run.observation.images, axis=(0, 2)) + 0.5).astype(int).tolist()
+    return replace(inputs, seen_px=tuple((width, height) for width, height in seen))

@@ -88,7 +88,9 @@ def _teach(
             if start:
                 stage.require_start(taught)
             else:
-                stage.require_face(settings.face_numbers, taught)
+                asked = settings.trajectory.visible_views
+                least = None if asked == "all" else asked
+                stage.require_face(settings.face_numbers, taught, least)
             check = None
             if calibration is not None and not start:
                 check = stage.checked(plan_inputs(settings), calibration, taught)

@@ -93,7 +93,9 @@ def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Ite
             yield (*path, "joints", i), f"{what}, {turn(low):.6g} to {turn(high):.6g} {unit}"
 
 
-def _goal_images(task: TaskSettings | None, markers: Markers | None) -> Iterator[Finding]:
+def _goal_images(
+    task: TaskSettings | None, markers: Markers | None, trajectory: Trajectory
+) -> Iterator[Finding]:
     if task is None or task.goal.images is None:
         return
     path, images = ("task", "goal", "images"), task.goal.images
@@ -111,7 +113,8 @@ def _goal_images(task: TaskSettings | None, markers: Markers | None) -> Iterator
             yield (*path, key), f"{len(given)} entries for {len(numbers)} markers"
         elif key in images.view:
             counts.update(number for number, at in zip(numbers, given or (), strict=True) if at is not None)
-    enough = min(2, len(images.view))
+    asked = trajectory.visible_views
+    enough = len(images.view) if asked == "all" else asked
     for key in images.view:
         pixels = dict(zip(numbers, images.side(key) or (), strict=False))
         whole = len(pixels) == len(numbers) == len(images.side(key) or ())

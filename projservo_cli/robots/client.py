@@ -193,16 +193,17 @@ class DrivenRobot:
             self.give_up()
         return self.disturbance
 
-    def unseen(self, least: int, *, held: bool = False) -> str:
-        """Return which cameras show no marker of the calibration, if so many or more do not; else empty.
+    def unseen(self, seeing: int, *, held: bool = False) -> str:
+        """Return which cameras show no marker of the calibration, unless so many others do; else empty.
 
+        seeing : number of cameras, at most all of them.
         held : whether the arm may be held meanwhile, to see whether that lasts.
         """
         if held:
             self._held_while(lambda: bool(max(self._dark) >= WINDOW), _LASTS)
         views = self.robot.view
         dark = [view for view, looks in zip(views, self._dark, strict=True) if looks >= WINDOW]
-        if len(dark) < min(least, len(views)):
+        if len(views) - len(dark) >= min(seeing, len(views)):
             return ""
         if len(dark) == 1:
             return f"the {dark[0]} camera shows no marker of the calibration"

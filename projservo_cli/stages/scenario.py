@@ -215,7 +215,7 @@ class Scenario:
         if given is None:
             goal, there = self._frames(self.goal_joints[0], (seed, GOAL_FRAMES))
         else:
-            goal, there = seen_images.s_star, np.array(given.deviations(numbers, self.inputs.face, VIEWS))
+            goal, there = seen_images.s_star, np.array(given.deviations(numbers, self.inputs.face, self.view))
         sigma = np.fmax(sigma, there)
         start = self._with_face("task.start", start, seen_images.q_start)
         seen_images = seen_images._replace(s_start=start, s_star=self._with_face("task.goal", goal, None))

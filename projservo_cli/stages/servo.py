@@ -46,6 +46,7 @@ from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import external_robot
 from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
+from projservo_cli.stages.record import all_of
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.stage_inputs import ServoInputs
 from projservo_cli.task.face import Task, center_of
@@ -137,25 +138,28 @@ class LawRun:
                     raise WorkFailed(f"the robot did not move, since at the start {wrong}", refutes=True)
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
-                unseen = self._require_images(driven, "the robot did not move, since where it stands", 2)
+                unseen = self._require_images(driven, "the robot did not move, since where it stands", 1)
                 for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
                         raise WorkFailed(f"stopped on the path to the start, since {wrong}", refutes=True)
                 if wrong := driven.at_rest(held=True):
                     raise WorkFailed(f"stopped at the start, since {wrong}", refutes=True)
-                at_start = self._require_images(driven, "stopped at the start of the task, since", 1)
+                at_start = self._require_images(driven, "stopped at the start of the task, since", 2)
                 self.unseen = at_start or unseen
             driven.begin()
             self.in_python(controller, driven, StallMonitor(driven, scenario.termination))
 
-    def _require_images(self, driven: DrivenRobot, what: str, least: int) -> str:
-        """Refuse to move a robot of which so many cameras or more show nothing, unless that was asked for."""
-        unseen = driven.unseen(least, held=least == 1)
+    def _require_images(self, driven: DrivenRobot, what: str, seeing: int) -> str:
+        """Refuse to move a robot of which fewer than so many cameras show markers, unless that was asked for.
+
+        Of fewer cameras, all must.
+        """
+        unseen = driven.unseen(seeing, held=seeing > 1)
         if unseen and not self.blind:
             remarks = "; ".join([unseen, *driven.robot.remarks()])
             raise WorkFailed(
-                f"{what} {remarks}: uncover both cameras and look at their light, or move the arm by hand to "
-                "where they see the tags; --blind (blind=True) drives it without images"
+                f"{what} {remarks}: uncover {all_of(driven.robot.view)} and look at the light, or move the "
+                "arm by hand to where they see the tags; --blind (blind=True) drives it without images"
             )
         return unseen
 

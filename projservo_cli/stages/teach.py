@@ -264,9 +264,13 @@ def require_start(taught: _Taught) -> None:
         )
 
 
-def require_face(face: Sequence[int], taught: _Taught) -> None:
-    """Refuse what does not show the whole face to two cameras, or to one alone, with a WorkFailed."""
-    shared = {*taught.marker[shared_markers(taught.s)].tolist()}
+def require_face(face: Sequence[int], taught: _Taught, least: int | None = None) -> None:
+    """Refuse what does not show the whole face to enough cameras, with a WorkFailed.
+
+    least : number of cameras; None for all.
+    """
+    enough = np.isfinite(taught.s[..., 0]).sum(axis=0) >= (least or len(taught.view))
+    shared = {*taught.marker[enough].tolist()}
     if unseen := [(number, side) for number, side in taught.unseen if number in {*face} - shared]:
         number, side = unseen[0]
         raise WorkFailed(

@@ -70,7 +70,7 @@ def configuration(folder, view, stamped=True, **more):
     USED["view"], robot = view, Rig()
     values = {
         "plant": {"use": f"{__name__}:Rig", "options": {"stamped": stamped}},
-        "data": {"table": "rig.csv"},
+        "data": {"table": "rig.csv", "image_size_px": [1280, 1024]},
         "markers": {"numbers": [*range(8)], "face": [0, 1, 2]},
         "robot": {"limits": {"joints": [[-4, 4]] * 4, "unit": "rad"}},
         "calibration": {"reference": {"joints": robot.q.tolist(), "unit": "rad"}, **POSES},
