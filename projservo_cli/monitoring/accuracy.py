@@ -18,6 +18,7 @@ from projservo_cli.monitoring.innovation_tests import (
     Residual,
     coordinate_rows,
     farthest_alone,
+    relative_noise,
     rigid_motions,
 )
 from projservo_cli.records import MM, BoolArray, Calibration, FloatArray, InputError, Model
@@ -120,7 +121,8 @@ def rigid_fit(calibration: Calibration, q: FloatArray, images: FloatArray, sigma
 
     images : (V, m, 2) px of the markers of the calibration, NaN where unseen; sigma : (V, m) deviations.
     """
-    pair, n = FramePair.at_rest(q, images, np.maximum(sigma, calibration.sigma_px)), len(q)
+    noise = np.maximum(sigma, calibration.sigma_px * relative_noise(calibration))
+    pair, n = FramePair.at_rest(q, images, noise), len(q)
     errors, moved = ErrorModel(calibration, calibration.sigma_px), np.eye(4)
     at = by_joints = errors.residual(pair)
     for _ in range(_STEPS):

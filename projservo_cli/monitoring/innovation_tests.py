@@ -127,7 +127,7 @@ class ErrorModel:
         self.errors, self.e = errors_of(calibration), calibration.sqrt_cov_shared.shape[1] + 3 * m
         nonlinear = _BEYOND_FIRST_ORDER * calibration.sigma_px
         self._least = max(nonlinear, MIN_SIGMA)
-        self._sigma = max(sigma_px, self._least)
+        self._sigma, self._of_views = max(sigma_px, self._least), relative_noise(calibration)
         self._stated = self._sigma / max(calibration.sigma_px, MIN_SIGMA) * (calibration.sigma_scale or 1.0)
         self.bias_px = max(calibration.model_px, nonlinear)
         sigma_q = calibration.sigma_q or 0.0
@@ -151,9 +151,9 @@ class ErrorModel:
 
     def noise(self, seen: BoolArray, stated: FloatArray | None) -> FloatArray:
         """Standard deviation (V, m) of pixels, px: those stated, as the calibration found them, if any."""
-        common = np.full(seen.shape, self._sigma)
+        common = np.broadcast_to(np.maximum(self._sigma * self._of_views, self._least), seen.shape)
         if stated is None:
-            return common
+            return common.copy()
         return np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), common)
 
     def residual(self, pair: FramePair) -> Residual:
@@ -744,6 +744,12 @@ def farthest_alone(S: FloatArray, r: FloatArray, detections: IntArray, limit: fl
     u, blocks = (P @ r[rows]).reshape(-1, 2, 1), P.reshape(len(k), 2, len(k), 2)[k, :, k]
     square = (u * np.linalg.solve(blocks, u)).sum(axis=(1, 2))
     return int(detections[np.argmax(square)]) if square.max() > limit else None
+
+
+def relative_noise(calibration: Calibration) -> FloatArray:
+    """Noise (V, 1) of each view over that of the calibration."""
+    common, own = max(calibration.sigma_px, MIN_SIGMA), calibration.sigma_view_px
+    return np.ones((len(calibration.P), 1)) if own is None else own[:, None] / common
 
 
 def coordinate_rows(detections: IntArray) -> IntArray:

@@ -9,17 +9,23 @@ import pytest
 from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate
-from projservo_cli.calibration.prediction import dense_pixel_changes, from_reference, parameters_from
+from projservo_cli.calibration.prediction import (
+    dense_pixel_changes,
+    errors_of,
+    from_reference,
+    parameters_from,
+)
 from projservo_cli.monitoring import innovation_tests
 from projservo_cli.monitoring.accuracy import Posture, resting_error_mm, rigid_fit
 from projservo_cli.monitoring.frame_pairs import Frame, Pairing
 from projservo_cli.monitoring.image_monitor import ImageMonitor, detected_fault
 from tests.calibration.simulated_robot import around, random_robot, trials
 from tests.calibration.test_cameras_on_the_tool import Hand
-from tests.monitoring.test_image_monitor import LOOKS, PERIOD, SIGMA, Arm, first_alarm, look, noisy
+from tests.monitoring.test_image_monitor import LOOKS, PERIOD, Arm, first_alarm, look, noisy
 
 RIGS = [(1, "world"), (2, "world"), (3, "world"), (4, "world"), (1, "tool"), (3, "tool")]
 TYPES, NAMES, ONSET = "RRPRR", ("wrist", "top", "low", "side"), 15
+NOISE = np.array([0.5, 0.5, 1.0, 0.3])  # of each view, px
 
 
 class Case(NamedTuple):
@@ -40,7 +46,7 @@ class Case(NamedTuple):
 
     def said(self, q, s):
         """When and what the monitor says of joints and images."""
-        return first_alarm(Arm(self.calibration, None, None, None), q, s)
+        return first_alarm(Arm(self.calibration, None, None, None), q, s, sigma=self.calibration.sigma_px)
 
 
 @pytest.fixture(scope="module", params=RIGS, ids=lambda rig: f"{rig[0]} {rig[1]}")
@@ -50,11 +56,11 @@ def case(request):
     robot = random_robot(TYPES, rng, markers=8, views=views)
     robot = Hand(**vars(robot)) if mount == "tool" else robot
     q = np.concatenate([trials(robot, frames=6), around(robot, 16, rng)])
-    seen = dataclasses.replace(robot.observe(q, SIGMA, rng), view=NAMES[:views])
+    seen = dataclasses.replace(robot.observe(q, NOISE[:views], rng), view=NAMES[:views])
     found = calibrate(seen, TYPES, source="recorded", mount=mount)
     turn = np.sin(np.linspace(0.0, 2.5, 40)[:, None] + np.arange(5.0)) - np.sin(np.arange(5.0))
     q = robot.q_reference + np.where(found.prismatic, 0.1, 0.4) * turn
-    return Case(robot, found, q, noisy(robot.images(q), 1))
+    return Case(robot, found, q, noisy(robot.images(q), 1, NOISE[:views, None, None]))
 
 
 def test_a_sound_run_is_no_fault_whichever_camera_is_lost(case):
@@ -157,7 +163,7 @@ def test_a_hand_before_one_camera_is_no_evidence_and_of_several_holds_no_arm(cas
     s = case.s.copy()
     s[ONSET : ONSET + 10, -1, :6] = np.nan
     s[ONSET - 1 : ONSET + 11, -1, 6:] += 4.0
-    test, held, views = ImageMonitor(case.calibration, SIGMA, LOOKS), False, []
+    test, held, views = ImageMonitor(case.calibration, case.calibration.sigma_px, LOOKS), False, []
     for k, row in enumerate(case.q):
         assert look(test, k, row, s[k]) == ""
         held |= test.holds
@@ -175,6 +181,7 @@ def permuted(calibration, order):
         c,
         view=tuple(c.view[v] for v in order),
         P=c.P[order],
+        sigma_view_px=None if c.sigma_view_px is None else c.sigma_view_px[order],
         sqrt_cov_shared=c.sqrt_cov_shared[rows],
         corner_squares=c.corner_squares[:, order],
     )
@@ -188,9 +195,9 @@ def test_the_order_of_the_views_does_not_matter(case):
     s = case.s + np.stack(there, axis=1) - case.robot.images(case.q)
     s[ONSET:, 0] += (3.0, -2.0)
     s[5, -1, 2] += 40.0
-    results = []
+    results, sigma = [], case.calibration.sigma_px
     for which in (np.arange(V), order):
-        test, said, aside = ImageMonitor(permuted(case.calibration, which), SIGMA, LOOKS), "", []
+        test, said, aside = ImageMonitor(permuted(case.calibration, which), sigma, LOOKS), "", []
         for k, (q, speed) in enumerate(zip(case.q, q_dot, strict=True)):
             at = late[which]
             joints, speeds = q + at[:, None] * speed, np.repeat(speed[None], V, 0)
@@ -211,15 +218,18 @@ def test_residuals_of_the_model_itself_are_no_fault_more_often_than_stated(case,
     runs, alarms, c = 8, 0, dataclasses.replace(case.calibration, sigma_q=1e-3)
     monkeypatch.setattr(innovation_tests, "_FALSE_ALARM", 0.2)
     params, away = parameters_from(c), from_reference(c, case.q)
-    J = dense_pixel_changes(params, case.calibration.errors, away) if c.mount == "world" else None
+    J = dense_pixel_changes(params, errors_of(c), away)
     for seed in range(runs):
         rng = np.random.default_rng(seed)
-        s = case.robot.images(case.q + 1e-3 * rng.standard_normal(case.q.shape))
-        if J is not None:
-            predicted = params.predict(away)
-            s += predicted + J @ rng.standard_normal(J.shape[-1]) - case.robot.images(case.q)
-        arm = Arm(c, None, None, None)
-        alarms += first_alarm(arm, case.q, noisy(s, seed))[0] is not None
+        by_joints = case.robot.images(case.q + 1e-3 * rng.standard_normal(case.q.shape))
+        s = (
+            params.predict(away)
+            + J @ rng.standard_normal(J.shape[-1])
+            + by_joints
+            - case.robot.images(case.q)
+        )
+        s = noisy(s, seed, NOISE[: len(case.views), None, None])
+        alarms += case._replace(calibration=c).said(case.q, s)[0] is not None
     assert alarms <= 0.2 * runs
 
 
