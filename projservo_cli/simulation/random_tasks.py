@@ -1,4 +1,4 @@
-"""Random reaching tasks of a simulated robot within sight of both cameras."""
+"""Random reaching tasks of a simulated robot within sight of its cameras."""
 
 import math
 
@@ -21,11 +21,12 @@ _MOST_DRAWS = 20_000_000  # joint vectors
 
 
 def random_tasks(
-    truth: Truth, q_front: FloatArray, count: int, rng: np.random.Generator
+    truth: Truth, q_front: FloatArray, count: int, rng: np.random.Generator, least_views: int = 0
 ) -> tuple[FloatArray, FloatArray]:
-    """Draw tasks within sight of both cameras, one of each sixth of half a turn in turn.
+    """Draw tasks within sight of the cameras, one of each sixth of half a turn in turn.
 
-    q_front : (n,) joints at which the cameras see the front of the face, rad or m.
+    q_front : (n,) joints at which the first camera sees the front of the face, rad or m.
+    least_views : number of cameras that see it at both ends, 0 for all.
     Returns joints (count, n) at start and goal, rad or m.
     """
     limits = truth.robot.limits
@@ -40,13 +41,14 @@ def random_tasks(
     while any(len(tasks) < high for tasks, high in zip(found, quota, strict=True)):
         if drawn >= _MOST_DRAWS:
             raise WorkFailed(
-                f"of {drawn} joint vectors too few show the face to both cameras for {count} tasks: "
+                f"of {drawn} joint vectors too few show the face to the cameras for {count} tasks: "
                 "turn the cameras towards the workspace or ask for fewer"
             )
         q = middle + half * rng.uniform(-1.0, 1.0, (_BATCH, len(middle)))
         drawn += _BATCH
         poses = _poses(truth, q)
-        waiting += [(q[i], poses[i, :3, :3]) for i in _accepted(truth, poses, front)]
+        shown = _accepted(truth, poses, front, least_views or len(truth.P))
+        waiting += [(q[i], poses[i, :3, :3]) for i in shown]
         while len(waiting) >= 2:
             (start, R), (goal, R_goal) = waiting.pop(0), waiting.pop(0)
             angle = math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(R.T @ R_goal)) - 1.0))))
@@ -59,14 +61,15 @@ def random_tasks(
 
 
 def _poses(truth: Truth, q: FloatArray) -> FloatArray:
-    """Displacements (k, 4, 4) from the reference at joints (k, n), [RH00] eq. (6) for many at once."""
+    """Displacements (k, 4, 4) of the face from the reference at joints (k, n), [RH00] eq. (6), many at once."""
     robot = truth.robot
     E = displacements(robot.H_hat_0, robot.prismatic, q - robot.q_reference)
-    return np.swapaxes(moved_points(E, np.eye(4))[0], 1, 2)
+    poses = np.swapaxes(moved_points(E, np.eye(4))[0], 1, 2)
+    return np.linalg.inv(poses) if truth.on_tool else poses
 
 
 def _cosines(truth: Truth, poses: FloatArray) -> FloatArray:
-    """Cosine (k, 2) of the angle between the normal of the face and the rays to the optical centres."""
+    """Cosine (k, V) of the angle between the normal of the face and the rays to the optical centres."""
     M = truth.M_face[:, :3]
     middle = M.mean(axis=0) if truth.center < 0 else M[truth.center]
     normal = np.linalg.svd(M - M.mean(axis=0))[2][2]
@@ -77,11 +80,11 @@ def _cosines(truth: Truth, poses: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kvi,ki->kv", rays, poses[:, :3, :3] @ normal))
 
 
-def _accepted(truth: Truth, poses: FloatArray, front: float) -> IntArray:
-    """Indices of the poses that show the face to both cameras."""
+def _accepted(truth: Truth, poses: FloatArray, front: float, least_views: int) -> IntArray:
+    """Indices of the poses that show the face to so many cameras."""
     m = image_points(truth.P, truth.M_face @ np.swapaxes(poses, 1, 2))
-    before = (m[..., 2] > 0.0).all(axis=(1, 2))
-    facing = (front * _cosines(truth, poses) >= _LEAST_COSINE).all(axis=1)
+    before = (m[..., 2] > 0.0).all(axis=2)
+    facing = front * _cosines(truth, poses) >= _LEAST_COSINE
     pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
-    inside = within_images(pixels, truth.image_size[:, None]).all(axis=(1, 2))
-    return np.flatnonzero(before & facing & inside)
+    inside = within_images(pixels, truth.image_size[:, None]).all(axis=2)
+    return np.flatnonzero((before & facing & inside).sum(axis=1) >= least_views)
