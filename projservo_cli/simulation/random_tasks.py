@@ -61,7 +61,7 @@ def random_tasks(
 
 
 def _poses(truth: Truth, q: FloatArray) -> FloatArray:
-    """Displacements (k, 4, 4) of the face from the reference at joints (k, n), [RH00] eq. (6), many at once."""
+    """Displacements (k, 4, 4) of the face from the reference at joints (k, n), [RH00] eq. (6)."""
     robot = truth.robot
     E = displacements(robot.H_hat_0, robot.prismatic, q - robot.q_reference)
     poses = np.swapaxes(moved_points(E, np.eye(4))[0], 1, 2)

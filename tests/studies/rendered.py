@@ -91,14 +91,15 @@ def driven(job):
     laws = ["exact_track"]
     if condition == "ideal" and seed <= CLASSICAL_TASKS:
         laws += list(POINT_LAWS)
-    rows = [told | {"by": law} | run_of(config, calibration, law, seed) for law in laws]
-    for by, row in by_hand_eye(config, known, seed):
+    ends = tasks_of()[seed]
+    rows = [told | {"by": law} | run_of(config, calibration, law, ends[1], near) for law in laws]
+    for by, row in by_hand_eye(config, known, ends, seed, near):
         rows.append(told | {"by": by} | row)
     return rows
 
 
-def run_of(config, calibration, law, seed):
-    """One run, with its true errors at the end."""
+def run_of(config, calibration, law, goal, judge):
+    """One run to joints (n,), with its true errors at the end as somebody judges them."""
     if law in POINT_LAWS:
         control = config.control.model_copy(update={"mode": ("regulate",)})
         stop = config.stop.model_copy(update={"max_steps": LATEST})
@@ -107,35 +108,50 @@ def run_of(config, calibration, law, seed):
         trace = servo.run(config, calibration, plan.run(config, calibration), law)
     except WorkFailed as error:
         return {"verdict": "not started", "reason": str(error), "arrived": False}
-    return judged(config, trace.pose[-1], seed, trace.verdict) | {
+    return judged(judge(truth_of(config), trace.pose[-1], goal), trace.verdict) | {
         "steps": trace.steps,
         "reason": trace.reason,
     }
 
 
-def judged(config, pose, seed, verdict):
-    """How far off a tool is in truth, and whether it arrived."""
-    truth = truth_of(config)
-    mm, deg = errors(pose, truth.robot.pose(tasks_of()[seed][1]), truth)
-    arrived = verdict == "converged" and mm <= NEAR_MM and deg <= NEAR_DEG
-    return {"verdict": verdict, "mm": mm, "deg": deg, "arrived": arrived}
+def judged(errors, verdict):
+    """True errors of a tool and whether it arrived, from the errors and whether they are small."""
+    row, small = errors
+    return {"verdict": verdict, **row, "arrived": verdict == "converged" and small}
+
+
+def near(truth, pose, goal):
+    """Errors of a tool at a pose (4, 4) whose goal is joints (n,), in truth, and whether they are small."""
+    mm, deg = errors(pose, truth.robot.pose(goal), truth)
+    return {"mm": mm, "deg": deg}, mm <= NEAR_MM and deg <= NEAR_DEG
+
+
+def hand_of(truth, q):
+    """Pose (4, 4) of the hand at joints (n,), or of the base in its frame, where the cameras are on it."""
+    pose = truth.robot.pose(q)
+    return np.linalg.inv(pose) if truth.on_tool else pose
 
 
 def known_by_hand_eye(config, seen):
-    """Both cameras, points of the tool, m, and how it sits on the hand, by the poses at rest."""
+    """The cameras, points of the tool, m, and how it sits on the hand, by the poses at rest.
+
+    For cameras on the hand, scene and base stand for tool and hand: who moves is all the same.
+    """
     truth = truth_of(config)
     still = np.ones(len(seen.q), dtype=bool) if seen.moving is None else seen.moving == 0
-    points = np.linalg.solve(truth.robot.base_tool, truth.M.T).T[:, :3]
-    hands, images = np.array([truth.robot.pose(q) for q in seen.q[still]]), seen.images[still]
+    points = truth.M[:, :3]
+    if not truth.on_tool:
+        points = np.linalg.solve(truth.robot.base_tool, truth.M.T).T[:, :3]
+    hands, images = np.array([hand_of(truth, q) for q in seen.q[still]]), seen.images[still]
     views = [hand_eye.calibrated(P, points, hands, images[:, v]) for v, P in enumerate(truth.P)]
     return views, points, hand_eye.mount_of(views, points, hands, images)
 
 
-def by_hand_eye(config, known, seed):
+def by_hand_eye(config, known, ends, seed, judge):
     """Rows of hand–eye calibration with inverse kinematics: straight, and after so many looks."""
     (views, points, mount), truth = known, truth_of(config)
     arm = truth.robot
-    start, goal = tasks_of()[seed]
+    start, goal = ends
     shown, sigma = observed_in_frames(config, truth, goal, (seed, 7))
     shown = np.where((sigma <= VAGUE_PX)[..., None], shown, np.nan)
     wanted = hand_eye.tool_in_base(views, points, shown)
@@ -144,11 +160,12 @@ def by_hand_eye(config, known, seed):
     robot.open()
     try:
         for look in range(LOOKS + 1):
-            sent = hand_eye.joints_for(arm, hand, robot.read()[0])
+            there = np.linalg.inv(hand) if truth.on_tool else hand
+            sent = hand_eye.joints_for(arm, there, robot.read()[0])
             if sent is None:
                 return [("hand-eye", {"verdict": "no joints", "arrived": False})]
             s = driven_to(robot, config, sent)
-            row = judged(config, arm.pose(robot.truth()), seed, "converged")
+            row = judged(judge(truth, arm.pose(robot.truth()), goal), "converged")
             rows.append((f"hand-eye, {look} looks", row | {"reason": views[0].method}))
             now = hand_eye.tool_in_base(views, points, s)
             if now is None:

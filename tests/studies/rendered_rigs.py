@@ -6,25 +6,24 @@
 One recording for each rig and thirty tasks by seed on it, driven by ``exact_track`` with the profile auto. A
 task fails unless the run converged within 1 mm and 0.3 degrees of the truth, by one camera within 2 mm along
 its ray. Beside it go OpenCV's hand–eye calibration with true intrinsics and inverse kinematics of the true
-model, as in ``rendered``, and, where there is one camera, the monocular law on the first ten tasks.
+model, as in ``rendered``, and, where there is one camera, the monocular law ``stacked`` on the first ten
+tasks.
 """
 
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.markers import Markers
 from projservo_cli.simulation.arm import camera_center
-from projservo_cli.simulation.faults import obstruction_of
-from projservo_cli.simulation.random_tasks import STRATA, random_tasks
-from tests.configured import calibrate, observed_in_frames, record, robot_by_itself, truth_of
+from tests.configured import calibrate, record, truth_of
 from tests.known import configured, with_task
-from tests.studies.common import in_two_processes, parser_of, row_of, tasks_in, write_rows
+from tests.studies.common import in_two_processes, parser_of, quantiles, tasks_in, write_rows
 from tests.studies.rendered import by_hand_eye, known_by_hand_eye, run_of, tell
-from tests.studies.rendered_conditions import ARM, FRAMES, FRONT, LEAST_PX, SEEDS, SHOWN_FRAMES
+from tests.studies.rendered_conditions import ARM, FRAMES, FRONT, SEEDS, SHOWN_FRAMES, drawn
 
 TASKS = Path(__file__).with_name("rendered_rigs_tasks.csv")
 # What arrived means, mm and degrees; the last along the ray of a camera that is the only one.
@@ -68,12 +67,10 @@ def around():
 
 def scene():
     """Tags of a roof in the base frame that face the tool at the reference."""
-    x, y, z = CELL_M
-    T = np.array([[0.0, 0.0, -1.0, x + SCENE_M], [-1.0, 0.0, 0.0, y], [0.0, 1.0, 0.0, z], [0.0, 0.0, 0.0, 1.0]])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = [[0, 0, -1], [-1, 0, 0], [0, 1, 0]], np.add(CELL_M, (SCENE_M, 0.0, 0.0))
     tags = Markers(tags="roof", tag_size_m=0.06).all_tags
-    return [
-        {"number": t.number, "size_m": t.size_m, "pose": (T @ np.array(t.pose)).tolist()} for t in tags
-    ]
+    return [{"number": t.number, "size_m": t.size_m, "pose": (T @ np.array(t.pose)).tolist()} for t in tags]
 
 
 HAND = {"mount": "tool"}
@@ -94,10 +91,94 @@ def base_of(rig):
         "rendered",
         f"robot={{mjcf: {ARM}, tip: attachment_site}}",
         f"rig={ {'image_size_px': [640, 480], **cameras} }",
-        f"markers={ {'tags': scene()} if moving else markers}",
+        f"markers={ {'tags': scene()} if moving else markers }",
         *(f"calibration.reference={front}", f"task={{start: {front}, goal: {{joints: {front}}}}}"),
         *(f"calibration.amplitude_deg={15 if moving else 25}", "calibration.random_poses=15"),
         *(f"noise.averaged_frames={SHOWN_FRAMES}", "trajectory.profile=auto", "plant.joint_limits=stop"),
         *(f"trajectory.visible_views={2 if len(cameras) == 4 else 'all'}", "control.laws=[exact]"),
         *("control.mode=track", f"plant.averaged_frames={FRAMES}", "plant.settle_s=0.3"),
     )
+
+
+def recorded(rig):
+    """A calibration by a rig, and what hand–eye calibration makes of the same images."""
+    config = base_of(rig)
+    with pytest.MonkeyPatch.context() as patch:
+        seen, sigma_px = record.observed(config)
+        patch.setattr("projservo_cli.stages.calibrate.observed", lambda *args, **kwargs: (seen, sigma_px))
+        try:
+            calibration, why = calibrate.run(config)[1], ""
+        except WorkFailed as error:
+            calibration, why = None, str(error)
+    return rig, calibration, why, known_by_hand_eye(config, seen)
+
+
+def driven(job):
+    """Rows of all that drives a task."""
+    rig, seed, calibration, known = job
+    ends = tasks_in(TASKS, rig=rig)[seed]
+    config, told = with_task(base_of(rig), ends, seed=seed), {"rig": rig, "seed": seed}
+    laws = ["exact_track"]
+    if len(truth_of(config).P) == 1 and seed <= MONOCULAR_TASKS:
+        laws.append("stacked")
+    rows = [told | {"by": law} | run_of(config, calibration, law, ends[1], judge) for law in laws]
+    return rows + [told | {"by": by} | row for by, row in by_hand_eye(config, known, ends, seed, judge)]
+
+
+def judge(truth, pose, q_goal):
+    """Errors of a tool at a pose (4, 4) whose goal is joints (n,), in truth, and whether they are small.
+
+    By the middle of the face, or by the frame of a tool that carries the cameras. ``along_mm`` is the part
+    along the ray from a camera that is the only one to the face.
+    """
+    goal, middle = truth.robot.pose(q_goal), truth.M_face.mean(axis=0)
+    if truth.on_tool:
+        way, face = pose[:3, 3] - goal[:3, 3], middle[:3]
+    else:
+        back = np.linalg.inv(truth.robot.base_tool)
+        way, face = ((pose - goal) @ back @ middle)[:3], (goal @ back @ middle)[:3]
+    turn = np.clip(0.5 * (np.trace(pose[:3, :3].T @ goal[:3, :3]) - 1.0), -1.0, 1.0)
+    mm, deg = 1e3 * float(np.linalg.norm(way)), math.degrees(math.acos(turn))
+    row, across = {"mm": mm, "deg": deg}, mm
+    if len(truth.P) == 1:
+        ray = face - camera_center(truth.cameras_at(q_goal)[0])
+        row["along_mm"] = 1e3 * abs(float(way @ ray)) / float(np.linalg.norm(ray))
+        across = math.sqrt(max(0.0, mm**2 - row["along_mm"] ** 2))
+    return row, across <= NEAR_MM and row.get("along_mm", 0.0) <= NEAR_ALONG_MM and deg <= NEAR_DEG
+
+
+def main():
+    """Record with every rig, drive all tasks, and print what came of it."""
+    parser = parser_of("rendered_rigs_study", __doc__, [("tasks", len(SEEDS), "of each rig")], rigs=RIGS)
+    parser.add_argument("--draw", action="store_true", help="draw the tasks anew, and drive nothing")
+    given = parser.parse_args()
+    if given.draw:
+        write_rows(TASKS, [row for rows in in_two_processes(drawn_of, list(RIGS), "rigs") for row in rows])
+        return
+    made, rows = {}, []
+    for rig, calibration, why, known in in_two_processes(recorded, given.rigs, "recordings"):
+        if calibration is None:
+            print(f"{rig}: no calibration: {why}", flush=True)
+            continue
+        made[rig] = calibration, known
+        told = f"chi2 {calibration.chi2_per_dof:.2f}, {calibration.reason}"
+        print(f"{rig}: usable {calibration.usable}, {told}", flush=True)
+    jobs = [(rig, seed, *both) for seed in list(SEEDS)[: given.tasks] for rig, both in made.items()]
+    for mine in in_two_processes(driven, jobs, "tasks"):
+        rows += mine
+        write_rows(given.output, rows)  # what is cut off leaves what was driven
+    for rig in made:
+        mine = [row for row in rows if row["rig"] == rig]
+        tell(rig, mine)
+        along = [row["along_mm"] for row in mine if row["by"] == "exact_track" and "along_mm" in row]
+        if along:
+            print(f"{rig}, exact_track: along the ray, mm {quantiles(along)}", flush=True)
+
+
+def drawn_of(rig):
+    """Tasks of a rig."""
+    return [{"rig": rig} | row for row in drawn(base_of(rig))]
+
+
+if __name__ == "__main__":
+    main()
