@@ -35,6 +35,8 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 _FOCALS = (0.6, 1.0, 1.7, 3.0, 5.0)
 # Maximum numbers of poses and of markers in the fit, and minimum number of markers of a pose, of poses.
 _POSES, _MARKERS, _LEAST_MARKERS, _LEAST_POSES = 120, 40, 4, 4
+# Number of poses with more markers than the minimum from which the others stay out of the fit.
+_ENOUGH_POSES = 10
 # Rounds of the factorisation, each of all cameras, then of the shape.
 _ROUNDS = 60
 # Minimum depth of a shape over its width in the frame of a factorisation, which noise may take below zero.
@@ -179,7 +181,9 @@ def _chosen(detections: Detections) -> tuple[IntArray, IntArray, FloatArray, Flo
     marker = np.sort(np.argsort(-often, kind="stable")[:_MARKERS])
     marker = marker[often[marker] >= _LEAST_POSES]
     count = np.isfinite(images[:, marker, 0]).sum(axis=1)
-    pose = np.flatnonzero(count >= _LEAST_MARKERS)
+    # A start knows poses of four markers badly, and a fit then falls into minima of these: more, if enough.
+    more = np.count_nonzero(count > _LEAST_MARKERS) >= _ENOUGH_POSES
+    pose = np.flatnonzero(count >= _LEAST_MARKERS + more)
     if pose.size < _LEAST_POSES:
         raise WorkFailed(
             f"the {detections.view[0]} camera alone saw {_LEAST_MARKERS} markers at once in {pose.size} "
