@@ -98,18 +98,23 @@ def drawn(config):
         while found is None:
             starts, goals = random_tasks(truth, np.array(FRONT), STRATA, rng, least)
             ends = starts[(seed - 1) % STRATA], goals[(seed - 1) % STRATA]
+            if not all(_is_large(truth, q, least) for q in ends):
+                continue
             robots = [robot_by_itself(config, truth, q, 0.0, 0, 0) for q in ends]
             free = not any("touches" in obstruction_of(robot) for robot in robots)
             found = ends if free and all(_shows(config, truth, q, least) for q in ends) else None
         yield {"seed": seed} | row_of(found)
 
 
-def _shows(config, truth, q, least):
-    """Whether so many frames at joints (n,) show the middle tag, as wide as asked for."""
+def _is_large(truth, q, least):
+    """Whether the middle tag is as wide as asked for in so many images at joints (n,)."""
     face = truth.images(q, truth.M_face)
     sides = np.linalg.norm(face - np.roll(face, 1, axis=1), axis=2)
-    if np.sort(sides.max(axis=1))[-least] < LEAST_PX:
-        return False
+    return np.sort(sides.max(axis=1))[-least] >= LEAST_PX
+
+
+def _shows(config, truth, q, least):
+    """Whether so many frames at joints (n,) show the middle tag."""
     s, _ = observed_in_frames(config.model_copy(update={"noise": type(config.noise)()}), truth, q, (0, 0))
     return bool(np.isfinite(s[:, list(truth.face)]).all(axis=(1, 2)).sum() >= least)
 

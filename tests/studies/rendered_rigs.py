@@ -153,7 +153,7 @@ def main():
     parser.add_argument("--draw", action="store_true", help="draw the tasks anew, and drive nothing")
     given = parser.parse_args()
     if given.draw:
-        write_rows(TASKS, [row for rows in in_two_processes(drawn_of, list(RIGS), "rigs") for row in rows])
+        write_rows(TASKS, [row for mine in in_two_processes(drawn_of, list(RIGS), "rigs") for row in mine])
         return
     made, rows = {}, []
     for rig, calibration, why, known in in_two_processes(recorded, given.rigs, "recordings"):
