@@ -239,7 +239,7 @@ class _Search:
                 continue
             F = slopes(found.params.curve, found.params.prismatic, bent.q[np.unique(detections.pose_of)])
             fits += [found] if np.linalg.det(F).min() >= _FOLDS else []
-        return min(fits, key=left_out_px) if len(fits) > 1 else next(iter(fits), None)
+        return min(fits, key=lambda fit: fit.sigma_px) if fits else None
 
     def automatic(self) -> tuple[list[Hypothesis], Solution]:
         """Choose hypotheses that score tests name while left-out poses err less; and their fit."""
