@@ -57,9 +57,11 @@ _AS_MUCH = 0.95
 _MAX_CHOSEN, _TRIED = 6, 4
 # Maximum deviation, rad (prismatic × 0.3 m/rad), of a joint within its range by a term that is determined.
 _OPEN = np.radians(5.0)
-# Deviations from zero below which a term of one joint of many is left out, and deflection, rad by the largest
-# torque, beyond that of any joint.
-_APART, _BENDS = 2.0, np.radians(5.0)
+# Deviations from zero below which a term of one joint of many is left out: H. Akaike's criterion of 1974, by
+# which a parameter is worth a gain of two in χ².
+_APART = 1.41
+# Deflection by the largest torque, rad, beyond that of any joint.
+_BENDS = np.radians(5.0)
 # Minimum determinant of the derivatives of true joints by readings, within the recorded poses.
 _FOLDS = 0.2
 # Rounds of the search for the direction of gravity, and the usual deflection, rad, which keeps it finite.
