@@ -208,7 +208,7 @@ class SweepTable:
             return np.full(self.rows, "all")
         if name == "self_occluded":
             hidden = [self[name] > 0 for name in self.names if name.startswith("self_occluded_steps_")]
-            return np.any(hidden, axis=0)
+            return np.asarray(np.any(hidden, axis=0))
         if name == "left_image":
             return self["first_outside_image"] >= 0
         if name == "path_length_ratio":

@@ -154,8 +154,11 @@ def _space(figure: "style.Figure", data: Data) -> Any:
     axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
     axes.patch.set_visible(False)
     axes.computed_zorder = False
-    for camera, line in zip(data["pyramids"], style.view_lines(data["view"]), strict=True):
-        axes.plot(*edges_of(camera).T, **line | {"linestyle": style.SOLID, "linewidth": 1.0})
+    for (center, *corners), line in zip(data["pyramids"], style.view_lines(data["view"]), strict=True):
+        edges = line | {"linestyle": style.SOLID, "linewidth": 1.0}
+        axes.plot(*style.closed(np.stack(corners)).T, **edges)
+        for corner in corners:
+            axes.plot(*np.stack([center, corner]).T, **edges)
     return axes
 
 
