@@ -1,15 +1,17 @@
 """Robots with one camera to three, of any names in any order: read, recorded, calibrated and taught."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 
-from projservo_cli import Observations, calibrate, record
+from projservo_cli import Observations, calibrate, plan, record, servo
 from projservo_cli.config import load_config
 from projservo_cli.config.inputs import calibration_inputs, teach_inputs
 from projservo_cli.records import VIEWS, InputError, JointLimits, WorkFailed
+from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.latency import DelayPrior, Delays
 from projservo_cli.robots.standstill import Standstill, averaged
@@ -62,8 +64,20 @@ class Rig(Quiet):
         return self.q, {name: one for name, one in given.items() if name not in self.lost}, self.time
 
 
+class Losing(Rig):
+    """Loses its left camera, if it has one, while a law drives it."""
+
+    def command(self, target, speed, due):
+        super().command(target, speed, due)
+        self.lost = ("left",) if self.time > 3.0 else ()
+
+
 def opened(robot, view=None):
     return PluginRobot(robot, "plant m:C", 8, BOUNDS, 5.0, 5.0, view=view)
+
+
+def vector(q):
+    return {"joints": q.tolist(), "unit": "rad"}
 
 
 def configuration(folder, view, stamped=True, **more):
@@ -73,7 +87,7 @@ def configuration(folder, view, stamped=True, **more):
         "data": {"table": "rig.csv", "image_size_px": [1280, 1024]},
         "markers": {"numbers": [*range(8)], "face": [0, 1, 2]},
         "robot": {"limits": {"joints": [[-4, 4]] * 4, "unit": "rad"}},
-        "calibration": {"reference": {"joints": robot.q.tolist(), "unit": "rad"}, **POSES},
+        "calibration": {"reference": vector(robot.q), **POSES},
         "control": {"joint_speed_limit_deg_s": 2000},
     }
     values |= more
@@ -125,6 +139,20 @@ def test_nonsense_by_name(answer, message):
         foreign.read()
 
 
+def test_fewer_cameras_than_two_that_see_are_named():
+    for view, dark, told in [
+        (("top",), [9], "the top camera shows no marker"),
+        (VIEWS, [9, 0], "the left camera shows no marker"),
+        (VIEWS, [9, 9], "neither camera shows a marker"),
+        (NAMES[:3], [9, 0, 0], ""),
+        (NAMES[:3], [9, 0, 9], "none of the cameras left, top shows a marker"),
+        (NAMES[:3], [9, 9, 9], "no camera shows a marker"),
+    ]:
+        driven = SimpleNamespace(robot=SimpleNamespace(view=view), _dark=np.array(dark))
+        assert DrivenRobot.unseen(driven, 2) == (told and f"{told} of the calibration")
+    assert DrivenRobot.unseen(driven, 1) == "no camera shows a marker of the calibration"
+
+
 def test_a_robot_without_a_camera_of_the_calibration_is_refused():
     with pytest.raises(InputError, match=r"has the cameras left, right, and none named top"):
         opened(Rig(), ("left", "top"))
@@ -160,7 +188,7 @@ def test_each_view_is_averaged_waited_for_and_timed_as_if_it_were_alone():
 
 
 @pytest.mark.parametrize("view", [("top",), ("right", "left", "top")])
-def test_a_rig_of_any_names_is_recorded_continued_and_calibrated(tmp_path, monkeypatch, view):
+def test_a_rig_of_any_names_is_recorded_continued_calibrated_and_driven(tmp_path, monkeypatch, view):
     monkeypatch.chdir(tmp_path)
     config, path = configuration(tmp_path, view), tmp_path / "rig.csv"
     seen = record(config, path=path, progress=False)
@@ -174,6 +202,12 @@ def test_a_rig_of_any_names_is_recorded_continued_and_calibrated(tmp_path, monke
     exact = truth.images(ahead)[:, [NAMES.index(name) for name in view]]
     error = math.sqrt(np.mean((found.predict(ahead) - exact) ** 2))
     assert error < NOISE_PX, error
+    start, goal = (truth.q_reference + np.array(by) for by in ([0.2, -0.2, 0.1, 0.2], [-0.2, 0.1, -0.2, 0.0]))
+    ends = {"start": vector(start), "goal": {"joints": vector(goal)}}
+    asked, robot = configuration(tmp_path, view, task=ends), Losing(view)
+    driven = servo(asked, found, plan(asked, found), "exact", robot=robot)
+    assert (driven.verdict, robot.lost) == ("converged", ("left",))
+    assert np.degrees(np.abs(robot.q - goal)).max() < (0.3 if len(view) == 1 else 0.1)
     lines = path.read_text(encoding="utf-8").splitlines()
     path.write_text("\n".join(lines[:100]) + "\n", encoding="utf-8")
     with pytest.raises(InputError, match=rf"was begun with the cameras {', '.join(view)}, not left, right"):
