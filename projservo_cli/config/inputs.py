@@ -146,6 +146,7 @@ def preflight_inputs(config: Config) -> PreflightInputs:
         face=face,
         lengths=config.markers.lengths(face),
         dictionary=_dictionary(config),
+        mount=config.mount,
         board=_board(config),
     )
 

@@ -91,7 +91,7 @@ def check(
                 )
             elif confirmed is not None and confirmed(reach_of(joints.types)):
                 findings += _move_joints(robot, moved, progress)
-                findings += findings_of(moved, at_rest.marker)
+                findings += findings_of(moved, at_rest.marker, robot.view, inputs.mount)
     except (InputError, WorkFailed) as error:
         if isinstance(error, InputError) and at_rest is None:
             raise

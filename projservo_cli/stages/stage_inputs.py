@@ -181,6 +181,7 @@ class PreflightInputs:
     face: tuple[int, ...]  # numbers of the markers that must stay visible; may be empty
     lengths: FloatArray  # (f, f) distances between these, m; NaN if unknown
     dictionary: str | None  # of the tags; None if not configured
+    mount: str  # of the cameras, world or tool
     board: Board | None = None  # whose corners are the markers; None for tags
 
 
