@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.calibration import calibrate
-from projservo_cli.calibration.prediction import (
-    dense_pixel_changes,
-    errors_of,
-    from_reference,
-    parameters_from,
-)
+from projservo_cli.calibration import calibrate, prediction
 from projservo_cli.monitoring import innovation_tests
 from projservo_cli.monitoring.accuracy import Posture, resting_error_mm, rigid_fit
 from projservo_cli.monitoring.frame_pairs import Frame, Pairing
@@ -95,11 +89,9 @@ def test_a_joint_that_slips_is_named_as_a_joint(case, joint):
     assert "; or" not in said
 
 
-def displaced(case, what, by):
-    """Pixels by which images change where markers (m, 4) or cameras (V, 3, 4) are displaced by by (4, 4)."""
-    moved = getattr(case.robot, what).copy()
-    moved[:] = moved @ (by.T if what == "markers" else by)
-    return dataclasses.replace(case.robot, **{what: moved}).images(case.q) - case.robot.images(case.q)
+def change(case, **parts):
+    """Pixels by which images change where parts of the robot are others."""
+    return dataclasses.replace(case.robot, **parts).images(case.q) - case.robot.images(case.q)
 
 
 def test_what_moved_is_told_by_the_mount_and_in_one_posture_what_is_alike(case):
@@ -114,12 +106,13 @@ def test_what_moved_is_told_by_the_mount_and_in_one_posture_what_is_alike(case):
     elif case.one:
         rig = "was moved, or the base was"
     rig = f"{cameras} camera{'s' * (not case.one)} {rig}"
-    for what, name, other in (("markers", body, rig), ("cameras", rig, body)):
-        change = displaced(case, what, expm(by))
-        said = case.said(case.q, case.s + change * (np.arange(40) >= ONSET).reshape(-1, 1, 1, 1))[1]
+    moved = {"markers": case.robot.markers @ expm(by).T}, {"cameras": case.robot.cameras @ expm(by)}
+    for parts, name, other in zip(moved, (body, rig), (rig, body), strict=True):
+        off = change(case, **parts)
+        said = case.said(case.q, case.s + off * (np.arange(40) >= ONSET).reshape(-1, 1, 1, 1))[1]
         assert name in said
         assert other not in said
-        at_rest = detected_fault(case.calibration, case.q[-1], numbers, (case.s + change)[-1], None)
+        at_rest = detected_fault(case.calibration, case.q[-1], numbers, (case.s + off)[-1], None)
         assert name in at_rest
         assert other in at_rest
 
@@ -128,8 +121,7 @@ def test_a_marker_that_moves_is_named_and_by_one_camera_that_it_may_be_covered(c
     where = "in the scene" if case.calibration.mount == "tool" else "on the tool"
     by = np.zeros_like(case.robot.markers)
     by[3, :3] = 0.02, -0.015, 0.01
-    moved = dataclasses.replace(case.robot, markers=case.robot.markers + by).images(case.q)
-    s = case.s + (moved - case.robot.images(case.q)) * (np.arange(40) >= ONSET).reshape(-1, 1, 1, 1)
+    s = case.s + change(case, markers=case.robot.markers + by) * (np.arange(40) >= ONSET).reshape(-1, 1, 1, 1)
     numbers = case.calibration.marker
     for said in (case.said(case.q, s)[1], detected_fault(case.calibration, case.q[-1], numbers, s[-1], None)):
         assert f"marker 14 moved {where}, by" in said
@@ -217,17 +209,13 @@ def test_residuals_of_the_model_itself_are_no_fault_more_often_than_stated(case,
     """Errors of calibration, joints and instants of the first order; a chance of one run in five."""
     runs, alarms, c = 8, 0, dataclasses.replace(case.calibration, sigma_q=1e-3)
     monkeypatch.setattr(innovation_tests, "_FALSE_ALARM", 0.2)
-    params, away = parameters_from(c), from_reference(c, case.q)
-    J = dense_pixel_changes(params, errors_of(c), away)
+    params, away = prediction.parameters_from(c), prediction.from_reference(c, case.q)
+    J = prediction.dense_pixel_changes(params, prediction.errors_of(c), away)
+    off = params.predict(away) - case.robot.images(case.q)
     for seed in range(runs):
         rng = np.random.default_rng(seed)
-        by_joints = case.robot.images(case.q + 1e-3 * rng.standard_normal(case.q.shape))
-        s = (
-            params.predict(away)
-            + J @ rng.standard_normal(J.shape[-1])
-            + by_joints
-            - case.robot.images(case.q)
-        )
+        s = off + case.robot.images(case.q + 1e-3 * rng.standard_normal(case.q.shape))
+        s += J @ rng.standard_normal(J.shape[-1])
         s = noisy(s, seed, NOISE[: len(case.views), None, None])
         alarms += case._replace(calibration=c).said(case.q, s)[0] is not None
     assert alarms <= 0.2 * runs
@@ -235,8 +223,7 @@ def test_residuals_of_the_model_itself_are_no_fault_more_often_than_stated(case,
 
 def test_goal_images_fit_a_pose_of_the_body_and_a_shifted_one_is_named(case):
     V, s, q = len(case.views), case.s[-1], case.q[-1]
-    fit = rigid_fit(case.calibration, q, s, np.zeros(s.shape[:2]))
-    assert fit.agrees
+    assert rigid_fit(case.calibration, q, s, np.zeros(s.shape[:2])).agrees
     for v in range(V):
         shifted = s + np.reshape(np.arange(V) == v, (-1, 1, 1)) * np.array([4.0, -5.0])
         fit = rigid_fit(case.calibration, q, shifted, np.zeros(s.shape[:2]))
@@ -247,11 +234,8 @@ def test_goal_images_fit_a_pose_of_the_body_and_a_shifted_one_is_named(case):
     face = case.calibration.marker[:4].tolist()
     assert resting_error_mm(case.calibration, q, face, lengths, s) < 20.0
     posture = Posture(case.calibration.model(), q, case.calibration.M[:4], lengths)
-    by = 1e-4 * np.array([0.6, 0.0, 0.8])
-    step = np.eye(4)
-    step[:3, 3] = by
-    changes = displaced(case, "markers", step)[-1]
-    moved = posture.carry(case.calibration.M, np.isfinite(s[..., 0])) @ changes.ravel()
+    off = change(case, markers=case.robot.markers + 1e-4 * np.array([0.6, 0.0, 0.8, 0.0]))[-1]
+    moved = posture.carry(case.calibration.M, np.isfinite(s[..., 0])) @ off.ravel()
     assert np.linalg.norm(moved) == pytest.approx(0.1, rel=0.1)
 
 
