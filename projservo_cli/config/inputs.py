@@ -176,7 +176,7 @@ def _board(config: Config) -> Board | None:
 def _require_one_numbering(config: Config, command: str) -> None:
     """Refuse a board on the tool of which an image may number the corners from another end than the goal."""
     board = _board(config)
-    if board is not None and board.symmetric and config.cameras is not None:
+    if board is not None and board.symmetric and config.cameras is not None and not config.plant.simulated:
         raise InputError(
             f"markers.board: a {board} looks the same turned by 180°, so that images of {command} may number "
             "its corners from either end: take one with an odd and an even side, or charuco (record and "
