@@ -81,7 +81,8 @@ def places(schema: dict[str, Any]) -> dict[str, list[str]]:
             if keys:
                 place = f"{path}{key}"
                 found.setdefault(section, []).append(place)
-                visit(keys, f"{place}.")
+                further = schema["$defs"][section].get("additionalProperties")
+                visit(keys | ({"NAME": further} if named(further) else {}), f"{place}.")
 
     visit(schema["properties"], "")
     return found
