@@ -415,7 +415,7 @@ def _record(
     apart_ = which.size <= _MOST_APART
     if not apart_:
         # Of many markers each hardly matters to the camera: their errors count as independent ones.
-        noise, by_own = np.linalg.qr(np.hstack([noise, by_own]).T, mode="r").T, by_own[:, :0]
+        noise, by_own = np.asarray(np.linalg.qr(np.hstack([noise, by_own]).T, mode="r")).T, by_own[:, :0]
     first, more = c.sqrt_cov_shared.shape[1], by_own.shape[1] + noise.shape[1]
     shared = np.pad(c.sqrt_cov_shared, ((0, 0), (0, more)))
     shared[rows] = np.hstack([by_common, by_own, noise])
@@ -481,7 +481,7 @@ def _judged(c: Calibration, v: int, error: list[float], pose_of: IntArray, limit
         usable, reason = False, f"{text} ({limit:.3g} px allowed): add poses that spread farther"
     elif now > _MORE * before:
         advice = (f"{text}, {before:.3g} px before it moved: add poses that spread farther", *advice)
-    grown = {}
+    grown: dict[str, Any] = {}
     for field in ("predicted_rms_px", "predicted_p99_px", "predicted_recorded_px", "predicted_worst_px"):
         if (px := getattr(c, field)) is not None:
             grown[field] = float(np.sqrt(max(px**2 + (now**2 - before**2) / len(c.view), 0.0)))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from projservo_cli.cli import options as option
 from projservo_cli.cli.output import Console, visible, words_of, wrapped
@@ -26,6 +27,15 @@ def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -
     from projservo_cli.laws import LAWS
 
     return [law for law in LAWS if law.startswith(incomplete)]
+
+
+def _stages_or_files(
+    context: click.Context, parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Further stages for the completion of a shell, else files."""
+    del parameter
+    further = [name for name in main.stages if name.startswith(incomplete) and name not in context.obj]
+    return [*map(CompletionItem, further)] or [CompletionItem(incomplete, type="file")]
 
 
 @main.stage("record", epilog="Example: projservo record -c configs/stanford.yaml --output trials.csv")
@@ -121,7 +131,7 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
     type=click.IntRange(1, 100),
     help="Suggest N further poses to record, the most informative first; 5 without N.",
 )
-@click.argument("run", metavar="[RUN]", required=False, type=option.PATH)
+@click.argument("run", metavar="[RUN]", required=False, type=option.PATH, shell_complete=_stages_or_files)
 @click.option(
     "--refit",
     metavar="NAME",

@@ -14,6 +14,7 @@ from projservo_cli.calibration.prediction import (
 from projservo_cli.calibration.refit import errors_of_others, rows_of_camera
 from projservo_cli.planning.model_spread import Region, drawn_poses
 from projservo_cli.records import (
+    BoolArray,
     Calibration,
     FloatArray,
     InputError,
@@ -132,7 +133,8 @@ def refit_poses(calibration: Calibration, v: int, region: Region, rng: np.random
     Raises WorkFailed if no pose of the region shows the markers to it, and to another camera if there is one.
     """
     few = calibration.with_markers(even_choice(len(calibration.M), _MOST_SHOWN))
-    scene, others, seen, poses = parameters_from(few), np.arange(len(few.view)) != v, [], []
+    scene, others = parameters_from(few), np.arange(len(few.view)) != v
+    poses, seen = list[FloatArray](), list[BoolArray]()
     for q, in_view in drawn_poses(few, region, _BATCHES, rng):
         shown = in_view.sum(axis=2) >= _LEAST_SEEN
         good = np.flatnonzero(shown[:, v] & (shown[:, others].any(axis=1) | ~others.any()))
