@@ -59,7 +59,7 @@ class Stages:
             raise self.fails[name]
         self.made.append(name)
 
-    def calibrate(self, inputs: CalibrationInputs, *, progress: Any) -> Any:
+    def calibrate(self, inputs: CalibrationInputs, before: Any = None, *, progress: Any) -> Any:
         progress("trial motions", 1, 2)
         told = inputs.source
         if isinstance(told, Table):
