@@ -268,3 +268,34 @@ def test_a_view_and_an_animation_are_made_beside_a_report_that_is_up_to_date(
     assert answer.json["animation"].endswith("/animation.gif")
     assert "view: " in projservo("report", "-o", "out", "--view").out
     assert reported.made == []
+
+
+def test_a_refit_begins_at_the_stored_calibration_and_is_up_to_date_in_the_new_run(projservo, reported):
+    before, asked = load("out").path.read_bytes(), ("--refit", "left", "--data", "t.csv", "-o", "new")
+    for _ in range(2):
+        assert projservo("calibrate", "out", *asked).code == 0
+        assert reported.made == ["refit of left"]
+    assert projservo("calibrate", "new", "--refit", "right", "--data", "t.csv", "-o", "newer").code == 0
+    assert projservo("calibrate", "-o", "newer").code == 0
+    assert reported.made == ["refit of left", "refit of right"]
+    assert load("out").path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("out", "--refit", "left", "-o", "new"), "--refit left: takes --data TABLE"),
+        (("out", "--refit", "left", "--data", "t.csv", "-o", "out"), "-o out is the run itself"),
+        (
+            ("out", "--refit", "top", "--data", "t.csv", "-o", "new"),
+            "--refit top: the cameras are left, right",
+        ),
+        (("out", "--refit", "left", "--data", "t.csv", "-o", "new", "--lens"), "--lens and --refit left: "),
+        (("--refit", "left", "--data", "t.csv"), "calibrate RUN --refit NAME --data TABLE -o NEW"),
+        (("out", "--data", "t.csv"), "calibrate RUN --refit NAME --data TABLE -o NEW"),
+    ],
+)
+def test_a_refit_that_is_not_clear_is_refused_in_a_line(projservo, reported, words, said):
+    answer = projservo("calibrate", *words)
+    assert (answer.code, answer.err.count("\n"), reported.made) == (2, 1, [])
+    assert said in answer.err
