@@ -146,7 +146,7 @@ def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_t
     assert told.figures == ("figures/fig13_calibration.svg", "figures/fig17_frames.svg")
     assert {entry["reason"] for entry in told.omitted} == {
         "no model of robot and cameras is known that could be drawn: set robot, rig and markers",
-        "no length on the tool is known: set markers.positions_m or markers.tag_size_m",
+        "no length on the tool is known: set markers.positions_m, markers.tag_size_m or markers.board.size_m",
     }
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f"directTHREE: {trace.verdict} after {trace.steps} steps" in page
