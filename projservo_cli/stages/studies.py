@@ -17,7 +17,7 @@ from projservo_cli.geometry.displacements import (
     twist_exponential,
 )
 from projservo_cli.planning.margins import limits_alone
-from projservo_cli.records import Calibration, FloatArray, Model, Plan, Trace, WorkFailed
+from projservo_cli.records import VIEWS, Calibration, FloatArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.report.report_data import DIRECT, Studies
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
@@ -25,6 +25,7 @@ from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.stage_inputs import ServoInputs
+from projservo_cli.task.body import make_body
 
 GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
 PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)
@@ -52,13 +53,24 @@ class Comparison:
 
     def run(self, law: str, operators: str, gains: Gains, *, limited: bool) -> Trace:
         """Drive a direct law without limit, or with 5° a step and that of prismatic joints as configured."""
-        limits = self.scenario.termination
-        speed = np.full(len(self.scenario.ends.q_start), math.inf)
+        seen = self.scenario_by(operators)
+        limits = seen.termination
+        speed = np.full(len(seen.ends.q_start), math.inf)
         if limited:
             prismatic = self.truth.robot.prismatic
             speed = np.where(prismatic, limits.speed, math.radians(STEP_LIMIT_DEG) / gains.period)
-        scenario = replace(self.scenario, gains=gains, termination=limits._replace(speed=speed))
+        scenario = replace(seen, gains=gains, termination=limits._replace(speed=speed))
         return drive(scenario, self.sense, law, self.models[operators]).trace()
+
+    def scenario_by(self, operators: str) -> RunScenario:
+        """Return the setting with the body, where the face is measured with one, in the frame of a model."""
+        exact = self.scenario.exact
+        if operators == "calibrated" or not len(exact.body.M):
+            return self.scenario
+        M = self.truth.of(self.scenario.numbers)
+        if operators == "twin":
+            M = M @ np.linalg.inv(H_PE).T
+        return replace(self.scenario, exact=exact._replace(body=make_body(self.models[operators], M)))
 
 
 def projective_twin(model: Model) -> Model:
@@ -72,14 +84,18 @@ def projective_twin(model: Model) -> Model:
         model.a_inf @ H_PE,
         model.lens,
         curve=model.curve,
+        on_tool=model.on_tool,
     )
 
 
 def comparison_of(inputs: ServoInputs, calibration: Calibration, plan: Plan) -> Comparison:
     """Set up the extra runs; images are without noise, but for a goal that is known by them alone.
 
-    inputs : of laws by themselves on the ideal plant: nothing keeps them out of regions.
+    inputs : of laws by themselves on the ideal plant, which measure the face point by point, but with the
+        body where there are not two views: nothing keeps them out of regions.
     """
+    if len(calibration.view) != len(VIEWS):
+        inputs = replace(inputs, plan=replace(inputs.plan, features="body"))
     scenario = run_scenario(inputs, calibration)
     limits = scenario.termination._replace(stop_at_joint_limit=False, stop_at_border=False)
     scenario = replace(scenario, termination=limits)
@@ -135,7 +151,7 @@ def metric_plan(bench: Comparison) -> Plan:
     """The task partitioned with the true metric model, so that its operators are in metres."""
     asked, robot = bench.scenario.inputs.trajectory, bench.truth.robot
     trajectory = asked.model_copy(update={"profile": "linear", "n_samples": 2, "duration_s": None})
-    shown, limits = bench.scenario.ends, limits_alone(robot.limits)
+    shown, limits = bench.scenario_by("true").ends, limits_alone(robot.limits, len(bench.scenario.view))
     return plan_task(bench.models["true"], shown, trajectory, limits)
 
 

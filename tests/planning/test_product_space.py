@@ -173,6 +173,19 @@ def test_random_tasks_are_what_they_say():
             assert ((s >= -0.5) & (s <= size - 0.5)).all()
 
 
+def test_random_tasks_before_any_rig():
+    """Cameras on the tool see the face at both ends, and so many of three as are asked for, whichever."""
+    _, truth, _ = tasks_of("ur5", 6, 1)
+    away = truth.P[0] @ np.diag([-1.0, -1.0, 1.0, 1.0])  # looks backwards at the same height
+    three = replace(truth, P=np.stack([truth.P[0], away, truth.P[1]]), image_size=truth.image_size[[0, 0, 1]])
+    front = truth.robot.q_reference
+    for rig, least in ((replace(truth, on_tool=True), 2), (three, 2)):
+        for q in np.concatenate(random_tasks(rig, front, 6, np.random.default_rng(4), least)):
+            s = rig.images(q, rig.M_face)
+            size = rig.image_size[:, None]
+            assert ((s >= -0.5) & (s <= size - 0.5)).all(axis=(1, 2)).sum() >= least
+
+
 def test_random_tasks_need_limits():
     _, truth, _ = tasks_of("ur5", 6, 1)
     endless = replace(

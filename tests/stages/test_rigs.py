@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import predict
+from projservo_cli.config.inputs import report_inputs
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.simulation.arm import camera_center
+from projservo_cli.stages.studies import comparison_of, metric_plan
 from tests.configured import calibrate, plan, scenario_of, servo, truth_of
 from tests.known import configured
 
@@ -108,6 +110,16 @@ def test_the_textbook_law_of_one_camera_goes_small_ways():
     short = servo.run(near, calibration, plan.run(near, calibration), "stacked")
     assert short.verdict == "converged", short.reason
     assert servo.run(config, calibration, made, "stacked").verdict != "converged"
+
+
+@pytest.mark.parametrize("rig", ["one", "eye"])
+def test_extra_runs_of_a_report_measure_the_body_where_points_need_two_views(rig):
+    config, calibration, made = chain(rig)
+    bench = comparison_of(report_inputs(config).extra, calibration, made)
+    for operators in bench.models:
+        trace = bench.run("direct_two", operators, bench.scenario.gains, limited=True)
+        assert (trace.verdict, trace.features) == ("converged", "body"), trace.reason
+    assert metric_plan(bench).theta_r == pytest.approx(made.theta_r, abs=0.01)
 
 
 def test_the_order_of_views_changes_nothing_but_their_order():
