@@ -1,0 +1,34 @@
+"""One camera: the rigid body that its images show."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.calibration.detections import Detections
+from projservo_cli.calibration.epipolar import ImageFrame
+from projservo_cli.calibration.single_view import RigidBody
+from projservo_cli.records import Observation
+from projservo_cli.settings.markers import Markers
+
+CAMERA = np.array([[600.0, 0.0, 322.0], [0.0, 604.0, 236.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_poses_that_show_one_tag_alone_do_not_mislead_the_fit(seed):
+    """Tags nearly in a plane, half a metre away, as before a camera on the hand."""
+    rng, sigma_px = np.random.default_rng(seed), 0.01
+    points = Markers.model_validate({"tags": "roof"}).points
+    facing = Rotation.from_rotvec([np.pi, 0.0, 0.0])
+    turns = (Rotation.from_euler("xyz", rng.uniform(-0.35, 0.35, (36, 3))) * facing).as_rotvec()
+    places = rng.uniform([-0.05, -0.05, 0.4], [0.05, 0.05, 0.6], (36, 3))
+    images = [
+        cv2.projectPoints(points, *pose, CAMERA, None)[0][:, 0] for pose in zip(turns, places, strict=True)
+    ]
+    images = np.array(images)[:, None] + sigma_px * rng.standard_normal((36, 1, 20, 2))
+    images[::5, :, 4:] = np.nan
+    seen = Observation(np.arange(36), np.arange(20), rng.uniform(-1, 1, (36, 6)), images, view=("eye",))
+    detections = Detections.of(seen, "RRRRRR")
+    found = RigidBody.of(detections, ImageFrame.of(detections, (640, 480)))
+    assert found.sigma_px == pytest.approx(sigma_px, rel=0.1)
+    np.testing.assert_allclose(found.bodies[0].focal, [600.0, 604.0], rtol=2e-3)
