@@ -38,7 +38,7 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages.external_robot import plugin_robot
-from projservo_cli.stages.stage_inputs import Estimation, Trials
+from projservo_cli.stages.stage_inputs import CalibrationInputs, Estimation, Trials
 from projservo_cli.store import load as stored_run
 from projservo_cli.store import run_path
 from projservo_cli.store.sweep_table import TABLE, SweepTable
@@ -93,7 +93,9 @@ def simulate(
         config, seed = (seeded, None) if q is None else (config, seed)
     with Listener(progress) as listener:
         require_simulated(config)
-        trials = calibration_inputs(config.model_copy(update={"data": None})).source
+        inputs = calibration_inputs(config.model_copy(update={"data": None}))
+        assert isinstance(inputs, CalibrationInputs)
+        trials = inputs.source
         assert isinstance(trials, Trials)
         if q is None:
             return calibrating.simulated(trials, progress=listener.progress)
