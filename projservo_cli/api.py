@@ -38,7 +38,7 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
 from projservo_cli.stages.external_robot import plugin_robot
-from projservo_cli.stages.stage_inputs import CalibrationInputs, Estimation, Trials
+from projservo_cli.stages.stage_inputs import Estimation, RefitInputs, Trials
 from projservo_cli.store import load as stored_run
 from projservo_cli.store import run_path
 from projservo_cli.store.sweep_table import TABLE, SweepTable
@@ -94,7 +94,8 @@ def simulate(
     with Listener(progress) as listener:
         require_simulated(config)
         inputs = calibration_inputs(config.model_copy(update={"data": None}))
-        assert isinstance(inputs, CalibrationInputs)
+        while isinstance(inputs, RefitInputs):
+            inputs = inputs.before
         trials = inputs.source
         assert isinstance(trials, Trials)
         if q is None:

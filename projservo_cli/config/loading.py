@@ -461,13 +461,12 @@ def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
         part = values.get(section)
         if isinstance(part, dict) and isinstance(part.get(key), str) and part[key]:
             part[key] = str((base / part[key]).resolve())
-    calibration: Any = values.get("calibration")
+    calibration = values.get("calibration")
     refits = calibration.get("refits") if isinstance(calibration, dict) else None
-    listed: list[Any] = refits if isinstance(refits, list) else []
-    for refit in filter(lambda entry: isinstance(entry, dict), listed):
-        for key in ("table", "readings"):
-            if isinstance(refit.get(key), str) and refit[key]:
-                refit[key] = str((base / refit[key]).resolve())
+    for one in list[Any](refits) if isinstance(refits, list) else list[Any]():
+        for key in ("table", "readings") if isinstance(one, dict) else ():
+            if isinstance(one.get(key), str) and one[key]:
+                one[key] = str((base / one[key]).resolve())
     data = values.get("data")
     for file in (data.get("table") if isinstance(data, dict) else None, path):
         if isinstance(file, (str, pathlib.Path)) and str(file):
