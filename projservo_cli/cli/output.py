@@ -12,7 +12,6 @@ import click
 
 from projservo_cli.passwords import masked
 from projservo_cli.progress import Listener
-from projservo_cli.records import VIEWS
 
 _UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 _NOTES = {  # on runs, and their reasons
@@ -342,7 +341,7 @@ def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
     if not known:
         keys = "image_error_px", "estimated_position_error_mm", ""
         words, units = ("image", "within", ""), ("px", "mm", "")
-    views = next((trace["view"] for trace in value["laws"]), VIEWS)
+    views = next((trace["view"] for trace in value["laws"]), ("left", "right"))
     errors = "true errors" if known else "image errors"
     yield f"servo: {errors} at the end, self-occluded steps {'/'.join(views)}"
     first, second, last = words

@@ -143,7 +143,7 @@ def check_commands(folder, names, read):
     told = {row[0].strip(" `"): set(re.findall(r"`(\w+)`", row[1])) for row in rows if len(row) == 2}
     assert cli.run(["calibrate", "plan", "-o", "results/ur5", "--json"]) == 0
     found = json.loads(read())
-    later = {"cross_validation", "suggestions"}  # only where they are asked for
+    later = {"cross_validation", "suggestions", "joint_model"}  # only where they are asked for
     assert told["calibrate"] - {"name", "type", "excitation", "poorly_observable"} - later <= set(
         found["calibrate"]
     )
