@@ -56,6 +56,7 @@ SIZES = {
     "model_error_column": 4,
     "refit_column": 3,
     "joint_curve_column": 7,
+    "with_or_without": 2,
     "joint_curve_part": 5,
 }
 
@@ -660,6 +661,12 @@ class CrossValidation:
     posture_predicted_px: float | None = _scalar("px", "expected rms of it", default=None)
     time_rms_px: float | None = _scalar("px", "rms residual in folds of consecutive poses", default=None)
     time_predicted_px: float | None = _scalar("px", "expected rms of it", default=None)
+    others_px: FloatArray | None = _array(
+        "view with_or_without",
+        "px",
+        "rms residual of the other views, by fits with this view and without it; none of two views",
+        default=None,
+    )
 
 
 def in_unit(value: float, unit: str, digits: int = 6) -> str:

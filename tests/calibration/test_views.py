@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import projservo_cli as projservo
-from projservo_cli.calibration import calibrate, predict, prediction_variance
+from projservo_cli.calibration import calibrate, cross_validate, predict, prediction_variance
 from projservo_cli.calibration.checks.validation import residual_statistics
 from projservo_cli.metric.frame import links
 from projservo_cli.observations import Observations
@@ -50,6 +50,21 @@ def test_predictions_err_by_the_bound_and_as_stated(views):
     assert np.mean(squares) == pytest.approx(bound.mean_square(), rel=chance + 0.05)
     assert np.mean(stated) == pytest.approx(bound.mean_square(), rel=0.15)
     np.testing.assert_allclose(np.median(noise, axis=0), NOISE[views], rtol=0.05)
+
+
+def test_a_camera_with_noise_of_its_own_does_not_spoil_the_others():
+    """Each is left out in turn: the weights of the worst one keep it from the predictions of the others."""
+    robot, q, _, rng = recorded(3, seed=3)
+    seen, kept = robot.observe(q, 0.5, rng), []
+    seen.images[:, 2] += 6.0 * np.sin(np.arange(len(q)))[:, None, None] * [1.0, 0.5]
+    calibrate(seen, robot.joint_types, source="recorded", fitted=lambda *solved: kept.append(solved))
+    found = cross_validate(*kept[0], 4, seed=0)
+    assert found.others_px.shape == (3, 2)
+    # With the bad camera the others are predicted as without it; without a good one the bad one still errs.
+    assert found.others_px[2] == pytest.approx([found.others_px[2, 1]] * 2, rel=0.03)
+    assert (found.others_px[:2] > 3.0 * found.others_px[2]).all()
+    assert "no camera spoils the others" in found.reason
+    assert cross_validate(*kept[0], 4, seed=0, blocks=False).others_px is None
 
 
 def test_order_and_names_of_views_do_not_matter():

@@ -23,6 +23,7 @@ from projservo_cli.calibration.prediction import joint_derivative, predict, pred
 from projservo_cli.calibration.robust_fit import WARN_RATIO, Solution, fit_inliers
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.records import (
+    VIEWS,
     BoolArray,
     Calibration,
     CrossValidation,
@@ -39,6 +40,8 @@ _MIN_FOLDS = 2
 _BLOCKS = {"posture": "the model errs between postures", "time": "something changed over the recording"}
 # Held-out over predicted error in blocks, over that of random parts, from which it is named.
 _BLOCK_RATIO = 1.3
+# Held-out error of the other views with a camera over that without, from which it spoils them.
+_SPOILS = 1.1
 # Minimum number of detections of a marker in the other poses for its prediction.
 _MIN_READINGS = 4
 _OPEN = "the other poses do not determine the robot"
@@ -68,7 +71,8 @@ def cross_validate(
     folds : number of parts to divide the poses into.
     seed : seed of the division.
     progress : called after each part with the number done and the total.
-    blocks : whether to divide the poses into blocks of posture and of time too.
+    blocks : whether to divide the poses into blocks of posture and of time too, and to leave out each of
+        three cameras or more.
 
     Returns
     -------
@@ -81,8 +85,9 @@ def cross_validate(
     """
     detections = solution.problem.detections
     part, unit = _divide(detections, folds, np.random.default_rng(seed))
-    names = tuple(_BLOCKS) if blocks else ()
-    total, done = folds * (1 + len(names)), 0
+    names, V = tuple(_BLOCKS) if blocks else (), len(detections.view)
+    alone = range(V if blocks and len(VIEWS) < V else 0)  # cameras that are left out in turn
+    total, done = folds * (1 + len(names) + len(alone)), 0
 
     def on_fold() -> None:
         """Count a part."""
@@ -100,12 +105,15 @@ def cross_validate(
         length = np.linalg.norm(apart, axis=3)
         of_blocks[f"{name}_rms_px"] = distance_statistics(length[np.isfinite(length)])["rms_px"]
         of_blocks[f"{name}_predicted_px"] = _expected_px(spread)
+    others = np.array([_of_others(solution, v, part, residual, sigma_px, on_fold) for v in alone])
+    spoilt = _describe_others(detections.view, others) if len(others) else ""
     return CrossValidation(
         folds=folds,
         seed=seed,
         unit=unit,
         failed=tuple(failed),
-        reason=_describe_held_out(statistics["rms_px"], expected, len(failed), of_blocks),
+        reason=_describe_held_out(statistics["rms_px"], expected, len(failed), of_blocks) + spoilt,
+        others_px=others if len(others) else None,
         **statistics,
         predicted_rms_px=expected,
         pose=detections.pose,
@@ -114,6 +122,47 @@ def cross_validate(
         residual=residual,
         predicted=predicted,
         **of_blocks,
+    )
+
+
+def _of_others(
+    solution: Solution,
+    v: int,
+    part: IntArray,
+    residual: FloatArray,
+    sigma_px: float,
+    on_fold: Callable[[], None],
+) -> FloatArray:
+    """Held-out rms (2,) of the other views, px, by fits with a view and without it; NaN if there is none.
+
+    residual : (K, V, m, 2) of the fits with all views; both count where both predict.
+    """
+    whole, keep = solution.problem.detections, [u for u in range(len(residual[0])) if u != v]
+    some = whole.of_views(keep)
+    known = np.isin(whole.marker, some.marker)
+    lens = None if solution.params.lens is None else solution.params.lens[keep]
+    params = replace(solution.params, P=solution.params.P[keep], M=solution.params.M[known], lens=lens)
+    problem = solution.problem.alike(some).with_noise(solution.problem.tau)
+    rows = whole.seen[keep].any(axis=0)
+    used = solution.used[keep][:, rows]
+    rest = replace(solution, problem=problem, params=params, residual=problem.residual(params), used=used)
+    without, _, _ = _of_parts(rest, part, sigma_px, on_fold)
+    both = np.stack([residual[:, keep][:, :, known], without])
+    squares = np.square(both).sum(axis=-1)[:, np.isfinite(both).all(axis=(0, -1))]
+    return np.sqrt(squares.mean(axis=1)) if squares.size else np.full(2, np.nan)
+
+
+def _describe_others(view: tuple[str, ...], others: FloatArray) -> str:
+    """Name the camera without which the others (V, 2) are predicted best, or say that none spoils them."""
+    if not np.isfinite(others).any():
+        return ""
+    gain = others[:, 0] / others[:, 1]
+    v = int(np.nanargmax(gain))
+    if gain[v] < _SPOILS:
+        return f"; no camera spoils the others: without {view[v]} they err {1.0 / gain[v]:.3g} times as much"
+    return (
+        f"; leave out the {view[v]} camera: the others err {others[v, 0]:.3g} px rms with it, "
+        f"{others[v, 1]:.3g} px without"
     )
 
 
