@@ -74,7 +74,7 @@ def simulate(
     Returns
     -------
     Observations
-        What both cameras see, NaN where unseen, with what ``calibrate`` has to know of it.
+        What the cameras see, NaN where unseen, with what ``calibrate`` has to know of it.
 
     Raises
     ------
@@ -372,7 +372,7 @@ def sweep(
     ----------
     config : of a simulated robot with a task.
     laws : names, ``module:Class`` or classes; a name may contain its mode, such as ``exact_track``.
-    tasks : random tasks within sight of both cameras; by default that of the configuration alone.
+    tasks : random tasks within sight of the cameras; by default that of the configuration alone.
     runs : of each cell; by default one a task, or twenty.
     calibrations : of a cell, from noisy trials; run r is made with number r mod this.
     grid : lists of values by key, such as ``{"noise.servo_px": [0.0, 0.5]}``.

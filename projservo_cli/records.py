@@ -799,7 +799,7 @@ class Plan(JointSpaceSearch, TaskPartition, PlannedMotion):
     view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
     profile: str = _scalar(about="profile of the motion")
     feasible: bool = _scalar(
-        about="whether both cameras see the face all along; in the profile constrained, whether all "
+        about="whether the cameras see the face all along; in the profile constrained, whether all "
         "constraints hold; in the profile joint_space, whether a path was found"
     )
     reason: str = _scalar(about="reason why the plan is feasible or not")

@@ -12,7 +12,7 @@ from projservo_cli.cli.program import main
 
 # Squared error over its covariance that reveals another robot, or other units.
 _FAR = 20.0
-_TAUGHT = "# What both cameras saw: projservo teach. Name this file under task.goal, or task.start.\n"
+_TAUGHT = "# What the cameras saw: projservo teach. Name this file under task.goal, or task.start.\n"
 
 
 @main.command("teach", epilog="Example: projservo teach results/mine -c mine.yaml -o goal.yaml")
@@ -48,7 +48,7 @@ def _teach(
     force: bool,
     **options: Any,
 ) -> None:
-    """Write what both cameras see as a goal or a start.
+    """Write what the cameras see as a goal or a start.
 
     Looks where somebody has moved the robot to, with the hands away, averages --frames images and writes
     their pixels, with their uncertainty and the joint readings: task.goal takes the file, task.start its

@@ -59,7 +59,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     """Drive the robot through trial motions and write a table.
 
     Drives the robot of a configuration, simulated or yours, through its trial motions (and --motions, whose
-    readings --joint-unit is about), in steps that the joint-speed limit allows, and writes what both cameras
+    readings --joint-unit is about), in steps that the joint-speed limit allows, and writes what the cameras
     see into an observation table for calibrate.
 
     The table grows as the robot goes. After an interruption the same command continues it; a table of another
@@ -141,7 +141,7 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
 def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Learn the projective kinematics from trial motions.
 
-    Estimates both cameras and all joint operators from images alone, simulated from the configuration or
+    Estimates the cameras and all joint operators from images alone, simulated from the configuration or
     recorded in an observation table (--data).
 
     --cross-validate and --init become part of the configuration of the run. --suggest works on the
@@ -163,7 +163,7 @@ def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
 def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Plan the task as a translation and two rotations.
 
-    Partitions the task by the start and goal images and lays a path on which both cameras keep seeing the
+    Partitions the task by the start and goal images and lays a path on which the cameras keep seeing the
     face. Calibrates first where needed.
     """
     return _make(console, stages, options)
@@ -229,7 +229,7 @@ def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **op
 
     --view adds view.html, a 3D view of robot, rig, face and paths with a time slider, which needs no network;
     it needs pip install '.[view]' and a robot described in metres. --animation adds animation.gif,
-    what both cameras see under the direct and the classical laws. The page links to both; a report that is up
+    what the cameras see under the direct and the classical laws. The page links to both; a report that is up
     to date is not made again for them.
 
     projservo report SWEEP, with the folder of a sweep, writes its statistics and figures instead: success

@@ -136,7 +136,7 @@ class Demands(NamedTuple):
     keep: FloatArray  # (n,) minimum distance from a joint limit, rad or m, along a path through joint space
     min_face_px: float = 0.0  # minimum width of the face in an image along such a path, px
     # (t, 4) corners of tags, markers of the body in the order of their numbers, of which one is to be seen by
-    # both cameras; none where the face is
+    # enough cameras; none where the face is
     tags: IntArray = np.zeros((0, 4), np.int64)
     units: tuple[str, ...] = ()  # of each joint in messages: deg, rad or m
     view: tuple[str, ...] = VIEWS  # names of the views

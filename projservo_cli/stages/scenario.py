@@ -128,7 +128,7 @@ class Scenario:
         if (size := self.inputs.image_size or self.inputs.seen_px) is None:
             raise InputError(
                 "the size of the images, and so their border, is not known: set data.image_size_px, or "
-                "size_px of both cameras"
+                "size_px of the cameras"
             )
         joints, asked = self.joints, self.inputs.trajectory
         margins = asked.joint_margin_m, asked.joint_margin
@@ -252,7 +252,7 @@ class Scenario:
                 return np.ascontiguousarray(np.where(unseen[..., None], there, s))
         raise WorkFailed(
             f"{key}: the {self.view[view]} camera does not see marker {self.numbers[k]} of the face, and too "
-            "little else of the tool: turn it towards both cameras, or bring it nearer"
+            "little else of the tool: turn it towards the cameras, or bring it nearer"
         )
 
 
