@@ -15,7 +15,7 @@ from projservo_cli.store.observation_tables import read_table
 from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import around, random_robot, trials
 
-DRAWS = 6
+DRAWS = 4
 # Views of a calibration, and the noise of each, px.
 NOISE = {3: (0.3, 0.5, 1.2), 4: (0.4, 0.4, 0.4, 1.5)}
 
