@@ -12,7 +12,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PYTHON = sys.executable
 BIN = Path(PYTHON).parent
-PYTEST = [PYTHON, "-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "--benchmark-disable"]
+# A third process uses the time in which emulated arms, which move in real time, leave a processor idle.
+PYTEST = [PYTHON, "-m", "pytest", "-q", "-n", "3", "--dist", "worksteal", "--benchmark-disable"]
 SPHINX = [
     PYTHON,
     "-m",
@@ -26,6 +27,7 @@ SPHINX = [
     "docs",
     "build/docs",
 ]
+TUTORIAL = [PYTHON, "-m", "pytest", "-q", "tests/studies/so101_tutorial.py", "-k"]
 PACKAGE = ROOT / "projservo_cli"
 DOCSTRINGS = [PYTHON, "-m", "numpydoc", "lint", *sorted(map(str, PACKAGE.rglob("*.py")))]
 # Tests of compiled functions, once more without the compiler: the same bits, and indices that are looked at.
@@ -41,7 +43,7 @@ ATTEMPTS = {"tutorial": 2}
 Check = tuple[Sequence[str | Path], dict[str, str]]
 # Two at a time, in this order: the tutorial, whose emulator runs in real time, and the others behind it.
 SINGLE: dict[str, Check] = {
-    "tutorial": ([PYTHON, "-m", "pytest", "-q", "tests/studies/so101_tutorial.py"], {}),
+    "tutorial": ([*TUTORIAL, "not one_webcam"], {}),
     "types": ([BIN / "mypy"], {}),
     "documentation": (SPHINX, WITHOUT_COMPILER),
     "lint": ([BIN / "ruff", "check", "."], {}),
@@ -56,7 +58,7 @@ WHOLE: dict[str, Check] = {
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
 # Only by name. Coverage doubles the time of the first pass and adds a fifth to the second; lines of both add
-# up, one after the other. The rendered study takes forty minutes.
+# up, one after the other. The rendered study takes forty minutes, the tutorial with one webcam two.
 BY_NAME: dict[str, Check] = {
     "coverage without the compiler": (
         [*PYTEST, "--cov=projservo_cli", "--cov-report=", *UNCOMPILED],
@@ -67,6 +69,7 @@ BY_NAME: dict[str, Check] = {
         {},
     ),
     "rendered": ([PYTHON, "-m", "tests.studies.rendered"], {}),
+    "one webcam": ([*TUTORIAL, "one_webcam"], {}),
 }
 
 

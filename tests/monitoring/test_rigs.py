@@ -17,7 +17,7 @@ from tests.calibration.simulated_robot import around, random_robot, trials
 from tests.calibration.test_cameras_on_the_tool import Hand
 from tests.monitoring.test_image_monitor import LOOKS, PERIOD, Arm, first_alarm, look, noisy
 
-RIGS = [(1, "world"), (3, "world"), (4, "world"), (1, "tool"), (3, "tool")]
+RIGS = [(1, "world"), (3, "world"), (4, "world"), (1, "tool")]
 TYPES, NAMES, ONSET = "RRPRR", ("wrist", "top", "low", "side"), 15
 NOISE = np.array([0.5, 0.5, 1.0, 0.3])  # of each view, px
 

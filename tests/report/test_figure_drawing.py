@@ -14,7 +14,7 @@ def drawn(spec, material):
 VIEWS = {1: ("hand",), 3: ("left", "right", "ceiling")}
 
 
-@pytest.fixture(scope="module", params=["paper", "stanford", 1, 3])
+@pytest.fixture(scope="module", params=["paper", 1, 3])
 def figures(request):
     """All figures, of two cameras or of so many."""
     many = request.param in VIEWS
