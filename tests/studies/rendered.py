@@ -67,18 +67,24 @@ class Watched(FaultyRobot):
         return answer
 
 
+def calibrated(config):
+    """A recording, the calibration made of it and, where that is None, why it failed."""
+    with pytest.MonkeyPatch.context() as patch:
+        seen, sigma_px = record.observed(config)
+        patch.setattr("projservo_cli.stages.calibrate.observed", lambda *args, **kwargs: (seen, sigma_px))
+        try:
+            return seen, calibrate.run(config)[1], ""
+        except WorkFailed as error:
+            return seen, None, str(error)
+
+
 def recorded(condition):
     """A calibration, what it is made from and how corners compare with the truth."""
     config = base_of(condition)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("projservo_cli.simulation.faults.FaultyRobot", Watched)
         Watched.counts[:], Watched.squares[:], Watched.lens = 0.0, 0.0, condition == "lens"
-        seen, sigma_px = record.observed(config)
-        patch.setattr("projservo_cli.stages.calibrate.observed", lambda *args, **kwargs: (seen, sigma_px))
-        try:
-            calibration, why = calibrate.run(config)[1], ""
-        except WorkFailed as error:
-            calibration, why = None, str(error)
+        seen, calibration, why = calibrated(config)
     known = known_by_hand_eye(config, seen)
     return condition, calibration, why, known, Watched.counts.copy(), Watched.squares.copy()
 

@@ -14,15 +14,13 @@ import math
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from projservo_cli.records import WorkFailed
 from projservo_cli.settings.markers import Markers
 from projservo_cli.simulation.arm import camera_center
-from tests.configured import calibrate, record, truth_of
+from tests.configured import truth_of
 from tests.known import configured, with_task
 from tests.studies.common import in_two_processes, parser_of, quantiles, tasks_in, write_rows
-from tests.studies.rendered import by_hand_eye, known_by_hand_eye, run_of, tell
+from tests.studies.rendered import by_hand_eye, calibrated, known_by_hand_eye, run_of, tell
 from tests.studies.rendered_conditions import ARM, FRAMES, FRONT, SEEDS, SHOWN_FRAMES, drawn
 
 TASKS = Path(__file__).with_name("rendered_rigs_tasks.csv")
@@ -103,13 +101,7 @@ def base_of(rig):
 def recorded(rig):
     """A calibration by a rig, and what hand–eye calibration makes of the same images."""
     config = base_of(rig)
-    with pytest.MonkeyPatch.context() as patch:
-        seen, sigma_px = record.observed(config)
-        patch.setattr("projservo_cli.stages.calibrate.observed", lambda *args, **kwargs: (seen, sigma_px))
-        try:
-            calibration, why = calibrate.run(config)[1], ""
-        except WorkFailed as error:
-            calibration, why = None, str(error)
+    seen, calibration, why = calibrated(config)
     return rig, calibration, why, known_by_hand_eye(config, seen)
 
 
