@@ -11,6 +11,7 @@ from projservo_cli.records import InputError
 REGULATE = "regulate"
 TRACK = "track"
 IMAGE_TRACK = "image_track"
+INCIDENCES = "incidences"
 POINTS = "points"
 BODY = "body"
 
@@ -32,6 +33,7 @@ LAW_SPECS = {
     "blockwise": _LawSpec("block-wise", (REGULATE,), POINTS),
     "euclidean_points": _LawSpec("Euclidean points", (REGULATE,), POINTS, metric=True),
     "exact": _LawSpec("exact", (REGULATE, TRACK), BODY, paper=False),
+    INCIDENCES: _LawSpec("incidences", (REGULATE,), BODY, paper=False),
 }
 LAWS = tuple(LAW_SPECS)
 CODES = {law: code for code, law in enumerate(LAWS)}  # codes of the laws in compiled code

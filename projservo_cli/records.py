@@ -820,6 +820,19 @@ class Plan(JointSpaceSearch, TaskPartition, PlannedMotion):
     rejected_profiles: tuple[str, ...] = _scalar(
         about="profiles that auto rejected, each with the reason", default=()
     )
+    incidences: tuple[str, ...] = _scalar(
+        about="incidences that are to hold at the goal; none for the whole pose", default=()
+    )
+    free_dof: int | None = _scalar(
+        about="number of joint motions at the goal that keep all incidences; none for the whole pose",
+        default=None,
+    )
+    s_goal: FloatArray | None = _array(
+        "view observed xy",
+        "px",
+        "images of all markers of the body at the goal that was chosen, of those that incidences leave open",
+        default=None,
+    )
     relaxed_constraints: tuple[str, ...] = _scalar(
         about="constraints relaxed at the start and the goal, which have smaller margins themselves",
         default=(),
@@ -835,7 +848,9 @@ class RunMetrics:
     """Numbers by which runs of laws are compared."""
 
     position_error_mm: float | None = _scalar(
-        "mm", "true centre to true goal at the end; of the tool if the robot reports its true pose"
+        "mm",
+        "true centre to true goal at the end, the nearest one of a goal of incidences; of the tool if the "
+        "robot reports its true pose",
     )
     rotation_error_deg: float | None = _scalar("deg", "true rotation to the goal at the end")
     remaining_translation: float | None = _scalar(
@@ -911,7 +926,7 @@ class RunHistory:
         "time",
         "px",
         "error that decides convergence: the image error of the face, located by the body if "
-        "features is body",
+        "features is body; of a goal of incidences the least motion of the body's images that meets them",
     )
     tau: FloatArray = _array("time", about="translation error, unit-norm kernel of (8)")
     tau_affine: FloatArray = _array("time", about="translation error, scale fixed through a_inf")
@@ -931,6 +946,12 @@ class RunHistory:
     pose: FloatArray = _array("time row coordinate", "m", "true pose of the tool")
     goal_pose: FloatArray = _array("row coordinate", "m", "true goal pose, NaN if unknown")
     center: FloatArray = _array("time axis", "m", "true centre of the face")
+    incidence_px: FloatArray | None = _array(
+        "time incidence",
+        "px",
+        "error of each incidence over its deviation at one pixel of noise; none for the whole pose",
+        default=None,
+    )
     latency: FloatArray | None = _array(
         "time view",
         "s",
@@ -973,6 +994,13 @@ class Trace(RecordedFrames, RunHistory, RunMetrics):
     steps: int = _scalar(about="commands sent")
     period: float = _scalar("s", "control period")
     features: str = _scalar(about="image features: points or body")
+    incidences: tuple[str, ...] = _scalar(
+        about="incidences that were to hold at the goal; none for the whole pose", default=()
+    )
+    free_dof: int | None = _scalar(
+        about="number of joint motions at the goal that keep all incidences; none for the whole pose",
+        default=None,
+    )
     replan_attempts: int = _scalar(about="number of replanning attempts", default=0)
     unplanned: str = _scalar(
         about="reason why a run in a following mode ran without the plan; empty if it followed", default=""

@@ -21,6 +21,7 @@ from projservo_cli.records import CORNERS, InputError
 from projservo_cli.result_hashes import File
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
+from projservo_cli.settings.features import incidence_of
 from projservo_cli.simulation.described import (
     arm_of,
     cameras_of,
@@ -200,6 +201,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
     assert markers is not None
     simulated = config.plant.simulated and not predicted
     known = markers.known if markers.tags is not None else ()
+    pairs = () if config.task is None else config.task.goal.incidences
     return PlanInputs(
         task=config.task,
         seed=config.seed,
@@ -219,6 +221,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         features=config.control.features,
         tests_images=config.stop.innovation_threshold > 0.0,
         trajectory=config.trajectory,
+        incidences=tuple(incidence_of(pair, config.features) for pair in pairs),
     )
 
 

@@ -498,6 +498,10 @@ def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> 
     """
     task = document.values.get("task")
     for key in ("start", "goal") if isinstance(task, dict) else ():
+        further: dict[str, Any] = {}
+        if key == "goal" and isinstance(task.get(key), dict) and isinstance(task[key].get("taught"), str):
+            further = {name: value for name, value in task[key].items() if name != "taught"}
+            task[key] = task[key]["taught"]
         if not isinstance(task.get(key), str):
             continue
         where, path = f"{document.place(('task', key))}: task.{key}", (base / task[key]).resolve()
@@ -505,7 +509,7 @@ def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> 
             if key == "start":
                 del document.values["task"]
                 return
-            task["goal"] = {"joints": task.get("start")}
+            task["goal"] = {"joints": task.get("start"), **further}
             continue
         if not path.exists():
             command = f"projservo teach{' --start' * (key == 'start')} -c FILE -o {base / task[key]}"
@@ -521,7 +525,7 @@ def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> 
             raise InputError(f"{where}: {path}: is no file that projservo teach wrote")
         if key == "start" and not images.get("joints"):
             raise InputError(f"{where}: {path}: has no joints to start from")
-        task[key] = images["joints"] if key == "start" else taught.values
+        task[key] = images["joints"] if key == "start" else {**taught.values, **further}
 
 
 def _check_options(document: _Document) -> None:
@@ -616,6 +620,8 @@ def _without_unset(value: Any) -> Any:
             for key, inner in value
             if inner is not None or (key in fields and fields[key].default is not None)
         }
+    if isinstance(value, dict):
+        return {key: _without_unset(inner) for key, inner in value.items()}
     return [_without_unset(inner) for inner in value] if isinstance(value, tuple) else value
 
 

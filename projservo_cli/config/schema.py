@@ -33,6 +33,10 @@ def json_schema() -> dict[str, Any]:
     for key in ("start", "goal"):
         what = f"{task[key].pop('description', 'the goal')}; or the file that projservo teach wrote"
         task[key] = {"anyOf": [task[key], {"type": "string"}], "description": what}
+    schema["$defs"]["Goal"]["properties"]["taught"] = {
+        "type": "string",
+        "description": "File that projservo teach wrote, beside incidences.",
+    }
     return {**schema, "title": "Configuration of projservo"}
 
 

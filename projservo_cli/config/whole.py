@@ -16,6 +16,7 @@ from projservo_cli.records import LIMITS_MISSING, TOOL, WORLD, InputError
 from projservo_cli.settings.cameras import Cameras
 from projservo_cli.settings.control import RENDERED, Control, PlantSettings, ReportSettings, Stop
 from projservo_cli.settings.disturbance import Disturbance
+from projservo_cli.settings.features import Feature, Name, misplaced
 from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.robot import Rig, RobotSettings, like_degrees
 from projservo_cli.settings.sections import Finding, JointVector, Root, Whole
@@ -120,6 +121,24 @@ def _goal_images(
         whole = len(pixels) == len(numbers) == len(images.side(key) or ())
         for number in [k for k in markers.front if whole and counts[k] < enough and pixels[k] is None][:1]:
             yield (*path, key), f"marker {number} of the face is not seen; show the whole face"
+
+
+def _incidences(
+    features: Mapping[str, Feature], task: TaskSettings | None, markers: Markers | None, control: Control
+) -> Iterator[Finding]:
+    for name, feature in features.items():
+        source = None if any(feature.contradictions()) else feature.source
+        if isinstance(source, tuple) and markers is not None:
+            yield from markers.unknown(source, "features", name, feature.kind)
+        elif isinstance(source, str):
+            of = features.get(source)
+            if of is None or of.on != "tool" or of.given(feature.kind) == []:
+                yield ("features", name, feature.kind), f"there is no {feature.kind} {source} of the tool"
+    for i, pair in enumerate(() if task is None else task.goal.incidences):
+        for what in misplaced(pair, features):
+            yield ("task", "goal", "incidences", i), what
+    if task is not None and task.goal.incidences and control.features == "points":
+        yield ("control", "features"), "incidences are measured with the body: leave points out"
 
 
 def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator[Finding]:
@@ -233,7 +252,7 @@ def _speed_in_joint_space(
 _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the sections that each takes
     rule: {*inspect.signature(rule).parameters}
     for rule in (
-        *(_same_joints, _joint_vectors, _goal_images, _simulated_alone, _rendered),
+        *(_same_joints, _joint_vectors, _goal_images, _incidences, _simulated_alone, _rendered),
         *(
             _dictionary,
             _cameras,
@@ -276,6 +295,7 @@ class Settings(Printed, Root):
     noise: Noise = Noise()
     calibration: CalibrationSettings = CalibrationSettings()
     data: Data | None = None
+    features: dict[Name, Feature] = Field({}, description="points, lines and planes, by their names")
     task: TaskSettings | None = None
     trajectory: Trajectory = Trajectory()
     control: Control = Control()

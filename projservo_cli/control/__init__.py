@@ -5,6 +5,7 @@ Run files and tables know a law by its name, compiled code by its code in ``laws
 
 from projservo_cli.control.classical import blockwise, euclidean_points, stacked
 from projservo_cli.control.direct import direct_three, direct_two, exact
+from projservo_cli.control.incidence_law import incidences
 from projservo_cli.control.law import LOST, OK, Gains, Law, State, limit_speed
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.lens import distorts, undistort_into
@@ -15,7 +16,7 @@ from projservo_cli.task.trajectory import Reference, following, near_joint_path,
 # Share of the image-based command of a period that corrects a joint-space path.
 _CORRECTED = 0.2
 # Codes of the laws, in the order of their names.
-_DIRECT_THREE, _DIRECT_TWO, _STACKED, _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = range(len(LAWS))
+_DIRECT_THREE, _DIRECT_TWO, _STACKED, _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT, _ = range(len(LAWS))
 
 
 @internal
@@ -47,8 +48,10 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
         status = blockwise(model, task, gains, straight, q, state)
     elif code == _EUCLIDEAN_POINTS:
         status = euclidean_points(model, task, gains, straight, q, state)
-    else:
+    elif code == _EXACT:
         status = exact(model, task, gains, straight, q, state)
+    else:
+        status = incidences(model, task, gains, straight, q, state)
     if following(task.reference):
         limited = code == _EXACT
         if status != LOST and on_joint_path(task.reference, float(state.clock[0])):

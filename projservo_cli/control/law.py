@@ -18,7 +18,9 @@ from projservo_cli.geometry.algebra import (
     axpy,
     dot,
     inner,
+    inverse,
     mat,
+    mat_into,
     mul,
     sub,
     unit,
@@ -43,6 +45,7 @@ from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import VIEWS, FloatArray, IntArray, JointLimits, Model, position_limits
 from projservo_cli.task.body import ALL_VIEWS, GOAL_VIEWS, carry, fit_body
 from projservo_cli.task.face import Task, center_of
+from projservo_cli.task.incidences import image_error
 from projservo_cli.task.partition import NO_PARTS, Parts, Split, partition
 from projservo_cli.task.trajectory import following
 from projservo_cli.task.visibility import limited_translation
@@ -106,6 +109,9 @@ class State(NamedTuple):
 
     work: Work  # arrays of the kernels, the current operators among them
     A: FloatArray  # (m, 4) current points
+    pose: FloatArray  # (4, 4) measured displacement of the body from the reference
+    rates: FloatArray  # (w, n) derivatives of the weighted errors of incidences by the joints
+    wanted: FloatArray  # (w,) their velocity
     A_t: FloatArray  # (m, 4) target without translation
     A_r: FloatArray  # (m, 4) target without translation and rotation r
     q_hat: FloatArray  # (4, n) joint motions t, r, p, s; (4, 6) coordinates in the span of an arm of n ≠ 6
@@ -117,8 +123,8 @@ class State(NamedTuple):
     # (3,) sums of squared residuals of the predicted and of the fitted body, px², and the number of markers
     # used, once a view; NaN if the face is measured point by point
     fit: FloatArray
-    # (1,) image error of the face at the measured pose of the body, px rms per marker and view, even if the
-    # face is not seen; NaN if it is measured point by point
+    # (1,) image error of the face at the measured pose of the body, or of the incidences, px rms per marker
+    # and view, even if the face is not seen; NaN if it is measured point by point
     face_px: FloatArray
     normal: FloatArray  # (6, 7) workspace of the fit of the body
     path: FloatArray  # (129, n) joints at the ends of the parts of a step, the current ones first
@@ -133,10 +139,13 @@ class State(NamedTuple):
     q_ahead: FloatArray  # (n,) joint motion of the plan in the next period; zero without a plan
 
 
-def new_state(n: int, m: int, observed: int = 0, span: Span = OWN, views: int = len(VIEWS)) -> State:
+def new_state(
+    n: int, m: int, observed: int = 0, span: Span = OWN, views: int = len(VIEWS), rank: int = 0
+) -> State:
     """Initial state for n joints and m face markers in a number of views.
 
     observed : number of markers in images, m or more; span : of an arm of n ≠ 6 joints.
+    rank : number of independent errors of incidences.
     """
     q_dot = np.zeros(n)
     own = len(span.H_hat) == 0
@@ -144,6 +153,9 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN, views: int = 
     return State(
         work=workspace(n, rows_of(views, m), span),
         A=np.zeros((m, 4)),
+        pose=np.eye(4),
+        rates=np.zeros((rank, n)),
+        wanted=np.zeros(rank),
         A_t=np.zeros((m, 4)),
         A_r=np.zeros((m, 4)),
         q_hat=np.zeros((4, k)),
@@ -232,7 +244,11 @@ def _measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State
     if not fit.found:
         return False
     carry(task.body, fit.H, state.A)
-    state.face_px[0] = _predicted_error(model.P, state.A, task.A_star)
+    mat_into(state.pose, fit.H)
+    if task.incidences.weight.shape[0] > 0:
+        state.face_px[0] = image_error(task.incidences, fit.H, inverse(fit.H))
+    else:
+        state.face_px[0] = _predicted_error(model.P, state.A, task.A_star)
     return True
 
 

@@ -161,6 +161,21 @@ def meet(a: Vec4, b: Vec4, c: Vec4) -> Vec4:
 
 
 @inline
+def inverse(H: Mat4) -> Mat4:
+    """Inverse of a matrix: each row is dual to the three other columns."""
+    a, b, c, d = (H[0], H[4], H[8], H[12]), (H[1], H[5], H[9], H[13]), (H[2], H[6], H[10], H[14]), (
+        H[3], H[7], H[11], H[15],
+    )  # fmt: skip
+    A, B, C, D = meet(b, c, d), meet(a, c, d), meet(a, b, d), meet(a, b, c)
+    A, B = scale(1.0 / dot(A, a), A), scale(1.0 / dot(B, b), B)
+    C, D = scale(1.0 / dot(C, c), C), scale(1.0 / dot(D, d), D)
+    return (
+        A[0], A[1], A[2], A[3], B[0], B[1], B[2], B[3],
+        C[0], C[1], C[2], C[3], D[0], D[1], D[2], D[3],
+    )  # fmt: skip
+
+
+@inline
 def dual_pencil(A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
     """Two orthonormal vectors dual to the line through A and A + D: [RH00] eq. (3).
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PlainSerializer, StrictBool, StrictInt, WithJsonSchema, WrapValidator
 
 from projservo_cli.records import VIEWS, InputError
+from projservo_cli.settings.features import Pair
 from projservo_cli.settings.sections import (
     ByView,
     Count,
@@ -145,6 +146,12 @@ class Goal(Section):
         None, description="small displacement of a goal that roll_deg gives, in the tool frame"
     )
     images: GoalImages | None = Field(None, description="pixels of the face at the goal")
+    incidences: Annotated[tuple[Pair, ...], Field(max_length=20)] = Field(
+        (),
+        description="pairs of a feature of the tool and one of the scene, [pin, hole] or "
+        "[pin, hole, parallel], perpendicular or an angle in deg, that are to meet; the rest of the pose is "
+        "free. Empty: the whole pose",
+    )
 
     def contradictions(self) -> Iterator[Finding]:
         """No goal, or several."""

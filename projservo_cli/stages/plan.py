@@ -11,12 +11,14 @@ from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, vec
 from projservo_cli.geometry.displacements import composed_angle
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
-from projservo_cli.geometry.kinematics import forward_kinematics, project
+from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.image_size import image_sizes
 from projservo_cli.loop.rehearsal import begin
 from projservo_cli.monitoring.accuracy import RigidFit, metric_points, rigid_fit
 from projservo_cli.monitoring.image_monitor import detected_fault
+from projservo_cli.planning.constraints import constraints_of
+from projservo_cli.planning.goal_sets import MET_PX, goals_meeting
 from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
@@ -47,6 +49,7 @@ from projservo_cli.stages.plan_summary import minimum_of, reason_of, search_summ
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.task.face import Task, center_of, face_plane
+from projservo_cli.task.incidences import errors_px, linearized
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import TaskImages
 from projservo_cli.task.visibility import (
@@ -124,11 +127,10 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "
             f"choose among {', '.join(map(str, sorted(known)))}"
         )
-    scenario, trajectory = scenario_of(inputs, calibration), inputs.trajectory
+    scenario = scenario_of(inputs, calibration)
     if not scenario.untested:
         _require_taught_since(scenario, calibration)
-    search = search_of(scenario) if trajectory.needs_covariance else None
-    plan = plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
+    plan = _to_any_goal(scenario) if inputs.incidences else plan_in(scenario)
     face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
     notes = [
         plan.reason,
@@ -137,6 +139,56 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
         "" if face is None else _uneven(face),
     ]
     return replace(plan, reason="; ".join(filter(None, notes)))
+
+
+def plan_in(scenario: Scenario) -> Plan:
+    """Plan the task of a scenario as its trajectory is asked for; raises as ``plan_task``."""
+    asked = scenario.inputs.trajectory
+    search = search_of(scenario) if asked.needs_covariance else None
+    return plan_task(scenario.model, scenario.ends, asked, scenario.demands, search)
+
+
+# Goals to which a motion is planned until one is feasible.
+_GOALS = 6
+
+
+def _to_any_goal(scenario: Scenario) -> Plan:
+    """Plan to the first of the goals of all incidences that a feasible motion reaches, else to the best one.
+
+    Raises WorkFailed where no joints meet all incidences, with those that fail, or no motion leads to a goal.
+    """
+    model, ends = scenario.model, scenario.ends
+    state, task, _, _ = _partitioned(model, ends, scenario.inputs.trajectory, scenario.demands.limits)
+    body = body_at_start(model, task, ends, state.A)
+    c = constraints_of(model, body, task, ends.q_start, scenario.demands)
+    seed = scenario.inputs.trajectory.search.seed
+    goals, nearest = goals_meeting(c, task.incidences, ends.q_start, scenario.goal_joints, seed)
+    names = tuple(one.name for one in ends.incidences)
+    if not len(goals):
+        left = errors_px(task.incidences, forward_kinematics(model, nearest))
+        told = ", ".join(f"{name} {px:.3g} px" for name, px in zip(names, left, strict=True) if px > MET_PX)
+        raise WorkFailed(
+            f"no joints within their limits meet all incidences; the nearest leave {told}: leave one out, or "
+            "teach the goal elsewhere"
+        )
+    plans, failures = [], []
+    for q in goals[:_GOALS]:
+        H = forward_kinematics(model, q)
+        s_goal = project(model.P, task.body.M @ H.T, model.lens)
+        chosen = replace(scenario, s_chosen=s_goal, goal_joints=q[None])
+        try:
+            plan = plan_in(chosen)
+        except WorkFailed as error:
+            failures.append(error)
+            continue
+        _, J = linearized(task.incidences, H, joint_operators(model, q))
+        free = len(q) - int(np.linalg.matrix_rank(J, 1e-6))
+        plans.append(replace(plan, incidences=names, free_dof=free, s_goal=s_goal))
+        if plan.feasible:
+            break
+    if not plans:
+        raise failures[0]
+    return plans[-1] if plans[-1].feasible else plans[0]
 
 
 def _borders(inputs: PlanInputs, view: Sequence[str]) -> str:

@@ -8,6 +8,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import chain
+from typing import Self
 
 import numpy as np
 
@@ -28,6 +30,7 @@ from projservo_cli.records import (
     InputError,
     IntArray,
     Model,
+    Plan,
     WorkFailed,
 )
 from projservo_cli.robots.client import weights
@@ -47,6 +50,7 @@ from projservo_cli.simulation.streams import (
 from projservo_cli.simulation.workspace import Truth, plant_of, turned
 from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body
+from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.target import TaskImages
 
 _GUESSED = 1e-3  # weight of a marker in a fit that is predicted from others
@@ -66,11 +70,16 @@ class Scenario:
     goal_joints: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 if unknown
     view: tuple[str, ...]  # names of the views
     noise_px: float  # of the images in the loop; at least the residual of a calibration of recorded ones
+    # (V, b, 2) images of the goal that was chosen among those of the incidences, px; None for the taught one
+    s_chosen: FloatArray | None
 
     @cached_property
     def ends(self) -> TaskImages:
         """Start and goal as the laws see them."""
-        return self.images_at(self.inputs.seed)
+        images = self.images_at(self.inputs.seed)
+        if self.s_chosen is None:
+            return images
+        return images._replace(s_star=self.s_chosen, s_taught=images.s_star)
 
     @property
     def truth(self) -> Truth | None:
@@ -101,6 +110,13 @@ class Scenario:
         if not self.calibration.has_covariance:
             return "the calibration has no covariance, which the method bundle_adjustment gives"
         return ""
+
+    def towards(self, plan: Plan) -> Self:
+        """Return the scenario with the goal that a plan chose among those of the incidences."""
+        if plan.s_goal is None:
+            return self
+        end = plan.q[-1:] if np.isfinite(plan.q[-1:]).all() else self.goal_joints[:0]
+        return replace(self, s_chosen=plan.s_goal, goal_joints=end)
 
     def images_for(self, law: str) -> TaskImages:
         """Start and goal as a law measures them: with the body, or point by point."""
@@ -338,7 +354,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
     else:
         assert calibration is not None
         exact, ends, q_goal = _predicted_ends(inputs, task, calibration, joints, (*face, *pins))
-    exact = exact._replace(body=body, view=view)
+    exact = exact._replace(body=body, view=view, incidences=_positions(inputs.incidences, (*face, *pins)))
     if len(view) != len(VIEWS):
         near = _joints_near_goal(exact, q_goal, calibration, (*face, *pins))
         exact = exact._replace(q_near=near)
@@ -353,8 +369,27 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
         goal_joints=np.empty((0, len(joints.types))) if q_goal is None else q_goal[None],
         noise_px=sigma_px,
         view=view,
+        s_chosen=None,
     )
     return replace(found, exact=exact._replace(least_views=found.least_views))
+
+
+def _positions(asked: Sequence[Incidence], numbers: Sequence[int]) -> tuple[Incidence, ...]:
+    """Incidences by positions in the body instead of numbers of markers.
+
+    Raises InputError for a marker that the body lacks.
+    """
+    found = []
+    for one in asked:
+        for number in chain.from_iterable((*one.tool, *one.scene)):
+            if number not in numbers:
+                raise InputError(
+                    f"task.goal.incidences: {one.name} needs marker {number}, and the body has "
+                    f"{', '.join(map(str, numbers))}: name these, or set control.features: body"
+                )
+        flats = [tuple(tuple(map(numbers.index, point)) for point in flat) for flat in (one.tool, one.scene)]
+        found.append(one._replace(tool=flats[0], scene=flats[1]))
+    return tuple(found)
 
 
 def _require_same_rig(inputs: PlanInputs, calibration: Calibration | None) -> None:

@@ -12,10 +12,12 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli import plugins
 from projservo_cli.control.law import ERRORS, LOST, MAX_PARTS, OK, TAU_AFFINE, THETA_S, Gains
-from projservo_cli.geometry.algebra import mat
+from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.geometry.kinematics import forward
+from projservo_cli.geometry.lens import undistort
 from projservo_cli.geometry.mechanisms import in_span
-from projservo_cli.laws import CODES, REGULATE, law_and_mode
+from projservo_cli.laws import CODES, INCIDENCES, REGULATE, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
@@ -49,8 +51,10 @@ from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
 from projservo_cli.stages.record import all_of
 from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.stage_inputs import ServoInputs
+from projservo_cli.task.body import SETTLED, fit_body, make_body
 from projservo_cli.task.face import Task, center_of
-from projservo_cli.task.target import followed
+from projservo_cli.task.incidences import errors_px, incidences_of, metric_motions, nearest_goal, whole_pose
+from projservo_cli.task.target import TaskImages, followed
 
 _NOT_DRIVEN: Any = None  # in place of what a run leaves
 
@@ -201,12 +205,26 @@ class LawRun:
         task, scale = scenario.images_for(self.law).task(model), scenario.servo.speed_scale
         return followed(model, task, plan, scenario.gains.period, scale)
 
+    def _images(self) -> TaskImages:
+        """Start and goal as the law measures them, with the whole pose for a law of incidences without any.
+
+        Raises InputError for such a law without a body.
+        """
+        images = self.scenario.images_for(self.law)
+        if self.law != INCIDENCES or images.incidences:
+            return images
+        if not len(images.body.M):
+            raise InputError(
+                f"{self.law} measures with the body: leave control.features: points out, and calibrate well"
+            )
+        return images._replace(incidences=whole_pose(images.body.M[: self.scenario.m]))
+
     def _built_in(self) -> BuiltInLaw:
         """The built-in law with the model that it is given, and the sense of its rotations."""
         scenario, plan = self.scenario, self.plan
         model = self.believed or scenario.believed_by(self.law)
         if self.replans:
-            task = scenario.images_for(self.law).task(model)
+            task = self._images().task(model)
         else:
             assert isinstance(plan, Plan)
             task = self._task(model, plan)
@@ -252,6 +270,37 @@ class LawRun:
         between = path_deviation(self.plant, self.log, self.steps, period, start, goal)
         return max(MM * between, self.summary.center_deviation_at_samples_mm)
 
+    def _incidences(self) -> dict[str, Any]:
+        """Names of the incidences, their errors at each time, px, and the freedoms that they leave."""
+        scenario, images = self.scenario, self.scenario.ends
+        if not images.incidences:
+            return {}
+        task, model = images.task(scenario.model), scenario.model
+        seen, normal, errors = undistort(model.lens, self.log.s), np.zeros((COORDINATES, COORDINATES + 1)), []
+        for k in range(self.steps + 1):
+            fit = fit_body(model.P, task.body, seen[k], forward(model, self.log.read[k]), SETTLED, normal)
+            none = np.full(len(images.incidences), math.nan)
+            errors.append(errors_px(task.incidences, as_array(fit.H)) if fit.settled else none)
+        return {
+            "incidences": tuple(one.name for one in images.incidences),
+            "incidence_px": np.array(errors),
+            "free_dof": self.plan.free_dof if isinstance(self.plan, Plan) else None,
+        }
+
+    def _goal_pose(self) -> FloatArray:
+        """True pose (4, 4) of the tool at the goal, of incidences the nearest one, m; NaN if unknown."""
+        scenario, (base_tool, taught, _) = self.scenario, self.scenario.true_ends
+        if not scenario.exact.incidences or scenario.truth is None or not np.isfinite(taught).all():
+            return taught
+        model, on_tool = scenario.truth.model, self.plant.model.on_tool
+        H_taught = taught @ np.linalg.inv(base_tool)
+        body = make_body(model, scenario.truth.of(scenario.numbers))
+        rows = incidences_of(
+            model, body, np.linalg.inv(H_taught) if on_tool else H_taught, scenario.exact.incidences
+        )
+        goal = nearest_goal(rows, body, self.log.H[self.steps], metric_motions)
+        return np.asarray((np.linalg.inv(goal) if on_tool else goal) @ base_tool)
+
     def trace(self) -> Trace:
         """Record of the run."""
         scenario, log, steps = self.scenario, self.log, self.steps
@@ -274,7 +323,9 @@ class LawRun:
             read = _whole(driven.readings, rows)
         values = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
         moved = np.linalg.inv(H) if self.plant.model.on_tool else H
-        pose, goal_pose = moved @ scenario.true_ends.base_tool, scenario.true_ends.goal_pose
+        pose, goal_pose = moved @ scenario.true_ends.base_tool, self._goal_pose()
+        if scenario.exact.incidences and simulated:
+            values |= _apart_from(pose[-1], goal_pose, self.plant, scenario.true_ends.base_tool)
         if driven is not None and driven.truths and not simulated:
             pose, goal_pose = _reported_poses(scenario, _whole(driven.truths, rows))
             values["position_error_mm"] = MM * float(np.linalg.norm(goal_pose[:3, 3] - pose[-1, :3, 3]))
@@ -321,6 +372,7 @@ class LawRun:
             goal_pose=goal_pose,
             center=center if simulated else np.full_like(center, np.nan),
             unplanned=self.unplanned,
+            **self._incidences(),
             **_stated_mm(self, views),
             untested="; ".join(filter(None, (untested, self.unseen or lost))),
             overruns=None if driven is None else driven.steered.overruns,
@@ -339,6 +391,18 @@ def _whole(values: Sequence[FloatArray], rows: int) -> FloatArray:
     """Return the values at each time of a run, (rows, ...); NaN after its end."""
     missing = np.full_like(values[0], np.nan)
     return np.array([*values, *[missing] * (rows - len(values))])
+
+
+def _apart_from(
+    pose: FloatArray, goal_pose: FloatArray, plant: Plant, base_tool: FloatArray
+) -> dict[str, float]:
+    """Errors of a pose (4, 4), m, from that of the goal: of the face's centre, or of the tool's origin."""
+    middle = np.array(center_of(plant.M, plant.center))
+    point = np.eye(4)[3] if plant.model.on_tool else np.linalg.solve(base_tool, middle)
+    return {
+        "position_error_mm": MM * float(np.linalg.norm((goal_pose - pose) @ point)),
+        "rotation_error_deg": math.degrees(angle_between(mat(pose), mat(goal_pose))),
+    }
 
 
 def _reported_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -372,6 +436,8 @@ def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
     Nothing if no length on the face is known, or images disagree with the calibration.
     """
     scenario, calibration, m = run.scenario, run.scenario.calibration, run.scenario.m
+    if scenario.exact.incidences:  # from one goal of many
+        return {}
     noise = [_LEAST_NOISE_PX, scenario.noise_px, 0.0 if calibration is None else calibration.sigma_px]
     left = _rms(run.log.fit[run.steps, 1:2], 2.0 * views[-1:] - COORDINATES)[0]
     untested = run.driven is not None and scenario.untested
@@ -506,7 +572,7 @@ def run(inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, **
     follow has no time; WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
     ``refuses`` is set.
     """
-    scenario = run_scenario(inputs, calibration)
+    scenario = run_scenario(inputs, calibration).towards(plan)
     _require_its_task(scenario, plan)
     return drive(scenario, plan, name, **brought).trace()
 
@@ -562,7 +628,7 @@ def _in_compiled_loop(inputs: ServoInputs, law: str) -> bool:
 def sense_is_enough(inputs: ServoInputs, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
-    return mode == REGULATE and _in_compiled_loop(inputs, law)
+    return mode == REGULATE and _in_compiled_loop(inputs, law) and not inputs.plan.incidences
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,6 +21,7 @@ from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.workspace import Truth
+from projservo_cli.task.incidences import Incidence
 
 
 class OwnRobot(NamedTuple):
@@ -208,6 +209,8 @@ class PlanInputs:
     features: str | None  # points, body, or None for body where the calibration is usable
     tests_images: bool  # whether images are tested against the calibration
     trajectory: Trajectory
+    # that are to hold at the goal, by numbers of markers; none for the pose
+    incidences: tuple[Incidence, ...] = ()
     # Width and height to which recorded images reach at least, px, where their size is not known.
     seen_px: ImageSize | None = None
 

@@ -12,6 +12,7 @@ from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, points_into
 from projservo_cli.records import VIEWS, FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
+from projservo_cli.task.incidences import NO_INCIDENCES, Incidences
 from projservo_cli.task.trajectory import NO_REFERENCE, Reference
 
 # Index of the centre if it is the mean of all markers.
@@ -81,6 +82,8 @@ class Task(NamedTuple):
     least_views: int  # number of views that are to see the face
     body: Body = NO_BODY  # all markers of the body, to measure the face with; none for point by point
     reference: Reference = NO_REFERENCE  # plan to follow; none to regulate to the goal
+    H_star: FloatArray = np.eye(4)  # displacement of the body at the goal, if there is one
+    incidences: Incidences = NO_INCIDENCES  # that are to hold at the goal; none for the pose
 
 
 @njit
@@ -267,4 +270,5 @@ def new_task(
         O=optical_centers(model.P, model.a_inf),
         visible=np.zeros(len(model.P)),
         least_views=least_views or len(model.P),
+        H_star=np.eye(4),
     )

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import mul
+from projservo_cli.geometry.algebra import mat_into, mul
 from projservo_cli.geometry.displacements import translation
 from projservo_cli.geometry.jit import inline
 from projservo_cli.geometry.kernels import COORDINATES
@@ -22,12 +22,15 @@ from projservo_cli.task.face import (
     UNSEEN_GOAL,
     UNSEEN_START,
     Task,
+    center_of,
+    face_plane,
     new_task,
     order_into,
     require_found,
     sides_into,
     task_into,
 )
+from projservo_cli.task.incidences import Incidence, Incidences, incidences_of, weighted
 from projservo_cli.task.partition import Split, partition
 from projservo_cli.task.trajectory import Reference, both_rotations, trajectory_displacement
 
@@ -54,6 +57,9 @@ class TaskImages(NamedTuple):
     least_views: int = 0  # number of views that are to see the face, 0 for all
     # (n,) joints near those of the goal, rad or m, which predict its pose where no pair of views shows it
     q_near: FloatArray = np.zeros(0)
+    incidences: tuple[Incidence, ...] = ()  # that are to hold at the goal, by positions in the body
+    # (V, b, 2) images of the goal as it was taught, px, where that of the incidences is another
+    s_taught: FloatArray | None = None
 
     @property
     def pair(self) -> IntArray:
@@ -91,7 +97,19 @@ class TaskImages(NamedTuple):
             normal = np.zeros((COORDINATES, COORDINATES + 1))
             ends = self.q_start, self.q_near
             require_found(*body_task_into(model, ends, images, task, split, normal), self.view)
+            if self.incidences:
+                return task._replace(incidences=self._rows(model, task))
         return task
+
+    def _rows(self, model: Model, task: Task) -> Incidences:
+        """Rows of the incidences by a task to the goal, or to one that was taught elsewhere."""
+        taught = task
+        if self.s_taught is not None:
+            taught = self._replace(s_star=self.s_taught, s_taught=None, incidences=()).task(model)
+        rows = incidences_of(model, task.body, taught.H_star, self.incidences)
+        A = np.ascontiguousarray(task.body.M[: len(task.A_star)])
+        face = np.array(face_plane(A, task.order, center_of(A, task.center)))
+        return weighted(rows, model, task.body, task.H_star, task.body.in_goal, face)
 
 
 @inline
@@ -134,6 +152,7 @@ def body_task_into(
     if not fit.settled:
         return MISFIT_GOAL if fit.found else UNSEEN_GOAL, fit.views
     carry(task.body, fit.H, task.A_star)
+    mat_into(task.H_star, fit.H)
     if task.pair.shape[0] == 0 and not order_into(task.A_star, task.order, split.work.system.rhs):
         return ONE_LINE, 0
     for view in range(goal.shape[0]):

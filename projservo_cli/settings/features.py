@@ -1,0 +1,94 @@
+"""Points, lines and planes that incidences of a goal name."""
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Literal
+
+from pydantic import Field, StringConstraints
+
+from projservo_cli.settings.sections import Finding, Number, Section, Whole
+from projservo_cli.task.incidences import ANGLE, KINDS, MEET, PARALLEL, PERPENDICULAR, Incidence
+
+Name = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
+_Markers = Annotated[tuple[Whole, ...], Field(min_length=1, max_length=100)]
+_TOOL, _SCENE = "tool", "scene"
+
+
+class Feature(Section):
+    """A point, line or plane of the tool through its markers, or of the scene where that of the tool was."""
+
+    on: Literal["tool", "scene"] = Field(description="what the feature moves with; the scene stands still")
+    point: _Markers | Name | None = Field(
+        None,
+        description="numbers of markers, whose middle it is; of the scene the point of the tool that was "
+        "there when the goal was taught",
+    )
+    line: Annotated[tuple[Whole, ...], Field(min_length=2, max_length=2)] | Name | None = Field(
+        None, description="numbers of two markers, in the sense of the line; or as for a point"
+    )
+    plane: Annotated[tuple[Whole, ...], Field(min_length=3, max_length=3)] | Name | None = Field(
+        None, description="numbers of three markers, in the sense of the plane; or as for a point"
+    )
+
+    def contradictions(self) -> Iterator[Finding]:
+        """No kind or several, markers of the scene, and a tool that names another feature."""
+        kinds = self.given(*KINDS)
+        if len(kinds) != 1:
+            yield (), f"give exactly one of {', '.join(KINDS)}"
+            return
+        if self.on == _TOOL and isinstance(self.source, str):
+            yield (kinds[0],), "of the tool are numbers of its markers; a name stands for one of the scene"
+        if self.on == _SCENE and not isinstance(self.source, str):
+            yield (
+                (kinds[0],),
+                "of the scene is the name of a feature of the tool that was there when taught",
+            )
+        if isinstance(self.source, tuple) and len(set(self.source)) < len(self.source):
+            yield (kinds[0],), "a marker stands here twice"
+
+    @property
+    def kind(self) -> str:
+        """Return whether it is a point, a line or a plane."""
+        return self.given(*KINDS)[0]
+
+    @property
+    def source(self) -> tuple[int, ...] | str:
+        """Numbers of markers, or the name of the feature of the tool that it coincided with."""
+        source: tuple[int, ...] | str = getattr(self, self.kind)
+        return source
+
+    def flat(self, features: Mapping[str, "Feature"]) -> tuple[tuple[int, ...], ...]:
+        """Numbers of the markers of each point that spans it, of its own or of the feature that it names."""
+        if isinstance(self.source, str):
+            return features[self.source].flat(features)
+        return (self.source,) if self.kind == KINDS[0] else tuple((number,) for number in self.source)
+
+
+_Relation = Literal["meet", "parallel", "perpendicular"] | Annotated[Number, Field(gt=0, lt=180)]
+Pair = tuple[Name, Name] | tuple[Name, Name, _Relation]  # of the tool and of the scene, meet if not said
+
+
+def title_of(pair: Pair) -> str:
+    """Return a pair as messages and figures write it."""
+    relation = pair[2] if len(pair) == 3 else MEET
+    between = {MEET: "on", PARALLEL: "parallel to", PERPENDICULAR: "perpendicular to"}
+    return f"{pair[0]} {between.get(str(relation), f'at {relation} deg to')} {pair[1]}"
+
+
+def incidence_of(pair: Pair, features: Mapping[str, Feature]) -> Incidence:
+    """Return a pair with the numbers of its markers."""
+    relation = pair[2] if len(pair) == 3 else MEET
+    flats = (features[name].flat(features) for name in pair[:2])
+    if isinstance(relation, str):
+        return Incidence(title_of(pair), *flats, relation)
+    return Incidence(title_of(pair), *flats, ANGLE, float(relation))
+
+
+def misplaced(pair: Pair, features: Mapping[str, Feature]) -> Iterator[str]:
+    """Yield the reasons why a pair is no incidence of these features."""
+    for name, on in zip(pair[:2], (_TOOL, _SCENE), strict=True):
+        if name not in features:
+            yield f"there is no feature {name}; features: {', '.join(features) or 'none'}"
+        elif features[name].on != on:
+            yield f"{name} is on the {features[name].on}: name a feature of the tool, then one of the scene"
+        elif len(pair) == 3 and pair[2] != MEET and features[name].given(*KINDS) == [KINDS[0]]:
+            yield f"{name} is a point, which has no direction: leave {pair[2]} out, or name lines and planes"

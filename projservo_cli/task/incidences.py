@@ -1,0 +1,416 @@
+"""Tasks as lists of incidences: points, lines and planes of the tool that lie on those of the scene.
+
+Everything is made of a point A and a plane b, a_inf·A = 1: e = bᵀA, with the row [bᵀĤ_1 A, ..., bᵀĤ_n A] of
+the interaction. Points at infinity are directions, and make lines and planes parallel; with the metric form
+that the joints preserve, perpendicular or inclined. The joint motion of J⁺e does not depend on scale, choice
+of planes or projective frame where J has full row rank.
+
+Errors e have no unit. They are weighted by the images of the body at the goal, so that their norm is the
+least motion of its images that meets them; for a pose of six rows it is the image error itself.
+
+Source: J. Hespanha, Z. Dodds, G. Hager, A. Morse, "What tasks can be performed with an uncalibrated stereo
+vision system?", International Journal of Computer Vision 35, 1999, for what can be decided.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import null_space, qr
+
+from projservo_cli.geometry.algebra import Mat4, apply, apply_transposed, as_array, dot, mat, meet, vec
+from projservo_cli.geometry.displacements import twist_exponential
+from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.geometry.kinematics import image_jacobian
+from projservo_cli.metric.frame import invariant_upgrade
+from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Model, WorkFailed
+from projservo_cli.task.body import Body
+
+MEET, PARALLEL, PERPENDICULAR, ANGLE = "meet", "parallel", "perpendicular", "angle"
+KINDS = ("point", "line", "plane")  # by the number of points that span one
+# Variance of a combination of errors, of unit variance each, below which it depends on the others.
+_DEPENDENT = 1e-9
+# Newton steps to a displacement at which all incidences hold: how many, the largest turn of one, rad, and the
+# last, over unit motions; singular value over the largest that counts as zero.
+_STEPS, _STRIDE, _SETTLED, _SINGULAR = 50, 0.5, 1e-12, 1e-9
+
+# Measure (p, 6) of motions (6, 4, 4) of points (m, 4).
+Moved = Callable[[FloatArray, FloatArray], FloatArray]
+Flat = tuple[tuple[int, ...], ...]  # positions of markers in the body; a point is the middle of some
+
+
+class Incidence(NamedTuple):
+    """A feature of the tool and one of the scene that belong together when the task is done."""
+
+    name: str  # as messages and figures write it
+    tool: Flat  # one, two or three points that span it
+    # the feature of the tool where the goal was taught, which spans it there; or points (k, 4) of the scene
+    scene: Flat | FloatArray
+    relation: str = MEET
+    angle_deg: float = math.nan  # between both, for ``ANGLE``
+
+
+class Incidences(NamedTuple):
+    """Rows of all incidences, in the frame of a model; a row is of a point and a plane."""
+
+    tool: FloatArray  # (r, 4) points of the tool at the reference; planes of it where the sense is −1
+    scene: FloatArray  # (r, 4) planes of the scene; points of it where the sense is −1
+    sense: FloatArray  # (r,) 1 or −1
+    offset: FloatArray  # (r,) of e = bᵀA − offset
+    group: IntArray  # (r,) number of the incidence
+    # (w, r) from errors e to independent ones, in px at one pixel of noise; w is the rank
+    weight: FloatArray
+    # (v, r), (v,) the same of each incidence by itself, and its number
+    own_weight: FloatArray
+    own_group: IntArray
+    views: FloatArray  # (1,) markers of the body at the goal, once a view
+    # (g, 4), (g, 4) directions or planes of the tool at the reference and of the scene that have one sense
+    tool_sense: FloatArray
+    scene_sense: FloatArray
+    is_plane: BoolArray  # (g,) whether they are planes
+    turn_px: FloatArray  # (g,) error of half a turn, px
+    a: FloatArray  # (4,) plane of the face at the reference
+    shown: FloatArray  # (V,) a·O at the goal, in the frame of the body
+
+
+NO_INCIDENCES = Incidences(
+    tool=np.zeros((0, 4)),
+    scene=np.zeros((0, 4)),
+    sense=np.zeros(0),
+    offset=np.zeros(0),
+    group=np.zeros(0, dtype=np.int64),
+    weight=np.zeros((0, 0)),
+    own_weight=np.zeros((0, 0)),
+    own_group=np.zeros(0, dtype=np.int64),
+    views=np.zeros(1),
+    tool_sense=np.zeros((0, 4)),
+    scene_sense=np.zeros((0, 4)),
+    is_plane=np.zeros(0, dtype=np.bool_),
+    turn_px=np.zeros(0),
+    a=np.zeros(4),
+    shown=np.zeros(0),
+)
+
+
+@merged
+def error_of(incidences: Incidences, i: int, H: Mat4, H_back: Mat4) -> float:
+    """Error e = bᵀA − offset of row i at the displacement H of the body, whose inverse is H_back."""
+    if incidences.sense[i] > 0.0:
+        A, b = apply(H, vec(incidences.tool[i])), vec(incidences.scene[i])
+    else:
+        A, b = apply(H_back, vec(incidences.scene[i])), vec(incidences.tool[i])
+    return dot(b, A) - float(incidences.offset[i])
+
+
+@merged
+def rate_of(incidences: Incidences, i: int, H: Mat4, H_back: Mat4, H_hat: Mat4) -> float:
+    """Derivative of the error of row i by the amplitude of an operator Ĥ of the body at H: ±bᵀĤA."""
+    if incidences.sense[i] > 0.0:
+        return dot(vec(incidences.scene[i]), apply(H_hat, apply(H, vec(incidences.tool[i]))))
+    moved = apply(H_back, apply(H_hat, vec(incidences.scene[i])))
+    return -dot(vec(incidences.tool[i]), moved)
+
+
+@njit
+def image_error(incidences: Incidences, H: Mat4, H_back: Mat4) -> float:
+    """Least motion of the images of the body that meets all incidences, px rms per marker and view.
+
+    To first order; of a feature that points the other way, as much more as half a turn moves them.
+    """
+    total = 0.0
+    for k in range(incidences.weight.shape[0]):
+        error = 0.0
+        for i in range(incidences.weight.shape[1]):
+            error += incidences.weight[k, i] * error_of(incidences, i, H, H_back)
+        total += error * error
+    for k in range(incidences.turn_px.shape[0]):
+        if incidences.is_plane[k]:
+            moved = apply_transposed(H_back, vec(incidences.tool_sense[k]))
+        else:
+            moved = apply(H, vec(incidences.tool_sense[k]))
+        if dot(moved, vec(incidences.scene_sense[k])) < 0.0:
+            total += incidences.turn_px[k] * incidences.turn_px[k]
+    return math.sqrt(total / incidences.views[0])
+
+
+@njit
+def linearize_into(
+    incidences: Incidences, H: Mat4, H_back: Mat4, H_hat: FloatArray, e: FloatArray, J: FloatArray
+) -> None:
+    """Write the weighted errors (w,) at the displacement H of the body, and their derivatives (w, k).
+
+    H_back : inverse of H; H_hat : (k, 4, 4) operators of the body at H, by whose amplitudes.
+    """
+    e[:] = 0.0
+    J[:] = 0.0
+    for i in range(incidences.weight.shape[1]):
+        error = error_of(incidences, i, H, H_back)
+        for k in range(e.shape[0]):
+            e[k] += incidences.weight[k, i] * error
+        for j in range(H_hat.shape[0]):
+            rate = rate_of(incidences, i, H, H_back, mat(H_hat[j]))
+            for k in range(e.shape[0]):
+                J[k, j] += incidences.weight[k, i] * rate
+
+
+def linearized(incidences: Incidences, H: FloatArray, H_hat: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weighted errors (w,) at H (4, 4), and their derivatives (w, k) by operators (k, 4, 4) of the body."""
+    rank = len(incidences.weight)
+    e, J = np.zeros(rank), np.zeros((rank, len(H_hat)))
+    linearize_into(incidences, mat(H), mat(np.linalg.inv(H)), np.ascontiguousarray(H_hat), e, J)
+    return e, J
+
+
+def points_of(M: FloatArray, flat: Flat) -> FloatArray:
+    """Points (k, 4), a_inf·A = 1, that span a feature of markers (m, 4) of the body."""
+    return np.array([M[list(numbers)].mean(axis=0) for numbers in flat])
+
+
+def whole_pose(A: FloatArray) -> tuple[Incidence, ...]:
+    """Return the incidences of a pose: three points of the face (m, 4), far apart, each where it was."""
+    far = qr(A.T, mode="r", pivoting=True)[1][:3]
+    return tuple(Incidence("pose", ((int(k),),), ((int(k),),)) for k in far)
+
+
+class _Metric:
+    """Directions and normals in the metric that the joints preserve; S takes points to metric ones."""
+
+    def __init__(self, model: Model, name: str) -> None:
+        try:
+            S = invariant_upgrade(model.H_hat_0, model.prismatic)
+        except InputError as error:
+            why = str(error).removeprefix("metric: ")
+            raise InputError(
+                f"incidence {name}: angles need the metric form that the joints preserve, and {why}; "
+                "take meet or parallel"
+            ) from error
+        self._S, self._back = S, np.linalg.inv(S)
+
+    def unit(self, D: FloatArray) -> FloatArray:
+        """Direction (4,) of unit length."""
+        return np.asarray(D / np.linalg.norm(self._S[:3] @ D))
+
+    def normal(self, plane: FloatArray) -> FloatArray:
+        """Unit direction (4,) of the normal of a plane (4,)."""
+        return self.unit(self._back @ np.append((plane @ self._back)[:3], 0.0))
+
+    def along(self, D: FloatArray) -> FloatArray:
+        """Plane (4,) whose product with a direction is that of both directions."""
+        return np.asarray(self._S[:3].T @ (self._S[:3] @ D))
+
+
+def _plane(points: FloatArray) -> FloatArray:
+    """Plane (4,) through three points (3, 4), of unit norm."""
+    A, B, C = (vec(row) for row in points)
+    plane = np.array(meet(A, B, C))
+    return np.asarray(plane / np.linalg.norm(plane))
+
+
+def _directions(points: FloatArray) -> FloatArray:
+    """Directions (k − 1, 4) that span those of a line or plane through points (k, 4)."""
+    return np.asarray(points[1:] - points[0])
+
+
+Row = tuple[FloatArray, FloatArray, float, float]  # of the tool, of the scene, sense, offset
+
+
+def _incident(tool: FloatArray, scene: FloatArray, dual_of: FloatArray, own_dual: FloatArray) -> list[Row]:
+    """Rows that put the points (k, 4) of the smaller feature on the planes that hold the other.
+
+    dual_of, own_dual : points that span the feature of the scene and that of the tool.
+    """
+    if len(tool) <= len(scene):
+        return [(A, b, 1.0, 0.0) for A in tool for b in null_space(dual_of).T]
+    return [(b, A, -1.0, 0.0) for A in scene for b in null_space(own_dual).T]
+
+
+def _rows(one: Incidence, model: Model, tool: FloatArray, scene: FloatArray) -> list[Row]:
+    """Rows of an incidence between features that points (k, 4) at the reference and (l, 4) span."""
+    if one.relation == MEET:
+        return _incident(tool, scene, scene, tool)
+    if one.relation == PARALLEL:
+        return _incident(_directions(tool), _directions(scene), scene, tool)
+    metric, t, s = _Metric(model, one.name), _directions(tool), _directions(scene)
+    if one.relation == PERPENDICULAR:
+        if len(t) == len(s) == 2:  # the normal of one plane is a direction of the other
+            return [(metric.normal(_plane(tool)), _plane(scene), 1.0, 0.0)]
+        return [(D, metric.along(direction), 1.0, 0.0) for D in t for direction in s]
+    axes = [
+        metric.unit(D[0]) if len(D) == 1 else metric.normal(_plane(points))
+        for D, points in ((t, tool), (s, scene))
+    ]
+    angle = math.radians(one.angle_deg)
+    product = math.cos(angle) if len(t) == len(s) else math.sin(angle)
+    return [(axes[0], metric.along(axes[1]), 1.0, product)]
+
+
+def _has_sense(one: Incidence, tool: FloatArray, scene: FloatArray) -> bool:
+    """Whether both point the same way: lines or planes that meet or are parallel."""
+    return one.relation in (MEET, PARALLEL) and len(tool) == len(scene) > 1
+
+
+def incidences_of(model: Model, body: Body, H_taught: FloatArray, asked: Sequence[Incidence]) -> Incidences:
+    """Rows of incidences, in the frame of a model, not weighted yet.
+
+    H_taught : (4, 4) displacement of the body where the goal was taught.
+    Raises InputError for angles whose metric the joints leave open, WorkFailed for points that span no line
+    or plane.
+    """
+    rows: list[Row] = []
+    group: list[int] = []
+    senses: list[tuple[FloatArray, FloatArray, bool]] = []
+    for k, one in enumerate(asked):
+        tool = points_of(body.M, one.tool)
+        own = not isinstance(one.scene, np.ndarray)
+        scene = points_of(body.M, one.scene) @ H_taught.T if own else np.asarray(one.scene)
+        for points in (tool, scene):
+            if np.linalg.matrix_rank(points / np.linalg.norm(points, axis=1)[:, None], 1e-6) < len(points):
+                raise WorkFailed(
+                    f"incidence {one.name}: its points span no {KINDS[len(points) - 1]}: name others"
+                )
+        found = _rows(one, model, tool, scene)
+        rows += found
+        group += [k] * len(found)
+        if _has_sense(one, tool, scene):
+            plane = len(tool) == 3
+            senses.append(
+                (_plane(tool), _plane(scene), True)
+                if plane
+                else (_directions(tool)[0], _directions(scene)[0], False)
+            )
+    tool_rows, scene_rows, sense, offset = (np.array(column) for column in zip(*rows, strict=True))
+    return NO_INCIDENCES._replace(
+        tool=np.ascontiguousarray(tool_rows),
+        scene=np.ascontiguousarray(scene_rows),
+        sense=sense,
+        offset=offset,
+        group=np.array(group, dtype=np.int64),
+        tool_sense=np.array([A for A, _, _ in senses]).reshape(-1, 4),
+        scene_sense=np.array([b for _, b, _ in senses]).reshape(-1, 4),
+        is_plane=np.array([flat for _, _, flat in senses], dtype=np.bool_),
+        turn_px=np.zeros(len(senses)),
+    )
+
+
+def unweighted(incidences: Incidences) -> Incidences:
+    """Return the rows with errors of their own scale."""
+    return incidences._replace(weight=np.eye(len(incidences.sense)))
+
+
+def _motions(body: Body, H: FloatArray) -> FloatArray:
+    """Operators (6, 4, 4) at H (4, 4) of three translations and three rotations about the body's middle."""
+    shifts = body.D[:, :, None] * body.a_inf
+    return np.asarray(H @ np.concatenate([shifts, body.H_hat]) @ np.linalg.inv(H))
+
+
+def image_motions(model: Model, shows: BoolArray) -> Moved:
+    """Return the images (p, 6) of shown markers (V, m) by motions of a body, px, to measure these by."""
+
+    def moved(M: FloatArray, motions: FloatArray) -> FloatArray:
+        return image_jacobian(model.P, M, motions)[shows].reshape(-1, COORDINATES)
+
+    return moved
+
+
+def metric_motions(M: FloatArray, motions: FloatArray) -> FloatArray:
+    """Return the velocities (3 m, 6) of metric points (m, 4) by motions (6, 4, 4), to measure these by."""
+    return np.asarray(np.einsum("kab,mb->mak", motions, M)[:, :3].reshape(-1, COORDINATES))
+
+
+def weighted(
+    incidences: Incidences, model: Model, body: Body, H: FloatArray, shows: BoolArray, a: FloatArray
+) -> Incidences:
+    """Weigh the rows by the images of the body at a goal, and count which of them are independent.
+
+    H : (4, 4) displacement of the body at the goal; shows : (V, m) markers that images show there.
+    a : (4,) plane of the face at the reference.
+    Raises WorkFailed where the images do not determine the body, or no incidence changes with its motion.
+    """
+    motions = _motions(body, H)
+    J = image_motions(model, shows)(body.M @ H.T, motions)
+    _, B = linearized(unweighted(incidences), H, motions)
+    if np.linalg.matrix_rank(J) < COORDINATES:
+        raise WorkFailed("the images at the goal do not determine the pose of the body: show more markers")
+    half = B @ np.linalg.pinv(J)
+    sigma = np.linalg.norm(half, axis=1)
+    if not (sigma > 0.0).all():
+        raise WorkFailed("an incidence does not change with the motion of the tool: leave it out")
+    groups = range(int(incidences.group.max()) + 1)
+    own = [_independent(half, sigma, incidences.group == k) for k in groups]
+    back = np.linalg.inv(H)
+    O = np.array([null_space(P)[:, 0] for P in model.P])
+    O /= (O @ model.a_inf)[:, None]
+    turn_px = np.array(
+        [_turn_px(incidences, k, H, motions[3:], J[:, 3:]) for k in range(len(incidences.turn_px))]
+    )
+    return incidences._replace(
+        weight=_independent(half, sigma, incidences.group >= 0),
+        own_weight=np.concatenate(own),
+        own_group=np.repeat(groups, [len(weight) for weight in own]),
+        views=np.array([float(shows.sum())]),
+        turn_px=turn_px,
+        a=np.ascontiguousarray(a),
+        shown=(O @ back.T) @ a,
+    )
+
+
+def _independent(half: FloatArray, sigma: FloatArray, which: BoolArray) -> FloatArray:
+    """Weights (w, r) that make independent errors of unit variance of those of some rows.
+
+    half : (r, p) errors by pixels, whose product with its transpose is their covariance; sigma : (r,) their
+        deviations.
+    """
+    U, s, _ = np.linalg.svd((half / sigma[:, None])[which], full_matrices=False)
+    kept = s**2 > _DEPENDENT * s[0] ** 2
+    weight = np.zeros((int(kept.sum()), len(sigma)))
+    weight[:, which] = (U[:, kept] / s[kept]).T / sigma[which]
+    return weight
+
+
+def _turn_px(incidences: Incidences, k: int, H: FloatArray, turns: FloatArray, J: FloatArray) -> float:
+    """Motion of all images, px, by half a turn of a direction or plane: as far as to first order.
+
+    turns : operators (3, 4, 4) of rotations per rad; J : (2 k, 3) images by them.
+    """
+    moved = incidences.tool_sense[k] @ (np.linalg.inv(H) if incidences.is_plane[k] else H.T)
+    rates = turns @ moved if not incidences.is_plane[k] else -np.einsum("a,rab->rb", moved, turns)
+    across = np.linalg.svd(rates.T)[2][:2]  # the turns that move it most
+    return math.pi * float(np.sqrt(np.mean(np.sum((J @ across.T) ** 2, axis=0))))
+
+
+def nearest_goal(incidences: Incidences, body: Body, H: FloatArray, moved: Moved) -> FloatArray:
+    """Displacement (4, 4) near H at which all incidences hold, by Gauss and Newton.
+
+    moved : measures motions of the body; each step is the least of those that meet the incidences.
+    Incidences that contradict each other leave an error, as of ``image_error``.
+    """
+    rows = incidences if len(incidences.weight) else unweighted(incidences)
+    for _ in range(_STEPS):
+        motions = _motions(body, H)
+        J = moved(body.M @ H.T, motions)
+        back = np.linalg.pinv(J)
+        e, B = linearized(rows, H, motions)
+        step = -back @ np.linalg.lstsq(B @ back, e, rcond=_SINGULAR)[0]
+        turn = float(np.linalg.norm(step[3:]))
+        step *= min(1.0, _STRIDE / turn) if turn > 0.0 else 1.0
+        H = as_array(twist_exponential(mat(np.tensordot(step, motions, 1)))) @ H
+        if np.linalg.norm(J @ step) <= _SETTLED * np.linalg.norm(J):
+            break
+    return H
+
+
+def image_error_at(incidences: Incidences, H: FloatArray) -> float:
+    """Error of ``image_error`` at the displacement H (4, 4), px."""
+    return float(image_error(incidences, mat(H), mat(np.linalg.inv(H))))
+
+
+def errors_px(incidences: Incidences, H: FloatArray) -> FloatArray:
+    """Error (g,) of each incidence at H (4, 4) over its deviation at one pixel of noise, px.
+
+    The root of the mean square over its independent rows.
+    """
+    squares = linearized(incidences._replace(weight=incidences.own_weight), H, np.zeros((0, 4, 4)))[0] ** 2
+    count = np.bincount(incidences.own_group)
+    return np.asarray(np.sqrt(np.bincount(incidences.own_group, squares) / count))

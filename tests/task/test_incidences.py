@@ -1,0 +1,140 @@
+"""Incidences: what each kind leaves free, in any projective frame, and what pixels it takes."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from projservo_cli.control import command
+from projservo_cli.control.law import OK, Gains, Law, new_state
+from projservo_cli.laws import CODES
+from projservo_cli.records import InputError
+from projservo_cli.task.body import make_body
+from projservo_cli.task.incidences import (
+    ANGLE,
+    MEET,
+    PARALLEL,
+    PERPENDICULAR,
+    Incidence,
+    errors_px,
+    image_error_at,
+    image_motions,
+    incidences_of,
+    nearest_goal,
+    weighted,
+)
+from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
+from tests.samples import arm, displacement, face, frame, hat, in_frame, pixels, poe
+from tests.task.cases import make_task
+
+# Markers 4 to 7 are the corner of a box, and along its edges.
+POINT, LINE, PLANE = ((4,),), ((4,), (5,)), ((4,), (5,), (6,))
+ACROSS, WALL, SLANT = ((4,), (7,)), ((4,), (5,), (7,)), ((5,), (6,))
+# Two features, their relation, and the freedoms that it takes, counted by hand.
+KINDS = [
+    (POINT, POINT, MEET, 3),
+    (POINT, LINE, MEET, 2),
+    (POINT, PLANE, MEET, 1),
+    (LINE, POINT, MEET, 2),
+    (LINE, LINE, MEET, 4),
+    (LINE, PLANE, MEET, 2),
+    (PLANE, POINT, MEET, 1),
+    (PLANE, LINE, MEET, 2),
+    (PLANE, PLANE, MEET, 3),
+    (LINE, LINE, PARALLEL, 2),
+    (LINE, PLANE, PARALLEL, 1),
+    (PLANE, LINE, PARALLEL, 1),
+    (PLANE, PLANE, PARALLEL, 2),
+    (LINE, ACROSS, PERPENDICULAR, 1),
+    (ACROSS, PLANE, PERPENDICULAR, 2),
+    (PLANE, ACROSS, PERPENDICULAR, 2),
+    (PLANE, WALL, PERPENDICULAR, 1),
+    (LINE, ACROSS, ANGLE, 1),
+    (SLANT, WALL, ANGLE, 1),
+    (PLANE, WALL, ANGLE, 1),
+]
+ANGLE_DEG = 60.0  # 15° to 30° from that of the features
+GAINS = Gains(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.9)  # every step is one of Newton
+
+
+def random_arm(generator):
+    """An arm like that of the samples, with axes and markers moved at random."""
+    model = arm()
+    moved = [
+        np.linalg.multi_dot([g := expm(hat(*0.1 * generator.normal(size=(2, 3)))), H, np.linalg.inv(g)])
+        for H in model.H_hat_0
+    ]
+    box = 0.08 * np.vstack([np.zeros(3), np.eye(3)]) + 0.003 * generator.normal(size=(4, 3))
+    pins = np.c_[box, np.ones(4)] @ displacement(generator.normal(size=3), [0.03, 0.02, 1.4]).T
+    return model._replace(H_hat_0=np.array(moved)), np.concatenate([face(), pins])
+
+
+class Case:
+    """A list of incidences on a body, in the frame G, taught at joints ``q_star``."""
+
+    def __init__(self, model, M, asked, q_star, G=None):
+        G = np.eye(4) if G is None else G
+        self.model, self.M = in_frame(model, G), M @ G.T
+        self.body = make_body(self.model, self.M)
+        self.H = poe(self.model, q_star)
+        rows = incidences_of(self.model, self.body, self.H, asked)
+        shows = np.ones((2, len(M)), dtype=bool)
+        a = face_of(self.body.M[:4])
+        goal = nearest_goal(rows, self.body, self.H, image_motions(self.model, shows))
+        self.rows = weighted(rows, self.model, self.body, goal, shows, a)
+
+    def law(self, q):
+        """Law at joints q, its state, and the images."""
+        A = self.body.M[:4]
+        task = make_task(self.model, A @ poe(self.model, q).T, A @ self.H.T)
+        task = task._replace(body=self.body, incidences=self.rows)
+        state = new_state(len(q), 4, len(self.M), rank=len(self.rows.weight))
+        return Law(CODES["incidences"], self.model, task, GAINS), state
+
+    def drive(self, q, steps=40):
+        """Joints (n,) after so many steps of the law."""
+        law, state = self.law(q)
+        for _ in range(steps):
+            q_dot = step(law, state, self, q)
+            q = q + np.clip(q_dot, -0.3, 0.3)
+        return q
+
+
+def face_of(A):
+    """Plane of a face (4, 4)."""
+    return np.array(face_plane(np.ascontiguousarray(A), cyclic_order(A), center_of(A, MIDPOINT)))
+
+
+def step(law, state, case, q):
+    """Joint velocity of the law at joints q."""
+    s = pixels(case.model.P, case.body.M @ poe(case.model, q).T)
+    assert command(law, s, q, state) == OK
+    return state.q_dot.copy()
+
+
+def asked_of(kind):
+    tool, scene, relation, _ = kind
+    return [Incidence("a on b", tool, scene, relation, ANGLE_DEG if relation == ANGLE else np.nan)]
+
+
+def deviating(generator, n=6, size=0.2):
+    return generator.uniform(-size, size, n)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_met_with_the_same_joints_in_any_frame_and_leaves_free_what_it_should(kind):
+    for seed in range(10):
+        generator = np.random.default_rng([seed, KINDS.index(kind)])
+        model, M = random_arm(generator)
+        q_star = model.q_reference + deviating(generator)
+        q = q_star + deviating(generator)
+        cases = [Case(model, M, asked_of(kind), q_star, G) for G in (None, frame(seed), frame(seed + 99))]
+        ends = np.array([case.drive(q) for case in cases])
+        assert np.abs(ends - ends[0]).max() <= 1e-10, seed
+        for case, end in zip(cases, ends, strict=True):
+            rank = kind[3]
+            assert len(case.rows.weight) == rank
+            H = poe(case.model, end)
+            assert np.allclose(errors_px(case.rows, H), 0.0, atol=1e-7)
+            law, state = case.law(end)
+            step(law, state, case, end)
+            assert np.linalg.matrix_rank(state.rates, 1e-6) == rank
