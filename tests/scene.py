@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.control.law import ERRORS, Gains, Law, new_state
 from projservo_cli.geometry.lens import distort
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.laws import CODES
+from projservo_cli.laws import CODES, INCIDENCES
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.verdicts import VERDICTS, Limits, new_log
 from projservo_cli.records import FloatArray, Model, position_limits
@@ -17,6 +17,9 @@ from projservo_cli.task.body import make_body
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
 from projservo_cli.task.target import TaskImages
 from tests.samples import METRIC_A_INF, arm, face, in_frame, pixels, poe
+
+# Laws that measure a face point by point; that of incidences takes a body.
+FACE_LAWS = tuple(law for law in CODES if law != INCIDENCES)
 
 GAINS = Gains(2.5, 2.5, 2.5, 2.5, 1.0, 2.5, 0.04, 0.9)
 # Joint steps from start to goal: the face moves by 0.5 m and turns by 68° in view of both cameras.

@@ -38,7 +38,8 @@ def kind(schema: dict[str, Any], sections: Mapping[str, list[str]]) -> str:
         few = f", {least} or more" if least and least != most else ""
         return f"list of {count}({kind(schema['items'], sections)}){few}"
     if schema.get("type") == "object":
-        inner = schema["additionalProperties"]
+        patterns = schema.get("patternProperties", {})
+        inner = next(iter(patterns.values()), schema.get("additionalProperties"))
         return f"mapping of keys to {kind({} if inner is True else inner, sections)}"
     if "type" not in schema:
         return "any value"

@@ -15,7 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.control.law import ERRORS, Law, State, new_state
-from projservo_cli.laws import CODES, LAWS
+from projservo_cli.laws import CODES, INCIDENCES, LAWS
 from projservo_cli.loop.compiled import Course, many_steps, run_compiled
 from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.loop.verdicts import Log, new_log
@@ -24,6 +24,7 @@ from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.stages.scenario import run_scenario
 from projservo_cli.stages.stage_inputs import ServoInputs
 from projservo_cli.task.face import Task
+from projservo_cli.task.incidences import whole_pose
 
 STATES, STEPS, PIECE, ROUNDS = 256, 150, 64, 200
 NOISE_PX = 0.5
@@ -54,6 +55,8 @@ class Case:
         self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, *seen))
         self.whole = self._run(shown.task(self.model), scenario.plant_of("exact"))
         self.points = self._run(shown.by_points().task(self.model), scenario.plant_of("stacked"))
+        posed = shown._replace(incidences=whole_pose(shown.body.M[: self.m]))
+        self.incidences = self._run(posed.task(self.model), scenario.plant_of("exact"))
         self.law = BuiltInLaw(*self.points.law)
 
     def _run(self, task: Task, plant: Plant) -> _Job:
@@ -62,13 +65,14 @@ class Case:
         noise = np.ascontiguousarray(self.noise[:, :, :seen])
         law, course = Law(CODE, self.model, task, self.gains), Course(plant, self.limits, self.q_start)
         log = new_log(n, seen, self.limits.max_steps, len(ERRORS))
-        job = _Job(law, course, noise, new_state(n, self.m), log)
+        state = new_state(n, self.m, rank=len(task.incidences.weight))
+        job = _Job(law, course, noise, state, log)
         run_compiled(*job)
         return job
 
     def steps(self, law: str, *, body: bool = False) -> float:
         """One step of a law in each state."""
-        job = self.whole if body else self.points
+        job = self.incidences if law == INCIDENCES else self.whole if body else self.points
         return many_steps(job.law._replace(code=CODES[law]), job.course, job.state, job.log)
 
     def whole_run(self) -> _Job:

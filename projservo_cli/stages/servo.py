@@ -259,6 +259,11 @@ class LawRun:
         period, ends = self.scenario.gains.period, self.scenario.true_ends
         ended = Ended(VERDICTS.index(self.verdict), self.steps, self.limited)
         found = summarize(self.plant, self.log, ended, period, ends)
+        if self.scenario.exact.incidences and self.scenario.truth is not None:
+            H = self.log.H[self.steps]
+            pose = np.linalg.inv(H) if self.plant.model.on_tool else H
+            away = _apart_from(pose @ ends.base_tool, self.goal_pose, self.plant, ends.base_tool)
+            found = found._replace(**away)
         return found if self.scenario.truth is not None else found._replace(success=math.nan)
 
     def deviation_mm(self) -> float:
@@ -287,7 +292,8 @@ class LawRun:
             "free_dof": self.plan.free_dof if isinstance(self.plan, Plan) else None,
         }
 
-    def _goal_pose(self) -> FloatArray:
+    @cached_property
+    def goal_pose(self) -> FloatArray:
         """True pose (4, 4) of the tool at the goal, of incidences the nearest one, m; NaN if unknown."""
         scenario, (base_tool, taught, _) = self.scenario, self.scenario.true_ends
         if not scenario.exact.incidences or scenario.truth is None or not np.isfinite(taught).all():
@@ -323,9 +329,7 @@ class LawRun:
             read = _whole(driven.readings, rows)
         values = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
         moved = np.linalg.inv(H) if self.plant.model.on_tool else H
-        pose, goal_pose = moved @ scenario.true_ends.base_tool, self._goal_pose()
-        if scenario.exact.incidences and simulated:
-            values |= _apart_from(pose[-1], goal_pose, self.plant, scenario.true_ends.base_tool)
+        pose, goal_pose = moved @ scenario.true_ends.base_tool, self.goal_pose
         if driven is not None and driven.truths and not simulated:
             pose, goal_pose = _reported_poses(scenario, _whole(driven.truths, rows))
             values["position_error_mm"] = MM * float(np.linalg.norm(goal_pose[:3, 3] - pose[-1, :3, 3]))
@@ -572,8 +576,8 @@ def run(inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, **
     follow has no time; WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
     ``refuses`` is set.
     """
-    scenario = run_scenario(inputs, calibration).towards(plan)
-    _require_its_task(scenario, plan)
+    scenario = run_scenario(inputs, calibration)
+    _require_its_task(scenario.towards(plan), plan)
     return drive(scenario, plan, name, **brought).trace()
 
 
@@ -603,6 +607,8 @@ def drive(
     """
     law, mode = law_and_mode(name)
     unplanned, planned_s = "", None
+    if isinstance(plan, Plan):
+        scenario = scenario.towards(plan)
     if scenario.inputs.trajectory.keep_out and not (isinstance(plan, Plan) and plan.feasible):
         raise WorkFailed("the plan is not feasible, and with trajectory.keep_out no law runs without one")
     if mode != REGULATE and isinstance(plan, Plan):
@@ -628,7 +634,8 @@ def _in_compiled_loop(inputs: ServoInputs, law: str) -> bool:
 def sense_is_enough(inputs: ServoInputs, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
-    return mode == REGULATE and _in_compiled_loop(inputs, law) and not inputs.plan.incidences
+    pose = law != INCIDENCES and not inputs.plan.incidences  # others need a goal of the plan
+    return mode == REGULATE and _in_compiled_loop(inputs, law) and pose
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ import pytest
 
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.config.inputs import servo_inputs
-from projservo_cli.laws import LAWS
+from projservo_cli.laws import LAW_SPECS, LAWS
 from projservo_cli.records import InputError
 from projservo_cli.result_hashes import encoded
 from tests.conftest import SHIPPED
@@ -54,7 +54,7 @@ def test_a_configuration_loads_with_defaults_and_units(good):
     assert config.robot.ranges == ((-2 * math.pi, 2 * math.pi), (0.2, 0.9))
     assert config.noise.calibration_px == 0.1
     assert config.control.joint_speed_limit_deg_s is None
-    assert config.control.laws == tuple(law for law in LAWS if law != "exact")  # those of the paper
+    assert config.control.laws == tuple(law for law, spec in LAW_SPECS.items() if spec.paper)
     assert load_config(good, [f"control.laws=[{', '.join(LAWS)}]"]).control.laws == LAWS
     assert config.markers.known == (0, 1, 2, 3)
     with pytest.raises(ValueError, match="frozen"):

@@ -16,7 +16,7 @@ from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.target import TaskImages
 from tests.samples import frame, in_frame
-from tests.scene import GAINS, scene
+from tests.scene import FACE_LAWS, GAINS, scene
 
 
 class Instant(NamedTuple):
@@ -88,7 +88,7 @@ CHANGES = (
 METRIC = ("euclidean_points",)
 
 
-@pytest.mark.parametrize("law", CODES)
+@pytest.mark.parametrize("law", FACE_LAWS)
 @pytest.mark.parametrize("change", CHANGES)
 @settings(max_examples=15)
 @given(st.sampled_from(["RRRRRR", "RRPRRR"]), st.integers(4, 6), st.integers(0, 10**6))

@@ -7,7 +7,7 @@ import pytest
 from numba import typeof
 
 from projservo_cli.control.law import ERRORS, Law, State, new_state, reset
-from projservo_cli.laws import CODES, LAWS
+from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.jit_warmup import calls
 from projservo_cli.loop.run_metrics import SUBSAMPLES, Ended, path_deviation, summarize
@@ -17,7 +17,7 @@ from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.task.face import Task
 from tests.known import configured, known_scenario
 from tests.samples import poe
-from tests.scene import GAINS, STEP, Run, limits, scene
+from tests.scene import FACE_LAWS, GAINS, STEP, Run, limits, scene
 
 
 def test_log_describes_the_run_it_belongs_to():
@@ -62,7 +62,7 @@ def test_arrays_that_another_run_left_are_as_good_as_new(law, rng):
     assert used.state.limited[0] == fresh.state.limited[0]
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", FACE_LAWS)
 def test_at_the_goal_and_next_to_it_a_run_converges(law):
     """Without a command, and after steps of 1e-9 rad: errors of 1e-6 px, directions next to nothing."""
     run = Run(scene(np.zeros(6)), law)

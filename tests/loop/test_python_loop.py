@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from projservo_cli.control.law import ERRORS, OK
-from projservo_cli.laws import CODES, LAWS
+from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
 from projservo_cli.loop.verdicts import VERDICTS
 from projservo_cli.simulation.analytic_plant import AnalyticPlant
 from tests.control.following import Followed, tracked
 from tests.loop.bits import FOLLOWING
 from tests.samples import frame
-from tests.scene import GAINS, STEP, Run, limits, scene, with_pins
+from tests.scene import FACE_LAWS, GAINS, STEP, Run, limits, scene, with_pins
 
 SPEED = np.full(6, 0.5)
 
@@ -31,7 +31,8 @@ def same(left, right):
 
 
 @pytest.mark.parametrize(
-    ("law", "types"), [*((law, "RRRRRR") for law in LAWS), ("direct_two", "RRPRRR"), ("stacked", "RRPRRR")]
+    ("law", "types"),
+    [*((law, "RRRRRR") for law in FACE_LAWS), ("direct_two", "RRPRRR"), ("stacked", "RRPRRR")],
 )
 def test_both_loops_are_equal_to_the_bit(law, types, rng):
     """With noise, a speed limit that is active, and a projective model for the laws that take one."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.config.inputs import report_inputs
-from projservo_cli.laws import LAW_SPECS, LAWS, run_name
+from projservo_cli.laws import LAW_SPECS, run_name
 from projservo_cli.records import Calibration
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import ReportData
@@ -17,6 +17,7 @@ from projservo_cli.stages.report import in_metres
 from tests.configured import record, truth_of
 from tests.fake_records import fake, seen_by
 from tests.known import configured, driven, known_scenario, planned
+from tests.scene import FACE_LAWS
 
 SHORT = 4
 GAINS = (0.5, 0.1)
@@ -40,7 +41,7 @@ def case(name="paper", steps=SHORT, whole=False):
     plan = planned(scenario, model, samples=21, duration=3.0)
     sense = plan.rotation_sense()
     traces = {
-        law: driven(scenario, sense, law, true.model if LAW_SPECS[law].metric else model) for law in LAWS
+        law: driven(scenario, sense, law, true.model if LAW_SPECS[law].metric else model) for law in FACE_LAWS
     }
     traces["direct_three"] = filmed(traces["direct_three"], *true.image_size[0].astype(int))
     for law in FOLLOWING:

@@ -7,8 +7,8 @@ from scipy.linalg import expm
 from projservo_cli.control import command
 from projservo_cli.control.law import OK, Gains, Law, new_state
 from projservo_cli.laws import CODES
-from projservo_cli.records import InputError
 from projservo_cli.task.body import make_body
+from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
 from projservo_cli.task.incidences import (
     ANGLE,
     MEET,
@@ -16,13 +16,11 @@ from projservo_cli.task.incidences import (
     PERPENDICULAR,
     Incidence,
     errors_px,
-    image_error_at,
     image_motions,
     incidences_of,
     nearest_goal,
     weighted,
 )
-from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
 from tests.samples import arm, displacement, face, frame, hat, in_frame, pixels, poe
 from tests.task.cases import make_task
 
