@@ -21,7 +21,7 @@ from projservo_cli.records import InputError, WorkFailed
 
 GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
 _METHODS = {"plant": ("open", "read", "command", "stop", "close"), "law": ("__call__",)}
-_OPTIONAL = {"plant": ("now", "truth", "release", "hold", "identity"), "law": ()}
+_OPTIONAL = {"plant": ("now", "truth", "release", "hold", "identity"), "law": ("error",)}
 _OWN_PLANTS = {"so101": "projservo_cli.hardware.so101:SO101"}  # that projservo brings along
 DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
 # How alike two names are of which one is a slip, from 0 to 1: of a letter in four or five.

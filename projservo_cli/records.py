@@ -952,6 +952,20 @@ class RunHistory:
         "error of each incidence over its deviation at one pixel of noise; none for the whole pose",
         default=None,
     )
+    incidence_mm: FloatArray | None = _array(
+        "incidence",
+        "mm",
+        "distance of features that are to meet, at the end by the images; NaN without a known length, or of "
+        "others",
+        default=None,
+    )
+    incidence_deg: FloatArray | None = _array(
+        "incidence",
+        "deg",
+        "angle that an incidence is off at the end by the images; NaN of points, or where the joints leave "
+        "angles open",
+        default=None,
+    )
     latency: FloatArray | None = _array(
         "time view",
         "s",

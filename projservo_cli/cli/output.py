@@ -356,9 +356,21 @@ def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
             f"{first:>9}{second:>9}"
             f"{hidden:>5}{''.join(f'/{steps}' for steps in others):<4}{last:>10}"
         ).rstrip()
+    for trace in value["laws"]:
+        if trace["incidences"]:
+            rest = ", ".join(map(_incidence, trace["incidences"]))
+            name, free = run_name(trace["law"], trace["mode"]), trace["free_dof"]
+            yield wrapped(f"{name}: {rest}; {'no' if free == 0 else free} joint motion free", "  ")
     for name, said in _NOTES.items():
         for reason in dict.fromkeys(trace[name] for trace in value["laws"] if trace[name]):
             yield wrapped(f"{said}: {reason}", "  ")
+
+
+def _incidence(row: dict[str, Any]) -> str:
+    """Name of an incidence, and how far it is off at the end by the images."""
+    parts = ((row["error_mm"], "mm"), (row["error_deg"], "deg"), (row["error_px"], "px"))
+    said = [f"{number:.2g} {unit}" for number, unit in parts if number is not None and number == number]
+    return f"{row['name']} {', '.join(said)}"
 
 
 def _of_report(value: dict[str, Any], detailed: bool) -> Iterator[str]:

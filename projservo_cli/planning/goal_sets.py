@@ -51,7 +51,8 @@ def goals_meeting(
     starts += [*(near + _SPREAD * generator.standard_normal((_AROUND, n)) for near in starts)]
     if np.isfinite(low).all() and np.isfinite(high).all():
         starts.append(generator.uniform(low, high, (_ANYWHERE, n)))
-    found, rank = [], []
+    found: list[FloatArray] = []
+    rank: list[tuple[bool, float]] = []
     nearest, least = q_start, np.inf
     for start in np.vstack(starts):
         q = joints_meeting(c.model, incidences, start, low, high)

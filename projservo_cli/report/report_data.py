@@ -309,7 +309,7 @@ def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequen
     if stage == "plan":
         return path | _plan(run)
     if stage == "servo":
-        return path | {"laws": [scalars_of(run.traces[law]) for law in laws]}
+        return path | {"laws": [_law(run.traces[law]) for law in laws]}
     page = run.path.parent / PAGE_FILE
     report = run.results["report"].records[""]
     return path | {"page": page.resolve() if page.is_file() else None} | scalars_of(report)
@@ -323,8 +323,19 @@ def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
         return failure | {"usable": False, "lens": None, "rejected": None, "unshown": None} | numbers | lists
     if stage == "servo":
-        return failure | {"laws": [scalars_of(run.traces[law]) for law in laws]}
+        return failure | {"laws": [_law(run.traces[law]) for law in laws]}
     return failure | {"feasible": False} if stage == "plan" else failure
+
+
+def _law(trace: Trace) -> dict[str, Any]:
+    """Plain values of the run of a law, with the errors of its incidences at the end."""
+    values = scalars_of(trace)
+    if trace.incidence_px is None or trace.incidence_mm is None or trace.incidence_deg is None:
+        return values
+    left = (trace.incidence_px[-1], trace.incidence_mm, trace.incidence_deg)
+    rows = zip(trace.incidences, *(errors.tolist() for errors in left), strict=True)
+    keys = ("name", "error_px", "error_mm", "error_deg")
+    return values | {"incidences": [dict(zip(keys, row, strict=True)) for row in rows]}
 
 
 def _calibration(run: Run, names: Sequence[str | None]) -> dict[str, Any]:

@@ -77,10 +77,10 @@ def title_of(pair: Pair) -> str:
 def incidence_of(pair: Pair, features: Mapping[str, Feature]) -> Incidence:
     """Return a pair with the numbers of its markers."""
     relation = pair[2] if len(pair) == 3 else MEET
-    flats = (features[name].flat(features) for name in pair[:2])
+    tool, scene = (features[name].flat(features) for name in pair[:2])
     if isinstance(relation, str):
-        return Incidence(title_of(pair), *flats, relation)
-    return Incidence(title_of(pair), *flats, ANGLE, float(relation))
+        return Incidence(title_of(pair), tool, scene, relation)
+    return Incidence(title_of(pair), tool, scene, ANGLE, float(relation))
 
 
 def misplaced(pair: Pair, features: Mapping[str, Feature]) -> Iterator[str]:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -24,7 +24,7 @@ from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.run_metrics import Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.stall_monitor import StallMonitor
 from projservo_cli.loop.verdicts import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
-from projservo_cli.monitoring.accuracy import Posture, rigid_fit
+from projservo_cli.monitoring.accuracy import Posture, metric_points, rigid_fit
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
@@ -53,10 +53,24 @@ from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.stage_inputs import ServoInputs
 from projservo_cli.task.body import SETTLED, fit_body, make_body
 from projservo_cli.task.face import Task, center_of
-from projservo_cli.task.incidences import errors_px, incidences_of, metric_motions, nearest_goal, whole_pose
+from projservo_cli.task.incidences import (
+    errors_px,
+    incidences_of,
+    metric_errors,
+    metric_motions,
+    nearest_goal,
+    whole_pose,
+)
 from projservo_cli.task.target import TaskImages, followed
 
 _NOT_DRIVEN: Any = None  # in place of what a run leaves
+
+
+class _Judged(NamedTuple):
+    """Error that decides convergence, as words name it."""
+
+    name: str
+    unit: str
 
 
 @dataclass(eq=False)
@@ -83,6 +97,25 @@ class LawRun:
     replannings: tuple[str, ...] = ()  # time and reason of each replanning
     driven: DrivenRobot | None = None  # client of a robot of the contract
     unseen: str = ""  # which cameras showed nothing before the run, though they were to be compared
+    own_tolerance: float | None = None  # of an error that a law of somebody's states
+
+    @property
+    def own_unit(self) -> float:
+        """Factor of errors that decide convergence, in px, to what they are told in."""
+        return (
+            1.0
+            if self.own_tolerance is None
+            else self.own_tolerance / self.scenario.termination.image_error_px
+        )
+
+    @property
+    def judged(self) -> "_Judged":
+        """Error that decides convergence, in words."""
+        if self.own_tolerance is not None:
+            return _Judged("error of the law", "")
+        if self.scenario.exact.incidences and not math.isnan(float(self.log.fit[self.steps, 2])):
+            return _Judged("error of the incidences", " px")
+        return _Judged("image error", " px")
 
     @property
     def replans(self) -> bool:
@@ -187,6 +220,8 @@ class LawRun:
             stall=stall,
             execution=execution,
         )
+        if isinstance(law, PluginLaw) and law.states_error:
+            self.own_tolerance = law.tolerance
         if isinstance(plant, DrivenRobot):
             self.driven = plant
             if VERDICTS[code] == "converged" and plant.at_rest():
@@ -251,7 +286,7 @@ class LawRun:
         setup = copy.deepcopy(LawSetup(model, face, *shown, self.plan, gains, gains.period))
         factory = self.factory or plugins.find("law", self.law)
         law = plugins.called("law", self.law, factory, (setup,), {})
-        return PluginLaw(law, f"law {self.law}", scenario.least_views)
+        return PluginLaw(law, f"law {self.law}", scenario.least_views, scenario.termination.image_error_px)
 
     @cached_property
     def summary(self) -> Summary:
@@ -262,8 +297,8 @@ class LawRun:
         if self.scenario.exact.incidences and self.scenario.truth is not None:
             H = self.log.H[self.steps]
             pose = np.linalg.inv(H) if self.plant.model.on_tool else H
-            away = _apart_from(pose @ ends.base_tool, self.goal_pose, self.plant, ends.base_tool)
-            found = found._replace(**away)
+            mm, deg = _apart_from(pose @ ends.base_tool, self.goal_pose, self.plant, ends.base_tool)
+            found = found._replace(position_error_mm=mm, rotation_error_deg=deg)
         return found if self.scenario.truth is not None else found._replace(success=math.nan)
 
     def deviation_mm(self) -> float:
@@ -286,11 +321,26 @@ class LawRun:
             fit = fit_body(model.P, task.body, seen[k], forward(model, self.log.read[k]), SETTLED, normal)
             none = np.full(len(images.incidences), math.nan)
             errors.append(errors_px(task.incidences, as_array(fit.H)) if fit.settled else none)
+        taught = images.taught().task(model).H_star
+        mm, deg = metric_errors(model, images.incidences, task.body.M, (as_array(fit.H), taught))
         return {
+            "incidence_mm": MM * mm * self._metre(task.body.M),
+            "incidence_deg": deg,
             "incidences": tuple(one.name for one in images.incidences),
             "incidence_px": np.array(errors),
             "free_dof": self.plan.free_dof if isinstance(self.plan, Plan) else None,
         }
+
+    def _metre(self, M: FloatArray) -> float:
+        """Metres a unit of the metric of the arm, by known lengths of the face; NaN without.
+
+        M : (m, 4) markers of the body, those of the face first.
+        """
+        m, lengths = self.scenario.m, self.scenario.servo.lengths
+        X, (i, k) = metric_points(self.scenario.model, M[:m]), np.nonzero(lengths > 0.0)
+        if X is None or not len(i):
+            return math.nan
+        return float(np.median(lengths[i, k] / np.linalg.norm(X[i] - X[k], axis=1)))
 
     @cached_property
     def goal_pose(self) -> FloatArray:
@@ -360,7 +410,7 @@ class LawRun:
             s=np.ascontiguousarray(log.s[:rows, :, : s_star.shape[1]]),
             s_star=s_star,
             image_error=log.error[:rows],
-            convergence_error=log.judged[:rows],
+            convergence_error=self.own_unit * log.judged[:rows],
             tau=errors[:, 0],
             tau_affine=errors[:, 1],
             theta_r=errors[:, 2],
@@ -399,14 +449,12 @@ def _whole(values: Sequence[FloatArray], rows: int) -> FloatArray:
 
 def _apart_from(
     pose: FloatArray, goal_pose: FloatArray, plant: Plant, base_tool: FloatArray
-) -> dict[str, float]:
-    """Errors of a pose (4, 4), m, from that of the goal: of the face's centre, or of the tool's origin."""
+) -> tuple[float, float]:
+    """Errors, mm and deg, of a pose (4, 4), m, by the centre of the face, or the origin of a tool with cameras."""
     middle = np.array(center_of(plant.M, plant.center))
     point = np.eye(4)[3] if plant.model.on_tool else np.linalg.solve(base_tool, middle)
-    return {
-        "position_error_mm": MM * float(np.linalg.norm((goal_pose - pose) @ point)),
-        "rotation_error_deg": math.degrees(angle_between(mat(pose), mat(goal_pose))),
-    }
+    turn = angle_between(mat(pose), mat(goal_pose))
+    return MM * float(np.linalg.norm((goal_pose - pose) @ point)), math.degrees(turn)
 
 
 def _reported_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -509,26 +557,26 @@ def _stalled_by(run: LawRun) -> str:
 
 def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None]) -> str:
     """Return the reason of the verdict, one sentence."""
-    log, steps, limits = run.log, run.steps, run.scenario.termination
-    error, first = float(log.judged[steps]), float(log.judged[0])
-    within = tolerance(limits, float(log.fit[steps, 2]))
+    log, steps, limits, judged = run.log, run.steps, run.scenario.termination, run.judged
+    error, first = (f"{run.own_unit * float(log.judged[k]):.3g}{judged.unit}" for k in (steps, 0))
+    within = f"{run.own_unit * tolerance(limits, float(log.fit[steps, 2])):.3g}{judged.unit}"
     share, turn = remaining
     left = [
         *([] if share is None else [f"{share:.1%} of the translation"]),
         *([] if turn is None else [f"{turn:.3g} deg of rotation"]),
-        f"an image error of {error:.3g} px",
+        f"an {judged.name} of {error}",
     ]
     rest = f"{' and '.join(left)} {'are' if len(left) > 1 else 'is'} left"
     at_limit = in_unit(float(log.read[steps, joint]), run.scenario.joints.units[joint])
     reasons = {
-        "converged": f"image error {error:.3g} px is within {within:.3g} px{_apart(run)}",
-        "no progress": f"the robot stands still at an image error of {error:.3g} px: {run.why}"
+        "converged": f"{judged.name} {error} is within {within}{_apart(run)}",
+        "no progress": f"the robot stands still at an {judged.name} of {error}: {run.why}"
         if run.why
-        else f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
+        else f"no step left; {judged.name} {error} fell by less than 1 % in the last "
         f"{limits.stall_periods} steps: {_stalled_by(run)}",
         "following error": f"{run.why}; {rest}",
-        "max steps": f"no step left; image error {error:.3g} px was still changing",
-        "diverged": f"image error {error:.3g} px (at first {first:.3g}) or the distance of the face grew "
+        "max steps": f"no step left; {judged.name} {error} was still changing",
+        "diverged": f"{judged.name} {error} (at first {first}) or the distance of the face grew "
         f"{limits.diverged_factor:g}-fold",
         "out of view": f"a face marker left an image at step {steps}",
         "behind camera": f"a face marker passed behind a camera at step {steps}",
@@ -552,6 +600,8 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
 
 def _apart(run: LawRun) -> str:
     """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
+    if run.scenario.exact.incidences:  # the face may be anywhere that they leave open
+        return ""
     seen, most = float(run.log.error[run.steps]), _BY_NOISE * run.scenario.termination.image_error_px
     text = f"; the face itself is seen {seen:.3g} px off ({most:.3g} px by noise): it moved on the tool"
     return f"{text} since the goal was taught: teach it again" if seen > most else ""
@@ -669,11 +719,29 @@ class PluginLaw:
     law : pixels (V, k, 2) of the face and joint readings (n,) to joint velocities (n,), rad/s or m/s.
     name : of it, for messages.
     least_views : number of views that are to see the face.
+    image_error_px : image error at which a run converges, px, unless the law states an error of its own:
+        ``error(s, q)``, a number, and its ``tolerance``.
     """
 
-    def __init__(self, law: Callable[[FloatArray, FloatArray], Any], name: str, least_views: int) -> None:
+    def __init__(
+        self,
+        law: Callable[[FloatArray, FloatArray], Any],
+        name: str,
+        least_views: int,
+        image_error_px: float = math.inf,
+    ) -> None:
         self.law, self.name, self.least_views = law, name, least_views
         self.errors = np.full(len(ERRORS), np.nan)
+        self.face_px = np.full(1, math.nan)
+        self.states_error, self.tolerance = callable(getattr(law, "error", None)), math.nan
+        if self.states_error:
+            stated = getattr(law, "tolerance", None)
+            if isinstance(stated, bool) or not isinstance(stated, int | float) or not 0.0 < stated < math.inf:
+                raise InputError(
+                    f"{name}: has error(s, q) and tolerance {stated!r}: make it a positive number, in the "
+                    "unit of the error"
+                )
+            self.tolerance, self._px = float(stated), image_error_px
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant; the law is asked where enough views show the face."""
@@ -684,6 +752,9 @@ class PluginLaw:
             if answer is None:
                 return LOST, np.zeros_like(q)
             q_dot = np.array(answer, dtype=np.float64)
+            if self.states_error:
+                error = float(self.law.error(s.copy(), q.copy()))  # type: ignore[attr-defined]
+                self.face_px[0] = error / self.tolerance * self._px
         except Exception as error:
             raise WorkFailed(f"{self.name}: failed: {what_failed(error)}") from error
         if q_dot.shape != q.shape or not np.isfinite(q_dot).all():

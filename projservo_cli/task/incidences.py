@@ -32,6 +32,8 @@ MEET, PARALLEL, PERPENDICULAR, ANGLE = "meet", "parallel", "perpendicular", "ang
 KINDS = ("point", "line", "plane")  # by the number of points that span one
 # Variance of a combination of errors, of unit variance each, below which it depends on the others.
 _DEPENDENT = 1e-9
+# Angle between features, deg, by their relation.
+_WANTED = {MEET: 0.0, PARALLEL: 0.0, PERPENDICULAR: 90.0}
 # Newton steps to a displacement at which all incidences hold: how many, the largest turn of one, rad, and the
 # last, over unit motions; singular value over the largest that counts as zero.
 _STEPS, _STRIDE, _SETTLED, _SINGULAR = 50, 0.5, 1e-12, 1e-9
@@ -46,8 +48,7 @@ class Incidence(NamedTuple):
 
     name: str  # as messages and figures write it
     tool: Flat  # one, two or three points that span it
-    # the feature of the tool where the goal was taught, which spans it there; or points (k, 4) of the scene
-    scene: Flat | FloatArray
+    scene: Flat  # the feature of the tool that was there when the goal was taught
     relation: str = MEET
     angle_deg: float = math.nan  # between both, for ``ANGLE``
 
@@ -159,7 +160,8 @@ def linearized(incidences: Incidences, H: FloatArray, H_hat: FloatArray) -> tupl
     """Weighted errors (w,) at H (4, 4), and their derivatives (w, k) by operators (k, 4, 4) of the body."""
     rank = len(incidences.weight)
     e, J = np.zeros(rank), np.zeros((rank, len(H_hat)))
-    linearize_into(incidences, mat(H), mat(np.linalg.inv(H)), np.ascontiguousarray(H_hat), e, J)
+    back = np.asarray(np.linalg.inv(H), dtype=np.float64)
+    linearize_into(incidences, mat(H), mat(back), np.ascontiguousarray(H_hat), e, J)
     return e, J
 
 
@@ -263,8 +265,7 @@ def incidences_of(model: Model, body: Body, H_taught: FloatArray, asked: Sequenc
     senses: list[tuple[FloatArray, FloatArray, bool]] = []
     for k, one in enumerate(asked):
         tool = points_of(body.M, one.tool)
-        own = not isinstance(one.scene, np.ndarray)
-        scene = points_of(body.M, one.scene) @ H_taught.T if own else np.asarray(one.scene)
+        scene = points_of(body.M, one.scene) @ H_taught.T
         for points in (tool, scene):
             if np.linalg.matrix_rank(points / np.linalg.norm(points, axis=1)[:, None], 1e-6) < len(points):
                 raise WorkFailed(
@@ -403,7 +404,45 @@ def nearest_goal(incidences: Incidences, body: Body, H: FloatArray, moved: Moved
 
 def image_error_at(incidences: Incidences, H: FloatArray) -> float:
     """Error of ``image_error`` at the displacement H (4, 4), px."""
-    return float(image_error(incidences, mat(H), mat(np.linalg.inv(H))))
+    return float(image_error(incidences, mat(H), mat(np.asarray(np.linalg.inv(H), dtype=np.float64))))
+
+
+def metric_errors(
+    model: Model, asked: Sequence[Incidence], M: FloatArray, H: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Distances (g,) of features that are to meet, in a metric up to scale, and angles (g,) off, deg.
+
+    M : (m, 4) markers of the body; H : displacements (4, 4) of it now, and where the goal was taught.
+    NaN for what an incidence has not, and where the joints leave the metric open.
+    """
+    apart, off = np.full((2, len(asked)), math.nan)
+    try:
+        S = invariant_upgrade(model.H_hat_0, model.prismatic)
+    except InputError:
+        return apart, off
+    for k, one in enumerate(asked):
+        tool, scene = (
+            (X := points_of(M, flat) @ (S @ where).T)[:, :3] / X[:, 3:]
+            for flat, where in zip((one.tool, one.scene), H, strict=True)
+        )
+        if one.relation == MEET:
+            small, large = (tool, scene) if len(tool) <= len(scene) else (scene, tool)
+            across = null_space(_directions(large)) if len(large) > 1 else np.eye(3)
+            apart[k] = np.linalg.norm((small - large[0]) @ across, axis=1).max()
+        if min(len(tool), len(scene)) > 1:
+            off[k] = abs(_angle(tool, scene) - _WANTED.get(one.relation, one.angle_deg))
+    return apart, off
+
+
+def _angle(tool: FloatArray, scene: FloatArray) -> float:
+    """Angle, deg, between lines or planes through metric points (k, 3); in their sense if both are alike."""
+    axes = [
+        points[1] - points[0] if len(points) == 2 else np.cross(*_directions(points))
+        for points in (tool, scene)
+    ]
+    cosine = float(axes[0] @ axes[1] / np.prod([np.linalg.norm(axis) for axis in axes]))
+    between = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+    return between if len(tool) == len(scene) else abs(90.0 - between)
 
 
 def errors_px(incidences: Incidences, H: FloatArray) -> FloatArray:

@@ -76,6 +76,11 @@ class TaskImages(NamedTuple):
         s_start, s_star = (np.ascontiguousarray(s[:, :m]) for s in (self.s_start, self.s_star))
         return self._replace(s_start=s_start, s_star=s_star, pins=0, body=NO_BODY)
 
+    def taught(self) -> "TaskImages":
+        """Return the task to the pose that was taught."""
+        s_star = self.s_star if self.s_taught is None else self.s_taught
+        return self._replace(s_star=s_star, s_taught=None, incidences=())
+
     def task(self, model: Model) -> Task:
         """Task of laws with a model, calibrated or metric.
 
@@ -103,9 +108,7 @@ class TaskImages(NamedTuple):
 
     def _rows(self, model: Model, task: Task) -> Incidences:
         """Rows of the incidences by a task to the goal, or to one that was taught elsewhere."""
-        taught = task
-        if self.s_taught is not None:
-            taught = self._replace(s_star=self.s_taught, s_taught=None, incidences=()).task(model)
+        taught = task if self.s_taught is None else self.taught().task(model)
         rows = incidences_of(model, task.body, taught.H_star, self.incidences)
         A = np.ascontiguousarray(task.body.M[: len(task.A_star)])
         face = np.array(face_plane(A, task.order, center_of(A, task.center)))
