@@ -251,15 +251,17 @@ class Scenario:
     def _with_face(self, key: str, s: FloatArray, q: FloatArray | None) -> FloatArray:
         """Pixels (V, b, 2) with a whole face, at joints (n,) or, for None, at those that they show.
 
-        Raises WorkFailed where too little of the tool is seen.
+        In as many views as are to see the face; the others may show less. Raises WorkFailed where too little
+        of the tool is seen.
         """
         unseen = np.isnan(s[..., 0])
         unseen[:, self.m :] = False
-        if not unseen.any():
+        if (~unseen.any(axis=1)).sum() >= self.least_views:
             return s
         view, k = np.argwhere(unseen)[0]
-        known = self.calibration
-        if known is not None and np.isfinite(s[..., 0]).sum(axis=1).min() > CORNERS - 1:
+        known, much = self.calibration, np.isfinite(s[..., 0]).sum(axis=1) > CORNERS - 1
+        if known is not None and much.sum() >= self.least_views:
+            unseen[~much] = False
             off = 0.0
             if q is None:
                 q, off = joints_showing(known, self.numbers, s, self.exact.q_start)

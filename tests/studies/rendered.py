@@ -161,6 +161,8 @@ def by_hand_eye(config, known, ends, seed, judge):
     shown, sigma = observed_in_frames(config, truth, goal, (seed, 7))
     shown = np.where((sigma <= VAGUE_PX)[..., None], shown, np.nan)
     wanted = hand_eye.tool_in_base(views, points, shown)
+    if wanted is None:
+        return [("hand-eye", {"verdict": "goal unseen", "arrived": False})]
     hand, rows = wanted @ np.linalg.inv(mount), []
     robot = robot_by_itself(config, truth, start, 0.0, seed, STREAM)
     robot.open()

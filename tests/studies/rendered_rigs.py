@@ -1,7 +1,7 @@
 """How well a UR5e with its meshes arrives before other rendered rigs than two fixed cameras.
 
     python -m tests.studies.rendered_rigs --draw    (the tasks, into rendered_rigs_tasks.csv beside this file)
-    python -m tests.studies.rendered_rigs [--rigs ...] [--tasks 30] [-o runs.csv]
+    python -m tests.studies.rendered_rigs [--rigs ...] [--first 1] [--tasks 30] [-o runs.csv]
 
 One recording for each rig and thirty tasks by seed on it, driven by ``exact_track`` with the profile auto. A
 task fails unless the run converged within 1 mm and 0.3 degrees of the truth, by one camera within 2 mm along
@@ -141,7 +141,12 @@ def judge(truth, pose, q_goal):
 
 def main():
     """Record with every rig, drive all tasks, and print what came of it."""
-    parser = parser_of("rendered_rigs_study", __doc__, [("tasks", len(SEEDS), "of each rig")], rigs=RIGS)
+    parser = parser_of(
+        "rendered_rigs_study",
+        __doc__,
+        [("first", 1, "seed"), ("tasks", len(SEEDS), "of each rig")],
+        rigs=RIGS,
+    )
     parser.add_argument("--draw", action="store_true", help="draw the tasks anew, and drive nothing")
     given = parser.parse_args()
     if given.draw:
@@ -155,7 +160,11 @@ def main():
         made[rig] = calibration, known
         told = f"chi2 {calibration.chi2_per_dof:.2f}, {calibration.reason}"
         print(f"{rig}: usable {calibration.usable}, {told}", flush=True)
-    jobs = [(rig, seed, *both) for seed in list(SEEDS)[: given.tasks] for rig, both in made.items()]
+    jobs = [
+        (rig, seed, *both)
+        for seed in list(SEEDS)[given.first - 1 :][: given.tasks]
+        for rig, both in made.items()
+    ]
     for mine in in_two_processes(driven, jobs, "tasks"):
         rows += mine
         write_rows(given.output, rows)  # what is cut off leaves what was driven
