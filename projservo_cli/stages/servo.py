@@ -449,8 +449,8 @@ def _whole(values: Sequence[FloatArray], rows: int) -> FloatArray:
 
 def _apart_from(
     pose: FloatArray, goal_pose: FloatArray, plant: Plant, base_tool: FloatArray
-    """Errors, mm and deg, of a pose (4, 4), m: of the centre of the face, or the origin of the cameras' tool."""
-    """Errors, mm and deg, of a pose (4, 4), m: of the centre of the face, or the origin of the cameras' tool."""
+) -> tuple[float, float]:
+    """Errors, mm and deg, of a pose (4, 4), m, at the centre of the face, or at a tool with cameras."""
     middle = np.array(center_of(plant.M, plant.center))
     point = np.eye(4)[3] if plant.model.on_tool else np.linalg.solve(base_tool, middle)
     turn = angle_between(mat(pose), mat(goal_pose))
