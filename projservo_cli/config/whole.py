@@ -135,7 +135,7 @@ def _incidences(
             if of is None or of.on != "tool" or of.given(feature.kind) == []:
                 yield ("features", name, feature.kind), f"there is no {feature.kind} {source} of the tool"
     for i, pair in enumerate(() if task is None else task.goal.incidences):
-        for what in misplaced(pair, features):
+        if what := misplaced(pair, features):
             yield ("task", "goal", "incidences", i), what
     if task is not None and task.goal.incidences and control.features == "points":
         yield ("control", "features"), "incidences are measured with the body: leave points out"

@@ -83,12 +83,13 @@ def incidence_of(pair: Pair, features: Mapping[str, Feature]) -> Incidence:
     return Incidence(title_of(pair), tool, scene, ANGLE, float(relation))
 
 
-def misplaced(pair: Pair, features: Mapping[str, Feature]) -> Iterator[str]:
-    """Yield the reasons why a pair is no incidence of these features."""
+def misplaced(pair: Pair, features: Mapping[str, Feature]) -> str:
+    """Return the reason why a pair is no incidence of these features; empty if it is one."""
     for name, on in zip(pair[:2], (_TOOL, _SCENE), strict=True):
         if name not in features:
-            yield f"there is no feature {name}; features: {', '.join(features) or 'none'}"
-        elif features[name].on != on:
-            yield f"{name} is on the {features[name].on}: name a feature of the tool, then one of the scene"
-        elif len(pair) == 3 and pair[2] != MEET and features[name].given(*KINDS) == [KINDS[0]]:
-            yield f"{name} is a point, which has no direction: leave {pair[2]} out, or name lines and planes"
+            return f"there is no feature {name}; features: {', '.join(features) or 'none'}"
+        if features[name].on != on:
+            return f"{name} is on the {features[name].on}: name a feature of the tool, then one of the scene"
+        if len(pair) == 3 and pair[2] != MEET and features[name].given(*KINDS) == [KINDS[0]]:
+            return f"{name} is a point, which has no direction: leave {pair[2]} out, or name lines and planes"
+    return ""

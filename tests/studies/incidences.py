@@ -15,7 +15,7 @@ from projservo_cli.settings.features import Feature
 from tests.configured import calibrate, plan, servo
 from tests.studies.common import in_two_processes, parser_of, quantiles, rate, task_configs, write_rows
 
-ARMS = ("paper", "ur5")
+ARMS = ["paper", "ur5"]
 SHOWN = {
     "point": {"point": (8,)},
     "other": {"point": (9,)},
@@ -109,11 +109,9 @@ def main():
             for law in LAWS:
                 told = [row for row in rows if (row["arm"], row["kind"], row["law"]) == (arm, kind, law)]
                 done = [row for row in told if row["success"]]
-                print(
-                    f"{arm}, {kind}, {law}: planned {rate(sum(row['planned'] for row in told), len(told))} %, "
-                    f"success {rate(len(done), len(told))} %; mm {quantiles([row['mm'] for row in done])}",
-                    flush=True,
-                )
+                plans, good = rate(sum(row["planned"] for row in told), len(told)), rate(len(done), len(told))
+                mm = quantiles([row["mm"] for row in done])
+                print(f"{arm}, {kind}, {law}: planned {plans} %, success {good} %; mm {mm}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,77 @@
+"""Tasks of incidences through plan, run and trace, and laws that state an error of their own."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.stages.servo import PluginLaw
+from tests.configured import calibrate, plan, servo, truth_of
+from tests.known import configured
+
+
+@cache
+def made():
+    """Configuration of the insertion, its calibration and plan."""
+    config = configured("insertion")
+    calibration = calibrate.run(config)[1]
+    return config, calibration, plan.run(config, calibration)
+
+
+def axis_and_tip(truth, H):
+    """Both ends (2, 3) of the pin, in truth, at a displacement."""
+    return (truth.of((10, 11)) @ H.T)[:, :3]
+
+
+@pytest.mark.parametrize("law", ["exact_track", "incidences"])
+def test_a_pin_goes_into_its_hole_and_the_rest_stays_free(law):
+    """By trials at 0.5 px and images without noise: the pin within half a millimetre, wherever it is turned."""
+    config, calibration, planned = made()
+    trace, truth = servo.run(config, calibration, planned, law), truth_of(config)
+    assert (trace.verdict, trace.success, trace.free_dof) == ("converged", True, 1)
+    assert trace.incidences == ("pin on hole", "tip on bottom")
+    H = trace.pose[-1] @ np.linalg.inv(truth.robot.base_tool)
+    q_goal = config.task.goal.joints.values(config.joint_types)
+    ends, there = axis_and_tip(truth, H), axis_and_tip(truth, truth.displacement(q_goal))
+    along = (there[1] - there[0]) / np.linalg.norm(there[1] - there[0])
+    off = np.linalg.norm(np.cross(ends - there[0], along), axis=1).max()
+    tip = np.linalg.norm(ends[1] - there[1])
+    assert max(off, tip) < 0.5e-3
+    # The nearest goal is as near as the pin is.
+    assert trace.position_error_mm < 2e3 * max(off, tip)
+    assert (
+        np.degrees(np.arccos(min(1.0, (ends[1] - ends[0]) @ along / np.linalg.norm(ends[1] - ends[0])))) < 0.2
+    )
+    assert trace.incidence_px[0].min() > 50.0 > 0.05 > trace.incidence_px[-1].max()
+    assert trace.incidence_mm.max() < 0.1
+
+
+def test_incidences_that_contradict_each_other_are_refused_with_what_is_left_of_them():
+    config, calibration, _ = made()
+    goal = config.task.goal.model_copy(update={"incidences": (("pin", "hole"), ("pin", "hole", 40.0))})
+    config = config.model_copy(update={"task": config.task.model_copy(update={"goal": goal})})
+    with pytest.raises(WorkFailed, match=r"meet all incidences; the nearest leave .*pin at 40.0 deg to hole"):
+        plan.run(config, calibration)
+
+
+class Own:
+    """Law that stands still and states how far a joint is from a value."""
+
+    tolerance = 0.5
+
+    def __call__(self, s, q):
+        return np.zeros_like(q)
+
+    def error(self, s, q):
+        return 0.25 + abs(s).sum() * 0.0
+
+
+def test_a_law_that_states_an_error_is_judged_by_it():
+    law = PluginLaw(Own(), "law own", 2, image_error_px=0.2)
+    law(np.zeros((2, 4, 2)), np.zeros(6))
+    assert law.face_px[0] == pytest.approx(0.2 * 0.25 / 0.5)
+    wrong = Own()
+    wrong.tolerance = -1
+    with pytest.raises(InputError, match=r"law own: has error\(s, q\) and tolerance -1: make it a positive"):
+        PluginLaw(wrong, "law own", 2)
