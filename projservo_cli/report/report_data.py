@@ -192,6 +192,7 @@ class FigureSpec:
     modes: bool = False  # whether it compares runs that follow the plan with others
     goal: bool = False  # whether it needs a known goal pose
     frames: bool = False  # whether it shows frames; it is not omitted if no robot has any
+    incidences: bool = False  # whether it shows those of the goal; it is not omitted of a whole pose
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
 
@@ -200,7 +201,9 @@ class FigureSpec:
         """Its section on the page: calibration, metric, plan or control."""
         if not self.task:
             return "metric" if self.metric else "calibration"
-        return "control" if self.laws or self.studies or self.modes or self.frames else "plan"
+        return (
+            "control" if self.laws or self.studies or self.modes or self.frames or self.incidences else "plan"
+        )
 
     def drawn(self, data: Data) -> "Figure":
         """The figure of its data."""
@@ -213,6 +216,9 @@ class FigureSpec:
         if self.frames and isinstance(report_data, Driven | ReportData):
             filmed = any(trace.frame_index is not None for trace in report_data.traces.values())
             return "" if filmed else "the robot shows no frames"
+        if self.incidences and isinstance(report_data, Driven | ReportData):
+            partial = any(trace.incidence_px is not None for trace in report_data.traces.values())
+            return "" if partial else "the goal is a whole pose"
         if isinstance(report_data, Driven):
             return "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
         if len(report_data.calibration.joint_types) == 1:

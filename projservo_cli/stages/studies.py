@@ -92,8 +92,9 @@ def comparison_of(inputs: ServoInputs, calibration: Calibration, plan: Plan) -> 
     """Set up the extra runs; images are without noise, but for a goal that is known by them alone.
 
     inputs : of laws by themselves on the ideal plant, which measure the face point by point, but with the
-        body where there are not two views: nothing keeps them out of regions.
+        body where there are not two views: nothing keeps them out of regions. The goal is the taught pose.
     """
+    inputs = replace(inputs, plan=replace(inputs.plan, incidences=()))
     if len(calibration.view) != len(VIEWS):
         inputs = replace(inputs, plan=replace(inputs.plan, features="body"))
     scenario = run_scenario(inputs, calibration)

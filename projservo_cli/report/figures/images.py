@@ -5,7 +5,7 @@ import io
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.laws import BODY_LAWS, POINT_LAWS, title_of
+from projservo_cli.laws import BODY_LAWS, POINT_LAWS, REGULATE, law_and_mode, title_of
 from projservo_cli.loop.verdicts import plateau_stretch
 from projservo_cli.records import ByteArray, FloatArray, IntArray, Trace
 from projservo_cli.report import style
@@ -395,4 +395,44 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
         run = f"{data['run']}\n" if not (view or i) else ""
         apart = ", " if len(names[view]) <= _SHORT_NAME else "\n"
         panel.set_title(f"{run}{names[view]} camera{apart}{_MOMENTS[i]}, {seconds:.2f} s")
+    style.legend_below(figure, 4)
+
+
+_LEAST_PX = 1e-3  # lowest error that is drawn
+
+
+def _data_incidences(report_data: ReportData | Driven) -> Data:
+    """Error of each incidence over time, in each run."""
+    result: Data = {}
+    for name, trace in report_data.traces.items():
+        if trace.incidence_px is not None:
+            result["incidence"] = np.array(trace.incidences)
+            result[f"t_s_{name}"] = trace.period * np.arange(len(trace.incidence_px))
+            result[f"px_{name}"] = trace.incidence_px
+    return result
+
+
+@registered(
+    "fig19_incidences",
+    "Errors of the incidences",
+    "no figure",
+    _data_incidences,
+    height=3.2,
+    incidences=True,
+    alt="A panel for each incidence: its error over time on a logarithmic scale, a curve for each run.",
+)
+def _draw_incidences(data: Data, figure: "style.Figure") -> None:
+    """A panel for each incidence, a curve for each run."""
+    panels = figure.subplots(1, len(data["incidence"]), sharey=True, squeeze=False)[0]
+    runs = [name.removeprefix("px_") for name in data if name.startswith("px_")]
+    for k, (panel, incidence) in enumerate(zip(panels, data["incidence"], strict=True)):
+        for i, name in enumerate(runs):
+            law, mode = law_and_mode(name)
+            label = title_of(law) + (", by the plan" if mode != REGULATE else "")
+            panel.plot(
+                data[f"t_s_{name}"], np.maximum(data[f"px_{name}"][:, k], _LEAST_PX), **style.curve(i, label)
+            )
+        style.log_scale(panel)
+        panel.set(title=str(incidence), xlabel="time (s)")
+    panels[0].set_ylabel("error (px at one px of noise)")
     style.legend_below(figure, 4)
