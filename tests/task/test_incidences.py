@@ -1,14 +1,16 @@
 """Incidences: what each kind leaves free, in any projective frame, and what pixels it takes."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
 from projservo_cli.control import command
-from projservo_cli.control.law import OK, Gains, Law, new_state
+from projservo_cli.control.law import OK, UNLIMITED, Gains, Law, new_state
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.laws import CODES
-from projservo_cli.records import InputError
+from projservo_cli.records import InputError, position_limits
 from projservo_cli.task.body import SETTLED, fit_body, make_body
 from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
 from projservo_cli.task.incidences import (
@@ -86,18 +88,18 @@ class Case:
         goal = nearest_goal(rows, self.body, self.H, image_motions(self.model, shows))
         self.rows = weighted(rows, self.model, self.body, goal, shows, a)
 
-    def law(self, q):
-        """Law at joints q, its state, and the images."""
+    def law(self, q, gains=GAINS):
+        """Law at joints q, and its state."""
         A = self.body.M[:4]
         task = make_task(self.model, A @ poe(self.model, q).T, A @ self.H.T)
         task = task._replace(body=self.body, incidences=self.rows)
         state = new_state(len(q), 4, len(self.M), rank=len(self.rows.weight))
-        return Law(CODES["incidences"], self.model, task, GAINS), state
+        return Law(CODES["incidences"], self.model, task, gains), state
 
-    def drive(self, q, steps=40):
-        """Joints (n,) after so many steps of the law."""
-        law, state = self.law(q)
-        for _ in range(steps):
+    def drive(self, q, gain=1.0, limits=UNLIMITED):
+        """Joints (n,) where the law ends."""
+        law, state = self.law(q, GAINS._replace(gain=gain, limits=limits))
+        for _ in range(math.ceil(40 / gain)):
             q_dot = step(law, state, self, q)
             q = q + np.clip(q_dot, -0.3, 0.3)
         return q
@@ -218,3 +220,26 @@ def test_angles_need_axes_that_are_not_parallel():
     asked = [Incidence("pin upright", LINE, WALL, PERPENDICULAR)]
     with pytest.raises(InputError, match="pin upright: angles need the metric form"):
         incidences_of(slides, make_body(model, M), np.eye(4), asked)
+
+
+def test_free_motions_lead_away_from_limits_and_do_not_disturb_the_task():
+    """A joint that a task drives over a limit goes less far where the law knows it, and mostly stays within."""
+    better = 0
+    for seed in range(20):
+        generator = np.random.default_rng([17, seed])
+        model, M = random_arm(generator)
+        q_star = model.q_reference + deviating(generator)
+        q = q_star + deviating(generator)
+        case = Case(model, M, [Incidence("tip", POINT, POINT)], q_star)
+        plain = case.drive(q, gain=0.1)
+        joint = int(np.argmax(np.abs(plain - q)))
+        way = np.sign(plain[joint] - q[joint])
+        upper, lower = np.full((2, 6), q + 3.0), np.full((2, 6), q - 3.0)
+        bound = q[joint] + 0.7 * (plain[joint] - q[joint])
+        (upper if way > 0 else lower)[0, joint] = bound
+        led = case.drive(q, gain=0.1, limits=position_limits(lower[0], upper[0]))
+        assert errors_px(case.rows, poe(model, led)).max() < 0.05  # px, of steps that curve
+        over, over_plain = (way * (end[joint] - bound) for end in (led, plain))
+        assert over < over_plain
+        better += over <= 0.0
+    assert better >= 15
