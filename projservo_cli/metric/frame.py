@@ -237,7 +237,7 @@ def _tool_frame(M: FloatArray, face: Sequence[int], across: int) -> FloatArray:
     return _frame(x, np.cross(x, y), M[..., [*face], :].mean(axis=-2))
 
 
-class _Projective(NamedTuple):
+class ProjectiveParameters(NamedTuple):
     """Arrays of a calibration, or of many that are off by its deviations (…)."""
 
     P: FloatArray
@@ -246,8 +246,11 @@ class _Projective(NamedTuple):
     M: FloatArray
 
     @classmethod
-    def around(cls, c: Calibration, lens: FloatArray, factor: FloatArray) -> "_Projective":
-        """The calibration, then pairs off by plus and minus a step of each column of the factor."""
+    def around(cls, c: Calibration, lens: FloatArray, factor: FloatArray) -> "ProjectiveParameters":
+        """The calibration, then pairs off by plus and minus a step of each column of the factor.
+
+        ``changes_of`` takes what is computed from each of them.
+        """
         steps = _STEP * np.concatenate([np.zeros((len(factor), 1)), factor, -factor], axis=1).T
         n, B = len(c.H_hat_0), len(steps)
         of_curve = 0 if c.curve is None else len(c.curve.terms)
@@ -262,7 +265,15 @@ class _Projective(NamedTuple):
         )  # fmt: skip
 
 
-def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> MetricParameters:
+def changes_of(
+    values: FloatArray, difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract
+) -> FloatArray:
+    """Changes (c, …) by independent errors of unit variance, of values (1 + 2 c, …) of models around one."""
+    up, down = np.split(values[1:], 2)
+    return np.asarray(difference(up, down) / (2.0 * _STEP))
+
+
+def _bodies(models: ProjectiveParameters, c: Calibration, face: Sequence[int]) -> MetricParameters:
     """Bodies (B, …) of models, the first of which decides what frames rest on. Their scale is arbitrary."""
     G = invariant_upgrade(models.H_hat, c.prismatic)
     G = G * np.sign(models.M[:, :1] @ G[:, 3, :, None])
@@ -294,7 +305,7 @@ def _bodies(models: _Projective, c: Calibration, face: Sequence[int]) -> MetricP
     )
 
 
-def _right_handed(models: _Projective, G: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _right_handed(models: ProjectiveParameters, G: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Upgrades (B, 4, 4) to a right-handed frame, and markers (B, m, 3) there.
 
     Each camera has the markers in front of it, and so determines the handedness of the frame.
@@ -410,7 +421,7 @@ class Metric:
         marker = c.marker.tolist()
         chosen = range(len(marker)) if face is None else _known_indices(face, marker)
         lens = c.model().lens
-        models = _Projective.around(c, lens, factor)
+        models = ProjectiveParameters.around(c, lens, factor)
         try:
             bodies = _bodies(models, c, list(chosen))
             K = bodies.intrinsics()
@@ -670,12 +681,7 @@ class Metric:
         difference: Callable[[FloatArray, FloatArray], FloatArray] = np.subtract,
     ) -> FloatArray:
         """Changes (c, …) of a function of bodies by independent errors of unit variance."""
-        count = (len(self.bodies.P) - 1) // 2
-        up, down = (
-            function(MetricParameters(*(values[part] for values in self.bodies)))
-            for part in (slice(1, 1 + count), slice(1 + count, None))
-        )
-        return np.asarray(difference(up, down) / (2.0 * _STEP))
+        return changes_of(function(self.bodies), difference)
 
     def _readings(self, q: npt.ArrayLike) -> FloatArray:
         readings = np.asarray(q, dtype=np.float64)
