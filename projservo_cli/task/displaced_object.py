@@ -55,7 +55,7 @@ _SAME = 0.05
 _NOISE, _CONFIDENCE = 2.0, 0.999
 # Cosine of the angle between the axis of a turn and a line of markers, above which it is about that line.
 _ALONG = 0.95
-# Maximum number of steps of a fit, and fall of the sum of squares, over it, of one that is the last.
+# Maximum number of steps of a fit; fall of the sum of squares, over it, of the last; and least damping.
 _STEPS, _SETTLED = 100, 1e-12
 # Turns that the search for a pose starts from, (24, 3) rotation vectors: none is farther than 63° from one.
 _TURNS = Rotation.create_group("O").as_rotvec()
@@ -232,20 +232,18 @@ class _Bundle(NamedTuple):
         damping, (r, J) = np.full(len(X), 1e-3), self.linearized(X, T)
         cost = (r**2).sum(axis=1)
         for _ in range(_STEPS):
-            N, gradient = J.swapaxes(1, 2) @ J, (J.swapaxes(1, 2) @ r[..., None])[..., 0]
-            diagonal = np.einsum("bii->bi", N)
-            N += np.maximum(damping[:, None] * diagonal, 1e-300)[..., None] * np.eye(N.shape[1])
-            step = np.linalg.solve(N, gradient[..., None])[..., 0]
+            J, size = _unit_columns(J)
+            N = J.swapaxes(1, 2) @ J + damping[:, None, None] * np.eye(J.shape[2])
+            step = np.linalg.solve(N, J.swapaxes(1, 2) @ r[..., None])[..., 0] / size
             with np.errstate(all="ignore"):
                 X_new, T_new = self.moved(X, T, step)
-                r_new = self.residuals(X_new, T_new)[0]
-                cost_new = np.nan_to_num((r_new**2).sum(axis=1), nan=np.inf)
+                cost_new = np.nan_to_num((self.residuals(X_new, T_new)[0] ** 2).sum(axis=1), nan=np.inf)
             better = cost_new < cost
-            still = better & (cost - cost_new > _SETTLED * cost)
+            ended = np.where(better, cost - cost_new <= _SETTLED * cost, damping > 1.0 / _SETTLED)
             X, T = np.where(better[:, None, None], X_new, X), np.where(better[:, None, None, None], T_new, T)
             cost = np.where(better, cost_new, cost)
-            damping = np.where(better, 0.1 * damping, 10.0 * damping)
-            if not (still | (~better & (damping < 1e9))).any():
+            damping = np.where(better, np.maximum(0.1 * damping, _SETTLED), 10.0 * damping)
+            if ended.all():
                 break
             r, J = self.linearized(X, T)
         return X, T, cost
@@ -274,6 +272,12 @@ class _Bundle(NamedTuple):
             if ahead[i] and all(_apart(there[i], there[j]) for j in kept):
                 kept.append(i)
         return T[kept, 0], cost[kept]
+
+
+def _unit_columns(J: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivatives (…, N, p) over the norms of their columns, and these (…, p)."""
+    size = np.maximum(np.linalg.norm(J, axis=-2), 1e-300)
+    return J / size[..., None, :], size
 
 
 def _apart(X: FloatArray, Y: FloatArray) -> bool:
@@ -310,11 +314,9 @@ class _Fit(NamedTuple):
 
     def unseen(self, look: int) -> tuple[float, FloatArray]:
         """Largest deviation of the linear part of a displacement by the noise, and its direction."""
-        J = self.linearized()[1]
-        size = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-        N = (J / size).T @ (J / size)
+        J, size = _unit_columns(self.linearized()[1])
         # What is not seen at all gets a large deviation instead of an infinite one.
-        C = np.linalg.inv(N + 1e-12 * np.eye(len(N))) / np.outer(size, size)
+        C = np.linalg.inv(J.T @ J + _SETTLED * np.eye(len(size))) / np.outer(size, size)
         own = self.bundle.columns(look, len(self.X))
         values, vectors = np.linalg.eigh(C[own, own][3:, 3:])
         return float(np.sqrt(values[-1])), vectors[:, -1]
@@ -516,6 +518,7 @@ class CarriedGoal:
     changes: FloatArray  # (c, V, m, 2) of them by independent errors of unit variance, px
     H: FloatArray  # (4, 4) displacement of the tool from its reference, in the calibrated frame
     pose_changes: FloatArray  # (c, 6) translation, unit, and turn about the middle of the tool, rad
+    rms_px: float  # deviation of the pose in the images, rms per marker and view, px
     unit_mm: float  # mm in a unit; NaN without a known length
 
     @property
@@ -528,11 +531,6 @@ class CarriedGoal:
     def pose_covariance(self) -> FloatArray:
         """Covariance (6, 6) of the pose, unit² and rad²."""
         return np.asarray(self.pose_changes.T @ self.pose_changes)
-
-    @property
-    def rms_px(self) -> float:
-        """Deviation of the images, rms per marker and view, px."""
-        return float(np.sqrt((self.changes**2).sum(axis=(0, 3)).mean()))
 
     @property
     def position_mm(self) -> float:
@@ -644,11 +642,13 @@ class DisplacedObject:
         of_calibration -= of_object @ fit.moved(rig, fit.X) + of_goal @ tool.moved(rig, rig.M)
         changes = np.concatenate([of_object, of_goal, of_calibration], axis=1)
         pose = by(_generators(rig.turns, placed[:, :3].mean(axis=0)), placed, np.eye(4))
+        pose_changes = np.linalg.pinv(pose) @ changes
         return CarriedGoal(
             s=s,
             changes=changes.T.reshape(-1, *s.shape),
             H=np.linalg.inv(rig.G) @ H @ rig.G,
-            pose_changes=(np.linalg.pinv(pose) @ changes).T,
+            pose_changes=pose_changes.T,
+            rms_px=float(np.linalg.norm(pose @ pose_changes) / np.sqrt(s.size / 2)),
             unit_mm=self.unit_mm,
         )
 

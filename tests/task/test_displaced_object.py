@@ -1,0 +1,201 @@
+"""Goals carried by objects: exact images, OpenCV, errors against whole estimates, and what is not seen."""
+
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.task.displaced_object import DisplacedObject, Look
+from tests.calibration.simulated_robot import Robot, random_robot, rig
+from tests.metric.test_frame import calibrated
+from tests.samples import displacement, frame, pixels, prismatic, revolute
+from tests.studies.carried_goals import tags
+
+NUMBERS = range(40, 48)
+# Object of two tags of 60 mm before the rig, its displacement by 115 mm and 41°, and the tool at the goal.
+OBJECT = tags(0.06)[0] @ displacement([0.3, 2.8, -0.2], [0.03, 0.02, 0.05]).T
+MOVED = displacement([0.5, -0.3, 0.4], [0.06, -0.05, 0.08])
+AT_GOAL = displacement([-0.2, 0.3, 0.5], [-0.05, 0.04, -0.03])
+Z = [0.0, 0.0, 1.0]
+SCARA = Robot(
+    "RRPR",
+    np.array([revolute([0.3, 0.1, 0], Z), revolute([-0.2, 0.2, 0], Z), prismatic(Z), revolute([0.1, 0, 0], Z)]),
+    rig(),
+    random_robot("RR", np.random.default_rng(4)).markers,
+    np.zeros(4),
+)  # fmt: skip
+
+
+@pytest.fixture
+def arm(rng):
+    return random_robot("RRRPRR", rng)
+
+
+def looks(arm, *motions, X=OBJECT):
+    """Exact looks at an object before and after motions (4, 4)."""
+    return [Look(pixels(arm.cameras, X @ T.T)) for T in (np.eye(4), *motions)]
+
+
+def goal_of(arm, H=AT_GOAL):
+    return Look(pixels(arm.cameras, arm.markers @ H.T))
+
+
+def length_of(arm):
+    return np.linalg.norm(arm.markers[1] - arm.markers[0]), (0, 10)
+
+
+@pytest.mark.parametrize("seed", [None, 1, 2])
+@pytest.mark.parametrize(("types", "views"), [("RRRRRR", 2), ("RPRR", 3), ("RR", 2)])
+def test_exact_images_give_the_exact_goal(seed, types, views, rng):
+    arm, G = random_robot(types, rng, views=views), np.eye(4) if seed is None else frame(seed)
+    c = calibrated(arm, G)
+    c = dataclasses.replace(c, view=("left", "right", "top")[:views])
+    seen = looks(arm, displacement([0, 0, 0.1], [0.01, 0, 0]), MOVED)
+    seen[0].s[0, 1] = seen[2].s[1, 6] = math.nan  # one that two views see but at the second look, and one now
+    found = DisplacedObject.of(c, NUMBERS, seen, c.metric(*length_of(arm)))
+    back = np.linalg.inv(G)
+    assert found.D == pytest.approx(G @ MOVED @ back, abs=1e-9)
+    M = OBJECT @ G.T
+    assert pytest.approx(M / (M @ c.a_inf)[:, None], abs=1e-9) == found.M
+    assert found.marker == tuple(NUMBERS)
+    assert found.coordinates == 6
+    assert found.angle_deg == pytest.approx(np.degrees(Rotation.from_matrix(MOVED[:3, :3]).magnitude()))
+    assert found.shift_mm == pytest.approx(1e3 * np.linalg.norm((OBJECT @ MOVED.T - OBJECT).mean(axis=0)))
+    carried = found.carry(goal_of(arm))
+    assert carried.s == pytest.approx(pixels(arm.cameras, arm.markers @ (MOVED @ AT_GOAL).T), abs=1e-9)
+    assert carried.H == pytest.approx(G @ MOVED @ AT_GOAL @ back, abs=1e-9)
+
+
+def test_one_view_has_the_pose_of_opencv(arm, rng):
+    """Of an object whose shape is known exactly, with 0.5 px of noise now."""
+    taught, now = looks(arm, MOVED)
+    now = now._replace(s=now.s + 0.5 * rng.standard_normal(now.s.shape))
+    now.s[0] = math.nan
+    K, R, center, *_ = cv2.decomposeProjectionMatrix(arm.cameras[1])
+    given = OBJECT[:, :3].copy(), now.s[1].copy(), K / K[2, 2], None
+    _, *start = cv2.solvePnP(*given, flags=cv2.SOLVEPNP_SQPNP)
+    turn, t = cv2.solvePnPRefineLM(*given, *start, (cv2.TERM_CRITERIA_COUNT, 100, 0.0))
+    camera = np.eye(4)
+    camera[:3, :3], camera[:3, 3] = R, -R @ (center[:3] / center[3])[:, 0]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], t[:, 0]
+    sure = taught._replace(sigma=np.full((2, 8), 1e-6))
+    found = DisplacedObject.of(calibrated(arm, np.eye(4)), NUMBERS, [sure, now])
+    assert found.D == pytest.approx(np.linalg.solve(camera, pose), abs=1e-6)
+
+
+def off_by(arm, step, rng):
+    """An arm with other cameras, axes and markers: each is displaced, and so remains what it is."""
+    def move():
+        return displacement(step * rng.standard_normal(3), step * rng.standard_normal(3))
+
+    moves = [move() for _ in arm.twists]
+    twists = [T @ H @ np.linalg.inv(T) for T, H in zip(moves, arm.twists, strict=True)]
+    markers = arm.markers + step * np.c_[rng.standard_normal((len(arm.markers), 3)), np.zeros(len(arm.markers))]
+    return dataclasses.replace(
+        arm, twists=np.array(twists), cameras=np.array([P @ move() for P in arm.cameras]), markers=markers
+    )
+
+
+def test_errors_are_those_of_whole_estimates(arm, rng):
+    """To first order: by images of the object and the goal, and by a calibration that is off."""
+    G, step, std = frame(1), 1e-7, 1e-3
+    c, other = (calibrated(one, G) for one in (arm, off_by(arm, step, rng)))
+    change = [(b - a).reshape(-1, 1) for a, b in ((c.P, other.P), (c.H_hat_0, other.H_hat_0))]
+    c = dataclasses.replace(
+        c,
+        sqrt_cov_shared=std * np.concatenate(change) / step,
+        sqrt_cov_marker=std * (other.M - c.M)[..., None] / step,
+    )
+    seen, goal = looks(arm, MOVED), goal_of(arm)
+    carried = DisplacedObject.of(c, NUMBERS, seen).carry(goal)
+
+    def estimate(calibration, noise, of_goal):
+        moved = [Look(look.s + part) for look, part in zip(seen, noise, strict=True)]
+        return DisplacedObject.of(calibration, NUMBERS, moved).carry(Look(goal.s + of_goal)).s
+
+    noise, of_goal = rng.standard_normal((2, 2, 8, 2)), rng.standard_normal(goal.s.shape)
+    plain = carried.s
+    by_images = (estimate(c, 1e-4 * noise, 1e-4 * of_goal) - plain) / 1e-4
+    count = noise.size + of_goal.size
+    unit = np.r_[noise.ravel(), of_goal.ravel()] / c.sigma_px
+    assert np.einsum("c,cvmu->vmu", unit, carried.changes[:count]) == pytest.approx(by_images, rel=1e-3, abs=1e-3)
+    by_calibration = (estimate(other, 0.0 * noise, 0.0) - plain) * (std / step)
+    assert carried.changes[count] == pytest.approx(by_calibration, rel=1e-3, abs=1e-3)
+    # An object that has not moved leaves the goal where it was, whatever the calibration.
+    still = DisplacedObject.of(c, NUMBERS, looks(arm, np.eye(4))).carry(goal)
+    assert np.linalg.norm(still.pose_changes[count]) < 1e-6 * np.linalg.norm(carried.pose_changes[count])
+
+
+def test_more_looks_refine_the_shape(arm):
+    c = calibrated(arm, frame(2))
+    more = displacement([0.1, 0.2, 0.3], [0.02, 0.05, -0.03])
+    std = [DisplacedObject.of(c, NUMBERS, looks(arm, *Ts)).carry(goal_of(arm)).rms_px for Ts in ((MOVED,), (more, MOVED))]
+    assert std[1] < 0.97 * std[0]
+
+
+def hidden(look, *where):
+    for at in where:
+        look.s[at] = math.nan
+    return look
+
+
+def test_joints_without_a_metric_leave_twelve_coordinates():
+    """Of the object; the tool is where its joints, all parallel, can take it. Six would have smaller errors."""
+    H, seen, std = displacement([0.0, 0.0, 0.5], [-0.05, 0.04, -0.03]), looks(SCARA, MOVED), []
+    for twists in (SCARA.twists, [revolute([0.0, 0.1, 0.0], [1.0, 0.0, 0.0]), *SCARA.twists[1:]]):
+        arm = dataclasses.replace(SCARA, twists=np.array(twists))
+        found = DisplacedObject.of(calibrated(arm, frame(1)), NUMBERS, seen)
+        assert found.D == pytest.approx(frame(1) @ MOVED @ np.linalg.inv(frame(1)), abs=1e-9)
+        carried = found.carry(goal_of(arm, H))
+        assert carried.s == pytest.approx(pixels(arm.cameras, arm.markers @ (MOVED @ H).T), abs=1e-8)
+        std.append((found.coordinates, math.isnan(found.angle_deg), carried.rms_px))
+    assert [one[:2] for one in std] == [(12, True), (6, False)]
+    assert std[0][2] > 1.5 * std[1][2]
+
+
+LINE = np.c_[np.linspace(-0.05, 0.05, 8), np.zeros((8, 2)), np.ones(8)]
+FLAT = np.c_[np.random.default_rng(0).uniform(-0.05, 0.05, (8, 2)), np.zeros(8), np.ones(8)]
+E = np.s_
+REFUSED = {
+    "nothing": (OBJECT, [E[:, :]], "no marker of known shape is seen now: it is hidden"),
+    "one": (OBJECT, [E[:, 1:]], "marker 40 of known shape is seen now: all its turns are open"),
+    "two": (OBJECT, [E[:, 2:]], "only markers 40, 41 are seen now: its turn about their line is open"),
+    "a line": (LINE, [], "how the object is turned about the line of markers 40 and"),
+    "one view of a plane": (OBJECT, [E[0], E[:, 4:]], "fit two places of the object"),
+}
+
+
+@pytest.mark.parametrize(("X", "unseen", "said"), REFUSED.values(), ids=REFUSED)
+def test_what_is_not_seen_is_named(X, unseen, said, arm):
+    taught, now = looks(arm, MOVED, X=X)
+    with pytest.raises(WorkFailed, match=said):
+        DisplacedObject.of(calibrated(arm, frame(1)), NUMBERS, [taught, hidden(now, *unseen)])
+
+
+def test_what_is_no_displaced_object_is_named(arm):
+    c, (taught, now) = calibrated(arm, frame(1)), looks(arm, MOVED)
+    with pytest.raises(WorkFailed, match="do not lie on the object as they did.*most at marker 4[0-7]"):
+        DisplacedObject.of(c, NUMBERS, [taught, Look(now.s + np.where(np.arange(8) == 3, 20.0, 0.0)[:, None])])
+    few = [Look(np.where(np.arange(8)[:, None] < 6 + (np.arange(2) > 0)[:, None, None], look.s, math.nan)) for look in (taught, now)]
+    few[0].s[1, :4] = few[1].s[1, :4] = math.nan
+    with pytest.raises(WorkFailed, match="two cameras together see markers 44, 45 at best"):
+        DisplacedObject.of(c, NUMBERS, few)
+    one = dataclasses.replace(c, P=c.P[:1], view=("left",), sqrt_cov_shared=c.sqrt_cov_shared[12:])
+    with pytest.raises(WorkFailed, match="one camera tells the size of an object from its distance in no"):
+        DisplacedObject.of(one, NUMBERS, [Look(look.s[:1]) for look in (taught, now)])
+    found, goal = DisplacedObject.of(c, NUMBERS, [taught, now]), goal_of(arm)
+    with pytest.raises(WorkFailed, match="the goal shows 2 markers of the tool"):
+        found.carry(hidden(goal, E[:, 2:]))
+    with pytest.raises(WorkFailed, match="do not determine the plane at infinity"):
+        DisplacedObject.of(calibrated(random_robot("R", np.random.default_rng(1)), frame(1)), NUMBERS, [taught, now])
+    with pytest.raises(WorkFailed, match="show 4 off one plane, since the joints leave the metric open"):
+        DisplacedObject.of(calibrated(SCARA, frame(1)), NUMBERS, looks(SCARA, MOVED, X=FLAT))
+    with pytest.raises(InputError, match="cameras on the tool"):
+        DisplacedObject.of(dataclasses.replace(c, mount="tool"), NUMBERS, [taught, now])
+    with pytest.raises(InputError, match="has no covariance"):
+        DisplacedObject.of(c.without_covariance(), NUMBERS, [taught, now])
