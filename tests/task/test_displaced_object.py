@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.task.displaced_object import DisplacedObject, Look
+from projservo_cli.task.displaced_object import DisplacedObject
+from projservo_cli.task.look_bundle import Look
 from tests.calibration.simulated_robot import Robot, random_robot, rig
 from tests.metric.test_frame import calibrated
 from tests.samples import displacement, frame, pixels, prismatic, revolute
@@ -58,7 +59,7 @@ def test_exact_images_give_the_exact_goal(seed, types, views, rng):
     seen[0].s[0, 1] = seen[2].s[1, 6] = math.nan  # one that two views see but at the second look, and one now
     found = DisplacedObject.of(c, NUMBERS, seen, c.metric(*length_of(arm)))
     back = np.linalg.inv(G)
-    assert found.D == pytest.approx(G @ MOVED @ back, abs=1e-9)
+    assert pytest.approx(G @ MOVED @ back, abs=1e-9) == found.D
     M = OBJECT @ G.T
     assert pytest.approx(M / (M @ c.a_inf)[:, None], abs=1e-9) == found.M
     assert found.marker == tuple(NUMBERS)
@@ -67,7 +68,7 @@ def test_exact_images_give_the_exact_goal(seed, types, views, rng):
     assert found.shift_mm == pytest.approx(1e3 * np.linalg.norm((OBJECT @ MOVED.T - OBJECT).mean(axis=0)))
     carried = found.carry(goal_of(arm))
     assert carried.s == pytest.approx(pixels(arm.cameras, arm.markers @ (MOVED @ AT_GOAL).T), abs=1e-9)
-    assert carried.H == pytest.approx(G @ MOVED @ AT_GOAL @ back, abs=1e-9)
+    assert pytest.approx(G @ MOVED @ AT_GOAL @ back, abs=1e-9) == carried.H
 
 
 def test_one_view_has_the_pose_of_opencv(arm, rng):
@@ -85,17 +86,20 @@ def test_one_view_has_the_pose_of_opencv(arm, rng):
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], t[:, 0]
     sure = taught._replace(sigma=np.full((2, 8), 1e-6))
     found = DisplacedObject.of(calibrated(arm, np.eye(4)), NUMBERS, [sure, now])
-    assert found.D == pytest.approx(np.linalg.solve(camera, pose), abs=1e-6)
+    assert pytest.approx(np.linalg.solve(camera, pose), abs=1e-6) == found.D
 
 
 def off_by(arm, step, rng):
     """An arm with other cameras, axes and markers: each is displaced, and so remains what it is."""
+
     def move():
         return displacement(step * rng.standard_normal(3), step * rng.standard_normal(3))
 
     moves = [move() for _ in arm.twists]
     twists = [T @ H @ np.linalg.inv(T) for T, H in zip(moves, arm.twists, strict=True)]
-    markers = arm.markers + step * np.c_[rng.standard_normal((len(arm.markers), 3)), np.zeros(len(arm.markers))]
+    markers = (
+        arm.markers + step * np.c_[rng.standard_normal((len(arm.markers), 3)), np.zeros(len(arm.markers))]
+    )
     return dataclasses.replace(
         arm, twists=np.array(twists), cameras=np.array([P @ move() for P in arm.cameras]), markers=markers
     )
@@ -123,7 +127,9 @@ def test_errors_are_those_of_whole_estimates(arm, rng):
     by_images = (estimate(c, 1e-4 * noise, 1e-4 * of_goal) - plain) / 1e-4
     count = noise.size + of_goal.size
     unit = np.r_[noise.ravel(), of_goal.ravel()] / c.sigma_px
-    assert np.einsum("c,cvmu->vmu", unit, carried.changes[:count]) == pytest.approx(by_images, rel=1e-3, abs=1e-3)
+    assert np.einsum("c,cvmu->vmu", unit, carried.changes[:count]) == pytest.approx(
+        by_images, rel=1e-3, abs=1e-3
+    )
     by_calibration = (estimate(other, 0.0 * noise, 0.0) - plain) * (std / step)
     assert carried.changes[count] == pytest.approx(by_calibration, rel=1e-3, abs=1e-3)
     # An object that has not moved leaves the goal where it was, whatever the calibration.
@@ -134,7 +140,10 @@ def test_errors_are_those_of_whole_estimates(arm, rng):
 def test_more_looks_refine_the_shape(arm):
     c = calibrated(arm, frame(2))
     more = displacement([0.1, 0.2, 0.3], [0.02, 0.05, -0.03])
-    std = [DisplacedObject.of(c, NUMBERS, looks(arm, *Ts)).carry(goal_of(arm)).rms_px for Ts in ((MOVED,), (more, MOVED))]
+    std = [
+        DisplacedObject.of(c, NUMBERS, looks(arm, *Ts)).carry(goal_of(arm)).rms_px
+        for Ts in ((MOVED,), (more, MOVED))
+    ]
     assert std[1] < 0.97 * std[0]
 
 
@@ -150,7 +159,7 @@ def test_joints_without_a_metric_leave_twelve_coordinates():
     for twists in (SCARA.twists, [revolute([0.0, 0.1, 0.0], [1.0, 0.0, 0.0]), *SCARA.twists[1:]]):
         arm = dataclasses.replace(SCARA, twists=np.array(twists))
         found = DisplacedObject.of(calibrated(arm, frame(1)), NUMBERS, seen)
-        assert found.D == pytest.approx(frame(1) @ MOVED @ np.linalg.inv(frame(1)), abs=1e-9)
+        assert pytest.approx(frame(1) @ MOVED @ np.linalg.inv(frame(1)), abs=1e-9) == found.D
         carried = found.carry(goal_of(arm, H))
         assert carried.s == pytest.approx(pixels(arm.cameras, arm.markers @ (MOVED @ H).T), abs=1e-8)
         std.append((found.coordinates, math.isnan(found.angle_deg), carried.rms_px))
@@ -162,9 +171,9 @@ LINE = np.c_[np.linspace(-0.05, 0.05, 8), np.zeros((8, 2)), np.ones(8)]
 FLAT = np.c_[np.random.default_rng(0).uniform(-0.05, 0.05, (8, 2)), np.zeros(8), np.ones(8)]
 E = np.s_
 REFUSED = {
-    "nothing": (OBJECT, [E[:, :]], "no marker of known shape is seen now: it is hidden"),
-    "one": (OBJECT, [E[:, 1:]], "marker 40 of known shape is seen now: all its turns are open"),
-    "two": (OBJECT, [E[:, 2:]], "only markers 40, 41 are seen now: its turn about their line is open"),
+    "nothing": (OBJECT, [E[:, :]], "is seen now: marker none; it is hidden"),
+    "one": (OBJECT, [E[:, 1:]], "is seen now: marker 40; all its turns are open"),
+    "two": (OBJECT, [E[:, 2:]], "is seen now: markers 40, 41; its turn about their line is open: show 3 off"),
     "a line": (LINE, [], "how the object is turned about the line of markers 40 and"),
     "one view of a plane": (OBJECT, [E[0], E[:, 4:]], "fit two places of the object"),
 }
@@ -180,8 +189,13 @@ def test_what_is_not_seen_is_named(X, unseen, said, arm):
 def test_what_is_no_displaced_object_is_named(arm):
     c, (taught, now) = calibrated(arm, frame(1)), looks(arm, MOVED)
     with pytest.raises(WorkFailed, match="do not lie on the object as they did.*most at marker 4[0-7]"):
-        DisplacedObject.of(c, NUMBERS, [taught, Look(now.s + np.where(np.arange(8) == 3, 20.0, 0.0)[:, None])])
-    few = [Look(np.where(np.arange(8)[:, None] < 6 + (np.arange(2) > 0)[:, None, None], look.s, math.nan)) for look in (taught, now)]
+        DisplacedObject.of(
+            c, NUMBERS, [taught, Look(now.s + np.where(np.arange(8) == 3, 20.0, 0.0)[:, None])]
+        )
+    few = [
+        Look(np.where(np.arange(8)[:, None] < 6 + (np.arange(2) > 0)[:, None, None], look.s, math.nan))
+        for look in (taught, now)
+    ]
     few[0].s[1, :4] = few[1].s[1, :4] = math.nan
     with pytest.raises(WorkFailed, match="two cameras together see markers 44, 45 at best"):
         DisplacedObject.of(c, NUMBERS, few)
@@ -192,8 +206,10 @@ def test_what_is_no_displaced_object_is_named(arm):
     with pytest.raises(WorkFailed, match="the goal shows 2 markers of the tool"):
         found.carry(hidden(goal, E[:, 2:]))
     with pytest.raises(WorkFailed, match="do not determine the plane at infinity"):
-        DisplacedObject.of(calibrated(random_robot("R", np.random.default_rng(1)), frame(1)), NUMBERS, [taught, now])
-    with pytest.raises(WorkFailed, match="show 4 off one plane, since the joints leave the metric open"):
+        DisplacedObject.of(
+            calibrated(random_robot("R", np.random.default_rng(1)), frame(1)), NUMBERS, [taught, now]
+        )
+    with pytest.raises(WorkFailed, match="show 4 off one plane, as the joints leave the metric open"):
         DisplacedObject.of(calibrated(SCARA, frame(1)), NUMBERS, looks(SCARA, MOVED, X=FLAT))
     with pytest.raises(InputError, match="cameras on the tool"):
         DisplacedObject.of(dataclasses.replace(c, mount="tool"), NUMBERS, [taught, now])

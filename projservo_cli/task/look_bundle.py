@@ -1,0 +1,297 @@
+"""Maximum of the likelihood of the shape of a body and its displacements, by looks at it.
+
+In the frame in which the joints preserve the metric, a displacement is rigid, so has six coordinates. Where
+the joints leave the metric open, it is affine, and has twelve.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple, Self
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.calibration.prediction import error_factor_with_model, projection_derivative
+from projservo_cli.geometry.displacements import cross_matrix
+from projservo_cli.geometry.lens import distort, undistort
+from projservo_cli.metric.frame import ProjectiveParameters, changes_of
+from projservo_cli.records import BoolArray, Calibration, FloatArray, WorkFailed
+from projservo_cli.task.body import make_body
+
+# Singular value over the largest, below which joints leave the plane at infinity open, or preserve a form.
+_OPEN = 1e-6
+# Deviation of the invariant form from 1 above which the data do not determine it, as for a metric.
+_UNDETERMINED = 0.3
+# Number of symmetric forms of the plane at infinity.
+_FORMS = 6
+# Distance of two places of a body over its size, below which they are one.
+_SAME = 0.05
+# Maximum number of steps of a fit; fall of the sum of squares, over it, of the last; and least damping.
+_STEPS, _SETTLED = 100, 1e-12
+# Turns that the search for a pose starts from, (24, 3) rotation vectors: none is farther than 63° from one.
+_TURNS = Rotation.create_group("O").as_rotvec()
+
+
+class Look(NamedTuple):
+    """Images of markers at one time."""
+
+    s: FloatArray  # (V, k, 2) px, as cameras report them; NaN where unseen
+    sigma: FloatArray | None = None  # (V, k) deviation of a coordinate, px; None or NaN: as calibrated
+
+    def of(self, markers: BoolArray) -> "Look":
+        """Images of some markers (k,)."""
+        return Look(self.s[:, markers], None if self.sigma is None else self.sigma[:, markers])
+
+
+class Rig(NamedTuple):
+    """Cameras and tool, as calibrated and off by its errors, with the plane at infinity (0, 0, 0, 1).
+
+    Displacements are rigid there, if the joints determine the metric.
+    """
+
+    P: FloatArray  # (B, V, 3, 4)
+    lens: FloatArray  # (B, V, 5)
+    M: FloatArray  # (B, m, 4) markers of the tool at the reference
+    G: FloatArray  # (4, 4) from the calibrated frame
+    turns: FloatArray  # (3, 3, 3) rotations, per rad
+    linear: FloatArray  # (3 or 9, 3, 3) rotations, or all, that displace an object
+    sigma_px: float
+
+    @classmethod
+    def of(cls, c: Calibration) -> Self:
+        """Raises WorkFailed if the joints do not determine the plane at infinity, or preserve no metric."""
+        models = ProjectiveParameters.around(c, c.model().lens, error_factor_with_model(c))
+        U, sizes, _ = np.linalg.svd(np.concatenate(np.moveaxis(models.H_hat, 1, 0), axis=-1))
+        if sizes[0, 2] < _OPEN * sizes[0, 0]:
+            raise WorkFailed(
+                "objects: the joints do not determine the plane at infinity, so nothing tells how far an "
+                "object has moved: record motions of two joints whose axes are not parallel"
+            )
+        a_inf = U[..., 3] / (U[..., 3] @ c.M.mean(axis=0))[:, None]
+        D = np.linalg.svd(a_inf[:1])[2][1:]
+        G = np.concatenate([np.broadcast_to(D, (len(a_inf), 3, 4)), a_inf[:, None]], axis=1)
+        L = (G[:, None] @ models.H_hat @ np.linalg.inv(G)[:, None])[..., :3, :3]
+        root = _metric_root(L)
+        if root is None:
+            to_first = np.linalg.inv(G[0])
+            turns = (G[0] @ make_body(c.model(), c.M).H_hat @ to_first)[:, :3, :3]
+            linear = np.eye(9).reshape(9, 3, 3)
+        else:
+            turns = linear = cross_matrix(np.eye(3))
+            G[:, :3] = np.linalg.solve(root, G[:, :3])
+        M = models.M @ G.swapaxes(1, 2)
+        P = models.P @ np.linalg.inv(G)[:, None]
+        return cls(P, models.lens, M / M[..., 3:], G[0], turns, linear, c.sigma_px)
+
+    @property
+    def rigid(self) -> bool:
+        """Whether displacements are rigid."""
+        return len(self.linear) == len(self.turns)
+
+    def bundle(self, looks: Sequence[Look], E: FloatArray, fixed: int = -1) -> "Bundle":
+        """Least squares of some looks; arguments as of ``Bundle``."""
+        s = np.stack([np.asarray(look.s, dtype=np.float64) for look in looks])
+        sigma = np.stack([np.full(s.shape[1:3], np.nan) if x.sigma is None else x.sigma for x in looks])
+        sigma = np.where(np.isfinite(sigma) & (sigma > 0.0), sigma, self.sigma_px)
+        weight = np.where(np.isfinite(s).all(axis=-1), 1.0 / sigma, 0.0)
+        return Bundle(self.P[0], self.lens[0], s, weight, E, fixed)
+
+    def pixels(self, points: FloatArray) -> FloatArray:
+        """Pixels (B, V, N, 2) of points (N, 4) or (B, N, 4) by each of the models."""
+        m = points[..., None, :, :] @ self.P.swapaxes(2, 3)
+        return distort(self.lens[:, :, None], m[..., :2] / m[..., 2:])
+
+
+def _metric_root(L: FloatArray) -> FloatArray | None:
+    """Root A (B, 3, 3) of the form S = A Aᵀ with L S + S Lᵀ = 0 for all actions L (B, n, 3, 3) of the joints.
+
+    It changes smoothly from one model to the next. None if there is more than one form, within the errors.
+    """
+    i, j = np.triu_indices(3)
+    basis = np.zeros((_FORMS, 3, 3))
+    basis[range(_FORMS), i, j] = basis[range(_FORMS), j, i] = np.where(i == j, 1.0, np.sqrt(0.5))
+    moved = np.einsum("bnij,sjk->bniks", L, basis)
+    changes = (moved + moved.swapaxes(2, 3)).reshape(len(L), -1, _FORMS)
+    _, sizes, rows = np.linalg.svd(changes)
+    if sizes[0, -2] < _OPEN * max(sizes[0, 0], 1.0):
+        return None
+    form = rows[:, -1]
+    S = np.einsum("bs,sij->bij", form * np.einsum("bs,sii->b", form, basis)[:, None], basis)
+    try:
+        A = np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        return None
+    back = np.linalg.inv(A[0])
+    return A if np.linalg.norm(changes_of(back @ S @ back.T)) < _UNDETERMINED else None
+
+
+def generators(linear: FloatArray, center: FloatArray) -> FloatArray:
+    """Generators (3 + j, 4, 4) of translations, and of linear maps (j, 3, 3) about a point (3,)."""
+    E = np.zeros((3 + len(linear), 4, 4))
+    E[range(3), range(3), 3] = 1.0
+    E[3:, :3, :3], E[3:, :3, 3] = linear, -linear @ center
+    return E
+
+
+class Bundle(NamedTuple):
+    """Least squares of the images of points after displacements, from many starts (B, …) at once."""
+
+    P: FloatArray  # (V, 3, 4)
+    lens: FloatArray  # (V, 5)
+    s: FloatArray  # (L, V, k, 2) px, NaN where unseen
+    weight: FloatArray  # (L, V, k) 1 over the deviation, px; 0 where unseen
+    E: FloatArray  # (g, 4, 4) generators: a step takes a displacement T to T exp(ξ E)
+    fixed: int  # look in whose frame the points are, which are unknown too; −1 for none, of known points
+
+    @property
+    def free(self) -> bool:
+        """Whether the points are unknown too."""
+        return self.fixed >= 0
+
+    @property
+    def moving(self) -> list[int]:
+        """Looks with an unknown displacement."""
+        return [look for look in range(len(self.s)) if look != self.fixed]
+
+    def residuals(self, X: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals (B, N) over their deviation, and derivatives (B, L, V, k, 2, 4) of pixels by points.
+
+        X : (B, k, 4) points; T : (B, L, 4, 4) displacements.
+        """
+        Y = np.einsum("blij,bkj->blki", T, X)
+        pixels, G, _ = projection_derivative(self.P, self.lens, Y.reshape(-1, 4))
+        apart = (len(self.P), *Y.shape[:3])
+        pixels, by = (
+            np.moveaxis(part.reshape(*apart, *part.shape[2:]), 0, 2) for part in (pixels, G @ self.P[:, None])
+        )
+        weight = self.weight[..., None]
+        r = np.where(weight > 0.0, weight * (self.s - pixels), 0.0)
+        return r.reshape(len(X), -1), weight[..., None] * by
+
+    def columns(self, look: int, k: int) -> slice:
+        """Columns of the displacement of a look among those of k points."""
+        g = len(self.E)
+        first = (3 * k if self.free else 0) + g * self.moving.index(look)
+        return slice(first, first + g)
+
+    def by_motion(self, by_point: FloatArray, X: FloatArray, T: FloatArray) -> FloatArray:
+        """Derivatives (B, L, V, k, 2, g) by displacements, from those by points; as above."""
+        velocity = np.einsum("blij,gjm,bkm->blkgi", T, self.E, X, optimize=True)
+        return np.einsum("blvkdi,blkgi->blvkdg", by_point, velocity, optimize=True)
+
+    def linearized(self, X: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals (B, N), and derivatives (B, N, p) of pixels, both over their deviation."""
+        r, by_point = self.residuals(X, T)
+        by_motion = self.by_motion(by_point, X, T)
+        g, k = len(self.E), X.shape[1] if self.free else 0
+        J = np.zeros((*by_motion.shape[:-1], 3 * k + g * len(self.moving)))
+        by_X = by_point @ T[:, :, None, None, :, :3]
+        for i in range(k):
+            J[..., i, :, 3 * i : 3 * i + 3] = by_X[..., i, :, :]
+        for look in self.moving:
+            J[:, look, ..., self.columns(look, X.shape[1])] = by_motion[:, look]
+        return r, J.reshape(len(X), r.shape[1], -1)
+
+    def moved(self, X: FloatArray, T: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points and displacements after a step (B, p)."""
+        of_points, of_motions = np.split(step, [3 * X.shape[1] if self.free else 0], axis=1)
+        X, T = X.copy(), T.copy()
+        if self.free:
+            X[..., :3] += of_points.reshape(len(X), -1, 3)
+        xi = of_motions.reshape(len(X), len(self.moving), len(self.E))
+        T[:, self.moving] = T[:, self.moving] @ expm(np.einsum("blg,gij->blij", xi, self.E))
+        return X, T
+
+    def settled(self, X: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Points, displacements and sums of squares (B,) at a minimum, by Levenberg–Marquardt steps."""
+        damping, (r, J) = np.full(len(X), 1e-3), self.linearized(X, T)
+        cost = (r**2).sum(axis=1)
+        for _ in range(_STEPS):
+            J, size = _unit_columns(J)
+            N = J.swapaxes(1, 2) @ J + damping[:, None, None] * np.eye(J.shape[2])
+            step = np.linalg.solve(N, J.swapaxes(1, 2) @ r[..., None])[..., 0] / size
+            with np.errstate(all="ignore"):
+                X_new, T_new = self.moved(X, T, step)
+                cost_new = np.nan_to_num((self.residuals(X_new, T_new)[0] ** 2).sum(axis=1), nan=np.inf)
+            better = cost_new < cost
+            ended = np.where(better, cost - cost_new <= _SETTLED * cost, damping > 1.0 / _SETTLED)
+            X, T = np.where(better[:, None, None], X_new, X), np.where(better[:, None, None, None], T_new, T)
+            cost = np.where(better, cost_new, cost)
+            damping = np.where(better, np.maximum(0.1 * damping, _SETTLED), 10.0 * damping)
+            if ended.all():
+                break
+            r, J = self.linearized(X, T)
+        return X, T, cost
+
+    def poses(self, X: FloatArray, turns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Displacements (h, 4, 4) of known points X (k, 4) in one look, and χ² (h,): minima, least first.
+
+        turns : (3, 3, 3) rotations that the search starts from.
+        """
+        center = X[:, :3].mean(axis=0)
+        R = expm(np.einsum("bi,ijk->bjk", _TURNS, generators(turns, center)[3:]))
+        straight = undistort(self.lens, self.s[0])
+        rows = self.P[:, None, :2] - straight[..., None] * self.P[:, None, 2:]
+        rows = rows[self.weight[0] > 0.0]
+        turned = np.einsum("bij,kj->bki", R, X)
+        of = np.nonzero(self.weight[0] > 0.0)[1]
+        off = np.einsum("nrj,bnj->bnr", rows, turned[:, of]).reshape(len(R), -1)
+        R[:, :3, 3] -= off @ np.linalg.pinv(rows[..., :3].reshape(-1, 3)).T
+        many = np.broadcast_to(X, (len(R), *X.shape))
+        _, T, cost = self.settled(many, R[:, None])
+        there = np.einsum("bij,kj->bki", T[:, 0], X)
+        depth = np.einsum("vj,bkj->bvk", self.P[:, 2], there)
+        ahead = (depth > 0.0).all(axis=(1, 2), where=self.weight[0] > 0.0) & np.isfinite(cost)
+        kept: list[int] = []
+        for i in np.argsort(cost).tolist():
+            if ahead[i] and all(differ(there[i], there[j]) for j in kept):
+                kept.append(i)
+        return T[kept, 0], cost[kept]
+
+
+def _unit_columns(J: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivatives (…, N, p) over the norms of their columns, and these (…, p)."""
+    size = np.maximum(np.linalg.norm(J, axis=-2), 1e-300)
+    return J / size[..., None, :], size
+
+
+def differ(X: FloatArray, Y: FloatArray) -> bool:
+    """Whether points (k, 4) differ by more than a share of their size."""
+    size = np.linalg.norm(X - X.mean(axis=0), axis=1).max()
+    return bool(np.linalg.norm(X - Y, axis=1).max() > _SAME * size)
+
+
+class Fit(NamedTuple):
+    """Points of a body and its displacements at some looks."""
+
+    bundle: Bundle
+    X: FloatArray  # (k, 4) points in the frame of the fixed look
+    T: FloatArray  # (L, 4, 4)
+    cost: float  # χ²
+
+    @classmethod
+    def settled(cls, bundle: Bundle, X: FloatArray, T: FloatArray) -> Self:
+        """The minimum beside points (k, 4) and displacements (L, 4, 4)."""
+        X, T, cost = bundle.settled(X[None], T[None])
+        return cls(bundle, X[0], T[0], float(cost[0]))
+
+    def linearized(self) -> tuple[FloatArray, FloatArray]:
+        """Residuals (N,) and derivatives (N, p) of what is seen, over their deviation."""
+        r, J = self.bundle.linearized(self.X[None], self.T[None])
+        seen = np.repeat(self.bundle.weight > 0.0, 2)
+        return r[0, seen], J[0, seen]
+
+    def moved(self, rig: Rig, X: FloatArray) -> FloatArray:
+        """Changes (N, c) of what is seen by the errors of a calibration; X : (k, 4) or (B, k, 4) points."""
+        weight, looks = self.bundle.weight[..., None], range(len(self.T))
+        pixels = np.stack([changes_of(rig.pixels(X @ self.T[look].T)) for look in looks], axis=1)
+        return (weight * pixels)[:, self.bundle.weight > 0.0].reshape(len(pixels), -1).T
+
+    def unseen(self, look: int) -> tuple[float, FloatArray]:
+        """Largest deviation of the linear part of a displacement by the noise, and its direction."""
+        J, size = _unit_columns(self.linearized()[1])
+        # What is not seen at all gets a large deviation instead of an infinite one.
+        C = np.linalg.inv(J.T @ J + _SETTLED * np.eye(len(size))) / np.outer(size, size)
+        own = self.bundle.columns(look, len(self.X))
+        values, vectors = np.linalg.eigh(C[own, own][3:, 3:])
+        return float(np.sqrt(values[-1])), vectors[:, -1]
