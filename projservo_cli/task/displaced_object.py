@@ -19,6 +19,7 @@ from scipy.stats import chi2
 
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.geometry.lens import undistort
+from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.metric.frame import Metric, changes_of
 from projservo_cli.records import (
     MM,
@@ -38,6 +39,8 @@ _RIGID, _AFFINE = 3, 4
 _UNSEEN = 0.3
 # Difference of χ² below which two poses fit alike: the better one is the wrong one in 1 of 1,000 cases.
 _UNDECIDED = 13.8
+# Number of minima of a place for known points that the points are then freed from.
+_MINIMA = 3
 # Times the stated noise, and probability, beyond which residuals are not those of the same rigid object.
 _NOISE, _CONFIDENCE = 2.0, 0.999
 # Cosine of the angle between the axis of a turn and a line of markers, above which it is about that line.
@@ -117,21 +120,15 @@ class _Search:
         shown = placed.known & (self.views[look] > 0)
         if shown.sum() < self.least:
             raise WorkFailed(self._too_few(shown, when))
-        T, _ = self.bundle([look], shown, X).poses(X[shown], self.rig.turns)
-        if not len(T):
+        found = []
+        for start in self._structures(placed, X):
+            T, _ = self.bundle([look], shown, start).poses(start[shown], self.rig.turns)
+            found += [self._joined(placed, look, start, there) for there in T[:_MINIMA]]
+        if not found:
             raise WorkFailed(
                 f"objects: {self.numbers(shown)} fit no place before the cameras {when}: markers may be "
                 "numbered otherwise, or the cameras have moved; look again"
             )
-        found = []
-        for there in T[:2]:  # each of both minima that one view leaves
-            at = sorted([*zip(placed.looks, placed.fit.T, strict=True), (look, there)], key=itemgetter(0))
-            looks = tuple(i for i, _ in at)
-            points = np.where(placed.known[:, None], X, self.points(look, there))
-            known = np.isfinite(points[:, 0])
-            bundle = self.bundle(looks, known, points, looks.index(placed.looks[placed.fit.bundle.fixed]))
-            fit = Fit.settled(bundle, points[known], np.array([place for _, place in at]))
-            found.append(_Placed(fit, looks, known))
         best, *others = sorted(found, key=lambda one: one.fit.cost)
         at_look = best.looks.index(look)
         deviation, axis = best.fit.unseen(at_look)
@@ -147,6 +144,30 @@ class _Search:
                     "tilted; show it to a second camera, nearer, or more of its markers off one plane"
                 )
         return best
+
+    def _structures(self, placed: _Placed, X: FloatArray) -> list[FloatArray]:
+        """Points (k, 4) to start from: those known, and with one look alone their reversal in depth.
+
+        Images of a small object far away hardly tell the two apart, nor does a short baseline.
+        """
+        if len(placed.looks) > 1 or not self.rig.rigid:
+            return [X]
+        middle = placed.fit.X[:, :3].mean(axis=0)
+        depth = middle - optical_centers(self.rig.P[0], np.array([0.0, 0.0, 0.0, 1.0]))[:, :3].mean(axis=0)
+        depth /= np.linalg.norm(depth)
+        reversed_ = X.copy()
+        reversed_[:, :3] -= 2.0 * np.outer((X[:, :3] - middle) @ depth, depth)
+        return [X, reversed_]
+
+    def _joined(self, placed: _Placed, look: int, X: FloatArray, there: FloatArray) -> _Placed:
+        """The minimum with one more look, from points (k, 4) and their displacement (4, 4) there."""
+        at = sorted([*zip(placed.looks, placed.fit.T, strict=True), (look, there)], key=itemgetter(0))
+        looks = tuple(i for i, _ in at)
+        points = np.where(placed.known[:, None], X, self.points(look, there))
+        known = np.isfinite(points[:, 0])
+        bundle = self.bundle(looks, known, points, looks.index(placed.looks[placed.fit.bundle.fixed]))
+        fit = Fit.settled(bundle, points[known], np.array([place for _, place in at]))
+        return _Placed(fit, looks, known)
 
     def _no_shape(self, known: BoolArray, base: int) -> str:
         """Why the shape of the object is not known."""
