@@ -7,13 +7,14 @@ Errors are those of all images and of the calibration, to first order. A calibra
 object and the tool alike: what both errors have in common drops out of the images of the carried goal.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import itemgetter
 from typing import NamedTuple, Self
 
 import numpy as np
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -186,7 +187,7 @@ class _Search:
         """Markers that a look needs, and why."""
         if self.rig.rigid:
             return f"{_RIGID} off one line"
-        return f"{_AFFINE} off one plane, as the joints leave the metric open, and so 12 coordinates instead of 6"
+        return f"{_AFFINE} off one plane, as the joints leave the metric open: 12 coordinates instead of 6"
 
     def _too_few(self, shown: BoolArray, when: str) -> str:
         """Which freedom fewer markers than needed leave."""
@@ -359,18 +360,26 @@ class DisplacedObject:
             motion = out._replace(E=E).by_motion(by_point, points[None], T[None, None])
             return np.asarray(motion.reshape(s.size, -1))
 
-        by_goal = by(tool.bundle.E, tool.X, H)
-        by_now = by(fit.bundle.E, tool.X @ (to_taught @ tool.T[0]).T, fit.T[-1])
-        J = fit.linearized()[1]
-        by_object = np.zeros((s.size, J.shape[1]))
+        by_goal = by(tool.bundle.E, tool.X, H) @ tool.sensitivity
+        held = tool.X @ (to_taught @ tool.T[0]).T
+        step, of_calibration = fit.sensitivity, changes_of(rig.pixels(rig.M @ H.T)).reshape(-1, s.size).T
+        own = np.zeros((len(fit.bundle.E), len(step)))
         for look, sign in ((0, -1.0), (len(fit.T) - 1, 1.0)):
             if look != fit.bundle.fixed:
-                by_object[:, fit.bundle.columns(look, len(fit.X))] = sign * by_now
-        of_object = by_object @ np.linalg.pinv(J)
-        of_goal = by_goal @ np.linalg.pinv(tool.linearized()[1])
-        of_calibration = changes_of(rig.pixels(rig.M @ H.T)).reshape(-1, s.size).T
-        of_calibration -= of_object @ fit.moved(rig, fit.X) + of_goal @ tool.moved(rig, rig.M)
-        changes = np.concatenate([of_object, of_goal, of_calibration], axis=1)
+                own[:, fit.bundle.columns(look, len(fit.X))] += sign * np.eye(len(own))
+        # Errors of the displacement of the object by its images, and by the calibration.
+        xi = own @ step
+        xi_c = -xi @ fit.moved(rig, fit.X)
+        by_now = by(fit.bundle.E, held, fit.T[-1])
+        of_calibration += by_now @ xi_c - by_goal @ tool.moved(rig, rig.M)
+        exact = rig._replace(P=rig.P[:1], lens=rig.lens[:1])
+
+        def images(T: FloatArray) -> FloatArray:
+            """Images (K, V m 2) after small displacements (K, 4, 4) of the object."""
+            return exact.pixels(held @ (fit.T[-1] @ T).swapaxes(1, 2)).reshape(len(T), -1)
+
+        bent = _bent(images, fit.bundle.E, np.hstack([xi, xi_c]))
+        changes = np.concatenate([by_now @ xi, by_goal, of_calibration, bent], axis=1)
         pose = by(generators(rig.turns, placed[:, :3].mean(axis=0)), placed, np.eye(4))
         pose_changes = np.linalg.pinv(pose) @ changes
         return CarriedGoal(
@@ -381,6 +390,25 @@ class DisplacedObject:
             rms_px=float(np.linalg.norm(pose @ pose_changes) / np.sqrt(s.size / 2)),
             unit_mm=self.unit_mm,
         )
+
+
+def _bent(images: Callable[[FloatArray], FloatArray], E: FloatArray, errors: FloatArray) -> FloatArray:
+    """Changes (N, c) of second order of images (N,), uncorrelated with each other and with those of first.
+
+    The tool is beside the object, so a turn by an error takes it along an arc.
+    images : (K, N) of small displacements (K, 4, 4); E : (g, 4, 4) generators; errors : (g, c) coordinates of it.
+    """
+    values, vectors = np.linalg.eigh(errors @ errors.T)
+    L = vectors * np.sqrt(np.maximum(values, 0.0))
+
+    i, j = np.triu_indices(len(E))
+    sums, gaps = (L[:, i] + L[:, j]).T, (L[:, i] - L[:, j]).T
+    steps = np.stack([sums, -sums, gaps, -gaps])
+    at = images(expm(np.einsum("...g,gij->...ij", steps, E)).reshape(-1, 4, 4))
+    bent = 0.25 * np.einsum("s,skn->nk", [1.0, 1.0, -1.0, -1.0], at.reshape(4, len(i), -1))
+    # Of unit variance are z_i z_j and (z_i² − 1)/√2; the mean of z_i² is 1.
+    mean = 0.5 * bent[:, i == j].sum(axis=1)
+    return np.column_stack([np.where(i == j, np.sqrt(0.5), 1.0) * bent, mean])
 
 
 def _unit_m(rig: Rig, metric: Metric) -> float:

@@ -5,6 +5,8 @@ the joints leave the metric open, it is affine, and has twelve.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -26,8 +28,16 @@ _UNDETERMINED = 0.3
 _FORMS = 6
 # Distance of two places of a body over its size, below which they are one.
 _SAME = 0.05
-# Maximum number of steps of a fit; fall of the sum of squares, over it, of the last; and least damping.
-_STEPS, _SETTLED = 100, 1e-12
+# Maximum number of steps of a fit, and damping above which none leads down.
+_STEPS, _HOPELESS = 100, 1e8
+# Fall of χ² by the last step, over χ² and as of round-off.
+_SETTLED, _EXACT = 1e-10, 1e-16
+# Least damping, and least eigenvalue of second derivatives by coordinates of unit deviation.
+_REGULAR = 1e-12
+# Number of steps from all turns, and of places that are then followed to the end.
+_FIRST_STEPS, _PLACES = 12, 6
+# Step of the differences of gradients, over the deviation of a coordinate.
+_PROBE = 0.01
 # Turns that the search for a pose starts from, (24, 3) rotation vectors: none is farther than 63° from one.
 _TURNS = Rotation.create_group("O").as_rotvec()
 
@@ -202,22 +212,27 @@ class Bundle(NamedTuple):
         T[:, self.moving] = T[:, self.moving] @ expm(np.einsum("blg,gij->blij", xi, self.E))
         return X, T
 
-    def settled(self, X: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def settled(
+        self, X: FloatArray, T: FloatArray, steps: int = _STEPS
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Points, displacements and sums of squares (B,) at a minimum, by Levenberg–Marquardt steps."""
         damping, (r, J) = np.full(len(X), 1e-3), self.linearized(X, T)
         cost = (r**2).sum(axis=1)
-        for _ in range(_STEPS):
+        for _ in range(steps):
             J, size = _unit_columns(J)
             N = J.swapaxes(1, 2) @ J + damping[:, None, None] * np.eye(J.shape[2])
-            step = np.linalg.solve(N, J.swapaxes(1, 2) @ r[..., None])[..., 0] / size
+            gradient = (J.swapaxes(1, 2) @ r[..., None])[..., 0]
+            step = np.linalg.solve(N, gradient[..., None])[..., 0]
+            expected = (step * gradient).sum(axis=1)
             with np.errstate(all="ignore"):
-                X_new, T_new = self.moved(X, T, step)
+                X_new, T_new = self.moved(X, T, step / size)
                 cost_new = np.nan_to_num((self.residuals(X_new, T_new)[0] ** 2).sum(axis=1), nan=np.inf)
             better = cost_new < cost
-            ended = np.where(better, cost - cost_new <= _SETTLED * cost, damping > 1.0 / _SETTLED)
+            small = np.where(better, cost - cost_new, expected) <= _SETTLED * cost + _EXACT
+            ended = small | (damping > _HOPELESS)
             X, T = np.where(better[:, None, None], X_new, X), np.where(better[:, None, None, None], T_new, T)
             cost = np.where(better, cost_new, cost)
-            damping = np.where(better, np.maximum(0.1 * damping, _SETTLED), 10.0 * damping)
+            damping = np.where(better, np.maximum(0.1 * damping, _REGULAR), 10.0 * damping)
             if ended.all():
                 break
             r, J = self.linearized(X, T)
@@ -237,16 +252,19 @@ class Bundle(NamedTuple):
         of = np.nonzero(self.weight[0] > 0.0)[1]
         off = np.einsum("nrj,bnj->bnr", rows, turned[:, of]).reshape(len(R), -1)
         R[:, :3, 3] -= off @ np.linalg.pinv(rows[..., :3].reshape(-1, 3)).T
-        many = np.broadcast_to(X, (len(R), *X.shape))
-        _, T, cost = self.settled(many, R[:, None])
-        there = np.einsum("bij,kj->bki", T[:, 0], X)
+        return self._minima(X, self._minima(X, R, _FIRST_STEPS)[0][:_PLACES], _STEPS)
+
+    def _minima(self, X: FloatArray, T: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
+        """Displacements (h, 4, 4) with points before the cameras, and χ² (h,), by steps from some (B, 4, 4)."""
+        _, ends, cost = self.settled(np.broadcast_to(X, (len(T), *X.shape)), T[:, None], steps)
+        there = X @ ends[:, 0].swapaxes(1, 2)
         depth = np.einsum("vj,bkj->bvk", self.P[:, 2], there)
         ahead = (depth > 0.0).all(axis=(1, 2), where=self.weight[0] > 0.0) & np.isfinite(cost)
         kept: list[int] = []
         for i in np.argsort(cost).tolist():
             if ahead[i] and all(differ(there[i], there[j]) for j in kept):
                 kept.append(i)
-        return T[kept, 0], cost[kept]
+        return ends[kept, 0], cost[kept]
 
 
 def _unit_columns(J: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -261,7 +279,8 @@ def differ(X: FloatArray, Y: FloatArray) -> bool:
     return bool(np.linalg.norm(X - Y, axis=1).max() > _SAME * size)
 
 
-class Fit(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Fit:
     """Points of a body and its displacements at some looks."""
 
     bundle: Bundle
@@ -287,11 +306,31 @@ class Fit(NamedTuple):
         pixels = np.stack([changes_of(rig.pixels(X @ self.T[look].T)) for look in looks], axis=1)
         return (weight * pixels)[:, self.bundle.weight > 0.0].reshape(len(pixels), -1).T
 
+    @cached_property
+    def inverse_hessian(self) -> FloatArray:
+        """Inverse (p, p) of the second derivatives of χ²/2, with those of the images.
+
+        What noise has bent looks better determined than it is: the residuals tell.
+        """
+        J, size = _unit_columns(self.linearized()[1])
+        p = len(size)
+        step = np.concatenate([np.eye(p), -np.eye(p)]) * (_PROBE / size)
+        many = (np.broadcast_to(part, (len(step), *part.shape)) for part in (self.X, self.T))
+        r, J = self.bundle.linearized(*self.bundle.moved(*many, step))
+        up, down = np.split(-(J.swapaxes(1, 2) @ r[..., None])[..., 0] / size, 2)
+        H = (up - down) / (2.0 * _PROBE)
+        values, vectors = np.linalg.eigh(0.5 * (H + H.T))
+        # What is not seen at all gets a large deviation instead of an infinite one.
+        root = vectors / np.sqrt(np.maximum(values, _REGULAR)) / size[:, None]
+        return np.asarray(root @ root.T)
+
+    @cached_property
+    def sensitivity(self) -> FloatArray:
+        """Changes (p, N) of the minimum by the images that are seen, over their deviation."""
+        return np.asarray(self.inverse_hessian @ self.linearized()[1].T)
+
     def unseen(self, look: int) -> tuple[float, FloatArray]:
         """Largest deviation of the linear part of a displacement by the noise, and its direction."""
-        J, size = _unit_columns(self.linearized()[1])
-        # What is not seen at all gets a large deviation instead of an infinite one.
-        C = np.linalg.inv(J.T @ J + _SETTLED * np.eye(len(size))) / np.outer(size, size)
         own = self.bundle.columns(look, len(self.X))
-        values, vectors = np.linalg.eigh(C[own, own][3:, 3:])
+        values, vectors = np.linalg.eigh(self.inverse_hessian[own, own][3:, 3:])
         return float(np.sqrt(values[-1])), vectors[:, -1]

@@ -1,6 +1,6 @@
 """Goals carried by objects: whether 95 % regions hold the truth, and how large errors are.
 
-    python -m tests.studies.carried_goals [--calibrations 50] [--arms NAME ...] [-o carried_goals.csv]
+    python -m tests.studies.carried_goals [--calibrations 17] [--arms NAME ...] [-o carried_goals.csv]
 
 Each calibration of a simulated arm, from its own trial motions at 0.5 px, sees 24 objects of two tags, of 30
 and of 60 mm, 80 mm beside a goal of the tool. Each is displaced by up to 150 mm and 60°, and seen once before
@@ -28,7 +28,7 @@ from tests.studies.hand_eye_coverage import pose
 from tests.studies.metric_coverage import longest
 
 ARMS = ("ur5", "paper", "hobby")
-SEED, NOISE_PX = 510_000, 0.5
+SEED, NOISE_PX = 520_000, 0.5
 # Side of the tags, m, whether one camera alone sees the object at last, and how many such objects.
 KINDS = ((0.06, False, 10), (0.03, False, 10), (0.06, True, 4))
 BESIDE, FARTHEST, MOST = 0.08, 0.15, np.radians(60.0)  # m, m, rad
@@ -152,9 +152,8 @@ def draw(arm, seed):
             now[rng.integers(2)] = np.nan
         rows.append(row)
         try:
-            carried = DisplacedObject.of(c, range(40, 48), [Look(taught), Look(now)], metric).carry(
-                Look(goal)
-            )
+            found = DisplacedObject.of(c, range(40, 48), [Look(taught), Look(now)], metric=metric)
+            carried = found.carry(Look(goal))
         except WorkFailed as error:
             row["refused"] = str(error)
             continue
@@ -174,7 +173,7 @@ def main():
     parser = parser_of(
         "carried_goals",
         __doc__,
-        [("calibrations", 50, "of each arm, with 24 objects each")],
+        [("calibrations", 17, "of each arm, with 24 objects each")],
         arms=(ARMS, list(ARMS)),
     )
     given = parser.parse_args()
@@ -193,9 +192,9 @@ def main():
                    for a, b in (("mm", "std_mm"), ("deg", "std_deg"))]  # fmt: skip
             views = "one view" if one_view else "both views"
             print(
-                f"{arm}, tags of {1e3 * side:g} mm, {views}: {len(own)} objects, refused {len(own) - len(done)}, "
-                f"held {rate(held, len(done))} %; {quantiles([r['mm'] for r in done])} mm, "
-                f"{quantiles([r['deg'] for r in done])} deg; rms over stated {rms[0]:.2f}, {rms[1]:.2f}",
+                f"{arm}, tags of {1e3 * side:g} mm, {views}: {len(own)} objects, refused "
+                f"{len(own) - len(done)}, held {rate(held, len(done))} %; {quantiles([r['mm'] for r in done])} "
+                f"mm, {quantiles([r['deg'] for r in done])} deg; rms over stated {rms[0]:.2f}, {rms[1]:.2f}",
                 flush=True,
             )
         failed = [r["refused"] for r in rows if r["arm"] == arm and "refused" in r]
