@@ -141,8 +141,8 @@ class _Search:
             if apart < _UNDECIDED and differ(ends[0].T, ends[1].T):
                 raise WorkFailed(
                     f"objects: the images {when} fit two places of the object, χ² {apart:.3g} apart "
-                    f"({_UNDECIDED} decide): one view of {self.numbers(shown)} does not tell which way it is "
-                    "tilted; show it to a second camera, nearer, or more of its markers off one plane"
+                    f"({_UNDECIDED} decide): {self.numbers(shown)} do not show which way it is tilted; show "
+                    "it to a second camera, nearer, or more of its markers off one plane"
                 )
         return best
 
@@ -179,7 +179,7 @@ class _Search:
             )
         return (
             f"objects: two cameras together see {self.numbers(known)} at best (look {base + 1} of "
-            f"{len(self.looks)}), and its shape needs {self.needed}: turn the object towards both cameras"
+            f"{len(self.looks)}), and its shape needs {self.needed}: turn it towards both cameras"
         )
 
     @property
@@ -206,8 +206,8 @@ class _Search:
         """Which freedom the images leave, by the direction (3 or 9,) of its largest deviation."""
         if not self.rig.rigid:
             return (
-                f"objects: {self.numbers(shown)} do not show {when} how the object is stretched (± {std:.2g}, "
-                f"{_UNSEEN} at most); show {self.needed}"
+                f"objects: {self.numbers(shown)} do not show {when} how the object is stretched "
+                f"(± {std:.2g}, {_UNSEEN} at most); show {self.needed}"
             )
         numbers, X = np.asarray(self.marker)[placed.known], placed.fit.X[:, :3]
         lines = X[:, None] - X
@@ -360,26 +360,19 @@ class DisplacedObject:
             motion = out._replace(E=E).by_motion(by_point, points[None], T[None, None])
             return np.asarray(motion.reshape(s.size, -1))
 
-        by_goal = by(tool.bundle.E, tool.X, H) @ tool.sensitivity
         held = tool.X @ (to_taught @ tool.T[0]).T
-        step, of_calibration = fit.sensitivity, changes_of(rig.pixels(rig.M @ H.T)).reshape(-1, s.size).T
-        own = np.zeros((len(fit.bundle.E), len(step)))
-        for look, sign in ((0, -1.0), (len(fit.T) - 1, 1.0)):
-            if look != fit.bundle.fixed:
-                own[:, fit.bundle.columns(look, len(fit.X))] += sign * np.eye(len(own))
-        # Errors of the displacement of the object by its images, and by the calibration.
-        xi = own @ step
-        xi_c = -xi @ fit.moved(rig, fit.X)
-        by_now = by(fit.bundle.E, held, fit.T[-1])
-        of_calibration += by_now @ xi_c - by_goal @ tool.moved(rig, rig.M)
-        exact = rig._replace(P=rig.P[:1], lens=rig.lens[:1])
+        by_goal, by_now = by(tool.bundle.E, tool.X, H), by(fit.bundle.E, held, fit.T[-1])
+        (xi, xi_c), (goal_s, goal_c) = self._errors(), tool.errors(rig, rig.M)
+        of_calibration = changes_of(rig.pixels(rig.M @ H.T)).reshape(-1, s.size).T
+        of_calibration += by_now @ xi_c + by_goal @ goal_c
 
         def images(T: FloatArray) -> FloatArray:
             """Images (K, V m 2) after small displacements (K, 4, 4) of the object."""
+            exact = rig._replace(P=rig.P[:1], lens=rig.lens[:1])
             return exact.pixels(held @ (fit.T[-1] @ T).swapaxes(1, 2)).reshape(len(T), -1)
 
         bent = _bent(images, fit.bundle.E, np.hstack([xi, xi_c]))
-        changes = np.concatenate([by_now @ xi, by_goal, of_calibration, bent], axis=1)
+        changes = np.concatenate([by_now @ xi, by_goal @ goal_s, of_calibration, bent], axis=1)
         pose = by(generators(rig.turns, placed[:, :3].mean(axis=0)), placed, np.eye(4))
         pose_changes = np.linalg.pinv(pose) @ changes
         return CarriedGoal(
@@ -391,12 +384,23 @@ class DisplacedObject:
             unit_mm=self.unit_mm,
         )
 
+    def _errors(self) -> tuple[FloatArray, FloatArray]:
+        """Errors of the displacement of the object (g, N) by its images, and (g, c) by the calibration."""
+        fit = self._fit
+        by_images, by_calibration = fit.errors(self._rig, fit.X)
+        xi, xi_c = np.zeros((2, len(fit.bundle.E), 1))
+        for look, sign in ((0, -1.0), (len(fit.T) - 1, 1.0)):
+            if look != fit.bundle.fixed:
+                own = fit.bundle.columns(look, len(fit.X))
+                xi, xi_c = xi + sign * by_images[own], xi_c + sign * by_calibration[own]
+        return xi, xi_c
+
 
 def _bent(images: Callable[[FloatArray], FloatArray], E: FloatArray, errors: FloatArray) -> FloatArray:
     """Changes (N, c) of second order of images (N,), uncorrelated with each other and with those of first.
 
     The tool is beside the object, so a turn by an error takes it along an arc.
-    images : (K, N) of small displacements (K, 4, 4); E : (g, 4, 4) generators; errors : (g, c) coordinates of it.
+    images : (K, N) of small displacements (K, 4, 4) by generators E (g, 4, 4); errors : (g, c) of it.
     """
     values, vectors = np.linalg.eigh(errors @ errors.T)
     L = vectors * np.sqrt(np.maximum(values, 0.0))

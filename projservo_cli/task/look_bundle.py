@@ -187,7 +187,8 @@ class Bundle(NamedTuple):
     def by_motion(self, by_point: FloatArray, X: FloatArray, T: FloatArray) -> FloatArray:
         """Derivatives (B, L, V, k, 2, g) by displacements, from those by points; as above."""
         velocity = np.einsum("blij,gjm,bkm->blkgi", T, self.E, X, optimize=True)
-        return np.einsum("blvkdi,blkgi->blvkdg", by_point, velocity, optimize=True)
+        by_motion: FloatArray = np.einsum("blvkdi,blkgi->blvkdg", by_point, velocity, optimize=True)
+        return by_motion
 
     def linearized(self, X: FloatArray, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (B, N), and derivatives (B, N, p) of pixels, both over their deviation."""
@@ -255,7 +256,7 @@ class Bundle(NamedTuple):
         return self._minima(X, self._minima(X, R, _FIRST_STEPS)[0][:_PLACES], _STEPS)
 
     def _minima(self, X: FloatArray, T: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
-        """Displacements (h, 4, 4) with points before the cameras, and χ² (h,), by steps from some (B, 4, 4)."""
+        """Displacements (h, 4, 4) to before the cameras, and χ² (h,), by steps from some (B, 4, 4)."""
         _, ends, cost = self.settled(np.broadcast_to(X, (len(T), *X.shape)), T[:, None], steps)
         there = X @ ends[:, 0].swapaxes(1, 2)
         depth = np.einsum("vj,bkj->bvk", self.P[:, 2], there)
@@ -315,8 +316,8 @@ class Fit:
         J, size = _unit_columns(self.linearized()[1])
         p = len(size)
         step = np.concatenate([np.eye(p), -np.eye(p)]) * (_PROBE / size)
-        many = (np.broadcast_to(part, (len(step), *part.shape)) for part in (self.X, self.T))
-        r, J = self.bundle.linearized(*self.bundle.moved(*many, step))
+        X, T = (np.broadcast_to(part, (len(step), *part.shape)) for part in (self.X, self.T))
+        r, J = self.bundle.linearized(*self.bundle.moved(X, T, step))
         up, down = np.split(-(J.swapaxes(1, 2) @ r[..., None])[..., 0] / size, 2)
         H = (up - down) / (2.0 * _PROBE)
         values, vectors = np.linalg.eigh(0.5 * (H + H.T))
@@ -324,10 +325,13 @@ class Fit:
         root = vectors / np.sqrt(np.maximum(values, _REGULAR)) / size[:, None]
         return np.asarray(root @ root.T)
 
-    @cached_property
-    def sensitivity(self) -> FloatArray:
-        """Changes (p, N) of the minimum by the images that are seen, over their deviation."""
-        return np.asarray(self.inverse_hessian @ self.linearized()[1].T)
+    def errors(self, rig: Rig, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Errors (p, N) of the minimum by the images that are seen, and (p, c) by the calibration.
+
+        Each by independent ones of unit variance; X as for ``moved``.
+        """
+        by_images = self.inverse_hessian @ self.linearized()[1].T
+        return by_images, -by_images @ self.moved(rig, X)
 
     def unseen(self, look: int) -> tuple[float, FloatArray]:
         """Largest deviation of the linear part of a displacement by the noise, and its direction."""

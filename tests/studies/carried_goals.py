@@ -193,8 +193,9 @@ def main():
             views = "one view" if one_view else "both views"
             print(
                 f"{arm}, tags of {1e3 * side:g} mm, {views}: {len(own)} objects, refused "
-                f"{len(own) - len(done)}, held {rate(held, len(done))} %; {quantiles([r['mm'] for r in done])} "
-                f"mm, {quantiles([r['deg'] for r in done])} deg; rms over stated {rms[0]:.2f}, {rms[1]:.2f}",
+                f"{len(own) - len(done)}, held {rate(held, len(done))} %; "
+                f"{quantiles([r['mm'] for r in done])} mm, {quantiles([r['deg'] for r in done])} deg; "
+                f"rms over stated {rms[0]:.2f}, {rms[1]:.2f}",
                 flush=True,
             )
         failed = [r["refused"] for r in rows if r["arm"] == arm and "refused" in r]

@@ -17,18 +17,14 @@ from tests.samples import displacement, frame, pixels, prismatic, revolute
 from tests.studies.carried_goals import tags
 
 NUMBERS = range(40, 48)
-# Object of two tags of 60 mm before the rig, its displacement by 115 mm and 41°, and the tool at the goal.
+# Object of two tags of 60 mm before the rig, its displacement by 0.11 m and 41°, and the tool at the goal.
 OBJECT = tags(0.06)[0] @ displacement([0.3, 2.8, -0.2], [0.03, 0.02, 0.05]).T
 MOVED = displacement([0.5, -0.3, 0.4], [0.06, -0.05, 0.08])
 AT_GOAL = displacement([-0.2, 0.3, 0.5], [-0.05, 0.04, -0.03])
 Z = [0.0, 0.0, 1.0]
-SCARA = Robot(
-    "RRPR",
-    np.array([revolute([0.3, 0.1, 0], Z), revolute([-0.2, 0.2, 0], Z), prismatic(Z), revolute([0.1, 0, 0], Z)]),
-    rig(),
-    random_robot("RR", np.random.default_rng(4)).markers,
-    np.zeros(4),
-)  # fmt: skip
+UPRIGHT = [revolute(at, Z) for at in ([0.3, 0.1, 0.0], [-0.2, 0.2, 0.0], [0.1, 0.0, 0.0])]
+BODY = random_robot("RR", np.random.default_rng(4)).markers
+SCARA = Robot("RRRP", np.array([*UPRIGHT, prismatic(Z)]), rig(), BODY, np.zeros(4))
 
 
 @pytest.fixture
@@ -154,7 +150,7 @@ def hidden(look, *where):
 
 
 def test_joints_without_a_metric_leave_twelve_coordinates():
-    """Of the object; the tool is where its joints, all parallel, can take it. Six would have smaller errors."""
+    """Of the object; the tool is where its parallel joints take it. Six would have smaller errors."""
     H, seen, std = displacement([0.0, 0.0, 0.5], [-0.05, 0.04, -0.03]), looks(SCARA, MOVED), []
     for twists in (SCARA.twists, [revolute([0.0, 0.1, 0.0], [1.0, 0.0, 0.0]), *SCARA.twists[1:]]):
         arm = dataclasses.replace(SCARA, twists=np.array(twists))
@@ -188,7 +184,7 @@ def test_what_is_not_seen_is_named(X, unseen, said, arm):
 
 def test_what_is_no_displaced_object_is_named(arm):
     c, (taught, now) = calibrated(arm, frame(1)), looks(arm, MOVED)
-    with pytest.raises(WorkFailed, match="do not lie on the object as they did.*most at marker 4[0-7]"):
+    with pytest.raises(WorkFailed, match=r"do not lie on the object as they did.*most at marker 4[0-7]"):
         DisplacedObject.of(
             c, NUMBERS, [taught, Look(now.s + np.where(np.arange(8) == 3, 20.0, 0.0)[:, None])]
         )
