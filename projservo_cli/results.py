@@ -17,7 +17,7 @@ from projservo_cli.calibration.prediction import (
     predict,
     prediction_variance,
 )
-from projservo_cli.display import Displayable, Printed, numbers_in, require_radians, xarray
+from projservo_cli.display import Displayable, Printed, checked_array, numbers_in, require_radians, xarray
 from projservo_cli.files import bytes_of
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.metric.frame import Metric, Scale, links
@@ -39,6 +39,8 @@ from projservo_cli.records import (
 )
 from projservo_cli.settings.task import Trajectory
 from projservo_cli.simulation.urdf import UrdfChain, urdf_chain
+from projservo_cli.task.displaced_object import DisplacedObject
+from projservo_cli.task.look_bundle import Look
 
 _AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
 _MAX_BYTES = 10_000_000  # maximum size of a URDF
@@ -247,6 +249,38 @@ class ImageModel(Displayable, Calibration):
         ahead = np.where(np.abs(side) > _AT_INFINITY * norms, depth * side > 0.0, depth != 0.0)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.where(ahead[..., None], pixels_of(self.P, A, self.model().lens), np.nan)
+
+    def displaced(
+        self, marker: Sequence[int], looks: Sequence[npt.ArrayLike], *, metric: Metric | None = None
+    ) -> DisplacedObject:
+        """Find where an object of the scene lies by looks at it, to carry goals that were taught on it along.
+
+        Its displacement is rigid in the metric that the joints preserve, else affine. Looks in between
+        refine its shape.
+
+        Parameters
+        ----------
+        marker : (k,) numbers of the markers of the object, as messages name them.
+        looks : two or more, each (V, k, 2) px, NaN where unseen: the first when the goal was taught, the last
+            now.
+        metric : what ``metric`` gave, for mm.
+
+        Returns
+        -------
+        The object, with ``D``, ``shift_px``, ``shift_mm`` and ``angle_deg``; ``carry`` takes a goal along.
+
+        Raises
+        ------
+        InputError
+            If a look has another shape, cameras are on the tool or the calibration has no covariance.
+        WorkFailed
+            If images or joints do not show the displacement, with the freedom that is missing.
+        """
+        shape = (len(self.view), len(marker), 2)
+        seen = [Look(checked_array(f"looks[{i}]", s, shape, f"{shape} px")) for i, s in enumerate(looks)]
+        if len(seen) < 2:
+            raise InputError(f"looks: {len(seen)}, of two or more: one when the goal was taught, and one now")
+        return DisplacedObject.of(self, marker, seen, metric)
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""

@@ -338,13 +338,15 @@ class DisplacedObject:
             _fit=fit,
         )
 
-    def carry(self, goal: Look) -> CarriedGoal:
+    def carry(self, goal: Look | FloatArray) -> CarriedGoal:
         """Carry a goal of the tool along that was taught at the first look.
 
-        goal : images (V, m, 2) of the markers of the tool there, in the order of the calibration.
+        goal : images (V, m, 2) of the markers of the tool there, px, in the order of the calibration; NaN
+            where unseen.
         Raises WorkFailed if they do not determine a pose of the tool, or the carried one is out of sight.
         """
-        rig, fit, tool = self._rig, self._fit, _tool_at(self._rig, goal)
+        rig, fit = self._rig, self._fit
+        tool = _tool_at(rig, goal if isinstance(goal, Look) else Look(goal))
         to_taught = np.linalg.inv(fit.T[0])
         H = fit.T[-1] @ to_taught @ tool.T[0]
         placed = tool.X @ H.T

@@ -20,6 +20,7 @@ from tests.documentation.blocks import PAGES, ROOT, blocks_of, run_page
 
 # Those that run laws or plan: only with the compiler.
 DRIVING = {
+    "align-and-insert",
     "benchmark-a-law",
     "choose-your-rig",
     "commands",

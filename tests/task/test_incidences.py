@@ -223,7 +223,7 @@ def test_angles_need_axes_that_are_not_parallel():
 
 
 def test_free_motions_lead_away_from_limits_and_do_not_disturb_the_task():
-    """A joint that a task drives over a limit goes less far where the law knows it, and mostly stays within."""
+    """A joint that a task drives over a limit goes less far where the law knows it; most stay within."""
     better = 0
     for seed in range(20):
         generator = np.random.default_rng([17, seed])
