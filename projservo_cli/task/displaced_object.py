@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.geometry.lens import undistort
@@ -42,8 +42,8 @@ _UNSEEN = 0.3
 _UNDECIDED = 13.8
 # Number of minima of a place for known points that the points are then freed from.
 _MINIMA = 3
-# Times the stated noise, and probability, beyond which residuals are not those of the same rigid object.
-_NOISE, _CONFIDENCE = 2.0, 0.999
+# Times the stated noise, and chance, beyond which residuals are not those of the same rigid object.
+_NOISE, _BY_CHANCE = 2.0, 1e-3
 # Cosine of the angle between the axis of a turn and a line of markers, above which it is about that line.
 _ALONG = 0.95
 
@@ -231,7 +231,7 @@ def _require_same_object(rig: Rig, fit: Fit, marker: Sequence[int]) -> None:
     left = moved - J @ np.linalg.lstsq(J, moved)[0]
     along = left.T @ r
     square = r @ r - along @ np.linalg.solve(np.eye(left.shape[1]) + left.T @ left, along)
-    if square > _NOISE**2 * chi2.ppf(_CONFIDENCE, dof):
+    if square > _NOISE**2 * chdtri(dof, _BY_CHANCE):
         of = np.broadcast_to(np.arange(len(fit.X)), fit.bundle.weight.shape)[fit.bundle.weight > 0.0]
         worst = marker[int(np.argmax(np.bincount(of, (r.reshape(-1, 2) ** 2).sum(axis=1))))]
         raise WorkFailed(
