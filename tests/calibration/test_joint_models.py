@@ -128,7 +128,7 @@ def case(request):
     rng = np.random.default_rng(8)
     robot = random_robot("RRRRR", rng, markers=9)
     robot = robot if request.param == "world" else Hand(**vars(robot))
-    q, ahead = np.concatenate([trials(robot, frames=5), around(robot, 20, rng)]), around(robot, 60, rng)
+    q, ahead = np.concatenate([trials(robot, frames=3), around(robot, 16, rng)]), around(robot, 60, rng)
     seen = dataclasses.replace(robot.observe(bent(robot, q), SIGMA, rng), q=q)
     asked = (None, "auto", ("scale:3", "coupling:4-5"))
     found = [

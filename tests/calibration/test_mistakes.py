@@ -1,6 +1,7 @@
 """Tracks with mistakes of every kind: left out, told by kind, and as good as if they had never been seen."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -13,15 +14,17 @@ from tests.calibration.mistakes import KINDS, MISTAKES, median_error, shares_lef
 from tests.calibration.simulated_robot import random_robot, trials
 
 
-def calibrated(mistaken, **given):
-    letters = mistaken.robot.joint_types
-    return calibrate(mistaken.observation, letters, source="recorded", image_size=(1280, 1024), **given)
+@functools.cache
+def calibrated(mistake):
+    """A table of a few tracks with a mistake, and its calibration."""
+    mistaken = table(mistake, 4, 60, length=8)
+    letters, size = mistaken.robot.joint_types, (1280, 1024)
+    return mistaken, calibrate(mistaken.observation, letters, source="recorded", image_size=size)
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_fifth_of_the_sightings_may_be_wrong(mistake):
-    mistaken = table(mistake, 4, 60, length=8)
-    found = calibrated(mistaken)
+    mistaken, found = calibrated(mistake)
     assert found.usable
     wrong, right = shares_left_out(mistaken, found)
     assert np.isnan(wrong) or wrong > 0.9  # NaN where whole tracks are wrong
@@ -33,8 +36,8 @@ def test_a_fifth_of_the_sightings_may_be_wrong(mistake):
 
 @pytest.mark.parametrize(("mistake", "why"), [("still", "still"), ("far", "still"), ("body", "other body")])
 def test_tracks_of_something_else_are_told_with_the_reason(mistake, why):
-    mistaken = table(mistake, 5, 60, length=8)
-    told = findings(calibrated(mistaken))["rejected"]
+    mistaken, found = calibrated(mistake)
+    told = findings(found)["rejected"]
     truth = np.flatnonzero((mistaken.kind == KINDS.index(mistake)).sum(axis=0) > 1)
     assert set(told["tracks"][why]) == set(truth.tolist())
     assert told["observations"] <= 3

@@ -56,7 +56,7 @@ def table(robot, fault, i, size, seed):
 
 
 @pytest.mark.parametrize("name", FAULTS)
-@settings(max_examples=3, deadline=None, derandomize=True, phases=[Phase.generate])
+@settings(max_examples=2, deadline=None, derandomize=True, phases=[Phase.generate])
 @given(seed=st.integers(0, 10_000), i=st.integers(1, len(TYPES) - 1))
 def test_a_fault_is_named_and_its_effect_stated(name, seed, i):
     """Five deviations of the size, and a factor of two of the error: the bar of the study of model errors."""
@@ -78,7 +78,7 @@ def test_a_fault_is_named_and_its_effect_stated(name, seed, i):
 
 @pytest.mark.parametrize("types", ["RRRRR", "RRPRR"])
 def test_a_sound_arm_is_not_blamed(types):
-    for seed in range(4):
+    for seed in range(2):
         robot = random_robot(types, np.random.default_rng(seed))
         found = calibrate(table(robot, still, 0, 0.0, seed), types, source="recorded", joint_noise=None)
         assert found.usable
@@ -115,12 +115,12 @@ def test_every_kind_has_words_and_a_code():
     assert "mm" in describe(ModelError("joint_step", (2,), "", 0.02, 0.001, 0.5, 3), prismatic)[1]
 
 
-@pytest.mark.parametrize(("moved", "at"), [((0, 1), 22), ((1,), 30)])
+@pytest.mark.parametrize(("moved", "at"), [((0, 1), 22), ((1,), 24)])
 def test_a_table_that_is_bumped_amid_the_recording_is_named_and_no_readings_are(moved, at):
     """Both cameras see the base move alike; one camera that moves is told from that."""
     rng = np.random.default_rng(at)
-    robot = random_robot("RRRRR", rng, markers=20)
-    q = np.vstack([trials(robot, 6, np.radians(20)), around(robot, 12, rng, np.radians(20))])
+    robot = random_robot("RRRRR", rng)
+    q = np.vstack([trials(robot, 5, np.radians(20)), around(robot, 12, rng, np.radians(20))])
     w, bump = np.radians(1.5) * rng.standard_normal(3), np.zeros((4, 4))
     bump[:3, :3], bump[:3, 3] = np.cross(np.eye(3), w), 0.006 * rng.standard_normal(3)
     cameras = robot.cameras.copy()
@@ -128,7 +128,7 @@ def test_a_table_that_is_bumped_amid_the_recording_is_named_and_no_readings_are(
     images = robot.images(q)
     images[at:] = dataclasses.replace(robot, cameras=cameras).images(q[at:])
     images += 0.1 * rng.standard_normal(images.shape)
-    seen = Observation(np.arange(len(q)), np.arange(20), q, images)
+    seen = Observation(np.arange(len(q)), np.arange(10), q, images)
     with pytest.raises(WorkFailed) as refused:
         calibrate(seen, "RRRRR", source="recorded", joint_noise=None)
     what = "the right camera" if moved == (1,) else "the base of the arm or both cameras"

@@ -143,7 +143,7 @@ def test_a_joint_that_reads_but_stands_still_is_named(method, sigma):
 
 
 PRISMATIC = random_robot("RPRP", np.random.default_rng(3), markers=6)
-AROUND = around(PRISMATIC, 40, np.random.default_rng(1))
+AROUND = around(PRISMATIC, 20, np.random.default_rng(1))
 
 
 def test_a_joint_that_stands_still_in_poses_of_all_joints_is_named():
@@ -172,7 +172,7 @@ def test_readings_in_degrees_and_views_exchanged_now_and_then_are_told():
 
 
 @pytest.mark.parametrize(
-    ("types", "joint", "seed", "motions"), [("RRPRRR", 2, 5, trials), ("RPRP", 0, 3, lambda robot: AROUND)]
+    ("types", "joint", "seed", "motions"), [("RRPRRR", 2, 5, lambda robot: trials(robot, 6)), ("RPRP", 0, 3, lambda robot: AROUND)]
 )
 def test_a_joint_of_the_wrong_type_is_named(types, joint, seed, motions):
     robot = random_robot(types, np.random.default_rng(seed), markers=6)
@@ -215,10 +215,13 @@ def test_ratios_at_which_a_recorded_run_is_warned_of_and_refused(markers, frames
     found = calibrate(observation, "RRR", sigma_px=SIGMA, source="recorded")
     limit = min(1.15, 1.0 + 4.0 / np.sqrt(2.0 * found.dof))
     assert (limit < 1.06) == (frames > 4)
-    for ratio, warned in ((0.999 * limit, False), (1.001 * limit, True), (2.99, True)):
+    # Beyond the warning all is as with little data, which are quicker.
+    largest = [(2.99, True)] if frames == 4 else []
+    for ratio, warned in ((0.999 * limit, False), (1.001 * limit, True), *largest):
         given = found.sigma_fitted_px / ratio
         calibration = calibrate(observation, "RRR", sigma_px=given, source="recorded")
         assert calibration.usable
         assert ("more than pixel noise" in calibration.reason) == warned
         assert calibration.chi2_per_dof == pytest.approx(ratio**2, rel=1e-6)
-    assert "3.01 times" in refusal(observation, "RRR", sigma_px=found.sigma_fitted_px / 3.01)
+    if frames == 4:
+        assert "3.01 times" in refusal(observation, "RRR", sigma_px=found.sigma_fitted_px / 3.01)
