@@ -172,8 +172,8 @@ MIXED = [("9999", "9999"), ("-1", "-1"), ("-1000000000", "-1000000000")]
 
 @pytest.mark.parametrize(
     "placeholders",
-    [[MIXED[2]], MIXED[:2], [("-1", None)], [(None, "9999")]],
-    ids=["-1e9", "mixed", "u alone", "v alone"],
+    [MIXED, [("-1", None), (None, "9999")]],
+    ids=["both", "one alone"],
 )
 def test_numbers_for_unseen_markers_are_named_and_taken_as_unseen(told, recorded, tmp_path, placeholders):
     header, *rows = (line.split(",") for line in recorded.read_text().splitlines())
