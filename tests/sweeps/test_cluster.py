@@ -71,7 +71,7 @@ def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(clu
     assert "Traceback" not in err, err
     stored = len(processes.parts(out))
     assert 8 <= stored < 2 * processes.RUNS / processes.CHUNK
-    code, _, err = processes.finish(processes.start(config, out, "-j", "2"))
+    code, _, err = processes.finish(processes.start(config, out, "-j", "1"))
     assert code == 0, err
     assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in err
     assert not processes.differences(out, reference)

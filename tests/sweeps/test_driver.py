@@ -1,7 +1,6 @@
 """A sweep ended in every way and gone on with is the sweep that was not; its table is what readers expect."""
 
 import json
-import os
 import signal
 import threading
 
@@ -12,7 +11,7 @@ from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweeps import engine
 from projservo_cli.sweeps.engine import Engine
 from projservo_cli.sweeps.folder import Folder
-from tests.sweeps import processes
+from tests.sweeps import dying, processes
 from tests.sweeps.cases import columns, design, make
 
 pytestmark = pytest.mark.volume
@@ -38,7 +37,7 @@ def test_interrupted_then_killed_it_is_in_the_end_as_if_nothing_had_been(whole, 
     processes.kill_group(process)
     stored = len(processes.parts(tmp_path))
     assert processes.CHUNK * stored < 2 * processes.RUNS
-    code, out, err = processes.finish(processes.start(config, tmp_path, "-j", "2", "--json"))
+    code, out, err = processes.finish(processes.start(config, tmp_path, "-j", "1", "--json"))
     assert code == 0, err
     assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in err
     told = json.loads(out)
@@ -122,24 +121,10 @@ def test_threads_give_the_same_and_are_left_in_order(tmp_path):
         assert values.tobytes() == reference[name].tobytes(), name
 
 
-def dead_once(job):
-    """A job that ends its process the first time it is made."""
-    number, marker = job
-    if number == 3 and not marker.exists():
-        marker.touch()
-        os._exit(9)
-    return number
-
-
-def always_dead(job):
-    """A job that no process survives."""
-    os._exit(9)
-
-
 def test_jobs_of_a_lost_process_are_made_again_until_processes_die_again_and_again(tmp_path, monkeypatch):
     jobs = [(number, tmp_path / "died") for number in range(12)]
-    assert sorted(Engine(2).completed(dead_once, jobs)) == list(range(12))
+    assert sorted(Engine(2).completed(dying.once, jobs)) == list(range(12))
     assert (tmp_path / "died").exists()
     monkeypatch.setattr(engine, "MOST_LOSSES", 1)
     with pytest.raises(WorkFailed, match="lost 2 times in a row"):
-        list(Engine(2).completed(always_dead, [1]))
+        list(Engine(2).completed(dying.always, [1]))
