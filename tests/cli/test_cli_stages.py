@@ -48,11 +48,9 @@ def test_up_to_date_is_skipped_and_prints_the_same(projservo, stages):
         ("task.goal.roll_deg=90", ALL[1:]),
         ("control.gain_t=1", ALL[2:]),
         ("control.laws=[stacked]", ["report"]),
-        ("control.must_converge=[]", ["report"]),  # the page tells which must
         ("control.mode=[regulate, image_track]", ["stacked_image_track", "report"]),
         ("report.formats=[png]", ["report"]),
         ("noise.servo_px=0.1", ALL[1:]),
-        ("name=other", ["report"]),  # which prints it
     ],
 )
 def test_only_what_depends_on_a_change_is_redone(projservo, reported, change, remade):
@@ -157,12 +155,12 @@ OWN = "tests.cli.conftest:Law"
     ],
 )
 def test_a_named_law_must_converge_unless_it_is_classical_or_the_configuration_says_so(
-    projservo, stages, law, settings, code
+    projservo, reported, law, settings, code
 ):
-    stages.verdicts = dict.fromkeys((law, f"{law}_track"), "no progress")
+    reported.verdicts = dict.fromkeys((law, f"{law}_track"), "no progress")
     sets = [word for one in settings for word in ("--set", one)]
-    by_flag = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", law, *sets)
-    named = projservo("servo", "-c", "tiny.yaml", "-o", "two", "--set", f"control.laws=['{law}']", *sets)
+    by_flag = projservo("servo", "-o", "out", "--force", "--law", law, *sets)
+    named = projservo("servo", "-o", "out", "--force", "--set", f"control.laws=['{law}']", *sets)
     for answer in (by_flag, named):
         assert (answer.code, answer.err.count("ended in no progress: text ä\n")) == (code, 1)
         assert (" must converge, but ended" in answer.err) == bool(code)
