@@ -1,4 +1,4 @@
-"""Faults of rigs of one to four cameras of any names, fixed or on the tool: what is named, and how often."""
+"""Faults of rigs of one and three cameras of any names, fixed or on the tool: what is named, how often."""
 
 import dataclasses
 import re
@@ -17,9 +17,9 @@ from tests.calibration.simulated_robot import around, random_robot, trials
 from tests.calibration.test_cameras_on_the_tool import Hand
 from tests.monitoring.test_image_monitor import LOOKS, PERIOD, Arm, first_alarm, look, noisy
 
-RIGS = [(1, "world"), (3, "world"), (4, "world"), (1, "tool")]
-TYPES, NAMES, ONSET = "RRPRR", ("wrist", "top", "low", "side"), 15
-NOISE = np.array([0.5, 0.5, 1.0, 0.3])  # of each view, px
+RIGS = [(1, "world"), (3, "world"), (1, "tool")]
+TYPES, NAMES, ONSET = "RRPRR", ("wrist", "top", "low"), 15
+NOISE = np.array([0.5, 0.5, 1.0])  # of each view, px
 
 
 class Case(NamedTuple):
@@ -76,7 +76,7 @@ def test_a_camera_that_moves_is_named_by_its_name(case):
         assert not any(f" {other} camera" in said for other in case.views if other != name)
 
 
-@pytest.mark.parametrize("joint", [0, 2, 4])
+@pytest.mark.parametrize("joint", [2, 4])
 def test_a_joint_that_slips_is_named_as_a_joint(case, joint):
     by = 0.015 if TYPES[joint] == "P" else np.radians(3.0)
     read = case.q.copy()
@@ -98,7 +98,7 @@ def test_what_moved_is_told_by_the_mount_and_in_one_posture_what_is_alike(case):
     by = np.zeros((4, 4))
     by[:3, :3], by[:3, 3] = np.cross([0.02, -0.03, 0.02], np.eye(3)).T, (0.006, 0.008, -0.006)
     tool, numbers = case.calibration.mount == "tool", case.calibration.marker
-    cameras = ("the wrist", "both", "all", "all")[len(case.views) - 1]
+    cameras = ("the wrist", "both", "all")[len(case.views) - 1]
     body = "the scene was moved, or the base was" if tool else "the tool was moved in its holder"
     rig = "were moved alike, or the base was"
     if tool:
