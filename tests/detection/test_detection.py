@@ -98,7 +98,7 @@ def show(truth, q, rng):
 
 def test_images_alone_calibrate_a_robot_to_hundredths_of_a_pixel(projservo, rng):
     path = Path(__file__).parents[2] / "configs" / "ur5.yaml"
-    config = load_config(path, ["calibration.frames_per_joint=3", "calibration.amplitude_deg=20"])
+    config = load_config(path, ["calibration.frames_per_joint=2", "calibration.amplitude_deg=20"])
     truth = truth_of(config)
     trials = trial_motions(config)
     corners = show(truth, trials, rng)
@@ -113,7 +113,7 @@ def test_images_alone_calibrate_a_robot_to_hundredths_of_a_pixel(projservo, rng)
     assert np.sqrt(np.nanmean(error**2)) < 0.06
     assert np.nanmax(np.abs(error)) < 0.3
     seen = np.isfinite(table.images[..., 0])
-    assert answer.json["both"] == seen.all(axis=1).sum() > 150
+    assert answer.json["both"] == seen.all(axis=1).sum() > 100
     assert answer.json["unseen"] == (~seen).all(axis=1).sum()
     assert "exists already" in projservo(*command, "-o", "trials.csv").err
     few = Path("q.csv").read_text().splitlines()[:4]
