@@ -41,10 +41,15 @@ WITHOUT_COMPILER = {"NUMBA_DISABLE_JIT": "1"}
 ATTEMPTS = {"tutorial": 2}
 
 Check = tuple[Sequence[str | Path], dict[str, str]]
-# Two at a time, in this order: the tutorial, whose emulator runs in real time, and the others behind it.
+# Three at a time, in this order: the tutorial, whose emulator runs in real time, and the others behind it, in
+# the time that it leaves.
 SINGLE: dict[str, Check] = {
     "tutorial": ([*TUTORIAL, "not one_webcam"], {}),
     "types": ([BIN / "mypy"], {}),
+    "mathematics without the compiler": (
+        [PYTHON, "-m", "pytest", "-q", "--benchmark-disable", *UNCOMPILED],
+        WITHOUT_COMPILER,
+    ),
     "documentation": (SPHINX, WITHOUT_COMPILER),
     "lint": ([BIN / "ruff", "check", "."], {}),
     "format": ([BIN / "ruff", "format", "--check", "."], {}),
@@ -53,7 +58,6 @@ SINGLE: dict[str, Check] = {
 }
 # Each on both processors, or timed.
 WHOLE: dict[str, Check] = {
-    "mathematics without the compiler": ([*PYTEST, *UNCOMPILED], WITHOUT_COMPILER),
     "tests": ([*PYTEST, "--ignore=tests/benchmarks"], {}),
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
@@ -108,7 +112,7 @@ def main(names: Sequence[str]) -> int:
         return 2
     names = names or [*SINGLE, *WHOLE]
     passed: dict[str, bool] = {}
-    for group, processors in ((SINGLE, 2), (WHOLE | BY_NAME, 1)):
+    for group, processors in ((SINGLE, 3), (WHOLE | BY_NAME, 1)):
         chosen = [name for name in names if name in group]
         with ThreadPoolExecutor(processors) as pool:
             passed |= dict(zip(chosen, pool.map(run, chosen, [group[name] for name in chosen]), strict=True))
