@@ -1,6 +1,7 @@
 """Every command of the documentation is run, in a folder of its own for each page."""
 
 import json
+import os
 import re
 import shutil
 import sys
@@ -265,6 +266,7 @@ def test_page(request, folder, name, capsys, monkeypatch):
         require_gl()
     if name == "reproduce-the-paper":  # its command is that of README, and finds all up to date
         shutil.copytree(request.getfixturevalue("first_chain"), folder / "results" / "paper")
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # other processes would import all anew
     if name == "read-a-report":  # frames and figures of a task that is reported on as a whole elsewhere
         monkeypatch.setattr(film, "FRAMES", 6)
         monkeypatch.setattr(report, "FIGURES", report.FIGURES[:3])

@@ -12,7 +12,7 @@ from projservo_cli.store.sweep_table import SweepTable
 from tests.conftest import ROOT
 
 # Runs of a law and of a part: seconds of work, on a busy machine long after the first parts are seen.
-RUNS, CHUNK = 96, 8
+RUNS, CHUNK = 64, 8
 SWEEP = """\
 base: {base}
 runs: {runs}
