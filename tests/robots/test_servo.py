@@ -271,21 +271,20 @@ def test_a_real_robot_moves_whenever_it_is_asked_to_and_a_report_shows_what_is_s
     assert (asked.code, asked.json["laws"][0]["verdict"]) == (1, "fault detected")
     for call in range(2):  # what is wrong is mended, and nothing else is said about it
         CALLS.clear()
-        again = servo(*SOUND, "--json")
+        again = servo(*SOUND, *NEAR, "--json")
         assert (again.code, again.json["laws"][0]["verdict"]) == (0, "converged"), call
         assert len(commands()) > 10
-    dry = servo(*SOUND, "-n", "--json").json["steps"]
+    dry = servo(*SOUND, *NEAR, "-n", "--json").json["steps"]
     assert [step["stage"] for step in dry if step["why"]] == ["servo"]
     sent = len(CALLS)
-    shown = projservo(
-        "report", "-c", UR5, "-o", "run", *SOUND, "--set", "control.laws=[direct_three]", "--json"
-    )
+    laws = ["--set", "control.laws=[direct_three]"]
+    shown = projservo("report", "-c", UR5, "-o", "run", *SOUND, *NEAR, *laws, "--json")
     assert shown.code == 0, shown.err
     (stored,) = shown.json["replayed"]
     date = load("run").results["servo/direct_three"].provenance["date"]
     assert stored == {"law": "direct_three", "plant": "tests.robots.robots:Sound", "date": date}
     assert f"the stored run of tests.robots.robots:Sound, recorded {date}" in shown.err.replace("\n", " ")
     assert len(CALLS) == sent
-    config = load_config(UR5, [Override.parse(SOUND[1])])
+    config = load_config(UR5, [Override.parse(text) for text in (SOUND[1], NEAR[1])])
     ps.Experiment(config, "run", progress=False).make("servo", laws=["direct_three"])
     assert CALLS.count("open") == 1  # of a new object
