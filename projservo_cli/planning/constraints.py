@@ -41,7 +41,6 @@ from projservo_cli.planning.margins import (
 )
 from projservo_cli.records import (
     NO_SPREAD,
-    BoolArray,
     FloatArray,
     IntArray,
     JointLimits,
@@ -234,15 +233,15 @@ def _best_sight_into(c: Constraints, q: FloatArray, visible: bool, trial: "Trial
         for view in range(V):
             if _rank(trial, view) < c.least_views:
                 minimum = min(minimum, trial.excess[view])
+            else:
+                for kind in range(3):
+                    trial.sight[kind * V + view] = math.inf
         if tag == 0 or minimum > best:
             best = minimum
             row_into(trial.margins[first:end], trial.sight)
-            for view in range(V):
-                trial.counts[view] = _rank(trial, view) < c.least_views
     for view in range(V):
-        if not trial.counts[view]:
-            for kind in range(4):
-                trial.margins[column(FRONT, V) + kind * V + view] = math.inf
+        if trial.margins[first + view] == math.inf:
+            trial.margins[column(FRONT, V) + view] = math.inf
 
 
 @merged
@@ -262,24 +261,26 @@ def twin_of(c: Constraints, j: int) -> Model:
 
 
 @internal
-def max_error(c: Constraints, q: FloatArray, H: Mat4, error: FloatArray) -> float:
+def max_error(c: Constraints, q: FloatArray, H: Mat4, trial: "Trial") -> float:
     """Largest standard deviation of a coordinate, px, at the worst marker along each direction.
 
-    error : (V,) on return that of each image.
+    That of each image is written to ``trial.error``.
     """
-    V = c.O.shape[0]
+    V, error, worst = c.O.shape[0], trial.error, trial.worst
     for view in range(V):
         error[view] = c.spread.rest * c.spread.rest
     for j in range(1, c.spread.P.shape[0]):
         twin = twin_of(c, j)
         H_j = forward(twin, q)
         for view in range(V):
-            worst = 0.0
-            for k in range(c.M.shape[0]):
-                A, A_j = apply(H, vec(c.M[k])), apply(H_j, vec(c.spread.M[j, k]))
+            worst[view] = 0.0
+        for k in range(c.M.shape[0]):
+            A, A_j = apply(H, vec(c.M[k])), apply(H_j, vec(c.spread.M[j, k]))
+            for view in range(V):
                 s, s_j = straight_pixel(c.model.P[view], A), straight_pixel(twin.P[view], A_j)
-                worst = max(worst, squared(s, s_j))
-            error[view] += 0.5 * worst
+                worst[view] = max(worst[view], squared(s, s_j))
+        for view in range(V):
+            error[view] += 0.5 * worst[view]
     maximum = 0.0
     for view in range(V):
         error[view] = math.sqrt(error[view])
@@ -378,7 +379,7 @@ def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
         room = min(room, margins[image + view] - c.full[image + view])
     near = room < DEVIATIONS * maximum or margins[clear] - c.full[clear] < DEVIATIONS * anywhere
     if visible and maximum > 0.0 and near:
-        anywhere = max_error(c, q, H, trial.error)
+        anywhere = max_error(c, q, H, trial)
     for view in range(V):
         margins[image + view] -= DEVIATIONS * trial.error[view]
     margins[clear] -= DEVIATIONS * anywhere
@@ -440,8 +441,8 @@ class Trial(NamedTuple):
     demands: FloatArray  # margins, demands: (c,)
     sight: FloatArray  # (3 V,) side, width and border of one tag
     excess: FloatArray  # (V,) least excess of these in each view
-    counts: BoolArray  # (V,) whether a view is one of those that are to see the face
     error: FloatArray  # (V,) error of a prediction in each image, px
+    worst: FloatArray  # (V,) squared error, px², along one direction
     s: FloatArray
     s_before: FloatArray  # s, s_before: (V, b, 2) px
     q: FloatArray  # (n,)
@@ -457,8 +458,8 @@ def new_trial(c: Constraints) -> Trial:
         demands=margins.copy(),
         sight=np.zeros(3 * V),
         excess=np.zeros(V),
-        counts=np.ones(V, np.bool_),
         error=np.zeros(V),
+        worst=np.zeros(V),
         s=s,
         s_before=s.copy(),
         q=np.zeros(n),

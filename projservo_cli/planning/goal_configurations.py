@@ -307,7 +307,7 @@ def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
             return HIDDEN
     # A goal was chosen, and is seen on arrival: what its prediction may be off speaks for it.
     H = forward(c.model, q)
-    doubt = min(DEVIATIONS * max_error(c, q, H, trial.error), FINE_PX)
+    doubt = min(DEVIATIONS * max_error(c, q, H, trial), FINE_PX)
     return _SHOWN if clear_by(c, H, trial.s) > -doubt else _BLOCKED
 
 
