@@ -9,10 +9,8 @@ from pydantic_core import PydanticCustomError
 
 from projservo_cli import plugins
 from projservo_cli.laws import LAW_SPECS, LAWS, mode_in
-from projservo_cli.records import InputError
-from projservo_cli.settings.disturbance import of_all
+from projservo_cli.settings.disturbance import Delays
 from projservo_cli.settings.sections import (
-    ByView,
     Count,
     Finding,
     NotNegative,
@@ -145,23 +143,6 @@ class Control(Section):
                 )
 
 
-class EachView(ByView):
-    """A number for each camera, by its name, and for those that are not named."""
-
-    __pydantic_extra__: dict[str, Number]
-    left: Number | None = Field(None, description="time offset of the left camera; others by their names")
-    right: Number | None = Field(None, description="time offset of the right camera")
-    others: Number | None = Field(None, description="time offset of cameras that are not named")
-
-    def of(self, view: str) -> float:
-        """Return the number of a camera. Raises InputError where there is none."""
-        number: float | None = getattr(self, view, None)
-        number = self.others if number is None else number
-        if number is None:
-            raise InputError(f"plant.time_offset_s: names no {view}: give its number, or others")
-        return number
-
-
 class RenderedOptions(Section):
     """Options of the plant mujoco."""
 
@@ -207,9 +188,7 @@ class PlantSettings(Section):
         description="maximum distance of a joint at rest from its set-point; prismatic joints: 5.24 mm "
         "per degree",
     )
-    time_offset_s: Annotated[
-        EachView | None, BeforeValidator(of_all, json_schema_input_type=Number | EachView | None)
-    ] = Field(
+    time_offset_s: Delays | None = Field(
         None,
         description="time from the middle of an exposure to the joint readings that arrive with its "
         "image; a number for all cameras, or {left, right} or other names; null: estimated",

@@ -81,33 +81,33 @@ class _MarkerMoved(Section):
     by_m: Vector3 = Field(description="displacement in the frame of the tool")
 
 
-class _Delays(ByView):
-    """Latency of cameras by their names, s, and of those that are not named."""
+class EachView(ByView):
+    """A time for each camera, by its name, s, and for those that are not named."""
 
-    __pydantic_extra__: dict[str, NotNegative]
+    __pydantic_extra__: dict[str, Number]
+    left: Number | None = Field(None, description="that of the left camera; others by their names")
+    right: Number | None = Field(None, description="that of the right camera")
+    others: Number | None = Field(None, description="that of cameras that are not named")
 
-    left: NotNegative = Field(0.0, description="latency of the left camera")
-    right: NotNegative = Field(0.0, description="latency of the right camera")
-    others: NotNegative = Field(0.0, description="latency of other cameras, unless they are named")
-
-    def of(self, view: str) -> float:
-        """Return the latency of a camera."""
-        latency: float = getattr(self, view, self.others)
-        return latency
+    def of(self, view: str) -> float | None:
+        """Return the time of a camera, if it is given."""
+        time: float | None = getattr(self, view, None)
+        return self.others if time is None else time
 
 
-def of_all(value: Any) -> Any:
+def _of_all(value: Any) -> Any:
     """One number stands for all cameras."""
     return dict.fromkeys((*VIEWS, "others"), value) if isinstance(value, int | float) else value
+
+
+Delays = Annotated[EachView, BeforeValidator(_of_all, json_schema_input_type=Number | EachView)]
 
 
 class Faults(Section):
     """Permanent faults of the simulated robot and its cameras, which a calibration has to model too."""
 
-    camera_latency_s: Annotated[
-        _Delays, BeforeValidator(of_all, json_schema_input_type=NotNegative | _Delays)
-    ] = Field(
-        _Delays(),
+    camera_latency_s: Delays = Field(
+        EachView(left=0.0, right=0.0, others=0.0),
         description="time from the middle of an exposure to the joint readings that arrive with its "
         "image, at least half the exposure; a number for all cameras, or {left, right} or other names",
     )
@@ -146,7 +146,9 @@ class Faults(Section):
     )
 
     def contradictions(self) -> Iterator[Finding]:
-        """Yield keys without effect because another is missing."""
+        """Yield latencies of images not taken yet, and keys without effect because another is missing."""
+        if (least := min(latency or 0.0 for _, latency in self.camera_latency_s)) < 0:
+            yield ("camera_latency_s",), f"{least:g} is negative: no image comes before it was taken"
         if self.frame_offset_s and self.frame_rate_hz is None:
             yield ("frame_offset_s",), "is that of cameras that run freely: set frame_rate_hz as well"
         if self.quantize_setpoints and self.encoder_counts_per_turn is None:

@@ -403,7 +403,7 @@ class _Camera:
         self._joints, self._world, self._faults, self._events = joints, world, faults, events
         self._view, self._looks = view, 0
         # No frame is read before it was exposed whole.
-        self._delay = max(faults.camera_latency_s.of(world.truth.view[view]), 0.5 * faults.exposure_s)
+        self._delay = max(faults.camera_latency_s.of(world.truth.view[view]) or 0.0, 0.5 * faults.exposure_s)
         self._interval = 0.0 if faults.frame_rate_hz is None else 1.0 / faults.frame_rate_hz
         self._clock = float(world.random(view, 0).uniform(-_CLOCKS_S, _CLOCKS_S))
         self._first = float(world.random(0, 0).uniform(0.0, 1.0)) * self._interval

@@ -22,8 +22,7 @@ from projservo_cli.robots.latency import DelayPrior
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
-from projservo_cli.settings.control import EachView
-from projservo_cli.settings.disturbance import Events
+from projservo_cli.settings.disturbance import EachView, Events
 from projservo_cli.simulation.analytic_plant import Plant, observe
 from projservo_cli.simulation.faults import (
     FaultyRobot,
@@ -270,6 +269,10 @@ def _delays_of(given: EachView | None, calibration: Calibration) -> DelayPrior:
         sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
         known = DelayPrior(calibration.time_offset_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
     if given is not None:
-        mean = np.array([given.of(name) for name in view])
+        if missing := [name for name in view if given.of(name) is None]:
+            raise InputError(
+                f"plant.time_offset_s: names no {', '.join(missing)}: give their numbers, or others"
+            )
+        mean = np.array([given.of(name) for name in view], float)
         known = known._replace(mean=mean, sigma=np.zeros(len(view)))
     return known

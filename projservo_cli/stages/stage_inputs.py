@@ -13,8 +13,8 @@ from projservo_cli.records import TOOL, FloatArray
 from projservo_cli.result_hashes import File, digest, encoded
 from projservo_cli.robots.settings import Following, JointSettings
 from projservo_cli.settings.cameras import Cameras
-from projservo_cli.settings.control import EachView, Stop
-from projservo_cli.settings.disturbance import Events
+from projservo_cli.settings.control import Stop
+from projservo_cli.settings.disturbance import EachView, Events
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import TaskSettings, Trajectory
 from projservo_cli.simulation.arm import SerialArm
