@@ -51,7 +51,7 @@ from projservo_cli.simulation.workspace import Truth, plant_of, turned
 from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.incidences import Incidence
-from projservo_cli.task.target import TaskImages
+from projservo_cli.task.target import TaskImages, is_stereo
 
 _GUESSED = 1e-3  # weight of a marker in a fit that is predicted from others
 
@@ -124,7 +124,7 @@ class Scenario:
 
     def measures_body(self, law: str) -> bool:
         """Whether a law measures the face with the body; classical laws from two views do not."""
-        return law in BODY_LAWS or len(self.view) != len(VIEWS)
+        return law in BODY_LAWS or not is_stereo(self.view)
 
     def numbers_of(self, law: str) -> tuple[int, ...]:
         """Numbers of the markers that a law observes."""
@@ -357,7 +357,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
         assert calibration is not None
         exact, ends, q_goal = _predicted_ends(inputs, task, calibration, joints, (*face, *pins))
     exact = exact._replace(body=body, view=view, incidences=_positions(inputs.incidences, (*face, *pins)))
-    if len(view) != len(VIEWS):
+    if not is_stereo(view):
         near = _joints_near_goal(exact, q_goal, calibration, (*face, *pins))
         exact = exact._replace(q_near=near)
     found = Scenario(
@@ -462,7 +462,7 @@ def _by_points(features: str | None, calibration: Calibration | None, view: Sequ
 
     Raises InputError where points are asked for and there are not two views.
     """
-    if len(view) != len(VIEWS):
+    if not is_stereo(view):
         if features == "points":
             raise InputError(
                 f"control.features: points are measured from two views, and there are {len(view)} "

@@ -17,7 +17,7 @@ from projservo_cli.geometry.displacements import (
     twist_exponential,
 )
 from projservo_cli.planning.margins import limits_alone
-from projservo_cli.records import VIEWS, Calibration, FloatArray, Model, Plan, Trace, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.report.report_data import DIRECT, Studies
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
@@ -26,6 +26,7 @@ from projservo_cli.stages.scenario import RunScenario, run_scenario
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.stage_inputs import ServoInputs
 from projservo_cli.task.body import make_body
+from projservo_cli.task.target import is_stereo
 
 GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
 PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)
@@ -95,7 +96,7 @@ def comparison_of(inputs: ServoInputs, calibration: Calibration, plan: Plan) -> 
         body where there are not two views: nothing keeps them out of regions. The goal is the taught pose.
     """
     inputs = replace(inputs, plan=replace(inputs.plan, incidences=()))
-    if len(calibration.view) != len(VIEWS):
+    if not is_stereo(calibration.view):
         inputs = replace(inputs, plan=replace(inputs.plan, features="body"))
     scenario = run_scenario(inputs, calibration)
     limits = scenario.termination._replace(stop_at_joint_limit=False, stop_at_border=False)

@@ -1,6 +1,7 @@
 """Target of a law: its task by the face, by all markers of the body, and with a plan to follow."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -44,6 +45,11 @@ _ROUND_OFF = 1e-9
 _DIFFERENCE = 1e-4
 
 
+def is_stereo(view: Sequence[str]) -> bool:
+    """Tell whether there are two views, from which points are measured one by one."""
+    return len(view) == len(VIEWS)
+
+
 class TaskImages(NamedTuple):
     """Images at start and goal of a task: teaching by showing."""
 
@@ -66,8 +72,8 @@ class TaskImages(NamedTuple):
         """Views (2,) that show the whole face at start and goal, the first ones; none without two."""
         m = self.s_start.shape[1] - self.pins
         shown = np.isfinite([self.s_start[:, :m], self.s_star[:, :m]]).all(axis=(0, 2, 3))
-        if len(self.view) == len(VIEWS):
-            return np.arange(len(VIEWS))
+        if is_stereo(self.view):
+            return np.arange(len(self.view))
         return np.flatnonzero(shown)[:2] if shown.sum() > 1 else np.arange(0)
 
     def by_points(self) -> "TaskImages":
