@@ -114,12 +114,9 @@ class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming err
         self.refutes = refutes
 
 
-NO_LENS = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2)
-
-
 def no_lenses(views: int) -> FloatArray:
     """Lenses (V, 5) that do not distort."""
-    return np.tile(NO_LENS[:1], (views, 1))
+    return np.tile([0.0, 0.0, 1.0, 0.0, 0.0], (views, 1))
 
 
 class JointLimits(NamedTuple):
@@ -181,7 +178,7 @@ class Model(NamedTuple):
     q_reference: FloatArray  # (n,) joint reading at the reference, rad or m
     a_inf: FloatArray  # (4,) plane at infinity, the common left null vector of the operators
     # (V, 5) radial distortion of the views: image centre u, v and radius, px, then k1, k2
-    lens: FloatArray = NO_LENS
+    lens: FloatArray
     # whether the cameras are on the tool: the joints then move the scene, the last one first
     on_tool: bool = False
     curve: JointCurve = NO_CURVE  # true joints by readings

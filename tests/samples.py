@@ -7,7 +7,7 @@ the oracles of the kinematics.
 import numpy as np
 from scipy.linalg import expm
 
-from projservo_cli.records import Model, prismatic_of
+from projservo_cli.records import Model, no_lenses, prismatic_of
 
 METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -62,6 +62,7 @@ def arm(types="RRRRRR"):
         prismatic_of(types),
         np.linspace(-0.4, 0.5, len(types)),
         METRIC_A_INF.copy(),
+        no_lenses(2),
     )
 
 

@@ -28,6 +28,7 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
     letters_of,
+    no_lenses,
 )
 
 Progress = Callable[[str, int, int], None]
@@ -439,8 +440,8 @@ class Nominal:
                 f"{self.where}: marker {missing[0]} of the data is not in it; add the marker (marker_numbers "
                 "says which is which), or leave calibration.init out"
             )
-        a_inf = np.array([0.0, 0.0, 0.0, 1.0])
-        model = Model(self.P, self.H_hat, detections.prismatic, self.q_reference, a_inf)
+        a_inf, lens = np.array([0.0, 0.0, 0.0, 1.0]), no_lenses(len(self.P))
+        model = Model(self.P, self.H_hat, detections.prismatic, self.q_reference, a_inf, lens)
         column = {int(number): j for j, number in enumerate(self.marker)}
         M = self.M[[column[int(number)] for number in detections.marker]]
         M = M @ forward_kinematics(model, q_reference).T

@@ -47,7 +47,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     q, O, matrices, order = np.zeros(4), np.zeros((2, 4)), np.zeros((4, 4, 4)), np.zeros(4, np.int64)
     limits = JointLimits(q, q, q, q)
     slides = np.zeros(4, np.bool_)
-    model = Model(P=np.zeros((2, 3, 4)), H_hat_0=matrices, prismatic=slides, q_reference=q, a_inf=q)
+    model = Model(np.zeros((2, 3, 4)), matrices, slides, q_reference=q, a_inf=q, lens=np.zeros((2, 5)))
     task = Task(
         s_star=np.zeros((2, 4, 2)),
         A_star=matrices[0],

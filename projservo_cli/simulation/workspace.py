@@ -12,7 +12,7 @@ from projservo_cli.geometry.displacements import rigid
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import within_images
-from projservo_cli.records import NO_LENS, VIEWS, BoolArray, FloatArray, Model, WorkFailed
+from projservo_cli.records import VIEWS, BoolArray, FloatArray, Model, WorkFailed
 from projservo_cli.settings.task import Goal
 from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.simulation.arm import (
@@ -40,7 +40,7 @@ class Truth:
     face: tuple[int, ...]  # indices of the face markers; none where the configuration has no face
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
     image_size: FloatArray  # (V, 2) width and height of each image, px
-    lens: FloatArray = field(default_factory=NO_LENS.copy)  # (V, 5) true lenses
+    lens: FloatArray  # (V, 5) true lenses
     # (m, 3) directions that markers look in at the robot's reference; zero where they are seen from anywhere
     normals: FloatArray = field(default_factory=lambda: np.zeros(3))
     view: tuple[str, ...] = VIEWS  # names of the views

@@ -14,8 +14,9 @@ from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.geometry.displacements import displacements
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
-from projservo_cli.records import Model, prismatic_of
+from projservo_cli.records import Model, no_lenses, prismatic_of
 from tests.calibration.simulated_robot import Robot, around, random_robot
+from tests.samples import METRIC_A_INF
 
 LENS = np.array([[640.0, 512.0, 640.0, -0.06, 0.01], [640.0, 512.0, 640.0, 0.03, -0.01]])
 
@@ -129,7 +130,7 @@ def test_memory_of_a_search_grows_by_little_a_sighting(monkeypatch):
 def test_twin_of_the_kernels():
     robot = random_robot("RPRR", np.random.default_rng(7))
     prismatic = prismatic_of(robot.joint_types)
-    model = Model(robot.cameras, robot.twists, prismatic, robot.q_reference, np.array([0.0, 0.0, 0.0, 1.0]))
+    model = Model(robot.cameras, robot.twists, prismatic, robot.q_reference, METRIC_A_INF, no_lenses(2))
     problem, scene = problem_of(robot, count=3)
     E = displacements(scene.H_hat, problem.detections.prismatic, problem.q)
     for k, q in enumerate(problem.detections.q):

@@ -20,7 +20,7 @@ from projservo_cli.geometry.kinematics import (
     joint_operators,
 )
 from projservo_cli.metric.frame import Metric
-from projservo_cli.records import BASIS, NO_CURVE, InputError, JointCurve, Model, WorkFailed
+from projservo_cli.records import BASIS, NO_CURVE, InputError, JointCurve, Model, WorkFailed, no_lenses
 from projservo_cli.store import Result, Run, load, save
 from tests.calibration.simulated_robot import around, random_robot, trials
 from tests.calibration.test_cameras_on_the_tool import Hand
@@ -47,9 +47,8 @@ def some_arm(rng, types="RRPRR"):
 
 
 def model_of(H_hat, prismatic, curve, q_reference):
-    return Model(
-        np.zeros((2, 3, 4)), H_hat, prismatic, q_reference, np.array([0.0, 0.0, 0.0, 1.0]), curve=curve
-    )
+    P, a_inf = np.zeros((2, 3, 4)), np.array([0.0, 0.0, 0.0, 1.0])
+    return Model(P, H_hat, prismatic, q_reference, a_inf, no_lenses(2), curve=curve)
 
 
 @pytest.mark.parametrize("seed", range(5))

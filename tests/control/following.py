@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from projservo_cli.planning.margins import limits_alone
-from projservo_cli.records import NO_LENS, JointLimits
+from projservo_cli.records import JointLimits, no_lenses
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.task.target import TaskImages, followed
 from tests.known import asked
@@ -34,7 +34,7 @@ def _planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0)
     demands = limits_alone(JointLimits(np.full(n, -9.0), np.full(n, 9.0), *np.full((2, n), speed)))
     shown = TaskImages(sc.q_start, sc.s_start, sc.s_star, sc.plant.center)
     motion = asked(profile, duration=duration, ramp=ramp)
-    return plan_task(model._replace(lens=NO_LENS), shown, motion, demands)
+    return plan_task(model._replace(lens=no_lenses(2)), shown, motion, demands)
 
 
 def tracked(sc, G=None, plan=None, rate=1.0, task=None):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators, project
-from projservo_cli.records import Model, prismatic_of
+from projservo_cli.records import Model, no_lenses, prismatic_of
 from tests.samples import arm, face, frame, hat, in_frame, operators, pixels, poe
 
 TYPES = ["RRRRRR", "RRPRRR", "PRR", "RRRRRRR", "R", "RRRPP"]
@@ -85,6 +85,7 @@ def test_true_kinematics_reproduce_the_reference_pixels(reference_truth, shared_
         prismatic_of(truth["joint_types"]),
         np.array(truth["q_reference"]),
         np.array([0, 0, 0, 1.0]),
+        no_lenses(2),
     )
     body = np.c_[truth["markers_tool"], np.ones(len(truth["markers_tool"]))]
     M_0 = body @ np.array(truth["T_base_tool_at_reference"]).T

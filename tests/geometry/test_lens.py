@@ -12,7 +12,7 @@ from projservo_cli.geometry.lens import (
     distort_visible,
     undistort_pixel,
 )
-from projservo_cli.records import NO_LENS
+from projservo_cli.records import no_lenses
 
 COEFFICIENTS = [(-0.2, 0.05), (-0.2, 0.0), (0.15, -0.02), (0.1, 0.1), (0.0, -0.05), (-0.3, 0.2)]
 
@@ -86,9 +86,9 @@ def test_what_lies_beyond_the_turn_has_no_image():
 
 def test_without_distortion_pixels_are_the_same_to_the_bit(rng):
     pixels = rng.uniform(-1e3, 1e3, (2, 30, 2))
-    assert distort_visible(NO_LENS[:, None], pixels) is pixels
+    assert distort_visible(no_lenses(2)[:, None], pixels) is pixels
     u, v = pixels[0, 0]
-    assert undistort_pixel(NO_LENS[0], u, v) == (u, v)
-    assert distort_pixel(NO_LENS[0], u, v) == (u, v)
+    assert undistort_pixel(no_lenses(1)[0], u, v) == (u, v)
+    assert distort_pixel(no_lenses(1)[0], u, v) == (u, v)
     centre = lens(-0.2, 0.05)[:2]
     assert undistort_pixel(lens(-0.2, 0.05), *centre) == tuple(centre)

@@ -15,7 +15,7 @@ from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
 from projservo_cli.loop.verdicts import VERDICTS, Limits
-from projservo_cli.records import Model, position_limits
+from projservo_cli.records import Model, no_lenses, position_limits
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Plant
 from projservo_cli.simulation.arm import METRIC_A_INF
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
@@ -43,7 +43,9 @@ class FreeFlying(AnalyticPlant):
 
 def free_flying_plant(P, M, center):
     """Plant of a free-flying rig with cameras P, whose images have no border and whose twists no limits."""
-    model = Model(P, rig_twists(), np.zeros(6, dtype=np.bool_), np.zeros(6), METRIC_A_INF.copy())
+    model = Model(
+        P, rig_twists(), np.zeros(6, dtype=np.bool_), np.zeros(6), METRIC_A_INF.copy(), no_lenses(2)
+    )
     order = cyclic_order(M)
     O = optical_centers(P, METRIC_A_INF)
     side = np.sign(O @ np.array(face_plane(M, order, center_of(M, center))))
