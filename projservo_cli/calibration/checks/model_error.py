@@ -107,9 +107,9 @@ class _Extent(NamedTuple):
 
     middle: FloatArray  # (n,) of the readings from the reference
     half: FloatArray  # (n,) half their range
-    center: FloatArray  # (2, 2) of the images, px
-    radius: FloatArray  # (2,) half the size of the images, px
-    depth: FloatArray  # (2, 2) mean and deviation of depths
+    center: FloatArray  # (V, 2) of the images, px
+    radius: FloatArray  # (V,) half the size of the images, px
+    depth: FloatArray  # (V, 2) mean and deviation of depths
 
     @classmethod
     def of(cls, solution: Solution) -> "_Extent":
@@ -715,7 +715,7 @@ _WORDS = {
     "camera_step": ("motion of the {view} camera", "the {view} camera moved{first}, by {size}"),
     "base": (
         "motion of the base or the cameras",
-        "the base of the arm or both cameras moved{first}, by {size}",
+        "the base of the arm or all cameras moved{first}, by {size}",
     ),
     "tool": ("markers that moved on the tool", "the markers moved on the tool{first}, by {size}"),
     "lens": ("lens of the {view} camera", "the lens of the {view} camera distorts, by {size}"),
