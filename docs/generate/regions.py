@@ -16,7 +16,7 @@ from projservo_cli.cli import main
 from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.loop import verdicts as loop_verdicts
-from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED
+from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, NUMBERED, measured
 
 # Where a run file holds which record.
 GROUPS = {
@@ -111,10 +111,14 @@ def sweep_columns() -> Iterator[str]:
                 text(column.units.removeprefix("1")),
                 text(column.about),
             )
-            for column in (*NUMBERED, *MEASURED, BETWEEN)
+            for column in (*NUMBERED, *measured(), BETWEEN)
         ),
     )
-    yield from ("", f"A sweep with `between_samples` has `{BETWEEN.name}`.")
+    yield from (
+        "",
+        f"A sweep with `between_samples` has `{BETWEEN.name}`. Each camera of a rig has its column",
+    )
+    yield "`self_occluded_steps_<view>`; random tasks show the face to `trajectory.visible_views` of them."
 
 
 def verdicts() -> Iterator[str]:

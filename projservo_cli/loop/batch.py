@@ -20,7 +20,7 @@ from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.lens import undistort_into
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.rehearsal import Rehearsal, first_parts, is_half_turn
-from projservo_cli.loop.run_metrics import Ended, Summary, summarize
+from projservo_cli.loop.run_metrics import Ended, Summary, self_occluded_steps, summarize
 from projservo_cli.loop.verdicts import RUNNING, Log, new_log
 from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.simulation.analytic_plant import Ends
@@ -35,7 +35,8 @@ from projservo_cli.task.target import body_task_into
 
 # A run that could not be begun; other verdicts as of ``step``.
 NOT_STARTED = -2
-# Columns of the numbers of a run: verdict, steps, then those of its summary.
+# Columns of the numbers of a run: verdict, steps, those of its summary, and then, of each view, the times at
+# which its camera is behind the face.
 VERDICT, STEPS = range(2)
 NUMBERS = ("verdict", "steps", *Summary._fields)
 _NOT_OPENED = -1
@@ -95,13 +96,13 @@ class Batch:
         self.rehearsal = Rehearsal(setting.model, q_start, m, plant.limits)
 
     def numbers(self, images: FloatArray, noise: FloatArray) -> FloatArray:
-        """Measure the task, partition it, drive the law to its verdict and sum up: (r, ``NUMBERS``).
+        """Measure the task, partition it, drive the law to its verdict and sum up: (r, ``NUMBERS`` + V).
 
         images : (r, 2, V, b, 2) of each run at the start and at the goal, the face first, px.
         noise : (r, k, V, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
             short.
         """
-        numbers = np.full((len(images), len(NUMBERS)), math.nan)
+        numbers = np.full((len(images), len(NUMBERS) + images.shape[2]), math.nan)
         at, made, opened = self.scratch, 0, _NOT_OPENED
         while made < len(images):
             made += _until_rehearsal(self.setting, images[made:], noise[made:], at, opened, numbers[made:])
@@ -193,3 +194,5 @@ def _drive(setting: Setting, status: int, noise: FloatArray, scratch: _Scratch, 
         for value in literal_unroll(summary):
             numbers[column] = value
             column += 1
+        for view in range(scratch.log.hidden.shape[1]):
+            numbers[column + view] = self_occluded_steps(scratch.log, steps, view)

@@ -30,10 +30,6 @@ class Summary(NamedTuple):
     # and no joint was past a limit, 0 where not; what happens between the instants is not looked at
     success: float
     image_error_px: float  # at the end, rms over markers and views
-    # self_occluded_steps_left, self_occluded_steps_right: instants at which the first and the last camera are
-    # behind the face; a trace counts those of each
-    self_occluded_steps_left: int
-    self_occluded_steps_right: int
     first_outside_image: int
     first_beyond_limit: int  # first_outside_image, first_beyond_limit: instants, −1 for never
     speed_limited_steps: int
@@ -52,13 +48,9 @@ class Summary(NamedTuple):
 def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -> Summary:
     """Numbers of a run."""
     steps = ended.steps
-    hidden_left, hidden_right, slowed = 0, 0, 0
-    for k in range(steps + 1):
-        if log.hidden[k, 0] > 0.5:
-            hidden_left += 1
-        if log.hidden[k, log.hidden.shape[1] - 1] > 0.5:
-            hidden_right += 1
-        if k < steps and log.factor[k] < 1.0:
+    slowed = 0
+    for k in range(steps):
+        if log.factor[k] < 1.0:
             slowed += 1
     middle, goal = center_of(plant.M, plant.center), vec(ends.goal)
     first, last = mat(log.H[0]), mat(log.H[steps])
@@ -77,8 +69,6 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
     return Summary(
         success=1.0 if arrived and _keeps_within(plant, log, steps) else 0.0,
         image_error_px=float(log.error[steps]),
-        self_occluded_steps_left=hidden_left,
-        self_occluded_steps_right=hidden_right,
         first_outside_image=int(log.events[0]),
         first_beyond_limit=int(log.events[1]),
         speed_limited_steps=slowed,
@@ -91,6 +81,16 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
         path_length_mm=MM * length,
         center_deviation_at_samples_mm=MM * at_samples,
     )
+
+
+@njit
+def self_occluded_steps(log: Log, steps: int, view: int) -> int:
+    """Number of instants at which a camera is behind the face."""
+    count = 0
+    for k in range(steps + 1):
+        if log.hidden[k, view] > 0.5:
+            count += 1
+    return count
 
 
 @merged

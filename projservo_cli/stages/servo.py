@@ -21,7 +21,14 @@ from projservo_cli.laws import CODES, INCIDENCES, REGULATE, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
-from projservo_cli.loop.run_metrics import Ended, Summary, angle_between, path_deviation, summarize
+from projservo_cli.loop.run_metrics import (
+    Ended,
+    Summary,
+    angle_between,
+    path_deviation,
+    self_occluded_steps,
+    summarize,
+)
 from projservo_cli.loop.stall_monitor import StallMonitor
 from projservo_cli.loop.verdicts import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.monitoring.accuracy import Posture, metric_points, rigid_fit
@@ -301,6 +308,11 @@ class LawRun:
             found = found._replace(position_error_mm=mm, rotation_error_deg=deg)
         return found if self.scenario.truth is not None else found._replace(success=math.nan)
 
+    @property
+    def self_occluded_steps(self) -> tuple[int, ...]:
+        """Number of times (V,) at which each camera is behind the face."""
+        return tuple(self_occluded_steps(self.log, self.steps, v) for v in range(self.log.hidden.shape[1]))
+
     def deviation_mm(self) -> float:
         """Largest distance of the true centre from its line, between the samples too, mm; NaN if unknown."""
         goal, period = self.scenario.true_ends.goal, self.scenario.gains.period
@@ -384,14 +396,13 @@ class LawRun:
             pose, goal_pose = _reported_poses(scenario, _whole(driven.truths, rows))
             values["position_error_mm"] = MM * float(np.linalg.norm(goal_pose[:3, 3] - pose[-1, :3, 3]))
             values["rotation_error_deg"] = math.degrees(angle_between(mat(pose[-1]), mat(goal_pose)))
-        hidden = log.hidden[:rows] > 0.5
         numbers: dict[str, Any] = {n: None if math.isnan(values[n]) else values[n] for n in _SUMMARY_FIELDS}
         if simulated:
             numbers["success"] = values["success"] == 1.0
         return Trace(
             **numbers,
             view=scenario.view,
-            self_occluded_steps=tuple(hidden.sum(axis=0).tolist()),
+            self_occluded_steps=self.self_occluded_steps,
             law=self.law,
             mode=self.mode,
             planned_s=self.planned_s,
@@ -421,7 +432,7 @@ class LawRun:
             views_used=views,
             q_dot=log.q_dot[:steps],
             speed_factor=log.factor[:steps],
-            self_occluded=hidden,
+            self_occluded=log.hidden[:rows] > 0.5,
             pose=pose,
             goal_pose=goal_pose,
             center=center if simulated else np.full_like(center, np.nan),

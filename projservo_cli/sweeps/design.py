@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -230,6 +230,14 @@ class Design:
         cells = [c for c in range(self.cells) if self.cell(c).trajectory.needs_covariance]
         return {self.calibration_key(*place) for place in product(cells, range(self._calibrations))}
 
+    @cached_property
+    def view(self) -> tuple[str, ...]:
+        """Names of the views of all cells."""
+        keys = [key for axis in self.axes for key in (*axis.keys, *chain(*axis.also.values()))]
+        step = 1 if any(key.startswith("rig") for key in keys) else self.cells // len(self.bases)
+        rigs = [self.cell(cell).rig for cell in range(0, self.cells, step)]
+        return tuple(dict.fromkeys(name for rig in rigs if rig is not None for name in rig.cameras))
+
     @property
     def _calibrations(self) -> int:
         """Return the number of calibrations of a cell."""
@@ -244,7 +252,9 @@ class Design:
         assert self.sweep.tasks is not None
         q_front = np.array(config.task.start.values(config.robot.joint_types))
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(TASKS,)))
-        return random_tasks(truth_of(config), q_front, self.sweep.tasks.random, rng)
+        asked = config.trajectory.visible_views
+        least_views = 0 if asked == "all" else asked
+        return random_tasks(truth_of(config), q_front, self.sweep.tasks.random, rng, least_views)
 
     def config(self, run: int) -> Config:
         """Configuration of a run."""

@@ -15,7 +15,7 @@ from projservo_cli.laws import CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled import Course
 from projservo_cli.loop.verdicts import FAILED, RUNNING, VERDICTS
-from projservo_cli.records import Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
+from projservo_cli.records import VIEWS, Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.result_hashes import key_of
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rotation_sense
@@ -46,39 +46,51 @@ NUMBERED = (
     Heading("task", "i8", "1", "number of the random task, -1 for that of the base"),
     Heading("seed", "i8", "1", "seed of the run"),
 )
-MEASURED = (
-    _text("verdict", ALL_VERDICTS, "verdict of the run"),
-    Heading(
-        "success",
-        "u1",
-        "1",
-        "1 if it converged and at every time, in truth, no joint was past a limit, no camera behind "
-        "the face and every marker of the face in both images",
-    ),
-    Heading("usable", "i1", "1", "whether its calibration is usable"),
-    Heading("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
-    Heading("rotation_deg", "f8", "deg", "true rotation from start to goal"),
-    Heading("distance_mm", "f8", "mm", "true distance of the centre from start to goal"),
-    Heading("position_error_mm", "f8", "mm", "true centre to true goal at the end"),
-    Heading("rotation_error_deg", "f8", "deg", "true rotation to the goal at the end"),
-    Heading("image_error_px", "f8", "px", "image error at the end, rms over markers and views"),
-    Heading("self_occluded_steps_left", "i8", "1", "times at which the left camera is behind the face"),
-    Heading("self_occluded_steps_right", "i8", "1", "times at which the right camera is behind the face"),
-    Heading(
-        "first_outside_image", "i8", "1", "first time index with a marker outside an image, -1 for never"
-    ),
-    Heading("first_beyond_limit", "i8", "1", "first time index beyond a joint limit, -1 for never"),
-    Heading("speed_limited_steps", "i8", "1", "commands scaled to the joint-speed limit"),
-    Heading(
-        "visibility_limited_steps",
-        "i8",
-        "1",
-        "commands whose translation was limited to visibility_fraction·tau_0",
-    ),
-    Heading("path_length_mm", "f8", "mm", "length of the path of the centre, from sample to sample"),
-    Heading("center_deviation_at_samples_mm", "f8", "mm", "maximum distance of the centre from the line"),
-    Heading("effort", "f8", "rad²/s or m²/s", "integral of the squared joint velocities"),
-)
+
+
+def _self_occluded(view: Sequence[str]) -> list[str]:
+    """Columns of the times at which each camera is behind the face."""
+    return [f"self_occluded_steps_{name}" for name in view]
+
+
+def measured(view: Sequence[str] = VIEWS) -> tuple[Heading, ...]:
+    """Columns of the values that are measured of each run, of a rig with some views."""
+    about = (f"times at which the {name} camera is behind the face" for name in view)
+    hidden = (Heading(name, "i8", "1", text) for name, text in zip(_self_occluded(view), about, strict=True))
+    return (
+        _text("verdict", ALL_VERDICTS, "verdict of the run"),
+        Heading(
+            "success",
+            "u1",
+            "1",
+            "1 if it converged and at every time, in truth, no joint was past a limit, no camera behind "
+            "the face and every marker of the face in both images",
+        ),
+        Heading("usable", "i1", "1", "whether its calibration is usable"),
+        Heading("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
+        Heading("rotation_deg", "f8", "deg", "true rotation from start to goal"),
+        Heading("distance_mm", "f8", "mm", "true distance of the centre from start to goal"),
+        Heading("position_error_mm", "f8", "mm", "true centre to true goal at the end"),
+        Heading("rotation_error_deg", "f8", "deg", "true rotation to the goal at the end"),
+        Heading("image_error_px", "f8", "px", "image error at the end, rms over markers and views"),
+        *hidden,
+        Heading(
+            "first_outside_image", "i8", "1", "first time index with a marker outside an image, -1 for never"
+        ),
+        Heading("first_beyond_limit", "i8", "1", "first time index beyond a joint limit, -1 for never"),
+        Heading("speed_limited_steps", "i8", "1", "commands scaled to the joint-speed limit"),
+        Heading(
+            "visibility_limited_steps",
+            "i8",
+            "1",
+            "commands whose translation was limited to visibility_fraction·tau_0",
+        ),
+        Heading("path_length_mm", "f8", "mm", "length of the path of the centre, from sample to sample"),
+        Heading("center_deviation_at_samples_mm", "f8", "mm", "maximum distance of the centre from the line"),
+        Heading("effort", "f8", "rad²/s or m²/s", "integral of the squared joint velocities"),
+    )
+
+
 BETWEEN = Heading("center_deviation_mm", "f8", "mm", "maximum distance of the centre, between samples too")
 
 
@@ -88,7 +100,7 @@ def columns_of(design: Design) -> tuple[Heading, ...]:
     random = design.sweep.random.items()
     drawn = [_input(key, given.choice or (0.0,), "value drawn for the run") for key, given in random]
     between = (BETWEEN,) if design.sweep.between_samples else ()
-    return (*NUMBERED, *axes, *drawn, *MEASURED, *between)
+    return (*NUMBERED, *axes, *drawn, *measured(design.view), *between)
 
 
 def _input(name: str, values: Sequence[Any], about: str) -> Heading:
@@ -107,7 +119,6 @@ def _displayed(value: Any) -> Any:
 _Columns = dict[str, npt.NDArray[Any]]
 # Text of a verdict of the kernel in the table.
 _SAID = {code: name.encode() for code, name in enumerate(VERDICTS)}
-_COUNTS = tuple(column.name for column in MEASURED if column.dtype.startswith("i") and column.name in NUMBERS)
 
 
 class Part(NamedTuple):
@@ -207,12 +218,15 @@ def _measured(
 ) -> tuple[dict[str, Any], Sequence[str]]:
     """Return the measured values of compiled runs, by column, and why each did not start, if so."""
     try:
-        numbers = _numbers_of(run_scenario(given, calibration), name, seeds.tolist())
+        scenario = run_scenario(given, calibration)
+        numbers = _numbers_of(scenario, name, seeds.tolist())
     except WorkFailed as error:
         return {"verdict": NOT_STARTED}, [str(error)] * len(seeds)
-    found: dict[str, Any] = {name: numbers[:, i] for i, name in enumerate(NUMBERS)}
-    for name in _COUNTS:
-        found[name] = np.where(numbers[:, VERDICT] < 0, NONE, found[name])
+    names = (*NUMBERS, *_self_occluded(scenario.view))
+    found: dict[str, Any] = dict(zip(names, numbers.T, strict=True))
+    for column in measured(scenario.view):
+        if column.dtype == "i8":
+            found[column.name] = np.where(numbers[:, VERDICT] < 0, NONE, found[column.name])
     found["success"] = found["success"] == 1.0
     found["verdict"] = [_SAID.get(int(code), NOT_STARTED.encode()) for code in numbers[:, VERDICT]]
     return found, ["" if code in _SAID else _UNMEASURED for code in numbers[:, VERDICT].tolist()]
@@ -225,7 +239,7 @@ TOGETHER = 16
 
 
 def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatArray:
-    """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its seed alone."""
+    """Numbers (k, ``NUMBERS`` + V) of the runs of seeds (k), each a function of its seed alone."""
     setting = Setting(
         code=CODES[law],
         model=scenario.model,
@@ -240,7 +254,7 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
         q_near=scenario.exact.q_near,
     )
     batch = Batch(setting, len(scenario.numbers))
-    found = np.empty((len(seeds), len(NUMBERS)))
+    found = np.empty((len(seeds), len(NUMBERS) + len(scenario.view)))
     for first in range(0, len(seeds), TOGETHER):
         running, instants = list(range(first, min(first + TOGETHER, len(seeds)))), INSTANTS
         while running:  # those that outlast their noise are repeated with more
@@ -295,6 +309,7 @@ def _run(
     except WorkFailed as error:
         return {"verdict": NOT_STARTED}, None, str(error)
     row = {"verdict": made.verdict, "steps": made.steps, **made.summary._asdict()}
+    row |= zip(_self_occluded(scenario.view), made.self_occluded_steps, strict=True)
     if design.sweep.between_samples:
         row[BETWEEN.name] = made.deviation_mm()
     return row, made.trace() if keep else None, made.why if made.verdict == VERDICTS[FAILED] else ""
