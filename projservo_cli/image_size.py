@@ -17,7 +17,7 @@ ImageSize = tuple[int, int] | tuple[tuple[int, int], ...]
 """Width and height of the images, px: of all views, or of one each."""
 
 
-def image_sizes(size: Any, views: int = 2) -> FloatArray:
+def image_sizes(size: Any, views: int) -> FloatArray:
     """Width and height (V, 2) of each image, px, by those of all views or of one each; infinite for None."""
     sizes = np.array(math.inf if size is None else size, dtype=np.float64)
     return np.broadcast_to(sizes, (views, 2)).copy()

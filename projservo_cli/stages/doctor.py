@@ -160,7 +160,8 @@ def calibration_finding(
     """
     if not calibration.usable or not calibration.has_covariance:
         return Finding(WARNING, _CALIBRATION, "is not usable", "record and calibrate again")
-    size = image_sizes(image_size or [view.frame.grey.shape[::-1] for view in at_rest.views] or None)
+    known = image_size or [view.frame.grey.shape[::-1] for view in at_rest.views] or None
+    size = image_sizes(known, len(at_rest.s))
     marker = np.array(at_rest.marker, dtype=np.int64)
     if not np.isfinite(at_rest.s[:, np.isin(marker, calibration.marker)]).any():
         return Finding(WARNING, _CALIBRATION, "was not compared: no marker of it is seen", "show the tags")

@@ -25,6 +25,13 @@ from tests.conftest import ROOT
 from tests.hardware.arms_in_motion import Faults, Rail, findings
 from tests.hardware.streams import Stream, picture
 
+# A camera above those of the hobby arm.
+TOP = {
+    "focal_px": [600, 600],
+    "principal_point_px": [319.5, 239.5],
+    "position_m": [0.68, 0.0, 0.5],
+    "target_m": [0.2, 0.0, 0.22],
+}
 LEFT = picture(at=(60.0, 80.0), numbers=(0, 1, 2), side=50.0, step=75.0)
 CONFIGURATION = """\
 name: arm
@@ -154,15 +161,19 @@ def test_a_source_that_is_taken_or_no_camera_is_refused(projservo, tmp_path, mon
     assert (answer.code, answer.err.count("\n"), words in answer.err) == (2, 1, True), answer.err
 
 
-@pytest.fixture(scope="module")
-def calibrated():
+def of_hobby(*changes):
+    """A calibration of the hobby arm, which carries a roof of tags."""
     settings = (
         "markers={tags: roof, tag_size_m: 0.04}",
         "noise.calibration_px=0.05",
         "calibration.random_poses=8",
     )
-    config = load_config("configs/hobby.yaml", settings)
-    return calibrate.run(calibration_inputs(config))[1]
+    return calibrate.run(calibration_inputs(load_config("configs/hobby.yaml", (*settings, *changes))))[1]
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    return of_hobby()
 
 
 @pytest.mark.parametrize(
@@ -198,8 +209,10 @@ def test_a_calibrated_run_tells_what_changed_since(calibrated, change, words):
     assert "mm" not in unknown.text
 
 
-@pytest.mark.parametrize("slipped", [False, True])
-def test_a_camera_that_moved_is_named_with_the_poses_that_mend_it(calibrated, slipped):
+@pytest.mark.parametrize(("views", "slipped"), [(2, False), (2, True), (3, False)])
+def test_a_camera_that_moved_is_named_with_the_poses_that_mend_it(calibrated, views, slipped):
+    if views == 3:
+        calibrated = of_hobby(f"rig.top={json.dumps(TOP)}")
     q, off = calibrated.q_reference, np.zeros(len(calibrated.q_reference))
     off[1] = np.radians(3.0 * slipped)
     s = predict(calibrated, (q + off)[None])[0]

@@ -8,7 +8,9 @@ import pytest
 
 from projservo_cli.calibration import predict
 from projservo_cli.config.inputs import report_inputs
+from projservo_cli.experiment import plan_scene_of
 from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.report import figures
 from projservo_cli.simulation.arm import camera_center
 from projservo_cli.stages.studies import comparison_of, metric_plan
 from tests.configured import calibrate, plan, scenario_of, servo, truth_of
@@ -79,6 +81,7 @@ def test_the_arm_arrives_by_any_rig(rig):
     assert made.view == calibration.view == truth.view
     assert made.feasible, made.reason
     assert made.margin.shape[1] == len(truth.view)
+    assert len(figures.of_plan(made, plan_scene_of(config, calibration)).axes) == len(truth.view) + 3
     for law in ("exact_track", "direct_two"):
         trace = servo.run(config, calibration, made, law)
         assert (trace.verdict, trace.view) == ("converged", truth.view), trace.reason

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from projservo_cli.image_size import image_sizes
+from projservo_cli.image_size import image_sizes as image_sizes
 from projservo_cli.records import (
     Calibration,
     CrossValidation,
@@ -53,7 +53,7 @@ def of_plan(plan: Plan, scene: Any) -> "Figure":
 
     scene : has ``model``, ``limits``, ``image_size`` and ``trajectory``.
     """
-    extent = image_sizes(np.nanmax(plan.s, axis=(0, 2)) if scene.image_size is None else scene.image_size)
+    extent = scene.image_size if scene.image_size is not None else np.nanmax(plan.s, axis=(0, 2))
     lowest, highest = plan.q.min(axis=0), plan.q.max(axis=0)
     robot = SimpleNamespace(
         prismatic=scene.model.prismatic,
