@@ -17,12 +17,13 @@ from projservo_cli.calibration.prediction import (
     predict,
     prediction_variance,
 )
+from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.display import Displayable, Printed, checked_array, numbers_in, require_radians, xarray
 from projservo_cli.files import bytes_of
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.metric.frame import Metric, Scale, links
 from projservo_cli.metric.kinematic_errors import KinematicErrors, in_model_frames, kinematic_errors
-from projservo_cli.observations import require_observations
+from projservo_cli.observations import Observations, require_observations
 from projservo_cli.records import (
     MM,
     TOOL,
@@ -171,6 +172,30 @@ class ImageModel(Displayable, Calibration):
         """
         require_observations("score", observation, Observation)
         return residual_statistics(self, observation)
+
+    def refitted(self, view: str, observations: Observations) -> "ImageModel":
+        """Fit a camera that moved again, as ``projservo calibrate --refit`` does.
+
+        Parameters
+        ----------
+        view : name of the camera.
+        observations : images of its markers since it moved, at joint readings, and perhaps by other cameras.
+
+        Returns
+        -------
+        The calibration with the new camera; one that is not ``usable`` says why in ``reason``.
+
+        Raises
+        ------
+        InputError
+            If there is no such camera, or the calibration has no covariance.
+        WorkFailed
+            If the images do not determine the camera, or do not confirm the joint readings.
+        """
+        require_observations("refitted", observations)
+        found, old = refit(self, observations, view, observations.image_size), self.observation
+        old = None if old is None else since_moved(old, observations, view)
+        return ImageModel.of(Calibration(**_fields_of(found, Calibration)), observation=old)
 
     def covariance(self) -> FloatArray:
         """Return the covariance of P, H_hat_0, lenses (k1, k2 of both, if estimated) and M, each raveled.
@@ -414,7 +439,7 @@ class PlanScene(NamedTuple):
 
     model: Model  # as calibrated
     limits: JointLimits  # infinite where none is set
-    image_size: FloatArray | None  # (2, 2) px, of each; None where unknown
+    image_size: FloatArray | None  # (V, 2) px, of each; None where unknown
     trajectory: Trajectory  # requested motion
 
 

@@ -25,7 +25,7 @@ INTERFACE: dict[Any, tuple[str, ...]] = {
     api.simulate: (),
     api.record: (),
     api.calibrate: (),
-    ImageModel: ("predict", "jacobian", "score", "covariance", "metric", "project", "plot"),
+    ImageModel: ("predict", "jacobian", "score", "refitted", "covariance", "metric", "project", "plot"),
     MetricModel: (
         *("pose", "pose_covariance", "position_std", "triangulate", "triangulation_covariance"),
         *("covariance", "in_frames_of", "errors_of", "to_xarray"),

@@ -247,6 +247,19 @@ def refit(
     return _record(calibration, observation, camera, ratio, image_size)
 
 
+def since_moved(old: Observation, new: Observation, view: str) -> Observation:
+    """Images at rest of old and new poses; those of a camera that moved between them are the new ones."""
+    old, new, v = old.at_rest, new.at_rest, old.view.index(view)
+    images = np.full((len(old.q) + len(new.q), *old.images.shape[1:]), np.nan)
+    images[: len(old.q)], images[: len(old.q), v] = old.images, np.nan
+    there, here = np.nonzero(old.marker[:, None] == new.marker)
+    for k, name in enumerate(new.view):
+        if name in old.view:
+            images[len(old.q) :, old.view.index(name), there] = new.images[:, k, here]
+    number = np.concatenate([old.pose, old.pose.max() + 1 + np.arange(len(new.q))])
+    return Observation(number, old.marker, np.concatenate([old.q, new.q]), images, view=old.view)
+
+
 def _fitted(images: _Images, v: int) -> _Camera:
     """Resect a camera, then minimize squared residuals, with a Cauchy loss at first.
 

@@ -10,7 +10,7 @@ from projservo_cli.calibration import Nominal, Solution, calibrate, cross_valida
 from projservo_cli.calibration.checks.board_numbering import BoardNumbering
 from projservo_cli.calibration.checks.screening import screened
 from projservo_cli.calibration.checks.undecided import undecided_pairs
-from projservo_cli.calibration.refit import refit
+from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.files import write_whole
 from projservo_cli.image_size import image_corners, image_sizes
 from projservo_cli.nominal import read_nominal
@@ -65,22 +65,13 @@ def run(
 
 
 def _refitted(inputs: RefitInputs, before: Calibrated) -> Calibrated:
-    """Fit a camera again; the observation has its new images in the place of those before it moved."""
+    """Fit a camera again."""
     old, calibration, _ = before
     kind, path = (calibration.joint_types, inputs.joint_unit), inputs.file.path
     readings = inputs.readings
     seen = read_table(path, *kind) if readings is None else read_detections(path, readings.path, *kind)
-    found, seen = refit(calibration, seen, inputs.view, inputs.image_size), seen.at_rest
-    old, v = old.at_rest, old.view.index(inputs.view)
-    images = np.full((len(old.q) + len(seen.q), *old.images.shape[1:]), np.nan)
-    images[: len(old.q)], images[: len(old.q), v] = old.images, np.nan
-    there, here = np.nonzero(old.marker[:, None] == seen.marker)
-    for k, name in enumerate(seen.view):
-        if name in old.view:
-            images[len(old.q) :, old.view.index(name), there] = seen.images[:, k, here]
-    number = np.concatenate([old.pose, old.pose.max() + 1 + np.arange(len(seen.q))])
-    whole = Observation(number, old.marker, np.concatenate([old.q, seen.q]), images, view=old.view)
-    return whole, found, None
+    found = refit(calibration, seen, inputs.view, inputs.image_size)
+    return since_moved(old, seen, inputs.view), found, None
 
 
 def recorded(table: Table) -> Observations:
