@@ -1,5 +1,7 @@
 """Chessboards and ChArUco boards in rendered images: corners, numbers, deviations, and a calibration."""
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,8 @@ from projservo_cli.detection import Board, BoardFinder, finder_of
 from projservo_cli.settings.markers import BoardSettings, Markers
 from tests.calibration.simulated_robot import Robot, around, random_robot
 from tests.detection.test_detection import joints, write
+from tests.hardware.still import Quiet
+from tests.hardware.streams import Stream
 from tests.samples import revolute
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install '.[detect]'")
@@ -126,6 +130,65 @@ def test_images_of_a_symmetric_board_calibrate_a_robot(projservo, monkeypatch, t
     assert answer.code == 0, answer.err
     assert answer.json["sigma_px"] < 0.03
     assert len(answer.json["turned_images"]) > 3
+
+
+class Carrier(Quiet):
+    """An arm that carries a board to where it is sent, and shows it to two cameras."""
+
+    board = Board.of("charuco:5x4")
+    places = board.places - board.places.mean(axis=0)
+    body = np.c_[0.14 * places, np.zeros(len(places)), np.ones(len(places))]
+    arm = random_robot("RR", np.random.default_rng(3))
+    arm = replace(arm, markers=body, cameras=np.diag([0.25, 0.25, 1.0]) @ arm.cameras)
+    at, kept = arm.q_reference, {}  # where it stands, and images of each place
+
+    def joints(self):
+        return Carrier.at, None
+
+    def command(self, target, speed, due):
+        Carrier.at = target.copy()
+
+    @classmethod
+    def image(cls, view, rng):
+        """What a camera sees of the board, with noise of its own."""
+        key = view, cls.at.tobytes()
+        if key not in cls.kept:
+            H = cv2.findHomography(cls.places, cls.arm.images(cls.at[None])[0, view])[0]
+            cls.kept[key] = drawn(cls.board, H, 0.8, 0.0, rng, (320, 240))[0]
+        return np.clip(cls.kept[key] + rng.normal(0.0, 3.0, (240, 320)), 0, 255).astype(np.uint8)
+
+
+CARRIED = """\
+name: arm
+plant: {{use: "tests.detection.test_boards:Carrier", settle_s: 0.05}}
+data: {{table: arm.csv, joints: RR, image_size_px: [320, 240]}}
+cameras: {{left: {{source: "{left}"}}, right: {{source: "{right}"}}, max_age_s: 5, reconnect_s: 20}}
+markers: {{board: {{kind: charuco, rows: 4, columns: 5, size_m: 0.14, dictionary: 4X4_250}}}}
+robot: {{limits: {{joints: [[-2, 2], [-2, 2]], unit: rad}}}}
+calibration:
+  {{reference: {{joints: {q}, unit: rad}}, frames_per_joint: 2, amplitude_deg: 20, random_poses: 4}}
+control: {{joint_speed_limit_deg_s: 600}}
+"""
+TOLD = {
+    "record": "9 poses recorded",
+    "calibrate": "calibrate: usable",
+    "teach --frames 3": "markers that disagree with the calibration: none",
+    "doctor": "agrees with the images",
+}
+
+
+def test_a_board_is_recorded_calibrated_taught_and_checked(projservo, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    streams = [Stream(partial(Carrier.image, view, np.random.default_rng(view))) for view in range(2)]
+    left, right = (stream.url for stream in streams)
+    text = CARRIED.format(left=left, right=right, q=Carrier.arm.q_reference.tolist())
+    Path("arm.yaml").write_text(text, encoding="utf-8")
+    for command, words in TOLD.items():
+        Carrier.at = Carrier.arm.q_reference
+        answer = projservo(*command.split(), "-c", "arm.yaml")
+        assert (answer.code, words in answer.out) == (0, True), answer.out + answer.err
+    for stream in streams:
+        stream.close()
 
 
 REFUSED = {
