@@ -111,12 +111,16 @@ class RigidBody(ImageGeometry):
         """
         pose, marker, images, weight = _chosen(detections)
         focals, middle = float(frame.size[0]) * np.array(_FOCALS), frame.center[0]
-        starts = _flat_starts(images, focals, middle) or _deep_starts(images, focals, middle)
+        starts = _flat_starts(images, focals, middle, _PLANE) or _deep_starts(images, focals, middle)
         rough = _all_fitted(images, weight, starts, middle, _ROUGHLY)[:_FEW]
+        if not rough:  # small turns hardly show the depth of a body: it is taken as flat at first
+            starts = _flat_starts(images, focals, middle, np.inf)
+            rough = _all_fitted(images, weight, starts, middle, _ROUGHLY)[:_FEW]
         bodies = _all_fitted(images, weight, [body.start for body in rough], middle, _EVALUATIONS)
         if not bodies:
             raise WorkFailed(
-                f"no rigid body explains the images of the {detections.view[0]} camera: check marker numbers"
+                f"no rigid body explains the images of the {detections.view[0]} camera: check marker "
+                "numbers, and add poses in which several joints move"
             )
         count = 2 * len(bodies[0].residual)
         dof = count - (6 * len(pose) + 3 * len(marker) + _INTRINSICS - _GAUGE)
@@ -260,11 +264,13 @@ def _posed(A: FloatArray, b: FloatArray, X: FloatArray, focal: float, middle: Fl
     return _Start(R, ray * (focal / s.mean(axis=1))[:, None], X, focal)
 
 
-def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray) -> list[_Start]:
+def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray, most: float) -> list[_Start]:
     """Starts of a flat body, empty if it is not flat: of the likeliest planes at each focal length, px.
 
     Homographies from one image to the others, [HZ04] 4.1, show any plane; in metric coordinates of the right
     plane the first two columns of each are orthogonal and of equal length, Z. Zhang, PAMI 22(11), 2000.
+
+    most : distance from a homography, over the extent of the markers in the image, of a flat body.
     """
     seen = np.isfinite(images[..., 0])
     across = [np.linalg.svd(x[k] - x[k].mean(axis=0))[1] for x, k in zip(images, seen, strict=True)]
@@ -278,9 +284,9 @@ def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray) -> 
         moved = homogeneous(images[first, both]) @ H[k].T
         left = moved[:, :2] / moved[:, 2:] - images[k, both]
         off[k] = np.median(np.linalg.norm(left, axis=1)) / max(float(extent[k]), 1e-9)
-    if others.size < _LEAST_POSES or float(np.median(off[others])) > _PLANE:
+    if others.size < _LEAST_POSES or float(np.median(off[others])) > most:
         return []
-    known, starts = others[off[others] <= 4.0 * _PLANE], list[_Start]()
+    known, starts = others[off[others] <= 4.0 * most], list[_Start]()
     center = homogeneous(images[first, seen[first]].mean(axis=0)[None])[0]
     for focal in focals.tolist():
         camera = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
@@ -290,7 +296,7 @@ def _flat_starts(images: FloatArray, focals: FloatArray, middle: FloatArray) -> 
         uu, vv, uv = (u**2).sum(axis=-1), (v**2).sum(axis=-1), (u * v).sum(axis=-1)
         wrong = np.median(((uu - vv) ** 2 + 4.0 * uv**2) / (uu + vv) ** 2, axis=0)
         for number in np.argsort(wrong)[:_PLANES_TRIED]:
-            starts.append(_flat_start(images, camera, H, planes[number], off <= 4.0 * _PLANE))
+            starts.append(_flat_start(images, camera, H, planes[number], off <= 4.0 * most))
     return starts
 
 

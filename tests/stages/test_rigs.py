@@ -91,6 +91,14 @@ def test_the_arm_arrives_by_any_rig(rig):
         assert trace.rotation_error_deg < 0.02
 
 
+def test_one_camera_on_the_hand_starts_from_small_trials_of_single_joints():
+    """They hardly show the depth of the scene."""
+    config = rigged(
+        "eye", "calibration={amplitude_deg: 12, random_poses: 0, seed: 1}", "noise.calibration_px=0.5"
+    )
+    assert calibrate.run(config)[1].usable
+
+
 @pytest.mark.parametrize("rig", ["four", "hand"])
 def test_a_plan_through_joint_space_keeps_what_it_asks_of_the_views(rig):
     config, calibration, _ = chain(rig)
