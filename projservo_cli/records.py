@@ -485,7 +485,7 @@ class Rejections:
     )
     moved_images: IntArray | None = _array(
         "moved_row moved_column",
-        about="rejected images that a camera shows that moved: pose, index of the view",
+        about="images of a camera that moved, or had not settled: pose, index of the view",
         default=None,
     )
     turned_images: IntArray | None = _array(

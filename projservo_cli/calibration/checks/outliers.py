@@ -30,6 +30,10 @@ _MOSTLY = 0.5
 _SEEN_OF_IMAGE = 4
 # Maximum motion of such an image, over the spread of its markers.
 _SMALL_MOTION = 0.1
+# Minimum number of poses over which a camera settles, and of later ones, whose shifts are by chance.
+_SETTLES, _LATER = 2, 10
+# Standard deviations of chance above which further poses belong to the settling of a camera.
+_SETTLED = 2.5
 # Maximum number of runs of poses that a message names.
 _MAX_RUNS = 4
 
@@ -105,7 +109,38 @@ def _moved_images(solution: Solution, out: BoolArray) -> IntArray:
         median = float(np.median(np.linalg.norm(fit.fun.reshape(-1, 2), axis=1)))
         if median <= _CORRECTED * RAYLEIGH * sigma and np.abs(fit.x).max() <= _SMALL_MOTION * radius:
             found.append((int(k), view))
-    return np.array(found, dtype=np.int64).reshape(-1, 2)
+    for view in {view for _, view in found}:
+        found += [(k, view) for k in _settling(detections, residual[view], out[view], view, found)]
+    return np.array([*dict.fromkeys(found)], dtype=np.int64).reshape(-1, 2)
+
+
+def _settling(
+    detections: Detections, residual: FloatArray, out: BoolArray, view: int, moved: list[tuple[int, int]]
+) -> list[int]:
+    """Poses over which a camera settled, none if it did not.
+
+    They begin with the first ones, at which one camera or another moved, of which this one at some. They go
+    on while shifts the same way are larger together than those of later images are by chance.
+
+    residual : (N, 2) of the view, px; out : (N,) rejected; moved : poses and views of small motions.
+    """
+    poses, known = np.unique(detections.pose_of), {k for k, _ in moved}
+    at = [(detections.pose_of == k) & detections.seen[view] for k in poses]
+    sound = np.array([rows.any() and out[rows].mean() < _MOSTLY for rows in at])
+    first = next((i for i, k in enumerate(poses.tolist()) if k not in known), len(poses))
+    here = [i for i in range(first) if (int(poses[i]), view) in moved]
+    if first < _SETTLES or not here or sound[:first].any():
+        return []
+    shift = np.array([np.median(residual[rows], axis=0) if rows.any() else np.zeros(2) for rows in at])
+    along = shift @ shift[here[0]]
+    best, last = _SETTLED, first
+    for end in range(first + 1, len(poses)):
+        few, rest = along[first:end][sound[first:end]], along[end:][sound[end:]]
+        if rest.size < _LATER:
+            break
+        apart = few.sum() / max(float(np.sqrt(few.size * np.mean(rest**2))), 1e-300)
+        best, last = max((best, last), (float(apart), end))
+    return [k for k, rows in zip(poses[:last].tolist(), at, strict=False) if rows.any()]
 
 
 def describe_moved(detections: Detections, moved: IntArray) -> str:
