@@ -20,7 +20,7 @@ from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.lens import undistort_into
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.rehearsal import Rehearsal, first_parts, is_half_turn
-from projservo_cli.loop.run_metrics import Ended, Summary, self_occluded_steps, summarize
+from projservo_cli.loop.run_metrics import Ended, Summary, summarize
 from projservo_cli.loop.verdicts import RUNNING, Log, new_log
 from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.simulation.analytic_plant import Ends
@@ -195,4 +195,6 @@ def _drive(setting: Setting, status: int, noise: FloatArray, scratch: _Scratch, 
             numbers[column] = value
             column += 1
         for view in range(scratch.log.hidden.shape[1]):
-            numbers[column + view] = self_occluded_steps(scratch.log, steps, view)
+            numbers[column + view] = 0.0
+            for k in range(steps + 1):
+                numbers[column + view] += scratch.log.hidden[k, view]

@@ -83,16 +83,6 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
     )
 
 
-@njit
-def self_occluded_steps(log: Log, steps: int, view: int) -> int:
-    """Number of instants at which a camera is behind the face."""
-    count = 0
-    for k in range(steps + 1):
-        if log.hidden[k, view] > 0.5:
-            count += 1
-    return count
-
-
 @merged
 def _keeps_within(plant: Plant, log: Log, steps: int) -> bool:
     """Whether at each instant all joints are within their limits and the face within enough true images."""

@@ -21,14 +21,7 @@ from projservo_cli.laws import CODES, INCIDENCES, REGULATE, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import ExecutionMonitor
-from projservo_cli.loop.run_metrics import (
-    Ended,
-    Summary,
-    angle_between,
-    path_deviation,
-    self_occluded_steps,
-    summarize,
-)
+from projservo_cli.loop.run_metrics import Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.stall_monitor import StallMonitor
 from projservo_cli.loop.verdicts import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.monitoring.accuracy import Posture, metric_points, rigid_fit
@@ -311,7 +304,7 @@ class LawRun:
     @property
     def self_occluded_steps(self) -> tuple[int, ...]:
         """Number of times (V,) at which each camera is behind the face."""
-        return tuple(self_occluded_steps(self.log, self.steps, v) for v in range(self.log.hidden.shape[1]))
+        return tuple(np.count_nonzero(self.log.hidden[: self.steps + 1], axis=0).tolist())
 
     def deviation_mm(self) -> float:
         """Largest distance of the true centre from its line, between the samples too, mm; NaN if unknown."""
