@@ -6,7 +6,8 @@ sight and within limits come first, and among them the near ones with margins.
 
 import numpy as np
 
-from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
 from projservo_cli.planning.constraints import Constraints, time_between
 from projservo_cli.planning.rrt_connect import margins_at
 from projservo_cli.records import FloatArray, Model
@@ -17,8 +18,23 @@ from projservo_cli.task.incidences import Incidences, image_error_at, linearized
 _AROUND, _ANYWHERE, _SPREAD = 24, 24, 0.5
 # Newton steps, the longest of a joint, rad or m, and the image error, px, at which all incidences hold.
 _STEPS, _STRIDE, MET_PX = 40, 0.4, 1e-6
+# Margin over that asked for, from which more of it counts no more.
+_AMPLE = 10.0
 # Difference of joints, rad or m, below which goals are one.
 _DISTINCT = 0.1
+
+
+def _share(c: Constraints, q: FloatArray) -> float:
+    """Margins at joints (n,) over those asked for, the smallest share; of a pose that images show badly less.
+
+    Three deviations of the joints at one pixel of noise are to be within the margin of a limit.
+    """
+    asked = np.where(c.full > 0.0, c.full, 1.0)
+    share = float((margins_at(c, q)[0][: len(asked)] / asked).min())
+    H = forward_kinematics(c.model, q)
+    J = image_jacobian(c.model.P, c.M @ H.T, joint_operators(c.model, q)).reshape(-1, len(q))
+    told = np.linalg.svd(J * c.keep / 3.0, compute_uv=False)
+    return min(share, float(told[min(len(q), COORDINATES) - 1]))
 
 
 def joints_meeting(
@@ -62,9 +78,8 @@ def goals_meeting(
         if left > MET_PX or any(np.abs(q - other).max() < _DISTINCT for other in found):
             continue
         found.append(q)
-        asked = np.where(c.full > 0.0, c.full, 1.0)
-        share = float((margins_at(c, q)[0][: len(asked)] / asked).min())
+        share = _share(c, q)
         time = time_between(c.limits.speed, q, q_start)
-        rank.append((share <= 0.0, time * (2.0 - min(max(share, 0.0), 1.0))))
+        rank.append((share <= 0.0, time * (1.0 + 1.0 / min(max(share, 0.1), _AMPLE))))
     order = sorted(range(len(found)), key=rank.__getitem__)
     return np.array([found[i] for i in order]).reshape(-1, n), nearest

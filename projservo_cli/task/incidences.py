@@ -37,6 +37,9 @@ _WANTED = {MEET: 0.0, PARALLEL: 0.0, PERPENDICULAR: 90.0}
 # Newton steps to a displacement at which all incidences hold: how many, the largest turn of one, rad, and the
 # last, over unit motions; singular value over the largest that counts as zero.
 _STEPS, _STRIDE, _SETTLED, _SINGULAR = 50, 0.5, 1e-12, 1e-9
+# Error over what a unit of the measured motion changes, from which no motion lowers it, and the turn, rad,
+# that leads away from there.
+_FAR, _NUDGE = 1e6, 0.1
 
 # Measure (p, 6) of motions (6, 4, 4) of points (m, 4).
 Moved = Callable[[FloatArray, FloatArray], FloatArray]
@@ -393,6 +396,9 @@ def nearest_goal(incidences: Incidences, body: Body, H: FloatArray, moved: Moved
         J = moved(body.M @ H.T, motions)
         back = np.linalg.pinv(J)
         e, B = linearized(rows, H, motions)
+        if np.linalg.norm(e) > _FAR * np.linalg.norm(B @ back):  # as of a line to be turned across itself
+            H = as_array(twist_exponential(mat(_NUDGE * motions[3:].sum(axis=0)))) @ H
+            continue
         step = -back @ np.linalg.lstsq(B @ back, e, rcond=_SINGULAR)[0]
         turn = float(np.linalg.norm(step[3:]))
         step *= min(1.0, _STRIDE / turn) if turn > 0.0 else 1.0

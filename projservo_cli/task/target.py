@@ -31,7 +31,14 @@ from projservo_cli.task.face import (
     sides_into,
     task_into,
 )
-from projservo_cli.task.incidences import Incidence, Incidences, incidences_of, weighted
+from projservo_cli.task.incidences import (
+    Incidence,
+    Incidences,
+    image_motions,
+    incidences_of,
+    nearest_goal,
+    weighted,
+)
 from projservo_cli.task.partition import Split, partition
 from projservo_cli.task.trajectory import Reference, both_rotations, trajectory_displacement
 
@@ -118,7 +125,9 @@ class TaskImages(NamedTuple):
         rows = incidences_of(model, task.body, taught.H_star, self.incidences)
         A = np.ascontiguousarray(task.body.M[: len(task.A_star)])
         face = np.array(face_plane(A, task.order, center_of(A, task.center)))
-        return weighted(rows, model, task.body, task.H_star, task.body.in_goal, face)
+        shows = task.body.in_goal
+        goal = nearest_goal(rows, task.body, task.H_star, image_motions(model, shows))
+        return weighted(rows, model, task.body, goal, shows, face)
 
 
 @inline

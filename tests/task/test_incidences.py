@@ -222,6 +222,20 @@ def test_angles_need_axes_that_are_not_parallel():
         incidences_of(slides, make_body(model, M), np.eye(4), asked)
 
 
+def test_a_line_is_turned_across_itself_although_no_first_step_lowers_the_error():
+    for seed in range(5):
+        generator = np.random.default_rng([23, seed])
+        model, M = random_arm(generator)
+        case = Case(model, M, [Incidence("pin", LINE, LINE, PERPENDICULAR)], model.q_reference)
+        assert case.rows.weight.shape == (1, 1)
+        end = case.drive(model.q_reference + deviating(generator), gain=0.2)
+        assert errors_px(case.rows, poe(model, end)).max() < 1e-6
+        _, (deg,) = metric_errors(
+            model, [Incidence("pin", LINE, LINE, PERPENDICULAR)], M, (poe(model, end), np.eye(4))
+        )
+        assert deg < 1e-6
+
+
 def test_free_motions_lead_away_from_limits_and_do_not_disturb_the_task():
     """A joint that a task drives over a limit goes less far where the law knows it; most stay within."""
     better = 0
