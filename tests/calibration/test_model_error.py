@@ -131,6 +131,6 @@ def test_a_table_that_is_bumped_amid_the_recording_is_named_and_no_readings_are(
     seen = Observation(np.arange(len(q)), np.arange(10), q, images)
     with pytest.raises(WorkFailed) as refused:
         calibrate(seen, "RRRRR", source="recorded", joint_noise=None)
-    what = "the right camera" if moved == (1,) else "the base of the arm or both cameras"
+    what = "the right camera" if moved == (1,) else "the base of the arm or all cameras"
     assert f"{what} moved at pose {at}" in str(refused.value)
     assert "check the joint readings" not in str(refused.value)
