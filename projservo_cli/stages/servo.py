@@ -57,8 +57,8 @@ from projservo_cli.task.incidences import (
     errors_px,
     incidences_of,
     metric_errors,
-    metric_motions,
     nearest_goal,
+    point_velocities,
     whole_pose,
 )
 from projservo_cli.task.target import TaskImages, followed
@@ -359,7 +359,7 @@ class LawRun:
         rows = incidences_of(
             model, body, np.linalg.inv(H_taught) if on_tool else H_taught, scenario.exact.incidences
         )
-        goal = nearest_goal(rows, body, self.log.H[self.steps], metric_motions)
+        goal = nearest_goal(rows, body, self.log.H[self.steps], point_velocities)
         return np.asarray((np.linalg.inv(goal) if on_tool else goal) @ base_tool)
 
     def trace(self) -> Trace:

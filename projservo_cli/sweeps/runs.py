@@ -53,7 +53,7 @@ def _self_occluded(view: Sequence[str]) -> list[str]:
     return [f"self_occluded_steps_{name}" for name in view]
 
 
-def measured(view: Sequence[str] = VIEWS) -> tuple[Heading, ...]:
+def measured_columns(view: Sequence[str] = VIEWS) -> tuple[Heading, ...]:
     """Columns of the values that are measured of each run, of a rig with some views."""
     about = (f"times at which the {name} camera is behind the face" for name in view)
     hidden = (Heading(name, "i8", "1", text) for name, text in zip(_self_occluded(view), about, strict=True))
@@ -100,7 +100,7 @@ def columns_of(design: Design) -> tuple[Heading, ...]:
     random = design.sweep.random.items()
     drawn = [_input(key, given.choice or (0.0,), "value drawn for the run") for key, given in random]
     between = (BETWEEN,) if design.sweep.between_samples else ()
-    return (*NUMBERED, *axes, *drawn, *measured(design.view), *between)
+    return (*NUMBERED, *axes, *drawn, *measured_columns(design.view), *between)
 
 
 def _input(name: str, values: Sequence[Any], about: str) -> Heading:
@@ -224,7 +224,7 @@ def _measured(
         return {"verdict": NOT_STARTED}, [str(error)] * len(seeds)
     names = (*NUMBERS, *_self_occluded(scenario.view))
     found: dict[str, Any] = dict(zip(names, numbers.T, strict=True))
-    for column in measured(scenario.view):
+    for column in measured_columns(scenario.view):
         if column.dtype == "i8":
             found[column.name] = np.where(numbers[:, VERDICT] < 0, NONE, found[column.name])
     found["success"] = found["success"] == 1.0

@@ -32,7 +32,7 @@ from projservo_cli.records import (
     IntArray,
     WorkFailed,
 )
-from projservo_cli.task.look_bundle import Bundle, Fit, Look, Rig, differ, generators
+from projservo_cli.task.look_bundle import Bundle, BundleFit, Look, LookRig, differ, generators
 
 # Number of markers that six coordinates need, and that twelve need.
 _RIGID, _AFFINE = 3, 4
@@ -51,7 +51,7 @@ _ALONG = 0.95
 class _Placed(NamedTuple):
     """Object at the looks that it has been found in."""
 
-    fit: Fit
+    fit: BundleFit
     looks: tuple[int, ...]  # (L,) indices of the looks
     known: BoolArray  # (k,) markers whose points are known
 
@@ -60,7 +60,7 @@ class _Placed(NamedTuple):
 class _Search:
     """Search for an object in looks at it."""
 
-    rig: Rig
+    rig: LookRig
     marker: Sequence[int]  # (k,) numbers of its markers
     looks: Sequence[Look]
 
@@ -103,7 +103,7 @@ class _Search:
         known = np.isfinite(X[:, 0])
         if known.sum() < self.least:
             raise WorkFailed(self._no_shape(known, base))
-        fit = Fit.settled(self.bundle([base], known, X, 0), X[known], np.eye(4)[None])
+        fit = BundleFit.settled(self.bundle([base], known, X, 0), X[known], np.eye(4)[None])
         placed, last = _Placed(fit, (base,), known), len(self.looks) - 1
         for look in dict.fromkeys((last, 0, *range(1, last))):
             try:
@@ -167,7 +167,7 @@ class _Search:
         points = np.where(placed.known[:, None], X, self.points(look, there))
         known = np.isfinite(points[:, 0])
         bundle = self.bundle(looks, known, points, looks.index(placed.looks[placed.fit.bundle.fixed]))
-        fit = Fit.settled(bundle, points[known], np.array([place for _, place in at]))
+        fit = BundleFit.settled(bundle, points[known], np.array([place for _, place in at]))
         return _Placed(fit, looks, known)
 
     def _no_shape(self, known: BoolArray, base: int) -> str:
@@ -221,7 +221,7 @@ class _Search:
         )
 
 
-def _require_same_object(rig: Rig, fit: Fit, marker: Sequence[int]) -> None:
+def _require_same_object(rig: LookRig, fit: BundleFit, marker: Sequence[int]) -> None:
     """Refuse markers that do not lie as they did, beyond noise and errors of the calibration."""
     r, J = fit.linearized()
     dof = len(r) - J.shape[1]
@@ -286,8 +286,8 @@ class DisplacedObject:
     angle_deg: float  # turn; NaN if the joints do not determine the metric
     noise_factor: float  # residuals over their deviation, rms per degree of freedom
     unit_mm: float  # mm in a unit of the frame that it was found in; NaN without a known length
-    _rig: Rig
-    _fit: Fit
+    _rig: LookRig
+    _fit: BundleFit
 
     @property
     def coordinates(self) -> int:
@@ -316,7 +316,7 @@ class DisplacedObject:
             )
         if not c.has_covariance or not c.sqrt_cov_shared.size:
             raise InputError(f"objects: the method {c.method} has no covariance: use bundle_adjustment")
-        rig = Rig.of(c)
+        rig = LookRig.of(c)
         fit, _, known = _Search(rig, marker, looks).found()
         numbers = tuple(np.asarray(marker)[known].tolist())
         _require_same_object(rig, fit, numbers)
@@ -417,7 +417,7 @@ def _bent(images: Callable[[FloatArray], FloatArray], E: FloatArray, errors: Flo
     return np.column_stack([np.where(i == j, np.sqrt(0.5), 1.0) * bent, mean])
 
 
-def _unit_m(rig: Rig, metric: Metric) -> float:
+def _unit_m(rig: LookRig, metric: Metric) -> float:
     """Length of a unit of the frame of a rig, m, by the two markers of the tool farthest apart."""
     X, M = metric.markers, rig.M[0]
     apart = np.linalg.norm(X[:, None] - X, axis=-1)
@@ -425,8 +425,8 @@ def _unit_m(rig: Rig, metric: Metric) -> float:
     return float(apart[i, j] / np.linalg.norm(M[i] - M[j]))
 
 
-def _tool_at(rig: Rig, goal: Look) -> Fit:
-    """Fit the pose of the tool to its images at a goal.
+def _tool_at(rig: LookRig, goal: Look) -> BundleFit:
+    """BundleFit the pose of the tool to its images at a goal.
 
     Raises WorkFailed if they do not determine it.
     """
@@ -443,7 +443,7 @@ def _tool_at(rig: Rig, goal: Look) -> Fit:
         raise WorkFailed(
             "objects: the images of the goal fit no pose of the tool before the cameras: teach again"
         )
-    fit = Fit(bundle, M, T[:1], float(cost[0]))
+    fit = BundleFit(bundle, M, T[:1], float(cost[0]))
     deviation, _ = fit.unseen(0)
     if deviation > _UNSEEN:
         raise WorkFailed(

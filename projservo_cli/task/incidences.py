@@ -309,7 +309,7 @@ def _motions(body: Body, H: FloatArray) -> FloatArray:
     return np.asarray(H @ np.concatenate([shifts, body.H_hat]) @ np.linalg.inv(H))
 
 
-def image_motions(model: Model, shows: BoolArray) -> Moved:
+def image_velocities(model: Model, shows: BoolArray) -> Moved:
     """Return the images (p, 6) of shown markers (V, m) by motions of a body, px, to measure these by."""
 
     def moved(M: FloatArray, motions: FloatArray) -> FloatArray:
@@ -318,7 +318,7 @@ def image_motions(model: Model, shows: BoolArray) -> Moved:
     return moved
 
 
-def metric_motions(M: FloatArray, motions: FloatArray) -> FloatArray:
+def point_velocities(M: FloatArray, motions: FloatArray) -> FloatArray:
     """Return the velocities (3 m, 6) of metric points (m, 4) by motions (6, 4, 4), to measure these by."""
     return np.asarray(np.einsum("kab,mb->mak", motions, M)[:, :3].reshape(-1, COORDINATES))
 
@@ -333,7 +333,7 @@ def weighted(
     Raises WorkFailed where the images do not determine the body, or no incidence changes with its motion.
     """
     motions = _motions(body, H)
-    J = image_motions(model, shows)(body.M @ H.T, motions)
+    J = image_velocities(model, shows)(body.M @ H.T, motions)
     _, B = linearized(unweighted(incidences), H, motions)
     if np.linalg.matrix_rank(J) < COORDINATES:
         raise WorkFailed("the images at the goal do not determine the pose of the body: show more markers")

@@ -53,7 +53,7 @@ class Look(NamedTuple):
         return Look(self.s[:, markers], None if self.sigma is None else self.sigma[:, markers])
 
 
-class Rig(NamedTuple):
+class LookRig(NamedTuple):
     """Cameras and tool, as calibrated and off by its errors, with the plane at infinity (0, 0, 0, 1).
 
     Displacements are rigid there, if the joints determine the metric.
@@ -281,7 +281,7 @@ def differ(X: FloatArray, Y: FloatArray) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class BundleFit:
     """Points of a body and its displacements at some looks."""
 
     bundle: Bundle
@@ -301,7 +301,7 @@ class Fit:
         seen = np.repeat(self.bundle.weight > 0.0, 2)
         return r[0, seen], J[0, seen]
 
-    def moved(self, rig: Rig, X: FloatArray) -> FloatArray:
+    def moved(self, rig: LookRig, X: FloatArray) -> FloatArray:
         """Changes (N, c) of what is seen by the errors of a calibration; X : (k, 4) or (B, k, 4) points."""
         weight, looks = self.bundle.weight[..., None], range(len(self.T))
         pixels = np.stack([changes_of(rig.pixels(X @ self.T[look].T)) for look in looks], axis=1)
@@ -325,7 +325,7 @@ class Fit:
         root = vectors / np.sqrt(np.maximum(values, _REGULAR)) / size[:, None]
         return np.asarray(root @ root.T)
 
-    def errors(self, rig: Rig, X: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def errors(self, rig: LookRig, X: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Errors (p, N) of the minimum by the images that are seen, and (p, c) by the calibration.
 
         Each by independent ones of unit variance; X as for ``moved``.

@@ -34,7 +34,7 @@ from projservo_cli.task.face import (
 from projservo_cli.task.incidences import (
     Incidence,
     Incidences,
-    image_motions,
+    image_velocities,
     incidences_of,
     nearest_goal,
     weighted,
@@ -126,7 +126,7 @@ class TaskImages(NamedTuple):
         A = np.ascontiguousarray(task.body.M[: len(task.A_star)])
         face = np.array(face_plane(A, task.order, center_of(A, task.center)))
         shows = task.body.in_goal
-        goal = nearest_goal(rows, task.body, task.H_star, image_motions(model, shows))
+        goal = nearest_goal(rows, task.body, task.H_star, image_velocities(model, shows))
         return weighted(rows, model, task.body, goal, shows, face)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from projservo_cli.store.sweep_table import assemble, write_part
 from projservo_cli.sweeps.folder import Folder
-from projservo_cli.sweeps.runs import NUMBERED, measured
+from projservo_cli.sweeps.runs import NUMBERED, measured_columns
 from projservo_cli.sweeps.statistics import report
 from tests.sweeps.cases import columns, design, make
 
@@ -32,7 +32,7 @@ def made(tmp_path_factory):
     good = rng.random(count) < np.where(law == b"direct_two", 0.95, 0.6)
     arrived = good.copy()
     good[np.flatnonzero(good)[[3, 90]]] = False
-    values = {column.name: np.zeros(count, dtype=column.dtype) for column in (*NUMBERED, *measured())}
+    values = {column.name: np.zeros(count, dtype=column.dtype) for column in (*NUMBERED, *measured_columns())}
     values |= {
         "run": np.arange(count),
         "cell": cell,
@@ -47,7 +47,7 @@ def made(tmp_path_factory):
         "noise.servo_px": noise,
         "law": law,
     }
-    headings = (*NUMBERED, ("noise.servo_px", "f8", "1", ""), ("law", "S10", "1", ""), *measured())
+    headings = (*NUMBERED, ("noise.servo_px", "f8", "1", ""), ("law", "S10", "1", ""), *measured_columns())
     write_part(folder / "part.h5", values, {})
     attributes = {"axes": AXES, "columns": [name for name, *_ in headings], "random": [], "total": count}
     assemble(folder / "sweep.h5", [folder / "part.h5"], headings, attributes)

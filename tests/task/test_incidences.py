@@ -21,7 +21,7 @@ from projservo_cli.task.incidences import (
     Incidence,
     errors_px,
     image_error_at,
-    image_motions,
+    image_velocities,
     incidences_of,
     linearized,
     metric_errors,
@@ -85,7 +85,7 @@ class Case:
         rows = incidences_of(self.model, self.body, self.H, asked)
         shows = np.ones((2, len(M)), dtype=bool)
         a = face_of(self.body.M[:4])
-        goal = nearest_goal(rows, self.body, self.H, image_motions(self.model, shows))
+        goal = nearest_goal(rows, self.body, self.H, image_velocities(self.model, shows))
         self.rows = weighted(rows, self.model, self.body, goal, shows, a)
 
     def law(self, q, gains=GAINS):
