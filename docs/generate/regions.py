@@ -16,7 +16,7 @@ from projservo_cli.cli import main
 from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.loop import verdicts as loop_verdicts
-from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, NUMBERED, measured
+from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, NUMBERED, measured_columns
 
 # Where a run file holds which record.
 GROUPS = {
@@ -111,7 +111,7 @@ def sweep_columns() -> Iterator[str]:
                 text(column.units.removeprefix("1")),
                 text(column.about),
             )
-            for column in (*NUMBERED, *measured(), BETWEEN)
+            for column in (*NUMBERED, *measured_columns(), BETWEEN)
         ),
     )
     yield from (

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli import records
 from projservo_cli.config.schema import json_schema, sweep_schema
-from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, NUMBERED, measured
+from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, NUMBERED, measured_columns
 from tests.documentation.blocks import DOCS
 
 SCHEMAS = (json_schema(), sweep_schema())
@@ -40,7 +40,7 @@ def values(schema):
 
 
 def columns():
-    return {column.name for column in (*NUMBERED, *measured(), BETWEEN)}
+    return {column.name for column in (*NUMBERED, *measured_columns(), BETWEEN)}
 
 
 def keys():

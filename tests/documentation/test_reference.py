@@ -14,7 +14,7 @@ from projservo_cli.cli import main
 from projservo_cli.cli.equations import REGISTER
 from projservo_cli.config import Config
 from projservo_cli.config.schema import json_schema, sweep_schema
-from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured
+from projservo_cli.sweeps.runs import BETWEEN, NUMBERED, measured_columns
 from tests.documentation.blocks import INDEXES, PAGES, ROOT
 
 
@@ -40,7 +40,7 @@ def test_every_key_has_a_row(schema):
 
 def test_every_column_field_command_and_equation_is_there():
     columns = [row[0].strip("`") for row in told(regions.sweep_columns())]
-    assert columns == [column.name for column in (*NUMBERED, *measured(), BETWEEN)]
+    assert columns == [column.name for column in (*NUMBERED, *measured_columns(), BETWEEN)]
     rows = told(regions.run_file())
     classes = filter(dataclasses.is_dataclass, vars(records).values())
     named = {kind for kind in classes if dataclasses.fields(kind)[0].metadata}
