@@ -45,7 +45,7 @@ from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import VIEWS, FloatArray, IntArray, JointLimits, Model, position_limits
 from projservo_cli.task.body import ALL_VIEWS, GOAL_VIEWS, carry, fit_body
 from projservo_cli.task.face import Task, center_of
-from projservo_cli.task.incidences import image_error
+from projservo_cli.task.incidences import image_error, rank_of
 from projservo_cli.task.partition import NO_PARTS, Parts, Split, partition
 from projservo_cli.task.trajectory import following
 from projservo_cli.task.visibility import limited_translation
@@ -110,8 +110,6 @@ class State(NamedTuple):
     work: Work  # arrays of the kernels, the current operators among them
     A: FloatArray  # (m, 4) current points
     pose: FloatArray  # (4, 4) measured displacement of the body from the reference
-    rates: FloatArray  # (w, n) derivatives of the weighted errors of incidences by the joints
-    wanted: FloatArray  # (w,) their velocity
     A_t: FloatArray  # (m, 4) target without translation
     A_r: FloatArray  # (m, 4) target without translation and rotation r
     q_hat: FloatArray  # (4, n) joint motions t, r, p, s; (4, 6) coordinates in the span of an arm of n ≠ 6
@@ -139,13 +137,10 @@ class State(NamedTuple):
     q_ahead: FloatArray  # (n,) joint motion of the plan in the next period; zero without a plan
 
 
-def new_state(
-    n: int, m: int, observed: int = 0, span: Span = OWN, views: int = len(VIEWS), rank: int = 0
-) -> State:
+def new_state(n: int, m: int, observed: int = 0, span: Span = OWN, views: int = len(VIEWS)) -> State:
     """Initial state for n joints and m face markers in a number of views.
 
     observed : number of markers in images, m or more; span : of an arm of n ≠ 6 joints.
-    rank : number of independent errors of incidences.
     """
     q_dot = np.zeros(n)
     own = len(span.H_hat) == 0
@@ -154,8 +149,6 @@ def new_state(
         work=workspace(n, rows_of(views, m), span),
         A=np.zeros((m, 4)),
         pose=np.eye(4),
-        rates=np.zeros((rank, n)),
-        wanted=np.zeros(rank),
         A_t=np.zeros((m, 4)),
         A_r=np.zeros((m, 4)),
         q_hat=np.zeros((4, k)),
@@ -245,7 +238,7 @@ def _measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State
         return False
     carry(task.body, fit.H, state.A)
     mat_into(state.pose, fit.H)
-    if task.incidences.weight.shape[0] > 0:
+    if rank_of(task.incidences) > 0:
         state.face_px[0] = image_error(task.incidences, fit.H, inverse(fit.H))
     else:
         state.face_px[0] = _predicted_error(model.P, state.A, task.A_star)

@@ -168,7 +168,9 @@ def _measured_into(setting: Setting, model: Model, images: FloatArray, scratch: 
     status, _ = task_into(model, scratch.images, task, state.A, state.work.system.rhs)
     if status == FOUND and task.body.M.shape[0] > 0:
         ends = setting.course.q_start, setting.q_near
-        status, _ = body_task_into(model, ends, scratch.images, task, make_split(state), state.normal)
+        status, _ = body_task_into(
+            model, ends, scratch.images, task, make_split(state), state.normal, state.pose
+        )
     return status
 
 

@@ -201,7 +201,7 @@ class BuiltInLaw:
         self.gains = gains
         span = make_span(model, task.A_star)
         n, m, V = len(model.H_hat_0), len(task.A_star), len(model.P)
-        self.state = new_state(n, m, len(task.body.M), span, V, len(task.incidences.weight))
+        self.state = new_state(n, m, len(task.body.M), span, V)
         self._weight = np.ones((V, len(task.body.M)))
         self.law = Law(code, model, self._weighed(task), gains)
         self._bound: Any = None  # until it is called from Python

@@ -65,8 +65,7 @@ class Case:
         noise = np.ascontiguousarray(self.noise[:, :, :seen])
         law, course = Law(CODE, self.model, task, self.gains), Course(plant, self.limits, self.q_start)
         log = new_log(n, seen, self.limits.max_steps, len(ERRORS))
-        state = new_state(n, self.m, rank=len(task.incidences.weight))
-        job = _Job(law, course, noise, state, log)
+        job = _Job(law, course, noise, new_state(n, self.m), log)
         run_compiled(*job)
         return job
 

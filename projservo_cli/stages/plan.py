@@ -165,7 +165,7 @@ def _to_any_goal(scenario: Scenario) -> Plan:
     goals, nearest = goals_meeting(c, task.incidences, ends.q_start, scenario.goal_joints, seed)
     names = tuple(one.name for one in ends.incidences)
     if not len(goals):
-        left = errors_px(task.incidences, forward_kinematics(model, nearest))
+        (left,) = errors_px(task.incidences, forward_kinematics(model, nearest)[None])
         told = ", ".join(f"{name} {px:.3g} px" for name, px in zip(names, left, strict=True) if px > MET_PX)
         raise WorkFailed(
             f"no joints within their limits meet all incidences; the nearest leave {told}: leave one out, or "

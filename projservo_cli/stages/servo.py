@@ -321,18 +321,19 @@ class LawRun:
         if not images.incidences:
             return {}
         task, model = images.task(scenario.model), scenario.model
-        seen, normal, errors = undistort(model.lens, self.log.s), np.zeros((COORDINATES, COORDINATES + 1)), []
-        for k in range(self.steps + 1):
+        seen, normal = undistort(model.lens, self.log.s), np.zeros((COORDINATES, COORDINATES + 1))
+        H = np.full((self.steps + 1, 4, 4), math.nan)  # measured, as far as images show it
+        for k in range(len(H)):
             fit = fit_body(model.P, task.body, seen[k], forward(model, self.log.read[k]), SETTLED, normal)
-            none = np.full(len(images.incidences), math.nan)
-            errors.append(errors_px(task.incidences, as_array(fit.H)) if fit.settled else none)
-        taught = images.taught().task(model).H_star
-        mm, deg = metric_errors(model, images.incidences, task.body.M, (as_array(fit.H), taught))
+            if fit.settled:
+                H[k] = as_array(fit.H)
+        taught = images.displacement_taught(model)
+        mm, deg = metric_errors(model, images.incidences, task.body.M, (H[-1], taught))
         return {
             "incidence_mm": MM * mm * self._metre(task.body.M),
             "incidence_deg": deg,
             "incidences": tuple(one.name for one in images.incidences),
-            "incidence_px": np.array(errors),
+            "incidence_px": errors_px(task.incidences, H),
             "free_dof": self.plan.free_dof if isinstance(self.plan, Plan) else None,
         }
 

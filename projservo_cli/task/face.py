@@ -82,7 +82,6 @@ class Task(NamedTuple):
     least_views: int  # number of views that are to see the face
     body: Body = NO_BODY  # all markers of the body, to measure the face with; none for point by point
     reference: Reference = NO_REFERENCE  # plan to follow; none to regulate to the goal
-    H_star: FloatArray = np.eye(4)  # displacement of the body at the goal, if there is one
     incidences: Incidences = NO_INCIDENCES  # that are to hold at the goal; none for the pose
 
 
@@ -270,5 +269,4 @@ def new_task(
         O=optical_centers(model.P, model.a_inf),
         visible=np.zeros(len(model.P)),
         least_views=least_views or len(model.P),
-        H_star=np.eye(4),
     )

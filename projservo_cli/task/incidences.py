@@ -19,13 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import null_space, qr
 
-from projservo_cli.geometry.algebra import Mat4, apply, apply_transposed, as_array, dot, mat, meet, vec
+from projservo_cli.geometry.algebra import Mat4, apply, apply_transposed, as_array, dot, mat, meet, unit, vec
 from projservo_cli.geometry.displacements import twist_exponential
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import image_jacobian
+from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.metric.frame import invariant_upgrade
-from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Model, WorkFailed
+from projservo_cli.records import BoolArray, FloatArray, InputError, Model, WorkFailed
 from projservo_cli.task.body import Body
 
 MEET, PARALLEL, PERPENDICULAR, ANGLE = "meet", "parallel", "perpendicular", "angle"
@@ -57,64 +58,63 @@ class Incidence(NamedTuple):
 
 
 class Incidences(NamedTuple):
-    """Rows of all incidences, in the frame of a model; a row is of a point and a plane."""
+    """Rows of all incidences, in the frame of a model; a row is of a point and a plane.
 
-    tool: FloatArray  # (r, 4) points of the tool at the reference; planes of it where the sense is −1
-    scene: FloatArray  # (r, 4) planes of the scene; points of it where the sense is −1
-    sense: FloatArray  # (r,) 1 or −1
-    offset: FloatArray  # (r,) of e = bᵀA − offset
-    group: IntArray  # (r,) number of the incidence
-    # (w, r) from errors e to independent ones, in px at one pixel of noise; w is the rank
-    weight: FloatArray
-    # (v, r), (v,) the same of each incidence by itself, and its number
-    own_weight: FloatArray
-    own_group: IntArray
-    views: FloatArray  # (1,) markers of the body at the goal, once a view
-    # (g, 4), (g, 4) directions or planes of the tool at the reference and of the scene that have one sense
-    tool_sense: FloatArray
-    scene_sense: FloatArray
-    is_plane: BoolArray  # (g,) whether they are planes
-    turn_px: FloatArray  # (g,) error of half a turn, px
-    a: FloatArray  # (4,) plane of the face at the reference
-    shown: FloatArray  # (V,) a·O at the goal, in the frame of the body
+    Few arrays, since every step of every law hands them on.
+    """
+
+    # (r, 11 + w) point of the tool at the reference, plane of the scene, and a sense of 1; or plane of the
+    # tool, point of the scene, and a sense of −1; then the offset of e = bᵀA − offset, the number of the
+    # incidence, and the weight of e in each of w independent errors
+    rows: FloatArray
+    # (g, 10) direction or plane of the tool at the reference, that of the scene with the same sense, 1 for
+    # planes, and the error of half a turn, px
+    senses: FloatArray
+    # (5 + V,) plane a of the face at the reference, number of markers of the body at the goal, once a view,
+    # and a·O of each view there, in the frame of the body
+    sight: FloatArray
+
+    @property
+    def weight(self) -> FloatArray:
+        """Weights (w, r) of the rows in independent errors."""
+        return self.rows[:, _WEIGHT:].T
+
+    def weighing(self, weight: FloatArray) -> "Incidences":
+        """Return the rows with other weights (w, r)."""
+        return self._replace(rows=np.column_stack([self.rows[:, :_WEIGHT], weight.T]))
 
 
-NO_INCIDENCES = Incidences(
-    tool=np.zeros((0, 4)),
-    scene=np.zeros((0, 4)),
-    sense=np.zeros(0),
-    offset=np.zeros(0),
-    group=np.zeros(0, dtype=np.int64),
-    weight=np.zeros((0, 0)),
-    own_weight=np.zeros((0, 0)),
-    own_group=np.zeros(0, dtype=np.int64),
-    views=np.zeros(1),
-    tool_sense=np.zeros((0, 4)),
-    scene_sense=np.zeros((0, 4)),
-    is_plane=np.zeros(0, dtype=np.bool_),
-    turn_px=np.zeros(0),
-    a=np.zeros(4),
-    shown=np.zeros(0),
-)
+# Columns of the rows: of the tool, then of the scene, and these.
+_SCENE, _SENSE, _OFFSET, _GROUP, _WEIGHT = 4, 8, 9, 10, 11
+# Columns of the senses after those of the tool and the scene, and entries of the sight after the plane.
+_IS_PLANE, _TURN_PX = 8, 9
+VIEWS_USED, SHOWN = 4, 5
+NO_INCIDENCES = Incidences(rows=np.zeros((0, _WEIGHT)), senses=np.zeros((0, 10)), sight=np.zeros(5))
+
+
+@inline
+def rank_of(incidences: Incidences) -> int:
+    """Return the number of independent errors."""
+    columns: int = incidences.rows.shape[1]
+    return columns - _WEIGHT
 
 
 @merged
-def error_of(incidences: Incidences, i: int, H: Mat4, H_back: Mat4) -> float:
-    """Error e = bᵀA − offset of row i at the displacement H of the body, whose inverse is H_back."""
-    if incidences.sense[i] > 0.0:
-        A, b = apply(H, vec(incidences.tool[i])), vec(incidences.scene[i])
+def _error_of(row: FloatArray, H: Mat4, H_back: Mat4) -> float:
+    """Error e = bᵀA − offset of a row at the displacement H of the body, whose inverse is H_back."""
+    if row[_SENSE] > 0.0:
+        A, b = apply(H, vec(row)), vec(row[_SCENE:])
     else:
-        A, b = apply(H_back, vec(incidences.scene[i])), vec(incidences.tool[i])
-    return dot(b, A) - float(incidences.offset[i])
+        A, b = apply(H_back, vec(row[_SCENE:])), vec(row)
+    return dot(b, A) - float(row[_OFFSET])
 
 
 @merged
-def rate_of(incidences: Incidences, i: int, H: Mat4, H_back: Mat4, H_hat: Mat4) -> float:
-    """Derivative of the error of row i by the amplitude of an operator Ĥ of the body at H: ±bᵀĤA."""
-    if incidences.sense[i] > 0.0:
-        return dot(vec(incidences.scene[i]), apply(H_hat, apply(H, vec(incidences.tool[i]))))
-    moved = apply(H_back, apply(H_hat, vec(incidences.scene[i])))
-    return -dot(vec(incidences.tool[i]), moved)
+def _rate_of(row: FloatArray, H: Mat4, H_back: Mat4, H_hat: Mat4) -> float:
+    """Derivative of the error of a row by the amplitude of an operator Ĥ of the body at H: ±bᵀĤA."""
+    if row[_SENSE] > 0.0:
+        return dot(vec(row[_SCENE:]), apply(H_hat, apply(H, vec(row))))
+    return -dot(vec(row), apply(H_back, apply(H_hat, vec(row[_SCENE:]))))
 
 
 @njit
@@ -123,20 +123,20 @@ def image_error(incidences: Incidences, H: Mat4, H_back: Mat4) -> float:
 
     To first order; of a feature that points the other way, as much more as half a turn moves them.
     """
-    total = 0.0
-    for k in range(incidences.weight.shape[0]):
+    rows, total = incidences.rows, 0.0
+    for k in range(rank_of(incidences)):
         error = 0.0
-        for i in range(incidences.weight.shape[1]):
-            error += incidences.weight[k, i] * error_of(incidences, i, H, H_back)
+        for i in range(rows.shape[0]):
+            error += rows[i, _WEIGHT + k] * _error_of(rows[i], H, H_back)
         total += error * error
-    for k in range(incidences.turn_px.shape[0]):
-        if incidences.is_plane[k]:
-            moved = apply_transposed(H_back, vec(incidences.tool_sense[k]))
+    for sense in incidences.senses:
+        if sense[_IS_PLANE] > 0.0:
+            moved = apply_transposed(H_back, vec(sense))
         else:
-            moved = apply(H, vec(incidences.tool_sense[k]))
-        if dot(moved, vec(incidences.scene_sense[k])) < 0.0:
-            total += incidences.turn_px[k] * incidences.turn_px[k]
-    return math.sqrt(total / incidences.views[0])
+            moved = apply(H, vec(sense))
+        if dot(moved, vec(sense[_SCENE:])) < 0.0:
+            total += sense[_TURN_PX] * sense[_TURN_PX]
+    return math.sqrt(total / incidences.sight[VIEWS_USED])
 
 
 @njit
@@ -149,19 +149,19 @@ def linearize_into(
     """
     e[:] = 0.0
     J[:] = 0.0
-    for i in range(incidences.weight.shape[1]):
-        error = error_of(incidences, i, H, H_back)
+    for row in incidences.rows:
+        error = _error_of(row, H, H_back)
         for k in range(e.shape[0]):
-            e[k] += incidences.weight[k, i] * error
+            e[k] += row[_WEIGHT + k] * error
         for j in range(H_hat.shape[0]):
-            rate = rate_of(incidences, i, H, H_back, mat(H_hat[j]))
+            rate = _rate_of(row, H, H_back, mat(H_hat[j]))
             for k in range(e.shape[0]):
-                J[k, j] += incidences.weight[k, i] * rate
+                J[k, j] += row[_WEIGHT + k] * rate
 
 
 def linearized(incidences: Incidences, H: FloatArray, H_hat: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Weighted errors (w,) at H (4, 4), and their derivatives (w, k) by operators (k, 4, 4) of the body."""
-    rank = len(incidences.weight)
+    rank = rank_of(incidences)
     e, J = np.zeros(rank), np.zeros((rank, len(H_hat)))
     back = np.asarray(np.linalg.inv(H), dtype=np.float64)
     linearize_into(incidences, mat(H), mat(back), np.ascontiguousarray(H_hat), e, J)
@@ -209,8 +209,7 @@ class _Metric:
 def _plane(points: FloatArray) -> FloatArray:
     """Plane (4,) through three points (3, 4), of unit norm."""
     A, B, C = (vec(row) for row in points)
-    plane = np.array(meet(A, B, C))
-    return np.asarray(plane / np.linalg.norm(plane))
+    return np.array(unit(meet(A, B, C)))
 
 
 def _directions(points: FloatArray) -> FloatArray:
@@ -263,9 +262,7 @@ def incidences_of(model: Model, body: Body, H_taught: FloatArray, asked: Sequenc
     Raises InputError for angles whose metric the joints leave open, WorkFailed for points that span no line
     or plane.
     """
-    rows: list[Row] = []
-    group: list[int] = []
-    senses: list[tuple[FloatArray, FloatArray, bool]] = []
+    rows, senses = list[FloatArray](), [NO_INCIDENCES.senses]
     for k, one in enumerate(asked):
         tool = points_of(body.M, one.tool)
         scene = points_of(body.M, one.scene) @ H_taught.T
@@ -275,32 +272,17 @@ def incidences_of(model: Model, body: Body, H_taught: FloatArray, asked: Sequenc
                     f"incidence {one.name}: its points span no {KINDS[len(points) - 1]}: name others"
                 )
         found = _rows(one, model, tool, scene)
-        rows += found
-        group += [k] * len(found)
+        rows += [np.array([*A, *b, sense, offset, k]) for A, b, sense, offset in found]
         if _has_sense(one, tool, scene):
-            plane = len(tool) == 3
-            senses.append(
-                (_plane(tool), _plane(scene), True)
-                if plane
-                else (_directions(tool)[0], _directions(scene)[0], False)
-            )
-    tool_rows, scene_rows, sense, offset = (np.array(column) for column in zip(*rows, strict=True))
-    return NO_INCIDENCES._replace(
-        tool=np.ascontiguousarray(tool_rows),
-        scene=np.ascontiguousarray(scene_rows),
-        sense=sense,
-        offset=offset,
-        group=np.array(group, dtype=np.int64),
-        tool_sense=np.array([A for A, _, _ in senses]).reshape(-1, 4),
-        scene_sense=np.array([b for _, b, _ in senses]).reshape(-1, 4),
-        is_plane=np.array([flat for _, _, flat in senses], dtype=np.bool_),
-        turn_px=np.zeros(len(senses)),
-    )
+            plane = len(tool) == len(KINDS)
+            axes = [_plane(points) if plane else _directions(points)[0] for points in (tool, scene)]
+            senses.append(np.array([[*axes[0], *axes[1], plane, 0.0]]))
+    return NO_INCIDENCES._replace(rows=np.array(rows), senses=np.concatenate(senses))
 
 
 def unweighted(incidences: Incidences) -> Incidences:
     """Return the rows with errors of their own scale."""
-    return incidences._replace(weight=np.eye(len(incidences.sense)))
+    return incidences.weighing(np.eye(len(incidences.rows)))
 
 
 def _motions(body: Body, H: FloatArray) -> FloatArray:
@@ -326,7 +308,7 @@ def point_velocities(M: FloatArray, motions: FloatArray) -> FloatArray:
 def weighted(
     incidences: Incidences, model: Model, body: Body, H: FloatArray, shows: BoolArray, a: FloatArray
 ) -> Incidences:
-    """Weigh the rows by the images of the body at a goal, and count which of them are independent.
+    """Give errors the unit of a pixel, their deviation at one pixel of noise, and weigh the independent ones.
 
     H : (4, 4) displacement of the body at the goal; shows : (V, m) markers that images show there.
     a : (4,) plane of the face at the reference.
@@ -341,45 +323,34 @@ def weighted(
     sigma = np.linalg.norm(half, axis=1)
     if not (sigma > 0.0).all():
         raise WorkFailed("an incidence does not change with the motion of the tool: leave it out")
-    groups = range(int(incidences.group.max()) + 1)
-    own = [_independent(half, sigma, incidences.group == k) for k in groups]
-    back = np.linalg.inv(H)
-    O = np.array([null_space(P)[:, 0] for P in model.P])
-    O /= (O @ model.a_inf)[:, None]
-    turn_px = np.array(
-        [_turn_px(incidences, k, H, motions[3:], J[:, 3:]) for k in range(len(incidences.turn_px))]
-    )
-    return incidences._replace(
-        weight=_independent(half, sigma, incidences.group >= 0),
-        own_weight=np.concatenate(own),
-        own_group=np.repeat(groups, [len(weight) for weight in own]),
-        views=np.array([float(shows.sum())]),
-        turn_px=turn_px,
-        a=np.ascontiguousarray(a),
-        shown=(O @ back.T) @ a,
-    )
+    rows, senses, O = incidences.rows.copy(), incidences.senses.copy(), optical_centers(model.P, model.a_inf)
+    rows[:, _SCENE:_SENSE] /= sigma[:, None]
+    rows[:, _OFFSET] /= sigma
+    senses[:, _TURN_PX] = [_turn_px(sense, H, motions[3:], J[:, 3:]) for sense in senses]
+    shown = O @ np.linalg.inv(H).T @ a
+    sight = np.array([*a, shows.sum(), *shown], dtype=np.float64)
+    return Incidences(rows, senses, sight).weighing(_independent(half / sigma[:, None]))
 
 
-def _independent(half: FloatArray, sigma: FloatArray, which: BoolArray) -> FloatArray:
-    """Weights (w, r) that make independent errors of unit variance of those of some rows.
+def _independent(half: FloatArray) -> FloatArray:
+    """Weights (w, r) that make independent errors of unit variance of those of rows.
 
-    half : (r, p) errors by pixels, whose product with its transpose is their covariance; sigma : (r,) their
-        deviations.
+    half : (r, p) errors by independent ones, each of unit variance.
     """
-    U, s, _ = np.linalg.svd((half / sigma[:, None])[which], full_matrices=False)
+    U, s, _ = np.linalg.svd(half, full_matrices=False)
     kept = s**2 > _DEPENDENT * s[0] ** 2
-    weight = np.zeros((int(kept.sum()), len(sigma)))
-    weight[:, which] = (U[:, kept] / s[kept]).T / sigma[which]
-    return weight
+    return np.asarray((U[:, kept] / s[kept]).T)
 
 
-def _turn_px(incidences: Incidences, k: int, H: FloatArray, turns: FloatArray, J: FloatArray) -> float:
-    """Motion of all images, px, by half a turn of a direction or plane: as far as to first order.
+def _turn_px(sense: FloatArray, H: FloatArray, turns: FloatArray, J: FloatArray) -> float:
+    """Motion of all images, px, by half a turn of a direction or plane (10,): as far as to first order.
 
     turns : operators (3, 4, 4) of rotations per rad; J : (2 k, 3) images by them.
     """
-    moved = incidences.tool_sense[k] @ (np.linalg.inv(H) if incidences.is_plane[k] else H.T)
-    rates = turns @ moved if not incidences.is_plane[k] else -np.einsum("a,rab->rb", moved, turns)
+    if sense[_IS_PLANE]:
+        rates = -np.einsum("a,rab->rb", sense[:_SCENE] @ np.linalg.inv(H), turns)
+    else:
+        rates = turns @ (H @ sense[:_SCENE])
     across = np.linalg.svd(rates.T)[2][:2]  # the turns that move it most
     return math.pi * float(np.sqrt(np.mean(np.sum((J @ across.T) ** 2, axis=0))))
 
@@ -390,7 +361,7 @@ def nearest_goal(incidences: Incidences, body: Body, H: FloatArray, moved: Moved
     moved : measures motions of the body; each step is the least of those that meet the incidences.
     Incidences that contradict each other leave an error, as of ``image_error``.
     """
-    rows = incidences if len(incidences.weight) else unweighted(incidences)
+    rows = incidences if rank_of(incidences) else unweighted(incidences)
     for _ in range(_STEPS):
         motions = _motions(body, H)
         J = moved(body.M @ H.T, motions)
@@ -419,9 +390,11 @@ def metric_errors(
     """Distances (g,) of features that are to meet, in a metric up to scale, and angles (g,) off, deg.
 
     M : (m, 4) markers of the body; H : displacements (4, 4) of it now, and where the goal was taught.
-    NaN for what an incidence has not, and where the joints leave the metric open.
+    NaN for what an incidence has not, where the joints leave the metric open, and of a displacement of NaN.
     """
     apart, off = np.full((2, len(asked)), math.nan)
+    if not np.isfinite(H).all():
+        return apart, off
     try:
         S = invariant_upgrade(model.H_hat_0, model.prismatic)
     except InputError:
@@ -452,10 +425,15 @@ def _angle(tool: FloatArray, scene: FloatArray) -> float:
 
 
 def errors_px(incidences: Incidences, H: FloatArray) -> FloatArray:
-    """Error (g,) of each incidence at H (4, 4) over its deviation at one pixel of noise, px.
+    """Error (k, g) of each incidence at displacements H (k, 4, 4) over its deviation at one pixel of noise.
 
-    The root of the mean square over its independent rows.
+    The root of the mean square over its independent rows, px; NaN where a displacement is.
     """
-    squares = linearized(incidences._replace(weight=incidences.own_weight), H, np.zeros((0, 4, 4)))[0] ** 2
-    count = np.bincount(incidences.own_group)
-    return np.asarray(np.sqrt(np.bincount(incidences.own_group, squares) / count))
+    half, group, own = np.linalg.pinv(incidences.weight), incidences.rows[:, _GROUP], list[Incidences]()
+    for k in np.unique(group):
+        independent = _independent(half[group == k])
+        weight = np.zeros((len(independent), len(group)))
+        weight[:, group == k] = independent / math.sqrt(len(independent))
+        own.append(incidences.weighing(weight))
+    none = np.zeros((0, 4, 4))
+    return np.array([[float(np.linalg.norm(linearized(one, at, none)[0])) for one in own] for at in H])

@@ -100,7 +100,16 @@ class TaskImages(NamedTuple):
         Raises WorkFailed if a marker of the face cannot be triangulated, the face is degenerate or edge-on in
         a view; with a body, if a motion is not unique or the markers do not fit a pose of the body.
         """
-        m, n = self.s_start.shape[1] - self.pins, len(self.q_start)
+        task, H_star = self._measured(model)
+        return task._replace(incidences=self._rows(model, task, H_star)) if self.incidences else task
+
+    def displacement_taught(self, model: Model) -> FloatArray:
+        """Displacement (4, 4) of the body where the goal was taught; raises as ``task``."""
+        return self.taught()._measured(model)[1]
+
+    def _measured(self, model: Model) -> tuple[Task, FloatArray]:
+        """Task without incidences, and the displacement (4, 4) of the body at its goal."""
+        m, n, H_star = self.s_start.shape[1] - self.pins, len(self.q_start), np.eye(4)
         images = np.array([undistort(model.lens, s) for s in (self.s_start, self.s_star)])
         unseen = np.zeros((len(model.P), len(self.body.M)), dtype=np.bool_)
         task = new_task(model, self.s_star[:, :m], self.center, self.pair, self.least_views)._replace(
@@ -114,19 +123,17 @@ class TaskImages(NamedTuple):
             split = Split(work=work, A=A, A_t=A_t, A_r=A_r, q_hat=np.zeros((3, k)), driven=np.zeros((2, k)))
             normal = np.zeros((COORDINATES, COORDINATES + 1))
             ends = self.q_start, self.q_near
-            require_found(*body_task_into(model, ends, images, task, split, normal), self.view)
-            if self.incidences:
-                return task._replace(incidences=self._rows(model, task))
-        return task
+            require_found(*body_task_into(model, ends, images, task, split, normal, H_star), self.view)
+        return task, H_star
 
-    def _rows(self, model: Model, task: Task) -> Incidences:
-        """Rows of the incidences by a task to the goal, or to one that was taught elsewhere."""
-        taught = task if self.s_taught is None else self.taught().task(model)
-        rows = incidences_of(model, task.body, taught.H_star, self.incidences)
+    def _rows(self, model: Model, task: Task, H_star: FloatArray) -> Incidences:
+        """Rows of the incidences by a task to the goal (4, 4), or to one that was taught elsewhere."""
+        H_taught = H_star if self.s_taught is None else self.displacement_taught(model)
+        rows = incidences_of(model, task.body, H_taught, self.incidences)
         A = np.ascontiguousarray(task.body.M[: len(task.A_star)])
         face = np.array(face_plane(A, task.order, center_of(A, task.center)))
         shows = task.body.in_goal
-        goal = nearest_goal(rows, task.body, task.H_star, image_velocities(model, shows))
+        goal = nearest_goal(rows, task.body, H_star, image_velocities(model, shows))
         return weighted(rows, model, task.body, goal, shows, face)
 
 
@@ -138,6 +145,7 @@ def body_task_into(
     task: Task,
     split: Split,
     normal: FloatArray,
+    H_star: FloatArray,
 ) -> tuple[int, int]:
     """Complete the target points of a task by the whole body instead of the face alone.
 
@@ -149,6 +157,7 @@ def body_task_into(
     task : as of ``task_into``, with the body; on return with its points and its views at the goal.
     split : on return with the face at the start.
     normal : (6, 7) workspace of the fit of the body.
+    H_star : (4, 4) on return the displacement of the body at the goal.
     Returns the code of a problem, ``FOUND`` if there is none, and the number of markers seen, once a view.
     """
     goal, q_start = images[1], ends[0]
@@ -170,7 +179,7 @@ def body_task_into(
     if not fit.settled:
         return MISFIT_GOAL if fit.found else UNSEEN_GOAL, fit.views
     carry(task.body, fit.H, task.A_star)
-    mat_into(task.H_star, fit.H)
+    mat_into(H_star, fit.H)
     if task.pair.shape[0] == 0 and not order_into(task.A_star, task.order, split.work.system.rhs):
         return ONE_LINE, 0
     for view in range(goal.shape[0]):
