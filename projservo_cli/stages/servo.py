@@ -43,7 +43,7 @@ from projservo_cli.records import (
 from projservo_cli.results import ImageModel
 from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.contract import at_rest_after
-from projservo_cli.simulation.analytic_plant import AnalyticPlant, Plant
+from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import external_robot
@@ -291,14 +291,8 @@ class LawRun:
     @cached_property
     def summary(self) -> Summary:
         """Numbers of the run; NaN if they need an unknown truth."""
-        period, ends = self.scenario.gains.period, self.scenario.true_ends
         ended = Ended(VERDICTS.index(self.verdict), self.steps, self.limited)
-        found = summarize(self.plant, self.log, ended, period, ends)
-        if self.scenario.exact.incidences and self.scenario.truth is not None:
-            H = self.log.H[self.steps]
-            pose = np.linalg.inv(H) if self.plant.model.on_tool else H
-            mm, deg = _apart_from(pose @ ends.base_tool, self.goal_pose, self.plant, ends.base_tool)
-            found = found._replace(position_error_mm=mm, rotation_error_deg=deg)
+        found = summarize(self.plant, self.log, ended, self.scenario.gains.period, self.true_ends)
         return found if self.scenario.truth is not None else found._replace(success=math.nan)
 
     @property
@@ -308,7 +302,7 @@ class LawRun:
 
     def deviation_mm(self) -> float:
         """Largest distance of the true centre from its line, between the samples too, mm; NaN if unknown."""
-        goal, period = self.scenario.true_ends.goal, self.scenario.gains.period
+        goal, period = self.true_ends.goal, self.scenario.gains.period
         if not np.isfinite(goal).all():
             return math.nan
         start = self.log.H[0] @ np.array(center_of(self.plant.M, self.plant.center))
@@ -349,19 +343,20 @@ class LawRun:
         return float(np.median(lengths[i, k] / np.linalg.norm(X[i] - X[k], axis=1)))
 
     @cached_property
-    def goal_pose(self) -> FloatArray:
-        """True pose (4, 4) of the tool at the goal, of incidences the nearest one, m; NaN if unknown."""
-        scenario, (base_tool, taught, _) = self.scenario, self.scenario.true_ends
-        if not scenario.exact.incidences or scenario.truth is None or not np.isfinite(taught).all():
-            return taught
+    def true_ends(self) -> Ends:
+        """True poses of the tool, with the nearest goal to where it ended where incidences leave it open."""
+        scenario, ends = self.scenario, self.scenario.true_ends
+        if not scenario.exact.incidences or scenario.truth is None or not np.isfinite(ends.goal_pose).all():
+            return ends
         model, on_tool = scenario.truth.model, self.plant.model.on_tool
-        H_taught = taught @ np.linalg.inv(base_tool)
+        H_taught = ends.goal_pose @ np.linalg.inv(ends.base_tool)
         body = make_body(model, scenario.truth.of(scenario.numbers))
         rows = incidences_of(
             model, body, np.linalg.inv(H_taught) if on_tool else H_taught, scenario.exact.incidences
         )
-        goal = nearest_goal(rows, body, self.log.H[self.steps], point_velocities)
-        return np.asarray((np.linalg.inv(goal) if on_tool else goal) @ base_tool)
+        H = nearest_goal(rows, body, self.log.H[self.steps], point_velocities)
+        pose = (np.linalg.inv(H) if on_tool else H) @ ends.base_tool
+        return Ends(ends.base_tool, pose, H @ np.array(center_of(self.plant.M, self.plant.center)))
 
     def trace(self) -> Trace:
         """Record of the run."""
@@ -385,7 +380,7 @@ class LawRun:
             read = _whole(driven.readings, rows)
         values = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
         moved = np.linalg.inv(H) if self.plant.model.on_tool else H
-        pose, goal_pose = moved @ scenario.true_ends.base_tool, self.goal_pose
+        pose, goal_pose = moved @ self.true_ends.base_tool, self.true_ends.goal_pose
         if driven is not None and driven.truths and not simulated:
             pose, goal_pose = _reported_poses(scenario, _whole(driven.truths, rows))
             values["position_error_mm"] = MM * float(np.linalg.norm(goal_pose[:3, 3] - pose[-1, :3, 3]))
@@ -450,16 +445,6 @@ def _whole(values: Sequence[FloatArray], rows: int) -> FloatArray:
     """Return the values at each time of a run, (rows, ...); NaN after its end."""
     missing = np.full_like(values[0], np.nan)
     return np.array([*values, *[missing] * (rows - len(values))])
-
-
-def _apart_from(
-    pose: FloatArray, goal_pose: FloatArray, plant: Plant, base_tool: FloatArray
-) -> tuple[float, float]:
-    """Errors, mm and deg, of a pose (4, 4), m, at the centre of the face, or at a tool with cameras."""
-    middle = np.array(center_of(plant.M, plant.center))
-    point = np.eye(4)[3] if plant.model.on_tool else np.linalg.solve(base_tool, middle)
-    turn = angle_between(mat(pose), mat(goal_pose))
-    return MM * float(np.linalg.norm((goal_pose - pose) @ point)), math.degrees(turn)
 
 
 def _reported_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArray, FloatArray]:
