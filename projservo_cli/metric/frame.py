@@ -132,22 +132,31 @@ def invariant_upgrade(H_hat: FloatArray, prismatic: BoolArray) -> FloatArray:
         raise InputError(f"metric: {left} would fix it")
     U = np.linalg.svd(np.concatenate(np.moveaxis(H_hat, -3, 0), axis=-1))[0]
     D, a_inf = U[..., :3].swapaxes(-1, -2), U[..., 3]
-    L = (D[..., None, :, :] @ H_hat @ D.swapaxes(-1, -2)[..., None, :, :])[..., turning, :, :]
+    L = D[..., None, :, :] @ H_hat @ D.swapaxes(-1, -2)[..., None, :, :]
+    sizes, S = invariant_form(L[..., turning, :, :])
+    if (sizes[..., 4] < _SECOND_FORM * sizes[..., 0]).any():
+        raise InputError(_ALL_PARALLEL)
+    try:
+        A = np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        raise InputError(_ALL_PARALLEL) from None
+    return np.concatenate([np.linalg.solve(A, D), a_inf[..., None, :]], axis=-2)
+
+
+def invariant_form(L: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Form S (…, 3, 3) of positive trace that actions L (…, n, 3, 3) change least, L S + S Lᵀ.
+
+    Also returns the singular values (…, 6) of the changes of all symmetric forms; S is unique if but the last
+    is zero.
+    """
     i, j = np.triu_indices(3)
     basis = np.zeros((6, 3, 3))
     basis[range(6), i, j] = basis[range(6), j, i] = np.where(i == j, 1.0, np.sqrt(0.5))
     moved = np.einsum("...nab,sbc->...nacs", L, basis)
     changes = (moved + np.einsum("...nacs->...ncas", moved)).reshape(*L.shape[:-3], -1, 6)
     _, sizes, rows = np.linalg.svd(changes)
-    if (sizes[..., 4] < _SECOND_FORM * sizes[..., 0]).any():
-        raise InputError(_ALL_PARALLEL)
     S = np.einsum("...s,sab->...ab", rows[..., 5, :], basis)
-    S *= np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None]
-    try:
-        A = np.linalg.cholesky(S)
-    except np.linalg.LinAlgError:
-        raise InputError(_ALL_PARALLEL) from None
-    return np.concatenate([np.linalg.solve(A, D), a_inf[..., None, :]], axis=-2)
+    return sizes, np.asarray(S * np.sign(np.trace(S, axis1=-2, axis2=-1))[..., None, None])
 
 
 def directions(axes: FloatArray, prismatic: BoolArray) -> FloatArray:

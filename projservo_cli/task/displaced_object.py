@@ -426,7 +426,7 @@ def _unit_m(rig: LookRig, metric: Metric) -> float:
 
 
 def _tool_at(rig: LookRig, goal: Look) -> BundleFit:
-    """BundleFit the pose of the tool to its images at a goal.
+    """Fit the pose of the tool to its images at a goal.
 
     Raises WorkFailed if they do not determine it.
     """

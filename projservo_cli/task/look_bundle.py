@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.calibration.prediction import error_factor_with_model, projection_derivative
 from projservo_cli.geometry.displacements import cross_matrix
 from projservo_cli.geometry.lens import distort, undistort
-from projservo_cli.metric.frame import ProjectiveParameters, changes_of
+from projservo_cli.metric.frame import ProjectiveParameters, changes_of, invariant_form
 from projservo_cli.records import BoolArray, Calibration, FloatArray, WorkFailed
 from projservo_cli.task.body import make_body
 
@@ -24,8 +24,6 @@ from projservo_cli.task.body import make_body
 _OPEN = 1e-6
 # Deviation of the invariant form from 1 above which the data do not determine it, as for a metric.
 _UNDETERMINED = 0.3
-# Number of symmetric forms of the plane at infinity.
-_FORMS = 6
 # Distance of two places of a body over its size, below which they are one.
 _SAME = 0.05
 # Maximum number of steps of a fit, and damping above which none leads down.
@@ -117,18 +115,12 @@ def _metric_root(L: FloatArray) -> FloatArray | None:
 
     It changes smoothly from one model to the next. None if there is more than one form, within the errors.
     """
-    i, j = np.triu_indices(3)
-    basis = np.zeros((_FORMS, 3, 3))
-    basis[range(_FORMS), i, j] = basis[range(_FORMS), j, i] = np.where(i == j, 1.0, np.sqrt(0.5))
-    moved = np.einsum("bnij,sjk->bniks", L, basis)
-    changes = (moved + moved.swapaxes(2, 3)).reshape(len(L), -1, _FORMS)
-    _, sizes, rows = np.linalg.svd(changes)
+    sizes, S = invariant_form(L)
     if sizes[0, -2] < _OPEN * max(sizes[0, 0], 1.0):
         return None
-    form = rows[:, -1]
-    S = np.einsum("bs,sij->bij", form * np.einsum("bs,sii->b", form, basis)[:, None], basis)
+    S *= np.trace(S, axis1=1, axis2=2)[:, None, None]
     try:
-        A = np.linalg.cholesky(S)
+        A = np.asarray(np.linalg.cholesky(S), dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
     back = np.linalg.inv(A[0])
