@@ -191,8 +191,8 @@ class FigureSpec:
     shares: bool = False  # whether it shows shares of translation and rotations
     modes: bool = False  # whether it compares runs that follow the plan with others
     goal: bool = False  # whether it needs a known goal pose
-    frames: bool = False  # whether it shows frames; it is not omitted if no robot has any
-    incidences: bool = False  # whether it shows those of the goal; it is not omitted of a whole pose
+    frames: bool = False  # whether it shows frames
+    incidences: bool = False  # whether it shows those of the goal
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
 
@@ -201,9 +201,12 @@ class FigureSpec:
         """Its section on the page: calibration, metric, plan or control."""
         if not self.task:
             return "metric" if self.metric else "calibration"
-        return (
-            "control" if self.laws or self.studies or self.modes or self.frames or self.incidences else "plan"
-        )
+        return "control" if self.laws or self.studies or self.modes or self.optional else "plan"
+
+    @property
+    def optional(self) -> bool:
+        """Whether it is left out without a word where a run has nothing to show in it."""
+        return self.frames or self.incidences
 
     def drawn(self, data: Data) -> "Figure":
         """The figure of its data."""

@@ -175,7 +175,7 @@ def draw_all(
         progress("figures", done, len(FIGURES))
         contents: dict[str, bytes] = {}
         if reason := spec.lacking(report_data):
-            left_out += [] if spec.frames or spec.incidences else [{"what": spec.name, "reason": reason}]
+            left_out += [] if spec.optional else [{"what": spec.name, "reason": reason}]
         else:
             if partial := spec.partly(report_data):
                 left_out.append({"what": f"{spec.name}, in part", "reason": partial})

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from projservo_cli.image_size import image_sizes as image_sizes
 from projservo_cli.records import (
     Calibration,
     CrossValidation,
