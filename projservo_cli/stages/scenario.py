@@ -351,6 +351,11 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
         known = observed if calibration is None else calibration.marker.tolist()
         pins = tuple(number for number in observed if number in known and number not in face)
         body = _body(calibration or truth, (*face, *pins))
+    elif inputs.incidences:
+        raise WorkFailed(
+            "incidences are measured with the body, and the calibration is not usable: calibrate again, or "
+            "set control.features: body to try"
+        )
     if truth is not None:
         exact, ends, q_goal = _simulated_ends(task, joints.types, joints.units, truth, pins, inputs.center)
     else:
@@ -381,13 +386,13 @@ def _positions(asked: Sequence[Incidence], numbers: Sequence[int]) -> tuple[Inci
 
     Raises InputError for a marker that the body lacks.
     """
-    found = []
+    found = list[Incidence]()
     for one in asked:
         for number in chain.from_iterable((*one.tool, *one.scene)):
             if number not in numbers:
                 raise InputError(
                     f"task.goal.incidences: {one.name} needs marker {number}, and the body has "
-                    f"{', '.join(map(str, numbers))}: name these, or set control.features: body"
+                    f"{', '.join(map(str, numbers))}: name these, or calibrate with it"
                 )
         flats = [tuple(tuple(map(numbers.index, point)) for point in flat) for flat in (one.tool, one.scene)]
         found.append(one._replace(tool=flats[0], scene=flats[1]))

@@ -1,5 +1,6 @@
 """Tasks of incidences through plan, run and trace, and laws that state an error of their own."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -52,6 +53,12 @@ def test_incidences_that_contradict_each_other_are_refused_with_what_is_left_of_
     config = config.model_copy(update={"task": config.task.model_copy(update={"goal": goal})})
     with pytest.raises(WorkFailed, match=r"meet all incidences; the nearest leave .*pin at 40.0 deg to hole"):
         plan.run(config, calibration)
+
+
+def test_without_a_body_to_measure_with_incidences_are_refused():
+    config, calibration, _ = made()
+    with pytest.raises(WorkFailed, match="incidences are measured with the body"):
+        plan.run(config, replace(calibration, usable=False))
 
 
 class Own:
