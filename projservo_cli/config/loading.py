@@ -542,7 +542,7 @@ def _check_options(document: _Document) -> None:
 
 def _translated(model: type[BaseModel], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:
     """Return the findings of pydantic, in words."""
-    positions = [error["loc"] for error in errors]
+    positions = [tuple(part for part in error["loc"] if part != "[key]") for error in errors]
     for error, place in list(zip(errors, positions, strict=True))[:_MOST]:
         if error["type"] == CONTRADICTIONS:
             yield from error["ctx"]["found"]

@@ -1,31 +1,65 @@
 """Points, lines and planes that incidences of a goal name."""
 
+import re
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, StringConstraints
+from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from projservo_cli.settings.sections import Finding, Number, Section, Whole
 from projservo_cli.task.incidences import ANGLE, KINDS, MEET, PARALLEL, PERPENDICULAR, Incidence
 
-Name = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*$", max_length=40)]
-_Markers = Annotated[tuple[Whole, ...], Field(min_length=1, max_length=100)]
 _TOOL, _SCENE = "tool", "scene"
+_RELATIONS = (MEET, PARALLEL, PERPENDICULAR)
+_MOST = 100  # markers of which a point is the middle
+_NAME, _LONGEST = r"^[a-z][a-z0-9_]*$", 40
+
+
+def _name(name: str) -> str:
+    """A name that messages and figures can write; else ValueError."""
+    if not re.fullmatch(_NAME, name) or len(name) > _LONGEST:
+        raise ValueError("must be a name of small letters, digits and _, which begins with a letter")
+    return name
+
+
+Name = Annotated[
+    str,
+    AfterValidator(_name),
+    WithJsonSchema({"maxLength": _LONGEST, "pattern": _NAME, "type": "string"}),
+]
+
+
+def _numbers_or_name(least: int, most: int) -> BeforeValidator:
+    """Refuse in one line what is neither so many numbers of markers nor a name."""
+
+    def checked(value: Any) -> Any:
+        whole = isinstance(value, (list, tuple)) and all(type(x) is int and x >= 0 for x in value)
+        if not (value is None or isinstance(value, str) or (whole and least <= len(value) <= most)):
+            count = str(least) if least == most else f"{least} to {most}"
+            raise ValueError(f"must be numbers of {count} markers, or the name of a feature of the tool")
+        return value
+
+    return BeforeValidator(checked)
+
+
+_Point = Annotated[tuple[Whole, ...], Field(min_length=1, max_length=_MOST)]
+_Line = Annotated[tuple[Whole, ...], Field(min_length=2, max_length=2)]
+_Plane = Annotated[tuple[Whole, ...], Field(min_length=3, max_length=3)]
 
 
 class Feature(Section):
     """A point, line or plane of the tool through its markers, or of the scene where that of the tool was."""
 
     on: Literal["tool", "scene"] = Field(description="what the feature moves with; the scene stands still")
-    point: _Markers | Name | None = Field(
+    point: Annotated[_Point | Name | None, _numbers_or_name(1, _MOST)] = Field(
         None,
         description="numbers of markers, whose middle it is; of the scene the point of the tool that was "
         "there when the goal was taught",
     )
-    line: Annotated[tuple[Whole, ...], Field(min_length=2, max_length=2)] | Name | None = Field(
+    line: Annotated[_Line | Name | None, _numbers_or_name(2, 2)] = Field(
         None, description="numbers of two markers, in the sense of the line; or as for a point"
     )
-    plane: Annotated[tuple[Whole, ...], Field(min_length=3, max_length=3)] | Name | None = Field(
+    plane: Annotated[_Plane | Name | None, _numbers_or_name(3, 3)] = Field(
         None, description="numbers of three markers, in the sense of the plane; or as for a point"
     )
 
@@ -63,8 +97,23 @@ class Feature(Section):
         return (self.source,) if self.kind == KINDS[0] else tuple((number,) for number in self.source)
 
 
+def _pair(value: Any) -> Any:
+    """A pair of names, perhaps with how both lie; else ValueError."""
+    if not (isinstance(value, (list, tuple)) and len(value) in (2, 3)) or not all(
+        isinstance(name, str) for name in value[:2]
+    ):
+        raise ValueError("must be [feature of the tool, feature of the scene], perhaps with how both lie")
+    if len(value) == 3 and value[2] not in _RELATIONS:
+        angle = value[2]
+        if isinstance(angle, bool) or not isinstance(angle, int | float) or not 0.0 < angle < 180.0:
+            known = f"{', '.join(_RELATIONS)}, or an angle between 0 and 180 deg"
+            raise ValueError(f"{angle!r} does not say how both lie: {known}")
+    return value
+
+
 _Relation = Literal["meet", "parallel", "perpendicular"] | Annotated[Number, Field(gt=0, lt=180)]
-Pair = tuple[Name, Name] | tuple[Name, Name, _Relation]  # of the tool and of the scene, meet if not said
+# Of the tool and of the scene, which meet if not said.
+Pair = Annotated[tuple[Name, Name] | tuple[Name, Name, _Relation], BeforeValidator(_pair)]
 
 
 def in_words(pair: Pair) -> str:

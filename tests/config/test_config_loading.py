@@ -125,6 +125,11 @@ INCONSISTENT = [
     ("features={pin: {on: tool, line: [0, 9]}}", "features.pin.line.1", "there is no marker 9"),
     ("features={pin: {on: tool, line: [0, 0]}}", "features.pin.line", "a marker stands here twice"),
     ("features={pin: {on: tool, line: [0, 1], point: [2]}}", "features.pin", "exactly one of point, line"),
+    ("features={pin: {on: tool, line: [0]}}", "features.pin.line", "numbers of 2 markers"),
+    ("features={pin: {on: tool, point: []}}", "features.pin.point", "numbers of 1 to 100 markers"),
+    ("features={Pin: {on: tool, point: [0]}}", "features.Pin", "a name of small letters"),
+    ("task.goal.incidences=[[pin]]", "task.goal.incidences.0", "perhaps with how both lie"),
+    ("task.goal.incidences=[[pin, hole, meets]]", "task.goal.incidences.0", "'meets' does not say how"),
     ("features={hole: {on: scene, line: pin}}", "features.hole.line", "there is no line pin of the tool"),
     ("features={hole: {on: scene, line: [0, 1]}}", "features.hole.line", "the name of a feature of the tool"),
     ("task.goal.incidences=[[pin, hole]]", "task.goal.incidences.0", "there is no feature pin"),
@@ -234,3 +239,17 @@ def test_unreadable_text_is_refused(case):
 def test_duplicate_keys_are_refused_with_both_places(good):
     (line,) = errors(good, text=GOOD.replace("  face:", "  face: [0, 1, 3]\n  face:"))
     assert line == f"{good}:14:3: markers.face: the key stands here a second time (first at 13:3); keep one"
+
+
+def test_a_taught_goal_keeps_the_incidences_beside_it(tmp_path):
+    """Read from the file, written out whole, and read again."""
+    pixels = "[[1, 2], [3, 4], [5, 7]]"
+    (tmp_path / "goal.yaml").write_text(f"images: {{left: {pixels}, right: {pixels}}}")
+    features = "features: {pin: {on: tool, line: [0, 1]}, hole: {on: scene, line: pin}}\n"
+    goal = "{taught: goal.yaml, incidences: [[pin, hole], [pin, hole, 90]]}"
+    path = tmp_path / "good.yaml"
+    path.write_text(features + GOOD.replace("{roll_deg: 180}", goal), encoding="utf-8")
+    config = load_config(path)
+    assert config.task.goal.images.left[2] == (5.0, 7.0)
+    assert config.task.goal.incidences == (("pin", "hole"), ("pin", "hole", 90.0))
+    assert load_config("again.yaml", text=to_yaml(config)) == config
