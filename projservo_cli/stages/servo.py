@@ -723,7 +723,8 @@ class PluginLaw:
         self.law, self.name, self.least_views = law, name, least_views
         self.errors = np.full(len(ERRORS), np.nan)
         self.face_px = np.full(1, math.nan)
-        self.states_error, self.tolerance = callable(getattr(law, "error", None)), math.nan
+        self._error: Any = getattr(law, "error", None)
+        self.states_error, self.tolerance = callable(self._error), math.nan
         if self.states_error:
             stated = getattr(law, "tolerance", None)
             if isinstance(stated, bool) or not isinstance(stated, int | float) or not 0.0 < stated < math.inf:
@@ -743,7 +744,7 @@ class PluginLaw:
                 return LOST, np.zeros_like(q)
             q_dot = np.array(answer, dtype=np.float64)
             if self.states_error:
-                error = float(self.law.error(s.copy(), q.copy()))  # type: ignore[attr-defined]
+                error = float(self._error(s.copy(), q.copy()))
                 self.face_px[0] = error / self.tolerance * self._px
         except Exception as error:
             raise WorkFailed(f"{self.name}: failed: {what_failed(error)}") from error

@@ -171,7 +171,7 @@ class _Search:
         return _Placed(fit, looks, known)
 
     def _no_shape(self, known: BoolArray, base: int) -> str:
-        """Why the shape of the object is not known."""
+        """Return the reason why the shape of the object is not known."""
         if len(self.looks[0].s) == 1:
             return (
                 "objects: one camera tells the size of an object from its distance in no number of looks, so "
