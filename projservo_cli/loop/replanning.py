@@ -3,7 +3,8 @@
 A path is searched again, from where the robot is, where
 
 - the path ahead would leave an image, by the offset of both images from their prediction;
-- the face was lost, and seen again on the path backwards;
+- the face was lost, and seen again on the path backwards; lost once more, it is passed over: the robot
+  follows its path by its joint readings to where the face is seen again;
 - the law that ends the motion is stopped by a joint limit or a singularity, or comes no nearer: the joints
   that were taken for the goal are excluded from then on.
 """
@@ -33,6 +34,8 @@ from projservo_cli.task.face import Task
 
 # Periods between checks of the path ahead, by the mean offset of the images in the last ones.
 _EVERY, LAST = 10, 5
+# Senses along a path.
+_BACK, _ON = -1, 1
 # What stops a law.
 _STOPPED = {JOINT_LIMIT: "a joint limit", SINGULAR_VERDICT: "a singularity", DIVERGED: "growing errors"}
 
@@ -57,6 +60,7 @@ class ExecutionMonitor:
     replanner : of paths to the goal; searches : how often one may be searched again.
     limits : of the run.
     stall : monitor of a robot that may lag behind its set-points; None for one that does not.
+    blind : whether the robot may move on where the face is lost.
     ``attempts``: why a path was searched again each time, and when, in words.
     """
 
@@ -68,26 +72,34 @@ class ExecutionMonitor:
         searches: int,
         limits: Limits,
         stall: StallMonitor | None = None,
+        *,
+        blind: bool = True,
     ) -> None:
         self.law, self.follow, self.replanner = law, follow, replanner
         self.left, self.limits = searches, limits
         self.attempts: list[str] = []
-        self._stall = stall
+        self._stall, self._may_pass = stall, blind
         self._excluded: list[FloatArray] = []
-        self._goes_back = False
+        self._blind = 0  # sense in which the robot passes along the path where the face is lost; 0 if seen
+        self._lost = 0  # how often the face was lost
+        self._waited = 0  # periods without images at the end of the path
         self._alone = 0  # instants since the law is without a plan
 
     def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
         """Return the new verdict; write the velocity (n,) of the path backwards."""
         if k == self.limits.max_steps or verdict == CONVERGED:
             return verdict
-        if verdict == MARKERS_LOST or (verdict == WAITING and self._goes_back):
-            return self._back(log, k, q_dot)
+        if verdict == MARKERS_LOST or (verdict == WAITING and self._blind):
+            return self._passed(log, k, q_dot)
         if verdict == WAITING:
             return verdict
-        if self._goes_back and verdict == RUNNING:
-            self._goes_back = False
-            return self._replanned(log, k, verdict, "the face was lost, and seen again on the path backwards")
+        if self._blind and verdict == RUNNING:
+            sense, self._blind = self._blind, 0
+            if sense == _BACK:
+                what = "the face was lost, and seen again on the path backwards"
+                return self._replanned(log, k, verdict, what)
+            self.attempts.append(f"passed over where the face is lost to step {k}")
+            return verdict
         path, clock = self.law.law.task.reference.q, float(self.law.state.clock[0])
         if clock < len(path) - 1:
             if verdict == DIVERGED and np.isfinite(q_dot).all():
@@ -134,13 +146,24 @@ class ExecutionMonitor:
         self._alone = 0
         return WAITING
 
-    def _back(self, log: Log, k: int, q_dot: FloatArray) -> int:
-        """Go back a period along the path; the face is lost for good where it began."""
+    def _passed(self, log: Log, k: int, q_dot: FloatArray) -> int:
+        """Go a period along the path without images: back at first, on where the face was lost before.
+
+        The face is lost for good where the path begins, or at its end if no other joints show the goal.
+        """
         path, state = self.law.law.task.reference.q, self.law.state
-        self._goes_back = True
-        clock = min(float(state.clock[0]), float(len(path) - 1)) - 1.0
+        if not self._blind:
+            self._lost += 1
+            self._blind = _ON if self._may_pass and self._lost > 1 else _BACK
+        end = float(len(path) - 1)
+        clock = min(float(state.clock[0]), end) + self._blind
+        self._waited = self._waited + 1 if clock > end else 0
         if clock < 0.0:
             return MARKERS_LOST
+        if self._waited > self.limits.max_lost_periods:
+            self._blind, self._excluded = 0, [*self._excluded, path[-1].copy()]
+            return self._replanned(log, k, MARKERS_LOST, "the face is hidden at the end of the path")
+        clock = min(clock, end)
         state.clock[0], state.parts[0], state.share[0], state.blocked[0] = clock, 0, -1.0, -1
         there = np.array([np.interp(clock, np.arange(len(path)), joint) for joint in path.T])
         q_dot[:] = (there - log.read[k]) / self.law.gains.period

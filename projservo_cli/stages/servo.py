@@ -209,7 +209,8 @@ class LawRun:
             assert isinstance(self.plan, Plan)
             follow, searches = partial(self._task, law.law.model), scenario.servo.max_replan_attempts
             replanner = PathReplanner(scenario, self.plan)
-            execution = ExecutionMonitor(law, follow, replanner, searches, scenario.termination, stall)
+            blind, limits = self.blind or scenario.truth is not None, scenario.termination
+            execution = ExecutionMonitor(law, follow, replanner, searches, limits, stall, blind=blind)
         code, self.steps, self.log = run_in_python(
             law,
             plant,

@@ -41,7 +41,7 @@ class PathReplanner:
         return "another way" if self.count >= 0 else None
 
 
-def watched(ways, clock=0.0, searches=3, **bounds):
+def watched(ways, clock=0.0, searches=3, blind=True, **bounds):
     """A watch over a law on the way, that law's tasks and a log whose images are 1 px off."""
     state = SimpleNamespace(
         clock=np.array([clock]), parts=np.ones(1, int), share=np.zeros(1), blocked=np.zeros(1)
@@ -55,7 +55,9 @@ def watched(ways, clock=0.0, searches=3, **bounds):
     log.s[:] = SEEN + 1.0
     log.read[:] = 0.25
     return (
-        ExecutionMonitor(law, lambda plan: plan, ways, searches, limits(max_steps=100, **bounds)),
+        ExecutionMonitor(
+            law, lambda plan: plan, ways, searches, limits(max_steps=100, **bounds), blind=blind
+        ),
         followed,
         log,
     )
@@ -123,3 +125,46 @@ def test_a_face_that_is_nowhere_on_the_way_back_is_lost():
     watch, _, log = watched(PathReplanner(), clock=1.5)
     verdicts = [watch.ruled(log, k, MARKERS_LOST, np.zeros(2)) for k in range(3)]
     assert verdicts == [RUNNING, MARKERS_LOST, MARKERS_LOST]
+
+
+def lost_again(watch, log, ways):
+    """Lose the face a first time, see it again on the way back, and follow another way from there."""
+    watch.ruled(log, 50, MARKERS_LOST, np.zeros(2))
+    assert watch.ruled(log, 51, RUNNING, np.zeros(2)) == WAITING
+    watch.law.state.clock[0] = 17.5
+
+
+def test_a_face_that_is_lost_again_is_passed_over():
+    ways = PathReplanner()
+    watch, followed, log = watched(ways, clock=3.0)
+    lost_again(watch, log, ways)
+    q_dot = np.zeros(2)
+    assert watch.ruled(log, 60, MARKERS_LOST, q_dot) == RUNNING
+    np.testing.assert_allclose(q_dot, ((WAY[18] + WAY[19]) / 2 - 0.25) / 0.5)
+    assert watch.ruled(log, 61, RUNNING, q_dot) == RUNNING
+    assert watch.attempts[-1] == "passed over where the face is lost to step 61"
+    assert followed == ["another way"]
+
+
+def test_an_arm_that_must_not_move_blind_goes_back_each_time():
+    ways = PathReplanner()
+    watch, _, log = watched(ways, clock=3.0, blind=False)
+    lost_again(watch, log, ways)
+    q_dot = np.zeros(2)
+    assert watch.ruled(log, 60, MARKERS_LOST, q_dot) == RUNNING
+    np.testing.assert_allclose(q_dot, ((WAY[16] + WAY[17]) / 2 - 0.25) / 0.5)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_joints_that_hide_the_face_at_the_end_are_excluded(count):
+    ways = PathReplanner(count)
+    watch, followed, log = watched(ways, clock=3.0, max_lost_periods=4)
+    lost_again(watch, log, ways)
+    q_dot = np.zeros(2)
+    verdicts = [watch.ruled(log, 60, MARKERS_LOST, q_dot)]
+    verdicts += [watch.ruled(log, k, WAITING, q_dot) for k in range(61, 67)]
+    np.testing.assert_allclose(q_dot, (WAY[-1] - 0.25) / 0.5)
+    np.testing.assert_array_equal(ways.asked[-1][1], WAY[-1:])
+    assert verdicts == [RUNNING] * 6 + [WAITING if count == 2 else MARKERS_LOST]
+    assert len(followed) == count
+    assert "the face is hidden at the end of the path" in watch.attempts[-1]
