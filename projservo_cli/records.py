@@ -37,6 +37,7 @@ SIZES = {
     "xy": 2,
     "image_row": 3,
     "row": 4,
+    "span": 3,
     "coordinate": 4,
     "axis": 3,
     "own": 3,
@@ -948,6 +949,16 @@ class RunHistory:
         "px",
         "error of each incidence over its deviation at one pixel of noise; none for the whole pose",
         default=None,
+    )
+    feature_s: FloatArray | None = _array(
+        "time incidence span view xy",
+        "px",
+        "images of the points that span each feature of the tool, as the body was measured; NaN beyond the "
+        "one, two or three of a point, line or plane",
+        default=None,
+    )
+    feature_s_star: FloatArray | None = _array(
+        "incidence span view xy", "px", "images of those of the scene, where they were taught", default=None
     )
     incidence_mm: FloatArray | None = _array(
         "incidence",

@@ -16,11 +16,12 @@ from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
-from projservo_cli.report.figures.images import frames_of, near_pixels, with_halo
+from projservo_cli.report.figures.images import OF_SCENE, OF_TOOL, frames_of, near_pixels, with_halo
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
 from projservo_cli.report.figures.scene import (
     displaced,
     edges_of,
+    features_in_space,
     goal_displacement,
     plant_pyramids,
     standing,
@@ -50,10 +51,10 @@ Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}}
 _SEEN, _HIDDEN = style.SKY, style.VERMILION
 _KEY = (
     ("robot, face at the start", style.BLACK),
-    ("face", _SEEN),
+    ("face, features of the tool", _SEEN),
     ("face, hidden from a camera", _HIDDEN),
     ("markers", style.GREY),
-    ("goal, planned path of the {}", style.PURPLE),
+    ("goal, features of the scene, planned path of the {}", style.PURPLE),
     ("driven path of the {}", style.GREEN),
 )
 _CAMERAS_AT = 4  # place of the cameras in this key
@@ -73,6 +74,7 @@ class _Driven(NamedTuple):
     face: FloatArray  # (k, m, 3) in cyclic order
     markers: FloatArray  # (k, p, 3)
     cameras: FloatArray  # (k, V, 5, 3) optical centre and image corners of the viewing pyramids
+    features: FloatArray  # (k, e, 3) line along the features of the tool
 
 
 class _Motion(NamedTuple):
@@ -88,6 +90,7 @@ class _Motion(NamedTuple):
     trees: tuple[
         FloatArray, ...
     ]  # (e, 3) centre of the face along the edges of each search tree, NaN between
+    features: FloatArray  # (e, 3) line along the features of the scene
     runs: Mapping[str, _Driven]
 
 
@@ -105,11 +108,15 @@ def motion_of(
         around = style.closed((face @ displacement.T)[:, :3])
         goal = np.concatenate(at_goal) if plant.model.on_tool else around
     planned = _centers(plant, plan.q[np.isfinite(plan.q).all(axis=1)])
-    runs = {name: _driven(robot, plant, markers, rig, trace) for name, trace in traces.items()}
+    tool, scene = features_in_space(plant, traces) or np.zeros((2, 0, 3, 3))
+    features = displaced(style.outlines(tool), np.asarray(np.linalg.inv(of_face), dtype=np.float64))
+    runs = {name: _driven(robot, plant, (markers, features), rig, trace) for name, trace in traces.items()}
     edges = () if plan.tree_q is None else tree_edges(plan)
     trees = tuple(with_gaps(_centers(plant, q.reshape(-1, q.shape[-1]))) for q in edges)
     cameras = displaced(rig, of_rig)
-    return _Motion(plan.view, plant.model.on_tool, cameras, start, goal, planned, trees, runs)
+    return _Motion(
+        plan.view, plant.model.on_tool, cameras, start, goal, planned, trees, style.outlines(scene), runs
+    )
 
 
 def _sample_times(q: FloatArray) -> IntArray:
@@ -126,12 +133,16 @@ def _sample_times(q: FloatArray) -> IntArray:
     return np.unique(np.minimum(np.searchsorted(done, marks), len(q) - 1))
 
 
-def _driven(robot: SerialArm, plant: Plant, markers: FloatArray, rig: FloatArray, trace: Trace) -> _Driven:
+def _driven(
+    robot: SerialArm, plant: Plant, tool: tuple[FloatArray, FloatArray], rig: FloatArray, trace: Trace
+) -> _Driven:
+    """The run of a trace; ``tool`` are markers (p, 4) and features (e, 3) at the robot's reference, m."""
+    markers, features = tool
     instants, positions = _sample_times(trace.q), []
     for q in trace.q[instants]:
         polyline, H, of_rig = standing(robot, plant, q)
         face, points = ((M @ H.T)[:, :3] for M in (plant.M[plant.order], markers))
-        positions.append((polyline, face, points, displaced(rig, of_rig)))
+        positions.append((polyline, face, points, displaced(rig, of_rig), displaced(features, H)))
     moved = (np.stack(kind) for kind in zip(*positions, strict=True))
     verdict, path = f"{trace.verdict}, {trace.steps} steps", _centers(plant, trace.q)
     return _Driven(
@@ -241,6 +252,7 @@ def _scene(motion: _Motion, reach: Mapping[str, list[float]]) -> dict[str, Any]:
 def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
     """Range of each coordinate that a run keeps to, so that the scene stands still while the robot moves."""
     points = [motion.cameras, motion.start, run.robot, run.markers, run.path, run.cameras, motion.planned]
+    points += [motion.features, run.features]
     points += [*([] if motion.goal is None else [motion.goal]), *motion.trees]
     corners = np.concatenate([part.reshape(-1, 3) for part in points])
     low, high = np.nanmin(corners, axis=0), np.nanmax(corners, axis=0)
@@ -274,6 +286,8 @@ def _still(go: Any, motion: _Motion) -> Iterator[Any]:
     yield _line(go, style.closed(motion.start), "face at the start", style.BLACK, width=3)
     if motion.goal is not None:
         yield _line(go, motion.goal, "goal", style.PURPLE, width=4)
+    if len(motion.features):
+        yield _features(go, motion.features, "features of the scene", style.PURPLE)
     for points, (name, color) in zip(motion.trees, _TREES, strict=False):
         yield _line(go, points, name, color, width=1)
     if len(motion.planned):
@@ -298,7 +312,8 @@ def _moving(go: Any, motion: _Motion, run: _Driven, k: int) -> list[Any]:
     line_style = {"color": color, "flatshading": True, "name": "face", "hoverinfo": "name"}
     face = go.Mesh3d(**_coordinates(run.face[k]), **triangles, **line_style)
     cameras = _cameras(go, motion, run.cameras[k]) if motion.on_tool else ()
-    return [robot, face, _line(go, run.markers[k], "markers", style.GREY), *cameras]
+    features = [_features(go, run.features[k], "features of the tool", _SEEN)] * bool(run.features.size)
+    return [robot, face, _line(go, run.markers[k], "markers", style.GREY), *features, *cameras]
 
 
 def _line(go: Any, points: FloatArray, name: str, color: str, width: float | None = None) -> Any:
@@ -307,6 +322,11 @@ def _line(go: Any, points: FloatArray, name: str, color: str, width: float | Non
     if width is not None:
         line_style = {"mode": "lines", "line": {"color": color, "width": width}}
     return go.Scatter3d(**_coordinates(points), **line_style, name=name, hoverinfo="name")
+
+
+def _features(go: Any, outline: FloatArray, name: str, color: str) -> Any:
+    """Points, lines and planes along an outline."""
+    return _line(go, outline, name, color, width=6).update(mode="lines+markers", marker={"size": 4})
 
 
 def _coordinates(points: FloatArray) -> dict[str, list[float]]:
@@ -381,10 +401,19 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
         for column, (name, run) in zip(axes.T, runs.items(), strict=True):
             for view, (panel, camera) in enumerate(zip(column, run.view, strict=True)):
                 style.start_and_goal(panel, run.s[0, view, order], run.s_star[view, order], fill=False)
+                if run.feature_s_star is not None:
+                    panel.plot(*style.outlines(run.feature_s_star[:, :, view]).T, **OF_SCENE)
                 style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near, margin)
                 panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
                 panel.set_xlabel("u (px)" if view == views - 1 else "")
-            parts = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
+            features = np.zeros((len(run.s), 0, 3, views, 2)) if run.feature_s is None else run.feature_s
+            parts = zip(
+                column,
+                run.s[:, :, order].swapaxes(0, 1),
+                run.self_occluded.T,
+                np.moveaxis(features, 3, 0),
+                strict=True,
+            )
             columns.append([_Panel(*part) for part in parts])
             if (film := films[name]) is not None and run.frame_index is not None:
                 for panel, frames, extent in zip(columns[-1], film, sizes, strict=True):
@@ -410,13 +439,16 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
 
 
 class _Panel:
-    """Moving parts of one image under one law: paths (t, m, 2) and a face, hidden (t,) or not."""
+    """Moving parts of one image under one law: paths (t, m, 2), a face, hidden (t,) or not, and features."""
 
-    def __init__(self, axes: Any, s: FloatArray, hidden: BoolArray) -> None:
-        self.axes, self.s, self.hidden = axes, s, hidden
+    def __init__(self, axes: Any, s: FloatArray, hidden: BoolArray, features: FloatArray) -> None:
+        self.axes, self.s, self.hidden, self.features = axes, s, hidden, features  # (t, g, 3, 2)
         self.behind, self.paths = (
             [axes.plot([], [], **line)[0] for _ in s[0]] for line in (style.HIDDEN, _PATH)
         )
+        over = {"color": style.BLACK, "linewidth": 2.0, "zorder": 4}
+        over["label"] = OF_TOOL["label"] * bool(features.size)
+        (self.outline,) = axes.plot([], [], **OF_TOOL | over)
         (self.face,) = axes.fill([0.0], [0.0], linewidth=1.2, edgecolor=style.BLACK, alpha=0.9, zorder=3)
         place = {"transform": axes.transAxes, "ha": "center", "va": "bottom"}
         self.word = axes.text(0.5, 0.03, "", fontweight="bold", fontsize=8, **place)
@@ -442,6 +474,7 @@ class _Panel:
         for k, (line, behind) in enumerate(zip(self.paths, self.behind, strict=True)):
             line.set_data(*past[:, k].T)
             behind.set_data(*np.where(hidden[:, None], past[:, k], np.nan).T)
+        self.outline.set_data(*style.outlines(self.features[now]).T)
         here = past[-1][np.isfinite(past[-1]).all(axis=1)]
         self.face.set_visible(len(here) > 2)
         if len(here) > 2:

@@ -220,7 +220,7 @@ class FigureSpec:
             filmed = any(trace.frame_index is not None for trace in report_data.traces.values())
             return "" if filmed else "the robot shows no frames"
         if self.incidences and isinstance(report_data, Driven | ReportData):
-            partial = any(trace.incidence_px is not None for trace in report_data.traces.values())
+            partial = any(trace.feature_s is not None for trace in report_data.traces.values())
             return "" if partial else "the goal is a whole pose"
         if isinstance(report_data, Driven):
             return "no model of robot and cameras is known that could be drawn: set robot, rig and markers"

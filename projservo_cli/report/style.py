@@ -321,6 +321,13 @@ def closed(polygon: FloatArray) -> FloatArray:
     return np.concatenate([polygon, polygon[:1]])
 
 
+def outlines(features: FloatArray) -> FloatArray:
+    """One line (k, d) along features that points (g, s, d) span, planes as polygons, NaN between them."""
+    gap = np.full((1, features.shape[-1]), np.nan)
+    parts = [closed(span[np.isfinite(span).all(axis=1)]) for span in features]
+    return np.concatenate([gap[:0], *(part for span in parts for part in (span, gap))])
+
+
 def face(axes: "Axes", corners: FloatArray, line_style: LineStyle, *, fill: bool = False) -> None:
     """Draw a face from its corners (k, 2) in cyclic order; a dot marks the first."""
     loop = closed(corners)

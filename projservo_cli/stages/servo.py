@@ -55,6 +55,7 @@ from projservo_cli.task.body import SETTLED, fit_body, make_body
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.incidences import (
     errors_px,
+    images_of,
     incidences_of,
     metric_errors,
     nearest_goal,
@@ -324,7 +325,10 @@ class LawRun:
                 H[k] = as_array(fit.H)
         taught = images.displacement_taught(model)
         mm, deg = metric_errors(model, images.incidences, task.body.M, (H[-1], taught))
+        flats = [[one.tool for one in images.incidences], [one.scene for one in images.incidences]]
         return {
+            "feature_s": images_of(model, task.body.M, flats[0], H),
+            "feature_s_star": images_of(model, task.body.M, flats[1], taught[None])[0],
             "incidence_mm": MM * mm * self._metre(task.body.M),
             "incidence_deg": deg,
             "incidences": tuple(one.name for one in images.incidences),

@@ -23,7 +23,7 @@ from projservo_cli.geometry.algebra import Mat4, apply, apply_transposed, as_arr
 from projservo_cli.geometry.displacements import twist_exponential
 from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.geometry.kinematics import image_jacobian
+from projservo_cli.geometry.kinematics import image_jacobian, project
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.metric.frame import invariant_upgrade
 from projservo_cli.records import BoolArray, FloatArray, InputError, Model, WorkFailed
@@ -171,6 +171,18 @@ def linearized(incidences: Incidences, H: FloatArray, H_hat: FloatArray) -> tupl
 def points_of(M: FloatArray, flat: Flat) -> FloatArray:
     """Points (k, 4), a_inf·A = 1, that span a feature of markers (m, 4) of the body."""
     return np.array([M[list(numbers)].mean(axis=0) for numbers in flat])
+
+
+def images_of(model: Model, M: FloatArray, flats: Sequence[Flat], H: FloatArray) -> FloatArray:
+    """Images (k, g, 3, V, 2) of the points that span features of markers (m, 4) at displacements (k, 4, 4).
+
+    NaN beyond the points of a feature, and where a displacement is.
+    """
+    points = np.full((len(flats), len(KINDS), 4), math.nan)
+    for spanned, flat in zip(points, flats, strict=True):
+        spanned[: len(flat)] = points_of(M, flat)
+    pixels = project(model.P, np.einsum("kab,gsb->kgsa", H, points), model.lens)
+    return np.ascontiguousarray(np.moveaxis(pixels, 0, -2))
 
 
 def whole_pose(A: FloatArray) -> tuple[Incidence, ...]:

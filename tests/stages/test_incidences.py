@@ -7,6 +7,10 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.report.animation import motion_of
+from projservo_cli.report.figures.scene import features_in_space
+from projservo_cli.report.report_data import REGISTER, Driven
+from projservo_cli.simulation.workspace import plant_of
 from projservo_cli.stages.servo import PluginLaw
 from tests.configured import calibrate, plan, servo, truth_of
 from tests.known import configured
@@ -45,6 +49,33 @@ def test_a_pin_goes_into_its_hole_and_the_rest_stays_free(law):
     assert np.degrees(np.arccos(min(1.0, pin @ along))) < 0.2
     assert trace.incidence_px[0].min() > 50.0 > 0.05 > trace.incidence_px[-1].max()
     assert trace.incidence_mm.max() < 0.1
+
+
+def test_features_of_tool_and_scene_are_drawn_where_they_are():
+    """In space within two millimetres; in the images, the film and the 3D view."""
+    config, calibration, planned = made()
+    trace, truth = servo.run(config, calibration, planned, "exact_track"), truth_of(config)
+    q_start, q_goal = (
+        ends.values(config.joint_types) for ends in (config.task.start, config.task.goal.joints)
+    )
+    plant = plant_of(truth, np.array(q_start), opaque=True)
+    spanned = features_in_space(plant, {"": trace})
+    assert spanned is not None
+    for (pin, tip), q in zip(spanned, (q_start, q_goal), strict=True):
+        there = axis_and_tip(truth, truth.displacement(np.array(q)))
+        np.testing.assert_allclose(pin[:2], there, atol=2e-3)
+        np.testing.assert_allclose(tip[0], there[1], atol=2e-3)
+        assert np.isnan(tip[1:]).all()
+    figure = REGISTER["fig19_incidences"]
+    material = Driven(calibration, None, planned, {"exact_track": trace})
+    assert not figure.lacking(material)
+    drawn = figure.drawn(figure.data(material))
+    assert "1 joint motion free" in drawn.axes[0].get_title()
+    for axes in drawn.axes[: len(trace.view)]:
+        assert sum(line.get_label().startswith("features of the ") for line in axes.lines) == 3
+    motion = motion_of(truth.robot, plant, truth.M, planned, {"exact_track": trace})
+    last = motion.runs["exact_track"].features[-1]
+    assert np.nanmax(np.abs(last - motion.features)) < 2e-3
 
 
 def test_incidences_that_contradict_each_other_are_refused_with_what_is_left_of_them():

@@ -1,6 +1,8 @@
 """Figs. 4, 7 and 11 of [RH00], the overview and frames: paths and errors of the markers in the images."""
 
 import io
+import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +21,9 @@ from projservo_cli.report.report_data import (
     title,
 )
 from projservo_cli.task.face import cyclic_order
+
+if TYPE_CHECKING:
+    from matplotlib.gridspec import GridSpec
 
 _OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
 _NEAR_BORDER = 0.42  # distance from the middle, as a share of the image, from which its border shows
@@ -303,6 +308,9 @@ _HALO = 1.2  # points, by which lines over a frame are wider in white
 _FOUND = style.dots(style.ORANGE, "+", "markers found", markersize=4.0)
 _FACE = style.line(style.GREEN, width=1.2, label="face")
 _DRIVEN = style.line(style.VERMILION, width=0.9, label="path of a marker")
+OF_TOOL = style.line(style.GREEN, width=3.6, marker="o", label="features of the tool")
+OF_SCENE = style.line(style.BLUE, style.DASHED, 1.4, "o", "features of the scene")
+_FAINT_FACE = style.line(style.GREY, width=0.7, label="face at the start and at the end")
 
 
 def frames_of(
@@ -330,15 +338,25 @@ def frames_of(
     return films
 
 
+def _shown_run(report_data: Driven | ReportData, field: str) -> tuple[str, Trace]:
+    """Name and trace of the first direct law, else of the first, of the runs that have an array."""
+    runs = [run for run in report_data.traces.items() if getattr(run[1], field) is not None]
+    return next((run for run in runs if run[0] in BODY_LAWS), runs[0])
+
+
+def _side_by_side(figure: "style.Figure", grid: "GridSpec", row: int, count: int) -> list["style.Axes"]:
+    """So many panels of one width in a row of a grid."""
+    width = grid.ncols // count
+    return [figure.add_subplot(grid[row, k * width : (k + 1) * width]) for k in range(count)]
+
+
 def _data_frames(report_data: Driven | ReportData) -> Data:
     """Frames of three moments, all that was found in them, the path of the face and its goal.
 
-    Of the runs with frames it is that of the first direct law, else the first.
+    The run is one of those with frames.
     """
     order = cyclic_order(report_data.plan.A)
-    filmed = [name for name, trace in report_data.traces.items() if trace.frame_index is not None]
-    name = next((name for name in filmed if name in BODY_LAWS), filmed[0])
-    trace = report_data.traces[name]
+    name, trace = _shown_run(report_data, "frame_index")
     assert trace.frame_index is not None
     assert trace.frame_s is not None
     half = np.abs(trace.image_error[trace.frame_index] - 0.5 * trace.image_error[0])
@@ -352,6 +370,7 @@ def _data_frames(report_data: Driven | ReportData) -> Data:
         "found": trace.frame_s[selected],
         "s": trace.s[:, :, order],
         "s_star": trace.s_star[:, order],
+        **_feature_images(trace, trace.frame_index[selected]),
         **{f"frames_{view}": film for view, film in enumerate(frames)},
         "view": np.array(trace.view),
     }
@@ -389,6 +408,9 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
         style.face(panel, s[-1], _FACE)
         style.face(panel, data["s_star"][view], style.GOAL)
         panel.plot(*data["found"][i, view].T, **_FOUND)
+        if "feature" in data:
+            panel.plot(*style.outlines(data["feature_there"][:, :, view]).T, **OF_SCENE)
+            panel.plot(*style.outlines(data["feature"][i, :, :, view]).T, **OF_TOOL)
         with_halo(panel)
         panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
         seconds = data["instant"][i] * float(data["period_s"])
@@ -399,11 +421,27 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
 
 
 _LEAST_PX = 1e-3  # lowest error that is drawn
+_ERRORS_HEIGHT = 3.2  # inches, of the panels of errors with titles and legend
+_LEAST_ASPECT = 0.55  # height over width of an image of features
+
+
+def _feature_images(trace: Trace, instants: IntArray) -> Data:
+    """Images of the features of the tool at instants (k,) and of those of the scene; none for a pose."""
+    if trace.feature_s is None or trace.feature_s_star is None:
+        return {}
+    return {"feature": trace.feature_s[instants], "feature_there": trace.feature_s_star}
 
 
 def _data_incidences(report_data: ReportData | Driven) -> Data:
-    """Error of each incidence over time, in each run."""
-    result: Data = {}
+    """Images of features at both ends of a run, and the error of each incidence over time in all runs."""
+    name, shown = _shown_run(report_data, "feature_s")
+    result: Data = {
+        "run": np.array(title(name)),
+        "free_dof": np.array(-1 if shown.free_dof is None else shown.free_dof),
+        "face": shown.s[[0, -1]][:, :, cyclic_order(report_data.plan.A)],
+        "view": np.array(shown.view),
+        **_feature_images(shown, np.array([0, -1])),
+    }
     for name, trace in report_data.traces.items():
         if trace.incidence_px is not None:
             result["incidence"] = np.array(trace.incidences)
@@ -414,16 +452,39 @@ def _data_incidences(report_data: ReportData | Driven) -> Data:
 
 @registered(
     "fig19_incidences",
-    "Errors of the incidences",
+    "Incidences in the images, and their errors",
     "no figure",
     _data_incidences,
-    height=3.2,
     incidences=True,
-    alt="A panel for each incidence: its error over time on a logarithmic scale, a curve for each run.",
+    alt="Above, for each camera: the features of the tool at the start and at the end of a run, and those of "
+    "the scene. Below, for each incidence: its error over time on a logarithmic scale, a curve for each run.",
 )
 def _draw_incidences(data: Data, figure: "style.Figure") -> None:
-    """A panel for each incidence, a curve for each run."""
-    panels = figure.subplots(1, len(data["incidence"]), sharey=True, squeeze=False)[0]
+    """Above a panel for each camera, below one for each incidence with a curve for each run."""
+    names, count, free = data["view"], len(data["incidence"]), int(data["free_dof"])
+    pixels = [
+        np.concatenate([part.reshape(-1, 2) for part in (face, tool, data["feature_there"][:, :, view])])
+        for view, (face, tool) in enumerate(
+            zip(data["face"].swapaxes(0, 1), np.moveaxis(data["feature"], 3, 0), strict=True)
+        )
+    ]
+    height = _panel_width(len(names)) * style.aspect(np.concatenate(pixels), _LEAST_ASPECT)
+    figure.set_figheight(height + _ERRORS_HEIGHT)
+    grid = figure.add_gridspec(2, math.lcm(len(names), count), height_ratios=(height, _ERRORS_HEIGHT - 1.1))
+    images = _side_by_side(figure, grid, 0, len(names))
+    for view, (panel, name) in enumerate(zip(images, names, strict=True)):
+        for face in data["face"][:, view]:
+            style.face(panel, face, _FAINT_FACE)
+        start, end = data["feature"][:, :, :, view]
+        panel.plot(
+            *style.outlines(start).T, **OF_TOOL | style.START | {"label": "features of the tool at the start"}
+        )
+        panel.plot(*style.outlines(end).T, **OF_TOOL)
+        panel.plot(*style.outlines(data["feature_there"][:, :, view]).T, **OF_SCENE)
+        run = f"{data['run']}, " if not view else ""
+        left = f"{free or 'no'} joint motion{'s' * (free != 1)} free" if not view and free >= 0 else ""
+        style.image_axes(panel, f"{name} camera" if view else f"{run}{left}\n{name} camera", pixels[view])
+    panels = _side_by_side(figure, grid, 1, count)
     runs = [name.removeprefix("px_") for name in data if name.startswith("px_")]
     for k, (panel, incidence) in enumerate(zip(panels, data["incidence"], strict=True)):
         for i, name in enumerate(runs):
@@ -434,5 +495,6 @@ def _draw_incidences(data: Data, figure: "style.Figure") -> None:
             )
         style.log_scale(panel)
         panel.set(title=str(incidence), xlabel="time (s)")
+        panel.sharey(panels[0])
     panels[0].set_ylabel("error (px at one px of noise)")
     style.legend_below(figure, 4)

@@ -10,6 +10,7 @@ from scipy.special import chdtri
 
 from projservo_cli.geometry.displacements import homogeneous, twists
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.geometry.lens import undistort
 from projservo_cli.image_size import image_corners
 from projservo_cli.metric.frame import Metric, links
 from projservo_cli.records import MM, TOOL, BoolArray, FloatArray, Trace, WorkFailed
@@ -25,6 +26,8 @@ _GOAL = style.line(style.PURPLE, (0, (3, 1)), 1.6, label="face at the goal")  # 
 _AT_GOAL = style.line(style.PURPLE, width=1.2, marker="o", markersize=3, label="robot at the goal", alpha=0.6)
 _RIG_AT_GOAL = style.line(style.PURPLE, width=0.8, label="cameras at the goal")
 _FACE = "face at the start", "face"  # of cameras that stand still, and of those on the tool
+_FEATURES = style.line(style.BLACK, width=1.4, marker=".", markersize=5, label="features of the tool")
+_SCENE_FEATURES = style.line(style.PURPLE, width=1.4, marker=".", markersize=5, label="features of the scene")
 _ROLL_AXIS = style.line(style.GREEN, style.DASH_DOTTED, 0.9, label="roll axis of the rig")
 _LINE = style.line(style.GREY, style.DOTTED, label="straight line of the centre")
 
@@ -53,6 +56,8 @@ def _data(report_data: ReportData) -> Data:
         result["face_goal"] = (face @ goal.T)[:, :3]
         centers = [center_of(plant.M @ H.T, plant.center)[:3] for H in (start, goal)]
         result["line"] = np.array(centers)
+    if (spanned := features_in_space(plant, report_data.traces)) is not None:
+        result["features_start"], result["features_scene"] = map(style.outlines, spanned)
     return result
 
 
@@ -78,6 +83,31 @@ def goal_displacement(robot: SerialArm, traces: Mapping[str, Trace]) -> FloatArr
     poses = (trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all())
     pose = next(poses, None)
     return None if pose is None else np.asarray(pose @ np.linalg.inv(robot.base_tool))
+
+
+def features_in_space(plant: Plant, traces: Mapping[str, Trace]) -> tuple[FloatArray, FloatArray] | None:
+    """Points (g, 3, 3) that span features of the tool at the start and of the scene, m, NaN beyond.
+
+    They are where the true cameras see what was measured; None of a whole pose, by one camera, and of
+    cameras that move.
+    """
+    shown = next((trace for trace in traces.values() if trace.feature_s is not None), None)
+    if (
+        shown is None
+        or shown.feature_s is None
+        or shown.feature_s_star is None
+        or len(plant.model.P) < 2
+        or plant.model.on_tool
+    ):
+        return None
+    pixels = np.stack([shown.feature_s[0], shown.feature_s_star])
+    straight = undistort(plant.model.lens, np.moveaxis(pixels, -2, 0).reshape(len(plant.model.P), -1, 2))
+    points = np.full((straight.shape[1], 3), np.nan)
+    for k in np.flatnonzero(np.isfinite(straight).all(axis=(0, 2))):
+        rows = straight[:, k, :, None] * plant.model.P[:, 2:] - plant.model.P[:, :2]
+        points[k] = np.linalg.lstsq(rows[..., :3].reshape(-1, 3), -rows[..., 3].ravel())[0]
+    tool, scene = points.reshape(*pixels.shape[:3], 3)
+    return tool, scene
 
 
 def skeleton(H_hat: FloatArray, prismatic: BoolArray, tool: FloatArray) -> FloatArray:
@@ -146,6 +176,10 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         axes.plot(*style.closed(data["face_goal"]).T, **_GOAL)
         axes.plot(*data["line"].T, **_LINE)
         visible.append(data["face_goal"])
+    for name, line in (("features_start", _FEATURES), ("features_scene", _SCENE_FEATURES)):
+        if name in data:
+            axes.plot(*data[name].T, **line)
+            visible.append(data[name][np.isfinite(data[name]).all(axis=1)])
     _show(axes, figure, data["pyramids"], np.concatenate(visible))
 
 
