@@ -267,7 +267,7 @@ class Trajectory(Section):
         0.9,
         gt=0,
         le=1,
-        description="maximum translation ahead of the rotation, as a fraction of that at which "
+        description="maximum translation or rotation ahead of the other, as a fraction of that at which "
         "visibility changes",
     )
     n_samples: StrictInt = Field(101, ge=2, le=100_001, description="number of stored points of the path")

@@ -76,10 +76,12 @@ def coupled(reaching: Reaching, trajectory: Trajectory) -> Found:
     return Found(judged, motion, _timed(sigma * duration(judged), sigma, trajectory), feasible, reason)
 
 
-def by_profile(profile: str, reaching: Reaching, trajectory: Trajectory, pure_translation: float) -> Found:
-    """Shares of a profile of the paper; ``pure_translation`` of the translation at most before a rotation."""
+def by_profile(
+    profile: str, reaching: Reaching, trajectory: Trajectory, pure: tuple[float, float] = (1.0, 1.0)
+) -> Found:
+    """Shares of a profile of the paper; ``pure`` of translation and rotation at most before the other."""
     sigma = np.linspace(0.0, 1.0, trajectory.n_samples)
-    motion = along_shares(reaching, profile_shares(profile, sigma, pure_translation))
+    motion = along_shares(reaching, profile_shares(profile, sigma, pure))
     speed = reaching.demands.limits.speed
     shortest = minimum_time(speed, motion.along.q) if np.isfinite(speed).any() else np.nan * sigma
     time = _timed(shortest, sigma, trajectory)
@@ -213,7 +215,7 @@ def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: J
     )
     path = find_path(c, target, reaching.q_start, search.goal_joints, how)
     if path.timing is None:
-        linear = by_profile("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
+        linear = by_profile("linear", reaching, trajectory.model_copy(update={"duration_s": None}))
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.n_samples, np.nan)
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)

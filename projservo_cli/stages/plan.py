@@ -324,9 +324,9 @@ def _found(
     task: Task,
     trajectory: Trajectory,
     search: JointSearch | None,
-    tau_limit: float,
+    pure: tuple[float, float],
 ) -> Found:
-    """The motion of one profile; ``tau_limit`` of the translation at most before a rotation."""
+    """The motion of one profile; ``pure`` shares of translation and rotation at most before the other."""
     profile = trajectory.profile
     if profile == "joint_space":
         shut = why_closed(reaching.model, reaching.demands, search)
@@ -336,8 +336,7 @@ def _found(
     if profile == "constrained":
         found = coupled(reaching, trajectory)
     else:
-        tau = float(reaching.amplitudes[0])
-        found = by_profile(profile, reaching, trajectory, tau_limit / tau if tau > 0.0 else 1.0)
+        found = by_profile(profile, reaching, trajectory, pure)
     if trajectory.keep_out and found.feasible:
         found = kept_out(found, task, trajectory, NO_SPREAD if search is None else search.spread)
     return found
@@ -370,7 +369,12 @@ def _planned(
         q_start=images.q_start,
         body=body,
     )
-    found = _found(reaching, task, trajectory, search, tau_limit)
+    theta_limit = trajectory.visibility_fraction * _first_change(theta_0, parts.theta_r)
+    pure_t, pure_r = (
+        limit / abs(whole) if whole else 1.0
+        for limit, whole in ((tau_limit, parts.tau), (theta_limit, parts.theta_r))
+    )
+    found = _found(reaching, task, trajectory, search, (pure_t, pure_r))
     motion, along, time, path = found.motion, found.motion.along, found.time, found.path
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
     if len(images.q_start) < COORDINATES and path is None:
@@ -434,6 +438,12 @@ def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, 
         np.array([math.nan if t is None else t for t in tau_0]),
         np.array([(math.nan, math.nan) if t is None else t for t in theta_0]),
     )
+
+
+def _first_change(theta_0: FloatArray, theta_r: float) -> float:
+    """Least turn, rad, in the sense of θ_r to an angle of θ_0 (V, 2); infinite if none changes visibility."""
+    turns = np.remainder(math.copysign(1.0, theta_r) * theta_0, 2.0 * math.pi)
+    return float(np.nanmin(turns, initial=math.inf))
 
 
 def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:

@@ -16,17 +16,17 @@ _PLATEAU = 0.5
 PROFILES = ("linear", "exponential", "rotation_first", "translation_first", "planar_first")
 
 
-def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.0) -> FloatArray:
+def profile_shares(profile: str, sigma: FloatArray, pure: tuple[float, float] = (1.0, 1.0)) -> FloatArray:
     """Shares μ_t, μ_r, μ_p of the parts along the path, [RH00] eq. (18) and section 4.3.
 
     The exponential profile (1 − exp(−kσ)) / (1 − exp(−k)), k = 5, is the paper's 1 − exp(−σ/t_*)
     scaled to reach 1. A profile with a part first completes it in the first half of the path, before the
-    others start. A translation first goes as far as the unturned face stays visible, and completes while the
-    face turns.
+    others start. A translation first goes as far as the unturned face stays visible, a rotation first as far
+    as the face stays visible at its place, and either completes while the other runs.
 
     profile : one of ``PROFILES``.
     sigma : (k,) path parameter in [0, 1].
-    pure_translation : maximum share of the translation before any rotation, δ τ_0 / τ.
+    pure : maximum shares of translation, δ τ_0 / τ, and rotation, δ θ_0 / θ_r, before the other begins.
     Returns (k, 3) shares, each monotone from 0 to 1. Raises ValueError if the profile is unknown.
     """
     if profile not in PROFILES:
@@ -36,11 +36,11 @@ def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.
         return np.stack([share, share, share], axis=1)
     first = np.minimum(sigma / _PLATEAU, 1.0)
     second = np.maximum((sigma - _PLATEAU) / (1.0 - _PLATEAU), 0.0)
-    share = min(1.0, pure_translation)
+    alone_t, alone_r = (share * first + (1.0 - share) * second for share in np.minimum(1.0, pure))
     t, r, p = {
         "linear": (sigma, sigma, sigma),
-        "rotation_first": (second, first, sigma),
-        "translation_first": (share * first + (1.0 - share) * second, second, sigma),
+        "rotation_first": (second, alone_r, sigma),
+        "translation_first": (alone_t, second, sigma),
         "planar_first": (second, second, first),
     }[profile]
     return np.stack([t, r, p], axis=1)

@@ -27,6 +27,12 @@ def test_planned_images_lead_from_start_to_goal(name, profile):
         assert s == pytest.approx(pixels(example.truth.P, plan.A @ H.T), abs=1e-8)
 
 
+@pytest.mark.parametrize("profile", ["translation_first", "rotation_first"])
+def test_what_comes_first_waits_for_the_other_where_visibility_would_change(profile):
+    example = case("coupled")
+    assert example.planned(example.truth.model, profile).feasible
+
+
 @pytest.mark.parametrize("name", ["paper", "ur5", "stanford"])
 def test_margin_is_the_true_distance_of_camera_and_face(name):
     """From the points of the face along the path, in plain metres, relative to the start."""

@@ -1,13 +1,9 @@
-"""Profiles μ(σ) and the displacement they plan."""
-
-import math
+"""Profiles μ(σ)."""
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 
-from projservo_cli.task.trajectory import PROFILES, profile_shares, trajectory_displacement
-from tests.samples import frame, prismatic, revolute
+from projservo_cli.task.trajectory import PROFILES, profile_shares
 
 SIGMA = np.linspace(0, 1, 201)
 
@@ -32,20 +28,10 @@ def test_what_comes_first_is_done_before_the_rest_begins(profile, first, later):
     assert 0 < done <= begun < 200
 
 
-def test_linear_and_exponential():
-    assert profile_shares("linear", SIGMA) == pytest.approx(np.stack([SIGMA] * 3, axis=1), abs=0)
-    mu = profile_shares("exponential", SIGMA)[:, 0]
-    # What is left decays by a constant factor once its end, exp(−k), is added again: k = 5.
-    left = 1 - mu * (1 - math.exp(-5))
-    assert left[1:] / left[:-1] == pytest.approx(math.exp(-5 / 200) * np.ones(200), abs=1e-13)
-
-
-def test_planned_displacement_is_the_product_in_the_order_of_the_paper():
-    G = frame(4)
-    H_hat = np.array(
-        [G @ H @ np.linalg.inv(G) for H in (prismatic([1, 2, 3]), revolute([0, 0, 1], [1, 0, 0]),
-                                            revolute([0, 0, 1], [0, 0, 1]))]
-    )  # fmt: skip
-    planned = trajectory_displacement(H_hat, (0.4, 1.2, -2.0), np.array([0.5, 0.25, 1.0]))
-    wanted = expm(0.2 * H_hat[0]) @ expm(0.3 * H_hat[1]) @ expm(-2.0 * H_hat[2])
-    assert planned == pytest.approx(wanted, abs=1e-12)
+@pytest.mark.parametrize(("profile", "part"), [("translation_first", 0), ("rotation_first", 1)])
+def test_what_comes_first_waits_where_visibility_would_change(profile, part):
+    mu = profile_shares(profile, SIGMA, (0.7, 0.3))
+    alone = mu[mu[:, 1 - part] == 0, part]
+    assert alone.max() == pytest.approx((0.7, 0.3)[part])
+    assert (np.diff(mu, axis=0) >= 0).all()
+    assert mu[-1] == pytest.approx(np.ones(3), abs=1e-15)
