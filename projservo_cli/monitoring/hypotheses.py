@@ -196,6 +196,8 @@ class Evidence:
             q = away + self.q_reference
             pairs.append(pair._replace(q=q, images=images, noise=noise))
         residuals = [self._errors.residual(pair) for pair in pairs]
+        if any((there.seen != seen).any() for there, seen in zip(residuals, self.seen, strict=True)):
+            return fit  # a point behind a camera has no prediction: there is no state to go back to
         there = Evidence(self._errors, pairs, residuals, self._weights, self._agreed)
         left, theta = there.before, fit.theta
         if theta.size:

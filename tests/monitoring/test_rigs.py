@@ -11,9 +11,10 @@ from scipy.linalg import expm
 from projservo_cli.calibration import calibrate, prediction
 from projservo_cli.monitoring import innovation_tests
 from projservo_cli.monitoring.accuracy import Posture, resting_error_mm, rigid_fit
-from projservo_cli.monitoring.frame_pairs import Frame, Pairing
+from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
+from projservo_cli.monitoring.hypotheses import Evidence, causes_of
 from projservo_cli.monitoring.image_monitor import ImageMonitor, detected_fault
-from tests.calibration.simulated_robot import around, random_robot, trials
+from tests.calibration.simulated_robot import around, random_robot, revolute, trials
 from tests.calibration.test_cameras_on_the_tool import Hand
 from tests.monitoring.test_image_monitor import LOOKS, PERIOD, Arm, first_alarm, look, noisy
 
@@ -87,6 +88,24 @@ def test_a_joint_that_slips_is_named_as_a_joint(case, joint):
     assert abs(float(found[1])) == pytest.approx(15.0 if found[2] == "mm" else 3.0, rel=0.1)
     assert "was moved" not in said
     assert "; or" not in said
+
+
+def test_a_joint_of_the_other_sign_that_puts_all_markers_behind_the_camera_explains_nothing():
+    """The camera stands on the axis of the first joint, whose readings are near a quarter of a turn."""
+    rng = np.random.default_rng(3)
+    robot = random_robot("RRRRR", rng, markers=8, views=1)
+    center = np.linalg.svd(robot.cameras[0])[2][-1]
+    center = center[:3] / center[3]  # it looks at the origin
+    robot.twists[0] = revolute(center, np.cross(center, rng.standard_normal(3)))
+    robot.q_reference[0] = 0.5 * np.pi
+    seen = robot.observe(np.concatenate([trials(robot, frames=6), around(robot, 16, rng)]), 0.5, rng)
+    found = calibrate(seen, robot.joint_types, source="recorded")
+    errors, noise = innovation_tests.ErrorModel(found, 0.5), np.full((1, 8), 0.5)
+    pair = FramePair.at_rest(robot.q_reference, robot.images(robot.q_reference[None])[0] + 3.0, noise)
+    evidence = Evidence(errors, [pair], [errors.residual(pair)], np.ones(1), errors.nothing())
+    fits = evidence.explanations(causes_of(evidence, found.marker, None))
+    (mirrored,) = (fit for fit in fits if (fit.cause.kind, fit.cause.which) == ("mirrored", 0))
+    assert mirrored.gain < 0.0
 
 
 def change(case, **parts):
