@@ -160,8 +160,9 @@ def record(
         if robot is not None:
             assert given.trials.driven is not None
             assert given.own is not None
-            bounds = given.trials.driven.following.bounds(joints)
-            driven = plugin_robot(given.own, bounds, joints.types, made.marker.tolist(), robot)
+            how = given.trials.driven
+            bounds, numbers = how.following.bounds(joints), made.marker.tolist()
+            driven = plugin_robot(given.own, bounds, joints.types, numbers, robot, further=how.further)
         recording.record_poses(given, made, driven, kept=table is not None, progress=listener.progress)
     return Observations.of(
         made.observation(),

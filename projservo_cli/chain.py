@@ -133,8 +133,8 @@ class Chain:
         with self._compiling():
             for done, step in enumerate(steps):
                 self.listener.progress("results", done, len(steps))
-                if step is motion and self.confirm:
-                    self.listener.confirm("servo", self.config.plant)
+                if step is motion and not self._may_move(step):
+                    return
                 if step.why:
                     self._make_result(step)
                 if step.law and not self.failed:
@@ -147,6 +147,26 @@ class Chain:
         text = stored_yaml(self.config)
         if self.run.configuration != text:  # overrides are stored also where nothing had to be made
             self._keep(replace(self.run, configuration=text))
+
+    def _may_move(self, step: Step) -> bool:
+        """Tell where the object of a carried goal is, and whether a robot may go there, perhaps after asking.
+
+        Simulated or not: one that has moved too far is refused where nobody is asked.
+        """
+        record = step.record or inputs_of("servo", self.config)
+        if (carrier := record.plan.carrier) is not None:
+            from projservo_cli.stages.objects import too_far
+
+            plan = self.run.plan
+            self.listener.say(plan.object_words)
+            if (why := too_far(plan, carrier)) and not self.confirm:
+                self.failed, self.reason = step.name, why
+                return False
+            if why:
+                self.listener.say(why)
+        if self.confirm:
+            self.listener.confirm("servo", self.config.plant)
+        return True
 
     def reported(self, run: Run | None = None) -> Run:
         """Return the results that a report of the named runs of laws needs.

@@ -787,7 +787,69 @@ class JointSpaceSearch:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Plan(JointSpaceSearch, TaskPartition, PlannedMotion):
+class CarriedByObject:
+    """Object that the goal was taught on, where it is now, and the goal carried along; none without one."""
+
+    object_name: str | None = _scalar(about="name of the object that carries the goal", default=None)
+    object_shift_mm: float | None = _scalar(
+        "mm", "motion of its middle since the goal was taught; none if no length is known", default=None
+    )
+    object_angle_deg: float | None = _scalar(
+        "deg", "its rotation since; none if the joints do not determine the metric", default=None
+    )
+    object_shift_px: float | None = _scalar(
+        "px", "motion of its images since, rms per marker and view", default=None
+    )
+    goal_deviation_mm: float | None = _scalar(
+        "mm", "deviation of the carried goal, rms; none if no length is known", default=None
+    )
+    goal_deviation_deg: float | None = _scalar(
+        "deg", "deviation of its rotation; none if the joints do not determine the metric", default=None
+    )
+    goal_deviation_px: float | None = _scalar(
+        "px", "deviation of its images, rms per marker and view", default=None
+    )
+    object_marker: IntArray | None = _array(
+        "object_marker", about="numbers of the markers of the object", default=None
+    )
+    s_object: FloatArray | None = _array(
+        "view object_marker xy", "px", "images of these when it was planned, NaN if unseen", default=None
+    )
+    s_carried: FloatArray | None = _array(
+        "view observed xy", "px", "images of all markers of the body at the carried goal", default=None
+    )
+
+    @property
+    def object_words(self) -> str:
+        """How far the object has moved and how well its goal is known, in words; empty without one."""
+        if self.object_name is None:
+            return ""
+        shift = [
+            f"{number:.3g} {unit}"
+            for number, unit in (
+                (self.object_shift_mm, "mm"),
+                (self.object_angle_deg, "deg"),
+                (self.object_shift_px, "px"),
+            )
+            if number is not None
+        ]
+        known = [
+            f"{number:.2g} {unit}"
+            for number, unit in (
+                (self.goal_deviation_mm, "mm"),
+                (self.goal_deviation_deg, "deg"),
+                (self.goal_deviation_px, "px"),
+            )
+            if number is not None
+        ]
+        return (
+            f"{self.object_name} has moved by {' and '.join(shift[:-1]) or shift[-1]} since the goal was "
+            f"taught; the goal is known to {', '.join(known[:-1]) or known[-1]}"
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plan(CarriedByObject, JointSpaceSearch, TaskPartition, PlannedMotion):
     """A reaching task as a translation and two rotations, and the motion planned for it.
 
     Everything comes from the calibration and the start and goal images. Amplitudes are per view

@@ -74,7 +74,7 @@ def _canonical(value: Any) -> Any:
         return {"file": value.sha256}
     if isinstance(value, np.ndarray):
         return {"array": [value.dtype.str, value.shape, value.tobytes().hex()]}
-    if fields := _fields(value):
+    if (fields := _fields(value)) or hasattr(type(value), "model_fields"):
         kind = f"{type(value).__module__}:{type(value).__qualname__}"
         return {kind: {name: _canonical(inner) for name, inner in fields.items()}}
     if isinstance(value, dict):

@@ -308,6 +308,8 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
 
     feasible = "feasible" if value["feasible"] else "NOT feasible"
     yield wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}")
+    for one in value["objects"].values():
+        yield wrapped(one["reason"], "  ")
     profiles = [text if detailed else ": ".join(text.split(": ")[:2]) for text in value["rejected_profiles"]]
     if profiles:
         yield wrapped("; ".join(f"not {text}" for text in profiles), "  ")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.config.loading import Config, stored_yaml
+from projservo_cli.config.whole import carrier_of
 from projservo_cli.control.law import Gains
 from projservo_cli.detection import Board
 from projservo_cli.display import About
@@ -22,6 +23,7 @@ from projservo_cli.result_hashes import File
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
 from projservo_cli.settings.features import incidence_of
+from projservo_cli.settings.objects import ObjectSettings
 from projservo_cli.simulation.described import (
     arm_of,
     cameras_of,
@@ -32,9 +34,10 @@ from projservo_cli.simulation.described import (
 from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.simulation.rendering import RenderedScene
-from projservo_cli.simulation.workspace import Truth
+from projservo_cli.simulation.workspace import SceneObject, Truth
 from projservo_cli.stages.stage_inputs import (
     CalibrationInputs,
+    Carrier,
     Contract,
     Drive,
     Estimation,
@@ -126,7 +129,7 @@ def teach_inputs(config: Config) -> TeachInputs:
     """Return the inputs of teaching a pose."""
     numbers = _numbers(config, "teach")
     _require_one_numbering(config, "teach")
-    driven = _drive(config, truth_of(config) if config.plant.simulated else None)
+    driven = _drive(config, truth_of(config) if config.plant.simulated else None, shows=True)
     noise, settle_s = config.noise.servo_px, config.plant.settle_s
     return TeachInputs(driven, joints_of(config), numbers, noise, settle_s, config.seed)
 
@@ -209,7 +212,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         arm=None if config.arm is None else arm_of(config.arm),
         P=None if config.rig is None else cameras_of(config.rig),
         mount=config.mount,
-        scene=scene_of(config, files) if simulated else None,
+        scene=scene_of(config, files, config.objects.named) if simulated else None,
         face=face,
         center=center_in_face(markers),
         known=markers.known,
@@ -222,6 +225,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         tests_images=config.stop.innovation_threshold > 0.0,
         trajectory=config.trajectory,
         incidences=tuple(incidence_of(pair, config.features) for pair in pairs),
+        carrier=_carrier(config, files),
     )
 
 
@@ -258,12 +262,40 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
     )
 
 
+def _carrier(config: Config, files: Files | None) -> Carrier | None:
+    """Return the object that the goal is carried by; None for a goal that stands still."""
+    name, rendered = carrier_of(config.task, config.features), config.plant.rendered is not None
+    if name is None or config.task is None:
+        return None
+    simulated = config.plant.simulated
+    return Carrier(
+        name=name,
+        numbers=config.objects.named[name].numbers,
+        taught=config.task.goal.objects.of(name),
+        placed=next((one for one in objects_of(config) if one.name == name), None) if simulated else None,
+        at_first=scene_of(config, files, dict.fromkeys(config.objects.named)) if rendered else None,
+        driven=None if simulated else _drive(config, None, files),
+        lengths=_known_lengths(config),
+        limits=config.objects,
+    )
+
+
+def objects_of(config: Config) -> tuple[SceneObject, ...]:
+    """Objects of the simulated scene; those without places are left out."""
+    named = config.objects.named.items()
+    return tuple(
+        SceneObject(name, one.numbers, one.points, one.normals, one.moved)
+        for name, one in named
+        if one.points is not None
+    )
+
+
 def _contract(config: Config, plan: PlanInputs, files: Files | None) -> Contract | None:
     """Return the settings of a robot of the contract; None for the ideal plant."""
     plant = config.plant
     if plant.use is None and config.disturbance == Disturbance():
         return None
-    driven = _drive(config, plan.truth, files)
+    driven = _drive(config, plan.truth, files, shows=True)
     settle_s = plant.settle_s if plan.truth is None else None
     table = config.data.table if config.data is not None and plan.truth is None else ""
     identity = identity_in(table) if table and Path(table).is_file() else ""
@@ -386,15 +418,26 @@ def _truth(config: Config, *, face: bool) -> Truth:
     return described_truth(config.arm, config.rig, markers, k1, face)
 
 
-def scene_of(config: Config, files: Files | None = None) -> RenderedScene | None:
-    """Return the scene of rendered cameras; None for cameras that see points."""
+def scene_of(
+    config: Config, files: Files | None = None, objects: Mapping[str, ObjectSettings | None] | None = None
+) -> RenderedScene | None:
+    """Return the scene of rendered cameras; None for cameras that see points.
+
+    objects : those that stand in it; with None in place of their sections, where goals were taught.
+    """
     options = config.plant.rendered
     if options is None:
         return None
     assert config.arm is not None
     assert config.rig is not None
     assert config.markers is not None
-    return described_scene(config.arm, config.rig, config.markers, options, _file(config, "mjcf", files))
+    tags = [
+        tag.at(np.eye(4) if now is None else now.moved)
+        for name, now in (objects or {}).items()
+        for tag in config.objects.named[name].placed
+    ]
+    mjcf = _file(config, "mjcf", files)
+    return described_scene(config.arm, config.rig, config.markers, options, mjcf, tuple(tags))
 
 
 # What drives.
@@ -424,16 +467,23 @@ def joints_of(config: Config, *, paced: bool = True) -> JointSettings:
 
 
 def _drive(
-    config: Config, truth: Truth | None, files: Files | None = None, speed_scale: float | None = None
+    config: Config,
+    truth: Truth | None,
+    files: Files | None = None,
+    speed_scale: float | None = None,
+    *,
+    shows: bool = False,
 ) -> Drive:
     """Return how a robot of the contract is driven: the simulated one of a truth, else somebody's.
 
+    shows : whether cameras of a simulated one show objects, as those of somebody's do.
     speed_scale : factor of every command; None for that of the configuration.
     """
-    plant, period, robot = config.plant, config.control.period_s, None
+    plant, period, robot, objects = config.plant, config.control.period_s, None, config.objects.named
+    further = tuple(number for one in objects.values() for number in one.numbers)
     if truth is not None:
-        faults, scene = config.disturbance.part(Faults), scene_of(config, files)
-        robot = SimulatedRobot(truth, faults, scene, period)
+        faults, scene = config.disturbance.part(Faults), scene_of(config, files, objects if shows else None)
+        robot = SimulatedRobot(truth, faults, scene, period, objects_of(config) if shows else ())
     following = Following(
         period,
         plant.speed_scale if speed_scale is None else speed_scale,
@@ -441,7 +491,8 @@ def _drive(
         plant.max_steady_state_error_deg,
         plant.max_relative_target_deg,
     )
-    return Drive(robot or _own(config), following, plant.simulated and plant.joint_limits == "report")
+    endless, seen = plant.simulated and plant.joint_limits == "report", truth is None or shows
+    return Drive(robot or _own(config), following, endless, further if seen else ())
 
 
 def _own(config: Config) -> OwnRobot:

@@ -18,6 +18,7 @@ from projservo_cli.settings.control import RENDERED, Control, PlantSettings, Rep
 from projservo_cli.settings.disturbance import Disturbance
 from projservo_cli.settings.features import Feature, Name, misplaced
 from projservo_cli.settings.markers import Markers
+from projservo_cli.settings.objects import WORLD_AND_TOOL, Objects
 from projservo_cli.settings.robot import Rig, RobotSettings, like_degrees
 from projservo_cli.settings.sections import Finding, JointVector, Root, Whole
 from projservo_cli.settings.task import TaskSettings, Trajectory, sigma_key
@@ -141,6 +142,59 @@ def _incidences(
         yield ("control", "features"), "incidences are measured with the body: leave points out"
 
 
+def _objects(
+    objects: Objects, markers: Markers | None, rig: Rig | None, data: Data | None, plant: PlantSettings
+) -> Iterator[Finding]:
+    """Objects before cameras on the tool, with markers of the tool, or nowhere in a simulation."""
+    if objects.named and TOOL in (rig and rig.mount, data and data.mount):
+        yield ("objects",), "cameras on the tool see the scene that the goal is on: its images carry the goal"
+    for name, one in objects.named.items():
+        for number in (n for n in one.numbers if markers is not None and n in (markers.known or ())):
+            yield ("objects", name), f"marker {number} is on the tool: an object has markers of its own"
+            break
+        if plant.use == RENDERED and not one.placed:
+            yield ("objects", name), "plant mujoco shows tags: give number, size_m and pose of each"
+        elif plant.simulated and data is None and one.points is None:
+            yield ("objects", name), "is nowhere: give size_m and pose of its tags, or positions_m"
+
+
+def carrier_of(task: TaskSettings | None, features: Mapping[str, Feature]) -> str | None:
+    """Name of the object that a goal was taught on; None for a goal that stands still."""
+    if task is None or task.goal.on is not None:
+        return None if task is None else task.goal.on
+    on = {features[pair[1]].on for pair in task.goal.incidences if pair[1] in features}
+    return next(iter(sorted(on - {*WORLD_AND_TOOL})), None)
+
+
+def _carried(
+    objects: Objects, features: Mapping[str, Feature], task: TaskSettings | None, plant: PlantSettings
+) -> Iterator[Finding]:
+    """Objects that are none, a goal that would be torn, and one of which nobody saw the object."""
+    known = f"objects: {', '.join(objects.named) or 'none'}"
+    for name, feature in features.items():
+        if feature.on not in (*WORLD_AND_TOOL, *objects.named):
+            yield ("features", name, "on"), f"there is no object {feature.on}; {known}"
+    carrier = carrier_of(task, features)
+    if task is None or carrier is None:
+        return
+    if carrier not in objects.named:
+        if task.goal.on is not None:
+            yield ("task", "goal", "on"), f"there is no object {carrier}; {known}"
+        return
+    for i, pair in enumerate(task.goal.incidences):
+        if pair[1] in features and (on := features[pair[1]].on) != carrier:
+            yield (
+                ("task", "goal", "incidences", i),
+                f"{pair[1]} is on {on}, and the goal on {carrier}, which carries all of it: put {pair[1]} on "
+                f"{carrier}",
+            )
+    shown = task.goal.objects.of(carrier)
+    if shown is None and (task.goal.images is not None or not plant.simulated):
+        yield ("task", "goal"), f"does not show where {carrier} was: teach it again, projservo teach"
+    elif shown is not None and {*(shown.markers or ())} - {*objects.named[carrier].numbers}:
+        yield ("task", "goal", "objects", carrier), f"has markers that are not of {carrier}: teach it again"
+
+
 def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator[Finding]:
     if not plant.simulated and disturbance != Disturbance():
         yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
@@ -252,7 +306,16 @@ def _speed_in_joint_space(
 _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the sections that each takes
     rule: {*inspect.signature(rule).parameters}
     for rule in (
-        *(_same_joints, _joint_vectors, _goal_images, _incidences, _simulated_alone, _rendered),
+        *(
+            _same_joints,
+            _joint_vectors,
+            _goal_images,
+            _incidences,
+            _objects,
+            _carried,
+            _simulated_alone,
+            _rendered,
+        ),
         *(
             _dictionary,
             _cameras,
@@ -296,6 +359,7 @@ class Settings(Printed, Root):
     calibration: CalibrationSettings = CalibrationSettings()
     data: Data | None = None
     features: dict[Name, Feature] = Field({}, description="points, lines and planes, by their names")
+    objects: Objects = Objects()
     task: TaskSettings | None = None
     trajectory: Trajectory = Trajectory()
     control: Control = Control()

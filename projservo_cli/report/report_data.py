@@ -6,7 +6,7 @@ run, the truth behind it, and numbers read off both.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from projservo_cli.records import (
     WHY_LOST,
     BoolArray,
     Calibration,
+    CarriedByObject,
     CrossValidation,
     FloatArray,
     Model,
@@ -395,15 +396,24 @@ def _in_words(error: ModelError, calibration: Calibration) -> dict[str, Any]:
     return error._asdict() | {"text": describe(error, calibration.prismatic)[1]}
 
 
+# Numbers of the object that carries the goal of a plan.
+_OF_CARRIER = [field.name for field in fields(CarriedByObject) if "dims" not in field.metadata]
+
+
 def _plan(run: Run) -> dict[str, Any]:
     """Plain values of a plan, angles in deg, and the smallest margins along it."""
     plan, values = run.plan, scalars_of(run.plan)
     angles = {f"{name}_deg": math.degrees(values.pop(name)) for name in ("theta_r", "theta_p", "theta_s")}
+    carriers = {name: values.pop(name) for name in _OF_CARRIER}
+    of_object = {name.removeprefix("object_"): value for name, value in carriers.items()}
+    of_object |= {"markers": plan.object_marker, "reason": plan.object_words}
+    objects = {} if plan.object_name is None else {of_object.pop("name"): of_object}
     nearest = zip(NEAREST, plan.min_margin, plan.min_margin_mu, strict=True)
     return (
         values
         | angles
         | {
+            "objects": objects,
             "tau_0": plan.tau_0,
             "smallest_margin": plan.margin.min(axis=0),
             "margins": {name: {"min": lowest, "mu": mu} for name, lowest, mu in nearest},

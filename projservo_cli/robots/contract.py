@@ -38,6 +38,9 @@ _SURGE, _LEAP = 3.0, 0.05
 _WHOLE = 8  # readings in a row whose stamps are whole seconds by chance, at most
 
 
+_NO_OBJECTS = np.zeros((0, 0, 2))
+
+
 class Reading(NamedTuple):
     """One look at a robot, checked."""
 
@@ -47,6 +50,19 @@ class Reading(NamedTuple):
     t_view: FloatArray  # (V,) stamps of the frames, s, by whatever clock; NaN where there are none
     sigma_px: FloatArray | None  # (V, m) standard deviation of each corner, px; None where none is stated
     view: tuple[str, ...] = VIEWS  # names of the views
+    # (V, k, 2) px of the markers of objects, and (V, k) deviations of these if stated, likewise
+    s_objects: FloatArray = _NO_OBJECTS
+    sigma_objects: FloatArray | None = None
+
+    @property
+    def whole(self) -> "Reading":
+        """The reading with the markers of objects after those of the tool."""
+        if not self.s_objects.size:
+            return self
+        s, sigma = np.concatenate([self.s, self.s_objects], axis=1), None
+        if self.sigma_px is not None and self.sigma_objects is not None:
+            sigma = np.concatenate([self.sigma_px, self.sigma_objects], axis=1)
+        return self._replace(s=s, sigma_px=sigma, s_objects=_NO_OBJECTS, sigma_objects=None)
 
     def new_views(self, before: "Reading | None") -> list[bool]:
         """Whether each view has another frame than in the reading before."""
@@ -95,7 +111,8 @@ class Robot(Protocol):
     (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's time passes
     in ``command`` alone, which moves it to ``due``. And ``frames``, the images (V, height, width) of its
     last reading in grey, uint8, or None: a run keeps some, which the report shows. A class that takes an
-    argument ``limits`` is given those of its joints, ``JointLimits``.
+    argument ``limits`` is given those of its joints, ``JointLimits``; one with an argument ``numbers`` those
+    of all markers, in the order of its pixels.
     """
 
     def open(self) -> None:
@@ -105,7 +122,8 @@ class Robot(Protocol):
         """Look once.
 
         Returns ``q, pixels``, perhaps ``t_q, t_left, t_right`` and ``sigma_px`` after them, each of which may
-        be None: joints (n,), rad or m; pixels (V, m, 2) of all markers in each of V views, NaN where unseen;
+        be None: joints (n,), rad or m; pixels (V, m, 2) of all markers in each of V views, those of the tool
+        first, then those of the objects that are configured, NaN where unseen;
         when the joints were read, s, by the robot's clock; a stamp of each of the V images, s, by any clock;
         standard deviations (V, m) of the pixels. Or ``q, pixels`` and perhaps ``t_q`` with a mapping from
         names of views to pixels (m, 2), or to a tuple of pixels, stamp and perhaps deviations (m,): a view
@@ -132,7 +150,7 @@ class PluginRobot:
 
     robot : an object of the contract.
     name : of it, for messages.
-    markers : how many it observes.
+    markers : how many it observes on the tool; objects : how many further ones, on objects.
     bounds : of its commands; they give the number of joints, too.
     timeout_s, open_s : most time an answer may take, s, and opening it.
     image_size : width and height of its frames, px; None for any.
@@ -152,6 +170,7 @@ class PluginRobot:
         open_s: float,
         image_size: ImageSize | None = None,
         view: Sequence[str] | None = None,
+        objects: int = 0,
     ) -> None:
         self.robot, self.name, self.bounds, self.image_size = robot, name, bounds, image_size
         self._views: tuple[str, ...] = tuple(getattr(robot, "view", VIEWS))  # in the order of its answers
@@ -165,7 +184,7 @@ class PluginRobot:
             )
         self._rows = [self._views.index(one) for one in self.view]
         self.timeout_s, self.open_s = timeout_s, open_s
-        self._joints, self._markers = len(bounds.limits.speed), markers
+        self._joints, self._tool, self._markers = len(bounds.limits.speed), markers, markers + objects
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
         self._began = 0.0, 0.0  # what its clock showed first, and when, as below
         self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
@@ -422,7 +441,11 @@ class PluginRobot:
             if not ((stated > 0.0) & (stated < math.inf)).all():
                 raise WorkFailed(f"{self.name}: read() gave a sigma_px that is no positive number")
         t_q = before if np.isnan(times[0]) else float(times[0])
-        return Reading(q=q, s=s, t_q=t_q, t_view=times[1:], sigma_px=sigma, view=self.view)
+        found, tool = Reading(q=q, s=s, t_q=t_q, t_view=times[1:], sigma_px=sigma, view=self.view), self._tool
+        if tool == self._markers:
+            return found
+        parts = (None, None) if sigma is None else (sigma[:, :tool], sigma[:, tool:])
+        return found._replace(s=s[:, :tool], sigma_px=parts[0], s_objects=s[:, tool:], sigma_objects=parts[1])
 
     def _by_name(self, views: Mapping[Any, Any]) -> tuple[list[Any], list[Any], list[Any] | None]:
         """Pixels (m, 2), stamps and deviations (m,) of all views, from a mapping; NaN of a lost one."""

@@ -15,9 +15,14 @@ _MOST = 100  # markers of which a point is the middle
 _NAME, _LONGEST = r"^[a-z][a-z0-9_]*$", 40
 
 
+def is_name(name: str) -> bool:
+    """Whether messages and figures can write a name."""
+    return re.fullmatch(_NAME, name) is not None and len(name) <= _LONGEST
+
+
 def _name(name: str) -> str:
-    """A name that messages and figures can write; else ValueError."""
-    if not re.fullmatch(_NAME, name) or len(name) > _LONGEST:
+    """A name; else ValueError."""
+    if not is_name(name):
         raise ValueError("must be a name of small letters, digits and _, which begins with a letter")
     return name
 
@@ -50,7 +55,9 @@ _Plane = Annotated[tuple[Whole, ...], Field(min_length=3, max_length=3)]
 class Feature(Section):
     """A point, line or plane of the tool through its markers, or of the scene where that of the tool was."""
 
-    on: Literal["tool", "scene"] = Field(description="what the feature moves with; the scene stands still")
+    on: Name = Field(
+        description="what the feature moves with: tool, scene, which stands still, or the name of an object"
+    )
     point: Annotated[_Point | Name | None, _numbers_or_name(1, _MOST)] = Field(
         None,
         description="numbers of markers, whose middle it is; of the scene the point of the tool that was "
@@ -71,11 +78,9 @@ class Feature(Section):
             return
         if self.on == _TOOL and isinstance(self.source, str):
             yield (kinds[0],), "of the tool are numbers of its markers; a name stands for one of the scene"
-        if self.on == _SCENE and not isinstance(self.source, str):
-            yield (
-                (kinds[0],),
-                "of the scene is the name of a feature of the tool that was there when taught",
-            )
+        if self.on != _TOOL and not isinstance(self.source, str):
+            of = "the scene" if self.on == _SCENE else self.on
+            yield (kinds[0],), f"of {of} is the name of a feature of the tool that was there when taught"
         if isinstance(self.source, tuple) and len(set(self.source)) < len(self.source):
             yield (kinds[0],), "a marker stands here twice"
 
@@ -134,10 +139,10 @@ def incidence_of(pair: Pair, features: Mapping[str, Feature]) -> Incidence:
 
 def misplaced(pair: Pair, features: Mapping[str, Feature]) -> str:
     """Return the reason why a pair is no incidence of these features; empty if it is one."""
-    for name, on in zip(pair[:2], (_TOOL, _SCENE), strict=True):
+    for name, of_tool in zip(pair[:2], (True, False), strict=True):
         if name not in features:
             return f"there is no feature {name}; features: {', '.join(features) or 'none'}"
-        if features[name].on != on:
+        if (features[name].on == _TOOL) != of_tool:
             return f"{name} is on the {features[name].on}: name a feature of the tool, then one of the scene"
         if len(pair) == 3 and pair[2] != MEET and features[name].given(*KINDS) == [KINDS[0]]:
             return f"{name} is a point, which has no direction: leave {pair[2]} out, or name lines and planes"

@@ -21,14 +21,15 @@ _CORNERS = ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))  # as they are d
 
 
 class Tag(Section):
-    """A tag on the tool."""
+    """A tag on the tool, or on an object."""
 
     number: Whole = Field(
         description="number of the tag t in its dictionary; its corners are markers 4 t to 4 t + 3"
     )
     size_m: Positive = Field(description="side of the black square")
     pose: Matrix44 = Field(
-        description="pose in the frame of the tool, m: the tag faces along z, y is up on it"
+        description="pose in the frame of the tool, or for an object of the base, m: the tag faces along z, "
+        "y is up on it"
     )
 
     def contradictions(self) -> Iterator[Finding]:
@@ -41,6 +42,11 @@ class Tag(Section):
         """Its corners (4, 3) in the frame of the tool, m, in the order in which they are detected."""
         T = np.array(self.pose)
         return np.asarray(self.size_m * np.array(_CORNERS) @ T[:3, :2].T + T[:3, 3])
+
+    def at(self, T: FloatArray) -> "Tag":
+        """The tag after a displacement (4, 4)."""
+        pose = tuple(tuple(row) for row in (T @ np.array(self.pose)).tolist())
+        return self.model_copy(update={"pose": pose})
 
 
 _Side = Annotated[int, Strict(), Field(ge=LEAST_ROWS, le=1000)]

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, PlainSerializer, StrictBool, StrictInt, WithJsonSchema, WrapValidator
+from pydantic import ConfigDict, Field, PlainSerializer, StrictBool, StrictInt, WithJsonSchema, WrapValidator
 
 from projservo_cli.records import VIEWS, InputError
-from projservo_cli.settings.features import Pair
+from projservo_cli.settings.features import Name, Pair
 from projservo_cli.settings.sections import (
     ByView,
     Count,
@@ -135,6 +135,17 @@ class GoalImages(ByView):
         return None if any(map(math.isnan, known)) else math.sqrt(sum(known) / len(known))
 
 
+class _ObjectImages(Section):
+    """Pixels of the markers of objects, by the names of these."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, GoalImages]
+
+    def of(self, name: str) -> GoalImages | None:
+        """Pixels of an object; None without."""
+        return (self.model_extra or {}).get(name)
+
+
 class Goal(Section):
     """The goal: joint readings, a rotation about the roll axis of the rig, or images of the face."""
 
@@ -151,6 +162,15 @@ class Goal(Section):
         description="pairs of a feature of the tool and one of the scene, [pin, hole] or "
         "[pin, hole, parallel], perpendicular or an angle in deg, that are to meet; the rest of the pose is "
         "free. Empty: the whole pose",
+    )
+    on: Name | None = Field(
+        None,
+        description="object that the goal was taught on and is carried by; null: that of the features of the "
+        "scene, else none",
+    )
+    objects: _ObjectImages = Field(
+        _ObjectImages(),
+        description="pixels of objects when the goal was taught, by projservo teach",
     )
 
     def contradictions(self) -> Iterator[Finding]:

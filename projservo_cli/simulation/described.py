@@ -12,10 +12,10 @@ import numpy as np
 from projservo_cli.detection import DICTIONARY
 from projservo_cli.geometry.displacements import twists
 from projservo_cli.image_size import image_sizes
-from projservo_cli.records import TOOL, FloatArray, no_lenses, position_limits, prismatic_of
+from projservo_cli.records import CORNERS, TOOL, FloatArray, no_lenses, position_limits, prismatic_of
 from projservo_cli.result_hashes import File
 from projservo_cli.settings.control import RenderedOptions
-from projservo_cli.settings.markers import Markers
+from projservo_cli.settings.markers import Markers, Tag
 from projservo_cli.settings.robot import Camera, Rig, RobotSettings
 from projservo_cli.simulation.arm import Link, SerialArm, dh_twists
 from projservo_cli.simulation.rendering import RenderedScene, lens_of
@@ -115,20 +115,30 @@ def described_truth(robot: RobotSettings, rig: Rig, markers: Markers, k1: float,
 
 @lru_cache(maxsize=8)
 def described_scene(
-    robot: RobotSettings, rig: Rig, markers: Markers, options: RenderedOptions, mjcf: File | None
+    robot: RobotSettings,
+    rig: Rig,
+    markers: Markers,
+    options: RenderedOptions,
+    mjcf: File | None,
+    objects: tuple[Tag, ...] = (),
 ) -> RenderedScene:
-    """Return the scene before rendered cameras; ``mjcf`` is the model of the arm, None for capsules."""
+    """Return the scene before rendered cameras.
+
+    mjcf : the model of the arm, None for capsules; objects : tags of objects where they stand.
+    """
     assert markers.known is not None
+    further = [CORNERS * tag.number + k for tag in objects for k in range(CORNERS)]
     return RenderedScene(
         arm=arm_of(robot),
         P=cameras_of(rig),
         size=rig.image_size_px,
         tags=markers.all_tags,
-        numbers=markers.known,
+        numbers=(*markers.known, *further),
         dictionary=markers.dictionary or DICTIONARY,
         mjcf=mjcf,
         tip=robot.tip or "",
         options=options,
         view=tuple(rig.cameras),
         on_tool=rig.mount == TOOL,
+        objects=objects,
     )

@@ -22,7 +22,7 @@ from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.physics import Physics
 from projservo_cli.simulation.rendering import Frames, RenderedScene, rendered_model
 from projservo_cli.simulation.streams import generator
-from projservo_cli.simulation.workspace import Truth
+from projservo_cli.simulation.workspace import SceneObject, Truth
 
 # Joints are worked out this often at least, s, and taken as straight lines between.
 _GRID_S = 0.005
@@ -39,6 +39,7 @@ class SimulatedRobot(NamedTuple):
     faults: Faults
     scene: RenderedScene | None  # before rendered cameras; None for cameras that see points
     period: float  # of the loop, s
+    objects: tuple[SceneObject, ...] = ()  # that its cameras see, too
 
 
 class _Eyes(Protocol):
@@ -72,6 +73,7 @@ class Points(NamedTuple):
     see: Callable[[FloatArray, FloatArray], FloatArray]
     borders: bool
     sigma_px: float  # noise of a coordinate of each frame
+    standing: FloatArray = np.zeros((1, 0, 2))  # (V, k, 2) px of the markers of objects; NaN where unseen
 
     def open(self) -> None:
         """Nothing is to be opened."""
@@ -90,9 +92,10 @@ class Points(NamedTuple):
                 moved[1] if self.truth.on_tool else self.truth.robot.base_tool[:3, :3] @ moved[1],
             )
             M[self.truth.number.index(moved[0]), :3] += by
-        mean_pixels = [self.see(joints, M)[view] for joints in q]
-        noise = self.sigma_px * rng.standard_normal(mean_pixels[0].shape)
-        return np.asarray(np.mean(mean_pixels, axis=0) + noise), None
+        mean_pixels = np.mean([self.see(joints, M)[view] for joints in q], axis=0)
+        if self.standing.size:
+            mean_pixels = np.concatenate([mean_pixels, self.standing[view]])
+        return np.asarray(mean_pixels + self.sigma_px * rng.standard_normal(mean_pixels.shape)), None
 
 
 class _Servos(Protocol):
@@ -137,7 +140,8 @@ def robot_by_itself(
 
     drawn : seed, and stream of its random numbers.
     """
-    return robot_of(robot, q_start, Points(robot.truth, robot.truth.images, True, sigma_px), drawn, Events())
+    points = Points(robot.truth, robot.truth.images, True, sigma_px)
+    return robot_of(robot, q_start, points, drawn, Events())
 
 
 def robot_of(
@@ -148,8 +152,11 @@ def robot_of(
     points : cameras that see points, for a robot that is not before rendered ones.
     drawn : seed, and stream of its random numbers.
     """
-    truth, faults, scene, period = robot
+    truth, faults, scene, period, objects = robot
     if scene is None:
+        if objects:
+            standing = np.concatenate([one.images(truth, one.T) for one in objects], axis=1)
+            points = points._replace(standing=standing)
         return FaultyRobot(World(truth, q_start, points, period, *drawn), faults, events)
     rendered = rendered_model(scene)
     servos = Physics(rendered, q_start, faults.servo_time_constant_s, math.radians(faults.gravity_sag_deg))

@@ -51,13 +51,14 @@ class RenderedScene:
     P: FloatArray  # (V, 3, 4) cameras, px, from the base frame or, of those on the tool, from its frame
     size: tuple[int, int]  # width and height of the images, px
     tags: tuple[Tag, ...]
-    numbers: tuple[int, ...]  # of the markers, four corners a tag
+    numbers: tuple[int, ...]  # of the markers, four corners a tag, those of objects last
     dictionary: str  # of the tags
     mjcf: File | None  # the model of the arm, with the files that it names; None for one of capsules
     tip: str  # body or site of the model that is the tool
     options: RenderedOptions
     view: tuple[str, ...] = VIEWS  # names of the views
     on_tool: bool = False  # whether the cameras are on the tool, and the tags stand in the base frame
+    objects: tuple[Tag, ...] = ()  # further tags, which stand in the base frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +131,9 @@ def rendered_model(scene: RenderedScene) -> RenderedModel:
     tip = next(body for body in spec.bodies if body.id == holder)
     # Tags and cameras: one on the tool, the other in the base frame.
     body, place = (spec.worldbody, np.eye(4)) if scene.on_tool else (tip, tool)
-    _add_tags(body, spec, place, scene, finder)
+    _add_tags(body, spec, place, scene.tags, finder, standing=scene.on_tool)
+    if scene.objects:
+        _add_tags(spec.worldbody, spec, np.eye(4), scene.objects, finder, standing=True)
     at_reference = np.linalg.inv(scene.arm.base_tool) if scene.on_tool else np.eye(4)
     _put_light(spec, scene.options.light, P @ at_reference)
     K, R, t = (np.array(parts) for parts in zip(*map(_decomposed, P), strict=True))
@@ -203,15 +206,21 @@ def _name(tag: Tag, side: str) -> str:
     return f"tag {tag.number} {side}"
 
 
-def _add_tags(holder: Any, spec: Any, tool: FloatArray, scene: RenderedScene, finder: TagFinder) -> None:
-    """Hang tags on a body of a specification; tool : (4, 4) pose of their frame in its own, m."""
-    mj, tags = mujoco(), scene.tags
-    body, origin = holder.add_body(name="scene with tags" if scene.on_tool else "tool with tags"), tool[:3, 3]
-    if scene.on_tool:  # rods meet behind the tags
+def _add_tags(
+    holder: Any, spec: Any, tool: FloatArray, tags: Sequence[Tag], finder: TagFinder, *, standing: bool
+) -> None:
+    """Hang tags on a body of a specification.
+
+    tool : (4, 4) pose of their frame in its own, m; standing : whether that is the frame of the base.
+    """
+    mj = mujoco()
+    body, origin = holder.add_body(name="scene with tags" if standing else "tool with tags"), tool[:3, 3]
+    if standing:  # rods meet behind the tags
         origin = np.mean(
             [np.array(tag.pose)[:3, 3] - tag.size_m * np.array(tag.pose)[:3, 2] for tag in tags], 0
         )
-    spec.add_material(name="tag holder", rgba=_HOLDER, specular=0.0)
+    if not any(material.name == "tag holder" for material in spec.materials):
+        spec.add_material(name="tag holder", rgba=_HOLDER, specular=0.0)
 
     def add(shape: Any, material: str, **values: Any) -> None:
         """A geom that touches nothing, whatever the defaults of the file."""

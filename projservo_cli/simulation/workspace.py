@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -80,9 +81,16 @@ class Truth:
     def faces(self, q: FloatArray) -> BoolArray:
         """Whether markers look towards each camera (V, m) at the joints q (n,), and are not seen edge-on."""
         H = self.displacement(q)
-        away = np.array([camera_center(camera) for camera in self.P])[:, None] - (self.M @ H.T)[:, :3]
-        towards = (away * (self.normals @ H[:3, :3].T)).sum(axis=2) / np.linalg.norm(away, axis=2)
-        return np.asarray((towards > _EDGE_ON) | ~self.normals.any(axis=-1))
+        return self.towards(self.M @ H.T, self.normals @ H[:3, :3].T)
+
+    def towards(self, X: FloatArray, normals: FloatArray) -> BoolArray:
+        """Whether markers X (m, 4) that look along normals (m, 3) look towards each camera (V, m), likewise.
+
+        Those whose normal is zero are seen from anywhere.
+        """
+        away = np.array([camera_center(camera) for camera in self.P])[:, None] - X[:, :3]
+        towards = (away * normals).sum(axis=2) / np.linalg.norm(away, axis=2)
+        return np.asarray((towards > _EDGE_ON) | ~normals.any(axis=-1))
 
     def within(self, pixels: FloatArray, view: int | slice = slice(None)) -> FloatArray:
         """Pixels (..., V, m, 2), or (m, 2) of a view, NaN outside an image: centres reach to size − ½."""
@@ -101,6 +109,22 @@ class Truth:
     @cached_property
     def _from_tool(self) -> FloatArray:
         return np.asarray(np.linalg.inv(self.robot.base_tool), dtype=np.float64)
+
+
+class SceneObject(NamedTuple):
+    """An object of the simulated scene."""
+
+    name: str
+    number: tuple[int, ...]  # (k,) numbers of its markers
+    X: FloatArray  # (k, 4) these when the goal was taught, in the base frame, m
+    normals: FloatArray  # (k, 3) directions that they looked in; zero where they are seen from anywhere
+    T: FloatArray  # (4, 4) displacement since
+
+    def images(self, truth: Truth, T: FloatArray) -> FloatArray:
+        """True pixels (V, k, 2) of its markers after a displacement T (4, 4), NaN where unseen."""
+        X = self.X @ T.T
+        seen = truth.towards(X, self.normals @ T[:3, :3].T) & (truth.P[:, 2] @ X.T > 0.0)
+        return truth.within(np.where(seen[..., None], project(truth.P, X, truth.lens), np.nan))
 
 
 def turned(goal: Goal, arm: SerialArm, P: FloatArray, q_start: FloatArray) -> FloatArray:

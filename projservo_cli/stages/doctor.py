@@ -69,7 +69,8 @@ def check(
     joints, dictionary = inputs.joints.joints("", calibration), inputs.dictionary or DICTIONARY
     assert isinstance(inputs.driven.robot, OwnRobot)
     bounds = inputs.driven.following.bounds(joints)
-    robot = plugin_robot(inputs.driven.robot, bounds, joints.types, inputs.numbers)
+    further = inputs.driven.further
+    robot = plugin_robot(inputs.driven.robot, bounds, joints.types, inputs.numbers, further=further)
     findings: list[Finding] = []
     at_rest, moved, mend = None, list[Strokes](), None
     try:

@@ -47,10 +47,12 @@ def plugin_robot(
     numbers: Sequence[int],
     given: Robot | None = None,
     view: Sequence[str] | None = None,
+    further: Sequence[int] = (),
 ) -> PluginRobot:
     """Make a robot of somebody's, unless it is given; an InputError where a joint has no speed limit.
 
-    types : one letter a joint, R or P; numbers : of the markers that the robot observes.
+    types : one letter a joint, R or P; numbers : of the markers of the tool that the robot observes; further
+        : of those of objects, likewise.
     view : names of the views of readings, which go on where a camera is lost; None for all of the robot's,
         none of which may be lost.
     """
@@ -61,19 +63,20 @@ def plugin_robot(
                 f"plant {own.target}: a robot that is not simulated needs a limit: set control.{key}"
             )
     robot, name, timeout_s = (
-        _made(own, numbers, bounds, whole=view is None) if given is None else given,
+        _made(own, (*numbers, *further), bounds, whole=view is None) if given is None else given,
         f"plant {plugins.short_name(own.target)}",
         own.timeout_s,
     )
     if own.cameras is not None:  # a reading waits for a camera that reconnects
         timeout_s += own.cameras.reconnect_s
-    return PluginRobot(robot, name, len(numbers), bounds, timeout_s, own.open_s, own.image_size, view)
+    sizes = timeout_s, own.open_s, own.image_size
+    return PluginRobot(robot, name, len(numbers), bounds, *sizes, view, len(further))
 
 
 def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds, *, whole: bool) -> Robot:
     """Make an object of the class of a robot, with its options, and cameras where it brings none.
 
-    A class that takes an argument ``limits`` is given those of its joints.
+    A class that takes an argument ``limits`` is given those of its joints, and ``numbers`` all numbers.
 
     whole : whether none of these cameras may be lost.
     """
@@ -85,6 +88,8 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds, *, whole: bool)
         )
     if takes_limits(own):
         options["limits"] = bounds.limits
+    if "numbers" not in options and plugins.takes("plant", own.target, "numbers"):
+        options["numbers"] = tuple(numbers)
     if own.cameras is not None:
         arm: Arm = plugins.make("plant", own.target, (), options)
         if not plugins.brings_no_pixels(arm):
@@ -181,7 +186,15 @@ def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> Plugin
         endless = np.full(len(joints.types), math.inf)
         bounds = bounds._replace(limits=bounds.limits._replace(lower=-endless, upper=endless))
     markers = len(robot.world.truth.number)
-    return PluginRobot(robot, "the simulated robot", markers, bounds, _NEVER_LATE_S, _NEVER_LATE_S)
+    return PluginRobot(
+        robot,
+        "the simulated robot",
+        markers,
+        bounds,
+        _NEVER_LATE_S,
+        _NEVER_LATE_S,
+        objects=len(driven.further),
+    )
 
 
 def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -> FaultyRobot:
@@ -213,7 +226,10 @@ def connected_robot(scenario: RunScenario, law: str, given: Robot | None = None)
     driven = contract.driven
     if isinstance(driven.robot, OwnRobot):
         plant, bounds = _believed_plant(scenario, calibration), driven.following.bounds(joints)
-        robot = plugin_robot(driven.robot, bounds, joints.types, scenario.observed, given, calibration.view)
+        types, view = joints.types, calibration.view
+        robot = plugin_robot(
+            driven.robot, bounds, types, scenario.observed, given, view, further=driven.further
+        )
     else:
         plant = scenario.plant_of(law)
         robot = simulated_robot(driven, joints, _in_the_loop(scenario, driven.robot, contract.events))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -45,6 +46,7 @@ from projservo_cli.stages.motions import (
     search_of,
     why_closed,
 )
+from projservo_cli.stages.objects import carried_goal
 from projservo_cli.stages.plan_summary import minimum_of, reason_of, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.stage_inputs import PlanInputs
@@ -130,6 +132,9 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
     scenario = scenario_of(inputs, calibration)
     if not scenario.untested:
         _require_taught_since(scenario, calibration)
+    carried: dict[str, Any] = {}
+    if inputs.carrier is not None:
+        scenario, carried = carried_goal(scenario, inputs.carrier)
     plan = _to_any_goal(scenario) if inputs.incidences else plan_in(scenario)
     face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
     notes = [
@@ -138,7 +143,7 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
         _borders(inputs, calibration.view),
         "" if face is None else _uneven(face),
     ]
-    return replace(plan, reason="; ".join(filter(None, notes)))
+    return replace(plan, reason="; ".join(filter(None, notes)), **carried)
 
 
 def plan_in(scenario: Scenario) -> Plan:

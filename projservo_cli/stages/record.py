@@ -365,7 +365,9 @@ def _robot_of(trials: Trials, recording: _Recording, drawn: tuple[int, int]) -> 
         return None
     if isinstance(driven.robot, OwnRobot):
         bounds = driven.following.bounds(joints)
-        return plugin_robot(driven.robot, bounds, joints.types, recording.marker.tolist())
+        return plugin_robot(
+            driven.robot, bounds, joints.types, recording.marker.tolist(), further=driven.further
+        )
     first = recording.targets[recording.pending[0]]
     return simulated_robot(driven, joints, robot_by_itself(driven.robot, first, trials.noise_px, drawn))
 

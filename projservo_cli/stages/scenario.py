@@ -38,6 +38,7 @@ from projservo_cli.robots.settings import Joints, limit_passed
 from projservo_cli.settings.task import GoalImages, TaskSettings
 from projservo_cli.simulation.analytic_plant import NO_PINS, Ends, Plant
 from projservo_cli.simulation.faults import observed_in_frames
+from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.streams import (
     GOAL_FRAMES,
     PIN_NOISE,
@@ -48,7 +49,7 @@ from projservo_cli.simulation.streams import (
     generator,
 )
 from projservo_cli.simulation.workspace import Truth, plant_of, turned
-from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
+from projservo_cli.stages.stage_inputs import Carrier, PlanInputs, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.target import TaskImages, is_stereo
@@ -67,16 +68,20 @@ class Scenario:
     observed: tuple[int, ...]  # numbers of all markers that the robot observes, in its order
     exact: TaskImages  # start and goal without noise; predicted for a robot that is not simulated
     true_ends: Ends  # true poses of the tool; NaN if unknown
-    goal_joints: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 if unknown
+    q_taught: FloatArray | None  # (n,) joints at which the goal was taught, rad or m; None if unknown
+    goal_joints: FloatArray  # (k, n) joints at which the goal is shown, rad or m; k is 0 if unknown
     view: tuple[str, ...]  # names of the views
     noise_px: float  # of the images in the loop; at least the residual of a calibration of recorded ones
     # (V, b, 2) images of the goal that was chosen among those of the incidences, px; None for the taught one
     s_chosen: FloatArray | None
+    s_carried: FloatArray | None  # (V, b, 2) images of the taught goal where its object is now, px
 
     @cached_property
     def ends(self) -> TaskImages:
         """Start and goal as the laws see them."""
         images = self.images_at(self.inputs.seed)
+        if self.s_carried is not None:
+            images = images._replace(s_star=self.s_carried)
         if self.s_chosen is None:
             return images
         return images._replace(s_star=self.s_chosen, s_taught=images.s_star)
@@ -112,11 +117,23 @@ class Scenario:
         return ""
 
     def towards(self, plan: Plan) -> Self:
-        """Return the scenario with the goal that a plan chose among those of the incidences."""
-        if plan.s_goal is None:
-            return self
+        """Return the scenario with the goal that a plan carried along, or chose among those of incidences."""
+        found = self if plan.s_carried is None else self.carried(plan.s_carried)
+        if plan.s_goal is None and plan.s_carried is None:
+            return found
         end = plan.q[-1:] if np.isfinite(plan.q[-1:]).all() else self.goal_joints[:0]
-        return replace(self, s_chosen=plan.s_goal, goal_joints=end)
+        return replace(found, s_chosen=plan.s_goal, goal_joints=end)
+
+    def carried(self, s: FloatArray) -> Self:
+        """Return the scenario with a goal that was carried along, of which no joints are known.
+
+        s : (V, b, 2) its images, px.
+        """
+        exact = self.exact
+        if len(exact.q_near):
+            shown = exact._replace(s_star=s)
+            exact = exact._replace(q_near=_joints_near_goal(shown, None, self.calibration, self.numbers))
+        return replace(self, s_carried=s, exact=exact, goal_joints=self.goal_joints[:0])
 
     def images_for(self, law: str) -> TaskImages:
         """Start and goal as a law measures them: with the body, or point by point."""
@@ -229,7 +246,9 @@ class Scenario:
         numbers, seen_images, given = self.numbers, self.exact, self.goal_images
         start, sigma = self._frames(seen_images.q_start, (seed, START_FRAMES))
         if given is None:
-            goal, there = self._frames(self.goal_joints[0], (seed, GOAL_FRAMES))
+            assert self.q_taught is not None
+            scene = None if self.inputs.carrier is None else self.inputs.carrier.at_first
+            goal, there = self._frames(self.q_taught, (seed, GOAL_FRAMES), scene)
         else:
             goal, there = seen_images.s_star, np.array(given.deviations(numbers, self.inputs.face, self.view))
         sigma = np.fmax(sigma, there)
@@ -241,11 +260,17 @@ class Scenario:
         weight[np.isnan(sigma)] = _GUESSED
         return seen_images._replace(body=seen_images.body._replace(weight=weight))
 
-    def _frames(self, q: FloatArray, drawn: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Pixels (V, b, 2) in rendered frames at joints (n,), rad or m, and their deviations (V, b)."""
-        assert self.inputs.scene is not None
-        which = [self.inputs.scene.numbers.index(number) for number in self.numbers]
-        s, sigma = observed_in_frames(self.inputs.scene, self.inputs.averaged_frames, q, drawn)
+    def _frames(
+        self, q: FloatArray, drawn: tuple[int, int], scene: RenderedScene | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pixels (V, b, 2) in rendered frames at joints (n,), rad or m, and their deviations (V, b).
+
+        scene : another one than that of the inputs.
+        """
+        scene = scene or self.inputs.scene
+        assert scene is not None
+        which = [scene.numbers.index(number) for number in self.numbers]
+        s, sigma = observed_in_frames(scene, self.inputs.averaged_frames, q, drawn)
         return np.ascontiguousarray(s[:, which]), sigma[:, which]
 
     def _with_face(self, key: str, s: FloatArray, q: FloatArray | None) -> FloatArray:
@@ -372,13 +397,23 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
         numbers=(*face, *pins),
         observed=observed,
         exact=exact,
-        true_ends=ends,
+        true_ends=ends if inputs.carrier is None else _carried_ends(ends, inputs.carrier),
+        q_taught=q_goal,
         goal_joints=np.empty((0, len(joints.types))) if q_goal is None else q_goal[None],
         noise_px=sigma_px,
         view=view,
         s_chosen=None,
+        s_carried=None,
     )
     return replace(found, exact=exact._replace(least_views=found.least_views))
+
+
+def _carried_ends(ends: Ends, carrier: Carrier) -> Ends:
+    """Return the true poses of the tool with the goal carried along by its object, if that is simulated."""
+    if carrier.placed is None:
+        return ends
+    T = carrier.placed.T
+    return ends._replace(goal_pose=T @ ends.goal_pose, goal=T @ ends.goal)
 
 
 def _positions(asked: Sequence[Incidence], numbers: Sequence[int]) -> tuple[Incidence, ...]:

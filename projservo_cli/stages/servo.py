@@ -507,7 +507,9 @@ def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
         every = np.zeros((len(scenario.view), len(calibration.marker)), dtype=np.bool_)
         every[:, calibration.indices_of(numbers)] = used
         found["undetected_position_error_mm"] = run.driven.monitor.undetected_mm(q, every, posture)
-    if calibration is not None and (goal := scenario.goal_pixels) is not None:
+    if isinstance(run.plan, Plan) and run.plan.object_name is not None:
+        parts.append(run.plan.goal_deviation_mm or 0.0)
+    elif calibration is not None and (goal := scenario.goal_pixels) is not None:
         parts.append(rigid_fit(calibration, q, *goal).off_mm(posture, calibration.M))
     return found | {"estimated_position_error_mm": float(np.linalg.norm([*parts, *found.values()]))}
 
@@ -679,7 +681,10 @@ def _in_compiled_loop(inputs: ServoInputs, law: str) -> bool:
 def sense_is_enough(inputs: ServoInputs, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
-    pose = law != INCIDENCES and not inputs.plan.incidences  # others need a goal of the plan
+    asked = inputs.plan
+    pose = (
+        law != INCIDENCES and not asked.incidences and asked.carrier is None
+    )  # others need that of the plan
     return mode == REGULATE and _in_compiled_loop(inputs, law) and pose
 
 

@@ -15,12 +15,13 @@ from projservo_cli.robots.settings import Following, JointSettings
 from projservo_cli.settings.cameras import Cameras
 from projservo_cli.settings.control import Stop
 from projservo_cli.settings.disturbance import EachView, Events
+from projservo_cli.settings.objects import Objects
 from projservo_cli.settings.sections import JointVector
-from projservo_cli.settings.task import TaskSettings, Trajectory
+from projservo_cli.settings.task import GoalImages, TaskSettings, Trajectory
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.rendering import RenderedScene
-from projservo_cli.simulation.workspace import Truth
+from projservo_cli.simulation.workspace import SceneObject, Truth
 from projservo_cli.task.incidences import Incidence
 
 
@@ -43,6 +44,7 @@ class Drive(NamedTuple):
     robot: SimulatedRobot | OwnRobot
     following: Following
     endless: bool  # whether a simulated one goes beyond its limits
+    further: tuple[int, ...] = ()  # numbers of the markers of objects, which it observes after its own
 
 
 class Motions(NamedTuple):
@@ -213,6 +215,7 @@ class PlanInputs:
     incidences: tuple[Incidence, ...] = ()
     # Width and height to which recorded images reach at least, px, where their size is not known.
     seen_px: ImageSize | None = None
+    carrier: "Carrier | None" = None  # object that the goal was taught on; None for a goal that stands still
 
     def cameras_at(self, q: FloatArray) -> FloatArray | None:
         """Cameras (V, 3, 4) from the base frame at joints (n,), rad or m, px; None if not described."""
@@ -256,6 +259,20 @@ class KnownLengths(NamedTuple):
     apart: FloatArray  # (m, m) distances between them, m; NaN if unknown
     tag_size_m: float | None  # side of tags whose places are not known; None without such
     face: tuple[int, ...]  # numbers of the markers whose frame the tool has; may be empty
+
+
+@dataclass(frozen=True, eq=False)
+class Carrier:
+    """Object that a goal was taught on, and is carried by."""
+
+    name: str
+    numbers: tuple[int, ...]  # of its markers
+    taught: GoalImages | None  # its images when the goal was taught; None for those of a simulation
+    placed: SceneObject | None  # where it is in a simulation
+    at_first: RenderedScene | None  # scene with it where it was when the goal was taught
+    driven: Drive | None  # robot that looks at it; None where images are simulated by themselves
+    lengths: KnownLengths
+    limits: Objects  # how far it may have moved, and how uncertain the goal may be
 
 
 @dataclass(frozen=True, eq=False)

@@ -156,7 +156,7 @@ def _robot_to_teach(
     if at is not None:
         raise InputError("--at is where a simulated robot is put to; move yours by hand")
     bounds = driven.following.bounds(joints)
-    robot = plugin_robot(driven.robot, bounds, joints.types, inputs.numbers)
+    robot = plugin_robot(driven.robot, bounds, joints.types, inputs.numbers, further=driven.further)
     if by_hand and robot.lets_go and takes_limits(driven.robot):
         _require_limits(joints)
     return robot, None

@@ -114,6 +114,7 @@ plant:
 SCREWS = "joints: [{type: R, w: [0, 0, 1], v: [0, 0, 0]}, {type: P, w: [0, 0, 0], v: [1, 0, 0]}]"
 POSE = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
 # what is set, the path named, part of the message
+AT = "positions_m: [[1, 0, 0], [1, 1, 0], [1, 0, 1]]"  # of three markers
 INCONSISTENT = [
     ("control.gain_t=25", "control.gain_t", "gain · period_s is 1;"),
     ("task.goal.joints={joints: [1, 0.3], unit: deg}", "task.goal", "exactly one of"),
@@ -133,6 +134,16 @@ INCONSISTENT = [
     ("features={hole: {on: scene, line: pin}}", "features.hole.line", "there is no line pin of the tool"),
     ("features={hole: {on: scene, line: [0, 1]}}", "features.hole.line", "the name of a feature of the tool"),
     ("task.goal.incidences=[[pin, hole]]", "task.goal.incidences.0", "there is no feature pin"),
+    ("features={pin: {on: tool, line: [0, 1]}, hole: {on: block, line: pin}}", "features.hole.on",
+     "there is no object block; objects: none"),
+    ("task.goal.on=block", "task.goal.on", "there is no object block; objects: none"),
+    ("objects.block={tags: [10]}", "objects.block", "is nowhere: give size_m and pose of its tags"),
+    ("objects.block={tags: [10, {number: 11}]}", "objects.block.tags", "numbers of tags, or {number, size_m"),
+    (f"objects.block={{markers: [0, 40, 41], {AT}}}", "objects.block", "marker 0 is on the tool"),
+    (f"objects.tool={{markers: [40, 41, 42], {AT}}}", "objects.tool", "is no name of an object"),
+    (f"objects={{a: {{markers: [4, 5, 6], {AT}}}, b: {{markers: [7, 8, 4], {AT}}}}}", "objects.b",
+     "marker 4 is of a as well"),
+    (f"objects.a={{markers: [4, 5], {AT}}}", "objects.a.markers", "2 markers do not show how it is turned"),
     ("markers.face=[0, 1, 1]", "markers.face", "twice"),
     ("markers.center=3", "markers.center", "not on the face"),
     ("markers.center=middle", "markers.center", "must be midpoint or the number of a marker"),

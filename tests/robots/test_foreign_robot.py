@@ -79,7 +79,7 @@ def test_sound_answers_are_copied_and_all_calls_come_from_one_thread():
     robot = Scripted(lambda: ([0, 0], robot.s, 1, None, 3.5, np.ones((2, 3))))
     robot.s[0, 1, 0] = np.nan
     with opened(robot) as foreign:
-        q, s, t_q, t_view, sigma, _ = foreign.read()
+        q, s, t_q, t_view, sigma, *_ = foreign.read()
         assert (q.dtype, t_q, sigma.shape) == (np.float64, 1.0, (2, 3))
         np.testing.assert_array_equal(t_view, [np.nan, 3.5])
         assert np.isnan(s[0, 1]).all()  # a marker is seen or not

@@ -1,0 +1,138 @@
+"""Objects of the scene that goals are taught on, told apart by their markers."""
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BeforeValidator, ConfigDict, Field
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.geometry.displacements import rigid
+from projservo_cli.records import CORNERS, FloatArray
+from projservo_cli.settings.features import is_name
+from projservo_cli.settings.markers import Tag
+from projservo_cli.settings.sections import Finding, Positive, Section, Vector3, Whole
+
+WORLD_AND_TOOL = ("scene", "tool")
+"""What a feature moves with besides objects, whose names they cannot be."""
+_LEAST = 3  # markers that show how an object is turned
+
+
+def _of_one_kind(value: Any) -> Any:
+    """Numbers of tags, or tags with their places; else ValueError, in one line."""
+    kinds = {isinstance(one, (dict, Tag)) for one in value} if isinstance(value, (list, tuple)) else set()
+    if len(kinds) != 1 or not all(isinstance(one, (dict, Tag)) or type(one) is int for one in value):
+        raise ValueError("must be numbers of tags, or {number, size_m, pose} of each where it is simulated")
+    return value
+
+
+class Displacement(Section):
+    """A motion of an object, in the base frame."""
+
+    translation_m: Vector3 = Field((0.0, 0.0, 0.0), description="of the middle of its markers")
+    rotation_deg: Vector3 = Field((0.0, 0.0, 0.0), description="rotation vector, about that middle")
+
+
+class ObjectSettings(Section):
+    """Markers of an object, and where it is in a simulation."""
+
+    tags: Annotated[
+        tuple[Whole, ...] | tuple[Tag, ...] | None, Field(max_length=250), BeforeValidator(_of_one_kind)
+    ] = Field(
+        None,
+        description="numbers of its tags; in a simulation {number, size_m, pose} of each, the pose in the "
+        "base frame when the goal was taught",
+    )
+    markers: tuple[Whole, ...] | None = Field(None, description="instead of tags: numbers of its markers")
+    positions_m: tuple[Vector3, ...] | None = Field(
+        None, description="in a simulation: these markers in the base frame when the goal was taught"
+    )
+    displacement: Displacement = Field(
+        Displacement(), description="in a simulation: how it has moved since the goal was taught"
+    )
+
+    @property
+    def placed(self) -> tuple[Tag, ...]:
+        """Tags whose places are given."""
+        return tuple(tag for tag in self.tags or () if isinstance(tag, Tag))
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Numbers of its markers."""
+        tags = [tag.number if isinstance(tag, Tag) else tag for tag in self.tags or ()]
+        return self.markers or tuple(CORNERS * tag + k for tag in tags for k in range(CORNERS))
+
+    @property
+    def points(self) -> FloatArray | None:
+        """Its markers (k, 4) when the goal was taught, in the base frame, m; None if not given."""
+        if not self.placed and self.positions_m is None:
+            return None
+        points = np.concatenate([tag.corners for tag in self.placed]) if self.placed else self.positions_m
+        return np.asarray(np.c_[points, np.ones(len(self.numbers))])
+
+    @property
+    def normals(self) -> FloatArray:
+        """Directions (k, 3) that its tags look in; zero for markers that are seen from anywhere."""
+        if not self.placed:
+            return np.zeros((len(self.numbers), 3))
+        return np.repeat([np.array(tag.pose)[:3, 2] for tag in self.placed], CORNERS, axis=0)
+
+    @property
+    def moved(self) -> FloatArray:
+        """Its displacement (4, 4) since the goal was taught, in the base frame."""
+        assert self.points is not None
+        middle, by = self.points[:, :3].mean(axis=0), self.displacement
+        R = Rotation.from_rotvec(by.rotation_deg, degrees=True)
+        return rigid(R, middle - R.apply(middle) + by.translation_m)
+
+    def contradictions(self) -> Iterator[Finding]:
+        """No markers, too few or the same twice, and places of others than these."""
+        if len(self.given("tags", "markers")) != 1:
+            yield (), "give exactly one of tags and markers"
+            return
+        (key,) = self.given("tags", "markers")
+        if len({*self.numbers}) < len(self.numbers):
+            yield (key,), "a number stands here twice"
+        if len(self.numbers) < _LEAST:
+            yield (key,), f"{len(self.numbers)} markers do not show how it is turned: name {_LEAST} or more"
+        elif self.positions_m is not None and len(self.positions_m) != len(self.numbers):
+            yield ("positions_m",), f"{len(self.positions_m)} positions_m for {len(self.numbers)} markers"
+
+
+class Objects(Section):
+    """Objects by their names, and how far they may be from where the goal was taught.
+
+    Any other key is the name of an object.
+    """
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, ObjectSettings]
+
+    max_displacement_m: Positive = Field(
+        0.5,
+        description="displacement of an object beyond which servo asks first (--confirm) or refuses; needs a "
+        "known length on the tool",
+    )
+    max_rotation_deg: Positive = Field(90.0, description="rotation of an object, likewise")
+    max_goal_deviation_mm: Positive = Field(
+        5.0, description="standard deviation of a carried goal that plan accepts, where a length is known"
+    )
+    max_goal_deviation_px: Positive = Field(
+        5.0, description="likewise of its images, rms per marker and view"
+    )
+
+    @property
+    def named(self) -> Mapping[str, ObjectSettings]:
+        """Return the objects by their names."""
+        return self.model_extra or {}
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Yield names that are none, and markers of two objects."""
+        owner = dict[int, str]()
+        for name, one in self.named.items():
+            if name in WORLD_AND_TOOL or not is_name(name):
+                yield (name,), "is no name of an object: small letters, digits and _, and not scene or tool"
+            for number in one.numbers:
+                if owner.setdefault(number, name) != name:
+                    yield (name,), f"marker {number} is of {owner[number]} as well: name others"
+                    break

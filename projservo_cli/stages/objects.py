@@ -1,0 +1,144 @@
+"""The object that a goal was taught on: looked at anew, and the goal carried along."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from projservo_cli.metric.frame import Metric, Scale
+from projservo_cli.records import Calibration, InputError, Plan, WorkFailed
+from projservo_cli.results import ImageModel
+from projservo_cli.simulation.faults import observed_in_frames
+from projservo_cli.simulation.streams import OBJECT_NOW, OBJECT_TAUGHT, generator
+from projservo_cli.stages.scenario import Scenario
+from projservo_cli.stages.stage_inputs import Carrier, KnownLengths
+from projservo_cli.task.displaced_object import DisplacedObject
+from projservo_cli.task.look_bundle import Look
+
+
+def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | None, str]:
+    """A calibration in metres by the longest known length, or why there is none."""
+    at = np.flatnonzero(np.isin(known.numbers, calibration.marker))
+    apart = np.nan_to_num(known.apart[np.ix_(at, at)], nan=0.0)
+    length_m: float | None = None
+    between: Scale = "joint"
+    if known.tag_size_m is not None:
+        length_m, between = known.tag_size_m, "tags"
+    elif apart.any():
+        i, j = np.unravel_index(int(np.argmax(apart)), apart.shape)
+        length_m, between = float(apart[i, j]), (known.numbers[at[i]], known.numbers[at[j]])
+    elif not calibration.prismatic.any():
+        keys = "markers.positions_m, markers.tag_size_m or markers.board.size_m"
+        return None, f"no length on the tool is known: set {keys}"
+    face = [number for number in known.face if number in calibration.marker]
+    try:
+        return ImageModel.of(calibration).metric(length_m, between, face=face or None), ""
+    except (InputError, WorkFailed) as error:
+        return None, str(error)
+
+
+def carried_goal(scenario: Scenario, carrier: Carrier) -> tuple[Scenario, dict[str, Any]]:
+    """Look at the object anew, and carry the goal along: the scenario with it, and the fields of its plan.
+
+    Raises WorkFailed where images do not show the object or the goal well enough.
+    """
+    c = scenario.calibration
+    assert c is not None
+    metric, _ = in_metres(c, carrier.lengths)
+    taught, now = _taught(scenario, carrier), _simulated(scenario, carrier, now=True)
+    try:
+        found = DisplacedObject.of(c, carrier.numbers, [taught, now], metric)
+        goal = found.carry(_goal(scenario, c))
+    except WorkFailed as error:
+        raise WorkFailed(str(error).replace("objects:", f"objects.{carrier.name}:", 1)) from error
+    rigid, limits = found.coordinates == 6, carrier.limits
+    fields: dict[str, Any] = {
+        "object_name": carrier.name,
+        "object_shift_mm": _known(found.shift_mm),
+        "object_angle_deg": _known(found.angle_deg),
+        "object_shift_px": found.shift_px,
+        "goal_deviation_mm": _known(goal.position_mm),
+        "goal_deviation_deg": goal.rotation_deg if rigid else None,
+        "goal_deviation_px": goal.rms_px,
+        "object_marker": np.array(carrier.numbers, dtype=np.int64),
+        "s_object": now.s,
+        "s_carried": np.ascontiguousarray(goal.s[:, c.indices_of(scenario.numbers)]),
+    }
+    for unit in ("mm", "px"):
+        key, at = f"max_goal_deviation_{unit}", fields[f"goal_deviation_{unit}"]
+        if at is not None and at > (most := getattr(limits, key)):
+            raise WorkFailed(
+                f"objects.{carrier.name}: the carried goal is known to {at:.2g} {unit} only ({most:g} at "
+                f"most): show more of its markers, nearer to the goal and to the cameras, average more "
+                f"frames, or raise objects.{key}"
+            )
+    return scenario.carried(fields["s_carried"]), fields
+
+
+def too_far(plan: Plan, carrier: Carrier | None) -> str:
+    """Return why somebody should look before a robot goes to a carried goal; empty if that is not needed."""
+    if carrier is None:
+        return ""
+    shift, limits = plan.object_shift_mm, carrier.limits
+    for at, most, unit, key in (
+        (shift and 1e-3 * shift, limits.max_displacement_m, "m", "max_displacement_m"),
+        (plan.object_angle_deg, limits.max_rotation_deg, "deg", "max_rotation_deg"),
+    ):
+        if at is not None and at > most:
+            return (
+                f"objects.{carrier.name} has moved by {at:.3g} {unit}, more than {most:g}: look whether the "
+                f"goal is free there, then confirm it (--confirm), or raise objects.{key}"
+            )
+    return ""
+
+
+def _known(number: float) -> float | None:
+    """A number; None for NaN."""
+    return None if math.isnan(number) else number
+
+
+def _taught(scenario: Scenario, carrier: Carrier) -> Look:
+    """Images of the object when the goal was taught."""
+    images = carrier.taught
+    if images is None:
+        return _simulated(scenario, carrier, now=False)
+    pixels, unseen = images.pixels((), scenario.view), ((math.nan, math.nan),) * len(scenario.view)
+    shown = np.array([pixels.get(number, unseen) for number in carrier.numbers]).swapaxes(0, 1)
+    told = [number for number in carrier.numbers if number in pixels]
+    sigma = np.full(shown.shape[:2], np.nan)
+    known = [number in told for number in carrier.numbers]
+    sigma[:, known] = np.array(images.deviations(told, (), scenario.view)).reshape(len(shown), -1)
+    return Look(shown, sigma)
+
+
+def _simulated(scenario: Scenario, carrier: Carrier, *, now: bool) -> Look:
+    """Images of a simulated object: now, or when the goal was taught.
+
+    The arm is at the start of the task meanwhile, or where the goal was taught.
+    """
+    inputs, truth, placed = scenario.inputs, scenario.truth, carrier.placed
+    assert truth is not None
+    assert placed is not None
+    drawn = inputs.seed, OBJECT_NOW if now else OBJECT_TAUGHT
+    if inputs.scene is not None:
+        scene = inputs.scene if now else carrier.at_first
+        q = scenario.exact.q_start if now else scenario.q_taught
+        assert scene is not None
+        assert q is not None
+        which = [scene.numbers.index(number) for number in carrier.numbers]
+        s, sigma = observed_in_frames(scene, inputs.averaged_frames, q, drawn)
+        return Look(s[:, which], sigma[:, which])
+    s = placed.images(truth, placed.T if now else np.eye(4))
+    noise = inputs.noise_px / math.sqrt(inputs.averaged_frames)
+    s += noise * generator(*drawn).standard_normal(s.shape)
+    return Look(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)
+
+
+def _goal(scenario: Scenario, c: Calibration) -> Look:
+    """Images of the markers of the calibration at the goal as it was taught, and their deviations."""
+    if (given := scenario.goal_pixels) is not None:
+        return Look(*given)
+    s = np.full((len(c.view), len(c.marker), 2), np.nan)
+    s[:, c.indices_of(scenario.numbers)] = scenario.ends.s_star
+    noise = scenario.inputs.noise_px / math.sqrt(scenario.inputs.averaged_frames)
+    return Look(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)
