@@ -247,7 +247,7 @@ class _Strips(NamedTuple):
         ends = sides.start[s, main] + slope * np.stack([margin, sides.length - margin])
         first, last = np.ceil(ends.min(axis=0)), np.floor(ends.max(axis=0))
         stride = np.maximum(1.0, np.ceil((last - first + 1.0) / max_profiles))
-        profiles = int(max(1.0, ((last - first) // stride).max() + 1.0))
+        profiles = int(max(2.0, ((last - first) // stride).max() + 1.0))
         half = int(np.ceil((reach / np.abs(slope)).max())) + 1
         place = np.empty((2, len(s), profiles, 2 * half + 1))  # by main and other coordinate
         place[0] = (first[:, None] + stride[:, None] * np.arange(profiles))[..., None]

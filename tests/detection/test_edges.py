@@ -57,3 +57,9 @@ def test_a_side_that_is_covered_costs_its_two_corners_unless_it_is_a_little(grey
     found = found_in(image, CORNERS)
     assert np.isnan(found[:2]).all()
     np.testing.assert_allclose(found[2:], CORNERS[2:], atol=0.03)
+
+
+@pytest.mark.parametrize(("side", "height", "blur"), [(15.0, 9.0, 2.0), (18.0, 6.3, 1.0)])
+def test_a_tag_alone_whose_sides_are_too_short_for_neighbours_is_left(side, height, blur):
+    corners = 20.0 + np.array([[0.0, 0.0], [side, 0.0], [1.02 * side, height], [0.03 * side, height]])
+    assert np.isnan(found_in(dark_square(corners, (60, 60), blur), corners)).all()
