@@ -20,7 +20,7 @@ from tests.configured import calibrate, plan, servo, truth_of
 from tests.known import configured, with_task
 from tests.studies.common import in_two_processes, parser_of, quantiles, rate, write_rows
 
-ARMS = ("ur5", "hobby")
+ARMS = ["ur5", "hobby"]
 RECORDINGS = 10
 LATEST_S = 0.3
 # Joints that stand still after the strike are not missed: a reading counts as frozen where its joint still
