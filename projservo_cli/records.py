@@ -1036,6 +1036,9 @@ class RunHistory:
         "angles open",
         default=None,
     )
+    force: FloatArray | None = _array(
+        "time", "N", "force on the tool; none without stop.max_force_n", default=None
+    )
     latency: FloatArray | None = _array(
         "time view",
         "s",

@@ -200,6 +200,14 @@ def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator
         yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
 
 
+def _force(plant: PlantSettings, stop: Stop) -> Iterator[Finding]:
+    if plant.use is None and stop.max_force_n is not None:
+        yield (
+            ("stop", "max_force_n"),
+            "nothing touches points that are projected: set plant.use, or leave it out",
+        )
+
+
 def _rendered(
     plant: PlantSettings, noise: Noise, markers: Markers | None, rig: Rig | None
 ) -> Iterator[Finding]:
@@ -314,6 +322,7 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
             _objects,
             _carried,
             _simulated_alone,
+            _force,
             _rendered,
         ),
         *(

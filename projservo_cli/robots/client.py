@@ -46,6 +46,7 @@ class Known(NamedTuple):
     sigma_q: FloatArray  # (n,) deviation of joint readings, rad or m; 0 where none shows
     delays: DelayPrior
     timeout_s: float  # longest that an image may stand still while joints move, s
+    max_force_n: float | None = None  # on the tool, N; None for any
 
 
 class DrivenRobot:
@@ -65,7 +66,8 @@ class DrivenRobot:
     the images no longer agree with the calibration, or what failed; else empty. ``weight``: (V, k) of the
     pixels shown in a fit, where the robot states their deviations. Of each observation since ``begin``:
     ``delays`` of all views as followed, (V,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot
-    that knows them, joints (n,) or the pose (4, 4) of its tool; ``film`` of its frames.
+    that knows them, joints (n,) or the pose (4, 4) of its tool; ``film`` of its frames; ``forces`` on its
+    tool, N, where these are limited.
     """
 
     in_front = True
@@ -95,6 +97,7 @@ class DrivenRobot:
         self.delays: list[FloatArray] = []
         self.readings: list[FloatArray] = []
         self.truths: list[FloatArray] = []
+        self.forces: list[float] = []
         self.film = FrameRecorder()
         self.steered.overruns = 0
 
@@ -111,6 +114,13 @@ class DrivenRobot:
             self.film.show(len(self.readings), self.steered.reading.s, self.robot.frames)
         self.readings.append(read)
         self.truths += [] if truth is None else [truth]
+        if (limit := self.known.max_force_n) is not None:
+            self.forces.append(self.robot.force())
+            if self.forces[-1] > limit and not self.disturbance:
+                self.disturbance = (
+                    f"the tool is pressed with {self.forces[-1]:.3g} N, beyond the {limit:g} N of "
+                    "stop.max_force_n: see what it touches"
+                )
         return self.steered.set_point.at_rest
 
     def observe(self) -> FloatArray:

@@ -107,12 +107,13 @@ class Robot(Protocol):
     ``release()`` and ``hold()``, which let go of the arm, so that somebody can move it for ``projservo
     teach``, and hold it again; ``identity() -> str``, without spaces, which changes where readings mean
     something else, such as after homing, and without which no recording holds; ``remarks() -> list[str]``,
-    faults of its last images, such as darkness; and, if it is a simulator, ``truth()``, the pose
-    (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's time passes
-    in ``command`` alone, which moves it to ``due``. And ``frames``, the images (V, height, width) of its
-    last reading in grey, uint8, or None: a run keeps some, which the report shows. A class that takes an
-    argument ``limits`` is given those of its joints, ``JointLimits``; one with an argument ``numbers`` those
-    of all markers, in the order of its pixels.
+    faults of its last images, such as darkness; ``force() -> float``, the force on the tool, N, the greatest
+    since it was last asked for, which ``stop.max_force_n`` limits; and, if it is a simulator, ``truth()``,
+    the pose (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's
+    time passes in ``command`` alone, which moves it to ``due``. And ``frames``, the images (V, height, width)
+    of its last reading in grey, uint8, or None: a run keeps some, which the report shows. A class that takes
+    an argument ``limits`` is given those of its joints, ``JointLimits``; one with an argument ``numbers``
+    those of all markers, in the order of its pixels.
     """
 
     def open(self) -> None:
@@ -250,6 +251,12 @@ class PluginRobot:
         answer = self._ask("truth", method)
         shape = (4, 4) if np.ndim(answer) == 2 else (self._joints,)
         return self._numbers("truth() gave numbers", answer, shape, finite=True)
+
+    def force(self) -> float:
+        """Force on the tool, N, as the robot reports it; raises InputError where it reports none."""
+        if not callable(method := getattr(self.robot, "force", None)):
+            raise InputError(f"stop.max_force_n: {self.name} has no force(): add it, or leave the key out")
+        return float(self._numbers("force() gave numbers", self._ask("force", method), (), finite=True))
 
     def health(self) -> dict[str, float | str]:
         """Return the measurements of the robot on itself, such as its voltage, by name; may be empty."""

@@ -237,6 +237,11 @@ class Stop(Section):
     max_lost_periods: Whole = Field(
         25, description="periods for which the robot holds while markers are lost"
     )
+    max_force_n: Positive | None = Field(
+        None,
+        description="force on the tool, N, beyond which a run stops; asks force() of the robot class, and "
+        "the contacts of plant mujoco; null: any",
+    )
     innovation_threshold: NotNegative = Field(
         1.0,
         description="fault detection: a fault is an innovation beyond chance and beyond this factor × "

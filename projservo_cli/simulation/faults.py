@@ -101,10 +101,12 @@ class Points(NamedTuple):
 class _Servos(Protocol):
     """Servos of the joints.
 
-    ``setpoint``: (n,) where they are sent, rad or m.
+    ``setpoint``: (n,) where they are sent, rad or m. ``force``: the greatest on the arm when they last
+    followed, N.
     """
 
     setpoint: FloatArray
+    force: float
 
     @property
     def motor(self) -> FloatArray:
@@ -237,6 +239,11 @@ class FaultyRobot:
         """Time since the opening, s."""
         return self._joints.times[-1]
 
+    def force(self) -> float:
+        """Greatest force on the arm since it was last asked for, N; 0 where nothing is in its way."""
+        greatest, self._joints.force = self._joints.force, 0.0
+        return greatest
+
     @property
     def frames(self) -> ByteArray | None:
         """The last frames of the cameras as they were searched, where they are rendered."""
@@ -296,6 +303,8 @@ def _step(time: float, period: float) -> int:
 class _FirstOrder:
     """Servos that follow with a lag of first order, with sag under the load of the tool."""
 
+    force = 0.0  # nothing is in the way
+
     def __init__(
         self, load: Callable[[FloatArray], FloatArray], q: FloatArray, lag_s: float, sag: float
     ) -> None:
@@ -326,7 +335,8 @@ class _Joints:
     """Servos, play and links over time.
 
     ``servos``: what moves them. ``times, links``: every instant so far, s, and the true joints (n,) there.
-    ``tick``: (n,) of the encoders, 0 for none. All rad or m.
+    ``tick``: (n,) of the encoders, 0 for none. All rad or m. ``force``: the greatest on the arm so far, N,
+    which whoever asks sets back.
     """
 
     def __init__(self, world: World, faults: Faults, moved: JointMoved | None) -> None:
@@ -346,6 +356,7 @@ class _Joints:
         )
         self._link = self.servos.motor.copy()  # beyond the play
         self._slip = np.zeros(len(self._link))  # beyond both
+        self.force = 0.0
         self.times, self.links = [0.0], [self._link + self._flex * self._load(self._link)]
 
     def go(self, target: FloatArray, due: float) -> None:
@@ -368,6 +379,7 @@ class _Joints:
     def _advance(self, time: float, setpoint: FloatArray) -> None:
         """To a time, s, while the set-point goes evenly to joints (n,)."""
         self.servos.follow(setpoint, time - self.times[-1])
+        self.force = max(self.force, self.servos.force)
         if time >= self._moved_at - 1e-9:
             self._strike()
         motor = self.servos.motor

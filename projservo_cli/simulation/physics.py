@@ -48,7 +48,8 @@ class Physics:
 
     lag_s : lag of the set-points. sag : steady-state error of the added servo with the maximum load,
         rad; where it is zero, and in prismatic joints, they compensate gravity.
-    ``setpoint``: (n,) where joints are sent, rad or m.
+    ``setpoint``: (n,) where joints are sent, rad or m. ``force``: the greatest force on the arm by what is
+    not part of it, N, in the steps of the last ``follow``.
     Raises InputError where an actuator of the file cannot be driven, or cannot have this sag.
     """
 
@@ -85,6 +86,7 @@ class Physics:
         self._ours = np.array([i for i in range(len(q)) if i not in self._own], dtype=np.int64)
         self._model.dof_damping[self._rates[self._ours]] += self._damping[self._ours]
         self._motors = np.array([i for i, own in self._own.items() if not own.stiffness], dtype=np.int64)
+        self.force = 0.0
         self._begin(q)
 
     def _begin(self, q: FloatArray) -> None:
@@ -135,6 +137,16 @@ class Physics:
                 pairs[" and ".join(model.body(body).name or f"body {body}" for body in bodies)] = None
         return ", ".join(pairs)
 
+    def _pressed(self) -> float:
+        """Return the size of the sum of all forces on the arm by bodies that it does not move, N."""
+        total, wrench = np.zeros(3), np.zeros(6)
+        for i, contact in enumerate(self._data.contact):
+            first, second = (self._carries(int(self._model.geom_bodyid[geom])) for geom in contact.geom)
+            if first != second:
+                mujoco().mj_contactForce(self._model, self._data, i, wrench)
+                total += (1.0 if second else -1.0) * wrench[:3] @ contact.frame.reshape(3, 3)
+        return float(np.linalg.norm(total))
+
     def _carries(self, body: int) -> bool:
         """Whether the first joint of the arm moves a body."""
         while body > self._base:  # bodies come after what carries them
@@ -155,7 +167,7 @@ class Physics:
             self.setpoint = setpoint
             return
         steps = math.ceil(seconds / self._step_s - 1e-9)
-        h, begun, mj = seconds / steps, self.setpoint, mujoco()
+        h, begun, mj, self.force = seconds / steps, self.setpoint, mujoco(), 0.0
         self._model.opt.timestep = h
         for k in range(1, 1 + steps):
             self.setpoint = begun + (setpoint - begun) * (k / steps)
@@ -163,6 +175,7 @@ class Physics:
             before, self._sent = self._sent, self._sent + share * (self.setpoint - self._sent)
             self._drive((self._sent - before) / h, h)
             mj.mj_step(self._model, self._data)
+            self.force = max(self.force, self._pressed())
         self.setpoint = setpoint
         if self._data.warning[mj.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(self.motor).all():
             raise WorkFailed(

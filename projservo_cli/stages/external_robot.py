@@ -271,6 +271,7 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
         sigma_q=scenario.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
         delays=_delays_of(contract.time_offset_s, calibration),
         timeout_s=contract.timeout_s,
+        max_force_n=scenario.servo.stop.max_force_n,
     )
 
 

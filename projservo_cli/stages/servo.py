@@ -435,6 +435,7 @@ class LawRun:
             **_stated_mm(self, views),
             untested="; ".join(filter(None, (untested, self.unseen or lost))),
             overruns=None if driven is None else driven.steered.overruns,
+            force=None if driven is None or not driven.forces else _whole(driven.forces, rows),
             latency=None if driven is None else _whole(driven.delays, rows),
             **({} if driven is None else driven.film.fields()),
         )

@@ -58,6 +58,13 @@ class Telling(Sound):
         return self.q if self.tells_joints else self.world.robot.pose(self.q)
 
 
+class Pressing(Sound):
+    """Presses harder with each look."""
+
+    def force(self):
+        return 0.5 * self.count
+
+
 class Faulty(Sound):
     """Goes wrong in a way of its own after so many looks."""
 

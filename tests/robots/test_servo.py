@@ -161,6 +161,23 @@ def test_a_disturbance_ends_the_run_with_what_moved(servo, fault, culprit):
     assert CALLS[-2:] == ["stop", "close"]
 
 
+def test_a_run_stops_beyond_a_force_that_a_robot_tells(servo):
+    answer = servo(
+        "--set", f"plant={{use: '{HERE}:Pressing', {OPTIONS}}}}}", "--set", "stop.max_force_n=40", "--json"
+    )
+    (told,) = answer.json["laws"]
+    assert (answer.code, told["verdict"]) == (1, "fault detected")
+    assert "pressed with 40.5 N, beyond the 40 N of stop.max_force_n" in told["reason"]
+    force = load("run").traces["direct_three"].force
+    assert force is not None
+    assert np.nanmax(force[:-1]) <= 40.0 < force[-1]
+    assert CALLS[-2:] == ["stop", "close"]
+    answer = servo(*SOUND, "--set", "stop.max_force_n=40")
+    assert answer.code == 2
+    assert "has no force()" in answer.err
+    assert not commands()
+
+
 def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
     answer = servo(*faulty("bumped camera"))
     assert answer.code == 1

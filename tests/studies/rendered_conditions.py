@@ -45,12 +45,12 @@ TAUGHT = "play, taught images"
 LATEST = 300  # steps of classical laws
 
 
-def base_of(condition):
-    """Configuration of the arm with its meshes under a condition."""
+def base_of(condition, arm=ARM):
+    """Configuration of an arm, by default the one with its meshes alone, under a condition."""
     front = f"{{joints: {list(FRONT)}, unit: rad}}"
     return configured(
         "rendered",
-        f"robot={{mjcf: {ARM}, tip: attachment_site}}",
+        f"robot={{mjcf: {arm}, tip: attachment_site}}",
         *(f"calibration.reference={front}", f"task={{start: {front}, goal: {{joints: {front}}}}}"),
         *(f"noise.averaged_frames={SHOWN_FRAMES}", "trajectory.profile=auto", "plant.joint_limits=stop"),
         *(
