@@ -25,6 +25,7 @@ from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.steps import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
 from projservo_cli.store import SERVO, Run, save
 
+_STOPPED = ("failed", "object moved")  # verdicts after which nothing is driven
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
 
 
@@ -114,8 +115,8 @@ class Chain:
         """Kind and ``module:Class`` of the imports of the steps, of laws and of a robot."""
         servo = [law_and_mode(step.law)[0] for step in self.steps if step.law and step.why]
         found = dict.fromkeys(("law", law) for law in servo if law not in CODES)
-        records = any(step.stage == "record" and step.why for step in self.steps)
-        if (servo or records) and not self.config.plant.simulated:
+        looks = any(step.stage in ("record", "plan") and step.why and _drives(step) for step in self.steps)
+        if (servo or looks) and not self.config.plant.simulated:
             assert self.config.plant.use is not None
             found["plant", self.config.plant.use] = None
         return list(found)
@@ -140,7 +141,7 @@ class Chain:
                 if step.law and not self.failed:
                     self.laws_done += (step.law,)
                     trace = self.run.traces[step.law]
-                    if trace.verdict == "failed":  # nor is what failed driven by the next law
+                    if trace.verdict in _STOPPED:  # nor is what stopped driven by the next law
                         self.failed, self.reason = step.name, trace.reason
                 if self.failed:
                     return
@@ -254,7 +255,7 @@ class Chain:
         required = self.config.control.must_converge
         for trace in (self.run.traces[law] for law in self.laws_done):
             must, converged = must_converge(trace.law, required), trace.verdict == "converged"
-            if trace.verdict == "failed" or (converged and not trace.overruns):
+            if trace.verdict in _STOPPED or (converged and not trace.overruns):
                 continue  # failures are printed last
             but = " must converge, but" if must and not converged else ""
             reason = " ".join(trace.reason.split())
@@ -330,6 +331,11 @@ class Chain:
         from projservo_cli.loop.jit_warmup import compiling_in_background
 
         return compiling_in_background()
+
+
+def _drives(step: Step) -> bool:
+    """Whether a step reads a robot: a recording, and a plan to a goal on an object that lies anywhere."""
+    return step.stage == "record" or (step.record is not None and step.record.carrier is not None)
 
 
 def data_table(config: Config) -> Path:

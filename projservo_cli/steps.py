@@ -89,6 +89,9 @@ def steps_for(
             why = _reason(step, run, force and step.stage in named, remade)
             if step.law and "servo" in named and not config.plant.simulated:
                 why = why or "a real robot moves in every call"
+            looks = step.stage == "plan" and step.record is not None and step.record.carrier is not None
+            if looks and {"plan", "servo"} & {*named} and not config.plant.simulated:
+                why = why or "its object may lie elsewhere now"
             steps.append(replace(step, why=why))
         return steps
 

@@ -91,6 +91,7 @@ def _teach(
                 asked = settings.trajectory.visible_views
                 least = None if asked == "all" else asked
                 stage.require_face(settings.face_numbers, taught, least)
+                stage.require_objects(taught)
             check = None
             if calibration is not None and not start:
                 check = stage.checked(plan_inputs(settings), calibration, taught)
@@ -125,6 +126,7 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
         "sigma_px": taught.sigma,
         "unseen": taught.unseen,
         "moved": taught.moved,
+        "objects": {name: int(one.shared) for name, one in taught.objects.items()},
     }
     value |= dict.fromkeys(("off_px", "far", "reached", "reason")) if check is None else check._asdict()
     certain = f", to {np.nanmax(taught.sigma):.3g} px" if np.isfinite(taught.sigma).any() else ""
@@ -141,6 +143,8 @@ def _print_taught(console: Console, path: Path, taught: Any, check: Any, setting
         )
     if unseen := ", ".join(f"{number} ({side})" for number, side in taught.unseen):
         words.append(wrapped(f"unseen: {unseen}", "  "))
+    for name, one in taught.objects.items():
+        words.append(f"  {name}: {one.shared} of {len(one.marker)} markers{where}".rstrip(","))
     if check is not None:
         far = ", ".join(f"{number} ({side}) by {px:.3g} px" for number, side, px in check.far)
         words.append(wrapped(check.reason, "  "))

@@ -131,7 +131,8 @@ def teach_inputs(config: Config) -> TeachInputs:
     _require_one_numbering(config, "teach")
     driven = _drive(config, truth_of(config) if config.plant.simulated else None, shows=True)
     noise, settle_s = config.noise.servo_px, config.plant.settle_s
-    return TeachInputs(driven, joints_of(config), numbers, noise, settle_s, config.seed)
+    objects = tuple((name, one.numbers) for name, one in config.objects.named.items())
+    return TeachInputs(driven, joints_of(config), numbers, noise, settle_s, config.seed, objects)
 
 
 def preflight_inputs(config: Config) -> PreflightInputs:
@@ -275,6 +276,8 @@ def _carrier(config: Config, files: Files | None) -> Carrier | None:
         placed=next((one for one in objects_of(config) if one.name == name), None) if simulated else None,
         at_first=scene_of(config, files, dict.fromkeys(config.objects.named)) if rendered else None,
         driven=None if simulated else _drive(config, None, files),
+        frames=config.plant.averaged_frames,
+        settle_s=config.plant.settle_s,
         lengths=_known_lengths(config),
         limits=config.objects,
     )
@@ -282,11 +285,10 @@ def _carrier(config: Config, files: Files | None) -> Carrier | None:
 
 def objects_of(config: Config) -> tuple[SceneObject, ...]:
     """Objects of the simulated scene; those without places are left out."""
-    named = config.objects.named.items()
     return tuple(
-        SceneObject(name, one.numbers, one.points, one.normals, one.moved)
-        for name, one in named
-        if one.points is not None
+        SceneObject(name, one.numbers, points, one.normals, one.moved)
+        for name, one in config.objects.named.items()
+        if (points := one.points) is not None
     )
 
 

@@ -494,7 +494,8 @@ def _fill_in_arm(document: _Document) -> None:
 def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> None:
     """Replace the names of taught files, relative to the configuration, by their contents.
 
-    While it is being taught, a goal whose file is missing is the start, and without a start there is no task.
+    While it is being taught, a goal whose file is missing is the start, and without a start there is no task;
+    so is one on an object, whose file need not show that.
     """
     task = document.values.get("task")
     for key in ("start", "goal") if isinstance(task, dict) else ():
@@ -505,11 +506,11 @@ def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> 
         if not isinstance(task.get(key), str):
             continue
         where, path = f"{document.place(('task', key))}: task.{key}", (base / task[key]).resolve()
-        if teaching and not path.exists():
+        if teaching and (not path.exists() or (key == "goal" and document.values.get("objects"))):
             if key == "start":
                 del document.values["task"]
                 return
-            task["goal"] = {"joints": task.get("start"), **further}
+            task["goal"] = {"joints": task.get("start")}
             continue
         if not path.exists():
             command = f"projservo teach{' --start' * (key == 'start')} -c FILE -o {base / task[key]}"

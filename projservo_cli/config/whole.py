@@ -154,7 +154,7 @@ def _objects(
             break
         if plant.use == RENDERED and not one.placed:
             yield ("objects", name), "plant mujoco shows tags: give number, size_m and pose of each"
-        elif plant.simulated and data is None and one.points is None:
+        elif plant.simulated and data is None and not one.is_placed:
             yield ("objects", name), "is nowhere: give size_m and pose of its tags, or positions_m"
 
 

@@ -47,6 +47,7 @@ VERDICTS = (
     "fault detected",
     "failed",
     "following error",
+    "object moved",
 )
 PLATEAU_FALL = 0.01
 # Joint steps below this, rad or m, are none.

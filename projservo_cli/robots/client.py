@@ -20,6 +20,7 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 from projservo_cli.robots.contract import PluginRobot, Reading
 from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.robots.latency import DelayPrior, Delays, squares_by_joints
+from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.simulation.analytic_plant import Plant, observe
 
@@ -61,6 +62,7 @@ class DrivenRobot:
         true joints.
     known : of robot and images.
     monitor : of the raw images against the calibration; None tests nothing.
+    watch : over the object that carries the goal; None without one.
     ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
     of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
     the images no longer agree with the calibration, or what failed; else empty. ``weight``: (V, k) of the
@@ -73,8 +75,15 @@ class DrivenRobot:
     in_front = True
     takes_parts = True
 
-    def __init__(self, robot: PluginRobot, plant: Plant, known: Known, monitor: ImageMonitor | None) -> None:
-        self.robot, self.steered, self.plant = robot, Steered(robot), plant
+    def __init__(
+        self,
+        robot: PluginRobot,
+        plant: Plant,
+        known: Known,
+        monitor: ImageMonitor | None,
+        watch: ObjectWatch | None = None,
+    ) -> None:
+        self.watch, self.robot, self.steered, self.plant = watch, robot, Steered(robot), plant
         self.known, self.monitor = known, monitor
         self.markers = len(known.visible)
         self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.visible])
@@ -88,6 +97,7 @@ class DrivenRobot:
         self.hidden = np.zeros(V)
         self.disturbance = ""
         self.weight: FloatArray | None = None
+        self.retreats = 0  # periods by which it goes back where the object moves
         self._stale = 0  # looks in a row without a new frame while the arm is held
         self._dark = np.zeros(V, dtype=np.int64)  # looks in a row that show no marker of the calibration
         self.begin()
@@ -126,6 +136,11 @@ class DrivenRobot:
     def observe(self) -> FloatArray:
         """Pixels (V, k, 2) of the markers shown as they will be at rest, NaN where unseen; all are tested."""
         reading, history, order = self.steered.reading, self.steered.history, self.known.order
+        if self.watch is not None:
+            self.watch.observe(reading)
+            if self.watch.reason and not self.disturbance:
+                self.disturbance = self.watch.reason
+                self._retreat()
         if self.monitor is not None:
             _require_apart(self.robot.name, reading)
         images = np.where((order < 0)[:, None], np.nan, reading.s[:, order])
@@ -180,6 +195,17 @@ class DrivenRobot:
         """Set the fault as far as it is known, where there is no time for more observations."""
         if self.monitor is not None:
             self.disturbance = self.disturbance or self.monitor.give_up()
+
+    @property
+    def object_moved(self) -> bool:
+        """Whether it is the object of the goal that ended the run."""
+        return self.watch is not None and bool(self.disturbance) and self.disturbance == self.watch.reason
+
+    def _retreat(self) -> None:
+        """Go back the way that it came, by the last joint readings of the run."""
+        for q in self.readings[-2 : -2 - self.retreats : -1]:
+            self.steered.command(q - self.steered.target, self.robot.bounds.period)
+            self.steered.observe()
 
     def fits(self) -> str:
         """Return the fault that images show where the robot stands; empty where enough of them agree.

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from projservo_cli.records import FloatArray, IntArray, WorkFailed
-from projservo_cli.robots.contract import Reading
+from projservo_cli.robots.contract import PluginRobot, Reading
 
 # Drift of a joint, rad or m, and of an image, px rms, within which both count as still.
 STILL, _STILL_PX = 2e-5, 0.02
@@ -29,6 +29,22 @@ def at_rest(
             )
         reading = observe()
         yield reading
+
+
+def seen_at_rest(
+    robot: PluginRobot, observe: Callable[[], Reading], frames: int, settle_s: float, what: str
+) -> tuple[Reading, FloatArray, IntArray]:
+    """Wait until a robot and its images stand still, and average frames of each view, objects included.
+
+    Returns the mean, deviations (V, m) of a coordinate of it, px, NaN if unknown, and counts (V, m).
+    """
+    first, reading = robot.read(), observe()
+    if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
+        reading = [reading, *at_rest(reading, observe, settle_s, what)][-1]
+    mean, squares, count = averaged(reading, observe, frames)
+    sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
+    sigma = sigma if mean.sigma_px is None else mean.sigma_px
+    return mean, np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan), count
 
 
 def averaged(

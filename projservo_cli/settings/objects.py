@@ -63,9 +63,14 @@ class ObjectSettings(Section):
         return self.markers or tuple(CORNERS * tag + k for tag in tags for k in range(CORNERS))
 
     @property
+    def is_placed(self) -> bool:
+        """Whether its place in a simulation is given."""
+        return bool(self.placed) or self.positions_m is not None
+
+    @property
     def points(self) -> FloatArray | None:
         """Its markers (k, 4) when the goal was taught, in the base frame, m; None if not given."""
-        if not self.placed and self.positions_m is None:
+        if not self.is_placed:
             return None
         points = np.concatenate([tag.corners for tag in self.placed]) if self.placed else self.positions_m
         return np.asarray(np.c_[points, np.ones(len(self.numbers))])

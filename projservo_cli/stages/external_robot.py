@@ -15,10 +15,11 @@ from projservo_cli.image_size import image_sizes
 from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.passwords import MASK
-from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, InputError, Plan, WorkFailed
 from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
 from projservo_cli.robots.latency import DelayPrior
+from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
@@ -215,9 +216,12 @@ def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -
     return robot_of(robot, scenario.exact.q_start, points, drawn, events)
 
 
-def connected_robot(scenario: RunScenario, law: str, given: Robot | None = None) -> DrivenRobot:
+def connected_robot(
+    scenario: RunScenario, law: str, given: Robot | None = None, plan: Plan | None = None
+) -> DrivenRobot:
     """Return the robot as the loop of a law sees it: with its truth, or with the calibrated model.
 
+    plan : of which the object is watched, if its goal is carried by one.
     given : an object of the contract instead of one of a class.
     """
     contract, joints, calibration = scenario.servo.contract, scenario.joints, scenario.calibration
@@ -239,7 +243,12 @@ def connected_robot(scenario: RunScenario, law: str, given: Robot | None = None)
         visible = np.flatnonzero(np.isin(calibration.marker, scenario.observed))
         readings = scenario.termination.max_steps + 1 + WINDOW
         monitor = ImageMonitor(calibration, noise, readings, visible, plant.image_size)
-    return DrivenRobot(robot, plant, _known_of(scenario, contract, calibration, law), monitor)
+    watch = None
+    if plan is not None and plan.s_object is not None and plan.object_marker is not None:
+        numbers = plan.object_marker.tolist()
+        places = np.array([driven.further.index(number) for number in numbers])
+        watch = ObjectWatch(plan.object_name or "", numbers, places, plan.s_object)
+    return DrivenRobot(robot, plant, _known_of(scenario, contract, calibration, law), monitor, watch)
 
 
 def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:

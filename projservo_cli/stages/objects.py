@@ -1,6 +1,7 @@
 """The object that a goal was taught on: looked at anew, and the goal carried along."""
 
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -8,10 +9,13 @@ import numpy as np
 from projservo_cli.metric.frame import Metric, Scale
 from projservo_cli.records import Calibration, InputError, Plan, WorkFailed
 from projservo_cli.results import ImageModel
+from projservo_cli.robots.contract import Reading, at_rest_after
+from projservo_cli.robots.standstill import seen_at_rest
 from projservo_cli.simulation.faults import observed_in_frames
 from projservo_cli.simulation.streams import OBJECT_NOW, OBJECT_TAUGHT, generator
+from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.scenario import Scenario
-from projservo_cli.stages.stage_inputs import Carrier, KnownLengths
+from projservo_cli.stages.stage_inputs import Carrier, KnownLengths, OwnRobot
 from projservo_cli.task.displaced_object import DisplacedObject
 from projservo_cli.task.look_bundle import Look
 
@@ -45,7 +49,8 @@ def carried_goal(scenario: Scenario, carrier: Carrier) -> tuple[Scenario, dict[s
     c = scenario.calibration
     assert c is not None
     metric, _ = in_metres(c, carrier.lengths)
-    taught, now = _taught(scenario, carrier), _simulated(scenario, carrier, now=True)
+    taught = _taught(scenario, carrier)
+    now = _simulated(scenario, carrier, now=True) if carrier.driven is None else _seen(scenario, carrier)
     try:
         found = DisplacedObject.of(c, carrier.numbers, [taught, now], metric)
         goal = found.carry(_goal(scenario, c))
@@ -109,6 +114,26 @@ def _taught(scenario: Scenario, carrier: Carrier) -> Look:
     known = [number in told for number in carrier.numbers]
     sigma[:, known] = np.array(images.deviations(told, (), scenario.view)).reshape(len(shown), -1)
     return Look(shown, sigma)
+
+
+def _seen(scenario: Scenario, carrier: Carrier) -> Look:
+    """Images of the object by a robot where it stands; it is not moved."""
+    driven, c = carrier.driven, scenario.calibration
+    assert c is not None
+    assert driven is not None
+    assert isinstance(driven.robot, OwnRobot)
+    bounds, types = driven.following.bounds(scenario.joints), scenario.joints.types
+    numbers = scenario.observed
+    robot = plugin_robot(driven.robot, bounds, types, numbers, view=c.view, further=driven.further)
+
+    def observe() -> Reading:
+        time.sleep(bounds.period)
+        return robot.read().whole
+
+    with at_rest_after(robot):
+        mean, sigma, _ = seen_at_rest(robot, observe, carrier.frames, carrier.settle_s, "plan")
+    which = [len(numbers) + driven.further.index(number) for number in carrier.numbers]
+    return Look(mean.s[:, which], sigma[:, which])
 
 
 def _simulated(scenario: Scenario, carrier: Carrier, *, now: bool) -> Look:

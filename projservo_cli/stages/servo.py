@@ -64,6 +64,7 @@ from projservo_cli.task.incidences import (
 )
 from projservo_cli.task.target import TaskImages, followed
 
+_RETREAT = 10  # periods by which an arm goes back where the object of its goal moves
 _NOT_DRIVEN: Any = None  # in place of what a run leaves
 
 
@@ -166,25 +167,29 @@ class LawRun:
                 f"{order}, or set data.joint_order=stated if it is known; no robot is driven before"
             )
         controller = self.controller()
-        driven = external_robot.connected_robot(scenario, self.law, self.robot)
+        plan = self.plan if isinstance(self.plan, Plan) else None
+        driven = external_robot.connected_robot(scenario, self.law, self.robot, plan)
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), at_rest_after(driven.robot):
             if own:
                 driven.robot.require_identity(contract.identity)
                 wrong = driven.fits()
+                refutes = not driven.object_moved
                 if wrong:
-                    raise WorkFailed(f"the robot did not move, since at the start {wrong}", refutes=True)
+                    raise WorkFailed(f"the robot did not move, since at the start {wrong}", refutes=refutes)
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
                 unseen = self._require_images(driven, "the robot did not move, since where it stands", 1)
                 for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
-                        raise WorkFailed(f"stopped on the path to the start, since {wrong}", refutes=True)
+                        refutes = not driven.object_moved
+                        raise WorkFailed(f"stopped on the path to the start, since {wrong}", refutes=refutes)
                 if wrong := driven.at_rest(held=True):
                     raise WorkFailed(f"stopped at the start, since {wrong}", refutes=True)
                 at_start = self._require_images(driven, "stopped at the start of the task, since", 2)
                 self.unseen = at_start or unseen
             driven.begin()
+            driven.retreats = _RETREAT
             self.in_python(controller, driven, StallMonitor(driven, scenario.termination))
 
     def _require_images(self, driven: DrivenRobot, what: str, seeing: int) -> str:
@@ -228,6 +233,8 @@ class LawRun:
             self.driven = plant
             if VERDICTS[code] == "converged" and plant.at_rest():
                 code = VERDICTS.index("fault detected")
+            if VERDICTS[code] == "fault detected" and plant.object_moved:
+                code = VERDICTS.index("object moved")
             # It moves from sample to sample, in any mode.
             path = np.stack([self.log.q, np.roll(self.log.q, -1, axis=0)], axis=1)
             self.log = self.log._replace(path=path, parts=np.ones_like(self.log.parts))
@@ -583,7 +590,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
         "joint limit": f"joint {joint + 1} stands at its limit, {at_limit}, and the task would take it "
         f"beyond; {rest}",
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
-        **dict.fromkeys(("fault detected", "failed"), run.why),
+        **dict.fromkeys(("fault detected", "failed", "object moved"), run.why),
     }
     obstruction = ""
     if run.driven is not None and run.verdict != "converged":

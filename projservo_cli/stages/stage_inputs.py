@@ -172,6 +172,7 @@ class TeachInputs:
     noise_px: float  # standard deviation of simulated pixels
     settle_s: float  # for how long joints and images have stood still before
     seed: int
+    objects: tuple[tuple[str, tuple[int, ...]], ...] = ()  # names of objects, and numbers of their markers
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,6 +272,8 @@ class Carrier:
     placed: SceneObject | None  # where it is in a simulation
     at_first: RenderedScene | None  # scene with it where it was when the goal was taught
     driven: Drive | None  # robot that looks at it; None where images are simulated by themselves
+    frames: int  # images of it that such a robot averages
+    settle_s: float  # for how long joints and images have stood still before
     lengths: KnownLengths
     limits: Objects  # how far it may have moved, and how uncertain the goal may be
 

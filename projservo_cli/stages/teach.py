@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from projservo_cli.hardware.checks_at_rest import MIN_SHARED
 from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, at_rest_after
 from projservo_cli.robots.settings import Joints
-from projservo_cli.robots.standstill import at_rest, averaged
+from projservo_cli.robots.standstill import seen_at_rest
 from projservo_cli.settings.sections import JointVector
 from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, sigma_key
 from projservo_cli.simulation.faults import FaultyRobot, SimulatedRobot, robot_by_itself
@@ -24,6 +24,7 @@ from projservo_cli.stages.external_robot import plugin_robot, simulated_robot, t
 from projservo_cli.stages.record import all_of, shared_markers, sharing
 from projservo_cli.stages.stage_inputs import OwnRobot, PlanInputs, TeachInputs
 
+LEAST_OF_OBJECT = 3  # markers that show how an object is turned
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
 _SLACK = 1e-3  # rad or m; by how much more than it sags a reading may change
@@ -43,6 +44,8 @@ class _Taught:
     frames: IntArray  # (V,) how many there were of each view
     moved: FloatArray | None  # (n,) by how much joints moved when they were held again; None if never
     bounds: Bounds  # of the robot, with the units of its joints
+
+    objects: dict[str, "_Taught"] = field(default_factory=dict)  # objects that it saw, by their names
 
     @property
     def shared(self) -> int:
@@ -68,12 +71,20 @@ class _Taught:
             for name, side in zip(self.view, self.sigma, strict=True)
             if np.isfinite(side).any()
         }
-        numbers, joints = tuple(self.marker.tolist()), JointVector(joints=self.q.tolist(), unit="rad")
+        numbers = tuple(self.marker.tolist())
+        joints = JointVector(joints=self.q.tolist(), unit="rad") if len(self.q) else None
         return GoalImages.model_validate({"markers": numbers, **pixels, **sigma, "joints": joints})
 
     def as_goal(self) -> dict[str, Any]:
         """Return the section ``task.goal`` of a configuration."""
-        return {"images": self.images.model_dump(mode="json", exclude_none=True)}
+        of_objects = {name: one.images.model_dump(mode="json", exclude_none=True) for name, one in self._seen}
+        images = {"images": self.images.model_dump(mode="json", exclude_none=True)}
+        return images | ({"objects": of_objects} if of_objects else {})
+
+    @property
+    def _seen(self) -> list[tuple[str, "_Taught"]]:
+        """Names and images of the objects of which anything is seen."""
+        return [(name, one) for name, one in self.objects.items() if np.isfinite(one.s).any()]
 
 
 class _Checked(NamedTuple):
@@ -108,7 +119,7 @@ def teach(
             time.sleep(period)
         else:
             robot.command(q, np.zeros_like(q), robot.now() + period)
-        return robot.read()
+        return robot.read().whole
 
     with at_rest_after(robot):
         if wait is not None and robot.lets_go:
@@ -119,25 +130,26 @@ def teach(
             robot.by_hand("hold")
         if wait is not None:
             wait("take your hands away")
-        first, reading = robot.read(), observe()
-        if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
-            reading = [reading, *at_rest(reading, observe, inputs.settle_s, "teach")][-1]
-        stood = reading.q if moved is None else moved
-        mean, squares, count = averaged(reading, observe, frames)
+        stood = robot.read().q if moved is None else moved
+        mean, sigma, count = seen_at_rest(robot, observe, frames, inputs.settle_s, "teach")
         since = "while images were taken" if moved is None else "since the arm was held again"
         _require_still(robot.bounds, stood, robot.read().q, since)
-    sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
-    sigma = sigma if mean.sigma_px is None else mean.sigma_px
-    return _Taught(
+    tool = _Taught(
         marker=np.array(inputs.numbers, dtype=np.int64),
         q=mean.q,
         view=robot.view,
-        s=mean.s,
-        sigma=np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan),
+        s=mean.s[:, : len(inputs.numbers)],
+        sigma=sigma[:, : len(inputs.numbers)],
         frames=count.max(axis=1),
         moved=None if moved is None else mean.q - moved,
         bounds=robot.bounds,
     )
+    begin, objects = len(inputs.numbers), dict[str, _Taught]()
+    for name, numbers in inputs.objects:
+        own, begin = slice(begin, begin + len(numbers)), begin + len(numbers)
+        marker, nowhere = np.array(numbers, dtype=np.int64), np.zeros(0)
+        objects[name] = replace(tool, marker=marker, q=nowhere, s=mean.s[:, own], sigma=sigma[:, own])
+    return replace(tool, objects=objects)
 
 
 def _robot_to_teach(
@@ -232,6 +244,7 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
         inputs,
         seen_px=tuple((width, height) for width, height in seen_px),
         task=TaskSettings(start=start, goal=Goal(images=taught.images)),
+        carrier=None,
         trajectory=inputs.trajectory.model_copy(update={"profile": profile, "keep_out": ()}),
     )
     try:
@@ -262,6 +275,24 @@ def require_start(taught: _Taught) -> None:
             f"teach: {sharing(taught.view)} {taught.shared} of {len(taught.marker)} markers ({MIN_SHARED} at "
             f"least{seen}): turn the tool towards {all_of(taught.view)}, and look at light and focus"
         )
+
+
+def require_objects(taught: _Taught) -> None:
+    """Refuse objects of which too little is seen to carry a goal along, or that are all out of sight."""
+    seen = {name: _seen_of(one) for name, one in taught.objects.items()}
+    for name, numbers in seen.items():
+        if 0 < len(numbers) < LEAST_OF_OBJECT or not any(seen.values()):
+            raise WorkFailed(
+                f"teach: of the object {name}, {all_of(taught.view)} see marker "
+                f"{', '.join(map(str, numbers)) or 'none'} ({LEAST_OF_OBJECT} at least): turn it towards "
+                f"{all_of(taught.view)}, or leave it out of objects"
+            )
+
+
+def _seen_of(one: _Taught) -> list[int]:
+    """Numbers of the markers of an object that a camera sees."""
+    found: list[int] = one.marker[np.isfinite(one.s[..., 0]).any(axis=0)].tolist()
+    return found
 
 
 def require_face(face: Sequence[int], taught: _Taught, least: int | None = None) -> None:

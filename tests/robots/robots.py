@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.config import load_config
+from projservo_cli.config.inputs import objects_of
 from tests.configured import truth_of
 
 CALLS = []
@@ -63,6 +64,38 @@ class Pressing(Sound):
 
     def force(self):
         return 0.5 * self.count
+
+
+class Seeing(Sound):
+    """Sees the objects of its configuration too, wherever a test has put them.
+
+    ``shift``: (4, 4) displacement of all; ``later``: number of a reading and the displacement from there on.
+    ``looks``: how many readings there were, of all such robots.
+    ``hidden``: numbers of markers that nobody sees, of all those of objects from the reading ``unseen_from``.
+    ``exchanged``: m by which the markers of another object lie otherwise. ``last``: the robot made last.
+    """
+
+    shift, later, hidden, unseen_from, exchanged = np.eye(4), (10**9, None), (), 10**9, 0.0
+    looks, last = 0, None
+
+    def __init__(self, config, noise_px=0.1, numbers=()):
+        super().__init__(config, noise_px)
+        self.objects, self.numbers = objects_of(load_config(config)), np.array(numbers)
+        Seeing.last = self
+
+    def read(self):
+        q, s = super().read()
+        at, shift = self.later
+        Seeing.looks += 1
+        T = shift if self.looks >= at else self.shift
+        other = self.exchanged * np.random.default_rng(1).standard_normal((8, 4)) * [1, 1, 1, 0]
+        objects = [one._replace(X=one.X + other) for one in self.objects]
+        seen = np.concatenate([one.images(self.world, T) for one in objects], axis=1)
+        if self.looks >= self.unseen_from:
+            seen[:] = np.nan
+        s = np.concatenate([s, seen + self.noise_px * self.random.standard_normal(seen.shape)], axis=1)
+        s[:, np.isin(self.numbers, self.hidden)] = np.nan
+        return q, s
 
 
 class Faulty(Sound):

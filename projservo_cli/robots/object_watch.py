@@ -1,0 +1,60 @@
+"""Watch over an object that carries the goal of a run: whether cameras still see it where it was planned."""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from projservo_cli.monitoring.innovation_tests import WINDOW
+from projservo_cli.records import FloatArray, IntArray
+from projservo_cli.robots.contract import Reading
+
+# Number of frames of a view in a row that show an object elsewhere: as many as are seen before the first motion.
+_FRAMES = WINDOW
+_LOOKS = 20  # after which one view is enough: a camera that was moved has been named by then
+# Deviations of their mean beyond which it is elsewhere, and motion that counts as none, px: edges are drawn
+# as far aside by another light, or by what hides a part of a tag.
+_DEVIATIONS, _LEAST_PX = 4.0, 0.5
+_LEAST_MARKERS = 2  # seen in a view in all these frames
+
+
+class ObjectWatch:
+    """Object that stands still while a robot moves, or the reason why it does not.
+
+    A marker that is hidden is where it was seen last.
+
+    name : of the object; marker : (k,) numbers of its markers, at these places (k,) among those of objects.
+    s : (V, k, 2) px of them when the motion was planned, NaN where unseen.
+    ``reason``: what has moved, and by how much; empty where nothing has.
+    """
+
+    def __init__(self, name: str, marker: Sequence[int], places: IntArray, s: FloatArray) -> None:
+        self.name, self._marker, self._places = name, marker, places
+        self._planned, self.reason, self._looks = s, "", 0
+        self._frames: list[deque[FloatArray]] = [deque(maxlen=_FRAMES) for _ in s]
+
+    def observe(self, reading: Reading) -> None:
+        """Compare a reading with where the object was."""
+        off = list[bool]()
+        told = ""
+        for view, frames in enumerate(self._frames):
+            seen_now = reading.s_objects[view, self._places]
+            if not frames or not np.array_equal(seen_now, frames[-1], equal_nan=True):  # else the same frame
+                frames.append(seen_now)
+            away = np.linalg.norm(np.mean(frames, axis=0) - self._planned[view], axis=1)
+            seen = np.isfinite(away)
+            if len(frames) < _FRAMES or seen.sum() < _LEAST_MARKERS:
+                continue
+            # By the scatter of the frames, with that of the plan, which may be of one.
+            sigma = math.sqrt(float(np.var(np.array(frames)[:, seen], axis=0, ddof=1).mean()))
+            most = max(_LEAST_PX, _DEVIATIONS * sigma * math.sqrt(1.0 + 1.0 / _FRAMES))
+            off.append(bool((px := float(np.median(away[seen]))) > most))
+            if off[-1]:
+                told = f"{px:.3g} px in the {reading.view[view]} image ({most:.2g} at most)"
+        self._looks = self._looks + 1 if any(off) else 0
+        if off and (all(off) or self._looks >= _LOOKS):
+            self.reason = self.reason or (
+                f"the object {self.name}, markers {self._marker[0]} to {self._marker[-1]}, has moved since "
+                f"the motion was planned, by {told}: let it lie still, and plan again"
+            )

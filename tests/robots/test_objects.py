@@ -1,0 +1,100 @@
+"""A robot of somebody's that sees objects: taught, planned and driven to where they are now."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from projservo_cli import cli
+from projservo_cli.config import load_config
+from projservo_cli.store import load
+from tests.robots.robots import CALLS, Seeing, Sound
+
+CONFIG = Path(__file__).parents[2] / "configs" / "object.yaml"
+PART = load_config(CONFIG).objects.named["part"]
+OPTIONS = f"options: {{config: {CONFIG}}}, averaged_frames: 10"
+PLANT = f"plant={{use: 'tests.robots.robots:Seeing', {OPTIONS}}}"
+
+
+@pytest.fixture(scope="module")
+def taught(tmp_path_factory):
+    """A folder with a calibrated run, and a goal that was taught with the part where it was."""
+    folder = tmp_path_factory.mktemp("taught")
+    assert cli.run(["calibrate", "-c", str(CONFIG), "-o", str(folder / "run"), "-q"]) == 0
+    goal = ["--set", "task.goal={taught: goal.yaml, on: part}"]  # still to be taught
+    arguments = ["-c", str(CONFIG), "--set", PLANT, *goal, "-o", str(folder / "goal.yaml"), "-q"]
+    assert cli.run(["teach", str(folder / "run"), *arguments]) == 0
+    return folder
+
+
+@pytest.fixture
+def call(taught, projservo, monkeypatch):
+    """A command for the part where ``Seeing`` has it, by default as displaced in the configuration."""
+    monkeypatch.setattr(Seeing, "shift", PART.moved)
+
+    def called(*arguments, **where):
+        for name, value in where.items():
+            monkeypatch.setattr(Seeing, name, value)
+        monkeypatch.setattr(Seeing, "looks", 0)
+        goal = f"task.goal={{taught: {taught / 'goal.yaml'}, on: part}}"
+        given = ("-c", CONFIG, "-o", taught / "run", "--set", PLANT, "--set", goal)
+        return projservo(*arguments, *given)
+
+    return called
+
+
+def test_a_goal_taught_once_is_reached_wherever_the_part_lies_now(call, taught):
+    """Planned anew in each call, by what is seen where the arm stands."""
+    turned = PART.displacement.model_copy(update={"rotation_deg": (0.0, 0.0, 25.0)})
+    for T in (PART.moved, PART.model_copy(update={"displacement": turned}).moved):
+        answer = call("servo", "--law", "exact", shift=T)
+        assert answer.code == 0, answer.err
+        plan, arm = load(taught / "run").plan, Seeing.last.world.robot
+        goal = T @ arm.pose(Sound(CONFIG).q)
+        off = np.linalg.norm(arm.pose(Seeing.last.q)[:3, 3] - goal[:3, 3])
+        assert 1e3 * off < 3.0 * plan.goal_deviation_mm < 4.0
+    assert "plan: making (its object may lie elsewhere now" in answer.err
+
+
+def nudged(mm):
+    """The displacement of the configuration, and so much more."""
+    T = PART.moved.copy()
+    T[1, 3] += 1e-3 * mm
+    return T
+
+
+def test_an_object_that_moves_ends_the_run_and_the_arm_goes_back(call, taught):
+    """Named; the calibration is not called into question. What hides it does not end a run."""
+    answer = call("servo", "--law", "exact", later=(92, nudged(20.0)))
+    assert answer.code == 1
+    trace = load(taught / "run").traces["exact"]
+    assert trace.verdict == "object moved"
+    assert "the object part, markers 40 to 47, has moved since the motion was planned, by" in trace.reason
+    assert not load(taught / "run").refuted
+    driven = np.array([sent.step for sent in CALLS if isinstance(sent, tuple)])
+    along = driven[-9:].sum(axis=0) @ driven[-20:-10].sum(axis=0)
+    assert along < 0.0  # back
+    hidden = call("servo", "--law", "exact", later=(10**9, None), unseen_from=92)
+    assert hidden.code == 0, hidden.err
+
+
+def test_an_object_that_moved_since_it_was_planned_keeps_the_robot_still(call):
+    answer = call("servo", "--law", "exact", later=(12, nudged(3.0)))  # the first of servo
+    assert answer.code == 1
+    assert "the robot did not move, since at the start the object part" in answer.err.replace("\n", " ")
+    assert not [sent for sent in CALLS if isinstance(sent, tuple)]
+
+
+REFUSED = [
+    ({"hidden": tuple(range(40, 48))}, "is seen now: marker none; it is hidden or turned away"),
+    ({"hidden": tuple(range(42, 48))}, "markers 40, 41; its turn about their line is open"),
+    ({"exchanged": 0.004}, "markers do not lie on the object as they did"),
+]
+
+
+@pytest.mark.parametrize(("where", "message"), REFUSED)
+def test_an_object_that_is_not_seen_or_another_is_refused_before_anything_moves(call, where, message):
+    answer = call("plan", "servo", **where)
+    assert answer.code == 1
+    assert message in " ".join(answer.err.split()), answer.err
+    assert not [sent for sent in CALLS if isinstance(sent, tuple)]
