@@ -7,7 +7,7 @@ run, the truth behind it, and numbers read off both.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -93,6 +93,18 @@ class Studies:
     sweep: Mapping[tuple[str, str, bool, float], Trace]  # runs by (law, operators, limited, gain per step)
     own: Mapping[tuple[str, str, bool], Trace]  # runs with the configured gains by (law, operators, limited)
     rate: Mapping[tuple[str, float], Trace]  # runs with true operators by (law, period)
+    # directTHREE ``fast``, 0.9 of the translation a step with true operators, and ``tracked``, along the plan
+    # with calibrated ones, within the limit, where it can be followed
+    further: Mapping[str, Trace]
+
+
+class Composition(NamedTuple):
+    """The parts of the task put together, from its true partition."""
+
+    share: FloatArray  # (k,) shares λ of the task
+    distance: FloatArray  # (k,) how far apart both sides of (22) put the centre, m
+    axis_angle: float  # between the translation and the axis of the single rotation, rad
+    bias: FloatArray  # (2,) farthest that the laws ``DIRECT`` turn the face off its planned rotation, rad
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,11 +34,10 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.objects import in_metres
 from projservo_cli.stages.stage_inputs import ReportInputs, Scenery
 from projservo_cli.stages.studies import (
-    LAMBDAS,
     STEP_LIMIT_DEG,
     Comparison,
     comparison_of,
-    composition_error,
+    composition_of,
     metric_plan,
     run_studies,
 )
@@ -63,16 +62,15 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
     left_out: list[dict[str, str]] = []
     report_data: Fit = Fit(run.calibration, run.observation.at_rest, held_out=run.cross_validation)
     metric, no_metric = in_metres(run.calibration, inputs.lengths)
-    studies, share, distance, claims = None, np.zeros(0), np.zeros(0), []
+    studies, composition, claims = None, None, []
     if inputs.extra is not None:
         bench = comparison_of(inputs.extra, run.calibration, run.plan)
         with _unless_it_fails("studies", left_out):
             studies = run_studies(bench, progress=progress)
         report_data = _report_data(inputs, run, bench, studies, left_out)
         with _unless_it_fails("equation (22)", left_out):
-            distance = composition_error(metric_plan(bench))
-            share = np.array(LAMBDAS)
-        claims = [claim._asdict() for claim in claims_of(report_data, share, distance)]
+            composition = composition_of(metric_plan(bench), bench.scenario.gains)
+        claims = [claim._asdict() for claim in claims_of(report_data, composition)]
     elif run.traces:
         report_data = Driven(
             run.calibration, run.observation.at_rest, run.plan, run.traces, held_out=run.cross_validation
@@ -85,8 +83,8 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
         claims=tuple(claims),
         metric=() if metric is None else tuple(metric_rows(metric, chosen_poses(metric, report_data))),
         step_limit_deg=STEP_LIMIT_DEG,
-        share=share,
-        composition_mm=1e3 * distance,
+        share=np.zeros(0) if composition is None else composition.share,
+        composition_mm=np.zeros(0) if composition is None else 1e3 * composition.distance,
         **study_numbers(studies),
     )
     content = {"claims": report.claims, "drift": drift_rows(report), "omitted": report.omitted}

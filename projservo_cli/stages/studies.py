@@ -7,6 +7,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.algebra import as_array, mat
@@ -14,11 +15,13 @@ from projservo_cli.geometry.displacements import (
     composed_angle,
     composed_operator,
     exp_rotation,
+    screws,
     twist_exponential,
 )
+from projservo_cli.laws import TRACK, run_name
 from projservo_cli.planning.margins import limits_alone
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, Trace, WorkFailed
-from projservo_cli.report.report_data import DIRECT, Studies
+from projservo_cli.report.report_data import DIRECT, Composition, Studies
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.plan import plan_task
@@ -32,6 +35,10 @@ GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
 PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)
 STEP_LIMIT_DEG = 5.0
 LAMBDAS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+# Share of the translation that a step takes where its gain is as high as can be.
+FAST_PER_STEP = 0.9
+# Instants of a planned rotation, and steps of a law towards it.
+_INSTANTS, _STEPS = 4001, 400
 
 # An arbitrary frame of condition number 2.4 in which no coordinate is metric.
 H_PE = np.array([[1.1, 0.2, -0.1, 0.3], [-0.2, 0.9, 0.2, -0.1], [0.1, -0.1, 1.2, 0.2], [0.2, -0.1, 0.3, 1.0]])
@@ -44,7 +51,7 @@ class Comparison:
     scenario: RunScenario  # without noise and disturbances, and without an end at a border or a joint limit
     # by operators, ``true`` (metric), ``twin`` (the same in a projective frame) and ``calibrated``
     models: dict[str, Model]
-    sense: FloatArray  # (2, n) joint motions of both rotations as planned, for the sense of a half turn
+    plan: Plan  # that was made; half turns are driven in its sense
 
     @property
     def truth(self) -> Truth:
@@ -61,7 +68,14 @@ class Comparison:
             prismatic = self.truth.robot.prismatic
             speed = np.where(prismatic, limits.speed, math.radians(STEP_LIMIT_DEG) / gains.period)
         scenario = replace(seen, gains=gains, termination=limits._replace(speed=speed))
-        return drive(scenario, self.sense, law, self.models[operators]).trace()
+        return drive(scenario, self.plan.rotation_sense(), law, self.models[operators]).trace()
+
+    def followed(self) -> Trace | None:
+        """Drive directTHREE along the plan, with the configured limits; None where it cannot be followed."""
+        if not self.plan.feasible or self.plan.duration is None or np.isnan(self.plan.mu).any():
+            return None
+        law = run_name(DIRECT[0], TRACK)
+        return drive(self.scenario, self.plan, law, self.models["calibrated"]).trace()
 
     def scenario_by(self, operators: str) -> RunScenario:
         """Return the setting with the body, where the face is measured with one, in the frame of a model."""
@@ -104,7 +118,7 @@ def comparison_of(inputs: ServoInputs, calibration: Calibration, plan: Plan) -> 
     assert scenario.truth is not None
     metric = scenario.truth.model
     models = {"true": metric, "twin": projective_twin(metric), "calibrated": calibration.model()}
-    return Comparison(scenario, models, plan.rotation_sense())
+    return Comparison(scenario, models, plan)
 
 
 def _with_gain(gains: Gains, gain_per_step: float) -> Gains:
@@ -136,6 +150,8 @@ def run_studies(
     for done, (case, chosen, operators, limited) in enumerate(cases):
         progress("studies", done, len(cases))
         made[case] = bench.run(case[0], operators, chosen, limited=limited)
+    fast = own._replace(gain_t=FAST_PER_STEP / own.period)
+    further = {"fast": bench.run(DIRECT[0], "true", fast, limited=False), "tracked": bench.followed()}
     progress("studies", len(cases), len(cases))
     sweep, by_model, rate = ({c: trace for c, trace in made.items() if len(c) == n} for n in (4, 3, 2))
     return Studies(
@@ -146,6 +162,7 @@ def run_studies(
         sweep=sweep,
         own=by_model,
         rate=rate,
+        further={name: trace for name, trace in further.items() if trace is not None},
     )
 
 
@@ -176,3 +193,46 @@ def composition_error(plan: Plan, lambdas: Sequence[float] = LAMBDAS) -> FloatAr
         difference = product - as_array(twist_exponential(mat(summed)))
         distance.append(float(np.linalg.norm(difference @ plan.A_c)))
     return np.array(distance)
+
+
+def orientation_bias(plan: Plan, gains: Gains) -> FloatArray:
+    """Farthest that each of ``DIRECT`` turns the face off its planned rotation, rad, [RH00] eq. (21).
+
+    Each step turns the face as the law wants to, exactly, and partitions what is left anew: no joint steps
+    are involved. The planned rotation of directTHREE is exp(μ θ_r Ĥ_r) exp(μ θ_p Ĥ_p) of eq. (17), that of
+    directTWO exp(μ θ_s Ĥ_s), for μ from 0 to 1. From a metric plan.
+    """
+    r, p = screws(plan.H_hat)[1:, :3]
+    mu = np.linspace(0.0, 1.0, _INSTANTS)[:, None]
+    two_turns = Rotation.from_rotvec(mu * plan.theta_r * r) * Rotation.from_rotvec(mu * plan.theta_p * p)
+    goal, whole = two_turns[-1], two_turns[-1].as_rotvec()
+    axis = whole / max(float(np.linalg.norm(whole)), 1e-300)
+    off = np.zeros(2)
+    for law in range(2):
+        R, theta_p = Rotation.identity(), plan.theta_p
+        for _ in range(_STEPS):
+            left = goal * R.inv()
+            normal, c = R.apply(p), np.cross(R.apply(p), goal.apply(p))
+            sine = float(np.linalg.norm(c))
+            onto = math.atan2(sine, float(R.apply(p) @ goal.apply(p))) * c / sine if sine > 0.0 else c
+            within = float((Rotation.from_rotvec(-onto) * left).as_rotvec() @ normal)
+            theta_p = within - 2.0 * math.pi * round((within - theta_p) / (2.0 * math.pi))  # in its sense
+            three = gains.gain_r * onto + gains.gain_p * theta_p * normal
+            two = gains.gain_s * left.as_rotvec()
+            R = Rotation.from_rotvec(gains.period * (three, two)[law]) * R
+            half = np.linalg.norm(np.cross(axis, R.as_quat()[:3]))  # sine of half the turn about other axes
+            from_plan = (two_turns.inv() * R).magnitude().min(), 2.0 * math.asin(min(1.0, half))
+            off[law] = max(off[law], from_plan[law])
+    return off
+
+
+def composition_of(plan: Plan, gains: Gains) -> Composition:
+    """How the parts of a metric plan go together; raises WorkFailed if the task has no rotation."""
+    distance = composition_error(plan)
+    r, p = screws(plan.H_hat)[1:, :3]
+    axis = (Rotation.from_rotvec(plan.theta_r * r) * Rotation.from_rotvec(plan.theta_p * p)).as_rotvec()
+    way = screws(plan.H_hat)[0, 3:]
+    cosine = abs(float(way @ axis)) / max(float(np.linalg.norm(way) * np.linalg.norm(axis)), 1e-300)
+    return Composition(
+        np.array(LAMBDAS), distance, math.acos(min(1.0, cosine)), orientation_bias(plan, gains)
+    )

@@ -51,7 +51,7 @@ def case(name="paper", steps=SHORT, whole=False):
         known_scenario(config.idealized), termination=scenario.termination._replace(stop_at_joint_limit=False)
     )
     models = {"true": true.model, "twin": model, "calibrated": model}
-    bench = studies.Comparison(clean, models, sense)
+    bench = studies.Comparison(clean, models, plan)
     extra = studies.run_studies(bench) if whole else studies.run_studies(bench, GAINS, PERIODS_S)
     observation = record.simulate(config, true)
     calibration = known(config, true, model, observation.q)
@@ -106,7 +106,9 @@ def seen(names, name="paper"):
         plant=plant,
         plan=seen_by(material.plan, names),
         traces=traced(material.traces),
-        studies=replace(studied, **{of: traced(getattr(studied, of)) for of in ("sweep", "own", "rate")}),
+        studies=replace(
+            studied, **{of: traced(getattr(studied, of)) for of in ("sweep", "own", "rate", "further")}
+        ),
         metric=metric,
         no_metric=no_metric,
     )

@@ -22,7 +22,7 @@ def measured(words, material=None, own=None):
     material = material or case()[2]
     studies = dataclasses.replace(material.studies, own=material.studies.own | (own or {}))
     material = dataclasses.replace(material, studies=studies)
-    (claim,) = [claim for claim in claims_of(material, np.zeros(0), np.zeros(0)) if words in claim.claim]
+    (claim,) = [claim for claim in claims_of(material, None) if words in claim.claim]
     return claim.measured, claim.holds
 
 
@@ -73,7 +73,7 @@ def test_gap_of_two_paths_is_the_farthest_way_to_the_other(s, gap):
             for law, path in (("direct_three", first), ("direct_two", second))
         }
         told, _ = measured("differ very little", dataclasses.replace(material, traces=runs))
-        assert told == f"largest distance between both paths {gap:.1f} px"
+        assert told.startswith(f"largest distance between both paths {gap:.1f} px; the face is 66°")
 
 
 def test_image_errors_are_held_against_an_exponential_and_the_least_before():
@@ -124,6 +124,6 @@ def test_the_plateau_that_is_drawn_and_claimed_is_that_of_the_verdict():
     )
     shown = dataclasses.replace(material, traces={"stacked": still}, stall_periods=5)
     assert SPECS["fig04_classical"].data(shown)["plateau_stacked"].tolist() == [10, 29]
-    (claim,) = [c for c in claims_of(shown, np.zeros(0), np.zeros(0)) if "local minimum" in c.claim]
+    (claim,) = [c for c in claims_of(shown, None) if "local minimum" in c.claim]
     assert claim.measured.startswith("19 steps from step 10 at 30 px")
     assert claim.criterion.startswith("image error falls < 1 % in 5 steps")

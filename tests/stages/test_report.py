@@ -1,16 +1,23 @@
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
 
+from projservo_cli.control.law import Gains
+from projservo_cli.geometry.displacements import screws, twists
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures.path_deviation import study_numbers
+from projservo_cli.report.report_data import Composition
 from projservo_cli.stages import report, studies
 from projservo_cli.store import Result, load, save
 from tests.configured import report_on
 from tests.report.cases import GAINS, PERIODS_S, SPECS, case
 from tests.report.conftest import stored
+
+# The gains of the paper, a tenth of the error in each period.
+GAINS_OF_LAWS = Gains(2.5, 2.5, 2.5, 2.5, 1.0, 2.5, 0.04, 0.9)
 
 
 def changed(material, **traces):
@@ -77,6 +84,7 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
             sweep={key: unknown(trace) for key, trace in extra.sweep.items()},
             own={key: unknown(trace) for key, trace in extra.own.items()},
             rate={key: unknown(trace) for key, trace in extra.rate.items()},
+            further={key: unknown(trace) for key, trace in extra.further.items()},
         ),
     )
     for spec in SPECS.values():
@@ -100,10 +108,29 @@ def test_both_sides_of_eq_22_agree_to_first_order_only():
     # without a translation both sides are the same
     still = dataclasses.replace(plan, tau=0.0)
     assert studies.composition_error(still, lambdas).max() < 1e-12
-    *_, differs = claims_of(material, lambdas, distance)
-    *_, same = claims_of(material, lambdas, np.zeros(3))
+    *_, differs = claims_of(material, Composition(lambdas, distance, math.pi / 2, np.zeros(2)))
+    *_, same = claims_of(material, Composition(lambdas, np.zeros(3), 0.0, np.zeros(2)))
     assert (differs.holds, same.holds) == (False, True)
     assert "λ^2.0" in differs.measured
+
+
+def test_eq_22_has_its_counter_example_in_the_turn_of_the_paper_and_holds_along_the_axis():
+    """The translation of a pure turn is perpendicular to its axis; along the axis both sides are the same."""
+    plan = studies.metric_plan(case()[1])
+    of_paper = studies.composition_of(plan, GAINS_OF_LAWS)
+    assert math.degrees(of_paper.axis_angle) == pytest.approx(90.0, abs=1e-6)
+    assert of_paper.distance[0] > 0.4
+    turn = screws(plan.H_hat[1])[:3]
+    for direction, angle in ((turn, 0.0), (np.cross(turn, [0.3, 0.5, 0.7]), math.pi / 2)):
+        along = twists(np.r_[0.0, 0.0, 0.0, direction])
+        H_hat = np.array([along, *plan.H_hat[1:]])
+        other = studies.composition_of(dataclasses.replace(plan, H_hat=H_hat, theta_p=0.0), GAINS_OF_LAWS)
+        assert other.axis_angle == pytest.approx(angle, abs=1e-7)
+        assert (other.distance.max() < 1e-12) == (angle == 0.0)
+    # Rotations that do not commute turn the face off its planned rotation, one rotation does not: eq. (21).
+    assert np.degrees(of_paper.bias) == pytest.approx([8.3, 0.0], abs=0.05)
+    assert np.degrees(of_paper.bias[1]) < 1e-9
+    assert studies.orientation_bias(dataclasses.replace(plan, theta_p=0.0), GAINS_OF_LAWS).max() < 1e-3
 
 
 @pytest.mark.volume
@@ -117,7 +144,7 @@ def test_claims_of_a_whole_run_with_exact_operators(name):
         "Euclidean points: runs through self-occlusion, then converges",
     )
     plan = studies.metric_plan(bench)
-    claims = claims_of(material, np.array(studies.LAMBDAS), studies.composition_error(plan))
+    claims = claims_of(material, studies.composition_of(plan, bench.scenario.gains))
     assert len({claim.claim for claim in claims}) == len(claims) >= 24
     for claim in claims:
         assert claim.holds is not None

@@ -208,8 +208,11 @@ def _show(axes: Any, figure: "style.Figure", rig: FloatArray, points: FloatArray
 
     points = np.concatenate([points, rig.reshape(-1, 3)])
     low, high = points.min(axis=0), points.max(axis=0)
-    pad = 0.05 * (high - low).max()
-    extent = np.stack([low - pad, high + pad], axis=1)
+    longest = (high - low).max()
+    half = np.maximum(
+        0.5 * (high - low) + 0.05 * longest, 0.15 * longest
+    )  # room for the numbers of each axis
+    extent = 0.5 * (low + high)[:, None] + np.outer(half, [-1.0, 1.0])
     for name, (a, b) in zip("xyz", extent, strict=True):
         getattr(axes, f"set_{name}lim")(a, b)
         getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 14)
@@ -218,7 +221,9 @@ def _show(axes: Any, figure: "style.Figure", rig: FloatArray, points: FloatArray
         getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(step))
     axes.tick_params(pad=0)
     towards = rig[:, 0].mean(axis=0) - points.mean(axis=0)
-    axes.view_init(elev=22, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62)
+    above = np.linalg.norm(towards[:2]) < 0.3 * np.linalg.norm(towards)  # a rig that looks along z
+    azim = 45.0 if above else float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62.0
+    axes.view_init(elev=22, azim=azim)
     figure.set_layout_engine()
     style.legend_below(figure, 3)
     _fit(axes, figure, extent)
