@@ -187,8 +187,11 @@ def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
 )
 @click.option(
     "--goal",
+    "goals",
     metavar="NAME",
-    help="Go to this taught goal, NAME.yaml next to the configuration, instead of task.goal.",
+    multiple=True,
+    help="Go to this goal of task.goals, or taught one, NAME.yaml next to the configuration, instead of "
+    "task.goal and task.steps. Repeatable, for several one after the other.",
 )
 @click.option(
     "--from",

@@ -17,7 +17,7 @@ from projservo_cli.config.loading import Config, stored_yaml
 from projservo_cli.control.law import Gains
 from projservo_cli.detection import Board
 from projservo_cli.display import About
-from projservo_cli.records import CORNERS, InputError
+from projservo_cli.records import CORNERS, TOOL, InputError
 from projservo_cli.result_hashes import File
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
@@ -54,6 +54,7 @@ from projservo_cli.stages.stage_inputs import (
     Trials,
 )
 from projservo_cli.store.observation_tables import identity_in
+from projservo_cli.task.stand_off import Displacement
 
 _RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
 _TICKS = 4096  # in a turn of an encoder that is as coarse as any
@@ -221,8 +222,21 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         features=config.control.features,
         tests_images=config.stop.innovation_threshold > 0.0,
         trajectory=config.trajectory,
+        lengths=markers.lengths(face),
         incidences=tuple(incidence_of(pair, config.features) for pair in pairs),
+        displaced=_displacement(config),
     )
+
+
+def _displacement(config: Config) -> Displacement | None:
+    """Return the displacement of the goal, with the numbers of its markers; None without."""
+    along = None if config.task is None else config.task.goal.displaced
+    if config.task is None or along is None:
+        return None
+    if config.mount == TOOL:
+        raise InputError("displaced: goals of cameras on the tool are not displaced: teach the other goal")
+    flat, of_start = config.features[along.along].flat(config.features), config.task.goal.of_start
+    return Displacement(along.along, flat, along.by_m, along.by_px, of_start)
 
 
 def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
@@ -253,7 +267,6 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
         speed_scale=plant.speed_scale,
         max_replan_attempts=control.max_replan_attempts,
         refuses=control.on_plan_failure == "refuse",
-        lengths=config.markers.lengths(plan.face),
         contract=_contract(config, plan, files),
     )
 

@@ -73,9 +73,10 @@ DIRECT = ("direct_three", "direct_two")
 
 def title(name: str) -> str:
     """Name of a run as the figures write it: that of its law, and whether it follows the plan."""
-    law, mode = law_and_mode(name)
+    *step, run = name.split("/")
+    law, mode = law_and_mode(run)
     follows = {TRACK: ", following the plan", IMAGE_TRACK: ", following planned images"}
-    return title_of(law) + follows.get(mode, "")
+    return "".join(f"{part}: " for part in step) + title_of(law) + follows.get(mode, "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,9 +317,14 @@ def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequen
     if stage == "calibrate":
         return path | _calibration(run, names)
     if stage == "plan":
-        return path | _plan(run)
+        parts = [name.removeprefix("plan/") for name in run.results if name.startswith("plan/")]
+        if not parts:
+            return path | _plan(run)
+        plans = [{"step": part} | _plan(run.at_step(part)) for part in parts]
+        wrong = [f"{plan['step']}: {plan['reason']}" for plan in plans if not plan["feasible"]]
+        return path | {"feasible": not wrong, "reason": "; ".join(wrong), "plans": plans}
     if stage == "servo":
-        return path | {"laws": [_law(run.traces[law]) for law in laws]}
+        return path | _laws(run, laws)
     page = run.path.parent / PAGE_FILE
     report = run.results["report"].records[""]
     return path | {"page": page.resolve() if page.is_file() else None} | scalars_of(report)
@@ -332,8 +338,30 @@ def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
         return failure | {"usable": False, "lens": None, "rejected": None, "unshown": None} | numbers | lists
     if stage == "servo":
-        return failure | {"laws": [_law(run.traces[law]) for law in laws]}
+        return failure | _laws(run, laws)
     return failure | {"feasible": False} if stage == "plan" else failure
+
+
+# Values of a trace that the list of steps repeats.
+_OF_STEPS = ("verdict", "reason", "steps", "position_error_mm", "rotation_error_deg", "image_error_px")
+
+
+def _laws(run: Run, laws: Sequence[str]) -> dict[str, Any]:
+    """Plain values of runs of laws, of a sequence with its steps that were done or failed."""
+    values = {law: _law(run.traces[law]) for law in laws}
+    steps = []
+    for name, result in run.results.items():
+        stage, *of_step = name.split("/")
+        if stage == "servo" and (action := result.records.get("action")) is not None:
+            done = dict.fromkeys(_OF_STEPS) | {"verdict": "done", "reason": action.text, "steps": 0}
+            steps.append({"name": of_step[0], "kind": action.kind, "seconds": action.seconds} | done)
+        elif stage == "servo" and (law := "/".join(of_step)) in values and len(of_step) > 1:
+            of_trace, trace = values[law], run.traces[law]
+            seconds = trace.steps * trace.period
+            at = {key: of_trace.get(key) for key in _OF_STEPS}
+            steps.append({"name": of_step[0], "kind": "move", "seconds": seconds} | at)
+            of_trace["step"] = of_step[0]
+    return {"laws": list(values.values())} | ({"steps": steps} if steps else {})
 
 
 def _law(trace: Trace) -> dict[str, Any]:
