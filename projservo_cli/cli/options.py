@@ -295,7 +295,7 @@ def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
 
 
 def _overrides(options: Mapping[str, Any]) -> list["Override"]:
-    """Options that stand for keys of the configuration, then ``--set``, then ``--goal`` and ``--speed-scale``."""
+    """Options that stand for keys, then ``--set``, then ``--goal`` and ``--speed-scale``."""
     from projservo_cli.config import Override
 
     found = []

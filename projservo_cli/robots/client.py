@@ -70,6 +70,7 @@ class DrivenRobot:
 
     in_front = True
     takes_parts = True
+    stops = True  # whether the run is the last of the robot
 
     def __init__(self, steered: Steered, plant: Plant, known: Known, monitor: ImageMonitor | None) -> None:
         self.robot, self.steered, self.plant = (robot := steered.robot), steered, plant
@@ -271,8 +272,9 @@ class DrivenRobot:
         self.steered.command(step, period)
 
     def stop(self) -> None:
-        """Come to rest."""
-        self.robot.stop()
+        """Come to rest; in a session the robot holds its last set-point, until the session ends."""
+        if self.stops:
+            self.robot.stop()
 
 
 def _require_apart(name: str, reading: Reading) -> None:

@@ -172,6 +172,7 @@ class LawRun:
         # The matrices of a frame are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), nullcontext(shared) if shared else Session() as session:
             driven = external_robot.connected_robot(scenario, self.law, session, self.robot)
+            driven.stops = shared is None
             if own:
                 driven.robot.require_identity(contract.identity)
                 wrong = driven.fits()
