@@ -207,8 +207,9 @@ class SO101:
     """An arm of bus servos, driven by the contract of robots; its images are those of ``cameras``.
 
     port : of the arm, such as /dev/ttyACM0; ``auto`` takes the only one on which all servos answer.
-    ids : of the servos of the joints, base to tool. gripper : that of the gripper, which is held; None for
-        an arm without. gripper_counts : its readings closed and open; None for the limits that its servo keeps.
+    ids : of the servos of the joints, base to tool.
+    gripper : that of the gripper, which is held; None for an arm without.
+    gripper_counts : its readings closed and open; None for the limits that its servo keeps.
     limits : of its joints, rad and rad/s; without them the arm does not move.
     """
 
