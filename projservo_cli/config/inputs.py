@@ -290,7 +290,7 @@ def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
     files = files_of(config) if files is None else files
     about, trajectory = about_of(config, files.values()), config.trajectory
     formats, lengths = config.report.formats, _known_lengths(config)
-    if not config.has_task:
+    if not config.has_task or config.steps:
         return ReportInputs(about, formats, None, trajectory, lengths)
     alone = {
         "control": config.control.model_copy(update={"features": "points"}),

@@ -113,10 +113,11 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Driven(Fit):
-    """The runs of a robot of which no model is known, nor of its cameras."""
+    """The runs of a robot of which no model is known, nor of its cameras; or of a sequence."""
 
-    plan: Plan  # the plan
+    plan: Plan  # the plan, of a sequence that of its last motion
     traces: Mapping[str, Trace]  # runs of the laws by name
+    lacks: str = "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +195,7 @@ class FigureSpec:
     goal: bool = False  # whether it needs a known goal pose
     frames: bool = False  # whether it shows frames
     incidences: bool = False  # whether it shows those of the goal
+    sequence: bool = False  # whether it shows the motions of a sequence
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
 
@@ -207,7 +209,7 @@ class FigureSpec:
     @property
     def optional(self) -> bool:
         """Whether it is left out without a word where a run has nothing to show in it."""
-        return self.frames or self.incidences
+        return self.frames or self.incidences or self.sequence
 
     def drawn(self, data: Data) -> "Figure":
         """The figure of its data."""
@@ -223,8 +225,11 @@ class FigureSpec:
         if self.incidences and isinstance(report_data, Driven | ReportData):
             partial = any(trace.incidence_px is not None for trace in report_data.traces.values())
             return "" if partial else "the goal is a whole pose"
+        if self.sequence:
+            steps = isinstance(report_data, Driven) and any("/" in name for name in report_data.traces)
+            return "" if steps else "the task is one motion"
         if isinstance(report_data, Driven):
-            return "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
+            return report_data.lacks
         if len(report_data.calibration.joint_types) == 1:
             return "one joint cannot reach a pose"
         if not isinstance(report_data, ReportData):

@@ -3,11 +3,12 @@
     python -m tests.studies.pick_and_place [RUNS] [--fps 30] [--rate 0.25] [--killed]
 
 Bench, recording and mechanics are those of ``so101_goals``. In each run somebody puts the arm to where the
-part is to be gripped, and to where it is to be placed, and teaches both: the middle of the face and its normal,
-while the roll stays free. One call of ``servo`` then opens the gripper, approaches along the normal, grips,
-lifts, goes over the place and down to it, opens and retreats. The part is gripped where the gripper closes
-within 5 mm of it, moves with the tool, and is dropped where the gripper opens or loses torque. The truth is
-that of the emulator. With ``--killed`` run k is interrupted half a second after step k mod 9 began.
+part is to be gripped, and to where it is to be placed, and teaches both: the middle of the face and its
+normal, while the roll stays free. One call of ``servo`` then opens the gripper, approaches along the
+normal, grips, lifts, goes over the place and down to it, opens and retreats. The part is gripped where the
+gripper closes within 5 mm of it, moves with the tool, and is dropped where the gripper opens or loses
+torque. The truth is that of the emulator. With ``--killed`` run k is interrupted half a second after step k
+mod 9 began.
 """
 
 import argparse
@@ -176,7 +177,7 @@ def _driven(bench, runs, killed):
     for k in range(runs):
         there = []
         for name, q in zip(("grip", "place"), places[2 * k : 2 * k + 2], strict=True):
-            bench.script[:] = [None, by_hand(arm, q), lambda: there.append(truth.robot.pose(arm.link))]
+            bench.script[:] = [None, by_hand(arm, q), lambda at=there: at.append(truth.robot.pose(arm.link))]
             code, line = said(["teach", "-c", "arm.yaml", "-o", f"{name}.yaml", "--force"])
             if code != 0:
                 print(f"{k:3} {name} not taught, exit {code}: {line[-200:]}", flush=True)
@@ -194,15 +195,12 @@ def _driven(bench, runs, killed):
         kept += bool(holds)
         if code == 0:
             errors.append((mm, deg))
-        print(
-            f"{k:3} exit {code}: part {mm:.2f} mm, {deg:.2f}° off, {'' if holds else 'NOT '}kept  {line[-230:]}",
-            flush=True,
-        )
+        how = f"part {mm:.2f} mm, {deg:.2f}° off, {'' if holds else 'NOT '}kept"
+        print(f"{k:3} exit {code}: {how}  {line[-230:]}", flush=True)
     found = np.array(errors).reshape(-1, 2)
     placed = int(((found[:, 0] <= IN_PLACE_MM) & (found[:, 1] <= IN_PLACE_DEG)).sum())
-    print(
-        f"{placed} of {runs} parts within {IN_PLACE_MM:g} mm and {IN_PLACE_DEG:g}°; torque and grip kept in {kept}"
-    )
+    within = f"within {IN_PLACE_MM:g} mm and {IN_PLACE_DEG:g}°"
+    print(f"{placed} of {runs} parts {within}; torque and grip kept in {kept}")
     if len(found):
         print(f"mm {quantiles(found[:, 0])}; deg {quantiles(found[:, 1])}")
 
