@@ -10,7 +10,7 @@ import numpy as np
 
 from projservo_cli import plugins
 from projservo_cli.chain import FIGURES, Chain
-from projservo_cli.config import Config, load_config, shipped
+from projservo_cli.config import Config, load_config, shipped, to_goals, to_yaml
 from projservo_cli.config.inputs import joints_of
 from projservo_cli.display import Printed
 from projservo_cli.files import working_in
@@ -104,6 +104,30 @@ class Experiment(Printed):
             with working_in(self._run.path.parent, FIGURES):
                 self._run = stored(self._run.path)  # another process may have written it until now
                 return self._make(stages, _targets(laws), listener, force=force, blind=blind)
+
+    def servo(self, *goals: str, law: str = "", blind: bool = False) -> dict[str, RunTrace]:
+        """Drive to goals one after the other, over one connection, instead of the steps of the task.
+
+        Parameters
+        ----------
+        *goals : names of ``task.goals``, or of taught files ``NAME.yaml`` in the working folder.
+        law : in whose one mode the arm is driven; by default that of the configuration.
+        blind : as of ``make``.
+
+        Returns
+        -------
+        Traces by step and law; of one goal by law.
+
+        Raises
+        ------
+        InputError, WorkFailed
+            As of ``make``; also where a step does not converge, at which a sequence stops.
+        """
+        if not goals:
+            raise InputError("servo: name a goal or several, such as servo('above', 'grip')")
+        changes = to_goals(f"servo: {', '.join(goals)}", goals)
+        self._config = load_config(self.config.name, changes, text=to_yaml(self.config))
+        return self.make("servo", laws=(law,) if law else (), blind=blind).traces
 
     def _make(
         self, stages: Sequence[str], laws: Sequence[str], listener: Listener, *, force: bool, blind: bool

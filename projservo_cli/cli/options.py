@@ -296,7 +296,7 @@ def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
 
 def _overrides(options: Mapping[str, Any]) -> list["Override"]:
     """Options that stand for keys, then ``--set``, then ``--goal`` and ``--speed-scale``."""
-    from projservo_cli.config import Override
+    from projservo_cli.config import Override, to_goals
 
     found = []
     keys = {key: name for name, key in _KEYS.items() if not (name == "joint_unit" and "motions" in options)}
@@ -319,10 +319,8 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
         values = [[int(one[1]), int(one[2])] for one in sizes if one is not None]
         found.append(Override(flag, "data.image_size_px", values if len(values) > 1 else values[0]))
     found += map(Override.parse, options["sets"])  # which would undo what follows
-    if goals := [goal.removesuffix(".yaml") for goal in options.get("goals") or ()]:
-        flag, steps = f"--goal {' --goal '.join(goals)}", [{"to": goal} for goal in goals]
-        found.append(Override(flag, "task.steps", steps if len(goals) > 1 else []))
-        found.append(Override(flag, "task.goal", goals[-1]))
+    if goals := options.get("goals"):
+        found += to_goals(f"--goal {' --goal '.join(goals)}", goals)
     if (scale := options.get("speed_scale")) is not None:
         found.append(Override(f"--speed-scale {scale}", "plant.speed_scale", scale))
     return found

@@ -370,6 +370,14 @@ def overrides_of(what: str, values: Mapping[str, Any]) -> list["Override"]:
     return found
 
 
+def to_goals(what: str, goals: Sequence[str]) -> list["Override"]:
+    """Return overrides that messages call by ``what``: to goals of some names, one after the other."""
+    names = [goal.removesuffix(".yaml") for goal in goals]
+    steps = [{"to": name} for name in names] if len(names) > 1 else []
+    alone = [] if steps or names == ["goal"] else [Override(what, "task.goal", names[0])]
+    return [Override(what, "task.steps", steps), *alone]
+
+
 def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
     """Read and check the configuration of a sweep; ``base`` becomes absolute paths."""
     document = _Document.read(path)
@@ -497,8 +505,8 @@ def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> 
     """Replace the names of taught files, relative to the configuration, by their contents.
 
     While it is being taught, a goal whose file is missing is the start, and without a start there is no task.
-    A goal that steps name and that is not given is in the file of its name; the goal of a sequence is by
-    default the last of its steps.
+    A goal that steps name and that is not given is in the file of its name, or is the one called goal; the
+    goal of a sequence is by default the last of its steps.
     """
     task = document.values.get("task")
     if not isinstance(task, dict):
@@ -518,6 +526,8 @@ def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> 
         task.setdefault("goals", {})
     goals: dict[str, Any] = task["goals"] if isinstance(task.get("goals"), dict) else {}
     for name in named:
+        if name == "goal" and task.get("goal") is not None:
+            goals.setdefault("goal", task["goal"])
         if name not in goals and (teaching or (base / f"{name}.yaml").exists()):
             goals[name] = f"{name}.yaml"
     for name in list(goals):

@@ -9,6 +9,8 @@ import pytest
 
 from projservo_cli import cli
 from projservo_cli.config import load_config
+from projservo_cli.experiment import Experiment
+from projservo_cli.records import InputError
 from projservo_cli.stages import servo
 from projservo_cli.store import load
 from tests.configured import truth_of
@@ -87,7 +89,7 @@ def test_a_pin_is_brought_before_its_hole_goes_in_and_comes_out_along_it(call):
     assert np.linalg.norm(np.cross(before - inside[0], axis), axis=1).max() < 1e-3
     assert (inside - after) @ axis == pytest.approx((inside - after)[0] @ axis, rel=1e-2)
     traces = list(run.traces.values())
-    assert [trace.free_dof for trace in traces] == [1, 1, None]
+    assert [trace.free_dof for trace in traces] == [1, 1, 1]
     for earlier, later, name in zip(
         traces, traces[1:], MOTIONS[1:], strict=False
     ):  # each from where it stands
@@ -106,13 +108,15 @@ def test_a_pin_is_brought_before_its_hole_goes_in_and_comes_out_along_it(call):
 
 
 def test_the_first_step_that_fails_stops_and_says_what_is_held(call):
-    steps = [STEPS[2], STEPS[3], {"retreat": {"along": "pin", "by_px": 900.0}}, {"wait_s": 1.0}]
-    answer = call("--json", steps=steps, law=["--law", "incidences", "--set", "control.mode=[regulate]"])
+    steps = [{"retreat": {"along": "pin", "by_px": 1.0}}, STEPS[3], STEPS[2], {"wait_s": 1.0}]
+    law = ["--law", "incidences", "--set", "control.mode=[regulate]", "--set", "stop.max_steps=80"]
+    answer = call("--json", steps=steps, law=law)
     assert answer.code == 1
-    assert answer.json["failed"] == "servo/retreat/incidences"
-    assert [step["name"] for step in answer.json["steps"]] == ["in_hole", "gripper", "retreat"]
-    (line,) = [line for line in answer.err.splitlines() if line.startswith("projservo: servo/retreat")]
+    assert answer.json["failed"] == "servo/in_hole/incidences"
+    assert [step["name"] for step in answer.json["steps"]] == ["retreat", "gripper", "in_hole"]
+    (line,) = [line for line in answer.err.splitlines() if line.startswith("projservo: servo/in_hole")]
     assert "the gripper stays at 0.3; wait was not begun; the sequence begins again at its first" in line
+    assert "ended in max steps" in line
     assert "servo/wait" not in load("run").results
 
 
@@ -175,3 +179,13 @@ def test_goals_are_named_one_after_the_other_and_the_first_from_where_the_arm_st
     assert alone.code == 0, alone.err
     assert "steps" not in alone.json
     assert [name for name in load("run").results if "/" in name] == ["servo/exact_track"]
+
+
+def test_goals_are_named_in_python_too(calibrated):
+    run = Experiment(load_config(PUMA, ["control.mode=[track]", f"task.goals={json.dumps({'in': IN_HOLE})}"]))
+    run._run = load(calibrated)  # which is in memory from here on
+    traces = run.servo("in", "goal", law="exact")
+    assert [*traces] == ["in/exact_track", "goal/exact_track"]
+    np.testing.assert_array_equal(traces["goal/exact_track"].q[0], traces["in/exact_track"].q[-1])
+    with pytest.raises(InputError, match="name a goal or several"):
+        run.servo()
