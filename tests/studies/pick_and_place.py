@@ -3,12 +3,12 @@
     python -m tests.studies.pick_and_place [RUNS] [--fps 30] [--rate 0.25] [--killed]
 
 Bench, recording and mechanics are those of ``so101_goals``. In each run somebody puts the arm to where the
-part is to be gripped, and to where it is to be placed, and teaches both: the middle of the face and its
-normal, while the roll stays free. One call of ``servo`` then opens the gripper, approaches along the
-normal, grips, lifts, goes over the place and down to it, opens and retreats. The part is gripped where the
-gripper closes within 5 mm of it, moves with the tool, and is dropped where the gripper opens or loses
-torque. The truth is that of the emulator. With ``--killed`` run k is interrupted half a second after step k
-mod 9 began.
+part is to be gripped, and to where it is to be placed, and teaches both: the middle of the face and the
+direction of its upright edge; the turn about that follows, as five joints have it. One call of ``servo``
+then opens the gripper, approaches along the normal, grips, lifts, goes over the place and down to it, opens
+and retreats. The part is gripped where the gripper closes within 5 mm of it, moves with the tool, and is
+dropped where the gripper opens or loses torque. The truth is that of the emulator. With ``--killed`` run k
+is interrupted half a second after step k mod 9 began.
 """
 
 import argparse
@@ -34,12 +34,12 @@ OPENED, CLOSED, PART = 2600, 1200, 1500  # counts of the gripper, and that at wh
 REACH_M, IN_PLACE_MM, IN_PLACE_DEG = 0.005, 2.0, 2.0
 FEATURES = {
     "plate": "{on: tool, plane: [0, 1, 2]}",
-    "wall": "{on: scene, plane: plate}",
     "middle": "{on: tool, point: [0, 1, 2, 3]}",
     "spot": "{on: scene, point: middle}",
     "down": "{on: tool, line: [1, 0]}",
+    "upright": "{on: scene, line: down}",
 }
-INCIDENCES = "incidences: [[plate, wall, parallel], [middle, spot]]"
+INCIDENCES = "incidences: [[down, upright, parallel], [middle, spot]]"
 STEPS = """\
   steps:
     - {act: {gripper: 1.0}}
@@ -97,9 +97,9 @@ class Part:
 
 
 def off(pose, wanted):
-    """Distance, mm, and angle, deg, of two poses, the roll about the tool's own axis left out."""
-    turn = Rotation.from_matrix(pose[:3, :3].T @ wanted[:3, :3]).as_rotvec(degrees=True)
-    return 1e3 * np.linalg.norm(pose[:3, 3] - wanted[:3, 3]), float(np.linalg.norm(turn[:2]))
+    """Distance, mm, and angle, deg, of two poses (4, 4)."""
+    turn = Rotation.from_matrix(pose[:3, :3].T @ wanted[:3, :3]).magnitude()
+    return 1e3 * np.linalg.norm(pose[:3, 3] - wanted[:3, 3]), float(np.degrees(turn))
 
 
 def written(bench):
