@@ -179,9 +179,10 @@ class Chain:
             try:
                 if step.why:
                     self._make_result(step)
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, InputError) as error:
                 if step.part and step.stage == "servo":
-                    self.listener.say(f"{step.name}: interrupted{self._left_behind(step)}")
+                    what = "refused" if isinstance(error, InputError) else "interrupted"
+                    self.listener.say(f"{step.name}: {what}{self._left_behind(step)}")
                 raise
             if step.law and not self.failed:
                 name = step.name.removeprefix(SERVO)
@@ -387,7 +388,7 @@ class Chain:
 
             followed = (run.at_step(step.part) if step.part else run).plan
             given = replace(inputs, plan=_bounded(inputs.plan, run))
-            if config.task is not None and config.task.start_joints is None:
+            if step.part and config.task is not None and config.task.start_joints is None:
                 given, followed = self._from_here(step, given, followed)
             brought = {"blind": self.blind, "session": self.session}
             return (servo.run(given, run.calibration, followed, step.law, **brought),)
@@ -445,14 +446,15 @@ class Chain:
         return self.config.calibration.reference.values(self.config.joint_types or "")
 
     def _from_here(self, step: Step, inputs: ServoInputs, plan: Plan) -> tuple[ServoInputs, Plan]:
-        """Return the inputs of a run from where the arm stands, and a plan from there, which is kept."""
+        """Return the inputs of a step from where the arm stands, and a plan from there, which is kept."""
         from projservo_cli.stages import plan as planning
 
-        q, traces = plan.q_start, [one for one in self.run.traces.items() if step.part]
-        if self.session is not None and self.session.robot is not None and step.part:
+        motions = [name for name in parts_of("plan", self.config.steps) if name]
+        k, q = motions.index(step.part), plan.q_start
+        if k and self.session is not None and self.session.robot is not None:
             q = self.session.reading()
-        elif traces:
-            q = traces[-1][1].q[-1]
+        elif k:
+            q = self.run.traces[f"{motions[k - 1]}/{step.law}"].q[-1]
         inputs = replace(inputs, plan=replace(inputs.plan, q_current=q))
         if (q != plan.q_start).any():
             plan = planning.run(inputs.plan, self.run.calibration)

@@ -183,9 +183,21 @@ class Experiment(Printed):
         """Held-out errors of the calibration; None where they were not asked for."""
         return self._run.cross_validation
 
+    def at_step(self, name: str) -> "Experiment":
+        """Return one step of a sequence as an experiment of its own, with its ``plan`` and its ``traces``.
+
+        Raises InputError where no motion of such a name was made.
+        """
+        names = [one.removeprefix("plan/") for one in self.results if one.startswith("plan/")]
+        if name not in names:
+            raise InputError(f"at_step: there is no motion {name}; motions: {', '.join(names) or 'none'}")
+        found = Experiment.of(self._run.at_step(name))
+        found._config = self._readable()
+        return found
+
     @property
     def plan(self) -> MotionPlan:
-        """The plan."""
+        """The plan; of a sequence see ``at_step``."""
         self._require("plan")
         plan, config = self._run.plan, self._readable()
         return MotionPlan.of(plan, None if config is None else plan_scene_of(config, self._run.calibration))

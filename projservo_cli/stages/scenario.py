@@ -90,6 +90,11 @@ class Scenario:
         return self.inputs.truth
 
     @property
+    def starts_here(self) -> bool:
+        """Whether the start is where the arm stands."""
+        return self.inputs.task is not None and self.inputs.task.start_joints is None
+
+    @property
     def m(self) -> int:
         """Return the number of markers on the face."""
         return len(self.numbers) - self.exact.pins

@@ -4,7 +4,7 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -181,7 +181,7 @@ class LawRun:
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
                 unseen = self._require_images(driven, "the robot did not move, since where it stands", 1)
-                stands = scenario.inputs.q_current is not None and external_robot.stands_at(driven, start)
+                stands = scenario.starts_here and external_robot.stands_at(driven, start)
                 path = external_robot.path_to(driven.steered, start, settle_s, "servo")
                 for _ in () if stands else path:
                     if wrong := driven.agrees():
@@ -614,6 +614,10 @@ def run(inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, **
     follow has no time; WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
     ``refuses`` is set.
     """
+    task = inputs.plan.task
+    if task is not None and task.start_joints is None and inputs.plan.q_current is None:
+        # where the arm stood when it was planned
+        inputs = replace(inputs, plan=replace(inputs.plan, q_current=plan.q_start))
     scenario = run_scenario(inputs, calibration)
     _require_its_task(scenario.towards(plan), plan)
     return drive(scenario, plan, name, **brought).trace()

@@ -187,5 +187,9 @@ def test_goals_are_named_in_python_too(calibrated):
     traces = run.servo("in", "goal", law="exact")
     assert [*traces] == ["in/exact_track", "goal/exact_track"]
     np.testing.assert_array_equal(traces["goal/exact_track"].q[0], traces["in/exact_track"].q[-1])
+    assert run.at_step("goal").plan.feasible
+    assert [*run.at_step("goal").traces] == ["exact_track"]
+    with pytest.raises(InputError, match="there is no motion out; motions: in, goal"):
+        run.at_step("out")
     with pytest.raises(InputError, match="name a goal or several"):
         run.servo()
