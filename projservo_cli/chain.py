@@ -5,25 +5,47 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from projservo_cli import plugins
 from projservo_cli.config import Config, stored_yaml
-from projservo_cli.config.inputs import about_of, joints_of, recording_inputs, scenery_of, suggestion_inputs
+from projservo_cli.config.inputs import (
+    about_of,
+    joints_of,
+    recording_inputs,
+    scenery_of,
+    servo_inputs,
+    suggestion_inputs,
+)
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, run_name
 from projservo_cli.progress import Listener
 from projservo_cli.records import (
+    Action,
+    FloatArray,
     InputError,
     JointList,
+    Plan,
     WorkFailed,
 )
 from projservo_cli.result_hashes import digest
-from projservo_cli.stages.stage_inputs import PlanInputs
-from projservo_cli.steps import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
+from projservo_cli.settings.task import TaskStep
+from projservo_cli.stages.stage_inputs import Carrier, PlanInputs, ServoInputs
+from projservo_cli.steps import (
+    STAGES,
+    Step,
+    inputs_of,
+    key_of_calibration,
+    parts_of,
+    result_of,
+    steps_for,
+)
 from projservo_cli.store import SERVO, Run, save
+
+if TYPE_CHECKING:
+    from projservo_cli.robots.session import Session
 
 _STOPPED = ("failed", "object moved")  # verdicts after which nothing is driven
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
@@ -51,6 +73,7 @@ class Chain:
     confirm: bool = False  # whether to ask before the first motion
     in_memory: bool = False  # whether results stay in memory
     blind: bool = False  # whether a robot may move although cameras show nothing
+    session: "Session | None" = None  # connection to the robot that the steps of the task share
     steps: list[Step] = field(init=False)
     laws: tuple[str, ...] = field(init=False)  # names of the runs of laws that the steps make or need
     failed: str = ""  # name of the step that failed
@@ -63,7 +86,7 @@ class Chain:
         self.steps = steps_for(self.config, self.run, stages, laws=wanted, force=force, recording=why)
         if self.recording is not None:
             self.steps.insert(0, Step("record", "", "", {}, why))
-        self.laws = tuple(step.law for step in self.steps if step.law)
+        self.laws = tuple(step.name.removeprefix(SERVO) for step in self.steps if step.law)
 
     @property
     def pending(self) -> bool:
@@ -86,10 +109,10 @@ class Chain:
         """
         moving = None
         if not self.config.plant.simulated and "servo" not in self.names:
-            moving = next((step for step in self.steps if step.law and step.why), None)
+            moving = next((step for step in self.steps if step.stage == "servo" and step.why), None)
         if moving is not None:
             raise InputError(
-                f"{self.names[-1]} needs a run of {moving.law} ({moving.why}), which moves "
+                f"{self.names[-1]} needs a run of {moving.law or moving.part} ({moving.why}), which moves "
                 f"{self.config.plant.use}: run projservo servo first, or name the stage servo as well"
             )
         code = self.code()
@@ -107,7 +130,11 @@ class Chain:
         """Runs of a robot of somebody's that are shown as they were stored: law, plant, and date."""
         if self.config.plant.simulated or "servo" in self.names:
             return []
-        stored = [(step.law, self.run.results[step.name]) for step in self.steps if step.law and not step.why]
+        stored = [
+            (step.name.removeprefix(SERVO), self.run.results[step.name])
+            for step in self.steps
+            if step.law and not step.why
+        ]
         plant = plugins.short_name(self.config.plant.use or "")
         return [{"law": law, "plant": plant, "date": one.provenance.get("date")} for law, one in stored]
 
@@ -129,45 +156,97 @@ class Chain:
             self.listener.say("{law}: the stored run of {plant}, recorded {date}".format_map(one))
         if any(step.why for step in self.steps) and (notice := compilation()):
             self.listener.say(notice)  # the first run on a machine is slower by that
-        motion = next((step for step in self.steps if step.law and step.why), None)
         steps = [step for step in self.steps if step.stage != "record"]
-        with self._compiling():
-            for done, step in enumerate(steps):
-                self.listener.progress("results", done, len(steps))
-                if step is motion and not self._may_move(step):
-                    return
-                if step.why:
-                    self._make_result(step)
-                if step.law and not self.failed:
-                    self.laws_done += (step.law,)
-                    trace = self.run.traces[step.law]
-                    if trace.verdict in _STOPPED:  # nor is what stopped driven by the next law
-                        self.failed, self.reason = step.name, trace.reason
-                if self.failed:
-                    return
+        try:
+            with self._compiling(), self._connection():
+                self._make_steps(steps)
+        except WorkFailed as error:  # of a robot that may not be at rest
+            self._fail(steps[-1], " ".join(str(error).split()))
+        if self.failed:
+            return
         text = stored_yaml(self.config)
         if self.run.configuration != text:  # overrides are stored also where nothing had to be made
             self._keep(replace(self.run, configuration=text))
 
-    def _may_move(self, step: Step) -> bool:
-        """Tell where the object of a carried goal is, and whether a robot may go there, perhaps after asking.
+    def _make_steps(self, steps: Sequence[Step]) -> None:
+        """Make the outdated results of steps, until one fails."""
+        motion = next((step for step in steps if step.stage == "servo" and step.why), None)
+        for done, step in enumerate(steps):
+            self.listener.progress("results", done, len(steps))
+            if step is motion and not self._may_move(step, steps):
+                return
+            try:
+                if step.why:
+                    self._make_result(step)
+            except (KeyboardInterrupt, InputError) as error:
+                if step.part and step.stage == "servo":
+                    what = "refused" if isinstance(error, InputError) else "interrupted"
+                    self.listener.say(f"{step.name}: {what}{self._left_behind(step)}")
+                raise
+            if step.law and not self.failed:
+                name = step.name.removeprefix(SERVO)
+                self.laws_done += (name,)
+                trace = self.run.traces[name]
+                if trace.verdict in _STOPPED and not step.part:  # nor is it driven by the next law
+                    self._fail(step, trace.reason)
+                elif trace.verdict != "converged" and step.part:  # nor are the next steps made
+                    self._fail(step, f"ended in {trace.verdict}: {trace.reason}")
+            if self.failed:
+                return
 
-        Simulated or not: one that has moved too far is refused where nobody is asked.
+    def _may_move(self, motion: Step, steps: Sequence[Step]) -> bool:
+        """Tell where objects of carried goals are, and whether a robot may go there, perhaps after asking.
+
+        Simulated or not: where one has moved too far and nobody is asked, nothing moves.
         """
-        record = step.record or inputs_of("servo", self.config)
-        if (carrier := record.plan.carrier) is not None:
+        for step in steps:
+            if step.stage != "plan" or (carrier := self._carrier(step)) is None:
+                continue
             from projservo_cli.stages.objects import too_far
 
-            plan = self.run.plan
+            plan = self.run.results[step.name].records[""]
             self.listener.say(plan.object_words)
             if (why := too_far(plan, carrier)) and not self.confirm:
-                self.failed, self.reason = step.name, why
+                self._fail(motion, why)
                 return False
             if why:
                 self.listener.say(why)
         if self.confirm:
+            if self.config.steps:
+                self.listener.say(f"servo: one after the other: {', '.join(self.config.steps)}")
             self.listener.confirm("servo", self.config.plant)
         return True
+
+    def _carrier(self, step: Step) -> Carrier | None:
+        """Return the object of the goal of a plan; None for a goal that stands still."""
+        record = step.record or inputs_of("plan", self.config.at_step(step.part))
+        carrier: Carrier | None = record.carrier
+        return carrier
+
+    def _fail(self, step: Step, reason: str) -> None:
+        """Note the failure of a step, of a sequence with what stays as it was sent."""
+        after = self._left_behind(step) if step.part and step.stage == "servo" else ""
+        self.failed, self.reason = step.name, reason + after
+
+    def _left_behind(self, step: Step) -> str:
+        """Say what stays as it was sent, and which steps of the sequence were not begun."""
+        names = list(self.config.steps)
+        rest = names[names.index(step.part) + 1 :]
+        kept = "" if self.session is None else self.session.kept
+        begun = f"{', '.join(rest)} {'was' if len(rest) == 1 else 'were'} not begun" if rest else ""
+        return "".join(
+            f"; {text}" for text in (kept, begun, "the sequence begins again at its first step") if text
+        )
+
+    def _connection(self) -> "AbstractContextManager[Any]":
+        """Return the connection that steps share, or that says where the arm stands; else nothing."""
+        task = self.config.task
+        if task is None or (not task.steps and task.start_joints is not None):
+            return nullcontext()
+        from projservo_cli.robots.session import Session
+
+        self.session = Session()
+        return self.session
 
     def reported(self, run: Run | None = None) -> Run:
         """Return the results that a report of the named runs of laws needs.
@@ -175,7 +254,7 @@ class Chain:
         run : one that is not stored yet.
         """
         run = run or self.run
-        made = ["plan", *(SERVO + law for law in self.laws)] if self.laws else []
+        made = [step.name for step in self.steps if self.laws and step.stage in ("plan", "servo")]
         return replace(run, results={name: run.results[name] for name in ["calibrate", *made]})
 
     def record(self) -> bool:
@@ -246,17 +325,19 @@ class Chain:
             yield _Shortfall(f"calibrate: {of_calibration['suggestions_reason']}", fatal=True)
         yield from self._of_runs()
         # Other profiles are those of the paper, of which the margins are only measured.
-        searched = "plan" in results and self.run.plan.profile in ("constrained", "joint_space")
-        if searched and not self.run.plan.feasible:
-            yield _Shortfall(f"plan: {self.run.plan.reason}", fatal="plan" in self.names)
+        for step in self.steps:
+            plan = results[step.name].records[""] if step.stage == "plan" else None
+            if plan is not None and plan.profile in ("constrained", "joint_space") and not plan.feasible:
+                yield _Shortfall(f"{step.name}: {plan.reason}", fatal="plan" in self.names)
 
     def _of_runs(self) -> Iterator[_Shortfall]:
         """A line on each run that did not converge or missed periods, and whether the call fails by it."""
         required = self.config.control.must_converge
-        for trace in (self.run.traces[law] for law in self.laws_done):
+        failed = self.failed.removeprefix(SERVO)  # is printed last
+        for trace in (self.run.traces[law] for law in self.laws_done if law != failed):
             must, converged = must_converge(trace.law, required), trace.verdict == "converged"
             if trace.verdict in _STOPPED or (converged and not trace.overruns):
-                continue  # failures are printed last
+                continue
             but = " must converge, but" if must and not converged else ""
             reason = " ".join(trace.reason.split())
             text = (
@@ -281,12 +362,13 @@ class Chain:
         try:
             result = result_of(step, self.config, *self._made(step, run))
         except WorkFailed as error:
-            self.failed, self.reason = step.name, " ".join(str(error).split())
+            self._fail(step, " ".join(str(error).split()))
             if error.refutes:
                 self._keep(replace(self.run, refuted=self.reason))
             return
-        place = STAGES.index(step.stage)
+        place, run = STAGES.index(step.stage), replace(self.run, configuration=run.configuration)
         after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
+        after += self._of_other_tasks(step, run)
         results = {name: stored for name, stored in run.results.items() if name not in after}
         refuted = run.refuted
         if step.stage == "calibrate":
@@ -298,9 +380,23 @@ class Chain:
         if after:
             self.listener.say(f"{', '.join(after)}: dropped, their inputs were replaced")
 
+    def _of_other_tasks(self, step: Step, run: Run) -> list[str]:
+        """Names of plans that are not of this task, and of results of steps that are to come."""
+        names = [one.name for one in self.steps]
+        if step.stage == "plan":
+            plans = [name for name in run.results if name.split("/")[0] == "plan"]
+            return [name for name in plans if name not in names or names.index(name) > names.index(step.name)]
+        if not step.part or step.stage != "servo":
+            return []
+        done = names[: names.index(step.name) + 1]
+        return [name for name in run.results if name.startswith(SERVO) and name not in done]
+
     def _made(self, step: Step, run: Run) -> tuple[Any, ...]:
         """Return the result of a stage from its inputs; import its module on demand."""
-        inputs, progress = step.record or inputs_of(step.stage, self.config), self.listener.progress
+        if step.part and step.stage == "servo" and not step.law:
+            return (self._acted(self.config.steps[step.part]),)
+        config, progress = self.config.at_step(step.part), self.listener.progress
+        inputs = step.record or inputs_of(step.stage, config)
         if step.stage == "calibrate":
             from projservo_cli.stages import calibrate
 
@@ -313,15 +409,87 @@ class Chain:
         if step.stage == "plan":
             from projservo_cli.stages import plan
 
-            return (plan.run(_bounded(inputs, run), run.calibration),)
+            bounded = replace(_bounded(inputs, run), q_current=self._expected(step, run))
+            return (plan.run(bounded, run.calibration),)
         if step.stage == "servo":
             from projservo_cli.stages import servo
 
-            bounded = replace(inputs, plan=_bounded(inputs.plan, run))
-            return (servo.run(bounded, run.calibration, run.plan, step.law, blind=self.blind),)
+            followed = (run.at_step(step.part) if step.part else run).plan
+            given = replace(inputs, plan=_bounded(inputs.plan, run))
+            if step.part and config.task is not None and config.task.start_joints is None:
+                given, followed = self._from_here(step, given, followed)
+            brought = {"blind": self.blind, "session": self.session}
+            return (servo.run(given, run.calibration, followed, step.law, **brought),)
         from projservo_cli.stages import report
 
         return (report.run(inputs, self.reported(run), run.path.parent, progress=progress),)
+
+    def _acted(self, asked: TaskStep) -> Action:
+        """Have the robot act or wait."""
+        assert self.session is not None
+        if not self.config.plant.simulated:
+            self._opened(servo_inputs(self.config))
+        if asked.act is None:
+            assert asked.wait_s is not None
+            self.session.hold(asked.wait_s)
+            return Action("wait", f"{asked.wait_s:g} s", asked.wait_s)
+        seconds = sum(self.session.act(name, value) for name, value in asked.act.items())
+        return Action("act", ", ".join(f"{name} {value:g}" for name, value in asked.act.items()), seconds)
+
+    def _opened(self, inputs: ServoInputs) -> FloatArray:
+        """Open the robot of somebody's, unless it is, and return where it stands (n,), rad or m."""
+        from projservo_cli.stages.external_robot import opened_robot
+
+        assert self.session is not None
+        opened_robot(self.session, inputs, self.run.calibration)
+        actions = {name for step in self.config.steps.values() for name in step.act or ()}
+        self.session.require_acts(actions)
+        return self.session.reading()
+
+    def _expected(self, step: Step, run: Run) -> FloatArray | None:
+        """Return where the arm will stand before a step, by the plan before; None for a given start."""
+        task = self.config.task
+        if task is None:
+            return None
+        before = [one for one in parts_of("plan", self.config.steps) if one]
+        k = before.index(step.part) if step.part else 0
+        if k == 0:
+            return None if task.start_joints is not None else self._standing()
+        plan = run.at_step(before[k - 1]).plan
+        if not np.isfinite(plan.q[-1]).all():
+            raise WorkFailed(
+                f"where the arm then stands is open, since no joints follow the plan of {before[k - 1]}"
+            )
+        end: FloatArray = plan.q[-1]
+        return end
+
+    def _standing(self) -> FloatArray:
+        """Joints (n,) where the arm stands before anything moves it, rad or m."""
+        if not self.config.plant.simulated:
+            return self._opened(servo_inputs(self.config))
+        if self.config.calibration.reference is None:
+            raise InputError(
+                "task.start: current: a simulated robot stands at calibration.reference: set it, or joints"
+            )
+        return self.config.calibration.reference.values(self.config.joint_types or "")
+
+    def _from_here(self, step: Step, inputs: ServoInputs, plan: Plan) -> tuple[ServoInputs, Plan]:
+        """Return the inputs of a step from where the arm stands, and a plan from there, which is kept."""
+        from projservo_cli.stages import plan as planning
+
+        motions = [name for name in parts_of("plan", self.config.steps) if name]
+        k, q = motions.index(step.part), plan.q_start
+        if k and self.session is not None and self.session.robot is not None:
+            q = self.session.reading()
+        elif k:
+            q = self.run.traces[f"{motions[k - 1]}/{step.law}"].q[-1]
+        inputs = replace(inputs, plan=replace(inputs.plan, q_current=q))
+        if (q != plan.q_start).any():
+            plan = planning.run(inputs.plan, self.run.calibration, plan)
+            name = f"plan/{step.part}"
+            found = replace(self.run.results[name], records={"": plan})
+            self.run = replace(self.run, results={**self.run.results, name: found})
+        return inputs, plan
 
     def _compiling(self) -> AbstractContextManager[None]:
         """Return the background compilation for runs that follow a calibration."""

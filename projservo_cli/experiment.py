@@ -10,7 +10,7 @@ import numpy as np
 
 from projservo_cli import plugins
 from projservo_cli.chain import FIGURES, Chain
-from projservo_cli.config import Config, load_config, shipped
+from projservo_cli.config import Config, load_config, shipped, to_goals, to_yaml
 from projservo_cli.config.inputs import joints_of
 from projservo_cli.display import Printed
 from projservo_cli.files import working_in
@@ -105,6 +105,30 @@ class Experiment(Printed):
                 self._run = stored(self._run.path)  # another process may have written it until now
                 return self._make(stages, _targets(laws), listener, force=force, blind=blind)
 
+    def servo(self, *goals: str, law: str = "", blind: bool = False) -> dict[str, RunTrace]:
+        """Drive to goals one after the other, over one connection, instead of the steps of the task.
+
+        Parameters
+        ----------
+        *goals : names of ``task.goals``, or of taught files ``NAME.yaml`` in the working folder.
+        law : in whose one mode the arm is driven; by default that of the configuration.
+        blind : as of ``make``.
+
+        Returns
+        -------
+        Traces by step and law; of one goal by law.
+
+        Raises
+        ------
+        InputError, WorkFailed
+            As of ``make``; also where a step does not converge, at which a sequence stops.
+        """
+        if not goals:
+            raise InputError("servo: name a goal or several, such as servo('above', 'grip')")
+        changes = to_goals(f"servo: {', '.join(goals)}", goals)
+        self._config = load_config(self.config.name, changes, text=to_yaml(self.config))
+        return self.make("servo", laws=(law,) if law else (), blind=blind).traces
+
     def _make(
         self, stages: Sequence[str], laws: Sequence[str], listener: Listener, *, force: bool, blind: bool
     ) -> "Experiment":
@@ -159,9 +183,21 @@ class Experiment(Printed):
         """Held-out errors of the calibration; None where they were not asked for."""
         return self._run.cross_validation
 
+    def at_step(self, name: str) -> "Experiment":
+        """Return one step of a sequence as an experiment of its own, with its ``plan`` and its ``traces``.
+
+        Raises InputError where no motion of such a name was made.
+        """
+        names = [one.removeprefix("plan/") for one in self.results if one.startswith("plan/")]
+        if name not in names:
+            raise InputError(f"at_step: there is no motion {name}; motions: {', '.join(names) or 'none'}")
+        found = Experiment.of(self._run.at_step(name))
+        found._config = self._readable()
+        return found
+
     @property
     def plan(self) -> MotionPlan:
-        """The plan."""
+        """The plan; of a sequence see ``at_step``."""
         self._require("plan")
         plan, config = self._run.plan, self._readable()
         return MotionPlan.of(plan, None if config is None else plan_scene_of(config, self._run.calibration))

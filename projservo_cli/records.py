@@ -1100,6 +1100,15 @@ class Trace(RecordedFrames, RunHistory, RunMetrics):
 
 
 @dataclass(frozen=True, eq=False)
+class Action:
+    """A step of a sequence that no law drives, once it was done."""
+
+    kind: str = _scalar(about="act or wait")
+    text: str = _scalar(about="action and value, or the time to wait")
+    seconds: float = _scalar("s", "time for which the arm was held")
+
+
+@dataclass(frozen=True, eq=False)
 class Report:
     """Files of a report, the claims of the paper against the runs, and the numbers of the extra runs.
 

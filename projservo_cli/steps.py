@@ -25,6 +25,7 @@ from projservo_cli.records import InputError
 from projservo_cli.report.report_data import CLAIMS_FILE, PAGE_FILE
 from projservo_cli.result_hashes import key_of
 from projservo_cli.robots.source import source_hash
+from projservo_cli.settings.task import TaskStep
 from projservo_cli.store import SERVO, Result, Run
 
 # The stages in their order, and what makes the record that each is given.
@@ -50,11 +51,12 @@ class Step:
     note: str = ""  # what changed that does not outdate it, in words
     unkeyed: bool = False  # whether its law has no source, so that it is never up to date
     record: Any = None  # inputs of the stage; None where they cannot be made
+    part: str = ""  # name of the step of a sequence, else empty
 
     @property
     def name(self) -> str:
         """Name of the result in the run file."""
-        return f"{SERVO}{self.law}" if self.law else self.stage
+        return "/".join(filter(None, (self.stage, self.part, self.law)))
 
     @property
     def status(self) -> str:
@@ -84,15 +86,30 @@ def steps_for(
     def planned(stages: Sequence[str], laws: Sequence[str]) -> list[Step]:
         steps: list[Step] = []
         sources = _sources(laws, config, run) if "servo" in stages else {}
-        for step in _needed(inputs, sources, stages):
-            remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
+        if config.steps and len(sources) > 1:
+            raise InputError(
+                f"task.steps: one law in one mode drives a sequence, and there are {', '.join(sources)}: "
+                "name one, such as --law exact --set control.mode=[track] (control.laws, control.mode)"
+            )
+        own = "servo" in named and not config.plant.simulated
+        for step in _needed(inputs, sources, stages, config.steps):
+            before = [one for one in steps if one.stage != step.stage or step.part]
+            remade = bool(recording) or any(one.why for one in before)
             why = _reason(step, run, force and step.stage in named, remade)
-            if step.law and "servo" in named and not config.plant.simulated:
+            if step.stage == "servo" and own:
                 why = why or "a real robot moves in every call"
             looks = step.stage == "plan" and step.record is not None and step.record.carrier is not None
             if looks and {"plan", "servo"} & {*named} and not config.plant.simulated:
                 why = why or "its object may lie elsewhere now"
+            if step.stage == "plan" and own and config.task and config.task.start_joints is None:
+                why = why or "the arm may stand elsewhere"
             steps.append(replace(step, why=why))
+        if any(step.why for step in steps if step.part and step.stage == "servo"):
+            amid = "a sequence is not resumed amid"
+            steps = [
+                replace(step, why=step.why or amid) if step.part and step.stage == "servo" else step
+                for step in steps
+            ]
         return steps
 
     steps = planned(stages, laws or config.control.laws)
@@ -130,7 +147,9 @@ def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
     robot = f"source of {plant}"
     found: dict[str, _Read] = {}
     for law in run_names(laws, config.control.mode):
-        name, stored = law_and_mode(law)[0], run.results.get(f"{SERVO}{law}")
+        name = law_and_mode(law)[0]
+        part = next((f"{part}/" for part, step in config.steps.items() if step.moves), "")
+        stored = run.results.get(f"{SERVO}{part}{law}")
         before = {} if stored is None else stored.inputs
         own, note = source_hash(name) if ":" in name else "", ""
         hashed = {f"source of {name}": own} if own else {}
@@ -150,7 +169,7 @@ def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
 class _Inputs(NamedTuple):
     """Inputs of stages."""
 
-    records: Mapping[str, Any] = {}  # by stage; none where the configuration lacks a part of it
+    records: Mapping[str, Any] = {}  # by stage and step of a sequence; none where keys are missing
     files: Mapping[str, str] = {}  # hashes of the input files, by name
 
 
@@ -169,9 +188,18 @@ def _inputs(config: Config, run: Run, stages: Sequence[str]) -> _Inputs:
         files |= {name: file.path, name + _HASH: file.sha256}
     records: dict[str, Any] = {}
     for stage in stages:
-        with suppress(InputError):
-            records[stage] = _INPUTS[stage](config, read)
+        for part, step in parts_of(stage, config.steps).items():
+            with suppress(InputError):
+                moves = step is None or step.moves
+                records[f"{stage}/{part}"] = _INPUTS[stage](config.at_step(part), read) if moves else step
     return _Inputs(records, files)
+
+
+def parts_of(stage: str, steps: Mapping[str, TaskStep]) -> dict[str, TaskStep | None]:
+    """Return the steps of a sequence that a stage makes results of; of no name where it makes one alone."""
+    if not steps or stage not in ("plan", "servo"):
+        return {"": None}
+    return {name: step for name, step in steps.items() if step.moves or stage == "servo"}
 
 
 def inputs_of(stage: str, config: Config) -> Any:
@@ -189,16 +217,22 @@ def _key(own: str, before: Sequence[str], law: str, source: Mapping[str, str]) -
     return own and key_of(own, before=list(before), law=law, source=dict(source))
 
 
-def _needed(inputs: _Inputs, laws: Mapping[str, _Read], stages: Sequence[str]) -> Iterator[Step]:
-    """Every result of the stages with its key, each made from those before."""
+def _needed(
+    inputs: _Inputs, laws: Mapping[str, _Read], stages: Sequence[str], steps: Mapping[str, TaskStep]
+) -> Iterator[Step]:
+    """Every result of the stages with its key, each made from those before, in a sequence of a stage."""
     before: list[str] = []
     for stage in stages:
-        keys, record = [], inputs.records.get(stage)
-        own = "" if record is None else key_of(record)
+        keys: list[str] = []
         of_files = {"": _Read(inputs.files if stage == "calibrate" else {})}
-        for law, read in (laws if stage == "servo" else of_files).items():
-            keys.append(_key(own, before, law, read.hashed))
-            yield Step(stage, law, keys[-1], read.inputs, note=read.note, unkeyed=read.unkeyed, record=record)
+        for part, asked in parts_of(stage, steps).items():
+            record = inputs.records.get(f"{stage}/{part}")
+            own = "" if record is None else key_of(record)
+            moves = asked is None or asked.moves
+            for law, read in (laws if stage == "servo" and moves else of_files).items():
+                keys.append(_key(own, before + (keys if part else []), law, read.hashed))
+                made = Step(stage, law, keys[-1], read.inputs, note=read.note, unkeyed=read.unkeyed)
+                yield replace(made, record=record, part=part)
         before = keys
 
 
@@ -230,5 +264,6 @@ def _missing(run: Run) -> bool:
 def result_of(step: Step, config: Config, *made: Any) -> Result:
     """The result that consists of what its stage made."""
     labels = ("observation", "calibration", "cross_validation") if step.stage == "calibrate" else ("",)
+    labels = ("action",) if step.part and step.stage == "servo" and not step.law else labels
     records = {label: record for label, record in zip(labels, made, strict=True) if record is not None}
     return Result(step.key, stored_yaml(config), provenance.collect(seed=config.seed), step.inputs, records)

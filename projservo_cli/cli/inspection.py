@@ -27,7 +27,7 @@ def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
     target = option.one_run("show", run, output) or Path("results", "paper")
     from projservo_cli.config import load_config
     from projservo_cli.report.report_data import stage_object
-    from projservo_cli.store import SERVO, load
+    from projservo_cli.store import load
 
     found = load(target)
     config = load_config(found.path, text=found.configuration)
@@ -40,7 +40,7 @@ def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
         yield wrapped(f"configuration: {config.name}, {'recorded' if config.recorded else 'simulated'}")
         for stage, value in values.items():
             yield from words_of(stage, value, detailed=console.verbose)
-            result = found.results[stage if stage in found.results else SERVO + laws[-1]]
+            result = next(one for name, one in found.results.items() if name.split("/")[0] == stage)
             yield wrapped(_made(result.provenance), "  ")
         if console.verbose:
             yield found.configuration.rstrip()

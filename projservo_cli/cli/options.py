@@ -295,8 +295,8 @@ def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
 
 
 def _overrides(options: Mapping[str, Any]) -> list["Override"]:
-    """Options that stand for keys of the configuration, then ``--set``, then ``--speed-scale``."""
-    from projservo_cli.config import Override
+    """Options that stand for keys, then ``--set``, then ``--goal`` and ``--speed-scale``."""
+    from projservo_cli.config import Override, to_goals
 
     found = []
     keys = {key: name for name, key in _KEYS.items() if not (name == "joint_unit" and "motions" in options)}
@@ -318,10 +318,9 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
             )
         values = [[int(one[1]), int(one[2])] for one in sizes if one is not None]
         found.append(Override(flag, "data.image_size_px", values if len(values) > 1 else values[0]))
-    if (goal := options.get("goal")) is not None:
-        named = goal if goal.endswith((".yaml", ".yml")) else f"{goal}.yaml"
-        found.append(Override(f"--goal {goal}", "task.goal", named))
-    found += map(Override.parse, options["sets"])
-    if (scale := options.get("speed_scale")) is not None:  # --set plant=… would else undo it
+    found += map(Override.parse, options["sets"])  # which would undo what follows
+    if goals := options.get("goals"):
+        found += to_goals(f"--goal {' --goal '.join(goals)}", goals)
+    if (scale := options.get("speed_scale")) is not None:
         found.append(Override(f"--speed-scale {scale}", "plant.speed_scale", scale))
     return found

@@ -306,6 +306,11 @@ def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:
 def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     from projservo_cli.report.report_data import NEAREST
 
+    if "plans" in value:
+        for plan in value["plans"]:
+            yield f"plan of {plan['step']}:"
+            yield from _of_plan(plan, detailed)
+        return
     feasible = "feasible" if value["feasible"] else "NOT feasible"
     yield wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}")
     for one in value["objects"].values():
@@ -337,6 +342,10 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
 def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
     from projservo_cli.laws import run_name
 
+    def named(trace: dict[str, Any]) -> str:
+        """Name of a run by its step or its law."""
+        return str(trace.get("step") or run_name(trace["law"], trace["mode"]))
+
     known = any(trace["position_error_mm"] is not None for trace in value["laws"])
     keys = ("position_error_mm", "rotation_error_deg", "center_deviation_mm")
     words, units = ("position", "rotation", "path deviation"), ("mm", "deg", "mm")
@@ -349,20 +358,23 @@ def _of_laws(value: dict[str, Any], _: bool) -> Iterator[str]:
     first, second, last = words
     yield f"{'':<42}{first:>9}{second:>9}{last:>19}".rstrip()
     first, second, last = units
-    yield f"  {'law':<20}{'verdict':<15}{'steps':>5}{first:>9}{second:>9}{'occluded':>9}{last:>10}".rstrip()
+    head = "step" if "steps" in value else "law"
+    yield f"  {head:<20}{'verdict':<15}{'steps':>5}{first:>9}{second:>9}{'occluded':>9}{last:>10}".rstrip()
     for trace in value["laws"]:
         first, second, last = (_number(trace[key]) if key else "" for key in keys)
         hidden, *others = (trace[f"self_occluded_steps_{view}"] for view in trace["view"])
         yield (
-            f"  {run_name(trace['law'], trace['mode']):<20}{trace['verdict']:<15}{trace['steps']:>5}"
+            f"  {named(trace):<20}{trace['verdict']:<15}{trace['steps']:>5}"
             f"{first:>9}{second:>9}"
             f"{hidden:>5}{''.join(f'/{steps}' for steps in others):<4}{last:>10}"
         ).rstrip()
     for trace in value["laws"]:
         if trace["incidences"]:
             rest = ", ".join(map(_incidence, trace["incidences"]))
-            name, free = run_name(trace["law"], trace["mode"]), trace["free_dof"]
+            name, free = named(trace), trace["free_dof"]
             yield wrapped(f"{name}: {rest}; {'no' if free == 0 else free} joint motion free", "  ")
+    if acts := [step for step in value.get("steps", ()) if step["kind"] != "move"]:
+        yield wrapped(", ".join(f"{step['name']}: {step['reason']}" for step in acts), "  ")
     for name, said in _NOTES.items():
         for reason in dict.fromkeys(trace[name] for trace in value["laws"] if trace[name]):
             yield wrapped(f"{said}: {reason}", "  ")

@@ -187,8 +187,11 @@ def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
 )
 @click.option(
     "--goal",
+    "goals",
     metavar="NAME",
-    help="Go to this taught goal, NAME.yaml next to the configuration, instead of task.goal.",
+    multiple=True,
+    help="Go to this goal of task.goals, or taught one, NAME.yaml next to the configuration, instead of "
+    "task.goal and task.steps. Repeatable, for several one after the other.",
 )
 @click.option(
     "--from",
@@ -250,7 +253,11 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     chain = _asked(console, names, options)
     if options["dry_run"]:
         words = (f"{s.name}: {f'would be made ({s.why})' if s.why else s.status}" for s in chain.steps)
-        steps = [{"stage": s.stage, "law": s.law or None, "why": s.why or None} for s in chain.steps]
+        steps = [
+            {"stage": s.stage, "law": s.law or None, "why": s.why or None}
+            | ({"step": s.part} if s.part else {})
+            for s in chain.steps
+        ]
         console.report({"run": chain.run.path.resolve(), "dry_run": True, "steps": steps}, words)
         return 0
     folder = chain.run.path.parent
@@ -307,6 +314,10 @@ def _require_optional(config: Any, wanted: Sequence[str]) -> None:
     if config.task is None:
         text = "shows runs of laws, which need a task: set task.start and task.goal"
         raise InputError(f"--{wanted[0]}: {text}")
+    if config.steps:
+        raise InputError(
+            f"--{wanted[0]}: shows runs of one motion, and the task is a sequence: name a --goal"
+        )
     if "view" in wanted:
         plotly()
         try:

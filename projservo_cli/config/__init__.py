@@ -10,6 +10,7 @@ from projservo_cli.config.loading import (
     shipped,
     stored_yaml,
     sweep_of,
+    to_goals,
     to_yaml,
 )
 
@@ -23,5 +24,6 @@ __all__ = [
     "shipped",
     "stored_yaml",
     "sweep_of",
+    "to_goals",
     "to_yaml",
 ]

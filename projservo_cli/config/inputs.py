@@ -18,7 +18,7 @@ from projservo_cli.config.whole import carrier_of
 from projservo_cli.control.law import Gains
 from projservo_cli.detection import Board
 from projservo_cli.display import About
-from projservo_cli.records import CORNERS, InputError
+from projservo_cli.records import CORNERS, TOOL, InputError
 from projservo_cli.result_hashes import File
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
@@ -57,6 +57,7 @@ from projservo_cli.stages.stage_inputs import (
     Trials,
 )
 from projservo_cli.store.observation_tables import identity_in
+from projservo_cli.task.stand_off import Displacement
 
 _RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
 _TICKS = 4096  # in a turn of an encoder that is as coarse as any
@@ -225,9 +226,22 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         features=config.control.features,
         tests_images=config.stop.innovation_threshold > 0.0,
         trajectory=config.trajectory,
+        lengths=markers.lengths(face),
         incidences=tuple(incidence_of(pair, config.features) for pair in pairs),
         carrier=_carrier(config, files),
+        displaced=_displacement(config),
     )
+
+
+def _displacement(config: Config) -> Displacement | None:
+    """Return the displacement of the goal, with the numbers of its markers; None without."""
+    along = None if config.task is None else config.task.goal.displaced
+    if config.task is None or along is None:
+        return None
+    if config.mount == TOOL:
+        raise InputError("displaced: goals of cameras on the tool are not displaced: teach the other goal")
+    flat, of_start = config.features[along.along].flat(config.features), config.task.goal.of_start
+    return Displacement(along.along, flat, along.by_m, along.by_px, of_start)
 
 
 def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
@@ -258,7 +272,6 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
         speed_scale=plant.speed_scale,
         max_replan_attempts=control.max_replan_attempts,
         refuses=control.on_plan_failure == "refuse",
-        lengths=config.markers.lengths(plan.face),
         contract=_contract(config, plan, files),
     )
 
@@ -311,7 +324,7 @@ def report_inputs(config: Config, files: Files | None = None) -> ReportInputs:
     files = files_of(config) if files is None else files
     about, trajectory = about_of(config, files.values()), config.trajectory
     formats, lengths = config.report.formats, _known_lengths(config)
-    if not config.has_task:
+    if not config.has_task or config.steps:
         return ReportInputs(about, formats, None, trajectory, lengths)
     alone = {
         "control": config.control.model_copy(update={"features": "points"}),

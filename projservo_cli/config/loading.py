@@ -28,6 +28,7 @@ from projservo_cli.passwords import masked
 from projservo_cli.records import InputError
 from projservo_cli.settings.control import RENDERED, RenderedOptions
 from projservo_cli.settings.sections import CONTRADICTIONS, Finding, Root
+from projservo_cli.settings.task import CURRENT
 from projservo_cli.simulation.mjcf import read_mjcf
 from projservo_cli.simulation.urdf import read_urdf
 
@@ -64,6 +65,7 @@ _FILES = (
     *(("data", "table"), ("data", "readings")),
     *(("calibration", "init"), ("robot", "mjcf"), ("robot", "urdf")),
 )
+_YAML = (".yaml", ".yml")
 _DIGITS = 9  # of a position in a list
 _MOST = 200  # problems that are looked at; who has more has taken another file
 _Path = tuple[str | int, ...]
@@ -368,6 +370,14 @@ def overrides_of(what: str, values: Mapping[str, Any]) -> list["Override"]:
     return found
 
 
+def to_goals(what: str, goals: Sequence[str]) -> list["Override"]:
+    """Return overrides that messages call by ``what``: to goals of some names, one after the other."""
+    names = [goal.removesuffix(".yaml") for goal in goals]
+    steps = [{"to": name} for name in names] if len(names) > 1 else []
+    alone = [] if steps or names == ["goal"] else [Override(what, "task.goal", names[0])]
+    return [Override(what, "task.steps", steps), *alone]
+
+
 def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
     """Read and check the configuration of a sweep; ``base`` becomes absolute paths."""
     document = _Document.read(path)
@@ -496,37 +506,86 @@ def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> 
 
     While it is being taught, a goal whose file is missing is the start, and without a start there is no task;
     so is one on an object, whose file need not show that.
+    A goal that steps name and that is not given is in the file of its name, or is the one called goal; the
+    goal of a sequence is by default the last of its steps.
     """
     task = document.values.get("task")
-    for key in ("start", "goal") if isinstance(task, dict) else ():
-        further: dict[str, Any] = {}
-        if key == "goal" and isinstance(task.get(key), dict) and isinstance(task[key].get("taught"), str):
-            further = {name: value for name, value in task[key].items() if name != "taught"}
-            task[key] = task[key]["taught"]
-        if not isinstance(task.get(key), str):
-            continue
-        where, path = f"{document.place(('task', key))}: task.{key}", (base / task[key]).resolve()
-        if teaching and (not path.exists() or (key == "goal" and document.values.get("objects"))):
-            if key == "start":
-                del document.values["task"]
-                return
-            task["goal"] = {"joints": task.get("start")}
-            continue
-        if not path.exists():
-            command = f"projservo teach{' --start' * (key == 'start')} -c FILE -o {base / task[key]}"
-            raise InputError(
-                f"{where}: there is no {path} yet: teach it first, before a recording: {command}"
-            )
-        try:
-            taught = _Document(text_of(path, "a file that projservo teach wrote", _MAX_BYTES), str(path))
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from error
-        images = taught.values.get("images") if isinstance(taught.values, dict) else None
-        if taught.problems or not isinstance(images, dict):
-            raise InputError(f"{where}: {path}: is no file that projservo teach wrote")
-        if key == "start" and not images.get("joints"):
-            raise InputError(f"{where}: {path}: has no joints to start from")
-        task[key] = images["joints"] if key == "start" else {**taught.values, **further}
+    if not isinstance(task, dict):
+        return
+    if isinstance(task.get("start"), str) and task["start"] != CURRENT:
+        images = _taught(document, ("start",), base, task["start"], teaching)
+        if images is None:
+            del document.values["task"]
+            return
+        if not images["images"].get("joints"):
+            where = document.place(("task", "start"))
+            raise InputError(f"{where}: task.start: {base / task['start']}: has no joints to start from")
+        task["start"] = images["images"]["joints"]
+    steps = task["steps"] if isinstance(task.get("steps"), list) else list[Any]()
+    named = [goal for step in steps if isinstance(step, dict) for goal in _goals_named(step)]
+    if named:
+        task.setdefault("goals", {})
+    goals: dict[str, Any] = task["goals"] if isinstance(task.get("goals"), dict) else {}
+    for name in named:
+        if name == "goal" and task.get("goal") is not None:
+            goals.setdefault("goal", task["goal"])
+        if name not in goals and (teaching or (base / f"{name}.yaml").exists()):
+            goals[name] = f"{name}.yaml"
+    for name in list(goals):
+        _fill_in_goal(document, goals, ("goals", name), base, teaching)
+    if isinstance(goal := task.get("goal"), str):
+        task["goal"] = goals.get(goal, goal if goal.endswith(_YAML) else f"{goal}.yaml")
+    elif named and "goal" not in task and named[-1] in goals:
+        task["goal"] = goals[named[-1]]
+    _fill_in_goal(document, task, ("goal",), base, teaching)
+
+
+def _goals_named(step: dict[str, Any]) -> list[str]:
+    """Return the goal that a step names, if it does."""
+    approach = step.get("approach")
+    names = step.get("to"), approach.get("to") if isinstance(approach, dict) else None
+    return [name for name in names if isinstance(name, str)]
+
+
+def _fill_in_goal(
+    document: _Document, holder: dict[str, Any], path: _Path, base: pathlib.Path, teaching: bool
+) -> None:
+    """Replace the name of a taught file at a place of the task, which a mapping holds, by its contents."""
+    key, further = str(path[-1]), dict[str, Any]()
+    if isinstance(holder.get(key), dict) and isinstance(holder[key].get("taught"), str):
+        further = {name: value for name, value in holder[key].items() if name != "taught"}
+        holder[key] = holder[key]["taught"]
+    if isinstance(holder.get(key), str):
+        anew = teaching and document.values.get("objects")  # a file without the object is no goal yet
+        taught = None if anew else _taught(document, path, base, holder[key], teaching)
+        start = document.values["task"].get("start")
+        still_to_be = {"joints": start} if isinstance(start, dict) else {"roll_deg": 0.0}
+        holder[key] = still_to_be if taught is None else {**taught, **further}
+
+
+def _taught(
+    document: _Document, path: _Path, base: pathlib.Path, name: str, teaching: bool
+) -> dict[str, Any] | None:
+    """Return the contents of a file that ``teach`` wrote, for a place of the task; None if missing."""
+    where, file = f"{document.place(('task', *path))}: task.{'.'.join(map(str, path))}", base / name
+    if not file.resolve().exists():
+        if teaching:
+            return None
+        command = f"projservo teach{' --start' * (path == ('start',))} -c FILE -o {file}"
+        raise InputError(
+            f"{where}: there is no {file.resolve()} yet: teach it first, before a recording: {command}"
+        )
+    try:
+        taught = _Document(
+            text_of(file.resolve(), "a file that projservo teach wrote", _MAX_BYTES), str(file.resolve())
+        )
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error
+    images = taught.values.get("images") if isinstance(taught.values, dict) else None
+    if taught.problems or not isinstance(images, dict):
+        raise InputError(f"{where}: {file.resolve()}: is no file that projservo teach wrote")
+    contents: dict[str, Any] = taught.values
+    return contents
 
 
 def _check_options(document: _Document) -> None:

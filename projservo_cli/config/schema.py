@@ -33,6 +33,9 @@ def json_schema() -> dict[str, Any]:
     for key in ("start", "goal"):
         what = f"{task[key].pop('description', 'the goal')}; or the file that projservo teach wrote"
         task[key] = {"anyOf": [task[key], {"type": "string"}], "description": what}
+    ((name, one),) = task["goals"]["patternProperties"].items()
+    task["goals"]["patternProperties"] = {name: {"anyOf": [one, {"type": "string"}]}}
+    schema["$defs"]["TaskSettings"]["required"].remove("goal")  # by default that of the last step
     schema["$defs"]["Goal"]["properties"]["taught"] = {
         "type": "string",
         "description": "File that projservo teach wrote, beside incidences.",

@@ -21,7 +21,7 @@ from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.objects import WORLD_AND_TOOL, Objects
 from projservo_cli.settings.robot import Rig, RobotSettings, like_degrees
 from projservo_cli.settings.sections import Finding, JointVector, Root, Whole
-from projservo_cli.settings.task import TaskSettings, Trajectory, sigma_key
+from projservo_cli.settings.task import GoalImages, TaskSettings, TaskStep, Trajectory, sigma_key
 from projservo_cli.settings.trials import CalibrationSettings, Data, Noise
 
 
@@ -73,16 +73,17 @@ def _joint_vectors(
             if letter == "R" and (what := like_degrees(low, high)):
                 yield ("robot", "limits", "joints", i), f"{what} set unit: deg"
     if task is not None:
-        vectors["task", "start"] = task.start
+        vectors["task", "start"] = task.start_joints
         vectors["task", "start_offset"] = task.start_offset
-        vectors["task", "goal", "joints"] = task.goal.joints
-        if task.goal.images is not None:
-            vectors["task", "goal", "images", "joints"] = task.goal.images.joints
-    for path, vector in vectors.items():
+        for path, goal in task.each_goal.items():
+            vectors[("task", *path, "joints")] = goal.joints
+            if goal.images is not None:
+                vectors[("task", *path, "images", "joints")] = goal.images.joints
+    for place, vector in vectors.items():
         if vector is not None and types:
-            yield from vector.miscounted(types, *path)
-            if path[-1] in ("reference", "start") and robot is not None and robot.joint_types == types:
-                yield from _beyond_limits(robot, vector, *path)
+            yield from vector.miscounted(types, *place)
+            if place[-1] in ("reference", "start") and robot is not None and robot.joint_types == types:
+                yield from _beyond_limits(robot, vector, *place)
 
 
 def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Iterator[Finding]:
@@ -98,9 +99,14 @@ def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Ite
 def _goal_images(
     task: TaskSettings | None, markers: Markers | None, trajectory: Trajectory
 ) -> Iterator[Finding]:
-    if task is None or task.goal.images is None:
-        return
-    path, images = ("task", "goal", "images"), task.goal.images
+    for path, goal in ({} if task is None else task.each_goal).items():
+        if goal.images is not None:
+            yield from _images_of(("task", *path, "images"), goal.images, markers, trajectory)
+
+
+def _images_of(
+    path: tuple[str, ...], images: GoalImages, markers: Markers | None, trajectory: Trajectory
+) -> Iterator[Finding]:
     if markers is None or markers.front is None:
         yield path, "needs markers.face, whose markers these pixels are"
         return
@@ -135,10 +141,20 @@ def _incidences(
             of = features.get(source)
             if of is None or of.on != "tool" or of.given(feature.kind) == []:
                 yield ("features", name, feature.kind), f"there is no {feature.kind} {source} of the tool"
-    for i, pair in enumerate(() if task is None else task.goal.incidences):
-        if what := misplaced(pair, features):
-            yield ("task", "goal", "incidences", i), what
-    if task is not None and task.goal.incidences and control.features == "points":
+    goals, measured = {} if task is None else task.each_goal, False
+    for path, goal in goals.items():
+        measured |= bool(goal.incidences) or goal.displaced is not None
+        for i, pair in enumerate(goal.incidences):
+            if what := misplaced(pair, features):
+                yield ("task", *path, "incidences", i), what
+        if goal.displaced is not None and (what := goal.displaced.misplaced(features)):
+            yield ("task", *path, "displaced", "along"), what
+    for k, step in enumerate(() if task is None else task.steps):
+        along = step.approach or step.retreat
+        measured |= along is not None
+        if along is not None and (what := along.misplaced(features)):
+            yield ("task", "steps", k, step.kind, "along"), what
+    if measured and control.features == "points":
         yield ("control", "features"), "incidences are measured with the body: leave points out"
 
 
@@ -414,7 +430,17 @@ class Settings(Printed, Root):
     @property
     def reference(self) -> JointVector | None:
         """Joints around which the trial motions are made."""
-        return self.calibration.reference or (self.task.start if self.task is not None else None)
+        return self.calibration.reference or (self.task.start_joints if self.task is not None else None)
+
+    @property
+    def steps(self) -> dict[str, TaskStep]:
+        """Steps of the task by their names; none where it is a single motion."""
+        return {} if self.task is None else self.task.named_steps
+
+    def at_step(self, name: str) -> Self:
+        """Return the configuration of one step of the task; of no name, this one."""
+        assert self.task is not None or not name
+        return self.model_copy(update={"task": self.task.at_step(name)}) if name and self.task else self
 
     @property
     def idealized(self) -> Self:

@@ -44,6 +44,7 @@ _WRONG = {
 _FASTEST, _SCATTER = math.radians(720.0), math.radians(1.0)
 # Factor by which a servo may outrun set-points, so that it catches up; and speed limit of the gripper, rad/s.
 _CATCHES_UP, _GRIPPER = 1.5, math.radians(60.0)
+_GRIPS_S = 0.3  # after which a gripper has closed or opened, s
 # Repetitions of a reading that cannot be true, or reports a fault.
 _REPEATS = 4
 # How far a joint may turn while its torque comes on, be beyond a limit, or lag where it stands, rad.
@@ -206,8 +207,9 @@ class SO101:
     """An arm of bus servos, driven by the contract of robots; its images are those of ``cameras``.
 
     port : of the arm, such as /dev/ttyACM0; ``auto`` takes the only one on which all servos answer.
-    ids : of the servos of the joints, base to tool. gripper : that of the gripper, which is held; None for
-        an arm without.
+    ids : of the servos of the joints, base to tool.
+    gripper : that of the gripper, which is held; None for an arm without.
+    gripper_counts : its readings closed and open; None for the limits that its servo keeps.
     limits : of its joints, rad and rad/s; without them the arm does not move.
     """
 
@@ -222,12 +224,19 @@ class SO101:
         ids: Sequence[int] = (1, 2, 3, 4, 5),
         gripper: int | None = 6,
         limits: JointLimits | None = None,
+        gripper_counts: Sequence[int] | None = None,
     ) -> None:
         numbers = () if isinstance(ids, str) or not np.iterable(ids) else tuple(ids)
         if not numbers or not all(isinstance(i, int) for i in numbers):
             raise InputError(f"plant.options.ids {ids!r}: give the ids of the servos, such as [1, 2, 3]")
         if gripper is not None and not isinstance(gripper, int):
             raise InputError(f"plant.options.gripper {gripper!r}: give the id of its servo, or null")
+        ends = None if gripper_counts is None else tuple(gripper_counts)
+        if ends is not None and not (len(ends) == 2 and all(isinstance(x, int) for x in ends)):
+            raise InputError(f"plant.options.gripper_counts {ends!r}: give two counts, closed and open")
+        if ends is not None and not (0 <= min(ends) < max(ends) < TURN):
+            raise InputError(f"plant.options.gripper_counts {ends!r}: give two counts from 0 to {TURN - 1}")
+        self._gripper_counts = ends
         self._port, self._ids = port, numbers
         self._others = () if gripper is None else (gripper,)
         known = limits is not None and bool(np.isfinite([limits.lower, limits.upper]).all())
@@ -314,6 +323,28 @@ class SO101:
                     f"{self._servos.name(i)} turned by {_deg(turned)} when its torque came on ({_deg(_LEAP)} "
                     "at most): look what pulls at it"
                 )
+
+    def act(self, name: str, value: float) -> float:
+        """Open the gripper by a share, from 0, closed, to 1, and return how long that takes, s.
+
+        It pushes on at what is between its jaws, also when the arm is stopped or released.
+        """
+        if name != "gripper" or not self._others:
+            raise InputError(f"the arm has no {name}: give gripper, and its servo in plant.options.gripper")
+        if not 0.0 <= value <= 1.0:
+            raise InputError(f"gripper {value:g}: give a share, from 0, closed, to 1, open")
+        (i,) = self._others
+        closed, opened = self._gripper_counts or self._keeps(i)
+        if self._gripper_counts is None and opened - closed >= TURN - 1:
+            raise InputError(
+                f"gripper (servo {i}): how far it opens is not stored (registers 9 and 11): set "
+                "plant.options.gripper_counts to its readings closed and open"
+            )
+        count = round(closed + value * (opened - closed))
+        way = abs(count - self._read()[i].at) * COUNT
+        self._sent.pop(i, None)
+        self._servos.enable({i: count}, self._speeds())
+        return way / _GRIPPER + _GRIPS_S
 
     def release(self) -> None:
         """Let go of the arm; the gripper stays as it is."""
@@ -432,7 +463,8 @@ class SO101:
         for i, servo in servos.items():
             for bit, words in _WRONG.items():
                 # The first set-point ends an overload of before.
-                if servo.status & bit and (self._on or bit != _OVERLOADED):
+                pushes = bit == _OVERLOADED and (i in self._others or not self._on)  # as a grip does
+                if servo.status & bit and not pushes:
                     least, most = self._servos.volts[i]
                     what = words.format(volts=servo.volts, heat=servo.heat, least=least, most=most)
                     return f"{self._servos.name(i)}: {what}; it is sent nothing more, and may sink"

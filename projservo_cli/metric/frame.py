@@ -597,6 +597,30 @@ class Metric:
                 points[more] += (pinv @ off.swapaxes(0, 1).reshape(len(X), -1, 1))[..., 0]
         return points.reshape(*shape, 3)
 
+    def project(self, points: npt.ArrayLike) -> FloatArray:
+        """Pixels of points in all views, of which ``triangulate`` makes the points again.
+
+        Parameters
+        ----------
+        points : (…, m, 3) points, m, in the frame of the cameras: base, or flange.
+
+        Returns
+        -------
+        (…, V, m, 2) raw pixels; NaN behind a camera.
+
+        Raises
+        ------
+        InputError
+            For points of another shape.
+        """
+        X = np.asarray(points, dtype=np.float64)
+        if X.ndim < 2 or X.shape[-1] != 3:
+            raise InputError(f"points: of shape {X.shape}, expected (…, m, 3), m")
+        flat = X.reshape(-1, 3)
+        depth = homogeneous(flat) @ self.body.P[:, 2].T * np.sign(np.linalg.det(self.body.P[..., :3]))
+        s = np.where(depth[..., None] > 0.0, self.body.pixels(flat), np.nan)
+        return np.moveaxis(s.reshape(*X.shape[:-1], -1, 2), -2, -3)
+
     def triangulation_covariance(self, pixels: npt.ArrayLike) -> FloatArray:
         """Covariances of triangulated points, with the noise of their pixels.
 

@@ -1,5 +1,6 @@
 """Accuracy of an arrival: pixels by which images are off, or may be, carried to the face in millimetres."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -40,6 +41,14 @@ def metric_points(model: Model, M: FloatArray) -> FloatArray | None:
     except (InputError, np.linalg.LinAlgError):
         return None
     return np.asarray(X[:, :3] / X[:, 3:])
+
+
+def metres_a_unit(model: Model, M: FloatArray, lengths: FloatArray) -> float:
+    """Metres a unit of the metric of the arm, by lengths (m, m) between markers (m, 4); NaN if unknown."""
+    X, (i, k) = metric_points(model, M), np.nonzero(lengths > 0.0)
+    if X is None or not len(i):
+        return math.nan
+    return float(np.median(lengths[i, k] / np.linalg.norm(X[i] - X[k], axis=1)))
 
 
 class Posture:

@@ -164,7 +164,7 @@ def _view(run: Run, about: About, *, folder: str = "", prefix: str = "") -> dict
             (label, folder + name) for name, label in _EXTRAS.items() if (run_folder / name).is_file()
         ],
         "calibration": _calibration(values["calibrate"], about) if "calibrate" in values else None,
-        "plan": values["plan"] | _visibility(run.plan) if "plan" in values else None,
+        "plan": values["plan"] | _visibility(run.plan) if "plan" in run.results else None,
         "laws": [_law(trace, about) for trace in values["servo"]["laws"]] if "servo" in values else [],
         "reported": report is not None,
         "claims": report.claims if report else (),
@@ -233,7 +233,7 @@ def _visibility(plan: Plan) -> dict[str, Any]:
 def _law(trace: dict[str, Any], about: About) -> dict[str, Any]:
     """Plain values of the run of a law, with its title, words on it, and whether it was to converge."""
     return trace | {
-        "title": title(run_name(trace["law"], trace["mode"])),
+        "title": title("/".join(filter(None, (trace.get("step"), run_name(trace["law"], trace["mode"]))))),
         "words": _law_words(trace),
         "converged": trace["verdict"] == "converged",
         "must": must_converge(trace["law"], about.required),

@@ -74,9 +74,10 @@ DIRECT = ("direct_three", "direct_two")
 
 def title(name: str) -> str:
     """Name of a run as the figures write it: that of its law, and whether it follows the plan."""
-    law, mode = law_and_mode(name)
+    *step, run = name.split("/")
+    law, mode = law_and_mode(run)
     follows = {TRACK: ", following the plan", IMAGE_TRACK: ", following planned images"}
-    return title_of(law) + follows.get(mode, "")
+    return "".join(f"{part}: " for part in step) + title_of(law) + follows.get(mode, "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +126,11 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Driven(Fit):
-    """The runs of a robot of which no model is known, nor of its cameras."""
+    """The runs of a robot of which no model is known, nor of its cameras; or of a sequence."""
 
-    plan: Plan  # the plan
+    plan: Plan  # the plan, of a sequence that of its last motion
     traces: Mapping[str, Trace]  # runs of the laws by name
+    lacks: str = "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +208,7 @@ class FigureSpec:
     goal: bool = False  # whether it needs a known goal pose
     frames: bool = False  # whether it shows frames
     incidences: bool = False  # whether it shows those of the goal
+    sequence: bool = False  # whether it shows the motions of a sequence
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
 
@@ -219,7 +222,7 @@ class FigureSpec:
     @property
     def optional(self) -> bool:
         """Whether it is left out without a word where a run has nothing to show in it."""
-        return self.frames or self.incidences
+        return self.frames or self.incidences or self.sequence
 
     def drawn(self, data: Data) -> "Figure":
         """The figure of its data."""
@@ -235,8 +238,11 @@ class FigureSpec:
         if self.incidences and isinstance(report_data, Driven | ReportData):
             partial = any(trace.feature_s is not None for trace in report_data.traces.values())
             return "" if partial else "the goal is a whole pose"
+        if self.sequence:
+            steps = isinstance(report_data, Driven) and any("/" in name for name in report_data.traces)
+            return "" if steps else "the task is one motion"
         if isinstance(report_data, Driven):
-            return "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
+            return report_data.lacks
         if len(report_data.calibration.joint_types) == 1:
             return "one joint cannot reach a pose"
         if not isinstance(report_data, ReportData):
@@ -329,9 +335,14 @@ def stage_object(stage: str, run: Run, names: Sequence[str | None], laws: Sequen
     if stage == "calibrate":
         return path | _calibration(run, names)
     if stage == "plan":
-        return path | _plan(run)
+        parts = [name.removeprefix("plan/") for name in run.results if name.startswith("plan/")]
+        if not parts:
+            return path | _plan(run)
+        plans = [{"step": part} | _plan(run.at_step(part)) for part in parts]
+        wrong = [f"{plan['step']}: {plan['reason']}" for plan in plans if not plan["feasible"]]
+        return path | {"feasible": not wrong, "reason": "; ".join(wrong), "plans": plans}
     if stage == "servo":
-        return path | {"laws": [_law(run.traces[law]) for law in laws]}
+        return path | _laws(run, laws)
     page = run.path.parent / PAGE_FILE
     report = run.results["report"].records[""]
     return path | {"page": page.resolve() if page.is_file() else None} | scalars_of(report)
@@ -345,8 +356,30 @@ def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
         return failure | {"usable": False, "lens": None, "rejected": None, "unshown": None} | numbers | lists
     if stage == "servo":
-        return failure | {"laws": [_law(run.traces[law]) for law in laws]}
+        return failure | _laws(run, laws)
     return failure | {"feasible": False} if stage == "plan" else failure
+
+
+# Values of a trace that the list of steps repeats.
+_OF_STEPS = ("verdict", "reason", "steps", "position_error_mm", "rotation_error_deg", "image_error_px")
+
+
+def _laws(run: Run, laws: Sequence[str]) -> dict[str, Any]:
+    """Plain values of runs of laws, of a sequence with its steps that were done or failed."""
+    values = {law: _law(run.traces[law]) for law in laws}
+    steps = []
+    for name, result in run.results.items():
+        stage, *of_step = name.split("/")
+        if stage == "servo" and (action := result.records.get("action")) is not None:
+            done = dict.fromkeys(_OF_STEPS) | {"verdict": "done", "reason": action.text, "steps": 0}
+            steps.append({"name": of_step[0], "kind": action.kind, "seconds": action.seconds} | done)
+        elif stage == "servo" and (law := "/".join(of_step)) in values and len(of_step) > 1:
+            of_trace, trace = values[law], run.traces[law]
+            seconds = trace.steps * trace.period
+            at = {key: of_trace.get(key) for key in _OF_STEPS}
+            steps.append({"name": of_step[0], "kind": "move", "seconds": seconds} | at)
+            of_trace["step"] = of_step[0]
+    return {"laws": list(values.values())} | ({"steps": steps} if steps else {})
 
 
 def _law(trace: Trace) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from projservo_cli.geometry.kinematics import forward
 from projservo_cli.monitoring.image_monitor import ImageMonitor
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
-from projservo_cli.robots.contract import PluginRobot, Reading
+from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.robots.latency import DelayPrior, Delays, squares_by_joints
 from projservo_cli.robots.object_watch import ObjectWatch
@@ -57,7 +57,7 @@ class DrivenRobot:
     be there: each pixel is carried by predict(q) − predict(q_then) from when it was taken. Lag and delay so
     vanish from its loop.
 
-    robot : of the contract.
+    steered : set-points of a robot of the contract, ``robot``.
     plant : face; image size and joint limits: of the calibration, or the true ones of a robot that knows its
         true joints.
     known : of robot and images.
@@ -74,16 +74,17 @@ class DrivenRobot:
 
     in_front = True
     takes_parts = True
+    stops = True  # whether the run is the last of the robot
 
     def __init__(
         self,
-        robot: PluginRobot,
+        steered: Steered,
         plant: Plant,
         known: Known,
         monitor: ImageMonitor | None,
         watch: ObjectWatch | None = None,
     ) -> None:
-        self.watch, self.robot, self.steered, self.plant = watch, robot, Steered(robot), plant
+        self.robot, self.steered, self.plant, self.watch = (robot := steered.robot), steered, plant, watch
         self.known, self.monitor = known, monitor
         self.markers = len(known.visible)
         self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.visible])
@@ -307,8 +308,9 @@ class DrivenRobot:
         self.steered.command(step, period)
 
     def stop(self) -> None:
-        """Come to rest."""
-        self.robot.stop()
+        """Come to rest; in a session the robot holds its last set-point, until the session ends."""
+        if self.stops:
+            self.robot.stop()
 
 
 def _require_apart(name: str, reading: Reading) -> None:

@@ -110,10 +110,11 @@ class Robot(Protocol):
     faults of its last images, such as darkness; ``force() -> float``, the force on the tool, N, the greatest
     since it was last asked for, which ``stop.max_force_n`` limits; and, if it is a simulator, ``truth()``,
     the pose (4, 4) of the tool in its base frame, m, or its joints (n,), for results alone. A simulator's
-    time passes in ``command`` alone, which moves it to ``due``. And ``frames``, the images (V, height, width)
-    of its last reading in grey, uint8, or None: a run keeps some, which the report shows. A class that takes
-    an argument ``limits`` is given those of its joints, ``JointLimits``; one with an argument ``numbers``
-    those of all markers, in the order of its pixels.
+    time passes in ``command`` alone, which moves it to ``due``. ``act(name, value)`` is an action, such as of
+    a gripper: it returns at once, perhaps with the time that it takes, s, for which the arm is held. And
+    ``frames``, the images (V, height, width) of its last reading in grey, uint8, or None: a run keeps some,
+    which the report shows. A class that takes an argument ``limits`` is given those of its joints,
+    ``JointLimits``; one with an argument ``numbers`` those of all markers, in the order of its pixels.
     """
 
     def open(self) -> None:
@@ -269,6 +270,19 @@ class PluginRobot:
     def identity(self) -> str:
         """Return a text that changes with the meaning of the readings; may be empty."""
         return "".join(str(self._optional("identity", "")).split())
+
+    @property
+    def acts(self) -> bool:
+        """Whether it has actions."""
+        return callable(getattr(self.robot, "act", None))
+
+    def act(self, name: str, value: float) -> float:
+        """Have it act, if it can, and return how long that takes, s."""
+        method = getattr(self.robot, "act", None)
+        if not callable(method):
+            return 0.0  # of a simulated robot, which has nothing to act with
+        seconds = self._ask("act", lambda: method(name, value))
+        return float(self._numbers("act() gave a time", 0.0 if seconds is None else seconds, (), finite=True))
 
     def _optional(self, name: str, default: Any) -> Any:
         """Return the answer of a method that a class may have; the default without it."""

@@ -10,7 +10,7 @@ from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.records import FloatArray, IntArray
 from projservo_cli.robots.contract import Reading
 
-# Number of frames of a view in a row that show an object elsewhere: as many as are seen before the first motion.
+# Frames of a view in a row that show an object elsewhere: as many as are seen before the first motion.
 _FRAMES = WINDOW
 _LOOKS = 20  # after which one view is enough: a camera that was moved has been named by then
 # Deviations of their mean beyond which it is elsewhere, and motion that counts as none, px: edges are drawn

@@ -79,6 +79,10 @@ class Steered:
         """The set-point (n,), rad or m."""
         return self.set_point.target
 
+    def resume(self) -> None:
+        """Go on after a pause, in which no period was missed."""
+        self._due = None
+
     def observe(self) -> Reading:
         """Read joints and images."""
         self.reading = self.robot.read()

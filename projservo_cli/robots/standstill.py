@@ -49,7 +49,7 @@ def seen_at_rest(
 
 def averaged(
     reading: Reading, observe: Callable[[], Reading], wanted: int
-) -> tuple[Reading, FloatArray, FloatArray]:
+) -> tuple[Reading, FloatArray, IntArray]:
     """Return the mean of readings of a robot at rest, with a number of frames of each view, each once.
 
     Frames are weighted by their deviations, if they have any. Markers that most of the frames of a view do

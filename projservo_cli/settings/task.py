@@ -2,14 +2,23 @@
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import ConfigDict, Field, PlainSerializer, StrictBool, StrictInt, WithJsonSchema, WrapValidator
+from pydantic import (
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    Strict,
+    StrictBool,
+    StrictInt,
+    WithJsonSchema,
+    WrapValidator,
+)
 
 from projservo_cli.records import VIEWS, InputError
-from projservo_cli.settings.features import Name, Pair
+from projservo_cli.settings.features import Feature, Name, Pair
 from projservo_cli.settings.sections import (
     ByView,
     Count,
@@ -146,6 +155,33 @@ class _ObjectImages(Section):
         return (self.model_extra or {}).get(name)
 
 
+class Along(Section):
+    """A displacement back along a line, or from a plane along its normal, to the side that cameras see."""
+
+    along: Name = Field(description="name of a line or plane, where it is at the pose that is displaced")
+    by_m: Number | None = Field(None, description="length; below 0 the other way; needs a known length")
+    by_px: Number | None = Field(
+        None,
+        description="mean motion of the markers in the image in which they move most; below 0 the other way",
+    )
+
+    def contradictions(self) -> Iterator[Finding]:
+        """No amount, both, or none to speak of."""
+        kinds = self.given("by_m", "by_px")
+        if len(kinds) != 1:
+            yield (), "give exactly one of by_m and by_px"
+        elif getattr(self, kinds[0]) == 0.0:
+            yield (kinds[0],), "must not be 0"
+
+    def misplaced(self, features: Mapping[str, Feature]) -> str:
+        """Return the reason why it is along none of these features; empty if it is along one."""
+        if self.along not in features:
+            return f"there is no feature {self.along}; features: {', '.join(features) or 'none'}"
+        if not features[self.along].given("line", "plane"):
+            return f"{self.along} is a point, which has no direction: name a line or a plane"
+        return ""
+
+
 class Goal(Section):
     """The goal: joint readings, a rotation about the roll axis of the rig, or images of the face."""
 
@@ -172,28 +208,158 @@ class Goal(Section):
         _ObjectImages(),
         description="pixels of objects when the goal was taught, by projservo teach",
     )
+    displaced: Along | None = Field(
+        None, description="displacement of this goal, such as a stand-off; alone, of the start"
+    )
+
+    @property
+    def of_start(self) -> bool:
+        """Whether it is the start, displaced."""
+        return self.displaced is not None and not self.given("joints", "roll_deg", "images")
 
     def contradictions(self) -> Iterator[Finding]:
         """No goal, or several."""
         kinds = self.given("joints", "roll_deg", "images")
-        if len(kinds) != 1:
+        if len(kinds) != 1 and not self.of_start:
             given = f", not {' and '.join(kinds)}" if kinds else ""
             yield (), f"give exactly one of joints, roll_deg and images{given}"
         if self.perturbation is not None and self.roll_deg is None:
             yield ("perturbation",), "belongs to a goal given by roll_deg"
 
 
+class _Approach(Along):
+    """A displacement of a named goal."""
+
+    to: Name = Field(description="name of the goal that is displaced")
+
+
+_KINDS_OF_STEPS = ("to", "approach", "retreat", "act", "wait_s")
+
+
+class TaskStep(Section):
+    """One step of a sequence: a motion, an action of the robot, or a time to wait."""
+
+    to: Name | None = Field(None, description="name of the goal to go to")
+    approach: _Approach | None = Field(None, description="go to a goal displaced along a feature")
+    retreat: Along | None = Field(None, description="go back along a feature from where the arm stands")
+    act: Annotated[dict[Name, Number], Field(min_length=1)] | None = Field(
+        None, description="actions of the robot class by their names, such as {gripper: 0.3}"
+    )
+    wait_s: Annotated[float, Strict(), Field(gt=0, le=3600)] | None = Field(
+        None, description="time to hold the arm"
+    )
+
+    def contradictions(self) -> Iterator[Finding]:
+        """No kind of step, or several."""
+        if len(self.given(*_KINDS_OF_STEPS)) != 1:
+            yield (), f"give exactly one of {', '.join(_KINDS_OF_STEPS)}"
+
+    @property
+    def kind(self) -> str:
+        """Return its kind by the key that it gives."""
+        return self.given(*_KINDS_OF_STEPS)[0].removesuffix("_s")
+
+    @property
+    def moves(self) -> bool:
+        """Whether the arm moves by a law."""
+        return self.kind in ("to", "approach", "retreat")
+
+    @property
+    def goal(self) -> str | None:
+        """Name of the goal that it goes to, or that it approaches."""
+        return self.to if self.approach is None else self.approach.to
+
+    @property
+    def label(self) -> str:
+        """Name of the step, which others may have too."""
+        if self.act is not None:
+            return "_".join(self.act)
+        return self.to or "_".join(filter(None, (self.kind, self.goal)))
+
+
+CURRENT = "current"
+
+
+def _start(value: Any, read: Callable[[Any], Any]) -> Any:
+    """The word for where the arm stands, or joints."""
+    del read  # which would name both kinds in every message
+    return value if value == CURRENT else JointVector.model_validate(value)
+
+
 class TaskSettings(Section):
-    """A reaching task from ``start`` to ``goal``.
+    """A reaching task from ``start`` to ``goal``, or a sequence of them.
 
     ``start_offset`` moves the start alone: a goal that is a turn stays that of the start without it.
     """
 
-    start: JointVector = Field(description="joint readings at the start")
+    start: Annotated[JointVector | Literal["current"], WrapValidator(_start)] = Field(
+        description="joint readings at the start; current: where the arm stands, a simulated one at "
+        "calibration.reference"
+    )
     start_offset: JointVector | None = Field(
         None, description="offset of the start; the goal stays that of the start without it"
     )
     goal: Goal
+    goals: dict[Name, Goal] = Field({}, description="goals of the steps, by their names")
+    steps: Annotated[tuple[TaskStep, ...], Field(max_length=100)] = Field(
+        (), description="steps of a sequence, which one law drives; without goal it is the last of them"
+    )
+
+    def __hash__(self) -> int:  # mappings have none
+        return hash((self.start, self.start_offset, self.goal))
+
+    @property
+    def start_joints(self) -> JointVector | None:
+        """Joint readings at the start; None for where the arm stands."""
+        return None if isinstance(self.start, str) else self.start
+
+    @property
+    def each_goal(self) -> dict[tuple[str, ...], Goal]:
+        """Return the goal and those of the steps, by their places in the section."""
+        return {("goal",): self.goal} | {("goals", name): goal for name, goal in self.goals.items()}
+
+    @property
+    def named_steps(self) -> dict[str, TaskStep]:
+        """Return the steps by their names, with their numbers where several have one."""
+        labels = [step.label for step in self.steps]
+        names = [
+            label if labels.count(label) == 1 else f"{k:02d}-{label}" for k, label in enumerate(labels, 1)
+        ]
+        return dict(zip(names, self.steps, strict=True))
+
+    def at_step(self, name: str) -> Self:
+        """Return the task of a step, which starts where the arm stands unless it is the first motion."""
+        step = self.named_steps[name]
+        first = next(one for one, step in self.named_steps.items() if step.moves) == name
+        goal = self.goals[step.goal] if step.goal is not None else self._retreat(step)
+        if step.approach is not None:
+            amount = step.approach.model_dump(exclude={"to"})
+            goal = goal.model_copy(update={"displaced": Along(**amount)})
+        start = {} if first else {"start": CURRENT, "start_offset": None}
+        return self.model_copy(update={**start, "goal": goal, "goals": {}, "steps": ()})
+
+    def _retreat(self, step: TaskStep) -> Goal:
+        """Return the start of a retreat, displaced: what was free at the goal before stays so."""
+        before = [one.goal for one in self.steps[: self.steps.index(step)] if one.goal is not None]
+        incidences = self.goals[before[-1]].incidences if before else ()
+        return Goal(displaced=step.retreat, incidences=incidences)
+
+    def contradictions(self) -> Iterator[Finding]:
+        """An offset from nowhere, steps to unknown goals, and without a motion."""
+        if self.start == CURRENT and self.start_offset is not None:
+            yield ("start_offset",), "is that of joints: leave it out with start: current"
+        for k, step in enumerate(self.steps):
+            name = None if any(step.contradictions()) else step.goal
+            if name is not None and name not in self.goals:
+                known = ", ".join(self.goals) or "none"
+                yield (
+                    ("steps", k, step.kind),
+                    f"there is no goal {name} under task.goals, nor a file {name}.yaml; goals: {known}",
+                )
+            elif step.approach is not None and name is not None and self.goals[name].displaced is not None:
+                yield ("steps", k, "approach"), f"goal {name} is displaced itself: approach the other one"
+        if self.steps and not any(step.given("to", "approach", "retreat") for step in self.steps):
+            yield ("steps",), "no step moves the arm: give to, approach or retreat"
 
 
 _Polygon = Annotated[tuple[Vector2, ...], Field(min_length=3, max_length=200)]

@@ -21,6 +21,7 @@ from projservo_cli.robots.contract import Bounds, PluginRobot, Reading, Robot
 from projservo_cli.robots.latency import DelayPrior
 from projservo_cli.robots.object_watch import ObjectWatch
 from projservo_cli.robots.pacing import Steered
+from projservo_cli.robots.session import Session
 from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
 from projservo_cli.settings.disturbance import EachView, Events
@@ -33,8 +34,8 @@ from projservo_cli.simulation.faults import (
     robot_of,
 )
 from projservo_cli.simulation.streams import SERVO_NOISE
-from projservo_cli.stages.scenario import RunScenario
-from projservo_cli.stages.stage_inputs import Contract, Drive, OwnRobot
+from projservo_cli.stages.scenario import RunScenario, observed_numbers
+from projservo_cli.stages.stage_inputs import Contract, Drive, OwnRobot, ServoInputs
 
 _NEVER_LATE_S = 3600.0  # for a simulated robot, whose code may be compiled first
 # Minimum deviation of a delay and of single frames, s; width of a 95 % interval in deviations.
@@ -180,6 +181,12 @@ def path_to(
         )
 
 
+def stands_at(driven: DrivenRobot, q: FloatArray) -> bool:
+    """Whether a robot stands at joints (n,), as near as it is held."""
+    away = np.abs(driven.steered.observe().q - q)
+    return bool((away <= np.maximum(driven.robot.bounds.sag, STILL)).all())
+
+
 def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> PluginRobot:
     """A simulated robot of the contract, which is never late, and goes beyond its limits where it may."""
     bounds = driven.following.bounds(joints)
@@ -216,27 +223,49 @@ def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -
     return robot_of(robot, scenario.exact.q_start, points, drawn, events)
 
 
-def connected_robot(
-    scenario: RunScenario, law: str, given: Robot | None = None, plan: Plan | None = None
-) -> DrivenRobot:
-    """Return the robot as the loop of a law sees it: with its truth, or with the calibrated model.
+def opened_robot(
+    session: Session, inputs: ServoInputs, calibration: Calibration, given: Robot | None = None
+) -> Steered:
+    """Open a robot of somebody's in a session, unless it is; nothing is moved.
 
-    plan : of which the object is watched, if its goal is carried by one.
     given : an object of the contract instead of one of a class.
     """
-    contract, joints, calibration = scenario.servo.contract, scenario.joints, scenario.calibration
+    if session.steered is not None:
+        session.steered.resume()
+        return session.steered
+    contract, joints = inputs.contract, inputs.plan.joints.joints(calibration.joint_types, calibration)
+    assert contract is not None
+    assert isinstance(contract.driven.robot, OwnRobot)
+    bounds, observed = contract.driven.following.bounds(joints), observed_numbers(inputs.plan, calibration)
+    own, view, further = contract.driven.robot, calibration.view, contract.driven.further
+    return session.opened(plugin_robot(own, bounds, joints.types, observed, given, view, further))
+
+
+def connected_robot(
+    scenario: RunScenario,
+    law: str,
+    session: Session,
+    given: Robot | None = None,
+    plan: Plan | None = None,
+) -> DrivenRobot:
+    """Return the robot, open, as the loop of a law sees it: with its truth, or with the calibrated model.
+
+    session : which it is opened in, unless it is.
+    given : an object of the contract instead of one of a class.
+    plan : of which the object is watched, if its goal is carried by one.
+    """
+    contract, calibration = scenario.servo.contract, scenario.calibration
     assert calibration is not None
     assert contract is not None
     driven = contract.driven
     if isinstance(driven.robot, OwnRobot):
-        plant, bounds = _believed_plant(scenario, calibration), driven.following.bounds(joints)
-        types, view = joints.types, calibration.view
-        robot = plugin_robot(
-            driven.robot, bounds, types, scenario.observed, given, view, further=driven.further
-        )
+        plant = _believed_plant(scenario, calibration)
+        steered = opened_robot(session, scenario.servo, calibration, given)
     else:
         plant = scenario.plant_of(law)
-        robot = simulated_robot(driven, joints, _in_the_loop(scenario, driven.robot, contract.events))
+        steered = session.steered or session.opened(
+            simulated_robot(driven, scenario.joints, _in_the_loop(scenario, driven.robot, contract.events))
+        )
     monitor = None
     if not scenario.untested:
         noise = scenario.servo.stop.innovation_threshold * scenario.noise_px
@@ -248,7 +277,7 @@ def connected_robot(
         numbers = plan.object_marker.tolist()
         places = np.array([driven.further.index(number) for number in numbers])
         watch = ObjectWatch(plan.object_name or "", numbers, places, plan.s_object)
-    return DrivenRobot(robot, plant, _known_of(scenario, contract, calibration, law), monitor, watch)
+    return DrivenRobot(steered, plant, _known_of(scenario, contract, calibration, law), monitor, watch)
 
 
 def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:

@@ -114,7 +114,7 @@ def search_of(scenario: Scenario) -> JointSearch:
     limits, closed = scenario.joints.limits, ""
     if scenario.truth is None and not (np.isfinite(limits.lower) & np.isfinite(limits.upper)).all():
         closed = f"the limits of some joints are unknown: {LIMITS_MISSING}"
-    return JointSearch(scenario.goal_joints, scenario.goal_sigma_px, spread, closed)
+    return JointSearch(scenario.joints_at_goal, scenario.goal_sigma_px, spread, closed)
 
 
 def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> str:

@@ -41,11 +41,22 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
         return None, str(error)
 
 
-def carried_goal(scenario: Scenario, carrier: Carrier) -> tuple[Scenario, dict[str, Any]]:
+_FIELDS = (
+    *("object_name", "object_shift_mm", "object_angle_deg", "object_shift_px", "object_marker", "s_object"),
+    *("goal_deviation_mm", "goal_deviation_deg", "goal_deviation_px", "s_carried"),
+)
+
+
+def carried_goal(
+    scenario: Scenario, carrier: Carrier, before: Plan | None = None
+) -> tuple[Scenario, dict[str, Any]]:
     """Look at the object anew, and carry the goal along: the scenario with it, and the fields of its plan.
 
+    before : plan to the same goal from elsewhere, for which it was looked at; None to look now.
     Raises WorkFailed where images do not show the object or the goal well enough.
     """
+    if before is not None and before.s_carried is not None:
+        return scenario.carried(before.s_carried), {name: getattr(before, name) for name in _FIELDS}
     c = scenario.calibration
     assert c is not None
     metric, _ = in_metres(c, carrier.lengths)
@@ -164,6 +175,6 @@ def _goal(scenario: Scenario, c: Calibration) -> Look:
     if (given := scenario.goal_pixels) is not None:
         return Look(*given)
     s = np.full((len(c.view), len(c.marker), 2), np.nan)
-    s[:, c.indices_of(scenario.numbers)] = scenario.ends.s_star
+    s[:, c.indices_of(scenario.numbers)] = scenario.shown_at(scenario.inputs.seed).s_star
     noise = scenario.inputs.noise_px / math.sqrt(scenario.inputs.averaged_frames)
     return Look(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)

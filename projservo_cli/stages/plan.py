@@ -117,9 +117,10 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
         )
 
 
-def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
+def run(inputs: PlanInputs, calibration: Calibration, before: Plan | None = None) -> Plan:
     """Partition the task and plan its motion, from the calibration and the images alone.
 
+    before : plan to the same goal from elsewhere, whose look at an object holds; None to look anew.
     Raises InputError if the task is missing; WorkFailed if it cannot be partitioned.
     """
     known = set(calibration.marker.tolist())
@@ -134,7 +135,7 @@ def run(inputs: PlanInputs, calibration: Calibration) -> Plan:
         _require_taught_since(scenario, calibration)
     carried: dict[str, Any] = {}
     if inputs.carrier is not None:
-        scenario, carried = carried_goal(scenario, inputs.carrier)
+        scenario, carried = carried_goal(scenario, inputs.carrier, before)
     plan = _to_any_goal(scenario) if inputs.incidences else plan_in(scenario)
     face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
     notes = [

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from projservo_cli.store import Run
 
 FOLDER = "figures"
+_OF_ONE = "figures and claims are of one motion, and the task is a sequence: name a goal, --goal NAME"
 _NUMBERS = "csv"  # the numbers of each figure
 
 
@@ -72,9 +73,13 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
             composition = composition_of(metric_plan(bench), bench.scenario.gains)
         claims = [claim._asdict() for claim in claims_of(report_data, composition)]
     elif run.traces:
-        report_data = Driven(
-            run.calibration, run.observation.at_rest, run.plan, run.traces, held_out=run.cross_validation
-        )
+        *_, last = run.traces
+        part = last.split("/")[0] if "/" in last else ""
+        plan = run.at_step(part).plan if part else run.plan
+        known = run.calibration, run.observation.at_rest, plan, run.traces
+        report_data = driven = Driven(*known, held_out=run.cross_validation)
+        if part:
+            report_data = replace(driven, lacks=_OF_ONE)
     report_data = replace(report_data, metric=metric, no_metric=no_metric)
     figures = draw_all(report_data, directory, inputs.formats, left_out, progress)
     report = Report(

@@ -15,9 +15,11 @@ import numpy as np
 
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.control.law import Gains
+from projservo_cli.geometry.kinematics import project
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import BODY_LAWS, LAW_SPECS
 from projservo_cli.loop.verdicts import Limits
+from projservo_cli.monitoring.accuracy import metres_a_unit
 from projservo_cli.planning.margins import Demands
 from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
@@ -52,6 +54,7 @@ from projservo_cli.simulation.workspace import Truth, plant_of, turned
 from projservo_cli.stages.stage_inputs import Carrier, PlanInputs, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.incidences import Incidence
+from projservo_cli.task.stand_off import Displacement, displacement_back
 from projservo_cli.task.target import TaskImages, is_stereo
 
 _GUESSED = 1e-3  # weight of a marker in a fit that is predicted from others
@@ -80,8 +83,6 @@ class Scenario:
     def ends(self) -> TaskImages:
         """Start and goal as the laws see them."""
         images = self.images_at(self.inputs.seed)
-        if self.s_carried is not None:
-            images = images._replace(s_star=self.s_carried)
         if self.s_chosen is None:
             return images
         return images._replace(s_star=self.s_chosen, s_taught=images.s_star)
@@ -90,6 +91,11 @@ class Scenario:
     def truth(self) -> Truth | None:
         """Robot, rig and markers as they are; None for a robot that is not simulated."""
         return self.inputs.truth
+
+    @property
+    def starts_here(self) -> bool:
+        """Whether the start is where the arm stands."""
+        return self.inputs.task is not None and self.inputs.task.start_joints is None
 
     @property
     def m(self) -> int:
@@ -115,6 +121,12 @@ class Scenario:
         if not self.calibration.has_covariance:
             return "the calibration has no covariance, which the method bundle_adjustment gives"
         return ""
+
+    @property
+    def joints_at_goal(self) -> FloatArray:
+        """Joints (k, n) known to show the goal, rad or m; none of a displaced one."""
+        displaced = self.inputs.displaced is not None and self.s_chosen is None
+        return self.goal_joints[:0] if displaced else self.goal_joints
 
     def towards(self, plan: Plan) -> Self:
         """Return the scenario with the goal that a plan carried along, or chose among those of incidences."""
@@ -221,7 +233,27 @@ class Scenario:
         return images, sigma
 
     def images_at(self, seed: int) -> TaskImages:
-        """Start and goal as the images of a seed show them, which are averages."""
+        """Start and goal as the images of a seed show them; a goal may be carried along, then displaced."""
+        images, asked = self.shown_at(seed), self.inputs.displaced
+        if self.s_carried is not None:
+            images = images._replace(s_star=self.s_carried)
+        if asked is None:
+            return images
+        if not len(images.body.M):
+            raise WorkFailed(
+                "a goal is displaced with the body, and the calibration is not usable: calibrate again, or "
+                "set control.features: body to try"
+            )
+        model, back = self.model, _positioned(asked, self.numbers)
+        s = images.s_start if asked.of_start else images.s_star
+        H = images.displacement_at_start(model) if asked.of_start else images.displacement_taught(model)
+        metre = metres_a_unit(model, images.body.M[: self.m], self.inputs.lengths)
+        moved = displacement_back(model, images.body, H, back, np.isfinite(s[..., 0]), metre) @ H
+        there, before = (project(model.P, images.body.M @ at.T, model.lens) for at in (moved, H))
+        return images._replace(s_star=np.ascontiguousarray(there + s - before))
+
+    def shown_at(self, seed: int) -> TaskImages:
+        """Start and taught goal as the images of a seed show them, which are averages."""
         if self.inputs.scene is not None:
             return self._rendered(seed)
         sigma = self.inputs.noise_px / math.sqrt(self.inputs.averaged_frames)
@@ -365,7 +397,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
         observed = truth.number
     else:
         assert calibration is not None
-        observed = _observed(inputs, calibration)
+        observed = observed_numbers(inputs, calibration)
     if calibration is not None and (truth is None or inputs.scene is not None):
         sigma_px = max(sigma_px, calibration.sigma_fitted_px)
     view = calibration.view if calibration is not None else truth.view if truth is not None else VIEWS
@@ -382,7 +414,10 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
             "set control.features: body to try"
         )
     if truth is not None:
-        exact, ends, q_goal = _simulated_ends(task, joints.types, joints.units, truth, pins, inputs.center)
+        at = None if inputs.q_current is None else tuple(inputs.q_current.tolist())
+        exact, ends, q_goal = _simulated_ends(
+            task, joints.types, joints.units, truth, pins, inputs.center, at
+        )
     else:
         assert calibration is not None
         exact, ends, q_goal = _predicted_ends(inputs, task, calibration, joints, (*face, *pins))
@@ -390,6 +425,10 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
     if not is_stereo(view):
         near = _joints_near_goal(exact, q_goal, calibration, (*face, *pins))
         exact = exact._replace(q_near=near)
+    if inputs.carrier is not None:
+        ends = _carried_ends(ends, inputs.carrier)
+    if truth is not None and inputs.displaced is not None and len(body.M):
+        ends = _displaced_ends(inputs, truth, exact, ends, (*face, *pins))
     found = Scenario(
         inputs=inputs,
         calibration=calibration,
@@ -397,7 +436,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
         numbers=(*face, *pins),
         observed=observed,
         exact=exact,
-        true_ends=ends if inputs.carrier is None else _carried_ends(ends, inputs.carrier),
+        true_ends=ends,
         q_taught=q_goal,
         goal_joints=np.empty((0, len(joints.types))) if q_goal is None else q_goal[None],
         noise_px=sigma_px,
@@ -432,6 +471,35 @@ def _positions(asked: Sequence[Incidence], numbers: Sequence[int]) -> tuple[Inci
         flats = [tuple(tuple(map(numbers.index, point)) for point in flat) for flat in (one.tool, one.scene)]
         found.append(one._replace(tool=flats[0], scene=flats[1]))
     return tuple(found)
+
+
+def _positioned(asked: Displacement, numbers: Sequence[int]) -> Displacement:
+    """Displacement by positions in the body instead of numbers of markers.
+
+    Raises InputError for a marker that the body lacks.
+    """
+    for number in chain.from_iterable(asked.along):
+        if number not in numbers:
+            raise InputError(
+                f"displaced: {asked.name} needs marker {number}, and the body has "
+                f"{', '.join(map(str, numbers))}: name these, or calibrate with it"
+            )
+    return asked._replace(along=tuple(tuple(map(numbers.index, point)) for point in asked.along))
+
+
+def _displaced_ends(
+    inputs: PlanInputs, truth: Truth, exact: TaskImages, ends: Ends, numbers: tuple[int, ...]
+) -> Ends:
+    """True poses of the tool at start and displaced goal."""
+    assert inputs.displaced is not None
+    model, goal = truth.model, ends.goal_pose
+    if not np.isfinite(goal).all():
+        return ends
+    body, H = make_body(model, truth.of(numbers)), goal @ np.linalg.inv(ends.base_tool)
+    metre = metres_a_unit(model, body.M[: len(inputs.face)], inputs.lengths)
+    shows = np.isfinite((exact.s_start if inputs.displaced.of_start else exact.s_star)[..., 0])
+    back = displacement_back(model, body, H, _positioned(inputs.displaced, numbers), shows, metre)
+    return Ends(ends.base_tool, back @ goal, back @ ends.goal)
 
 
 def _require_same_rig(inputs: PlanInputs, calibration: Calibration | None) -> None:
@@ -522,7 +590,7 @@ def _body(known: Calibration | Truth, numbers: tuple[int, ...]) -> Body:
     return make_body(known.model(), known.M[known.indices_of(numbers)])
 
 
-def _observed(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
+def observed_numbers(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
     """Numbers of the markers that a robot which is not simulated observes, in its order."""
     numbers = tuple(calibration.marker.tolist()) if inputs.known is None else inputs.known
     for number in inputs.face:
@@ -533,9 +601,19 @@ def _observed(inputs: PlanInputs, calibration: Calibration) -> tuple[int, ...]:
 
 @lru_cache(maxsize=2048)
 def _simulated_ends(
-    task: TaskSettings, types: str, units: tuple[str, ...], truth: Truth, pins: tuple[int, ...], center: int
+    task: TaskSettings,
+    types: str,
+    units: tuple[str, ...],
+    truth: Truth,
+    pins: tuple[int, ...],
+    center: int,
+    current: tuple[float, ...] | None,
 ) -> tuple[TaskImages, Ends, FloatArray | None]:
-    """Return the images of the ends of a task, for any seed and noise, and the joints (n,) at the goal."""
+    """Return the images of the ends of a task, for any seed and noise, and the joints (n,) at the goal.
+
+    current : joints where the arm stands, if that is known.
+    """
+    at = None if current is None else np.array(current)
     M_pins, robot = truth.of(pins), truth.robot
 
     def images(q: FloatArray, key: str) -> FloatArray:
@@ -548,7 +626,7 @@ def _simulated_ends(
         return turned(task.goal, robot, truth.cameras_at(q), q)
 
     numbers = tuple(truth.number[i] for i in truth.face), pins
-    seen_images, q_goal = _task_images(task, types, numbers, (center, truth.view), images, turn)
+    seen_images, q_goal = _task_images(task, types, numbers, (center, truth.view), images, turn, at)
     return seen_images, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal), q_goal
 
 
@@ -559,6 +637,7 @@ def _task_images(
     how: tuple[int, tuple[str, ...]],
     images: Callable[[FloatArray, str], FloatArray],
     turn: Callable[[FloatArray], FloatArray],
+    q_current: FloatArray | None,
 ) -> tuple[TaskImages, FloatArray | None]:
     """Start and goal of a task, and the joints (n,) at the goal, None for a goal by images alone.
 
@@ -566,9 +645,10 @@ def _task_images(
     how : position of the centre marker within the face, or ``MIDPOINT``; names of the views.
     images : pixels (V, b, 2) at the joints (n,) of a key of the configuration.
     turn : joints (n,) of a goal that is a turn from the joints (n,) of the start.
+    q_current : (n,) joints where the arm stands, if that is known.
     """
     pins, given, (center, view) = len(numbers[1]), task.goal.joints, how
-    q_start = q_from = task.start.values(types)
+    q_start = q_from = _joints_at_start(task, q_current, types)
     if task.start_offset is not None:
         q_start = q_from + task.start_offset.values(types)
     s_start = images(q_start, "task.start" if task.start_offset is None else "task.start_offset")
@@ -578,8 +658,19 @@ def _task_images(
         s_star = np.array([pixels.get(number, unseen) for number in (*numbers[0], *numbers[1])])
         s_star = np.ascontiguousarray(np.swapaxes(s_star, 0, 1))
         return TaskImages(q_start, s_start, s_star, center, pins), None
+    if task.goal.of_start:
+        return TaskImages(q_start, s_start, s_start, center, pins), q_start
     q_goal = turn(q_from) if given is None else given.values(types)
     return TaskImages(q_start, s_start, images(q_goal, "task.goal"), center, pins), q_goal
+
+
+def _joints_at_start(task: TaskSettings, q_current: FloatArray | None, types: str) -> FloatArray:
+    """Joints (n,) at the start, rad or m. Raises InputError where nobody has asked where the arm stands."""
+    if task.start_joints is not None:
+        return task.start_joints.values(types)
+    if q_current is None:
+        raise InputError("task.start: current is where the arm stands: give joints, or run projservo servo")
+    return q_current
 
 
 def _unseen(views: int) -> tuple[tuple[float, float], ...]:
@@ -599,7 +690,7 @@ def _predicted_ends(
     m, columns, V = len(inputs.face), calibration.indices_of(numbers), len(calibration.view)
     least = V if inputs.trajectory.visible_views == "all" else inputs.trajectory.visible_views
     taught = None if task.goal.images is None else task.goal.images.joints
-    given = (task.start, "start"), (task.goal.joints, "goal.joints"), (taught, "goal.images.joints")
+    given = (task.start_joints, "start"), (task.goal.joints, "goal.joints"), (taught, "goal.images.joints")
     for vector, key in given:
         if vector is not None and len(vector.joints) != len(joints.types):
             raise InputError(f"task.{key}: {len(vector.joints)} values for {len(joints.types)} joints")
@@ -621,6 +712,7 @@ def _predicted_ends(
         return turned(task.goal, inputs.arm, P, q)
 
     seen_images, q_goal = _task_images(
-        task, joints.types, (numbers[:m], numbers[m:]), (inputs.center, calibration.view), images, turn
+        *(task, joints.types, (numbers[:m], numbers[m:]), (inputs.center, calibration.view)),
+        *(images, turn, inputs.q_current),
     )
     return seen_images, _unknown(np.full((4, 4), np.nan)), q_goal

@@ -3,7 +3,8 @@
 import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from contextlib import nullcontext
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.run_metrics import Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.stall_monitor import StallMonitor
 from projservo_cli.loop.verdicts import PLATEAU_FALL, VERDICTS, Log, new_log, plateau_stretch, tolerance
-from projservo_cli.monitoring.accuracy import Posture, metric_points, rigid_fit
+from projservo_cli.monitoring.accuracy import Posture, metres_a_unit, rigid_fit
 from projservo_cli.monitoring.innovation_tests import WINDOW
 from projservo_cli.plugins import what_failed
 from projservo_cli.records import (
@@ -42,7 +43,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.results import ImageModel
 from projservo_cli.robots.client import DrivenRobot
-from projservo_cli.robots.contract import at_rest_after
+from projservo_cli.robots.session import Session
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.workspace import Truth
@@ -89,6 +90,7 @@ class LawRun:
     factory: Callable[[Any], Any] | None = None  # makes the law of its setup; None for that of its name
     robot: Any = None  # an object of the contract; None for that of the configuration
     blind: bool = False  # whether a robot may move although cameras show no marker of the calibration
+    session: Session | None = None  # whose robot is driven; None for a connection of its own
     # As it ended.
     verdict: str = ""
     why: str = ""  # what held, disturbed or failed it, where something did
@@ -154,8 +156,9 @@ class LawRun:
     def by_contract(self) -> None:
         """Drive a robot of the contract from the start of the task, where a simulated one stands.
 
-        That of ``plant.use`` is driven there. Before its first motion, its images must agree with the
-        calibration where it stands. The robot is stopped and closed on every way out.
+        That of ``plant.use`` is driven there, unless it starts where it stands. Before its first motion, its
+        images must agree with the calibration where it stands. The robot is stopped and closed on every way
+        out, in a shared session at its end.
         """
         scenario, contract = self.scenario, self.scenario.servo.contract
         assert contract is not None
@@ -167,10 +170,11 @@ class LawRun:
                 f"{order}, or set data.joint_order=stated if it is known; no robot is driven before"
             )
         controller = self.controller()
-        plan = self.plan if isinstance(self.plan, Plan) else None
-        driven = external_robot.connected_robot(scenario, self.law, self.robot, plan)
+        shared, plan = self.session, self.plan if isinstance(self.plan, Plan) else None
         # The matrices of a frame are small: a second thread costs more than it gives.
-        with threadpool_limits(limits=1), at_rest_after(driven.robot):
+        with threadpool_limits(limits=1), nullcontext(shared) if shared else Session() as session:
+            driven = external_robot.connected_robot(scenario, self.law, session, self.robot, plan)
+            driven.stops = shared is None
             if own:
                 driven.robot.require_identity(contract.identity)
                 wrong = driven.fits()
@@ -180,7 +184,9 @@ class LawRun:
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
                 unseen = self._require_images(driven, "the robot did not move, since where it stands", 1)
-                for _ in external_robot.path_to(driven.steered, start, settle_s, "servo"):
+                stands = scenario.starts_here and external_robot.stands_at(driven, start)
+                path = external_robot.path_to(driven.steered, start, settle_s, "servo")
+                for _ in () if stands else path:
                     if wrong := driven.agrees():
                         refutes = not driven.object_moved
                         raise WorkFailed(f"stopped on the path to the start, since {wrong}", refutes=refutes)
@@ -333,26 +339,16 @@ class LawRun:
         taught = images.displacement_taught(model)
         mm, deg = metric_errors(model, images.incidences, task.body.M, (H[-1], taught))
         flats = [[one.tool for one in images.incidences], [one.scene for one in images.incidences]]
+        metre = metres_a_unit(model, task.body.M[: scenario.m], scenario.inputs.lengths)
         return {
             "feature_s": images_of(model, task.body.M, flats[0], H),
             "feature_s_star": images_of(model, task.body.M, flats[1], taught[None])[0],
-            "incidence_mm": MM * mm * self._metre(task.body.M),
+            "incidence_mm": MM * mm * metre,
             "incidence_deg": deg,
             "incidences": tuple(one.name for one in images.incidences),
             "incidence_px": errors_px(task.incidences, H),
             "free_dof": self.plan.free_dof if isinstance(self.plan, Plan) else None,
         }
-
-    def _metre(self, M: FloatArray) -> float:
-        """Metres a unit of the metric of the arm, by known lengths of the face; NaN without.
-
-        M : (m, 4) markers of the body, those of the face first.
-        """
-        m, lengths = self.scenario.m, self.scenario.servo.lengths
-        X, (i, k) = metric_points(self.scenario.model, M[:m]), np.nonzero(lengths > 0.0)
-        if X is None or not len(i):
-            return math.nan
-        return float(np.median(lengths[i, k] / np.linalg.norm(X[i] - X[k], axis=1)))
 
     @cached_property
     def true_ends(self) -> Ends:
@@ -454,7 +450,7 @@ _SUMMARY_FIELDS = [
 ]
 
 
-def _whole(values: Sequence[FloatArray], rows: int) -> FloatArray:
+def _whole(values: Sequence[FloatArray] | Sequence[float], rows: int) -> FloatArray:
     """Return the values at each time of a run, (rows, ...); NaN after its end."""
     missing = np.full_like(values[0], np.nan)
     return np.array([*values, *[missing] * (rows - len(values))])
@@ -466,8 +462,8 @@ def _reported_poses(scenario: RunScenario, truths: FloatArray) -> tuple[FloatArr
     truths : the poses, or joints (k, n), from which a configured arm gives them.
     """
     arm, goal = scenario.inputs.arm, np.full((4, 4), np.nan)
-    if arm is not None and len(scenario.goal_joints):
-        goal = arm.pose(scenario.goal_joints[0])
+    if arm is not None and len(scenario.joints_at_goal):
+        goal = arm.pose(scenario.joints_at_goal[0])
     if truths.ndim == 3:
         return truths, goal
     return np.array([goal * np.nan if arm is None else arm.pose(q) for q in truths]), goal
@@ -502,7 +498,7 @@ def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
     assert known is not None
     M = known.of(numbers) if isinstance(known, Truth) else known.M[known.indices_of(numbers)]
     s, s_star = run.log.s[run.steps], scenario.images_for(run.law).s_star
-    posture = Posture(scenario.model, q, M[:m], scenario.servo.lengths)
+    posture = Posture(scenario.model, q, M[:m], scenario.inputs.lengths)
     whole = np.isfinite(s[:, :m]).all(axis=(1, 2))
     if not posture.known or whole.sum() < scenario.least_views:
         return {}
@@ -605,7 +601,8 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
 
 def _apart(run: LawRun) -> str:
     """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
-    if run.scenario.exact.incidences:  # the face may be anywhere that they leave open
+    displaced = run.scenario.inputs.displaced  # to where it was never seen
+    if run.scenario.exact.incidences or displaced:  # the face may be anywhere that they leave open
         return ""
     seen, most = float(run.log.error[run.steps]), _BY_NOISE * run.scenario.termination.image_error_px
     text = f"; the face itself is seen {seen:.3g} px off ({most:.3g} px by noise): it moved on the tool"
@@ -626,11 +623,15 @@ def run(inputs: ServoInputs, calibration: Calibration, plan: Plan, name: str, **
     """Drive one law in one mode from the start of the task to its verdict.
 
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
-    brought : by a caller in Python: ``factory``, ``robot`` and ``blind`` of ``LawRun``.
+    brought : by a caller: ``factory``, ``robot``, ``blind`` and ``session`` of ``LawRun``.
     Raises InputError if a part of the simulation is missing, the plan is of another task, or the plan to
     follow has no time; WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
     ``refuses`` is set.
     """
+    task = inputs.plan.task
+    if task is not None and task.start_joints is None and inputs.plan.q_current is None:
+        # where the arm stood when it was planned
+        inputs = replace(inputs, plan=replace(inputs.plan, q_current=plan.q_start))
     scenario = run_scenario(inputs, calibration)
     _require_its_task(scenario.towards(plan), plan)
     return drive(scenario, plan, name, **brought).trace()

@@ -23,6 +23,7 @@ from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.workspace import SceneObject, Truth
 from projservo_cli.task.incidences import Incidence
+from projservo_cli.task.stand_off import Displacement
 
 
 class OwnRobot(NamedTuple):
@@ -212,11 +213,14 @@ class PlanInputs:
     features: str | None  # points, body, or None for body where the calibration is usable
     tests_images: bool  # whether images are tested against the calibration
     trajectory: Trajectory
+    lengths: FloatArray  # (m, m) distances between the markers of the face, m; NaN if unknown
     # that are to hold at the goal, by numbers of markers; none for the pose
     incidences: tuple[Incidence, ...] = ()
     # Width and height to which recorded images reach at least, px, where their size is not known.
     seen_px: ImageSize | None = None
     carrier: "Carrier | None" = None  # object that the goal was taught on; None for a goal that stands still
+    displaced: Displacement | None = None  # of the goal, or of the start in its place
+    q_current: FloatArray | None = None  # (n,) joints where the arm stands, rad or m, once that is known
 
     def cameras_at(self, q: FloatArray) -> FloatArray | None:
         """Cameras (V, 3, 4) from the base frame at joints (n,), rad or m, px; None if not described."""
@@ -249,7 +253,6 @@ class ServoInputs:
     speed_scale: float  # factor of every command
     max_replan_attempts: int  # maximum number of replanning attempts
     refuses: bool  # whether a law is not run where no joints could follow the plan
-    lengths: FloatArray  # (m, m) distances between the markers of the face, m; NaN if unknown
     contract: Contract | None  # None for the ideal plant
 
 

@@ -245,6 +245,7 @@ def checked(inputs: PlanInputs, calibration: Calibration, taught: _Taught) -> _C
         seen_px=tuple((width, height) for width, height in seen_px),
         task=TaskSettings(start=start, goal=Goal(images=taught.images)),
         carrier=None,
+        displaced=None,
         trajectory=inputs.trajectory.model_copy(update={"profile": profile, "keep_out": ()}),
     )
     try:

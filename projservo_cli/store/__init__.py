@@ -1,6 +1,7 @@
 """Run file (HDF5): all that an experiment made, one group a result, with the records in it or in subgroups.
 
-Only this package opens HDF5. The groups are ``calibrate``, ``plan``, ``servo/<law>`` and ``report``. Arrays
+Only this package opens HDF5. The groups are ``calibrate``, ``plan``, ``servo/<law>`` and ``report``, of a
+sequence ``plan/<step>`` and ``servo/<step>/<law>``, or ``servo/<step>`` of one that no law drives. Arrays
 are netCDF-4 variables, by h5netcdf; scalars and texts are attributes of their group. Files are written as a
 whole, and a line behind the HDF5 data has their checksum, which reading requires.
 
@@ -32,6 +33,7 @@ from projservo_cli.files import replacing
 from projservo_cli.records import (
     SIZES,
     VIEWS,
+    Action,
     Calibration,
     CrossValidation,
     InputError,
@@ -67,10 +69,10 @@ _RECORDS: dict[str, dict[str, type]] = {
         "cross_validation": CrossValidation,
     },
     "plan": {"": Plan},
-    "servo": {"": Trace},
+    "servo": {"": Trace, "action": Action},
     "report": {"": Report},
 }
-_NAME = re.compile(r"calibrate|plan|report|servo/[\w.:-]+")
+_NAME = re.compile(r"calibrate|plan(/[\w-]+)?|report|servo/([\w-]+/)?[\w.:-]+")
 _OLDER = "make it again in another folder: projservo calibrate plan servo report -c FILE -o FOLDER"
 _REMEDY = "restore it, or make it again in another folder"
 
@@ -122,9 +124,16 @@ class Run:
 
     @property
     def traces(self) -> dict[str, Trace]:
-        """Traces by law, in the order of their first runs."""
+        """Traces by law, of a sequence by step and law, in the order of their first runs."""
         found = {name: result for name, result in self.results.items() if name.startswith(SERVO)}
+        found = {name: result for name, result in found.items() if "" in result.records}
         return {name.removeprefix(SERVO): result.records[""] for name, result in found.items()}
+
+    def at_step(self, step: str) -> "Run":
+        """Return the calibration of a sequence with plan and trace of one of its steps."""
+        each = {(*name.split("/"), ""): one for name, one in self.results.items()}
+        found = {"/".join(name[::2]).rstrip("/"): one for name, one in each.items() if name[1] == step}
+        return dataclasses.replace(self, results={"calibrate": self.results["calibrate"], **found})
 
     def _record(self, result: str, name: str, kind: type[_Record]) -> _Record:
         found = self.results[result].records.get(name) if result in self.results else None
@@ -206,7 +215,7 @@ def load(target: Path | str) -> Run:
 def _load_result(group: h5py.Group, sizes: dict[str, int]) -> Result:
     known = _RECORDS[group.name.split("/")[1]]
     labels = attribute(group, "records", list)
-    if not {"", "calibration"} & set(labels) or not set(labels) <= set(known):
+    if not {"", "calibration", "action"} & set(labels) or not set(labels) <= set(known):
         raise ValueError(f"{group.name} holds the records {labels}")
     groups = {label: _member(group, label) if label else group for label in labels}
     records = {label: load_record(inner, known[label], sizes) for label, inner in groups.items()}

@@ -195,8 +195,13 @@ class Design:
             raise InputError(f"base {name}: a sweep drives the simulated robot; leave plant.use out")
         name_of_run(config)
         assert config.task is not None
+        if config.task.steps or config.task.start_joints is None:
+            raise InputError(
+                f"base {name}: a sweep is of one motion from given joints: leave task.steps out, and set "
+                "task.start"
+            )
         control = config.control.model_copy(update={"must_converge": ()})
-        reference = config.calibration.reference or config.task.start
+        reference = config.calibration.reference or config.task.start_joints
         calibration = config.calibration.model_copy(update={"reference": reference})
         update = {"name": self.sweep.name, "control": control, "calibration": calibration}
         return config.model_copy(update=update)
@@ -250,7 +255,8 @@ class Design:
         assert config.task is not None
         assert config.robot is not None
         assert self.sweep.tasks is not None
-        q_front = np.array(config.task.start.values(config.robot.joint_types))
+        assert config.task.start_joints is not None
+        q_front = np.array(config.task.start_joints.values(config.robot.joint_types))
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(TASKS,)))
         asked = config.trajectory.visible_views
         least_views = 0 if asked == "all" else asked

@@ -191,18 +191,18 @@ def whole_pose(A: FloatArray) -> tuple[Incidence, ...]:
     return tuple(Incidence("pose", ((int(k),),), ((int(k),),)) for k in far)
 
 
-class _Metric:
-    """Directions and normals in the metric that the joints preserve; S takes points to metric ones."""
+class JointMetric:
+    """Directions and normals in the metric that the joints preserve; S takes points to metric ones.
+
+    name : what needs it, for messages.
+    """
 
     def __init__(self, model: Model, name: str) -> None:
         try:
             S = invariant_upgrade(model.H_hat_0, model.prismatic)
         except InputError as error:
             why = str(error).removeprefix("metric: ")
-            raise InputError(
-                f"incidence {name}: angles need the metric form that the joints preserve, and {why}; "
-                "take meet or parallel"
-            ) from error
+            raise InputError(f"{name} needs the metric form that the joints preserve, and {why}") from error
         self._S, self._back = S, np.linalg.inv(S)
 
     def unit(self, D: FloatArray) -> FloatArray:
@@ -218,7 +218,7 @@ class _Metric:
         return np.asarray(self._S[:3].T @ (self._S[:3] @ D))
 
 
-def _plane(points: FloatArray) -> FloatArray:
+def plane_through(points: FloatArray) -> FloatArray:
     """Plane (4,) through three points (3, 4), of unit norm."""
     A, B, C = (vec(row) for row in points)
     return np.array(unit(meet(A, B, C)))
@@ -248,13 +248,13 @@ def _rows(one: Incidence, model: Model, tool: FloatArray, scene: FloatArray) -> 
         return _incident(tool, scene, scene, tool)
     if one.relation == PARALLEL:
         return _incident(_directions(tool), _directions(scene), scene, tool)
-    metric, t, s = _Metric(model, one.name), _directions(tool), _directions(scene)
+    metric, t, s = JointMetric(model, f"incidence {one.name}"), _directions(tool), _directions(scene)
     if one.relation == PERPENDICULAR:
         if len(t) == len(s) == 2:  # the normal of one plane is a direction of the other
-            return [(metric.normal(_plane(tool)), _plane(scene), 1.0, 0.0)]
+            return [(metric.normal(plane_through(tool)), plane_through(scene), 1.0, 0.0)]
         return [(D, metric.along(direction), 1.0, 0.0) for D in t for direction in s]
     axes = [
-        metric.unit(D[0]) if len(D) == 1 else metric.normal(_plane(points))
+        metric.unit(D[0]) if len(D) == 1 else metric.normal(plane_through(points))
         for D, points in ((t, tool), (s, scene))
     ]
     angle = math.radians(one.angle_deg)
@@ -287,7 +287,7 @@ def incidences_of(model: Model, body: Body, H_taught: FloatArray, asked: Sequenc
         rows += [np.array([*A, *b, sense, offset, k]) for A, b, sense, offset in found]
         if _has_sense(one, tool, scene):
             plane = len(tool) == len(KINDS)
-            axes = [_plane(points) if plane else _directions(points)[0] for points in (tool, scene)]
+            axes = [plane_through(points) if plane else _directions(points)[0] for points in (tool, scene)]
             senses.append(np.array([[*axes[0], *axes[1], plane, 0.0]]))
     return NO_INCIDENCES._replace(rows=np.array(rows), senses=np.concatenate(senses))
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import mat_into, mul
+from projservo_cli.geometry.algebra import as_array, mat_into, mul
 from projservo_cli.geometry.displacements import translation
 from projservo_cli.geometry.jit import inline
 from projservo_cli.geometry.kernels import COORDINATES
@@ -106,6 +106,16 @@ class TaskImages(NamedTuple):
     def displacement_taught(self, model: Model) -> FloatArray:
         """Displacement (4, 4) of the body where the goal was taught; raises as ``task``."""
         return self.taught()._measured(model)[1]
+
+    def displacement_at_start(self, model: Model) -> FloatArray:
+        """Displacement (4, 4) of the body at the start; raises WorkFailed where images do not show it."""
+        unseen = np.zeros((len(model.P), len(self.body.M)), dtype=np.bool_)
+        body, normal = self.body._replace(in_goal=unseen), np.zeros((COORDINATES, COORDINATES + 1))
+        start = forward(model, self.q_start)
+        fit = fit_body(model.P, body, undistort(model.lens, self.s_start), start, SETTLED, normal)
+        if not fit.settled:
+            require_found(MISFIT_START if fit.found else UNSEEN_START, fit.views, self.view)
+        return as_array(fit.H)
 
     def _measured(self, model: Model) -> tuple[Task, FloatArray]:
         """Task without incidences, and the displacement (4, 4) of the body at its goal."""

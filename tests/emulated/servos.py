@@ -53,6 +53,7 @@ class Servo:
     def __init__(self, number, arm, joint, zero, sign):
         self.number, self.arm, self.joint, self.zero, self.sign = number, arm, joint, zero, sign
         self.memory, self.overload, self._held = bytearray(86), False, float(zero)
+        self.between = None  # counts of the shaft at which a part stops the gripper
         for address, size, value in _FACTORY:
             self.put(address, size, value)
         self.memory[5] = number
@@ -69,8 +70,17 @@ class Servo:
     def shaft(self):
         """Counts of the shaft, which go on over whole turns."""
         if self.joint is None:
-            return self._held
+            return self._gripper()
         return self.zero + self.sign * self.arm.q[self.joint] * TURN / (2 * math.pi)
+
+    def _gripper(self):
+        """Counts of the shaft of a gripper, which turns towards its goal until a part stops it."""
+        if not self.moments or not self.on:
+            return self._held
+        (since, goal), speed = self.moments[-1], (self.get(46) & 0x7FFF) or TURN
+        way = speed * (self.arm.clock.now() - since)
+        there = self._held + np.clip(goal - self._held, -way, way)
+        return there if self.between is None else max(there, self.between)
 
     @property
     def present(self):
@@ -116,10 +126,11 @@ class Servo:
         """Turn to a goal, the long way round rather than over 4095; torque comes on by itself."""
         low, high = self.get(9), self.get(11)
         goal = min(max(self.get(42), low), high)
+        if self.joint is None:
+            self._held = self._gripper()
         self.moments.append((self.arm.clock.now(), goal))
         self.overload, self.memory[40] = False, 1
         if self.joint is None:
-            self._held += goal - self.present
             return
         self.arm.share[self.joint] = 1.0
         way = (goal - self.present) * self.sign * 2 * math.pi / TURN

@@ -353,6 +353,40 @@ def test_an_overload_of_before_ends_with_the_first_set_point(opened):
         again.joints()
 
 
+def test_the_gripper_closes_on_a_part_and_pushes_on_whatever_ends(opened, rig):
+    bus, arm = opened(rig(), gripper_counts=(1200, 2600))
+    gripper = bus.servos[6]
+    gripper.between = 1500
+    assert arm.act("gripper", 1.0) == pytest.approx(1100 * COUNT / math.radians(60.0) + 0.3, abs=0.05)
+    drive(arm, np.zeros(5))
+    time.sleep(1.7)
+    assert gripper.present == 2600
+    arm.act("gripper", 0.0)
+    time.sleep(1.7)
+    assert gripper.present == 1500
+    assert gripper.get(42) == 1200
+    gripper.overload = True  # which is no fault of a grip
+    drive(arm, np.zeros(5))
+    arm.stop()
+    arm.release()
+    assert gripper.on
+    assert gripper.get(42) == 1200
+
+
+def test_what_the_gripper_cannot_do_is_named(opened, rig):
+    for value, told, options in (
+        (0.5, "how far it opens is not stored .* plant.options.gripper_counts", {}),
+        (1.5, "give a share, from 0, closed, to 1, open", {"gripper_counts": (1200, 2600)}),
+        (0.5, "the arm has no gripper", {"gripper": None}),
+    ):
+        bus, arm = opened(rig(), **options)
+        with pytest.raises(InputError, match=told):
+            arm.act("gripper", value)
+        arm.close()
+    with pytest.raises(InputError, match="give two counts from 0 to 4095"):
+        SO101(bus.port, gripper_counts=(1, 5000))
+
+
 def test_a_gripper_that_holds_keeps_its_grip(opened, rig):
     bus = rig()
     bus.servos[6].write(GOAL, (1000).to_bytes(2, "little"))

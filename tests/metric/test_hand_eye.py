@@ -40,8 +40,11 @@ def test_exact_cameras_see_the_scene_from_a_flange_of_any_arm(types, views, fram
     s = np.array([m.cameras(row) @ points.T for row in q])
     np.testing.assert_allclose((s[:, :, :2] / s[:, :, 2:]).swapaxes(2, 3), arm.images(q), atol=1e-6)
     seen = arm.images(q)
-    seen[0, 0, 2] = np.nan
     expected = (np.linalg.inv(m.pose(q)) @ points.T).swapaxes(1, 2)[..., :3]
+    np.testing.assert_allclose(m.project(expected), seen, atol=1e-6)
+    behind = 2.0 * np.linalg.inv(m.camera_poses[0])[2, :3] if views == 1 else None
+    assert behind is None or np.isnan(m.project(-100.0 * behind[None])).all()
+    seen[0, 0, 2] = np.nan
     if views == 1:
         with pytest.raises(InputError, match="one camera determines no point"):
             m.triangulate(seen)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.laws import BODY_LAWS, POINT_LAWS, REGULATE, law_and_mode, title_of
+from projservo_cli.laws import BODY_LAWS, POINT_LAWS, title_of
 from projservo_cli.loop.verdicts import plateau_stretch
 from projservo_cli.records import ByteArray, FloatArray, IntArray, Trace
 from projservo_cli.report import style
@@ -443,7 +443,8 @@ def _data_incidences(report_data: ReportData | Driven) -> Data:
         **_feature_images(shown, np.array([0, -1])),
     }
     for name, trace in report_data.traces.items():
-        if trace.incidence_px is not None:
+        same = np.array_equal(result.get("incidence", trace.incidences), trace.incidences)
+        if trace.incidence_px is not None and same:  # of a sequence those of its first goal
             result["incidence"] = np.array(trace.incidences)
             result[f"t_s_{name}"] = trace.period * np.arange(len(trace.incidence_px))
             result[f"px_{name}"] = trace.incidence_px
@@ -488,13 +489,40 @@ def _draw_incidences(data: Data, figure: "style.Figure") -> None:
     runs = [name.removeprefix("px_") for name in data if name.startswith("px_")]
     for k, (panel, incidence) in enumerate(zip(panels, data["incidence"], strict=True)):
         for i, name in enumerate(runs):
-            law, mode = law_and_mode(name)
-            label = title_of(law) + (", by the plan" if mode != REGULATE else "")
-            panel.plot(
-                data[f"t_s_{name}"], np.maximum(data[f"px_{name}"][:, k], _LEAST_PX), **style.curve(i, label)
-            )
+            error = np.maximum(data[f"px_{name}"][:, k], _LEAST_PX)
+            panel.plot(data[f"t_s_{name}"], error, **style.curve(i, title(name)))
         style.log_scale(panel)
         panel.set(title=str(incidence), xlabel="time (s)")
         panel.sharey(panels[0])
     panels[0].set_ylabel("error (px at one px of noise)")
     style.legend_below(figure, 4)
+
+
+def _data_sequence(report_data: Driven) -> Data:
+    """Error that decides convergence over time, of one motion of a sequence after the other."""
+    result, before = Data(), 0.0
+    for name, trace in report_data.traces.items():
+        time = trace.period * np.arange(len(trace.convergence_error))
+        result |= {f"t_s_{name}": before + time, f"px_{name}": trace.convergence_error}
+        before += float(time[-1])
+    return result
+
+
+@registered(
+    "fig20_sequence",
+    "Image errors of the motions of a sequence",
+    "no figure",
+    _data_sequence,
+    height=3.2,
+    sequence=True,
+    alt="The image error of each motion over time, one after the other, on a logarithmic scale.",
+)
+def _draw_sequence(data: Data, figure: "style.Figure") -> None:
+    """A curve for each motion."""
+    panel = figure.subplots()
+    for i, name in enumerate(name.removeprefix("px_") for name in data if name.startswith("px_")):
+        error = np.maximum(data[f"px_{name}"], _LEAST_PX)
+        panel.plot(data[f"t_s_{name}"], error, **style.curve(i, name.split("/")[0]))
+    style.log_scale(panel)
+    panel.set(xlabel="time of motion (s)", ylabel="error (px)")
+    style.legend_below(figure, 3)
