@@ -78,9 +78,9 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
     elif run.traces:
         *_, last = run.traces
         part = last.split("/")[0] if "/" in last else ""
-        plan, lacks = run.at_step(part).plan if part else run.plan, {"lacks": _OF_ONE} if part else {}
-        known = run.calibration, run.observation.at_rest, plan, run.traces
-        report_data = Driven(*known, held_out=run.cross_validation, **lacks)
+        plan, lacks = (run.at_step(part).plan, _OF_ONE) if part else (run.plan, Driven.lacks)
+        known = run.calibration, run.observation.at_rest, plan, run.traces, lacks
+        report_data = Driven(*known, held_out=run.cross_validation)
     report_data = replace(report_data, metric=metric, no_metric=no_metric)
     figures = draw_all(report_data, directory, inputs.formats, left_out, progress)
     report = Report(
