@@ -25,6 +25,7 @@ GROUPS = {
     "calibrate/cross_validation": records.CrossValidation,
     "plan": records.Plan,
     "servo/<law>": records.Trace,
+    "servo/<step>/action": records.Action,
     "report": records.Report,
 }
 

@@ -283,7 +283,7 @@ def connected_robot(
 def _believed_plant(scenario: RunScenario, calibration: Calibration) -> Plant:
     """Return the calibrated robot and its face."""
     images = scenario.ends.by_points() if len(scenario.ends.pair) else scenario.ends
-    task = images.task(scenario.model)
+    task = images._replace(incidences=()).task(scenario.model)  # the face of the goal, whatever is judged
     return Plant(
         model=scenario.model,
         M=np.ascontiguousarray(calibration.M[calibration.indices_of(scenario.numbers[: scenario.m])]),

@@ -16,7 +16,16 @@ pytestmark = pytest.mark.volume  # a calibration and many steps
 
 GOALS = {
     "near": {"joints": {"joints": [3.66, -1.68, -1.65, 0.28, 1.26, 3.43], "unit": "rad"}},
-    "there": {"joints": {"joints": [3.46, -1.78, -1.55, 0.08, 1.36, 3.33], "unit": "rad"}},
+    "there": {
+        "joints": {"joints": [3.46, -1.78, -1.55, 0.08, 1.36, 3.33], "unit": "rad"},
+        "incidences": [["plate", "wall", "parallel"], ["middle", "spot"]],
+    },
+}
+FEATURES = {
+    "plate": {"on": "tool", "plane": [0, 1, 2]},
+    "wall": {"on": "scene", "plane": "plate"},
+    "middle": {"on": "tool", "point": [0, 1, 2, 3]},
+    "spot": {"on": "scene", "point": "middle"},
 }
 BACK = {"retreat": {"along": "plate", "by_m": 0.03}}
 STEPS = [
@@ -32,7 +41,7 @@ STEPS = [
 def asked(robot="Gripping", options="", **task):
     """Options of the command line for a sequence."""
     task = {"start": "current", "goals": GOALS, "steps": STEPS} | task
-    values = {"features": {"plate": {"on": "tool", "plane": [0, 1, 2]}}, "task": task}
+    values = {"features": FEATURES, "task": task}
     plant = f"plant={{use: '{HERE}:{robot}', {OPTIONS}{options}}}}}"
     return ["--set", plant, *(f"--set={key}={json.dumps(value)}" for key, value in values.items()), "--json"]
 
@@ -60,7 +69,8 @@ def test_one_connection_serves_plans_motions_and_actions(servo):
     before, after = (arm.pose(traces[f"{name}/exact"].q[-1]) for name in ("there", "retreat"))
     moved = np.linalg.inv(before) @ after
     assert np.linalg.norm(moved[:3, 3]) == pytest.approx(0.03, abs=2e-3)
-    assert np.degrees(np.arccos((np.trace(moved[:3, :3]) - 1) / 2)) < 0.5
+    assert np.degrees(np.arccos(moved[2, 2])) < 0.5  # the turn about the normal stays free
+    assert [trace.free_dof for trace in traces.values()] == [None, 1, 1]
 
 
 def test_an_interrupt_keeps_the_grip_and_says_so(servo):

@@ -140,6 +140,7 @@ def main():
     parser.add_argument("--rate", type=float, default=0.25, help="of the emulated clock; slower is safer")
     parser.add_argument("--killed", action="store_true", help="interrupt each run in another step")
     given = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background of a shell
     with (
         tempfile.TemporaryDirectory() as folder,
         pytest.MonkeyPatch.context() as patch,
