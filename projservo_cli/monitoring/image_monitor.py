@@ -77,6 +77,8 @@ class _Kept(NamedTuple):
 
     pair: FramePair
     residual: Residual
+    aside: BoolArray  # (V, m) detections that are off by themselves
+    stated: FloatArray | None  # (V, m) deviations of the pixels, px, as the finder states them
     view: int  # number of the view that it is of
     views: int  # views that agreed up to it
     covered: bool  # whether something passes before the views
@@ -149,6 +151,7 @@ class ImageMonitor:
         self._asides = np.zeros((views, len(self._shown)), dtype=np.int64)  # observations in a row
         self._crowded = 0  # observations in a row of which many detections are off by themselves
         self._forgiven: list[int] = []
+        self._stated: FloatArray | None = None  # with the last frames
         self.fault, self.agreeing = "", 0
         self.unanswered = np.zeros(len(calibration.q_reference))
         self.rejected = np.zeros((views, self._all), dtype=np.bool_)
@@ -184,7 +187,7 @@ class ImageMonitor:
         stated : (V, m) standard deviations of the pixels, px, if the finder states them.
         """
         images, stated = images[:, self._shown], None if stated is None else stated[:, self._shown]
-        detected = np.isfinite(images[..., 0])
+        detected, self._stated = np.isfinite(images[..., 0]), stated
         noise = self._errors.noise(detected, stated)
         if stated is not None and detected.any():
             images = np.where((noise > _VAGUE * np.median(noise[detected]))[..., None], np.nan, images)
@@ -212,8 +215,11 @@ class ImageMonitor:
             return self.fault
         seen = [np.where(tested.residual.seen[..., None], tested.pair.images, np.nan) for tested in last]
         mean, numbers = mean_image(np.array(seen)), self.calibration.marker
+        sigma = [tested.stated[..., None] for tested in last if tested.stated is not None]
+        stated = mean_image(np.array(sigma))[..., 0] if sigma else None
         q = np.mean([tested.pair.q for tested in last], axis=(0, 1))
-        return detected_fault(self.calibration, q, numbers, mean, self._image_size, self._sigma_px)
+        size = self._image_size
+        return detected_fault(self.calibration, q, numbers, mean, size, self._sigma_px, stated=stated)
 
     def undetected_mm(self, q: FloatArray, used: BoolArray, posture: Posture) -> float:
         """Return how far off the face may be at joints (n,) by what no test tells from none, mm.
@@ -261,7 +267,15 @@ class ImageMonitor:
             memory.keep(clean, float(pair.t.mean()), not tested.aside.any())
         self._kept = [
             *kept,
-            _Kept(pair=pair, residual=residual, view=self._view, views=memory.state.views, covered=covered),
+            _Kept(
+                pair=pair,
+                residual=residual,
+                aside=tested.aside,
+                stated=self._stated,
+                view=self._view,
+                views=memory.state.views,
+                covered=covered,
+            ),
         ]
         crowd = tested.aside.sum(axis=1) >= _MOST_FOR_LONG * residual.seen.sum(axis=1)
         crowd &= residual.seen.any(axis=1)
@@ -416,6 +430,7 @@ class ImageMonitor:
         """
         if self._sound < WINDOW:
             return False
+        kept = [tested._replace(residual=tested.residual.without(tested.aside)) for tested in kept]
         fits = self._explanations(kept, self._before)
         gained = max(self._unit * fit.gain - fit.cost for fit in fits)
         return gained <= 0.0 and self._evidence_now.before <= self._by_chance(self._evidence_now)
@@ -496,6 +511,8 @@ def detected_fault(
     images: FloatArray,
     image_size: FloatArray | None,
     sigma_px: float = 0.0,
+    *,
+    stated: FloatArray | None = None,
 ) -> str:
     """Return what changed since the calibration, by images of one posture at rest; empty for nothing.
 
@@ -505,6 +522,7 @@ def detected_fault(
     q : (n,) joint readings there, rad or m; images : (V, b, 2) pixels of the markers with the numbers
     marker (b,), NaN where unseen, those that the calibration does not know among them;
     image_size : (V, 2) px; sigma_px : pixel noise per coordinate where that is more than the calibration's.
+    stated : (V, m) deviations of the pixels of the markers of the calibration, px, if the finder states them.
     """
     if not calibration.usable or not calibration.has_covariance:
         return ""
@@ -515,10 +533,10 @@ def detected_fault(
     def fault_of(pixels: FloatArray) -> str:
         sigma = max(calibration.sigma_px, sigma_px)
         monitor, q_views = ImageMonitor(calibration, sigma, _SINGLE, image_size=image_size), np.stack([q] * V)
-        monitor.observe(instants, q_views, rest, instants, pixels, new)
+        monitor.observe(instants, q_views, rest, instants, pixels, new, stated=stated)
         enough = _NAMED_AT[-1 if V == 1 else 0]
         for k in range(1, enough * bool(monitor.rejected.any() and not monitor.pending)):
-            monitor.observe(instants + k, q_views, rest, instants, pixels, new)
+            monitor.observe(instants + k, q_views, rest, instants, pixels, new, stated=stated)
         return monitor.give_up()
 
     expected = predict(calibration, q[None])[0]
