@@ -177,6 +177,7 @@ class _LoopPlant(Monitored, Protocol):
     markers: int  # how many are observed, those of the face first
     takes_parts: bool  # whether a long step is sent in the parts that the law split it into
     weight: FloatArray | None  # (V, markers) of the pixels last observed in a fit; None for one
+    noise_ratio: float  # of what the pixels last observed state to the noise of the run; at least 1
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
@@ -292,6 +293,7 @@ def _instant(
     log.read[k] = plant.joints()
     log.q[k], log.H[k] = plant.q, plant.H
     log.s[k] = plant.observe()
+    log.noise_ratio[k] = plant.noise_ratio
     log.hidden[k] = plant.hidden
     distance = plant.distance()
     left = note(log, k, s_star, plant.plant, monitors.limits)

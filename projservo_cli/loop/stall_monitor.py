@@ -75,7 +75,7 @@ class StallMonitor:
         ends = verdict not in (RUNNING, WAITING, CONVERGED)
         if ends or k == self._limits.max_steps or math.isnan(error):
             return verdict
-        within = tolerance(self._limits, log.fit[k, 2])
+        within = tolerance(self._limits, log, k)
         verdict = self._arrived(verdict, error, within)
         return verdict if verdict == CONVERGED else self._stuck(now, verdict, error <= _GROWN * within)
 

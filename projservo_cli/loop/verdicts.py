@@ -87,6 +87,7 @@ class Log(NamedTuple):
     path: FloatArray  # (k, parts + 1, n) joints at the ends of the parts of each step
     parts: IntArray  # (k,) parts each step was sent in; 0 where the joints went straight to the end
     fit: FloatArray  # (k, 3) what measuring with the body left, as in the state of the law
+    noise_ratio: FloatArray  # (k,) of what pixels state to the noise of the run; at least 1
     # (3,) first instant outside an image, first beyond a joint limit, and the joint that passed one or
     # stopped the run at its own; −1 for never
     events: FloatArray
@@ -114,6 +115,7 @@ def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0, views: 
         path=np.zeros((rows, parts + 1, n)),
         parts=np.zeros(rows, dtype=np.int64),
         fit=np.full((rows, 3), np.nan),
+        noise_ratio=np.ones(rows),
         events=np.full(3, -1.0),
         begun=np.zeros(3),
         M=np.zeros((m, 4)),
@@ -205,7 +207,7 @@ def _first_cause(log: Log, k: int, now: Instant, limits: Limits) -> int:
         return OUT_OF_VIEW
     if now.status == LOST:
         return MARKERS_LOST
-    if error <= tolerance(limits, log.fit[k, 2]):
+    if error <= tolerance(limits, log, k):
         return CONVERGED
     grown = error > limits.diverged_factor * log.begun[1]
     receded = now.distance > limits.diverged_factor * log.begun[0]
@@ -217,15 +219,16 @@ def _first_cause(log: Log, k: int, now: Instant, limits: Limits) -> int:
 
 
 @merged
-def tolerance(limits: Limits, views: float) -> float:
-    """Image error that counts as converged, px rms per marker and view.
+def tolerance(limits: Limits, log: Log, k: int) -> float:
+    """Image error that counts as converged at an instant, px rms per marker and view.
 
     A body fitted by six coordinates to so many markers, counted once a view, keeps √(6 / (2 views)) of
-    the noise of their pixels; NaN where the face is measured point by point.
+    the noise of their pixels; all of it stays where the face is measured point by point.
     """
-    if not views > 0.0:
-        return limits.image_error_px
-    return limits.image_error_px - limits.noise_px * max(0.0, 1.0 - math.sqrt(3.0 / views))
+    views = log.fit[k, 2]
+    fitted = max(0.0, 1.0 - math.sqrt(3.0 / views)) if views > 0.0 else 0.0
+    more = (log.noise_ratio[k] - 1.0) * (1.0 - fitted)
+    return limits.image_error_px - limits.noise_px * (fitted - more)
 
 
 @merged

@@ -44,6 +44,7 @@ class Known(NamedTuple):
     visible: IntArray  # (k,) markers of the loop, by their places in the observations, the face first
     order: IntArray  # (m,) index there of each marker of the calibration, −1 where it is not observed
     sigma_px: float  # noise of the pixels
+    sigma_scale: float  # noise of a pixel over the deviation that it states
     sigma_q: FloatArray  # (n,) deviation of joint readings, rad or m; 0 where none shows
     delays: DelayPrior
     timeout_s: float  # longest that an image may stand still while joints move, s
@@ -66,10 +67,10 @@ class DrivenRobot:
     ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
     of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
     the images no longer agree with the calibration, or what failed; else empty. ``weight``: (V, k) of the
-    pixels shown in a fit, where the robot states their deviations. Of each observation since ``begin``:
-    ``delays`` of all views as followed, (V,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot
-    that knows them, joints (n,) or the pose (4, 4) of its tool; ``film`` of its frames; ``forces`` on its
-    tool, N, where these are limited.
+    pixels shown in a fit, where the robot states their deviations. ``noise_ratio``: of what these state to
+    the noise of the run; at least 1. Of each observation since ``begin``: ``delays`` of all views as followed,
+    (V,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot that knows them, joints (n,) or the
+    pose (4, 4) of its tool; ``film`` of its frames; ``forces`` on its tool, N, where these are limited.
     """
 
     in_front = True
@@ -99,6 +100,7 @@ class DrivenRobot:
         self.disturbance = ""
         self.weight: FloatArray | None = None
         self.retreats = 0  # periods by which it goes back where the object moves
+        self.noise_ratio = 1.0
         self._stale = 0  # looks in a row without a new frame while the arm is held
         self._dark = np.zeros(V, dtype=np.int64)  # looks in a row that show no marker of the calibration
         self.begin()
@@ -150,6 +152,7 @@ class DrivenRobot:
         if reading.sigma_px is not None:
             stated = reading.sigma_px[:, order]
             self.weight = weights(reading.sigma_px[:, visible], reading.s[:, visible])
+            self.noise_ratio = self._noise_of(reading.sigma_px[:, visible], reading.s[:, visible])
         frames = self._instants.update(reading.t_view, images, history)
         q_then = history.at(frames.t)
         if self.monitor is not None:
@@ -170,6 +173,13 @@ class DrivenRobot:
             self._carried[view] = there[view] - then[view][view] if carries else 0.0
         self.delays.append(self._instants.mean)
         return np.ascontiguousarray(reading.s[:, visible]) + self._carried
+
+    def _noise_of(self, sigma: FloatArray, s: FloatArray) -> float:
+        """Ratio of the noise that pixels (V, k, 2) of a fit state (V, k) to that of the run; at least 1."""
+        information = np.maximum(sigma[np.isfinite(s[..., 0])], MIN_SIGMA) ** -2.0
+        if not information.size or not self.known.sigma_px > 0.0:
+            return 1.0
+        return max(1.0, self.known.sigma_scale / (self.known.sigma_px * math.sqrt(information.mean())))
 
     def _leave_out(self, rejected: BoolArray, alike: bool) -> None:
         """Leave sightings (V, k) that are off by themselves out of the fit of the law.

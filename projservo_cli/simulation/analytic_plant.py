@@ -133,6 +133,7 @@ class AnalyticPlant:
     takes_parts = False
     holds = pending = False
     weight: FloatArray | None = None
+    noise_ratio = 1.0
 
     def __init__(self, plant: Plant, q_start: FloatArray, noise: FloatArray) -> None:
         self.plant = plant

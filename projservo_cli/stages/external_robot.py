@@ -306,6 +306,7 @@ def _known_of(scenario: RunScenario, contract: Contract, calibration: Calibratio
         visible=np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
         order=np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
         sigma_px=scenario.noise_px,
+        sigma_scale=calibration.sigma_scale or 1.0,
         sigma_q=scenario.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
         delays=_delays_of(contract.time_offset_s, calibration),
         timeout_s=contract.timeout_s,

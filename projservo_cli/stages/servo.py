@@ -474,6 +474,8 @@ _AGREES, _LEAST_NOISE_PX = 4.0, 0.01
 # Image error of a face of three markers as it is seen, over that which counts as converged: by noise once in
 # ten thousand.
 _BY_NOISE = 2.0
+# Noise of markers at the end, over that of the run, that is told.
+_VAGUE = 3.0
 # Joints that moved by less in the steps in which an error must fall hardly did, rad or m.
 _HARDLY = 0.01
 # A plan is of a task where its start, rad or m, and its goal images, px, are the same but for rounding and
@@ -560,7 +562,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
     """Return the reason of the verdict, one sentence."""
     log, steps, limits, judged = run.log, run.steps, run.scenario.termination, run.judged
     error, first = (f"{run.own_unit * float(log.judged[k]):.3g}{judged.unit}" for k in (steps, 0))
-    within = f"{run.own_unit * tolerance(limits, float(log.fit[steps, 2])):.3g}{judged.unit}"
+    within = f"{run.own_unit * tolerance(limits, log, steps):.3g}{judged.unit}"
     share, turn = remaining
     left = [
         *([] if share is None else [f"{share:.1%} of the translation"]),
@@ -570,7 +572,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
     rest = f"{' and '.join(left)} {'are' if len(left) > 1 else 'is'} left"
     at_limit = in_unit(float(log.read[steps, joint]), run.scenario.joints.units[joint])
     reasons = {
-        "converged": f"{judged.name} {error} is within {within}{_apart(run)}",
+        "converged": f"{judged.name} {error} is within {within}{_vague(run)}{_apart(run)}",
         "no progress": f"the robot stands still at an {judged.name} of {error}: {run.why}"
         if run.why
         else f"no step left; {judged.name} {error} fell by less than 1 % in the last "
@@ -599,12 +601,20 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
     return "; ".join(filter(None, (reasons[run.verdict], blind, obstruction)))
 
 
+def _vague(run: LawRun) -> str:
+    """Say that markers are seen there with more noise than elsewhere; empty if they are not."""
+    more = float(run.log.noise_ratio[run.steps])
+    return f" by {more:.2g} times the noise: look what covers markers there" if more > _VAGUE else ""
+
+
 def _apart(run: LawRun) -> str:
     """Say that the face as it is seen is off by more than noise, though the whole body is not; else empty."""
     displaced = run.scenario.inputs.displaced  # to where it was never seen
     if run.scenario.exact.incidences or displaced:  # the face may be anywhere that they leave open
         return ""
-    seen, most = float(run.log.error[run.steps]), _BY_NOISE * run.scenario.termination.image_error_px
+    limits, noise = run.scenario.termination, float(run.log.noise_ratio[run.steps])
+    by_noise = limits.image_error_px + (noise - 1.0) * limits.noise_px
+    seen, most = float(run.log.error[run.steps]), _BY_NOISE * by_noise
     text = f"; the face itself is seen {seen:.3g} px off ({most:.3g} px by noise): it moved on the tool"
     return f"{text} since the goal was taught: teach it again" if seen > most else ""
 

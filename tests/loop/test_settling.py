@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from projservo_cli.loop.stall_monitor import StallMonitor
-from projservo_cli.loop.verdicts import CONVERGED, FOLLOWING_ERROR, NO_PROGRESS, RUNNING, WAITING, new_log
+from projservo_cli.loop.verdicts import (
+    CONVERGED,
+    FOLLOWING_ERROR,
+    NO_PROGRESS,
+    RUNNING,
+    WAITING,
+    new_log,
+    tolerance,
+)
 from projservo_cli.records import JointLimits
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.latency import DelayPrior
@@ -114,3 +122,12 @@ def test_arrival_is_believed_once_the_robot_stands():
     )
     assert ruled == CONVERGED
     assert k == 24
+
+
+@pytest.mark.parametrize("views", [np.nan, 4.0, 16.0])
+def test_the_tolerance_is_by_the_noise_that_pixels_state(views):
+    """As in a run of that noise from the beginning."""
+    vague, plain = new_log(2, 4, 1, 5), new_log(2, 4, 1, 5)
+    vague.noise_ratio[0], vague.fit[0, 2], plain.fit[0, 2] = 40.0, views, views
+    limits_of = (LIMITS._replace(image_error_px=0.01 + noise, noise_px=noise) for noise in (0.02, 0.8))
+    assert tolerance(next(limits_of), vague, 0) == pytest.approx(tolerance(next(limits_of), plain, 0))
