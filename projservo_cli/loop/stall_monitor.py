@@ -27,6 +27,8 @@ _SETTLED = 0.5
 # held until it stands. It moves again if the error is beyond these tolerances, or beyond one in these
 # consecutive frames.
 _MORE, _GROWN, _LOOKS = 15, 3.0, 5
+# Without progress at an image error of no more than this multiple of the tolerance, steps become shorter.
+_NEAR = 10.0
 # Progress is an image error that falls by this fraction below its minimum so far.
 _FALL = 0.01
 # Joints stand if they move by less than these deviations of their readings, or than this, rad or m; their
@@ -61,8 +63,14 @@ class StallMonitor:
         self.reason, self.minimum = "", False
 
     def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
-        """Return the new verdict; it is not asked while the arm is held."""
-        del q_dot
+        """Return the new verdict; it is not asked while the arm is held.
+
+        Joint velocities (n,) without progress near the goal answer noise, which a singular arm amplifies;
+        ever smaller ones average over it.
+
+        Source: H. Robbins, S. Monro, "A stochastic approximation method", Annals of Mathematical Statistics
+        22 (1951) 400–407.
+        """
         steered, now = self._robot.steered, len(self._read)
         self._read.append(steered.reading.q)
         self._sent.append(steered.target)
@@ -76,6 +84,8 @@ class StallMonitor:
         if ends or k == self._limits.max_steps or math.isnan(error):
             return verdict
         within = tolerance(self._limits, log, k)
+        if now - self._since >= self._window and error <= _NEAR * within:
+            q_dot *= self._window / (now - self._since)
         verdict = self._arrived(verdict, error, within)
         return verdict if verdict == CONVERGED else self._stuck(now, verdict, error <= _GROWN * within)
 

@@ -131,3 +131,17 @@ def test_the_tolerance_is_by_the_noise_that_pixels_state(views):
     vague.noise_ratio[0], vague.fit[0, 2], plain.fit[0, 2] = 40.0, views, views
     limits_of = (LIMITS._replace(image_error_px=0.01 + noise, noise_px=noise) for noise in (0.02, 0.8))
     assert tolerance(next(limits_of), vague, 0) == pytest.approx(tolerance(next(limits_of), plain, 0))
+
+
+def test_steps_without_progress_near_the_goal_become_shorter_and_not_away_from_it():
+    for error, shorter in ((5.0, True), (50.0, False)):
+        robot, log = Robot(), new_log(2, 4, 1000, 5)
+        stall, sent = StallMonitor(robot, LIMITS), []
+        for k in range(60):
+            log.judged[k], q_dot = error, np.ones(2)
+            robot.steered.reading, robot.steered.target = SimpleNamespace(q=np.full(2, 0.1 * k)), np.zeros(2)
+            stall.ruled(log, k, RUNNING, q_dot)
+            sent.append(q_dot[0])
+        assert (np.diff(sent) <= 0.0).all()
+        assert (sent[-1] < 0.5) == shorter
+        assert sent[10] == 1.0
