@@ -228,7 +228,7 @@ def tolerance(limits: Limits, log: Log, k: int) -> float:
     views = log.fit[k, 2]
     fitted = max(0.0, 1.0 - math.sqrt(3.0 / views)) if views > 0.0 else 0.0
     more = (log.noise_ratio[k] - 1.0) * (1.0 - fitted)
-    return limits.image_error_px - limits.noise_px * (fitted - more)
+    return float(limits.image_error_px - limits.noise_px * (fitted - more))
 
 
 @merged

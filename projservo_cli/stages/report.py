@@ -12,8 +12,7 @@ import numpy as np
 from projservo_cli import provenance
 from projservo_cli.files import replacing, require_inside, write_whole
 from projservo_cli.image_size import ImageSize
-from projservo_cli.metric.frame import Metric, Scale
-from projservo_cli.records import VIEWS, Calibration, InputError, Report, Trace, WorkFailed
+from projservo_cli.records import VIEWS, Report, Trace, WorkFailed
 from projservo_cli.report import style
 from projservo_cli.report.animation import motion_of, write_animation, write_view
 from projservo_cli.report.claims import claims_of
@@ -30,16 +29,15 @@ from projservo_cli.report.report_data import (
     ReportData,
     Studies,
 )
-from projservo_cli.results import ImageModel
 from projservo_cli.simulation.workspace import plant_of
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.stage_inputs import KnownLengths, ReportInputs, Scenery
+from projservo_cli.stages.objects import in_metres
+from projservo_cli.stages.stage_inputs import ReportInputs, Scenery
 from projservo_cli.stages.studies import (
-    LAMBDAS,
     STEP_LIMIT_DEG,
     Comparison,
     comparison_of,
-    composition_error,
+    composition_of,
     metric_plan,
     run_studies,
 )
@@ -65,16 +63,15 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
     left_out: list[dict[str, str]] = []
     report_data: Fit = Fit(run.calibration, run.observation.at_rest, held_out=run.cross_validation)
     metric, no_metric = in_metres(run.calibration, inputs.lengths)
-    studies, share, distance, claims = None, np.zeros(0), np.zeros(0), []
+    studies, composition, claims = None, None, []
     if inputs.extra is not None:
         bench = comparison_of(inputs.extra, run.calibration, run.plan)
         with _unless_it_fails("studies", left_out):
             studies = run_studies(bench, progress=progress)
         report_data = _report_data(inputs, run, bench, studies, left_out)
         with _unless_it_fails("equation (22)", left_out):
-            distance = composition_error(metric_plan(bench))
-            share = np.array(LAMBDAS)
-        claims = [claim._asdict() for claim in claims_of(report_data, share, distance)]
+            composition = composition_of(metric_plan(bench), bench.scenario.gains)
+        claims = [claim._asdict() for claim in claims_of(report_data, composition)]
     elif run.traces:
         *_, last = run.traces
         part = last.split("/")[0] if "/" in last else ""
@@ -89,8 +86,8 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
         claims=tuple(claims),
         metric=() if metric is None else tuple(metric_rows(metric, chosen_poses(metric, report_data))),
         step_limit_deg=STEP_LIMIT_DEG,
-        share=share,
-        composition_mm=1e3 * distance,
+        share=np.zeros(0) if composition is None else composition.share,
+        composition_mm=np.zeros(0) if composition is None else 1e3 * composition.distance,
         **study_numbers(studies),
     )
     content = {"claims": report.claims, "drift": drift_rows(report), "omitted": report.omitted}
@@ -101,27 +98,6 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
     result = Result("", run.configuration, provenance.collect(seed=inputs.about.seed), {}, {"": report})
     write_page(replace(run, results={**run.results, "report": result}), inputs.about)
     return report
-
-
-def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | None, str]:
-    """A calibration in metres by the longest known length, or why there is none."""
-    at = np.flatnonzero(np.isin(known.numbers, calibration.marker))
-    apart = np.nan_to_num(known.apart[np.ix_(at, at)], nan=0.0)
-    length_m: float | None = None
-    between: Scale = "joint"
-    if known.tag_size_m is not None:
-        length_m, between = known.tag_size_m, "tags"
-    elif apart.any():
-        i, j = np.unravel_index(int(np.argmax(apart)), apart.shape)
-        length_m, between = float(apart[i, j]), (known.numbers[at[i]], known.numbers[at[j]])
-    elif not calibration.prismatic.any():
-        keys = "markers.positions_m, markers.tag_size_m or markers.board.size_m"
-        return None, f"no length on the tool is known: set {keys}"
-    face = [number for number in known.face if number in calibration.marker]
-    try:
-        return ImageModel.of(calibration).metric(length_m, between, face=face or None), ""
-    except (InputError, WorkFailed) as error:
-        return None, str(error)
 
 
 @contextmanager
