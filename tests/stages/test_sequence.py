@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,6 +104,11 @@ def test_a_pin_is_brought_before_its_hole_goes_in_and_comes_out_along_it(call):
     assert [line for line in planned if line.startswith("plan of")] == [
         f"plan of {name}:" for name in MOTIONS
     ]
+    assert call("report", "-q").code == 0
+    page = Path("run/report.html").read_text()
+    assert "fig20_sequence" in page
+    assert "approach_in_hole: exact, following the plan" in page
+    assert "the task is a sequence" in page
     dry = call("-n").out
     assert all(f"servo/{name}" in dry for name in names)
 
