@@ -48,23 +48,6 @@ class Sound:
         CALLS.append("close")
 
 
-class Gripping(Sound):
-    """Has a gripper, which takes a while; may be interrupted at a command."""
-
-    def __init__(self, config, interrupted=None):
-        super().__init__(config)
-        self.interrupted = interrupted
-
-    def act(self, name, value):
-        CALLS.append(f"{name} {value:g}")
-        return 0.4
-
-    def command(self, target, speed, due):
-        super().command(target, speed, due)
-        if sum(isinstance(call, tuple) for call in CALLS) == self.interrupted:
-            raise KeyboardInterrupt
-
-
 class Telling(Sound):
     """Tells where its tool truly is, or its joints."""
 
@@ -156,6 +139,23 @@ class Faulty(Sound):
             self.q = np.where(np.arange(len(before)) == 2, before, target)
         if self.wrong and self.fault == "command raises":
             raise RuntimeError("protective stop")
+
+
+class Gripping(Sound):
+    """Has a gripper, which takes a while; may be interrupted at a command."""
+
+    def __init__(self, config, interrupted=None):
+        super().__init__(config)
+        self.interrupted = interrupted
+
+    def act(self, name, value):
+        CALLS.append(f"{name} {value:g}")
+        return 0.4
+
+    def command(self, target, speed, due):
+        super().command(target, speed, due)
+        if sum(isinstance(call, tuple) for call in CALLS) == self.interrupted:
+            raise KeyboardInterrupt
 
 
 class NoStop:
