@@ -310,6 +310,7 @@ _FACE = style.line(style.GREEN, width=1.2, label="face")
 _DRIVEN = style.line(style.VERMILION, width=0.9, label="path of a marker")
 OF_TOOL = style.line(style.GREEN, width=3.6, marker="o", label="features of the tool")
 OF_SCENE = style.line(style.BLUE, style.DASHED, 1.4, "o", "features of the scene")
+_FINE = {"linewidth": 1.6, "markersize": 2.0}  # over frames
 _FAINT_FACE = style.line(style.GREY, width=0.7, label="face at the start and at the end")
 
 
@@ -409,8 +410,8 @@ def _draw_frames(data: Data, figure: "style.Figure") -> None:
         style.face(panel, data["s_star"][view], style.GOAL)
         panel.plot(*data["found"][i, view].T, **_FOUND)
         if "feature" in data:
-            panel.plot(*style.outlines(data["feature_there"][:, :, view]).T, **OF_SCENE)
-            panel.plot(*style.outlines(data["feature"][i, :, :, view]).T, **OF_TOOL)
+            panel.plot(*style.outlines(data["feature_there"][:, :, view]).T, **OF_SCENE | _FINE)
+            panel.plot(*style.outlines(data["feature"][i, :, :, view]).T, **OF_TOOL | _FINE)
         with_halo(panel)
         panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
         seconds = data["instant"][i] * float(data["period_s"])
@@ -487,13 +488,14 @@ def _draw_incidences(data: Data, figure: "style.Figure") -> None:
         style.image_axes(panel, f"{name} camera" if view else f"{run}{left}\n{name} camera", pixels[view])
     panels = _side_by_side(figure, grid, 1, count)
     runs = [name.removeprefix("px_") for name in data if name.startswith("px_")]
+    errors = np.concatenate([np.maximum(data[f"px_{name}"], _LEAST_PX).ravel() for name in runs])
+    lowest, highest = (bound(errors, initial=1.0, where=np.isfinite(errors)) for bound in (np.min, np.max))
     for k, (panel, incidence) in enumerate(zip(panels, data["incidence"], strict=True)):
         for i, name in enumerate(runs):
             error = np.maximum(data[f"px_{name}"][:, k], _LEAST_PX)
             panel.plot(data[f"t_s_{name}"], error, **style.curve(i, title(name)))
         style.log_scale(panel)
-        panel.set(title=str(incidence), xlabel="time (s)")
-        panel.sharey(panels[0])
+        panel.set(title=str(incidence), xlabel="time (s)", ylim=(0.5 * lowest, 2.0 * highest))
     panels[0].set_ylabel("error (px at one px of noise)")
     style.legend_below(figure, 4)
 
