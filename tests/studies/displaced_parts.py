@@ -3,9 +3,9 @@
     python -m tests.studies.displaced_parts [--tasks 30] [--faults 100] [-o displaced_parts.csv]
 
 The UR5e of rendered_conditions with one recording. In each task a part with two tags of 30 mm is beside the
-tool where the goal is taught; it is then displaced by up to 150 mm and 60 degrees, and seen once more with the
-arm at the start. A task fails unless ``exact_track`` brings the tip of the tool, 80 mm from the part, within 1 mm
-and 0.5 degrees of the truth. What users know goes beside it on the same images: OpenCV's hand–eye calibration
+tool where the goal is taught; it is then displaced by up to 150 mm and 60 degrees, and seen once more with
+the arm at the start. A task fails unless ``exact_track`` brings the tip of the tool, 80 mm from the part,
+within 1 mm and 0.5 degrees of the truth. What users know goes beside it on the same images: OpenCV's hand–eye calibration
 with true intrinsics, tool and part in metres, and inverse kinematics, once straight and then corrected by
 three looks.
 
@@ -56,7 +56,7 @@ def looked(config, q, drawn, *, now):
 
 @cache
 def task_of(seed):
-    """Configuration of a task, joints (n,) of its goal as taught, and the place (4,) of its tip on the tool."""
+    """Configuration of a task, joints (n,) of its goal as taught, and the place (4,) of its tip."""
     base, rng = base_of("ideal"), np.random.default_rng(SEED + seed)
     truth, q_goal, start = truth_of(base), tasks_of()[seed][1], np.array(FRONT)
     G = truth.robot.pose(q_goal)
@@ -250,9 +250,6 @@ def faults(count):
     with TemporaryDirectory() as name:
         folder = Path(name)
         calls = [["calibrate", "-c", str(CONFIG), "-o", str(folder / "run"), "-q"]]
-        plant = (
-            f"plant={{use: 'tests.robots.robots:Seeing', options: {{config: {CONFIG}}}, averaged_frames: 10}}"
-        )
         goal = ["--set", "task.goal={taught: goal.yaml, on: part}", "-o", str(folder / "goal.yaml"), "-q"]
         calls.append(["teach", str(folder / "run"), "-c", str(CONFIG), "--set", PLANT, *goal])
         for name, value in AS_TAUGHT.items():
