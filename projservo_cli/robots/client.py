@@ -70,7 +70,7 @@ class DrivenRobot:
     pixels shown in a fit, where the robot states their deviations. ``noise_ratio``: of what these state to
     the noise of the run; at least 1. Of each observation since ``begin``: ``delays`` of all views as
     followed, (V,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot that knows them, joints (n,)
-    or the pose (4, 4) of its tool; ``film`` of its frames; ``forces`` on its tool, N, where these are limited.
+    or the pose (4, 4) of its tool; ``film`` of its frames; ``forces`` on its tool, N, if limited.
     """
 
     in_front = True

@@ -5,9 +5,9 @@
 The UR5e of rendered_conditions with one recording. In each task a part with two tags of 30 mm is beside the
 tool where the goal is taught; it is then displaced by up to 150 mm and 60 degrees, and seen once more with
 the arm at the start. A task fails unless ``exact_track`` brings the tip of the tool, 80 mm from the part,
-within 1 mm and 0.5 degrees of the truth. What users know goes beside it on the same images: OpenCV's hand–eye calibration
-with true intrinsics, tool and part in metres, and inverse kinematics, once straight and then corrected by
-three looks.
+within 1 mm and 0.5 degrees of the truth. What users know goes beside it on the same images: OpenCV's
+hand–eye calibration with true intrinsics, tool and part in metres, and inverse kinematics, once straight and
+then corrected by three looks.
 
 Then objects that are hidden, exchanged, lack tags or move, before and during a run of the analytic UR5: the
 arm is to arrive where the part truly is, or the run to end with a reason.
