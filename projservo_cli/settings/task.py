@@ -331,18 +331,19 @@ class TaskSettings(Section):
         """Return the task of a step, which starts where the arm stands unless it is the first motion."""
         step = self.named_steps[name]
         first = next(one for one, step in self.named_steps.items() if step.moves) == name
-        goal = self.goals[step.goal] if step.goal is not None else self._retreat(step)
+        goal = self.goals[step.goal] if step.goal is not None else self._retreat(name)
         if step.approach is not None:
             amount = step.approach.model_dump(exclude={"to"})
             goal = goal.model_copy(update={"displaced": Along(**amount)})
         start = {} if first else {"start": CURRENT, "start_offset": None}
         return self.model_copy(update={**start, "goal": goal, "goals": {}, "steps": ()})
 
-    def _retreat(self, step: TaskStep) -> Goal:
+    def _retreat(self, name: str) -> Goal:
         """Return the start of a retreat, displaced: what was free at the goal before stays so."""
-        before = [one.goal for one in self.steps[: self.steps.index(step)] if one.goal is not None]
+        k = list(self.named_steps).index(name)
+        before = [one.goal for one in self.steps[:k] if one.goal is not None]
         incidences = self.goals[before[-1]].incidences if before else ()
-        return Goal(displaced=step.retreat, incidences=incidences)
+        return Goal(displaced=self.steps[k].retreat, incidences=incidences)
 
     def contradictions(self) -> Iterator[Finding]:
         """An offset from nowhere, steps to unknown goals, and without a motion."""

@@ -12,6 +12,7 @@ from projservo_cli import cli
 from projservo_cli.config import load_config
 from projservo_cli.experiment import Experiment
 from projservo_cli.records import InputError
+from projservo_cli.settings.task import TaskSettings
 from projservo_cli.stages import servo
 from projservo_cli.store import load
 from tests.configured import truth_of
@@ -199,3 +200,15 @@ def test_goals_are_named_in_python_too(calibrated):
         run.at_step("out")
     with pytest.raises(InputError, match="name a goal or several"):
         run.servo()
+
+
+def test_a_retreat_leaves_the_goal_before_it_though_another_one_is_alike():
+    at, joints = {"retreat": {"along": "pin", "by_px": 40.0}}, {"joints": {"joints": [0.0, 0.0]}}
+    pairs = [["pin", "hole"], ["tip", "bottom"]]
+    goals = {name: {**joints, "incidences": [pair]} for name, pair in zip("ab", pairs, strict=True)}
+    steps = [{"to": "a"}, at, {"to": "b"}, at]
+    task = TaskSettings.model_validate(
+        {"start": joints["joints"], "goal": goals["b"], "goals": goals, "steps": steps}
+    )
+    left = [task.at_step(name).goal.incidences for name in ("02-retreat", "04-retreat")]
+    assert left == [(("pin", "hole"),), (("tip", "bottom"),)]
