@@ -203,7 +203,10 @@ def test_goals_are_named_in_python_too(calibrated):
 
 
 def test_a_retreat_leaves_the_goal_before_it_though_another_one_is_alike():
-    at, joints = {"retreat": {"along": "pin", "by_px": 40.0}}, {"joints": {"joints": [0.0, 0.0]}}
+    at, joints = (
+        {"retreat": {"along": "pin", "by_px": 40.0}},
+        {"joints": {"joints": [0.0, 0.0], "unit": "rad"}},
+    )
     pairs = [["pin", "hole"], ["tip", "bottom"]]
     goals = {name: {**joints, "incidences": [pair]} for name, pair in zip("ab", pairs, strict=True)}
     steps = [{"to": "a"}, at, {"to": "b"}, at]
