@@ -142,7 +142,9 @@ class Chain:
         """Kind and ``module:Class`` of the imports of the steps, of laws and of a robot."""
         servo = [law_and_mode(step.law)[0] for step in self.steps if step.law and step.why]
         found = dict.fromkeys(("law", law) for law in servo if law not in CODES)
-        looks = any(step.stage in ("record", "plan") and step.why and _drives(step) for step in self.steps)
+        here = self.config.task is not None and self.config.task.start_joints is None
+        reads = [one for one in self.steps if one.stage in ("record", "plan") and one.why]
+        looks = any(_drives(step) or here for step in reads)
         if (servo or looks) and not self.config.plant.simulated:
             assert self.config.plant.use is not None
             found["plant", self.config.plant.use] = None
@@ -175,6 +177,8 @@ class Chain:
             self.listener.progress("results", done, len(steps))
             if step is motion and not self._may_move(step, steps):
                 return
+            if step is motion and step.part and not self.config.plant.simulated:
+                self._opened(servo_inputs(self.config))  # which refuses what could not act later
             try:
                 if step.why:
                     self._make_result(step)
@@ -410,7 +414,7 @@ class Chain:
             from projservo_cli.stages import plan
 
             bounded = replace(_bounded(inputs, run), q_current=self._expected(step, run))
-            return (plan.run(bounded, run.calibration),)
+            return (plan.run(bounded, run.calibration, session=self.session),)
         if step.stage == "servo":
             from projservo_cli.stages import servo
 

@@ -175,9 +175,11 @@ def _objects(
 
 
 def carrier_of(task: TaskSettings | None, features: Mapping[str, Feature]) -> str | None:
-    """Name of the object that a goal was taught on; None for a goal that stands still."""
-    if task is None or task.goal.on is not None:
-        return None if task is None else task.goal.on
+    """Name of the object that a goal was taught on; None for a goal that stands still, or is a retreat."""
+    if task is None or task.goal.of_start:
+        return None
+    if task.goal.on is not None:
+        return task.goal.on
     on = {features[pair[1]].on for pair in task.goal.incidences if pair[1] in features}
     return next(iter(sorted(on - {*WORLD_AND_TOOL})), None)
 

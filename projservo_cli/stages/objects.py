@@ -2,6 +2,7 @@
 
 import math
 import time
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ import numpy as np
 from projservo_cli.metric.frame import Metric, Scale
 from projservo_cli.records import Calibration, InputError, Plan, WorkFailed
 from projservo_cli.results import ImageModel
-from projservo_cli.robots.contract import Reading, at_rest_after
+from projservo_cli.robots.contract import Reading
+from projservo_cli.robots.session import Session
 from projservo_cli.robots.standstill import seen_at_rest
 from projservo_cli.simulation.faults import observed_in_frames
 from projservo_cli.simulation.streams import OBJECT_NOW, OBJECT_TAUGHT, generator
@@ -48,11 +50,12 @@ _FIELDS = (
 
 
 def carried_goal(
-    scenario: Scenario, carrier: Carrier, before: Plan | None = None
+    scenario: Scenario, carrier: Carrier, before: Plan | None = None, session: Session | None = None
 ) -> tuple[Scenario, dict[str, Any]]:
     """Look at the object anew, and carry the goal along: the scenario with it, and the fields of its plan.
 
     before : plan to the same goal from elsewhere, for which it was looked at; None to look now.
+    session : connection to the robot that looks; None for one of its own.
     Raises WorkFailed where images do not show the object or the goal well enough.
     """
     if before is not None and before.s_carried is not None:
@@ -61,7 +64,11 @@ def carried_goal(
     assert c is not None
     metric, _ = in_metres(c, carrier.lengths)
     taught = _taught(scenario, carrier)
-    now = _simulated(scenario, carrier, now=True) if carrier.driven is None else _seen(scenario, carrier)
+    now = (
+        _simulated(scenario, carrier, now=True)
+        if carrier.driven is None
+        else _seen(scenario, carrier, session)
+    )
     try:
         found = DisplacedObject.of(c, carrier.numbers, [taught, now], metric)
         goal = found.carry(_goal(scenario, c))
@@ -127,21 +134,24 @@ def _taught(scenario: Scenario, carrier: Carrier) -> Look:
     return Look(shown, sigma)
 
 
-def _seen(scenario: Scenario, carrier: Carrier) -> Look:
+def _seen(scenario: Scenario, carrier: Carrier, shared: Session | None) -> Look:
     """Images of the object by a robot where it stands; it is not moved."""
     driven, c = carrier.driven, scenario.calibration
     assert c is not None
     assert driven is not None
     assert isinstance(driven.robot, OwnRobot)
     bounds, types = driven.following.bounds(scenario.joints), scenario.joints.types
-    numbers = scenario.observed
-    robot = plugin_robot(driven.robot, bounds, types, numbers, view=c.view, further=driven.further)
+    numbers, further = scenario.observed, driven.further
+    with nullcontext(shared) if shared else Session() as session:
+        steered = session.steered or session.opened(
+            plugin_robot(driven.robot, bounds, types, numbers, view=c.view, further=further)
+        )
+        robot = steered.robot
 
-    def observe() -> Reading:
-        time.sleep(bounds.period)
-        return robot.read().whole
+        def observe() -> Reading:
+            time.sleep(bounds.period)
+            return robot.read().whole
 
-    with at_rest_after(robot):
         mean, sigma, _ = seen_at_rest(robot, observe, carrier.frames, carrier.settle_s, "plan")
     which = [len(numbers) + driven.further.index(number) for number in carrier.numbers]
     return Look(mean.s[:, which], sigma[:, which])

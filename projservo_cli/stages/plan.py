@@ -34,6 +34,7 @@ from projservo_cli.records import (
     in_sense,
     in_unit,
 )
+from projservo_cli.robots.session import Session
 from projservo_cli.settings.task import Trajectory
 from projservo_cli.stages.motions import (
     Found,
@@ -117,10 +118,16 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
         )
 
 
-def run(inputs: PlanInputs, calibration: Calibration, before: Plan | None = None) -> Plan:
+def run(
+    inputs: PlanInputs,
+    calibration: Calibration,
+    before: Plan | None = None,
+    session: Session | None = None,
+) -> Plan:
     """Partition the task and plan its motion, from the calibration and the images alone.
 
     before : plan to the same goal from elsewhere, whose look at an object holds; None to look anew.
+    session : connection to the robot that looks; None for one of its own.
     Raises InputError if the task is missing; WorkFailed if it cannot be partitioned.
     """
     known = set(calibration.marker.tolist())
@@ -135,7 +142,7 @@ def run(inputs: PlanInputs, calibration: Calibration, before: Plan | None = None
         _require_taught_since(scenario, calibration)
     carried: dict[str, Any] = {}
     if inputs.carrier is not None:
-        scenario, carried = carried_goal(scenario, inputs.carrier, before)
+        scenario, carried = carried_goal(scenario, inputs.carrier, before, session)
     plan = _to_any_goal(scenario) if inputs.incidences else plan_in(scenario)
     face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
     notes = [

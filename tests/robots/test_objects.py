@@ -1,5 +1,6 @@
 """A robot of somebody's that sees objects: taught, planned and driven to where they are now."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,28 @@ def test_a_goal_taught_once_is_reached_wherever_the_part_lies_now(call, taught):
         off = np.linalg.norm(arm.pose(Seeing.last.q)[:3, 3] - goal[:3, 3])
         assert 1e3 * off < 3.0 * plan.goal_deviation_mm < 4.0
     assert "plan: making (its object may lie elsewhere now" in answer.err
+
+
+def test_a_sequence_looks_at_its_object_over_the_connection_that_drives(call, taught):
+    """The approach and the goal are carried along; the retreat goes from where the arm stands."""
+    step = {"along": "plate", "by_m": 0.03}
+    steps = [{"approach": step | {"to": "goal"}}, {"to": "goal"}, {"retreat": step}]
+    features = {"plate": {"on": "tool", "plane": [0, 1, 2]}}
+    asked = [f"--set=task.steps={json.dumps(steps)}", f"--set=features={json.dumps(features)}"]
+    CALLS.clear()
+    answer = call("servo", "--law", "exact", "--set=control.mode=[regulate]", *asked, "--json")
+    assert answer.code == 0, answer.err
+    assert [step["name"] for step in answer.json["steps"]] == ["approach_goal", "goal", "retreat"]
+    assert [CALLS.count(name) for name in ("open", "stop", "close")] == [1, 1, 1]
+    run, arm = load(taught / "run"), Seeing.last.world.robot
+    before, there, after = (arm.pose(trace.q[-1]) for trace in run.traces.values())
+    goal = PART.moved @ arm.pose(Sound(CONFIG).q)
+    within = 3.0 * run.at_step("goal").plan.goal_deviation_mm
+    assert 1e3 * np.linalg.norm(there[:3, 3] - goal[:3, 3]) < within
+    for pose in (before, after):
+        away = (np.linalg.inv(there) @ pose)[:3, 3]
+        assert np.linalg.norm(away) == pytest.approx(0.03, abs=2e-3)
+        assert abs(away[2]) == pytest.approx(0.03, abs=2e-3)
 
 
 def nudged(mm):

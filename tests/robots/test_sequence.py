@@ -50,7 +50,7 @@ def once(name):
     return [call for call in CALLS if isinstance(call, str)].count(name)
 
 
-def test_one_connection_serves_plans_motions_and_actions(servo):
+def test_one_connection_serves_plans_motions_and_actions(servo, projservo):
     answer = servo(*asked(), law="exact")
     assert answer.code == 0, answer.err
     names = ["01-gripper", "near", "there", "04-gripper", "wait", "retreat"]
@@ -71,6 +71,11 @@ def test_one_connection_serves_plans_motions_and_actions(servo):
     assert np.linalg.norm(moved[:3, 3]) == pytest.approx(0.03, abs=2e-3)
     assert np.degrees(np.arccos(moved[2, 2])) < 0.5  # the turn about the normal stays free
     assert [trace.free_dof for trace in traces.values()] == [None, 1, 1]
+    calls = len(CALLS)
+    alone = projservo("plan", "-o", "run", "--force")  # which would read where the arm stands
+    assert alone.code == 2
+    assert "is named by the stored run alone, which starts no code" in alone.err
+    assert len(CALLS) == calls
 
 
 def test_an_interrupt_keeps_the_grip_and_says_so(servo):
