@@ -8,17 +8,21 @@ from typing import Any, Self
 
 # Period at which the clock of a bar advances, s.
 TICK_S = 0.5
+# Period of the lines that tell how far work is where there is no terminal, s.
+LINE_S = 60.0
 
 
 class _Bar:
-    """Progress bar, one at a time; silent if standard error is no terminal."""
+    """Progress bar, one at a time; a line a minute if standard error is no terminal."""
 
     def __init__(self) -> None:
         self._bar: Any = None
+        self._what, self._told = "", 0.0
 
     def __call__(self, what: str, done: int, total: int, note: str = "") -> None:
         """Move the bar of ``what`` to ``done`` of ``total``, with a note, and remove it at the end."""
         if not sys.stderr.isatty():
+            self._line(what, done, total)
             return
         if self._bar is None or self._bar.desc != what:
             from tqdm import tqdm
@@ -31,6 +35,15 @@ class _Bar:
         self._bar.update(done - self._bar.n)
         if done >= total:
             self.close()
+
+    def _line(self, what: str, done: int, total: int) -> None:
+        """Print how far the work of ``what`` is, once a minute from when it began."""
+        now = time.monotonic()
+        if what != self._what:
+            self._what, self._told = what, now
+        elif now - self._told >= LINE_S and done < total:
+            self._told = now
+            self.say(f"{what}: {done} of {total}")
 
     def say(self, text: str) -> None:
         """Print a message on standard error, above a visible bar."""

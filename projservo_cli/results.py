@@ -18,12 +18,21 @@ from projservo_cli.calibration.prediction import (
     prediction_variance,
 )
 from projservo_cli.calibration.refit import refit, since_moved
-from projservo_cli.display import Displayable, Printed, checked_array, numbers_in, require_radians, xarray
+from projservo_cli.display import (
+    Displayable,
+    Printed,
+    checked_array,
+    numbers_in,
+    pandas,
+    require_radians,
+    xarray,
+)
 from projservo_cli.files import bytes_of
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.metric.frame import Metric, Scale, links
 from projservo_cli.metric.kinematic_errors import KinematicErrors, in_model_frames, kinematic_errors
 from projservo_cli.observations import Observations, require_observations
+from projservo_cli.planning.pose_selection import Suggestion, region_around, suggest
 from projservo_cli.records import (
     MM,
     TOOL,
@@ -46,6 +55,15 @@ from projservo_cli.task.look_bundle import Look
 _AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
 _MAX_BYTES = 10_000_000  # maximum size of a URDF
 _AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there
+
+
+def _axes_of(ax: Any) -> Any:
+    """Return axes to draw into. Raises InputError for anything else, such as the array of ``subplots``."""
+    from matplotlib.axes import Axes
+
+    if not isinstance(ax, Axes):
+        raise InputError(f"plot: ax of type {type(ax).__name__}: give one axes of a figure")
+    return ax
 
 
 def _fields_of(record: Any, kind: type) -> dict[str, Any]:
@@ -82,18 +100,23 @@ class ImageModel(Displayable, Calibration):
 
         Parameters
         ----------
-        ax : axes in whose place the figure is shown; by default a separate figure is returned.
+        ax : axes into which the residuals alone are drawn, a colour a view; by default a figure is returned.
 
         Raises
         ------
         InputError
             When the observations that it was made from are not at hand.
         """
-        if self.observation is None:
-            raise InputError("plot: the observations that the calibration was made from are not at hand")
+        observed = self._at_hand("plot")
+        if ax is not None:
+            *_, v, off, used = self._residuals(observed)
+            for i, name in enumerate(self.view):
+                _axes_of(ax).plot(*off[(v == i) & used].T, ".", markersize=2.0, label=f"{name} camera")
+            ax.set(xlabel="u off the prediction (px)", ylabel="v off the prediction (px)")
+            return ax
         from projservo_cli.report import figures  # so that those who draw nothing need not import all figures
 
-        return figures.placed(figures.of_calibration(self, self.observation, self.cross_validation), ax)
+        return figures.of_calibration(self, observed, self.cross_validation)
 
     @overload
     def predict(self, q: npt.ArrayLike, *, return_std: Literal[False] = False) -> FloatArray: ...
@@ -196,6 +219,68 @@ class ImageModel(Displayable, Calibration):
         found, old = refit(self, observations, view, observations.image_size), self.observation
         old = None if old is None else since_moved(old, observations, view)
         return ImageModel.of(Calibration(**_fields_of(found, Calibration)), observation=old)
+
+    def suggest(
+        self, count: int = 5, *, limits: tuple[npt.ArrayLike, npt.ArrayLike] | None = None, seed: int = 0
+    ) -> tuple[Suggestion, ...]:
+        """Return the poses that would reduce the variance of predictions most, in their order.
+
+        Parameters
+        ----------
+        count : how many.
+        limits : lower and upper limits (n,) of the joints, rad or m; by default none.
+        seed : of the poses that are drawn to choose from, a little beyond those that were recorded.
+
+        Returns
+        -------
+        Suggestions with ``q`` (n,), ``from_pose``, ``delta`` (n,) from there, ``variance_before`` and
+        ``variance_after``, px².
+
+        Raises
+        ------
+        InputError
+            When the observations are not at hand, or there is no covariance.
+        WorkFailed
+            When no pose shows the markers to all views.
+        """
+        observed, n = self._at_hand("suggest"), len(self.joint_types)
+        lower, upper = (-np.inf, np.inf) if limits is None else limits
+        low, high = (np.broadcast_to(np.asarray(bound, dtype=np.float64), n) for bound in (lower, upper))
+        size = observed.image_size if isinstance(observed, Observations) else None
+        region = region_around(observed.at_rest, size, low, high)
+        return suggest(self, observed.at_rest, region, region, count, np.random.default_rng(seed))
+
+    def residuals(self) -> Any:
+        """Return the residuals of the calibration as a pandas table, a row for each marker seen in a view.
+
+        Columns are ``pose``, ``marker``, ``view``, the pixels ``u`` and ``v``, what they are off the
+        prediction, ``du`` and ``dv`` in px, and ``used``, whether the fit took them.
+
+        Raises
+        ------
+        InputError
+            When the observations are not at hand, or pandas is not installed.
+        """
+        pixels, pose, m, v, off, used = self._residuals(self._at_hand("residuals"))
+        columns = {"pose": pose, "marker": self.marker[m], "view": np.array(self.view)[v]}
+        (u, v), (du, dv) = pixels.T, off.T
+        return pandas().DataFrame(columns | {"u": u, "v": v, "du": du, "dv": dv, "used": used})
+
+    def _residuals(self, observed: Observation) -> tuple[npt.NDArray[Any], ...]:
+        """Pixels (r, 2), pose, marker and view by index, residuals (r, 2), and whether the fit took them."""
+        from projservo_cli.report.figures.calibration import observed_pixels
+
+        observed = observed.at_rest
+        pixels, rejected = observed_pixels(self, observed)
+        off = pixels - predict(self, observed.q)
+        k, v, m = np.nonzero(np.isfinite(off).all(axis=-1))
+        return pixels[k, v, m], observed.pose[k], m, v, off[k, v, m], rejected[k, v, m] == 0
+
+    def _at_hand(self, what: str) -> Observation:
+        """Return the observations that the calibration was made from."""
+        if self.observation is None:
+            raise InputError(f"{what}: the observations that the calibration was made from are not at hand")
+        return self.observation
 
     def covariance(self) -> FloatArray:
         """Return the covariance of P, H_hat_0, lenses (k1, k2 of both, if estimated) and M, each raveled.
@@ -460,18 +545,23 @@ class MotionPlan(Displayable, Plan):
 
         Parameters
         ----------
-        ax : axes in whose place the figure is shown; by default a separate figure is returned.
+        ax : axes into which visibility alone is drawn, a curve a camera; by default a figure is returned.
 
         Raises
         ------
         InputError
             When the calibration that it was made with is not at hand.
         """
+        if ax is not None:
+            for name, margin in zip(self.view, self.margin.T, strict=True):
+                _axes_of(ax).plot(self.time, margin, label=f"{name} camera")
+            ax.set(xlabel="time (s)", ylabel="visibility (start = 1)")
+            return ax
         if self.scene is None:
             raise InputError("plot: the calibration that the plan was made with is not at hand")
         from projservo_cli.report import figures
 
-        return figures.placed(figures.of_plan(self, self.scene), ax)
+        return figures.of_plan(self, self.scene)
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""
@@ -497,16 +587,23 @@ class RunTrace(Displayable, Trace):
         """Return a record with its functions."""
         return trace if isinstance(trace, cls) else cls(**_fields_of(trace, Trace), face=face)
 
-    def plot(self, ax: Any = None) -> Any:
+    def plot(self, ax: Any = None, *, label: str = "") -> Any:
         """Draw the image errors of the markers over time, as the report does.
 
         Parameters
         ----------
-        ax : axes in whose place the figure is shown; by default a separate figure is returned.
+        ax : axes into which the image error of the run is drawn as one curve, beside others; by default a
+            figure is returned.
+        label : name of that curve; by default that of the law.
         """
+        if ax is not None:
+            t = self.period * np.arange(len(self.image_error))
+            _axes_of(ax).semilogy(t, self.image_error, label=label or self.law)
+            ax.set(xlabel="time (s)", ylabel="image error (px rms)")
+            return ax
         from projservo_cli.report import figures
 
-        return figures.placed(figures.of_trace(self, self.face), ax)
+        return figures.of_trace(self, self.face)
 
     def coordinates(self) -> dict[str, Any]:
         """Return coordinates of dimensions, by their names; ``time`` in s."""

@@ -98,7 +98,7 @@ class Console(Listener):
             raise InputError("standard input ended before Enter was pressed: run this at a terminal")
 
     def progress(self, what: str, done: int, total: int, note: str = "") -> None:
-        """Move a progress bar; silent where standard error is not a terminal."""
+        """Move a progress bar; a line a minute where standard error is not a terminal."""
         if not self.quiet:
             self._bar(what, done, total, note)
 

@@ -292,6 +292,27 @@ class Config(Settings):
         """
         return load_config(shipped(path))
 
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Config":
+        """Check a configuration that is at hand, such as that of an arm of your own.
+
+        Parameters
+        ----------
+        values : by key, as in a YAML file; relative paths start at the working directory.
+
+        Raises
+        ------
+        InputError
+            With a line for each value that does not fit.
+        """
+        return load_config(None, values=values)
+
+    def __str__(self) -> str:
+        """The values that differ from their defaults, as YAML."""
+        return plain_yaml(masked(self.model_dump(mode="json", exclude_defaults=True))).rstrip()
+
+    __repr__ = __str__
+
     def replace(self, values: Mapping[str, Any]) -> "Config":
         """Return the configuration with other values, checked as a whole.
 
@@ -312,6 +333,7 @@ def load_config(
     overrides: Sequence[str | Override] = (),
     *,
     text: str | None = None,
+    values: Mapping[str, Any] | None = None,
     teaching: bool = False,
 ) -> Config:
     """Read and check a configuration; paths in it become absolute.
@@ -319,6 +341,7 @@ def load_config(
     path : the YAML file; None for a blank recorded configuration, which overrides fill.
     overrides : ``a.b=v`` as for ``--set``, applied in order.
     text : its content, where it is already at hand; ``path`` then only names it in messages.
+    values : the plain values themselves, where there is no text.
     teaching : a goal or a start whose file does not exist yet is still to be taught, and left out.
     Raises InputError, one line ``file:line:column: key: message`` for each error.
     """
@@ -326,7 +349,9 @@ def load_config(
     if path is not None and text is None:
         document = _Document.read(path)
     else:
-        document = _Document(text or "", str(path or ""))
+        document = _Document(text or "", "values" if values is not None else str(path or ""))
+    if values is not None:
+        document.values = plain(values)
     if document.values is None:
         document.values = {}
     if not isinstance(document.values, dict):

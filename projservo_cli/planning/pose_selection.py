@@ -1,6 +1,7 @@
 """Selection of the poses whose trial motions would reduce the variance of predictions most."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from projservo_cli.calibration.prediction import (
     parameters_from,
 )
 from projservo_cli.calibration.refit import errors_of_others, rows_of_camera
+from projservo_cli.image_size import image_corners, image_sizes
 from projservo_cli.planning.model_spread import Region, drawn_poses
 from projservo_cli.records import (
     BoolArray,
@@ -22,6 +24,9 @@ from projservo_cli.records import (
     WorkFailed,
 )
 
+# The range of the recorded readings is widened at each end by this share of itself; for a robot
+# whose limits are known, the candidates' by more.
+WIDER, FARTHER = 0.15, 1.0
 # Poses drawn to choose from, and to judge by; batches before giving up.
 _CANDIDATES, _TARGETS = 300, 150
 _BATCHES = 20
@@ -47,6 +52,24 @@ class Suggestion:
     # variance_before, variance_after: of predicted coordinates over the region of the data, px²
     variance_before: float
     variance_after: float
+
+
+def region_around(
+    observation: Observation, size: Any, low: FloatArray, high: FloatArray, share: float = WIDER
+) -> Region:
+    """Region of the recorded readings, widened at each end by a share of their range within limits (n,).
+
+    A recorded robot may have been where its limits do not reach. Of images without a ``size`` the region is
+    that of the pixels seen.
+    """
+    q, pixels = observation.q, observation.images
+    least, most = q.min(axis=0), q.max(axis=0)
+    span = share * (most - least)
+    image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
+    if size is not None:
+        image = image_corners(image_sizes(size, len(observation.view)))
+    within = np.maximum(least - span, np.minimum(low, least)), np.minimum(most + span, np.maximum(high, most))
+    return Region(*within, image)
 
 
 def suggest(

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from projservo_cli.calibration.checks.model_error import describe
 from projservo_cli.calibration.joint_model import describe_curve
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.laws import IMAGE_TRACK, REGULATE, TRACK, law_and_mode, title_of
+from projservo_cli.laws import IMAGE_TRACK, POINT_LAWS, REGULATE, TRACK, law_and_mode, title_of
 from projservo_cli.metric.frame import Metric
 from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
@@ -189,6 +189,11 @@ class ReportData(Fit):
         return project(self.plant.model.P, points).swapaxes(0, 1)
 
 
+def moved(report_data: Driven | ReportData) -> list[str]:
+    """Names of the runs that made a step."""
+    return [name for name, trace in report_data.traces.items() if trace.steps > 0]
+
+
 @dataclass(frozen=True)
 class FigureSpec:
     """One figure and its requirements."""
@@ -209,6 +214,7 @@ class FigureSpec:
     frames: bool = False  # whether it shows frames
     incidences: bool = False  # whether it shows those of the goal
     sequence: bool = False  # whether it shows the motions of a sequence
+    runs: bool = False  # whether it shows all runs, where there are some of laws that are not in the paper
     task: bool = True  # whether it needs a task; else a calibration with its observations is enough
     metric: bool = False  # whether it needs the calibration in metres
 
@@ -222,7 +228,7 @@ class FigureSpec:
     @property
     def optional(self) -> bool:
         """Whether it is left out without a word where a run has nothing to show in it."""
-        return self.frames or self.incidences or self.sequence
+        return self.frames or self.incidences or self.sequence or self.runs
 
     def drawn(self, data: Data) -> "Figure":
         """The figure of its data."""
@@ -235,6 +241,9 @@ class FigureSpec:
         if self.frames and isinstance(report_data, Driven | ReportData):
             filmed = any(trace.frame_index is not None for trace in report_data.traces.values())
             return "" if filmed else "the robot shows no frames"
+        if self.runs and isinstance(report_data, Driven | ReportData):
+            others = [law for law in moved(report_data) if law not in (*DIRECT, *POINT_LAWS)]
+            return "" if others else "all runs are of laws of the paper"
         if self.incidences and isinstance(report_data, Driven | ReportData):
             partial = any(trace.feature_s is not None for trace in report_data.traces.values())
             return "" if partial else "the goal is a whole pose"
@@ -254,7 +263,7 @@ class FigureSpec:
                 f"runs to compare are missing, of {', '.join(displayed)}; make them: projservo servo report"
             )
         if self.studies and report_data.studies is None:
-            return f"the extra runs could not be made: {report_data.no_studies}"
+            return report_data.no_studies
         if self.shares and np.isnan(report_data.plan.mu).all():
             return "a joint-space path has no fractions of translation and rotations: see figure 16"
         if self.modes and not report_data.compared():

@@ -12,11 +12,9 @@ from projservo_cli.calibration.checks.screening import screened
 from projservo_cli.calibration.checks.undecided import undecided_pairs
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.files import write_whole
-from projservo_cli.image_size import image_corners, image_sizes
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
-from projservo_cli.planning.model_spread import Region
-from projservo_cli.planning.pose_selection import Suggestion, suggest
+from projservo_cli.planning.pose_selection import FARTHER, Suggestion, region_around, suggest
 from projservo_cli.records import (
     TOOL,
     WORLD,
@@ -27,7 +25,6 @@ from projservo_cli.records import (
     Observation,
     WorkFailed,
 )
-from projservo_cli.robots.settings import JointSettings
 from projservo_cli.simulation.streams import SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed
@@ -173,11 +170,6 @@ def estimate(
     return board.observation, replace(calibration, advice=tuple(advice)), next(iter(held_out), None)
 
 
-# The range of the recorded readings is widened at each end by this share of itself; for a robot
-# whose limits are known, the candidates' by more.
-WIDER, FARTHER = 0.15, 1.0
-
-
 def suggest_motions(
     inputs: SuggestionInputs, observation: Observation, calibration: Calibration, count: int, path: Path
 ) -> tuple[Suggestion, ...]:
@@ -188,12 +180,10 @@ def suggest_motions(
     row each: q1 … qN, from_pose, delta_q1 … delta_qN, revolute joints in the unit of the recorded table.
     """
     observation = observation.at_rest
-    pixels, size = observation.images, inputs.image_size
-    image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
-    if size is not None:
-        image = image_corners(image_sizes(size, len(observation.view)))
-    targets = _region(inputs.joints, observation.q, WIDER, image)
-    candidates = targets if inputs.recorded else _region(inputs.joints, observation.q, FARTHER, image)
+    limits = inputs.joints.joints("R" * observation.q.shape[1]).limits
+    within = inputs.image_size, limits.lower, limits.upper
+    targets = region_around(observation, *within)
+    candidates = targets if inputs.recorded else region_around(observation, *within, FARTHER)
     rng = generator(inputs.seed, SUGGESTIONS)
     found = suggest(calibration, observation, candidates, targets, count, rng)
     turn = np.degrees(1.0) if inputs.unit == "deg" else 1.0
@@ -204,14 +194,3 @@ def suggest_motions(
     columns |= {f"delta_{name}": values for name, values in zip(joints, delta.T, strict=True)}
     write_whole(path, to_csv(columns))
     return found
-
-
-def _region(settings: JointSettings, q: FloatArray, share: float, image: FloatArray) -> Region:
-    """The range of readings (K, n), widened at each end by a share of it as far as the limits allow."""
-    span = np.ptp(q, axis=0)
-    low, high = q.min(axis=0) - share * span, q.max(axis=0) + share * span
-    joints = settings.joints("R" * q.shape[1])
-    # A recorded robot may have been where its configured limits do not reach.
-    low = np.maximum(low, np.minimum(joints.limits.lower, q.min(axis=0)))
-    high = np.minimum(high, np.maximum(joints.limits.upper, q.max(axis=0)))
-    return Region(low, high, image)

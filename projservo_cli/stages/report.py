@@ -23,6 +23,7 @@ from projservo_cli.report.page import write_page
 from projservo_cli.report.report_data import (
     ANIMATION_FILE,
     CLAIMS_FILE,
+    DIRECT,
     VIEW_FILE,
     Driven,
     Fit,
@@ -51,6 +52,9 @@ if TYPE_CHECKING:
 FOLDER = "figures"
 _OF_ONE = "figures and claims are of one motion, and the task is a sequence: name a goal, --goal NAME"
 _NUMBERS = "csv"  # the numbers of each figure
+# Reasons why a figure of extra runs is left out.
+_WHY_NONE = "the extra runs could not be made: {}"
+_NOT_ASKED = f"extra runs and claims are of {' and '.join(DIRECT)}: name both in control.laws"
 
 
 def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
@@ -66,12 +70,15 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
     studies, composition, claims = None, None, []
     if inputs.extra is not None:
         bench = comparison_of(inputs.extra, run.calibration, run.plan)
-        with _unless_it_fails("studies", left_out):
-            studies = run_studies(bench, progress=progress)
+        of_paper = set(DIRECT) <= run.traces.keys()
+        if of_paper:
+            with _unless_it_fails("studies", left_out):
+                studies = run_studies(bench, progress=progress)
         report_data = _report_data(inputs, run, bench, studies, left_out)
-        with _unless_it_fails("equation (22)", left_out):
-            composition = composition_of(metric_plan(bench), bench.scenario.gains)
-        claims = [claim._asdict() for claim in claims_of(report_data, composition)]
+        if of_paper:
+            with _unless_it_fails("equation (22)", left_out):
+                composition = composition_of(metric_plan(bench), bench.scenario.gains)
+            claims = [claim._asdict() for claim in claims_of(report_data, composition)]
     elif run.traces:
         *_, last = run.traces
         part = last.split("/")[0] if "/" in last else ""
@@ -128,7 +135,7 @@ def _report_data(
         numbers=tuple(truth.number[i] for i in truth.face),
         traces=run.traces,
         studies=studies,
-        no_studies="" if studies else left_out[-1]["reason"],
+        no_studies=_WHY_NONE.format(left_out[-1]["reason"]) if left_out else "" if studies else _NOT_ASKED,
         stall_periods=bench.scenario.termination.stall_periods,
         held_out=run.cross_validation,
         trajectory=inputs.trajectory,

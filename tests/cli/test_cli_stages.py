@@ -214,10 +214,13 @@ def test_a_failure_of_the_program_itself_is_one_line_and_verbose_shows_where(pro
     assert "Traceback" in projservo("plan", "-o", "out", "-v").err
 
 
-def test_progress_shows_only_to_someone_who_watches_and_its_clock_goes_on(capsys, monkeypatch):
+def test_progress_is_a_bar_to_someone_who_watches_and_else_a_line_a_minute(capsys, monkeypatch):
+    monkeypatch.setattr(progress.time, "monotonic", iter([0.0, 30.0, 61.0, 100.0, 200.0]).__next__)
     with Console() as console:
-        console.progress("work", 1, 2)
-    assert capsys.readouterr().err == ""
+        for done in range(5):
+            console.progress("work", done, 4)
+    assert capsys.readouterr().err == "work: 2 of 4\n"  # once a minute, and not at the end
+    monkeypatch.undo()
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     monkeypatch.setattr(progress, "TICK_S", 0.01)
     with Console(quiet=True) as console:

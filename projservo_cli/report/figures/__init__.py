@@ -13,7 +13,6 @@ import numpy as np
 from projservo_cli.records import (
     Calibration,
     CrossValidation,
-    InputError,
     Observation,
     Plan,
     Trace,
@@ -77,22 +76,3 @@ def of_trace(trace: Trace, markers: tuple[int, ...]) -> "Figure":
         "marker": np.array(markers or range(trace.s.shape[2])),
     }
     return REGISTER["fig11_image_errors"].drawn(data)
-
-
-def placed(figure: "Figure", axes: Any) -> Any:
-    """Return a figure, or the axes in whose place it is shown as a picture.
-
-    Raises InputError for anything else than axes, such as the array that ``subplots`` gives.
-    """
-    if axes is None:
-        return figure
-    from matplotlib.axes import Axes
-
-    if not isinstance(axes, Axes):
-        raise InputError(f"plot: ax of type {type(axes).__name__}: give one axes of a figure")
-    figure.set_dpi(2.0 * axes.figure.dpi)
-    figure.canvas.draw()
-    canvas: Any = figure.canvas
-    axes.imshow(np.asarray(canvas.buffer_rgba()))
-    axes.set_axis_off()
-    return axes

@@ -43,7 +43,7 @@ def _data(fit: Fit) -> Data:
     """Residuals, noise model, predicted error of each pose, excitation and information of a fit."""
     calibration, observation = fit.calibration, fit.observation
     predicted = predict(calibration, observation.q)
-    pixels, rejected = _observed(calibration, observation)
+    pixels, rejected = observed_pixels(calibration, observation)
     measured: BoolArray = np.all(np.isfinite(pixels), axis=-1)
     excluded = (rejected > 0) | ~np.isfinite(predicted).all(axis=-1)
     used = measured & ~excluded
@@ -129,7 +129,7 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
     return tested, variance
 
 
-def _observed(calibration: Calibration, observation: Observation) -> tuple[FloatArray, IntArray]:
+def observed_pixels(calibration: Calibration, observation: Observation) -> tuple[FloatArray, IntArray]:
     """Pixels (K, 2, m, 2) of the calibrated markers, and why the fit left them out (K, 2, m), 0 for not.
 
     Those are outliers (1), markers that were read under another number (2), and poses in doubt (3).

@@ -1,18 +1,24 @@
 """Figs. 9, 10 and 12 of [RH00]: control errors and joints under direct control, over time."""
 
+import math
+
 import numpy as np
 
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import (
     Data,
+    Driven,
     ReportData,
     curve_difference,
     joint_kinds,
     joint_units,
+    moved,
     percent,
     registered,
+    title,
 )
+from projservo_cli.task.face import cyclic_order
 
 _DECADES = 1e-5  # of its start, down to which an error is drawn on a logarithmic scale
 _FAINT: style.LineStyle = {"linewidth": 0.8, "alpha": 0.55, "label": ""}
@@ -25,6 +31,7 @@ _TRANSLATION = {
 }
 _HIDES = 3.0  # times the step of the slower half of the joints, beyond which a step hides theirs
 _LIMIT = style.line(style.GREY, width=0.8)
+_RUN_PATH = style.line(style.GREY, width=0.8, label="path of a marker")
 _WAYS = (("free", False), ("limited", True))  # without and with the limit of the joint speed
 
 
@@ -217,3 +224,65 @@ def _draw_joints(data: Data, figure: "style.Figure") -> None:
         column[-1].set_xlabel("time (s)")
     lines = [style.curve(i, f"$q_{i + 1}$") for i in range(len(prismatic))]
     style.legend_below(figure, min(len(lines) + 1, 8), [*lines, _LIMIT | {"label": "limit"}])
+
+
+def _data_runs(report_data: Driven) -> Data:
+    """Images, image error, joints and joint velocities of every run over time, by its name."""
+    order, prismatic = cyclic_order(report_data.plan.A), report_data.calibration.prismatic
+    scale, runs = joint_units(prismatic), moved(report_data)
+    result: Data = {"run": np.array(runs), "view": np.array(report_data.view), "prismatic": prismatic}
+    for name in runs:
+        trace = report_data.traces[name]
+        result |= {
+            f"t_s_{name}": _time(trace),
+            f"s_{name}": trace.s[:, :, order],
+            f"s_star_{name}": trace.s_star[:, order],
+            f"image_error_px_{name}": trace.image_error,
+            f"q_{name}": trace.q * scale,
+            f"q_dot_{name}": trace.q_dot * scale,
+            f"verdict_{name}": np.array(f"{title(name)}\n{trace.verdict}, {trace.steps} steps"),
+        }
+    return result
+
+
+@registered(
+    "fig20_runs",
+    "Every run: images, image error, joints and commands",
+    "not in the paper",
+    _data_runs,
+    runs=True,
+    alt="A row for each run: the paths of the markers in the camera images, and the image error, the joints "
+    "and the commanded joint velocities over time.",
+)
+def _draw_runs(data: Data, figure: "style.Figure") -> None:
+    """Two rows a run: above the images, below its curves over time."""
+    runs, names, slides = [str(name) for name in data["run"]], data["view"], data["prismatic"]
+    figure.set_figheight(4.4 * len(runs) + 0.5)
+    columns = math.lcm(len(names), 3)
+    grid = figure.add_gridspec(2 * len(runs), columns)
+    units = "deg or mm" if slides.any() and not slides.all() else "mm" if slides.all() else "deg"
+
+    def panels(row: int, count: int) -> list["style.Axes"]:
+        width = columns // count
+        return [figure.add_subplot(grid[row, k * width : (k + 1) * width]) for k in range(count)]
+
+    for k, name in enumerate(runs):
+        s, s_star, t = data[f"s_{name}"], data[f"s_star_{name}"], data[f"t_s_{name}"]
+        for view, panel in enumerate(images := panels(2 * k, len(names))):
+            style.paths(panel, s[:, view], _RUN_PATH)
+            style.start_and_goal(panel, s[0, view], s_star[view])
+            below = "" if view else f"{data[f'verdict_{name}']}\n"
+            pixels = np.concatenate([s[:, view], s_star[None, view]])
+            style.image_axes(panel, f"{below}{names[view]} camera", pixels)
+        style.name_first_ordinate(images)
+        error, joints, commands = panels(2 * k + 1, 3)
+        error.plot(t, data[f"image_error_px_{name}"], **style.line(style.BLACK))
+        style.log_scale(error)
+        for i in range(len(slides)):
+            line = style.curve(i, f"$q_{{{i + 1}}}$")
+            joints.plot(t, data[f"q_{name}"][:, i], **line)
+            commands.plot(t[:-1], data[f"q_dot_{name}"][:, i], **line)
+        ordinates = "image error (px)", f"joint ({units})", f"velocity ({units} per s)"
+        for panel, what in zip((error, joints, commands), ordinates, strict=True):
+            panel.set(ylabel=what, xlabel="time (s)")
+    style.legend_below(figure, 8)
