@@ -220,7 +220,8 @@ def orientation_bias(plan: Plan, gains: Gains) -> FloatArray:
             three = gains.gain_r * onto + gains.gain_p * theta_p * normal
             two = gains.gain_s * left.as_rotvec()
             R = Rotation.from_rotvec(gains.period * (three, two)[law]) * R
-            half = float(np.linalg.norm(np.cross(axis, R.as_quat()[:3])))  # sine of half the turn about other axes
+            # Sine of half the turn about other axes.
+            half = float(np.linalg.norm(np.cross(axis, R.as_quat()[:3])))
             from_plan = (two_turns.inv() * R).magnitude().min(), 2.0 * math.asin(min(1.0, half))
             off[law] = max(off[law], from_plan[law])
     return off
