@@ -216,7 +216,8 @@ class ImageMonitor:
         seen = [np.where(tested.residual.seen[..., None], tested.pair.images, np.nan) for tested in last]
         mean, numbers = mean_image(np.array(seen)), self.calibration.marker
         sigma = [tested.stated[..., None] for tested in last if tested.stated is not None]
-        stated = mean_image(np.array(sigma))[..., 0] if sigma else None
+        # Errors of a finder that stay do not average away: no mean is as sure as its frames are said to be.
+        stated = self._errors.raised(mean_image(np.array(sigma))[..., 0]) if sigma else None
         q = np.mean([tested.pair.q for tested in last], axis=(0, 1))
         size = self._image_size
         return detected_fault(self.calibration, q, numbers, mean, size, self._sigma_px, stated=stated)

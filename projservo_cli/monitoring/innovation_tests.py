@@ -156,6 +156,11 @@ class ErrorModel:
             return common.copy()
         return np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), common)
 
+    def raised(self, stated: FloatArray) -> FloatArray:
+        """Return deviations (V, m) as stated, px, raised to those that hold where none are stated."""
+        common = np.broadcast_to(np.maximum(self._sigma * self._of_views, self._least), stated.shape)
+        return np.fmax(stated, common / self._stated)
+
     def residual(self, pair: FramePair) -> Residual:
         """Residuals of an observation and their derivatives, each view at its own joints."""
         scene, away = self.scene, from_reference(self.calibration, pair.q)
