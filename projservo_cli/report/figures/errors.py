@@ -246,7 +246,7 @@ def _data_runs(report_data: Driven) -> Data:
 
 
 @registered(
-    "fig20_runs",
+    "fig21_runs",
     "Every run: images, image error, joints and commands",
     "not in the paper",
     _data_runs,
