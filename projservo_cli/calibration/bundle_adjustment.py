@@ -18,6 +18,7 @@ elimination nor the gauge, and hold the whole derivative.
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +37,7 @@ def _axis_of(H_hat: FloatArray) -> FloatArray:
     return np.stack([H_hat[..., 2, 1], H_hat[..., 0, 2], H_hat[..., 1, 0]], axis=-1)
 
 
+@lru_cache(maxsize=2)  # asked for by derivative and steps of the same parameters
 def _generators(params: Parameters) -> list[FloatArray]:
     """Rigid motions (b, 4, 4) that move each joint's screw: two turns and two shifts, or two turns."""
     H_hat, prismatic = params.H_hat, params.prismatic
