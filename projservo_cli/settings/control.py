@@ -226,7 +226,10 @@ class Stop(Section):
     """Stopping rules of the closed loop."""
 
     image_error_px: Positive = Field(0.01, description="image error below which a run has converged, rms")
-    noise_factor: NotNegative = Field(2.0, description="image_error_px grows by this factor × noise.servo_px")
+    noise_factor: NotNegative = Field(
+        2.0,
+        description="image_error_px grows by this factor × noise.servo_px, or × what pixels state if more",
+    )
     max_steps: Count = Field(2000, description="maximum number of commands")
     diverged_factor: Number = Field(
         10.0, gt=1, description="growth of the image error or the distance at which a run has diverged"

@@ -604,7 +604,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
 def _vague(run: LawRun) -> str:
     """Say that markers are seen there with more noise than elsewhere; empty if they are not."""
     more = float(run.log.noise_ratio[run.steps])
-    return f" by {more:.2g} times the noise: look what covers markers there" if more > _VAGUE else ""
+    return f"; markers there state {more:.2g} times the noise: look what covers them" if more > _VAGUE else ""
 
 
 def _apart(run: LawRun) -> str:
