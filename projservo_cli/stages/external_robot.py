@@ -273,6 +273,8 @@ def connected_robot(
         readings = scenario.termination.max_steps + 1 + WINDOW
         monitor = ImageMonitor(calibration, noise, readings, visible, plant.image_size)
     watch = None
+    if session.acted:  # it may hold the object
+        plan = None
     if plan is not None and plan.s_object is not None and plan.object_marker is not None:
         numbers = plan.object_marker.tolist()
         places = np.array([driven.further.index(number) for number in numbers])

@@ -264,3 +264,9 @@ def test_a_taught_goal_keeps_the_incidences_beside_it(tmp_path):
     assert config.task.goal.images.left[2] == (5.0, 7.0)
     assert config.task.goal.incidences == (("pin", "hole"), ("pin", "hole", 90.0))
     assert load_config("again.yaml", text=to_yaml(config)) == config
+
+
+def test_objects_before_cameras_on_the_tool_are_refused_in_one_line(good):
+    wanted = [f"objects.block={{markers: [40, 41, 42], {AT}}}", "rig.mount=tool"]
+    (found,) = errors(good, *wanted)
+    assert "objects: cameras on the tool see the scene that the goal is on: its images carry" in found

@@ -1,6 +1,7 @@
 """A robot of somebody's that sees objects: taught, planned and driven to where they are now."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,14 @@ def test_a_sequence_looks_at_its_object_over_the_connection_that_drives(call, ta
         away = (np.linalg.inv(there) @ pose)[:3, 3]
         assert np.linalg.norm(away) == pytest.approx(0.03, abs=2e-3)
         assert abs(away[2]) == pytest.approx(0.03, abs=2e-3)
+
+
+def test_a_part_that_has_moved_far_is_gone_to_by_confirmation_alone(call):
+    answer = call("servo", "--law", "exact", "--set", "objects.max_displacement_m=0.09")
+    assert answer.code == 1
+    told = " ".join(answer.err.split())
+    assert re.search(r"objects.part has moved by 0.099\d* m, more than 0.09: .* raise objects.max_d", told)
+    assert not [sent for sent in CALLS if isinstance(sent, tuple)]
 
 
 def nudged(mm):
