@@ -242,8 +242,9 @@ class FigureSpec:
             filmed = any(trace.frame_index is not None for trace in report_data.traces.values())
             return "" if filmed else "the robot shows no frames"
         if self.runs and isinstance(report_data, Driven | ReportData):
-            others = [law for law in moved(report_data) if law not in (*DIRECT, *POINT_LAWS)]
-            return "" if others else "all runs are of laws of the paper"
+            others = {*moved(report_data)} - {*DIRECT, *POINT_LAWS}
+            parts = any("/" in name for name in others)  # of a sequence, which has a figure of its own
+            return "" if others and not parts else "all runs are of laws of the paper"
         if self.incidences and isinstance(report_data, Driven | ReportData):
             partial = any(trace.feature_s is not None for trace in report_data.traces.values())
             return "" if partial else "the goal is a whole pose"
