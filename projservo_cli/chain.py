@@ -32,7 +32,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.result_hashes import digest
 from projservo_cli.settings.task import TaskStep
-from projservo_cli.stages.stage_inputs import Carrier, PlanInputs, ServoInputs
+from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
 from projservo_cli.steps import (
     STAGES,
     Step,
@@ -206,7 +206,7 @@ class Chain:
         for step in steps:
             if step.stage != "plan" or (carrier := self._carrier(step)) is None:
                 continue
-            from projservo_cli.stages.objects import too_far
+            from projservo_cli.stages.carried_goals import too_far
 
             plan = self.run.results[step.name].records[""]
             self.listener.say(plan.object_words)
@@ -221,10 +221,10 @@ class Chain:
             self.listener.confirm("servo", self.config.plant)
         return True
 
-    def _carrier(self, step: Step) -> Carrier | None:
+    def _carrier(self, step: Step) -> CarryingObject | None:
         """Return the object of the goal of a plan; None for a goal that stands still."""
         record = step.record or inputs_of("plan", self.config.at_step(step.part))
-        carrier: Carrier | None = record.carrier
+        carrier: CarryingObject | None = record.carrier
         return carrier
 
     def _fail(self, step: Step, reason: str) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.config.loading import Config, stored_yaml
-from projservo_cli.config.whole import carrier_of
+from projservo_cli.config.whole import name_of_carrier
 from projservo_cli.control.law import Gains
 from projservo_cli.detection import Board
 from projservo_cli.display import About
@@ -37,7 +37,7 @@ from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.workspace import SceneObject, Truth
 from projservo_cli.stages.stage_inputs import (
     CalibrationInputs,
-    Carrier,
+    CarryingObject,
     Contract,
     Drive,
     Estimation,
@@ -57,7 +57,7 @@ from projservo_cli.stages.stage_inputs import (
     Trials,
 )
 from projservo_cli.store.observation_tables import identity_in
-from projservo_cli.task.stand_off import Displacement
+from projservo_cli.task.stand_off import StandOff
 
 _RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
 _TICKS = 4096  # in a turn of an encoder that is as coarse as any
@@ -233,7 +233,7 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
     )
 
 
-def _displacement(config: Config) -> Displacement | None:
+def _displacement(config: Config) -> StandOff | None:
     """Return the displacement of the goal, with the numbers of its markers; None without."""
     along = None if config.task is None else config.task.goal.displaced
     if config.task is None or along is None:
@@ -241,7 +241,7 @@ def _displacement(config: Config) -> Displacement | None:
     if config.mount == TOOL:
         raise InputError("displaced: goals of cameras on the tool are not displaced: teach the other goal")
     flat, of_start = config.features[along.along].flat(config.features), config.task.goal.of_start
-    return Displacement(along.along, flat, along.by_m, along.by_px, of_start)
+    return StandOff(along.along, flat, along.by_m, along.by_px, of_start)
 
 
 def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
@@ -276,13 +276,13 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
     )
 
 
-def _carrier(config: Config, files: Files | None) -> Carrier | None:
+def _carrier(config: Config, files: Files | None) -> CarryingObject | None:
     """Return the object that the goal is carried by; None for a goal that stands still."""
-    name, rendered = carrier_of(config.task, config.features), config.plant.rendered is not None
+    name, rendered = name_of_carrier(config.task, config.features), config.plant.rendered is not None
     if name is None or config.task is None:
         return None
     simulated = config.plant.simulated
-    return Carrier(
+    return CarryingObject(
         name=name,
         numbers=config.objects.named[name].numbers,
         taught=config.task.goal.objects.of(name),

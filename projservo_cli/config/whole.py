@@ -174,7 +174,7 @@ def _objects(
             yield ("objects", name), "is nowhere: give size_m and pose of its tags, or positions_m"
 
 
-def carrier_of(task: TaskSettings | None, features: Mapping[str, Feature]) -> str | None:
+def name_of_carrier(task: TaskSettings | None, features: Mapping[str, Feature]) -> str | None:
     """Name of the object that a goal was taught on; None for a goal that stands still, or is a retreat."""
     if task is None or task.goal.of_start:
         return None
@@ -192,7 +192,7 @@ def _carried(
     for name, feature in features.items():
         if feature.on not in (*WORLD_AND_TOOL, *objects.named):
             yield ("features", name, "on"), f"there is no object {feature.on}; {known}"
-    carrier = carrier_of(task, features)
+    carrier = name_of_carrier(task, features)
     if task is None or carrier is None:
         return
     if carrier not in objects.named:

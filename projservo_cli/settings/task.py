@@ -155,7 +155,7 @@ class _ObjectImages(Section):
         return (self.model_extra or {}).get(name)
 
 
-class Along(Section):
+class DisplacedAlong(Section):
     """A displacement back along a line, or from a plane along its normal, to the side that cameras see."""
 
     along: Name = Field(description="name of a line or plane, where it is at the pose that is displaced")
@@ -208,7 +208,7 @@ class Goal(Section):
         _ObjectImages(),
         description="pixels of objects when the goal was taught, by projservo teach",
     )
-    displaced: Along | None = Field(
+    displaced: DisplacedAlong | None = Field(
         None, description="displacement of this goal, such as a stand-off; alone, of the start"
     )
 
@@ -227,7 +227,7 @@ class Goal(Section):
             yield ("perturbation",), "belongs to a goal given by roll_deg"
 
 
-class _Approach(Along):
+class _Approach(DisplacedAlong):
     """A displacement of a named goal."""
 
     to: Name = Field(description="name of the goal that is displaced")
@@ -241,7 +241,9 @@ class TaskStep(Section):
 
     to: Name | None = Field(None, description="name of the goal to go to")
     approach: _Approach | None = Field(None, description="go to a goal displaced along a feature")
-    retreat: Along | None = Field(None, description="go back along a feature from where the arm stands")
+    retreat: DisplacedAlong | None = Field(
+        None, description="go back along a feature from where the arm stands"
+    )
     act: Annotated[dict[Name, Number], Field(min_length=1)] | None = Field(
         None, description="actions of the robot class by their names, such as {gripper: 0.3}"
     )
@@ -334,7 +336,7 @@ class TaskSettings(Section):
         goal = self.goals[step.goal] if step.goal is not None else self._retreat(name)
         if step.approach is not None:
             amount = step.approach.model_dump(exclude={"to"})
-            goal = goal.model_copy(update={"displaced": Along(**amount)})
+            goal = goal.model_copy(update={"displaced": DisplacedAlong(**amount)})
         start = {} if first else {"start": CURRENT, "start_offset": None}
         return self.model_copy(update={**start, "goal": goal, "goals": {}, "steps": ()})
 

@@ -36,6 +36,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.session import Session
 from projservo_cli.settings.task import Trajectory
+from projservo_cli.stages.carried_goals import carried_goal
 from projservo_cli.stages.motions import (
     Found,
     JointSearch,
@@ -47,7 +48,6 @@ from projservo_cli.stages.motions import (
     search_of,
     why_closed,
 )
-from projservo_cli.stages.objects import carried_goal
 from projservo_cli.stages.plan_summary import minimum_of, reason_of, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.stage_inputs import PlanInputs

@@ -32,7 +32,7 @@ from projservo_cli.report.report_data import (
 )
 from projservo_cli.simulation.workspace import plant_of
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.objects import in_metres
+from projservo_cli.stages.carried_goals import in_metres
 from projservo_cli.stages.stage_inputs import ReportInputs, Scenery
 from projservo_cli.stages.studies import (
     STEP_LIMIT_DEG,

@@ -51,10 +51,10 @@ from projservo_cli.simulation.streams import (
     generator,
 )
 from projservo_cli.simulation.workspace import Truth, plant_of, turned
-from projservo_cli.stages.stage_inputs import Carrier, PlanInputs, ServoInputs
+from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body
 from projservo_cli.task.incidences import Incidence
-from projservo_cli.task.stand_off import Displacement, displacement_back
+from projservo_cli.task.stand_off import StandOff, displacement_back
 from projservo_cli.task.target import TaskImages, is_stereo
 
 _GUESSED = 1e-3  # weight of a marker in a fit that is predicted from others
@@ -447,7 +447,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
     return replace(found, exact=exact._replace(least_views=found.least_views))
 
 
-def _carried_ends(ends: Ends, carrier: Carrier) -> Ends:
+def _carried_ends(ends: Ends, carrier: CarryingObject) -> Ends:
     """Return the true poses of the tool with the goal carried along by its object, if that is simulated."""
     if carrier.placed is None:
         return ends
@@ -473,7 +473,7 @@ def _positions(asked: Sequence[Incidence], numbers: Sequence[int]) -> tuple[Inci
     return tuple(found)
 
 
-def _positioned(asked: Displacement, numbers: Sequence[int]) -> Displacement:
+def _positioned(asked: StandOff, numbers: Sequence[int]) -> StandOff:
     """Displacement by positions in the body instead of numbers of markers.
 
     Raises InputError for a marker that the body lacks.

@@ -23,7 +23,7 @@ from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.workspace import SceneObject, Truth
 from projservo_cli.task.incidences import Incidence
-from projservo_cli.task.stand_off import Displacement
+from projservo_cli.task.stand_off import StandOff
 
 
 class OwnRobot(NamedTuple):
@@ -218,8 +218,10 @@ class PlanInputs:
     incidences: tuple[Incidence, ...] = ()
     # Width and height to which recorded images reach at least, px, where their size is not known.
     seen_px: ImageSize | None = None
-    carrier: "Carrier | None" = None  # object that the goal was taught on; None for a goal that stands still
-    displaced: Displacement | None = None  # of the goal, or of the start in its place
+    carrier: "CarryingObject | None" = (
+        None  # object that the goal was taught on; None for a goal that stands still
+    )
+    displaced: StandOff | None = None  # of the goal, or of the start in its place
     q_current: FloatArray | None = None  # (n,) joints where the arm stands, rad or m, once that is known
 
     def cameras_at(self, q: FloatArray) -> FloatArray | None:
@@ -266,7 +268,7 @@ class KnownLengths(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Carrier:
+class CarryingObject:
     """Object that a goal was taught on, and is carried by."""
 
     name: str

@@ -20,7 +20,7 @@ from projservo_cli.task.incidences import Flat, JointMetric, plane_through, poin
 _DOUBLINGS, _FIRST = 30, 1e-3
 
 
-class Displacement(NamedTuple):
+class StandOff(NamedTuple):
     """A displacement back along a line, or from a plane to the side that the first camera sees."""
 
     name: str  # of the feature, as messages write it
@@ -30,7 +30,7 @@ class Displacement(NamedTuple):
     of_start: bool = False  # whether it is that of the start instead of the goal
 
 
-def _direction_back(model: Model, body: Body, H: FloatArray, asked: Displacement) -> FloatArray:
+def _direction_back(model: Model, body: Body, H: FloatArray, asked: StandOff) -> FloatArray:
     """Direction (4,) back along the feature of the body at H (4, 4), of any length."""
     points = points_of(body.M, asked.along) @ H.T
     if np.linalg.matrix_rank(points / np.linalg.norm(points, axis=1)[:, None], 1e-6) < len(points):
@@ -43,7 +43,7 @@ def _direction_back(model: Model, body: Body, H: FloatArray, asked: Displacement
 
 
 def displacement_back(
-    model: Model, body: Body, H: FloatArray, asked: Displacement, shows: BoolArray, metre: float
+    model: Model, body: Body, H: FloatArray, asked: StandOff, shows: BoolArray, metre: float
 ) -> FloatArray:
     """Displacement (4, 4) that leads a body at H (4, 4) back along a feature of it, by a length or in images.
 

@@ -13,7 +13,7 @@ from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import ReportData
 from projservo_cli.robots.frame_recorder import FrameRecorder
 from projservo_cli.stages import studies
-from projservo_cli.stages.objects import in_metres
+from projservo_cli.stages.carried_goals import in_metres
 from tests.configured import record, truth_of
 from tests.fake_records import fake, seen_by
 from tests.known import configured, driven, known_scenario, planned

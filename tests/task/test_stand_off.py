@@ -7,7 +7,7 @@ from projservo_cli.geometry.kinematics import project
 from projservo_cli.monitoring.accuracy import metres_a_unit
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.task.body import make_body
-from projservo_cli.task.stand_off import Displacement, displacement_back
+from projservo_cli.task.stand_off import StandOff, displacement_back
 from tests.samples import frame, in_frame, poe
 from tests.task.test_incidences import deviating, random_arm
 
@@ -29,7 +29,7 @@ def test_a_displaced_goal_is_as_far_as_asked_for_in_any_frame(kind, amount):
         generator = np.random.default_rng(seed)
         model, M = random_arm(generator)
         q = model.q_reference + deviating(generator)
-        asked = Displacement("pin", ALONG[kind], **({"by_m": None, "by_px": None} | amount))
+        asked = StandOff("pin", ALONG[kind], **({"by_m": None, "by_px": None} | amount))
         frames = [np.eye(4), frame(seed), frame(seed + 99)]
         units = [_unit(model, M, q, G) for G in frames]
         each = [displaced(model, M, q, asked, G, u) for G, u in zip(frames, units, strict=True)]
@@ -64,9 +64,9 @@ def test_what_cannot_be_displaced_is_refused_in_one_line():
     model, M = random_arm(np.random.default_rng(0))
     q, line = model.q_reference, ALONG["line"]
     for asked, metre, error, words in (
-        (Displacement("pin", line, 0.05, None), np.nan, InputError, "by_m needs a known length .* by_px"),
-        (Displacement("pin", ((4,), (4,)), 0.05, None), 1.0, WorkFailed, "points of pin span no line"),
-        (Displacement("pin", line, None, 1e9), 1.0, WorkFailed, "no way along pin moves the images by"),
+        (StandOff("pin", line, 0.05, None), np.nan, InputError, "by_m needs a known length .* by_px"),
+        (StandOff("pin", ((4,), (4,)), 0.05, None), 1.0, WorkFailed, "points of pin span no line"),
+        (StandOff("pin", line, None, 1e9), 1.0, WorkFailed, "no way along pin moves the images by"),
     ):
         with pytest.raises(error, match=words) as refused:
             displaced(model, M, q, asked, np.eye(4), metre)

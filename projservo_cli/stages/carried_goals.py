@@ -17,7 +17,7 @@ from projservo_cli.simulation.faults import observed_in_frames
 from projservo_cli.simulation.streams import OBJECT_NOW, OBJECT_TAUGHT, generator
 from projservo_cli.stages.external_robot import plugin_robot
 from projservo_cli.stages.scenario import Scenario
-from projservo_cli.stages.stage_inputs import Carrier, KnownLengths, OwnRobot
+from projservo_cli.stages.stage_inputs import CarryingObject, KnownLengths, OwnRobot
 from projservo_cli.task.displaced_object import DisplacedObject
 from projservo_cli.task.look_bundle import Look
 
@@ -50,7 +50,7 @@ _FIELDS = (
 
 
 def carried_goal(
-    scenario: Scenario, carrier: Carrier, before: Plan | None = None, session: Session | None = None
+    scenario: Scenario, carrier: CarryingObject, before: Plan | None = None, session: Session | None = None
 ) -> tuple[Scenario, dict[str, Any]]:
     """Look at the object anew, and carry the goal along: the scenario with it, and the fields of its plan.
 
@@ -98,7 +98,7 @@ def carried_goal(
     return scenario.carried(fields["s_carried"]), fields
 
 
-def too_far(plan: Plan, carrier: Carrier | None) -> str:
+def too_far(plan: Plan, carrier: CarryingObject | None) -> str:
     """Return why somebody should look before a robot goes to a carried goal; empty if that is not needed."""
     if carrier is None:
         return ""
@@ -120,7 +120,7 @@ def _known(number: float) -> float | None:
     return None if math.isnan(number) else number
 
 
-def _taught(scenario: Scenario, carrier: Carrier) -> Look:
+def _taught(scenario: Scenario, carrier: CarryingObject) -> Look:
     """Images of the object when the goal was taught."""
     images = carrier.taught
     if images is None:
@@ -134,7 +134,7 @@ def _taught(scenario: Scenario, carrier: Carrier) -> Look:
     return Look(shown, sigma)
 
 
-def _seen(scenario: Scenario, carrier: Carrier, shared: Session | None) -> Look:
+def _seen(scenario: Scenario, carrier: CarryingObject, shared: Session | None) -> Look:
     """Images of the object by a robot where it stands; it is not moved."""
     driven, c = carrier.driven, scenario.calibration
     assert c is not None
@@ -157,7 +157,7 @@ def _seen(scenario: Scenario, carrier: Carrier, shared: Session | None) -> Look:
     return Look(mean.s[:, which], sigma[:, which])
 
 
-def _simulated(scenario: Scenario, carrier: Carrier, *, now: bool) -> Look:
+def _simulated(scenario: Scenario, carrier: CarryingObject, *, now: bool) -> Look:
     """Images of a simulated object: now, or when the goal was taught.
 
     The arm is at the start of the task meanwhile, or where the goal was taught.
