@@ -812,6 +812,9 @@ class CarriedByObject:
     object_marker: IntArray | None = _array(
         "object_marker", about="numbers of the markers of the object", default=None
     )
+    object_left_out: str | None = _scalar(
+        about="numbers of its markers that were off by themselves in a look, and left out of it", default=None
+    )
     s_object: FloatArray | None = _array(
         "view object_marker xy", "px", "images of these when it was planned, NaN if unseen", default=None
     )
@@ -845,6 +848,7 @@ class CarriedByObject:
         return (
             f"{self.object_name} has moved by {' and '.join(shift[:-1]) or shift[-1]} since the goal was "
             f"taught; the goal is known to {', '.join(known[:-1]) or known[-1]}"
+            + (f"; off by itself and left out: marker {self.object_left_out}" if self.object_left_out else "")
         )
 
 

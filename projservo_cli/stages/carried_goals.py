@@ -44,7 +44,8 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
 
 
 _FIELDS = (
-    *("object_name", "object_shift_mm", "object_angle_deg", "object_shift_px", "object_marker", "s_object"),
+    *("object_name", "object_shift_mm", "object_angle_deg", "object_shift_px", "object_marker"),
+    *("object_left_out", "s_object"),
     *("goal_deviation_mm", "goal_deviation_deg", "goal_deviation_px", "s_carried"),
 )
 
@@ -84,6 +85,7 @@ def carried_goal(
         "goal_deviation_deg": goal.rotation_deg if rigid else None,
         "goal_deviation_px": goal.rms_px,
         "object_marker": np.array(carrier.numbers, dtype=np.int64),
+        "object_left_out": ", ".join(map(str, found.left_out)) or None,
         "s_object": now.s,
         "s_carried": np.ascontiguousarray(goal.s[:, c.indices_of(scenario.numbers)]),
     }

@@ -44,6 +44,9 @@ _UNDECIDED = 13.8
 _MINIMA = 3
 # Times the stated noise, and chance, beyond which residuals are not those of the same rigid object.
 _NOISE, _BY_CHANCE = 2.0, 1e-3
+# Of so many markers seen in a look, one that is off by itself may be left out; times the noise up to which
+# the others then lie as they did.
+_SHARE, _WITHOUT = 8, 1.5
 # Cosine of the angle between the axis of a turn and a line of markers, above which it is about that line.
 _ALONG = 0.95
 
@@ -221,24 +224,54 @@ class _Search:
         )
 
 
-def _require_same_object(rig: LookRig, fit: BundleFit, marker: Sequence[int]) -> None:
-    """Refuse markers that do not lie as they did, beyond noise and errors of the calibration."""
+def _elsewhere(rig: LookRig, fit: BundleFit, most: float) -> tuple[float, int, int] | None:
+    """Residuals of markers that do not lie as they did, beyond ``most`` times noise and calibration.
+
+    Returns how many times the noise they are, with look and marker that are off most; None if they do.
+    """
     r, J = fit.linearized()
     dof = len(r) - J.shape[1]
     if dof < 1:
-        return
+        return None
     moved = fit.moved(rig, fit.X)
     left = moved - J @ np.linalg.lstsq(J, moved)[0]
     along = left.T @ r
     square = r @ r - along @ np.linalg.solve(np.eye(left.shape[1]) + left.T @ left, along)
-    if square > _NOISE**2 * chdtri(dof, _BY_CHANCE):
-        of = np.broadcast_to(np.arange(len(fit.X)), fit.bundle.weight.shape)[fit.bundle.weight > 0.0]
-        worst = marker[int(np.argmax(np.bincount(of, (r.reshape(-1, 2) ** 2).sum(axis=1))))]
-        raise WorkFailed(
-            f"objects: markers do not lie on the object as they did: residuals {np.sqrt(square / dof):.3g} "
-            f"times the noise ({_NOISE:g} at most), most at marker {worst}: it has come off or slipped, the "
-            "object is another one, or it moved while images were taken"
-        )
+    if square <= most**2 * chdtri(dof, _BY_CHANCE):
+        return None
+    off = np.zeros(fit.bundle.weight.shape)
+    off[fit.bundle.weight > 0.0] = (r.reshape(-1, 2) ** 2).sum(axis=1)
+    look, k = np.unravel_index(int(np.argmax(off.sum(axis=1))), off.sum(axis=1).shape)
+    return float(np.sqrt(square / dof)), int(look), int(k)
+
+
+def _of_one_object(
+    rig: LookRig, marker: Sequence[int], looks: Sequence[Look]
+) -> tuple[BundleFit, BoolArray, tuple[int, ...]]:
+    """The object as found in looks, its markers (k,) that are known, and numbers of those that were left out.
+
+    A marker that is off by itself in one look, as a finder errs at a covered edge, is left out of that look,
+    one of ``_SHARE`` seen at most. Raises WorkFailed where more are off: that is another object.
+    """
+    looks, left_out = list(looks), list[int]()
+    while True:
+        fit, found_in, known = _Search(rig, marker, looks).found()
+        most = _WITHOUT if left_out else _NOISE
+        off = _elsewhere(rig, fit, most)
+        if off is None:
+            return fit, known, tuple(left_out)
+        times, look, k = off[0], found_in[off[1]], int(np.flatnonzero(known)[off[2]])
+        seen = np.isfinite(looks[look].s).all(axis=-1).any(axis=0)
+        if (1 + len(left_out)) * _SHARE > seen.sum():
+            raise WorkFailed(
+                f"objects: markers do not lie on the object as they did: residuals {times:.3g} times the "
+                f"noise ({most:g} at most), most at marker {marker[k]}: it has come off or slipped, the "
+                "object is another one, or it moved while images were taken"
+            )
+        left_out.append(int(marker[k]))
+        s = looks[look].s.copy()
+        s[:, k] = np.nan
+        looks[look] = looks[look]._replace(s=s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,6 +319,7 @@ class DisplacedObject:
     angle_deg: float  # turn; NaN if the joints do not determine the metric
     noise_factor: float  # residuals over their deviation, rms per degree of freedom
     unit_mm: float  # mm in a unit of the frame that it was found in; NaN without a known length
+    left_out: tuple[int, ...]  # numbers of markers that were off by themselves in a look, and left out of it
     _rig: LookRig
     _fit: BundleFit
 
@@ -317,9 +351,8 @@ class DisplacedObject:
         if not c.has_covariance or not c.sqrt_cov_shared.size:
             raise InputError(f"objects: the method {c.method} has no covariance: use bundle_adjustment")
         rig = LookRig.of(c)
-        fit, _, known = _Search(rig, marker, looks).found()
+        fit, known, left_out = _of_one_object(rig, marker, looks)
         numbers = tuple(np.asarray(marker)[known].tolist())
-        _require_same_object(rig, fit, numbers)
         T, back = fit.T[-1] @ np.linalg.inv(fit.T[0]), np.linalg.inv(rig.G)
         taught, now = fit.X @ fit.T[0].T, fit.X @ fit.T[-1].T
         shift = rig.pixels(now)[0] - rig.pixels(taught)[0]
@@ -334,6 +367,7 @@ class DisplacedObject:
             angle_deg=float(np.degrees(Rotation.from_matrix(T[:3, :3]).magnitude())) if rig.rigid else np.nan,
             noise_factor=float(np.sqrt(fit.cost / max(len(r) - J.shape[1], 1))),
             unit_mm=float(unit),
+            left_out=left_out,
             _rig=rig,
             _fit=fit,
         )

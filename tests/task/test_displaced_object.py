@@ -183,11 +183,20 @@ def test_what_is_not_seen_is_named(X, unseen, said, arm):
         DisplacedObject.of(calibrated(arm, frame(1)), NUMBERS, [taught, hidden(now, *unseen)])
 
 
+def test_a_marker_that_is_off_by_itself_is_left_out_of_its_look(arm):
+    c, (taught, now) = calibrated(arm, frame(1)), looks(arm, MOVED)
+    off = Look(now.s + np.where(np.arange(8) == 3, 20.0, 0.0)[:, None], now.sigma)
+    found = DisplacedObject.of(c, NUMBERS, [taught, off])
+    gone = DisplacedObject.of(c, NUMBERS, [taught, hidden(now, E[:, 3])])
+    assert (found.left_out, gone.left_out) == ((43,), ())
+    np.testing.assert_allclose(found.D, gone.D, rtol=0.0, atol=1e-12)
+
+
 def test_what_is_no_displaced_object_is_named(arm):
     c, (taught, now) = calibrated(arm, frame(1)), looks(arm, MOVED)
     with pytest.raises(WorkFailed, match=r"do not lie on the object as they did.*most at marker 4[0-7]"):
         DisplacedObject.of(
-            c, NUMBERS, [taught, Look(now.s + np.where(np.arange(8) == 3, 20.0, 0.0)[:, None])]
+            c, NUMBERS, [taught, Look(now.s + np.where(np.arange(8) >= 5, 40.0, 0.0)[:, None])]
         )
     few = [
         Look(np.where(np.arange(8)[:, None] < 6 + (np.arange(2) > 0)[:, None, None], look.s, math.nan))
