@@ -225,7 +225,7 @@ def test_angles_need_axes_that_are_not_parallel():
     model, M = random_arm(np.random.default_rng(2))
     slides = model._replace(H_hat_0=np.array([*map(prismatic, np.eye(3))]), prismatic=np.ones(3, bool))
     asked = [Incidence("pin upright", LINE, WALL, PERPENDICULAR)]
-    with pytest.raises(InputError, match="pin upright: angles need the metric form"):
+    with pytest.raises(InputError, match="pin upright needs the metric form"):
         incidences_of(slides, make_body(model, M), np.eye(4), asked)
 
 
