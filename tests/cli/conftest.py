@@ -105,7 +105,7 @@ def pretend(patch, folder):
     """Pretended stages, in a folder with a configuration and a table."""
     pretended = Stages()
     patch.setattr(calibrate, "run", lambda *given, **named: pretended.calibrate(*given, **named))
-    patch.setattr(plan, "run", lambda *given: pretended.plan(*given))
+    patch.setattr(plan, "run", lambda *given, **brought: pretended.plan(*given))
     patch.setattr(servo, "run", lambda *given, **brought: pretended.servo(*given))
     patch.setattr(report, "run", lambda *given, **named: pretended.report(*given, **named))
     patch.setattr(steps, "_missing", lambda run: pretended.gone)

@@ -55,7 +55,8 @@ def test_show_tells_what_a_run_holds(projservo, reported, tmp_path):
     assert "gain_t: 2.5" in projservo("show", "results/paper", "-v").out
 
 
-CONSEQUENCES = {"21", "22"}  # statements on what the laws integrate to; no function computes them by itself
+# Statements on what the laws integrate to, and a section of one symbol: no function computes them by itself.
+CONSEQUENCES = {"21", "22", "§2"}
 
 
 @pytest.mark.parametrize("entry", REGISTER, ids=lambda entry: entry.number)

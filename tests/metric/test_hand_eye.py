@@ -42,7 +42,7 @@ def test_exact_cameras_see_the_scene_from_a_flange_of_any_arm(types, views, fram
     seen = arm.images(q)
     expected = (np.linalg.inv(m.pose(q)) @ points.T).swapaxes(1, 2)[..., :3]
     np.testing.assert_allclose(m.project(expected), seen, atol=1e-6)
-    behind = 2.0 * np.linalg.inv(m.camera_poses[0])[2, :3] if views == 1 else None
+    behind = 2.0 * np.linalg.inv(m.poses[0])[2, :3] if views == 1 else None
     assert behind is None or np.isnan(m.project(-100.0 * behind[None])).all()
     seen[0, 0, 2] = np.nan
     if views == 1:
