@@ -73,7 +73,14 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
         verdict = verdict_at(
             log,
             k,
-            Instant(in_front=in_front, left=left, distance=distance, status=status, q_dot=state.q_dot),
+            Instant(
+                in_front=in_front,
+                left=left,
+                distance=distance,
+                status=status,
+                q_dot=state.q_dot,
+                noise_ratio=1.0,
+            ),
             limits,
         )
         if verdict == WAITING:

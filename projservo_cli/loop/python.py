@@ -293,7 +293,6 @@ def _instant(
     log.read[k] = plant.joints()
     log.q[k], log.H[k] = plant.q, plant.H
     log.s[k] = plant.observe()
-    log.noise_ratio[k] = plant.noise_ratio
     log.hidden[k] = plant.hidden
     distance = plant.distance()
     left = note(log, k, s_star, plant.plant, monitors.limits)
@@ -308,9 +307,8 @@ def _instant(
         log.errors[k], log.fit[k] = law.errors, _optional(law, "fit")
         face_px = float(_optional(law, "face_px")[0])
         log.judged[k] = face_px if math.isfinite(face_px) else log.judged[k]
-    return monitors.of_instant(
-        log, k, Instant(in_front=plant.in_front, left=left, distance=distance, status=status, q_dot=q_dot)
-    ), q_dot
+    now = Instant(plant.in_front, left, distance, status, q_dot, plant.noise_ratio)
+    return monitors.of_instant(log, k, now), q_dot
 
 
 def _send(

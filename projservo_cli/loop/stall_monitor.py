@@ -83,7 +83,7 @@ class StallMonitor:
         ends = verdict not in (RUNNING, WAITING, CONVERGED)
         if ends or k == self._limits.max_steps or math.isnan(error):
             return verdict
-        within = tolerance(self._limits, log, k)
+        within = tolerance(self._limits, float(log.fit[k, 2]), self._robot.noise_ratio)
         if now - self._since >= self._window and error <= _NEAR * within:
             q_dot *= self._window / (now - self._since)
         verdict = self._arrived(verdict, error, within)

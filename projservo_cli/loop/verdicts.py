@@ -87,7 +87,6 @@ class Log(NamedTuple):
     path: FloatArray  # (k, parts + 1, n) joints at the ends of the parts of each step
     parts: IntArray  # (k,) parts each step was sent in; 0 where the joints went straight to the end
     fit: FloatArray  # (k, 3) what measuring with the body left, as in the state of the law
-    noise_ratio: FloatArray  # (k,) of what pixels state to the noise of the run; at least 1
     # (3,) first instant outside an image, first beyond a joint limit, and the joint that passed one or
     # stopped the run at its own; −1 for never
     events: FloatArray
@@ -115,7 +114,6 @@ def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0, views: 
         path=np.zeros((rows, parts + 1, n)),
         parts=np.zeros(rows, dtype=np.int64),
         fit=np.full((rows, 3), np.nan),
-        noise_ratio=np.ones(rows),
         events=np.full(3, -1.0),
         begun=np.zeros(3),
         M=np.zeros((m, 4)),
@@ -178,6 +176,7 @@ class Instant(NamedTuple):
     distance: float  # of the face from the rig, m
     status: int  # of the law
     q_dot: FloatArray  # (n,) the command, rad/s or m/s
+    noise_ratio: float = 1.0  # of what pixels state to the noise of the run; at least 1
 
 
 @merged
@@ -207,7 +206,7 @@ def _first_cause(log: Log, k: int, now: Instant, limits: Limits) -> int:
         return OUT_OF_VIEW
     if now.status == LOST:
         return MARKERS_LOST
-    if error <= tolerance(limits, log, k):
+    if error <= tolerance(limits, log.fit[k, 2], now.noise_ratio):
         return CONVERGED
     grown = error > limits.diverged_factor * log.begun[1]
     receded = now.distance > limits.diverged_factor * log.begun[0]
@@ -219,15 +218,15 @@ def _first_cause(log: Log, k: int, now: Instant, limits: Limits) -> int:
 
 
 @merged
-def tolerance(limits: Limits, log: Log, k: int) -> float:
-    """Image error that counts as converged at an instant, px rms per marker and view.
+def tolerance(limits: Limits, views: float, noise_ratio: float) -> float:
+    """Image error that counts as converged, px rms per marker and view.
 
     A body fitted by six coordinates to so many markers, counted once a view, keeps √(6 / (2 views)) of
-    the noise of their pixels; all of it stays where the face is measured point by point.
+    the noise of their pixels; all of it stays where the face is measured point by point, for NaN.
+    noise_ratio : of what pixels state to the noise of the run.
     """
-    views = log.fit[k, 2]
     fitted = max(0.0, 1.0 - math.sqrt(3.0 / views)) if views > 0.0 else 0.0
-    more = (log.noise_ratio[k] - 1.0) * (1.0 - fitted)
+    more = (noise_ratio - 1.0) * (1.0 - fitted)
     return float(limits.image_error_px - limits.noise_px * (fitted - more))
 
 

@@ -101,6 +101,7 @@ class LawRun:
     replannings: tuple[str, ...] = ()  # time and reason of each replanning
     driven: DrivenRobot | None = None  # client of a robot of the contract
     unseen: str = ""  # which cameras showed nothing before the run, though they were to be compared
+    noise_ratio: float = 1.0  # of what pixels stated at the end to the noise of the run; at least 1
     own_tolerance: float | None = None  # of an error that a law of somebody's states
 
     @property
@@ -233,6 +234,7 @@ class LawRun:
             stall=stall,
             execution=execution,
         )
+        self.noise_ratio = plant.noise_ratio
         if isinstance(law, PluginLaw) and law.states_error:
             self.own_tolerance = law.tolerance
         if isinstance(plant, DrivenRobot):
@@ -562,7 +564,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
     """Return the reason of the verdict, one sentence."""
     log, steps, limits, judged = run.log, run.steps, run.scenario.termination, run.judged
     error, first = (f"{run.own_unit * float(log.judged[k]):.3g}{judged.unit}" for k in (steps, 0))
-    within = f"{run.own_unit * tolerance(limits, log, steps):.3g}{judged.unit}"
+    within = f"{run.own_unit * tolerance(limits, float(log.fit[steps, 2]), run.noise_ratio):.3g}{judged.unit}"
     share, turn = remaining
     left = [
         *([] if share is None else [f"{share:.1%} of the translation"]),
@@ -603,8 +605,8 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
 
 def _vague(run: LawRun) -> str:
     """Say that markers are seen there with more noise than elsewhere; empty if they are not."""
-    more = float(run.log.noise_ratio[run.steps])
-    return f"; markers there state {more:.2g} times the noise: look what covers them" if more > _VAGUE else ""
+    more, look = run.noise_ratio, "look what covers them"
+    return f"; markers there state {more:.2g} times the noise: {look}" if more > _VAGUE else ""
 
 
 def _apart(run: LawRun) -> str:
@@ -612,8 +614,8 @@ def _apart(run: LawRun) -> str:
     displaced = run.scenario.inputs.displaced  # to where it was never seen
     if run.scenario.exact.incidences or displaced:  # the face may be anywhere that they leave open
         return ""
-    limits, noise = run.scenario.termination, float(run.log.noise_ratio[run.steps])
-    by_noise = limits.image_error_px + (noise - 1.0) * limits.noise_px
+    limits = run.scenario.termination
+    by_noise = limits.image_error_px + (run.noise_ratio - 1.0) * limits.noise_px
     seen, most = float(run.log.error[run.steps]), _BY_NOISE * by_noise
     text = f"; the face itself is seen {seen:.3g} px off ({most:.3g} px by noise): it moved on the tool"
     return f"{text} since the goal was taught: teach it again" if seen > most else ""
