@@ -278,9 +278,10 @@ def servo_inputs(config: Config, files: Files | None = None) -> ServoInputs:
 
 def _carrier(config: Config, files: Files | None) -> CarryingObject | None:
     """Return the object that the goal is carried by; None for a goal that stands still."""
-    name, rendered = name_of_carrier(config.task, config.features), config.plant.rendered is not None
+    name = None if config.task is None else name_of_carrier(config.task.goal, config.features)
     if name is None or config.task is None:
         return None
+    rendered = config.plant.rendered is not None
     simulated = config.plant.simulated
     return CarryingObject(
         name=name,

@@ -3,7 +3,7 @@
 import inspect
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Self, cast
 
 import numpy as np
@@ -21,7 +21,7 @@ from projservo_cli.settings.markers import Markers
 from projservo_cli.settings.objects import WORLD_AND_TOOL, Objects
 from projservo_cli.settings.robot import Rig, RobotSettings, like_degrees
 from projservo_cli.settings.sections import Finding, JointVector, Root, Whole
-from projservo_cli.settings.task import GoalImages, TaskSettings, TaskStep, Trajectory, sigma_key
+from projservo_cli.settings.task import Goal, GoalImages, TaskSettings, TaskStep, Trajectory, sigma_key
 from projservo_cli.settings.trials import CalibrationSettings, Data, Noise
 
 
@@ -174,13 +174,13 @@ def _objects(
             yield ("objects", name), "is nowhere: give size_m and pose of its tags, or positions_m"
 
 
-def name_of_carrier(task: TaskSettings | None, features: Mapping[str, Feature]) -> str | None:
+def name_of_carrier(goal: Goal, features: Mapping[str, Feature]) -> str | None:
     """Name of the object that a goal was taught on; None for a goal that stands still, or is a retreat."""
-    if task is None or task.goal.of_start:
+    if goal.of_start:
         return None
-    if task.goal.on is not None:
-        return task.goal.on
-    on = {features[pair[1]].on for pair in task.goal.incidences if pair[1] in features}
+    if goal.on is not None:
+        return goal.on
+    on = {features[pair[1]].on for pair in goal.incidences if pair[1] in features}
     return next(iter(sorted(on - {*WORLD_AND_TOOL})), None)
 
 
@@ -192,25 +192,36 @@ def _carried(
     for name, feature in features.items():
         if feature.on not in (*WORLD_AND_TOOL, *objects.named):
             yield ("features", name, "on"), f"there is no object {feature.on}; {known}"
-    carrier = name_of_carrier(task, features)
-    if task is None or carrier is None:
-        return
-    if carrier not in objects.named:
-        if task.goal.on is not None:
-            yield ("task", "goal", "on"), f"there is no object {carrier}; {known}"
-        return
-    for i, pair in enumerate(task.goal.incidences):
+    for path, goal in ({} if task is None else task.each_goal).items():
+        carrier = name_of_carrier(goal, features)
+        if carrier is not None and carrier in objects.named:
+            numbers = objects.named[carrier].numbers
+            yield from _carried_by(carrier, numbers, ("task", *path), goal, features, plant)
+        elif goal.on is not None:
+            yield ("task", *path, "on"), f"there is no object {carrier}; {known}"
+
+
+def _carried_by(
+    carrier: str,
+    numbers: Sequence[int],
+    path: tuple[str, ...],
+    goal: Goal,
+    features: Mapping[str, Feature],
+    plant: PlantSettings,
+) -> Iterator[Finding]:
+    """Features that the object of a goal at a path does not carry, and images that do not show it."""
+    for i, pair in enumerate(goal.incidences):
         if pair[1] in features and (on := features[pair[1]].on) != carrier:
             yield (
-                ("task", "goal", "incidences", i),
+                (*path, "incidences", i),
                 f"{pair[1]} is on {on}, and the goal on {carrier}, which carries all of it: put {pair[1]} on "
                 f"{carrier}",
             )
-    shown = task.goal.objects.of(carrier)
-    if shown is None and (task.goal.images is not None or not plant.simulated):
-        yield ("task", "goal"), f"does not show where {carrier} was: teach it again, projservo teach"
-    elif shown is not None and {*(shown.markers or ())} - {*objects.named[carrier].numbers}:
-        yield ("task", "goal", "objects", carrier), f"has markers that are not of {carrier}: teach it again"
+    shown = goal.objects.of(carrier)
+    if shown is None and (goal.images is not None or not plant.simulated):
+        yield path, f"does not show where {carrier} was: teach it again, projservo teach"
+    elif shown is not None and {*(shown.markers or ())} - {*numbers}:
+        yield (*path, "objects", carrier), f"has markers that are not of {carrier}: teach it again"
 
 
 def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator[Finding]:

@@ -137,6 +137,7 @@ INCONSISTENT = [
     ("features={pin: {on: tool, line: [0, 1]}, hole: {on: block, line: pin}}", "features.hole.on",
      "there is no object block; objects: none"),
     ("task.goal.on=block", "task.goal.on", "there is no object block; objects: none"),
+    ("task.goals={grip: {roll_deg: 1.0, on: block}}", "task.goals.grip.on", "there is no object block"),
     ("objects.block={tags: [10]}", "objects.block", "is nowhere: give size_m and pose of its tags"),
     ("objects.block={tags: [10, {number: 11}]}", "objects.block.tags", "numbers of tags, or {number, size_m"),
     (f"objects.block={{markers: [0, 40, 41], {AT}}}", "objects.block", "marker 0 is on the tool"),
