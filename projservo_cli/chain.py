@@ -38,7 +38,6 @@ from projservo_cli.steps import (
     Step,
     inputs_of,
     key_of_calibration,
-    parts_of,
     result_of,
     steps_for,
 )
@@ -210,6 +209,11 @@ class Chain:
 
             plan = self.run.results[step.name].records[""]
             self.listener.say(plan.object_words)
+            if plan.object_shift_mm is None:
+                self.listener.say(
+                    "objects.max_displacement_m is not compared, since no length on the tool is known: set "
+                    "markers.positions_m, markers.tag_size_m or markers.board.size_m"
+                )
             if (why := too_far(plan, carrier)) and not self.confirm:
                 self._fail(motion, why)
                 return False
@@ -443,9 +447,13 @@ class Chain:
     def _opened(self, inputs: ServoInputs) -> FloatArray:
         """Open the robot of somebody's, unless it is, and return where it stands (n,), rad or m."""
         from projservo_cli.stages.external_robot import opened_robot
+        from projservo_cli.stages.scenario import observed_numbers
 
+        c = self.run.calibration
         assert self.session is not None
-        opened_robot(self.session, inputs, self.run.calibration)
+        assert inputs.contract is not None
+        joints = inputs.plan.joints.joints(c.joint_types, c)
+        opened_robot(self.session, inputs.contract.driven, joints, observed_numbers(inputs.plan, c), c.view)
         actions = {name for step in self.config.steps.values() for name in step.act or ()}
         self.session.require_acts(actions)
         return self.session.reading()
@@ -455,7 +463,7 @@ class Chain:
         task = self.config.task
         if task is None:
             return None
-        before = [one for one in parts_of("plan", self.config.steps) if one]
+        before = self._motions
         k = before.index(step.part) if step.part else 0
         if k == 0:
             return None if task.start_joints is not None else self._standing()
@@ -466,6 +474,11 @@ class Chain:
             )
         end: FloatArray = plan.q[-1]
         return end
+
+    @property
+    def _motions(self) -> list[str]:
+        """Names of the steps of a sequence that move the arm."""
+        return [name for name, step in self.config.steps.items() if step.moves]
 
     def _standing(self) -> FloatArray:
         """Joints (n,) where the arm stands before anything moves it, rad or m."""
@@ -481,7 +494,7 @@ class Chain:
         """Return the inputs of a step from where the arm stands, and a plan from there, which is kept."""
         from projservo_cli.stages import plan as planning
 
-        motions = [name for name in parts_of("plan", self.config.steps) if name]
+        motions = self._motions
         k, q = motions.index(step.part), plan.q_start
         if k and self.session is not None and self.session.robot is not None:
             q = self.session.reading()

@@ -151,15 +151,18 @@ class ErrorModel:
 
     def noise(self, seen: BoolArray, stated: FloatArray | None) -> FloatArray:
         """Standard deviation (V, m) of pixels, px: those stated, as the calibration found them, if any."""
-        common = np.broadcast_to(np.maximum(self._sigma * self._of_views, self._least), seen.shape)
+        common = self._common(seen.shape)
         if stated is None:
             return common.copy()
         return np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), common)
 
     def raised(self, stated: FloatArray) -> FloatArray:
         """Return deviations (V, m) as stated, px, raised to those that hold where none are stated."""
-        common = np.broadcast_to(np.maximum(self._sigma * self._of_views, self._least), stated.shape)
-        return np.fmax(stated, common / self._stated)
+        return np.fmax(stated, self._common(stated.shape) / self._stated)
+
+    def _common(self, shape: tuple[int, ...]) -> FloatArray:
+        """Deviations (V, m) of pixels that hold where none are stated, px."""
+        return np.broadcast_to(np.maximum(self._sigma * self._of_views, self._least), shape)
 
     def residual(self, pair: FramePair) -> Residual:
         """Residuals of an observation and their derivatives, each view at its own joints."""

@@ -33,10 +33,11 @@ def at_rest(
 
 def seen_at_rest(
     robot: PluginRobot, observe: Callable[[], Reading], frames: int, settle_s: float, what: str
-) -> tuple[Reading, FloatArray, IntArray]:
+) -> tuple[Reading, Reading, FloatArray, IntArray]:
     """Wait until a robot and its images stand still, and average frames of each view, objects included.
 
-    Returns the mean, deviations (V, m) of a coordinate of it, px, NaN if unknown, and counts (V, m).
+    Returns the first reading at rest, the mean, deviations (V, m) of a coordinate of it, px, NaN if unknown,
+    and counts (V, m).
     """
     first, reading = robot.read(), observe()
     if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
@@ -44,7 +45,7 @@ def seen_at_rest(
     mean, squares, count = averaged(reading, observe, frames)
     sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
     sigma = sigma if mean.sigma_px is None else mean.sigma_px
-    return mean, np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan), count
+    return reading, mean, np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan), count
 
 
 def averaged(

@@ -3,21 +3,22 @@
 import math
 import time
 from contextlib import nullcontext
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
 from projservo_cli.metric.frame import Metric, Scale
-from projservo_cli.records import Calibration, InputError, Plan, WorkFailed
+from projservo_cli.records import Calibration, CarriedByObject, InputError, Plan, WorkFailed
 from projservo_cli.results import ImageModel
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.session import Session
 from projservo_cli.robots.standstill import seen_at_rest
 from projservo_cli.simulation.faults import observed_in_frames
 from projservo_cli.simulation.streams import OBJECT_NOW, OBJECT_TAUGHT, generator
-from projservo_cli.stages.external_robot import plugin_robot
+from projservo_cli.stages.external_robot import opened_robot
 from projservo_cli.stages.scenario import Scenario
-from projservo_cli.stages.stage_inputs import CarryingObject, KnownLengths, OwnRobot
+from projservo_cli.stages.stage_inputs import CarryingObject, KnownLengths
 from projservo_cli.task.displaced_object import DisplacedObject
 from projservo_cli.task.look_bundle import Look
 
@@ -43,13 +44,6 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
         return None, str(error)
 
 
-_FIELDS = (
-    *("object_name", "object_shift_mm", "object_angle_deg", "object_shift_px", "object_marker"),
-    *("object_left_out", "s_object"),
-    *("goal_deviation_mm", "goal_deviation_deg", "goal_deviation_px", "s_carried"),
-)
-
-
 def carried_goal(
     scenario: Scenario, carrier: CarryingObject, before: Plan | None = None, session: Session | None = None
 ) -> tuple[Scenario, dict[str, Any]]:
@@ -60,7 +54,8 @@ def carried_goal(
     Raises WorkFailed where images do not show the object or the goal well enough.
     """
     if before is not None and before.s_carried is not None:
-        return scenario.carried(before.s_carried), {name: getattr(before, name) for name in _FIELDS}
+        known = {one.name: getattr(before, one.name) for one in fields(CarriedByObject)}
+        return scenario.carried(before.s_carried), known
     c = scenario.calibration
     assert c is not None
     metric, _ = in_metres(c, carrier.lengths)
@@ -76,7 +71,7 @@ def carried_goal(
     except WorkFailed as error:
         raise WorkFailed(str(error).replace("objects:", f"objects.{carrier.name}:", 1)) from error
     rigid, limits = found.coordinates == 6, carrier.limits
-    fields: dict[str, Any] = {
+    found_now: dict[str, Any] = {
         "object_name": carrier.name,
         "object_shift_mm": _known(found.shift_mm),
         "object_angle_deg": _known(found.angle_deg),
@@ -90,14 +85,14 @@ def carried_goal(
         "s_carried": np.ascontiguousarray(goal.s[:, c.indices_of(scenario.numbers)]),
     }
     for unit in ("mm", "px"):
-        key, at = f"max_goal_deviation_{unit}", fields[f"goal_deviation_{unit}"]
+        key, at = f"max_goal_deviation_{unit}", found_now[f"goal_deviation_{unit}"]
         if at is not None and at > (most := getattr(limits, key)):
             raise WorkFailed(
                 f"objects.{carrier.name}: the carried goal is known to {at:.2g} {unit} only ({most:g} at "
                 f"most): show more of its markers, nearer to the goal and to the cameras, average more "
                 f"frames, or raise objects.{key}"
             )
-    return scenario.carried(fields["s_carried"]), fields
+    return scenario.carried(found_now["s_carried"]), found_now
 
 
 def too_far(plan: Plan, carrier: CarryingObject | None) -> str:
@@ -141,20 +136,15 @@ def _seen(scenario: Scenario, carrier: CarryingObject, shared: Session | None) -
     driven, c = carrier.driven, scenario.calibration
     assert c is not None
     assert driven is not None
-    assert isinstance(driven.robot, OwnRobot)
-    bounds, types = driven.following.bounds(scenario.joints), scenario.joints.types
-    numbers, further = scenario.observed, driven.further
+    numbers = scenario.observed
     with nullcontext(shared) if shared else Session() as session:
-        steered = session.steered or session.opened(
-            plugin_robot(driven.robot, bounds, types, numbers, view=c.view, further=further)
-        )
-        robot = steered.robot
+        robot = opened_robot(session, driven, scenario.joints, numbers, c.view).robot
 
         def observe() -> Reading:
-            time.sleep(bounds.period)
+            time.sleep(robot.bounds.period)
             return robot.read().whole
 
-        mean, sigma, _ = seen_at_rest(robot, observe, carrier.frames, carrier.settle_s, "plan")
+        _, mean, sigma, _ = seen_at_rest(robot, observe, carrier.frames, carrier.settle_s, "plan")
     which = [len(numbers) + driven.further.index(number) for number in carrier.numbers]
     return Look(mean.s[:, which], sigma[:, which])
 

@@ -34,8 +34,8 @@ from projservo_cli.simulation.faults import (
     robot_of,
 )
 from projservo_cli.simulation.streams import SERVO_NOISE
-from projservo_cli.stages.scenario import RunScenario, observed_numbers
-from projservo_cli.stages.stage_inputs import Contract, Drive, OwnRobot, ServoInputs
+from projservo_cli.stages.scenario import RunScenario
+from projservo_cli.stages.stage_inputs import Contract, Drive, OwnRobot
 
 _NEVER_LATE_S = 3600.0  # for a simulated robot, whose code may be compiled first
 # Minimum deviation of a delay and of single frames, s; width of a 95 % interval in deviations.
@@ -224,21 +224,24 @@ def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -
 
 
 def opened_robot(
-    session: Session, inputs: ServoInputs, calibration: Calibration, given: Robot | None = None
+    session: Session,
+    driven: Drive,
+    joints: Joints,
+    observed: Sequence[int],
+    view: Sequence[str],
+    given: Robot | None = None,
 ) -> Steered:
     """Open a robot of somebody's in a session, unless it is; nothing is moved.
 
+    observed : numbers of the markers of the tool; view : names of the views of the calibration.
     given : an object of the contract instead of one of a class.
     """
     if session.steered is not None:
         session.steered.resume()
         return session.steered
-    contract, joints = inputs.contract, inputs.plan.joints.joints(calibration.joint_types, calibration)
-    assert contract is not None
-    assert isinstance(contract.driven.robot, OwnRobot)
-    bounds, observed = contract.driven.following.bounds(joints), observed_numbers(inputs.plan, calibration)
-    own, view, further = contract.driven.robot, calibration.view, contract.driven.further
-    return session.opened(plugin_robot(own, bounds, joints.types, observed, given, view, further))
+    assert isinstance(driven.robot, OwnRobot)
+    bounds, types = driven.following.bounds(joints), joints.types
+    return session.opened(plugin_robot(driven.robot, bounds, types, observed, given, view, driven.further))
 
 
 def connected_robot(
@@ -260,7 +263,8 @@ def connected_robot(
     driven = contract.driven
     if isinstance(driven.robot, OwnRobot):
         plant = _believed_plant(scenario, calibration)
-        steered = opened_robot(session, scenario.servo, calibration, given)
+        known = scenario.joints, scenario.observed, calibration.view
+        steered = opened_robot(session, driven, *known, given)
     else:
         plant = scenario.plant_of(law)
         steered = session.steered or session.opened(

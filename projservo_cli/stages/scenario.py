@@ -53,7 +53,7 @@ from projservo_cli.simulation.streams import (
 from projservo_cli.simulation.workspace import Truth, plant_of, turned
 from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
 from projservo_cli.task.body import NO_BODY, Body, make_body
-from projservo_cli.task.incidences import Incidence
+from projservo_cli.task.incidences import Flat, Incidence
 from projservo_cli.task.stand_off import StandOff, displacement_back
 from projservo_cli.task.target import TaskImages, is_stereo
 
@@ -456,35 +456,31 @@ def _carried_ends(ends: Ends, carrier: CarryingObject) -> Ends:
 
 
 def _positions(asked: Sequence[Incidence], numbers: Sequence[int]) -> tuple[Incidence, ...]:
-    """Incidences by positions in the body instead of numbers of markers.
-
-    Raises InputError for a marker that the body lacks.
-    """
-    found = list[Incidence]()
-    for one in asked:
-        for number in chain.from_iterable((*one.tool, *one.scene)):
-            if number not in numbers:
-                raise InputError(
-                    f"task.goal.incidences: {one.name} needs marker {number}, and the body has "
-                    f"{', '.join(map(str, numbers))}: name these, or calibrate with it"
-                )
-        flats = [tuple(tuple(map(numbers.index, point)) for point in flat) for flat in (one.tool, one.scene)]
-        found.append(one._replace(tool=flats[0], scene=flats[1]))
-    return tuple(found)
+    """Incidences by positions in the body instead of numbers of markers; raises as ``_in_body``."""
+    names = [f"task.goal.incidences: {one.name}" for one in asked]
+    return tuple(
+        one._replace(tool=_in_body(one.tool, numbers, name), scene=_in_body(one.scene, numbers, name))
+        for one, name in zip(asked, names, strict=True)
+    )
 
 
 def _positioned(asked: StandOff, numbers: Sequence[int]) -> StandOff:
-    """Displacement by positions in the body instead of numbers of markers.
+    """Displacement by positions in the body instead of numbers of markers; raises as ``_in_body``."""
+    return asked._replace(along=_in_body(asked.along, numbers, f"displaced: {asked.name}"))
 
-    Raises InputError for a marker that the body lacks.
+
+def _in_body(points: Flat, numbers: Sequence[int], name: str) -> Flat:
+    """Points that span a feature, by positions in the body instead of numbers of markers.
+
+    name : of what they are for, as a message begins. Raises InputError for a marker that the body lacks.
     """
-    for number in chain.from_iterable(asked.along):
+    for number in chain.from_iterable(points):
         if number not in numbers:
             raise InputError(
-                f"displaced: {asked.name} needs marker {number}, and the body has "
-                f"{', '.join(map(str, numbers))}: name these, or calibrate with it"
+                f"{name} needs marker {number}, and the body has {', '.join(map(str, numbers))}: name these, "
+                "or calibrate with it"
             )
-    return asked._replace(along=tuple(tuple(map(numbers.index, point)) for point in asked.along))
+    return tuple(tuple(map(numbers.index, point)) for point in points)
 
 
 def _displaced_ends(

@@ -23,8 +23,8 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages.external_robot import plugin_robot, simulated_robot, takes_limits
 from projservo_cli.stages.record import all_of, shared_markers, sharing
 from projservo_cli.stages.stage_inputs import OwnRobot, PlanInputs, TeachInputs
+from projservo_cli.task.displaced_object import RIGID
 
-LEAST_OF_OBJECT = 3  # markers that show how an object is turned
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
 _SLACK = 1e-3  # rad or m; by how much more than it sags a reading may change
@@ -130,8 +130,8 @@ def teach(
             robot.by_hand("hold")
         if wait is not None:
             wait("take your hands away")
-        stood = robot.read().q if moved is None else moved
-        mean, sigma, count = seen_at_rest(robot, observe, frames, inputs.settle_s, "teach")
+        rest, mean, sigma, count = seen_at_rest(robot, observe, frames, inputs.settle_s, "teach")
+        stood = rest.q if moved is None else moved
         since = "while images were taken" if moved is None else "since the arm was held again"
         _require_still(robot.bounds, stood, robot.read().q, since)
     tool = _Taught(
@@ -282,10 +282,10 @@ def require_objects(taught: _Taught) -> None:
     """Refuse objects of which too little is seen to carry a goal along, or that are all out of sight."""
     seen = {name: _seen_of(one) for name, one in taught.objects.items()}
     for name, numbers in seen.items():
-        if 0 < len(numbers) < LEAST_OF_OBJECT or not any(seen.values()):
+        if 0 < len(numbers) < RIGID or not any(seen.values()):
             raise WorkFailed(
                 f"teach: of the object {name}, {all_of(taught.view)} see marker "
-                f"{', '.join(map(str, numbers)) or 'none'} ({LEAST_OF_OBJECT} at least): turn it towards "
+                f"{', '.join(map(str, numbers)) or 'none'} ({RIGID} at least): turn it towards "
                 f"{all_of(taught.view)}, or leave it out of objects"
             )
 

@@ -35,7 +35,7 @@ from projservo_cli.records import (
 from projservo_cli.task.look_bundle import Bundle, BundleFit, Look, LookRig, differ, generators
 
 # Number of markers that six coordinates need, and that twelve need.
-_RIGID, _AFFINE = 3, 4
+RIGID, _AFFINE = 3, 4
 # Deviation of a turn, rad, or of a stretch, above which it is not seen: first order means nothing there.
 _UNSEEN = 0.3
 # Difference of χ² below which two poses fit alike: the better one is the wrong one in 1 of 1,000 cases.
@@ -75,7 +75,7 @@ class _Search:
     @property
     def least(self) -> int:
         """Number of markers that a look needs."""
-        return _RIGID if self.rig.rigid else _AFFINE
+        return RIGID if self.rig.rigid else _AFFINE
 
     def numbers(self, markers: BoolArray) -> str:
         """Numbers of markers (k,), in words."""
@@ -189,7 +189,7 @@ class _Search:
     def needed(self) -> str:
         """Markers that a look needs, and why."""
         if self.rig.rigid:
-            return f"{_RIGID} off one line"
+            return f"{RIGID} off one line"
         return f"{_AFFINE} off one plane, as the joints leave the metric open: 12 coordinates instead of 6"
 
     def _too_few(self, shown: BoolArray, when: str) -> str:
@@ -241,7 +241,8 @@ def _elsewhere(rig: LookRig, fit: BundleFit, most: float) -> tuple[float, int, i
         return None
     off = np.zeros(fit.bundle.weight.shape)
     off[fit.bundle.weight > 0.0] = (r.reshape(-1, 2) ** 2).sum(axis=1)
-    look, k = np.unravel_index(int(np.argmax(off.sum(axis=1))), off.sum(axis=1).shape)
+    at_look = off.sum(axis=1)
+    look, k = np.unravel_index(int(np.argmax(at_look)), at_look.shape)
     return float(np.sqrt(square / dof)), int(look), int(k)
 
 
@@ -467,9 +468,9 @@ def _tool_at(rig: LookRig, goal: Look) -> BundleFit:
     M = rig.M[0]
     bundle = rig.bundle([goal], generators(rig.turns, M[:, :3].mean(axis=0)))
     seen = bundle.weight[0].any(axis=0)
-    if seen.sum() < _RIGID:
+    if seen.sum() < RIGID:
         raise WorkFailed(
-            f"objects: the goal shows {int(seen.sum())} markers of the tool, and its pose needs {_RIGID}: "
+            f"objects: the goal shows {int(seen.sum())} markers of the tool, and its pose needs {RIGID}: "
             "teach it where the cameras see more"
         )
     T, cost = rig.bundle([goal.of(seen)], bundle.E).poses(M[seen], rig.turns)

@@ -37,7 +37,7 @@ from tests.studies import hand_eye
 from tests.studies.carried_goals import direction, seen, tags
 from tests.studies.common import in_two_processes, parser_of, quantiles, written
 from tests.studies.hand_eye_coverage import pose
-from tests.studies.rendered import LOOKS, calibrated, driven_to, known_by_hand_eye
+from tests.studies.rendered import calibrated, corrected, known_by_hand_eye
 from tests.studies.rendered_conditions import FRONT, SEEDS, base_of, tasks_of
 
 SEED, SIDE_M, NUMBERS = 730_000, 0.03, (10, 11)
@@ -159,8 +159,7 @@ def driven(job):
 
 def by_hand_eye(config, known, q_goal, tip, seed):
     """Rows of hand–eye calibration with inverse kinematics: straight, and after so many looks."""
-    (views, points, mount), truth = known, truth_of(config)
-    arm, m = truth.robot, len(truth.number)
+    (views, points, _), m = known, len(truth_of(config).number)
     part = config.objects.named["part"].points[:, :3]
     taught, now = (
         looked(config, q_goal, (seed, 7), now=False),
@@ -171,24 +170,12 @@ def by_hand_eye(config, known, q_goal, tip, seed):
     if wanted is None or places[0] is None or places[1] is None:
         return [{"by": "hand-eye", "verdict": "unseen", "arrived": False}]
     wanted = places[1] @ np.linalg.inv(places[0]) @ wanted
-    hand, rows = wanted @ np.linalg.inv(mount), []
-    robot = robot_by_itself(config, truth, np.array(FRONT), 0.0, seed, 6)
-    robot.open()
-    try:
-        for look in range(LOOKS + 1):
-            sent = hand_eye.joints_for(arm, hand, robot.read()[0])
-            if sent is None:
-                return [{"by": "hand-eye", "verdict": "no joints", "arrived": False}]
-            s = driven_to(robot, config, sent)
-            row = judged(config, q_goal, tip, arm.pose(robot.truth()))
-            rows.append({"by": f"hand-eye, {look} looks", "verdict": "converged", **row})
-            there = hand_eye.tool_in_base(views, points, s[:, :m])
-            if there is None:
-                break
-            hand = wanted @ np.linalg.inv(there) @ hand
-    finally:
-        robot.close()
-    return [rows[0], rows[-1]]
+
+    def judge(pose):
+        return {"verdict": "converged", **judged(config, q_goal, tip, pose)}
+
+    rows = corrected(config, known, wanted, np.array(FRONT), (seed, 6), judge)
+    return [{"by": by, **row} for by, row in rows]
 
 
 KINDS = ("hidden", "tags missing", "exchanged", "moved before", "moved during")

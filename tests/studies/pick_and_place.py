@@ -26,8 +26,8 @@ from projservo_cli.config.inputs import truth_of
 from projservo_cli.robots.session import Session
 from projservo_cli.stages import servo
 from tests.studies.common import quantiles
-from tests.studies.so101_goals import LONGER, goals, said
-from tests.studies.so101_tutorial import START, benched, by_hand, configure, through_all
+from tests.studies.so101_goals import goals, prepared, said
+from tests.studies.so101_tutorial import benched, by_hand
 
 RUNS = 20
 OPENED, CLOSED, PART = 2600, 1200, 1500  # counts of the gripper, and that at which the part stops it
@@ -146,30 +146,9 @@ def main():
         pytest.MonkeyPatch.context() as patch,
         benched(Path(folder), patch, given.rate, given.fps) as bench,
     ):
-        if _prepared(bench):
+        if prepared(bench, "-o", "run"):
+            written(bench)
             _driven(bench, given.runs, given.killed)
-
-
-def _prepared(bench):
-    """Record and calibrate; whether that went well."""
-    arm = bench.arm
-    prepare = {
-        "init --arm so101 arm.yaml": [],
-        "limits -c arm.yaml": [None, by_hand(arm, *through_all())],
-        "teach --start -c arm.yaml": [None, by_hand(arm, START), None],
-        "teach -c arm.yaml": [None, by_hand(arm, np.array(START) + 5.0), None],
-        "record calibrate -c arm.yaml -o run": [],
-    }
-    for command, acts in prepare.items():
-        bench.script[:] = acts
-        code, line = said(command.split())
-        print(f"{command}: {code} {line[-200:]}", flush=True)
-        if command.startswith("init"):
-            configure(bench, LONGER)
-        if code != 0:
-            return False
-    written(bench)
-    return True
 
 
 def _driven(bench, runs, killed):

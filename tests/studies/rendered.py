@@ -155,25 +155,36 @@ def known_by_hand_eye(config, seen):
 
 def by_hand_eye(config, known, ends, seed, judge):
     """Rows of hand–eye calibration with inverse kinematics: straight, and after so many looks."""
-    (views, points, mount), truth = known, truth_of(config)
-    arm = truth.robot
-    start, goal = ends
+    (views, points, _), truth, (start, goal) = known, truth_of(config), ends
     shown, sigma = observed_in_frames(config, truth, goal, (seed, 7))
     shown = np.where((sigma <= VAGUE_PX)[..., None], shown, np.nan)
     wanted = hand_eye.tool_in_base(views, points, shown)
     if wanted is None:
         return [("hand-eye", {"verdict": "goal unseen", "arrived": False})]
+
+    def judge_now(pose):
+        return judged(judge(truth, pose, goal), "converged")
+
+    return corrected(config, known, wanted, start, (seed, STREAM), judge_now)
+
+
+def corrected(config, known, wanted, start, drawn, judge):
+    """Rows of inverse kinematics to a pose (4, 4) of the tool before a camera: straight, and after looks.
+
+    start : joints (n,) of the robot, whose noise is of ``drawn``; judge : of a pose (4, 4) of the hand.
+    """
+    (views, points, mount), truth = known, truth_of(config)
     hand, rows = wanted @ np.linalg.inv(mount), []
-    robot = robot_by_itself(config, truth, start, 0.0, seed, STREAM)
+    robot = robot_by_itself(config, truth, start, 0.0, *drawn)
     robot.open()
     try:
         for look in range(LOOKS + 1):
             there = np.linalg.inv(hand) if truth.on_tool else hand
-            sent = hand_eye.joints_for(arm, there, robot.read()[0])
+            sent = hand_eye.joints_for(truth.robot, there, robot.read()[0])
             if sent is None:
                 return [("hand-eye", {"verdict": "no joints", "arrived": False})]
-            s = driven_to(robot, config, sent)
-            row = judged(judge(truth, arm.pose(robot.truth()), goal), "converged")
+            s = driven_to(robot, config, sent)[:, : len(truth.number)]
+            row = judge(truth.robot.pose(robot.truth()))
             rows.append((f"hand-eye, {look} looks", row | {"reason": views[0].method}))
             now = hand_eye.tool_in_base(views, points, s)
             if now is None:

@@ -63,14 +63,15 @@ def main():
         _driven(bench, given.goals)
 
 
-def _driven(bench, count):
-    arm, truth, errors = bench.arm, truth_of(bench.arm.config), []
+def prepared(bench, *where):
+    """Record and calibrate, into a run if its folder is named so, ``-o FOLDER``; whether that went well."""
+    arm = bench.arm
     prepare = {
         "init --arm so101 arm.yaml": [],
         "limits -c arm.yaml": [None, by_hand(arm, *through_all())],
         "teach --start -c arm.yaml": [None, by_hand(arm, START), None],
         "teach -c arm.yaml": [None, by_hand(arm, np.array(START) + 5.0), None],
-        "record calibrate -c arm.yaml": [],
+        " ".join(("record calibrate -c arm.yaml", *where)): [],
     }
     for command, acts in prepare.items():
         bench.script[:] = acts
@@ -79,7 +80,14 @@ def _driven(bench, count):
         if command.startswith("init"):
             configure(bench, LONGER)
         if code != 0:
-            return
+            return False
+    return True
+
+
+def _driven(bench, count):
+    if not prepared(bench):
+        return
+    arm, truth, errors = bench.arm, truth_of(bench.arm.config), []
     for k, q in enumerate(goals(truth, count)):
         taught = []
         bench.script[:] = [None, by_hand(arm, q), lambda taught=taught: taught.append(arm.link.copy())]
