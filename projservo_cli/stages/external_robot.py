@@ -49,6 +49,7 @@ def plugin_robot(
     numbers: Sequence[int],
     given: Robot | None = None,
     view: Sequence[str] | None = None,
+    *,
     further: Sequence[int] = (),
 ) -> PluginRobot:
     """Make a robot of somebody's, unless it is given; an InputError where a joint has no speed limit.
@@ -241,7 +242,8 @@ def opened_robot(
         return session.steered
     assert isinstance(driven.robot, OwnRobot)
     bounds, types = driven.following.bounds(joints), joints.types
-    return session.opened(plugin_robot(driven.robot, bounds, types, observed, given, view, driven.further))
+    known, further = (driven.robot, bounds, types, observed), driven.further
+    return session.opened(plugin_robot(*known, given, view, further=further))
 
 
 def connected_robot(

@@ -416,7 +416,7 @@ def scenario_of(inputs: PlanInputs, calibration: Calibration | None = None) -> S
     if truth is not None:
         at = None if inputs.q_current is None else tuple(inputs.q_current.tolist())
         exact, ends, q_goal = _simulated_ends(
-            task, joints.types, joints.units, truth, pins, inputs.center, at
+            task, joints.types, joints.units, truth, pins, inputs.center, current=at
         )
     else:
         assert calibration is not None
@@ -603,6 +603,7 @@ def _simulated_ends(
     truth: Truth,
     pins: tuple[int, ...],
     center: int,
+    *,
     current: tuple[float, ...] | None,
 ) -> tuple[TaskImages, Ends, FloatArray | None]:
     """Return the images of the ends of a task, for any seed and noise, and the joints (n,) at the goal.
@@ -622,7 +623,7 @@ def _simulated_ends(
         return turned(task.goal, robot, truth.cameras_at(q), q)
 
     numbers = tuple(truth.number[i] for i in truth.face), pins
-    seen_images, q_goal = _task_images(task, types, numbers, (center, truth.view), images, turn, at)
+    seen_images, q_goal = _task_images(task, types, numbers, (center, truth.view), images, turn, q_current=at)
     return seen_images, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal), q_goal
 
 
@@ -633,6 +634,7 @@ def _task_images(
     how: tuple[int, tuple[str, ...]],
     images: Callable[[FloatArray, str], FloatArray],
     turn: Callable[[FloatArray], FloatArray],
+    *,
     q_current: FloatArray | None,
 ) -> tuple[TaskImages, FloatArray | None]:
     """Start and goal of a task, and the joints (n,) at the goal, None for a goal by images alone.
@@ -709,6 +711,7 @@ def _predicted_ends(
 
     seen_images, q_goal = _task_images(
         *(task, joints.types, (numbers[:m], numbers[m:]), (inputs.center, calibration.view)),
-        *(images, turn, inputs.q_current),
+        *(images, turn),
+        q_current=inputs.q_current,
     )
     return seen_images, _unknown(np.full((4, 4), np.nan)), q_goal
