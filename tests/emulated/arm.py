@@ -62,7 +62,7 @@ class Arm:
     def __init__(self, clock, q_deg=(0, 10, -25, 15, 0), mechanics=None, settings=()):
         self.clock, self.mechanics = clock, mechanics or Mechanics()
         self.config = load_config(shipped("hobby"), (*TAGS, *settings))
-        self.rendered = rendered_model(scene_of(self.config))
+        self.rendered = rendered_model(scene_of(self.config, None, dict.fromkeys(self.config.objects.named)))
         self._model = copy.copy(self.rendered.model)
         self._model.opt.timestep = STEP_S
         self._places, self._rates = self.rendered.positions, self.rendered.rates
@@ -79,6 +79,7 @@ class Arm:
         self.hand = q.copy()  # where somebody holds it while torque is off; None lets it fall
         self._hand_speed = HAND_SPEED
         self.overloaded_s = np.zeros(self.n)
+        self.displacement = np.eye(4)  # (4, 4) of the objects of the settings, in the base frame, m
         self.lock, self._time = threading.RLock(), clock.now()
         self._past = deque([(self._time, q.copy())])
 

@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from projservo_cli.simulation.rendering import Frames
 from tests.emulated.streams import Served
@@ -17,15 +18,19 @@ _STILL = 1e-6  # rad, by which joints at rest creep
 class _Unsearched(Frames):
     """Frames that nobody searches for tags where they are taken; an arm at rest is drawn once."""
 
-    def __init__(self, rendered):
-        super().__init__(rendered)
-        self._kept = {}
+    def __init__(self, arm):
+        super().__init__(arm.rendered)
+        self._arm, self._kept = arm, {}
 
     def _drawn(self, view, q):
-        before = self._kept.get(view)
-        if before is None or np.abs(before[0] - q).max() > _STILL:
-            before = self._kept[view] = q.copy(), super()._drawn(view, q)
-        return before[1]
+        T, before = self._arm.displacement, self._kept.get(view)
+        if before is None or np.abs(before[0] - q).max() > _STILL or (before[1] != T).any():
+            if self.rendered.scene.objects:
+                objects = self._model.body("scene with tags")
+                objects.pos, turn = T[:3, 3], Rotation.from_matrix(T[:3, :3])
+                objects.quat = turn.as_quat(scalar_first=True)
+            before = self._kept[view] = q.copy(), T, super()._drawn(view, q)
+        return before[2]
 
     def _found(self, view):
         return np.empty((0, 2)), np.empty(0)
@@ -87,7 +92,7 @@ class Cameras:
 
     def _draw(self):
         """Draw both views, frame after frame, in the one thread that may."""
-        eyes = _Unsearched(self.arm.rendered)
+        eyes = _Unsearched(self.arm)
         try:
             eyes.open()
         except Exception as error:  # without GL, of whatever kind

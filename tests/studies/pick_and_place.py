@@ -1,17 +1,19 @@
-"""Pick, lift and place a part with an emulated SO-101, by taught goals; and kill the command in each step.
+"""Pick a part wherever it lies with an emulated SO-101, lift and place it; and kill the command in each step.
 
     python -m tests.studies.pick_and_place [RUNS] [--fps 30] [--rate 0.25] [--killed]
 
-Bench, recording and mechanics are those of ``so101_goals``. In each run somebody puts the arm to where the
-part is to be gripped, and to where it is to be placed, and teaches both: the middle of the face and the
-direction of its upright edge; the turn about that follows, as five joints have it. One call of ``servo``
-then opens the gripper, approaches along the normal, grips, lifts, goes over the place and down to it, opens
-and retreats. The part is gripped where the gripper closes within 5 mm of it, moves with the tool, and is
-dropped where the gripper opens or loses torque. The truth is that of the emulator. With ``--killed`` run k
-is interrupted half a second after step k mod 9 began.
+Bench, recording and mechanics are those of ``so101_goals``; a part with two tags of 30 mm lies beside the
+tool where somebody teaches once how it is gripped: the middle of the face and the direction of its upright
+edge; the turn about that follows, as five joints have it. For each run the part is put elsewhere, up to
+150 mm and 60 degrees away, and somebody teaches where it is to be placed. One call of ``servo`` then opens
+the gripper, approaches along the normal, grips, lifts, goes over the place and down to it, opens and retreats.
+The part is gripped where the gripper closes within 5 mm and 5 degrees of how it was taught, moves with the
+tool before the cameras, and is dropped where the gripper opens or loses torque. The truth is that of the
+emulator. With ``--killed`` run k is interrupted half a second after step k mod 9 began.
 """
 
 import argparse
+import json
 import os
 import signal
 import tempfile
@@ -22,24 +24,43 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.config import load_config, shipped
 from projservo_cli.config.inputs import truth_of
+from projservo_cli.geometry.displacements import rigid
 from projservo_cli.robots.session import Session
+from projservo_cli.settings.objects import ObjectSettings
 from projservo_cli.stages import servo
+from tests.emulated.arm import TAGS
+from tests.studies.carried_goals import seen
 from tests.studies.common import quantiles
 from tests.studies.so101_goals import goals, prepared, said
-from tests.studies.so101_tutorial import benched, by_hand
+from tests.studies.so101_tutorial import START, benched, by_hand
 
 RUNS = 20
 OPENED, CLOSED, PART = 2600, 1200, 1500  # counts of the gripper, and that at which the part stops it
-REACH_M, IN_PLACE_MM, IN_PLACE_DEG = 0.005, 2.0, 2.0
+REACH_M, REACH_DEG, IN_PLACE_MM, IN_PLACE_DEG = 0.005, 5.0, 2.0, 2.0
+SEED, FARTHEST_M, MOST_DEG, APART_PX = 8_400, 0.15, 60.0, 12.0
+GRIP = (16.0, 8.0, -22.0, 14.0, 0.0)  # joints where the grip is taught, deg
+SIDE_M = 0.03
+# Both tags of the part in the frame of the tool that grips it, m; their normals open by 50 degrees.
+TAGS_AT = [
+    rigid(Rotation.from_euler("x", turn, degrees=True), [x, 0.145, 0.02])
+    for x, turn in ((-0.022, -25.0), (0.022, 25.0))
+]
+NUMBERS = (10, 11)
 FEATURES = {
     "plate": "{on: tool, plane: [0, 1, 2]}",
     "middle": "{on: tool, point: [0, 1, 2, 3]}",
-    "spot": "{on: scene, point: middle}",
     "down": "{on: tool, line: [1, 0]}",
-    "upright": "{on: scene, line: down}",
+    "spot": "{on: part, point: middle}",
+    "upright": "{on: part, line: down}",
+    "place_spot": "{on: scene, point: middle}",
+    "place_upright": "{on: scene, line: down}",
 }
-INCIDENCES = "incidences: [[down, upright, parallel], [middle, spot]]"
+INCIDENCES = {
+    "grip": "[[down, upright, parallel], [middle, spot]]",
+    "place": "[[down, place_upright, parallel], [middle, place_spot]]",
+}
 STEPS = """\
   steps:
     - {act: {gripper: 1.0}}
@@ -54,14 +75,24 @@ STEPS = """\
 """
 
 
+def part_of(G):
+    """Settings of the part that a tool at a pose (4, 4) grips."""
+    tags = [
+        {"number": number, "size_m": SIDE_M, "pose": (G @ T).tolist()}
+        for number, T in zip(NUMBERS, TAGS_AT, strict=True)
+    ]
+    return ObjectSettings.model_validate({"tags": tags})
+
+
 class Part:
     """A part on the bench, which the gripper takes along; ``dropped`` where it was let go of elsewhere.
 
-    pose : (4, 4) of the tool that grips it right, m.
+    grip : (4, 4) pose of the tool that grips it right where it lay when that was taught, m.
+    ``bench.arm.displacement``: (4, 4) its motion since then.
     """
 
-    def __init__(self, bench, truth, pose):
-        self.bench, self.truth, self.pose, self.held, self.dropped = bench, truth, pose, None, False
+    def __init__(self, bench, truth, grip):
+        self.bench, self.truth, self.grip, self.held, self.dropped = bench, truth, grip, None, False
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
@@ -73,9 +104,9 @@ class Part:
         self._stopping.set()
         self._thread.join()
 
-    def tool(self):
-        """Pose (4, 4) of the tool, m."""
-        return self.truth.robot.pose(self.bench.arm.link)
+    def off(self, tool):
+        """Distance, mm, and angle, deg, of a tool (4, 4) from one that grips the part, but for its turn."""
+        return off(self.truth, self.bench.arm.displacement @ self.grip, tool)
 
     def _watch(self):
         while not self._stopping.is_set():
@@ -84,32 +115,60 @@ class Part:
 
     def look(self):
         """Grip, carry or let go of the part, as the gripper stands now."""
-        gripper, tool = self.bench.bus.servos[6], self.tool()
-        near = np.linalg.norm(tool[:3, 3] - self.pose[:3, 3]) < REACH_M
+        arm, gripper = self.bench.arm, self.bench.bus.servos[6]
+        tool = self.truth.robot.pose(arm.link)
+        mm, deg = self.off(tool)
+        near = mm < 1e3 * REACH_M and deg < REACH_DEG
         gripper.between = PART if near or self.held is not None else None
         grips = gripper.on and gripper.present <= PART + 20
         if self.held is not None:
-            self.pose = tool @ self.held
-            if not (grips and self.bench.arm.torque_on.all()):
+            arm.displacement = tool @ self.held
+            if not (grips and arm.torque_on.all()):
                 self.dropped, self.held = not gripper.on or self.dropped, None
         elif grips and near:
-            self.held = np.linalg.inv(tool) @ self.pose
+            self.held = np.linalg.inv(tool) @ arm.displacement
 
 
-def off(pose, wanted):
-    """Distance, mm, and angle, deg, of two poses (4, 4)."""
-    turn = Rotation.from_matrix(pose[:3, :3].T @ wanted[:3, :3]).magnitude()
-    return 1e3 * np.linalg.norm(pose[:3, 3] - wanted[:3, 3]), float(np.degrees(turn))
+def off(truth, wanted, tool):
+    """Distance, mm, of the middle of the face from that of a tool (4, 4), and angle, deg, of its edge."""
+    middle = truth.M_face.mean(axis=0) @ np.linalg.inv(truth.robot.base_tool).T
+    cosine = wanted[:3, 0] @ tool[:3, 0]
+    return 1e3 * np.linalg.norm((wanted - tool) @ middle), float(np.degrees(np.arccos(min(cosine, 1.0))))
+
+
+def displacements(truth, grip, count):
+    """Motions (4, 4) of the part after which the arm can grip it, and sees it from the start."""
+    rng, part, found = np.random.default_rng(SEED), part_of(grip), []
+    at_start = truth.images(np.radians(START), truth.M)
+    for q in goals(truth, 100 * count):
+        turn = rigid(Rotation.from_euler("x", rng.uniform(-15.0, 15.0), degrees=True), np.zeros(3))
+        T = truth.robot.pose(np.radians(q)) @ turn @ np.linalg.inv(grip)
+        X, R = part.points @ T.T, Rotation.from_matrix(T[:3, :3])
+        far = np.linalg.norm((X - part.points)[:, :3].mean(axis=0)) > FARTHEST_M
+        if far or np.degrees(R.magnitude()) > MOST_DEG or not seen(truth, X, R.apply(part.normals[::4])):
+            continue
+        s = np.array([(X @ P.T)[:, :2] / (X @ P.T)[:, 2:] for P in truth.P])
+        beside = (s.min(axis=1) > at_start.max(axis=1) + APART_PX) | (
+            s.max(axis=1) < at_start.min(axis=1) - APART_PX
+        )
+        inside = np.minimum(s, truth.image_size[:, None] - s).min() > 2.0 * APART_PX
+        if inside and beside.any(axis=1).all():  # the tool hides it from neither camera
+            found.append(T)
+        if len(found) == count:
+            return found
+    raise ValueError(f"{len(found)} of {count} places of the part are seen")
 
 
 def written(bench):
-    """Add features, steps and the gripper's readings to arm.yaml."""
+    """Add the part, features, steps and the gripper's readings to arm.yaml."""
     file = bench.folder / "arm.yaml"
     text = file.read_text()
     gripper = f"gripper: 6, gripper_counts: [{CLOSED}, {OPENED}]"
     named = "".join(f"  {name}: {feature}\n" for name, feature in FEATURES.items())
-    taught = "".join(f"    {name}: {{taught: {name}.yaml, {INCIDENCES}}}\n" for name in ("grip", "place"))
-    text = text.replace("gripper: 6", gripper).replace("task:\n", f"features:\n{named}\ntask:\n")
+    part = f"objects:\n  part: {{tags: {list(NUMBERS)}}}\n"
+    goal = "    {0}: {{taught: {0}.yaml, incidences: {1}}}\n"
+    taught = "".join(goal.format(name, listed) for name, listed in INCIDENCES.items())
+    text = text.replace("gripper: 6", gripper).replace("task:\n", f"{part}features:\n{named}\ntask:\n")
     file.write_text(
         text.replace("  goal: goal.yaml    # projservo teach writes it\n", f"  goals:\n{taught}{STEPS}")
     )
@@ -141,42 +200,55 @@ def main():
     parser.add_argument("--killed", action="store_true", help="interrupt each run in another step")
     given = parser.parse_args()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background of a shell
+    truth = truth_of(load_config(shipped("hobby"), TAGS))
+    grip = truth.robot.pose(np.radians(GRIP))
+    settings = (f"objects={json.dumps({'part': {'tags': part_of(grip).model_dump(mode='json')['tags']}})}",)
     with (
         tempfile.TemporaryDirectory() as folder,
         pytest.MonkeyPatch.context() as patch,
-        benched(Path(folder), patch, given.rate, given.fps) as bench,
+        benched(Path(folder), patch, given.rate, given.fps, settings) as bench,
     ):
         if prepared(bench, "-o", "run"):
             written(bench)
-            _driven(bench, given.runs, given.killed)
+            _driven(bench, truth, given.runs, given.killed)
 
 
-def _driven(bench, runs, killed):
-    arm, truth, errors = bench.arm, truth_of(bench.arm.config), []
-    places, kept = goals(truth, 2 * runs), 0
-    for k in range(runs):
-        there = []
-        for name, q in zip(("grip", "place"), places[2 * k : 2 * k + 2], strict=True):
-            bench.script[:] = [None, by_hand(arm, q), lambda at=there: at.append(truth.robot.pose(arm.link))]
-            code, line = said(["teach", "-c", "arm.yaml", "-o", f"{name}.yaml", "--force"])
-            if code != 0:
-                print(f"{k:3} {name} not taught, exit {code}: {line[-200:]}", flush=True)
-        if len(there) < 2:
+def taught(bench, name, q):
+    """Have somebody put the arm to joints (n,), deg, and teach a goal; joints where that was, or None."""
+    there = []
+    bench.script[:] = [None, by_hand(bench.arm, q), lambda: there.append(bench.arm.link.copy())]
+    code, line = said(["teach", "-c", "arm.yaml", "-o", f"{name}.yaml", "--force"])
+    if code != 0:
+        print(f"{name} not taught, exit {code}: {line[-300:]}", flush=True)
+    return there[0] if code == 0 else None
+
+
+def _driven(bench, truth, runs, killed):
+    arm, errors, kept = bench.arm, [], 0
+    if (q := taught(bench, "grip", GRIP)) is None:
+        return
+    grip = truth.robot.pose(q)
+    moved = displacements(truth, grip, runs)
+    for k, (T, at) in enumerate(zip(moved, goals(truth, runs), strict=True)):
+        if (q := taught(bench, "place", at)) is None:
             continue
-        with Part(bench, truth, there[0]) as part, pytest.MonkeyPatch.context() as patch:
+        said(["release", "-c", "arm.yaml"])
+        by_hand(arm, START)()
+        arm.displacement = T
+        with Part(bench, truth, grip) as part, pytest.MonkeyPatch.context() as patch:
             if killed:
                 interrupted(patch, k % 9)
             code, line = said(["servo", "-c", "arm.yaml", "-o", "run"])
             arm.clock.sleep(1.0)
             part.look()
-        mm, deg = off(part.pose, there[1])
+        mm, deg = part.off(truth.robot.pose(q))
         gripper = bench.bus.servos[6]
         holds = not part.dropped and gripper.on and arm.torque_on.all()
         kept += bool(holds)
         if code == 0:
             errors.append((mm, deg))
         how = f"part {mm:.2f} mm, {deg:.2f}° off, {'' if holds else 'NOT '}kept"
-        print(f"{k:3} exit {code}: {how}  {line[-230:]}", flush=True)
+        print(f"{k:3} exit {code}: {how}  {line[-300:]}", flush=True)
     found = np.array(errors).reshape(-1, 2)
     placed = int(((found[:, 0] <= IN_PLACE_MM) & (found[:, 1] <= IN_PLACE_DEG)).sum())
     within = f"within {IN_PLACE_MM:g} mm and {IN_PLACE_DEG:g}°"

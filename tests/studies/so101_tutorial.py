@@ -68,8 +68,11 @@ def through_all(span=75.0):
 
 
 @contextmanager
-def benched(folder, monkeypatch, rate=RATE, rate_hz=15.0):
-    """An emulated arm with its cameras, and somebody who presses Enter, in a folder."""
+def benched(folder, monkeypatch, rate=RATE, rate_hz=15.0, settings=()):
+    """An emulated arm with its cameras, and somebody who presses Enter, in a folder.
+
+    settings : of its configuration, ``a.b=v``.
+    """
     monkeypatch.chdir(folder)
     clock = Clock(rate)
     monkeypatch.setattr(so101.tempfile, "gettempdir", lambda: str(folder))
@@ -85,7 +88,7 @@ def benched(folder, monkeypatch, rate=RATE, rate_hz=15.0):
         return "\n"
 
     monkeypatch.setattr("sys.stdin", types.SimpleNamespace(isatty=lambda: True, readline=enter))
-    arm = Arm(clock, START, Mechanics())
+    arm = Arm(clock, START, Mechanics(), settings)
     with Bus(arm) as bus, Cameras(arm, Optics(rate_hz=rate_hz)) as cameras:
         begun = time.process_time()
         time.sleep(1.0)
