@@ -4,10 +4,10 @@
 
 Bench, recording and mechanics are those of ``so101_goals``; a part with two tags of 30 mm lies beside the
 tool where somebody teaches once how it is gripped: the middle of the face and the direction of its upright
-edge; the turn about that follows, as five joints have it. For each run the part is put elsewhere, up to
-150 mm and 60 degrees away, and somebody teaches where it is to be placed. One call of ``servo`` then opens
-the gripper, approaches along the normal, grips, lifts, goes over the place and down to it, opens and retreats.
-The part is gripped where the gripper closes within 5 mm and 5 degrees of how it was taught, moves with the
+edge; the turn about that follows, as five joints have it. For each run somebody teaches where the part is to
+be placed, and puts it elsewhere, up to 150 mm and 60 degrees away. One call of ``servo`` then opens the
+gripper, approaches along the normal, grips, lifts, goes over the place and down to it, opens and retreats. The
+part is gripped where the gripper closes within 5 mm and 5 degrees of how it was taught, moves with the
 tool before the cameras, and is dropped where the gripper opens or loses torque. The truth is that of the
 emulator. With ``--killed`` run k is interrupted half a second after step k mod 9 began.
 """
@@ -48,6 +48,7 @@ TAGS_AT = [
     for x, turn in ((-0.022, -25.0), (0.022, 25.0))
 ]
 NUMBERS = (10, 11)
+AWAY = rigid(Rotation.identity(), [-5.0, 0.0, 0.0])
 FEATURES = {
     "plate": "{on: tool, plane: [0, 1, 2]}",
     "middle": "{on: tool, point: [0, 1, 2, 3]}",
@@ -208,6 +209,7 @@ def main():
         pytest.MonkeyPatch.context() as patch,
         benched(Path(folder), patch, given.rate, given.fps, settings) as bench,
     ):
+        bench.arm.displacement = AWAY
         if prepared(bench, "-o", "run"):
             written(bench)
             _driven(bench, truth, given.runs, given.killed)
@@ -225,11 +227,13 @@ def taught(bench, name, q):
 
 def _driven(bench, truth, runs, killed):
     arm, errors, kept = bench.arm, [], 0
+    arm.displacement = np.eye(4)
     if (q := taught(bench, "grip", GRIP)) is None:
         return
     grip = truth.robot.pose(q)
     moved = displacements(truth, grip, runs)
     for k, (T, at) in enumerate(zip(moved, goals(truth, runs), strict=True)):
+        arm.displacement = AWAY
         if (q := taught(bench, "place", at)) is None:
             continue
         said(["release", "-c", "arm.yaml"])
