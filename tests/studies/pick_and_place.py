@@ -6,8 +6,8 @@ Bench, recording and mechanics are those of ``so101_goals``; a part with two tag
 tool where somebody teaches once how it is gripped: the middle of the face and the direction of its upright
 edge; the turn about that follows, as five joints have it. For each run somebody teaches where the part is to
 be placed, and puts it elsewhere, up to 150 mm and 60 degrees away. One call of ``servo`` then opens the
-gripper, approaches along the normal, grips, lifts, goes over the place and down to it, opens and retreats. The
-part is gripped where the gripper closes within 5 mm and 5 degrees of how it was taught, moves with the
+gripper, approaches along the normal, grips, lifts, goes over the place and down to it, opens and retreats.
+The part is gripped where the gripper closes within 5 mm and 5 degrees of how it was taught, moves with the
 tool before the cameras, and is dropped where the gripper opens or loses torque. The truth is that of the
 emulator. With ``--killed`` run k is interrupted half a second after step k mod 9 began.
 """
