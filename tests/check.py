@@ -62,7 +62,7 @@ WHOLE: dict[str, Check] = {
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
 # Only by name. Coverage doubles the time of the first pass and adds a fifth to the second; lines of both add
-# up, one after the other. The rendered study takes forty minutes, the tutorial with one webcam two.
+# up, one after the other. The rendered study takes forty minutes, the tutorials with one webcam and a part two to five.
 BY_NAME: dict[str, Check] = {
     "coverage without the compiler": (
         [*PYTEST, "--cov=projservo_cli", "--cov-report=", *UNCOMPILED],
@@ -74,6 +74,7 @@ BY_NAME: dict[str, Check] = {
     ),
     "rendered": ([PYTHON, "-m", "tests.studies.rendered"], {}),
     "one webcam": ([*TUTORIAL, "one_webcam"], {}),
+    "part": ([PYTHON, "-m", "pytest", "-q", "tests/studies/pick_and_place.py"], {}),
 }
 
 

@@ -90,6 +90,10 @@ class Cameras:
             webcam.close()
         self._thread.join(5.0)
 
+    def picture(self, view):
+        """The last frame of a view, JPEG."""
+        return self._webcams[view].kept[-1][2]
+
     def _draw(self):
         """Draw both views, frame after frame, in the one thread that may."""
         eyes = _Unsearched(self.arm)

@@ -18,8 +18,10 @@ import os
 import signal
 import tempfile
 import threading
+from contextlib import contextmanager
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -27,14 +29,16 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.config import load_config, shipped
 from projservo_cli.config.inputs import truth_of
 from projservo_cli.geometry.displacements import rigid
+from projservo_cli.records import InputError
 from projservo_cli.robots.session import Session
 from projservo_cli.settings.objects import ObjectSettings
 from projservo_cli.stages import servo
+from tests.documentation.blocks import PAGES, blocks_of
 from tests.emulated.arm import TAGS
 from tests.studies.carried_goals import seen
 from tests.studies.common import quantiles
 from tests.studies.so101_goals import goals, prepared, said
-from tests.studies.so101_tutorial import START, benched, by_hand
+from tests.studies.so101_tutorial import RATE, START, benched, by_hand
 
 RUNS = 20
 OPENED, CLOSED, PART = 2600, 1200, 1500  # counts of the gripper, and that at which the part stops it
@@ -49,31 +53,6 @@ TAGS_AT = [
 ]
 NUMBERS = (10, 11)
 AWAY = rigid(Rotation.identity(), [-5.0, 0.0, 0.0])
-FEATURES = {
-    "plate": "{on: tool, plane: [0, 1, 2]}",
-    "middle": "{on: tool, point: [0, 1, 2, 3]}",
-    "down": "{on: tool, line: [1, 0]}",
-    "spot": "{on: part, point: middle}",
-    "upright": "{on: part, line: down}",
-    "place_spot": "{on: scene, point: middle}",
-    "place_upright": "{on: scene, line: down}",
-}
-INCIDENCES = {
-    "grip": "[[down, upright, parallel], [middle, spot]]",
-    "place": "[[down, place_upright, parallel], [middle, place_spot]]",
-}
-STEPS = """\
-  steps:
-    - {act: {gripper: 1.0}}
-    - {approach: {along: plate, by_m: -0.03, to: grip}}
-    - {to: grip}
-    - {act: {gripper: 0.0}}
-    - {retreat: {along: down, by_m: 0.03}}
-    - {approach: {along: down, by_m: 0.03, to: place}}
-    - {to: place}
-    - {act: {gripper: 1.0}}
-    - {retreat: {along: plate, by_m: -0.03}}
-"""
 
 
 def part_of(G):
@@ -161,18 +140,17 @@ def displacements(truth, grip, count):
 
 
 def written(bench):
-    """Add the part, features, steps and the gripper's readings to arm.yaml."""
-    file = bench.folder / "arm.yaml"
+    """Put the parts of a configuration that the tutorial shows into arm.yaml."""
+    file, page = bench.folder / "arm.yaml", PAGES["pick-a-part"]
+    named, task, options = (block.text for block in blocks_of(page) if block.language == "yaml")
     text = file.read_text()
-    gripper = f"gripper: 6, gripper_counts: [{CLOSED}, {OPENED}]"
-    named = "".join(f"  {name}: {feature}\n" for name, feature in FEATURES.items())
-    part = f"objects:\n  part: {{tags: {list(NUMBERS)}}}\n"
-    goal = "    {0}: {{taught: {0}.yaml, incidences: {1}}}\n"
-    taught = "".join(goal.format(name, listed) for name, listed in INCIDENCES.items())
-    text = text.replace("gripper: 6", gripper).replace("task:\n", f"{part}features:\n{named}\ntask:\n")
-    file.write_text(
-        text.replace("  goal: goal.yaml    # projservo teach writes it\n", f"  goals:\n{taught}{STEPS}")
-    )
+    for before, after in (
+        ("  goal: goal.yaml    # projservo teach writes it\n", task),
+        ("options: {port: auto, ids: [1, 2, 3, 4, 5], gripper: 6}\n", options),
+    ):
+        assert before in text
+        text = text.replace(before, after)
+    file.write_text(f"{text}\n{named}")
 
 
 def interrupted(patch, step):
@@ -192,6 +170,65 @@ def interrupted(patch, step):
     patch.setattr(Session, "act", counted(Session.act))
 
 
+def pictures(bench, patch):
+    """JPEGs of the right camera before each action, as they are taken."""
+    taken, act = [], Session.act
+
+    def pictured(*given, **more):
+        taken.append(bench.cameras.picture(1))
+        return act(*given, **more)
+
+    patch.setattr(Session, "act", pictured)
+    return taken
+
+
+@contextmanager
+def with_part(rate, fps):
+    """An emulated arm on its bench with a part, its true geometry, and the pose (4, 4) taught to grip it."""
+    truth = truth_of(load_config(shipped("hobby"), TAGS))
+    grip = truth.robot.pose(np.radians(GRIP))
+    settings = (f"objects={json.dumps({'part': {'tags': part_of(grip).model_dump(mode='json')['tags']}})}",)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        pytest.MonkeyPatch.context() as patch,
+        benched(Path(folder), patch, rate, fps, settings) as bench,
+    ):
+        bench.arm.displacement = AWAY
+        yield bench, truth, grip
+
+
+@pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="plans and drives")
+def test_the_commands_of_the_tutorial_pick_a_part_and_place_it():
+    try:
+        with with_part(RATE, 15.0) as (bench, truth, grip):
+            assert prepared(bench)
+            written(bench)
+            text = "\n".join(block.text for block in blocks_of(PAGES["pick-a-part"]))
+            by_name = {"grip.yaml": GRIP, "place.yaml": (place := goals(truth, 1)[0])}
+            for line in (line for line in text.splitlines() if line.startswith("projservo ")):
+                words = line.split()[1:]
+                if words[0] == "teach":
+                    bench.arm.displacement = np.eye(4) if words[-1] == "grip.yaml" else AWAY
+                    bench.script[:] = [None, by_hand(bench.arm, by_name[words[-1]]), None]
+                if words[0] == "servo":
+                    put_at_start(bench, displacements(truth, grip, 1)[0])
+                with Part(bench, truth, grip) as part:
+                    code, printed = said(words)
+                    assert code == 0, f"{line}: {printed}"
+            mm, deg = part.off(truth.robot.pose(np.radians(place)))
+            assert mm < IN_PLACE_MM
+            assert deg < IN_PLACE_DEG
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+def put_at_start(bench, T):
+    """Have somebody put the arm to its start, and the part to where it has moved by T (4, 4)."""
+    said(["release", "-c", "arm.yaml"])
+    by_hand(bench.arm, START)()
+    bench.arm.displacement = T
+
+
 def main():
     """Print what became of the part in each run, and a summary."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -199,20 +236,15 @@ def main():
     parser.add_argument("--fps", type=float, default=30.0, help="frames a second of both cameras")
     parser.add_argument("--rate", type=float, default=0.25, help="of the emulated clock; slower is safer")
     parser.add_argument("--killed", action="store_true", help="interrupt each run in another step")
+    parser.add_argument(
+        "--picture", type=Path, help="PNG of the first run: taught, elsewhere, gripped, placed"
+    )
     given = parser.parse_args()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background of a shell
-    truth = truth_of(load_config(shipped("hobby"), TAGS))
-    grip = truth.robot.pose(np.radians(GRIP))
-    settings = (f"objects={json.dumps({'part': {'tags': part_of(grip).model_dump(mode='json')['tags']}})}",)
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        pytest.MonkeyPatch.context() as patch,
-        benched(Path(folder), patch, given.rate, given.fps, settings) as bench,
-    ):
-        bench.arm.displacement = AWAY
+    with with_part(given.rate, given.fps) as (bench, truth, _):
         if prepared(bench, "-o", "run"):
             written(bench)
-            _driven(bench, truth, given.runs, given.killed)
+            _driven(bench, truth, given)
 
 
 def taught(bench, name, q):
@@ -225,26 +257,28 @@ def taught(bench, name, q):
     return there[0] if code == 0 else None
 
 
-def _driven(bench, truth, runs, killed):
-    arm, errors, kept = bench.arm, [], 0
+def _driven(bench, truth, given):
+    arm, runs, errors, kept = bench.arm, given.runs, [], 0
     arm.displacement = np.eye(4)
     if (q := taught(bench, "grip", GRIP)) is None:
         return
-    grip = truth.robot.pose(q)
+    grip, at_grip = truth.robot.pose(q), bench.cameras.picture(1)
     moved = displacements(truth, grip, runs)
     for k, (T, at) in enumerate(zip(moved, goals(truth, runs), strict=True)):
         arm.displacement = AWAY
         if (q := taught(bench, "place", at)) is None:
             continue
-        said(["release", "-c", "arm.yaml"])
-        by_hand(arm, START)()
-        arm.displacement = T
+        put_at_start(bench, T)
         with Part(bench, truth, grip) as part, pytest.MonkeyPatch.context() as patch:
-            if killed:
+            if given.killed:
                 interrupted(patch, k % 9)
+            taken = pictures(bench, patch)
             code, line = said(["servo", "-c", "arm.yaml", "-o", "run"])
             arm.clock.sleep(1.0)
             part.look()
+        if given.picture and k == 0:
+            drawn = [cv2.imdecode(np.frombuffer(one, np.uint8), 0)[110:430] for one in (at_grip, *taken)]
+            cv2.imwrite(str(given.picture), np.hstack(drawn))
         mm, deg = part.off(truth.robot.pose(q))
         gripper = bench.bus.servos[6]
         holds = not part.dropped and gripper.on and arm.torque_on.all()
