@@ -62,7 +62,8 @@ WHOLE: dict[str, Check] = {
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
 # Only by name. Coverage doubles the time of the first pass and adds a fifth to the second; lines of both add
-# up, one after the other. The rendered study takes forty minutes, the tutorials with one webcam and a part two to five.
+# up, one after the other. The rendered study takes forty minutes, the tutorials with one webcam and with a
+# part two and five.
 BY_NAME: dict[str, Check] = {
     "coverage without the compiler": (
         [*PYTEST, "--cov=projservo_cli", "--cov-report=", *UNCOMPILED],
