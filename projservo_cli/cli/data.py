@@ -82,6 +82,7 @@ def _teach(
     calibrated = option.calibrated_run(run, settings)
     calibration = None if calibrated is None else calibrated.calibration
     asks = not settings.plant.simulated and sys.stdin.isatty()
+    hidden = ""
     with writing(output):
         try:
             taught = stage.teach(teach_inputs(settings), frames, put, console.wait if asks else None)
@@ -91,7 +92,8 @@ def _teach(
                 asked = settings.trajectory.visible_views
                 least = None if asked == "all" else asked
                 stage.require_face(settings.face_numbers, taught, least)
-                stage.require_objects(taught)
+                several = settings.task is not None and bool(settings.task.goals)
+                hidden = stage.require_objects(taught, one_goal=not several)
             check = None
             if calibration is not None and not start:
                 check = stage.checked(plan_inputs(settings), calibration, taught)
@@ -110,6 +112,8 @@ def _teach(
             "teach: a recording starts with these markers unseen: turn the tool until "
             f"{sharing(taught.view)} all tags, and teach again with --force"
         )
+    if hidden:
+        console.say(hidden)
     if check is not None and not check.reached:
         raise WorkFailed(f"{output}: by the calibration, {check.reason}")
 

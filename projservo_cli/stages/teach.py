@@ -278,16 +278,22 @@ def require_start(taught: _Taught) -> None:
         )
 
 
-def require_objects(taught: _Taught) -> None:
-    """Refuse objects of which too little is seen to carry a goal along, or that are all out of sight."""
+def require_objects(taught: _Taught, *, one_goal: bool) -> str:
+    """Return which objects show too little to carry a goal along, or that all are out of sight; else "".
+
+    one_goal : whether there is no other goal, so that this one is on an object; a WorkFailed says it then.
+    """
     seen = {name: _seen_of(one) for name, one in taught.objects.items()}
     for name, numbers in seen.items():
         if 0 < len(numbers) < RIGID or not any(seen.values()):
-            raise WorkFailed(
+            told = (
                 f"teach: of the object {name}, {all_of(taught.view)} see marker "
-                f"{', '.join(map(str, numbers)) or 'none'} ({RIGID} at least): turn it towards "
-                f"{all_of(taught.view)}, or leave it out of objects"
+                f"{', '.join(map(str, numbers)) or 'none'} ({RIGID} at least)"
             )
+            if one_goal:
+                raise WorkFailed(f"{told}: turn it towards {all_of(taught.view)}, or leave it out of objects")
+            return f"{told}: for a goal on it, turn it towards {all_of(taught.view)} and teach with --force"
+    return ""
 
 
 def _seen_of(one: _Taught) -> list[int]:

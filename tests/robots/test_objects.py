@@ -80,6 +80,26 @@ def test_a_sequence_looks_at_its_object_over_the_connection_that_drives(call, ta
         assert abs(away[2]) == pytest.approx(0.03, abs=2e-3)
 
 
+def test_a_goal_that_may_stand_still_is_taught_without_the_part(taught, tmp_path, projservo, monkeypatch):
+    """The only goal is on the part; of several, teach says what a goal on it would need."""
+    monkeypatch.chdir(tmp_path)
+    for name, value in {"shift": np.eye(4), "hidden": PART.numbers, "looks": 0}.items():
+        monkeypatch.setattr(Seeing, name, value)
+
+    def teach(setting):
+        given = ("-c", CONFIG, "--set", PLANT, "--set", setting, "-o", "place.yaml")
+        return projservo("teach", taught / "run", *given)
+
+    answer = teach("task.goal={taught: place.yaml, on: part}")
+    assert answer.code == 1
+    assert "of the object part, both cameras see marker none (3 at least)" in answer.err
+    assert not Path("place.yaml").exists()
+    answer = teach("task.goals={place: place.yaml}")
+    assert answer.code == 0, answer.err
+    assert "for a goal on it, turn it towards both cameras" in answer.err
+    assert Path("place.yaml").exists()
+
+
 def test_a_part_that_has_moved_far_is_gone_to_by_confirmation_alone(call):
     answer = call("servo", "--law", "exact", "--set", "objects.max_displacement_m=0.09")
     assert answer.code == 1
