@@ -86,17 +86,17 @@ def test_a_goal_that_may_stand_still_is_taught_without_the_part(taught, tmp_path
     for name, value in {"shift": np.eye(4), "hidden": PART.numbers, "looks": 0}.items():
         monkeypatch.setattr(Seeing, name, value)
 
-    def teach(setting):
-        given = ("-c", CONFIG, "--set", PLANT, "--set", setting, "-o", "place.yaml")
-        return projservo("teach", taught / "run", *given)
+    def teach(*settings):
+        given = [word for setting in (PLANT, *settings) for word in ("--set", setting)]
+        return projservo("teach", taught / "run", "-c", CONFIG, *given, "-o", "place.yaml")
 
     answer = teach("task.goal={taught: place.yaml, on: part}")
     assert answer.code == 1
     assert "of the object part, both cameras see marker none (3 at least)" in answer.err
     assert not Path("place.yaml").exists()
-    answer = teach("task.goals={place: place.yaml}")
+    answer = teach("task.goal=goal.yaml", "task.goals={place: place.yaml}")
     assert answer.code == 0, answer.err
-    assert "for a goal on it, turn it towards both cameras" in answer.err
+    assert "for a goal on it, turn it towards both cameras" in " ".join(answer.err.split())
     assert Path("place.yaml").exists()
 
 
