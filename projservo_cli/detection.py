@@ -153,7 +153,7 @@ _SADDLE, _SADDLE_STEPS, _SADDLE_FLOOR = 7, 12, 0.001
 # Rms residual, in contrasts, and distance from the guess, in squares, above which a corner is rejected.
 _MISFIT, _FAR_SADDLE = 0.25, 0.3
 # Minimum width of a cell, px, to fit edges of a tag, whose border is one cell wide.
-MIN_CELL = 2.3
+MIN_CELL = 1.8
 # Minimum length of a side to fit, px.
 _MIN_SIDE = 6.0
 # Minimum extent of a profile on either side of an edge, px.
@@ -190,6 +190,9 @@ _RIGID = 1e3
 _FLOOR = 0.002
 # Error by the next edge, as a share of a cell, and its distance, as a share of a cell.
 _LEAK = (0.5, 0.6)
+# Cell width below which profiles reach into the next cell, px, and power of its ratio by which the error
+# grows, fitted to drawn tags with cells of 1.7 to 2.3 px, blurred by 0.4 to 1.3 px.
+_NARROW, _BY_NARROWNESS = 2.3, 3
 # Grey value from which white is clipped, less noise and JPEG artefacts.
 _CLIPPED = 252.0
 # Rms error of an edge fitted to min(k Φ, 1), as a share of the blur, for exposures k from 1 to 1½.
@@ -380,6 +383,7 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
     residual = _edge_model(x, strips)[0]
     C = np.linalg.inv(A) * ((residual**2).sum(axis=(1, 2)) / (count[good] - 5.0))[:, None, None]
     leak = _LEAK[0] * sides.cell * ndtr(-_LEAK[1] * sides.cell / x[:, 4])
+    leak *= np.maximum(1.0, _NARROW / sides.cell) ** _BY_NARROWNESS
     left_out = _FLOOR**2 + leak**2 + (_OVEREXPOSED * _clipped(strips) * x[:, 4]) ** 2
     by_place = np.array([[1.0, -0.5, 2.0 / 3.0], [1.0, 0.5, 2.0 / 3.0]])  # of n at both ends by n_0, k, c
     C = C[:, [2, 3, 5]][:, :, [2, 3, 5]]

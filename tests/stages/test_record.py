@@ -306,10 +306,10 @@ def without(view, *markers):
 
 
 def shrunk(q, s):
-    """Images in which the widest tag is 11 px wide."""
+    """Images in which the widest tag is 10 px wide."""
     middle, tags = s.mean(axis=1, keepdims=True), s[:, :8].reshape(2, 2, 4, 2)
     side = np.linalg.norm(tags - np.roll(tags, 1, axis=2), axis=-1).max()
-    return middle + 11.0 / max(side, 300.0) * (s - middle)
+    return middle + 10.0 / max(side, 300.0) * (s - middle)
 
 
 @pytest.mark.parametrize(
@@ -329,7 +329,7 @@ def shrunk(q, s):
         ),
         (
             shrunk,
-            r"tags are 11\.\d px wide in the left image .*, 1\.\d+ px a cell \(2\.3 at least\)",
+            r"tags are 10\.\d px wide in the left image .*, 1\.\d+ px a cell \(1\.8 at least\)",
         ),
     ],
 )

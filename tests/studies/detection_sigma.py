@@ -14,6 +14,7 @@ from projservo_cli.records import BoolArray, FloatArray
 from tests.detection.rendering import render
 
 SEED, IMAGES = 17, 400
+SIDES, TILT, BLURS = (20.0, 120.0), 75.0, (0.5, 3.0)  # px, deg, px
 SIZE = (640, 480)
 PLACES = [(u, v) for u in (107, 320, 533) for v in (120, 360)]
 FAR = 10.0  # of the camera from a tag, in its own lengths
@@ -45,17 +46,18 @@ def seen(side, tilt, center, rng):
     return center + side * X[:, :2] / (1.0 + X[:, 2:] / FAR)
 
 
-def errors(images, seed=SEED):
-    """What is found in so many images, beside the truth."""
+def errors(images, seed=SEED, sides=SIDES, tilt=TILT, blurs=BLURS):
+    """What is found in so many images, beside the truth.
+
+    sides : of tags, px; tilt : at most, deg; blurs : of images, px.
+    """
     finder, rng, found = TagFinder("4X4_50"), np.random.default_rng(seed), []
     for _ in range(images):
         tags = {
-            10 * k: seen(
-                np.exp(rng.uniform(*np.log([20.0, 120.0]))), np.radians(rng.uniform(0.0, 75.0)), at, rng
-            )
+            10 * k: seen(np.exp(rng.uniform(*np.log(sides))), np.radians(rng.uniform(0.0, tilt)), at, rng)
             for k, at in enumerate(rng.permutation(PLACES)[:5] + rng.uniform(-3.0, 3.0, (5, 2)))
         }
-        blur, noise = rng.uniform(0.5, 3.0), rng.uniform(1.0, 5.0)
+        blur, noise = rng.uniform(*blurs), rng.uniform(1.0, 5.0)
         image = render(cv2, TAGS, SIZE, list(tags.items()), blur=blur, noise=noise, rng=rng)
         for number, tag in finder.find(image.astype(np.float64))[0].items():
             known = np.isfinite(tag.sigma)
