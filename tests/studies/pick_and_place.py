@@ -247,6 +247,14 @@ def main():
             _driven(bench, truth, given)
 
 
+def draw(path, jpegs):
+    """Write four frames in two rows: taught, elsewhere, gripped, placed."""
+    parts = [cv2.imdecode(np.frombuffer(one, np.uint8), 0)[90:430, 130:590] for one in jpegs]
+    parts = [cv2.copyMakeBorder(one, 3, 3, 3, 3, cv2.BORDER_CONSTANT, value=255) for one in parts]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.block([parts[:2], parts[2:]]))
+
+
 def taught(bench, name, q):
     """Have somebody put the arm to joints (n,), deg, and teach a goal; joints where that was, or None."""
     there = []
@@ -276,9 +284,8 @@ def _driven(bench, truth, given):
             code, line = said(["servo", "-c", "arm.yaml", "-o", "run"])
             arm.clock.sleep(1.0)
             part.look()
-        if given.picture and k == 0:
-            drawn = [cv2.imdecode(np.frombuffer(one, np.uint8), 0)[110:430] for one in (at_grip, *taken)]
-            cv2.imwrite(str(given.picture), np.hstack(drawn))
+        if given.pictures and len(taken) == 3:
+            draw(given.pictures / f"{k}.png", (at_grip, *taken))
         mm, deg = part.off(truth.robot.pose(q))
         gripper = bench.bus.servos[6]
         holds = not part.dropped and gripper.on and arm.torque_on.all()
