@@ -453,7 +453,12 @@ class Settings(Printed, Root):
     def at_step(self, name: str) -> Self:
         """Return the configuration of one step of the task; of no name, this one."""
         assert self.task is not None or not name
-        return self.model_copy(update={"task": self.task.at_step(name)}) if name and self.task else self
+        if not name or self.task is None:
+            return self
+        seconds, trajectory = self.steps[name].duration_s, self.trajectory
+        if seconds is not None:
+            trajectory = trajectory.model_copy(update={"duration_s": seconds})
+        return self.model_copy(update={"task": self.task.at_step(name), "trajectory": trajectory})
 
     @property
     def idealized(self) -> Self:

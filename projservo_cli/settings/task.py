@@ -250,11 +250,16 @@ class TaskStep(Section):
     wait_s: Annotated[float, Strict(), Field(gt=0, le=3600)] | None = Field(
         None, description="time to hold the arm"
     )
+    duration_s: Positive | None = Field(
+        None, description="of a motion, such as one into contact; null: trajectory.duration_s"
+    )
 
     def contradictions(self) -> Iterator[Finding]:
         """No kind of step, or several."""
         if len(self.given(*_KINDS_OF_STEPS)) != 1:
             yield (), f"give exactly one of {', '.join(_KINDS_OF_STEPS)}"
+        elif self.duration_s is not None and not self.moves:
+            yield ("duration_s",), "is of a motion: to, approach or retreat; the robot class times an action"
 
     @property
     def kind(self) -> str:

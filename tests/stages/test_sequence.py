@@ -27,7 +27,7 @@ IN_HOLE = {
 STEPS = [
     {"act": {"gripper": 1.0}},
     {"approach": {"along": "pin", "by_m": 0.05, "to": "in_hole"}},
-    {"to": "in_hole"},
+    {"to": "in_hole", "duration_s": 4.0},
     {"act": {"gripper": 0.3}},
     {"wait_s": 0.5},
     {"retreat": {"along": "pin", "by_px": 40.0}},
@@ -84,6 +84,9 @@ def test_a_pin_is_brought_before_its_hole_goes_in_and_comes_out_along_it(call):
     assert list(run.results)[1:] == [f"plan/{name}" for name in MOTIONS] + [
         f"servo/{name}{'/exact_track' * (name in MOTIONS)}" for name in names
     ]
+    durations = [run.at_step(name).plan.duration for name in MOTIONS]
+    assert durations[1] == pytest.approx(4.0)
+    assert max(durations[::2]) < 2.0  # none is given
     truth = truth_of(load_config(PUMA))
     before, inside, after = (pin(trace, truth) for trace in run.traces.values())
     axis = (inside[1] - inside[0]) / np.linalg.norm(inside[1] - inside[0])
@@ -151,6 +154,7 @@ def test_an_interrupt_says_what_is_held(call, monkeypatch):
             {"steps": [{"to": "in_hole", "wait_s": 1.0}]},
             "exactly one of to, approach, retreat, act",
         ),
+        ({"steps": [{"act": {"gripper": 1}, "duration_s": 2}, STEPS[2]]}, "duration_s: is of a motion"),
         ({"steps": [{"retreat": {"along": "pin"}}, STEPS[2]]}, "give exactly one of by_m and by_px"),
         ({"steps": [{"retreat": {"along": "tip", "by_m": 0.1}}, STEPS[2]]}, "tip is a point, which has no"),
         (
