@@ -3,12 +3,12 @@
     python -m tests.studies.insertion [--tasks 30] [--conditions ...] [-o runs.csv]
 
 The arm, cameras and trials are those of the rendered study. A pin stands out of its tool along the diagonal
-of the middle tag; a fixed block has a hole 20 mm deep with a chamfer of 1 mm. Two goals are taught, the tip
-on the floor of the hole and 60 mm before that, and driven to one after the other by ``exact_track`` with the
-incidences pin on hole and tip on floor, so that the roll about the pin stays free. MuJoCo has the contact;
-the servos are those of the arm's file, with 2000 Nm/rad in the first three joints and 500 Nm/rad in the
-wrist, their load compensated as industrial arms do, and a run stops beyond 30 N. In the second condition the
-block is 4 mm beside where it was when the goals were taught, so that the pin meets its rim: the run has to
+of the middle tag; a fixed block has a hole 20 mm deep with a chamfer of 1 mm. One goal is taught, the tip on
+the floor of the hole, with the incidences pin on hole and tip on floor, so that the roll about the pin stays
+free. In two steps of a sequence ``exact_track`` approaches it along the pin and goes in. MuJoCo has the
+contact; the servos are those of the arm's file, with 2000 Nm/rad in the first three joints and 500 Nm/rad in
+the wrist, their load compensated as industrial arms do, and a run stops beyond 30 N. In the second condition
+the block is 4 mm beside where it was when the goal was taught, so that the pin meets its rim: the run has to
 stop and say why.
 
     python -m tests.studies.insertion --draw
@@ -16,7 +16,6 @@ stop and say why.
 draws the tasks anew and writes insertion_tasks.csv beside this file, which the study reads.
 """
 
-import csv
 import math
 import sys
 from pathlib import Path
@@ -27,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.features import Feature
+from projservo_cli.settings.task import TaskStep
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.mjcf import mujoco
 from tests.configured import plan, robot_by_itself, servo, truth_of
@@ -57,6 +57,10 @@ FEATURES = {
     "floor": Feature(on="scene", point="tip"),
 }
 INCIDENCES = (("pin", "hole"), ("tip", "floor"))
+STEPS = (
+    TaskStep.model_validate({"approach": {"along": "pin", "by_m": STAND_OFF_M, "to": "inside"}}),
+    TaskStep.model_validate({"to": "inside", "duration_s": SLOWLY_S}),
+)
 # Depth of the tip that counts as in, m: on the floor to a millimetre.
 IN_M = DEPTH_M - 0.001
 
@@ -195,11 +199,7 @@ def drawn():
         rng = np.random.default_rng(seed)
         while (ends := task_of(rng, truth.robot)) is None or not clear(folder, ends):
             pass
-        yield (
-            {"seed": seed}
-            | row_of(ends[::2])
-            | {f"before_q{i}": repr(float(x)) for i, x in enumerate(ends[1], 1)}
-        )
+        yield {"seed": seed} | row_of(ends[::2])
 
 
 def clear(folder, ends):
@@ -223,43 +223,36 @@ def goal_of(config, q, seed):
     )
 
 
-def run(config, calibration, ends, aim, seed):
-    """A run from joints (n,) to a goal near others, and why there was none."""
-    chosen = with_task(config, ends, aim, seed=seed)
-    try:
-        return servo.run(chosen, calibration, plan.run(chosen, calibration), "exact_track"), ""
-    except WorkFailed as error:
-        return None, str(error)
-
-
 def driven(job):
     """Row of a task."""
     condition, seed, calibration = job
-    folder, (start, goal) = mkdtemp(), tasks_in(TASKS)[seed]
-    before = before_of(seed)
+    folder, (q, goal) = mkdtemp(), tasks_in(TASKS)[seed]
     truth = truth_of(config_of(folder, "bare", None))
     into, mouth = hole_of(truth, goal)
-    taught = config_of(folder, "taught", (into, mouth))
+    aim = goal_of(config_of(folder, "taught", (into, mouth)), goal, seed)
     if condition == "moved":
         side = np.cross(into, [0.0, 1.0, 0.0])
         mouth = mouth + MOVED_M * side / np.linalg.norm(side)
-    config, row = config_of(folder, "task", (into, mouth)), {"condition": condition, "seed": seed}
-    first, why = run(config, calibration, (start, before), goal_of(taught, before, seed), seed)
-    if first is None or first.verdict != "converged":
-        told = {"verdict": "not started", "reason": why} if first is None else told_of(first)
-        return row | told | {"leg": "before the hole", "in": False}
-    slow = config.trajectory.model_copy(update={"duration_s": SLOWLY_S})
-    slow = config.model_copy(update={"trajectory": slow})
-    last, why = run(slow, calibration, (first.q[-1], goal), goal_of(taught, goal, seed), seed)
-    if last is None:
-        return row | {"leg": "into the hole", "verdict": "not started", "reason": why, "in": False}
-    pin, tip = along(last.pose[-1])
+    config = config_of(folder, "task", (into, mouth))
+    task = config.task.model_copy(update={"goals": {"inside": aim}, "steps": STEPS})
+    config = config.model_copy(update={"task": task})
+    row = {"condition": condition, "seed": seed, "in": False}
+    for name in config.steps:
+        step = config.at_step(name)
+        step, row["leg"] = with_task(step, (q, goal), step.task.goal, seed=seed), name
+        try:
+            trace = servo.run(step, calibration, plan.run(step, calibration), "exact_track")
+        except WorkFailed as error:
+            return row | {"verdict": "not started", "reason": str(error)}
+        row, q = row | told_of(trace), trace.q[-1]
+        if trace.verdict != "converged":
+            break
+    pin, tip = along(trace.pose[-1])
     depth = float((tip - mouth) @ into)
-    turned = last.pose[-1][:3, :3].T @ truth.robot.pose(goal)[:3, :3]
+    turned = trace.pose[-1][:3, :3].T @ truth.robot.pose(goal)[:3, :3]
     return (
         row
-        | told_of(last)
-        | {"leg": "into the hole", "in": last.verdict == "converged" and depth >= IN_M}
+        | {"in": trace.verdict == "converged" and depth >= IN_M}
         | {"depth_mm": 1e3 * depth, "beside_mm": 1e3 * float(np.linalg.norm(tip - mouth - depth * into))}
         | {"tilt_deg": math.degrees(math.acos(min(1.0, float(pin @ into))))}
         | {"roll_deg": math.degrees(float(np.linalg.norm(Rotation.from_matrix(turned).as_rotvec())))}
@@ -276,13 +269,6 @@ def told_of(trace):
         "peak_n": float(force.max()),
         "left_n": float(force[-1]),
     }
-
-
-def before_of(seed):
-    """Joints (n,) of a task before the hole."""
-    with open(TASKS, encoding="utf-8", newline="") as file:
-        row = next(row for row in csv.DictReader(file) if int(row["seed"]) == seed)
-    return np.array([float(row[f"before_q{i}"]) for i in range(1, 7)])
 
 
 def main():
