@@ -83,9 +83,14 @@ def steps_for(
     stages = STAGES[: max(map(STAGES.index, named)) + 1]
     inputs = _Inputs() if recording else _inputs(config, run, stages)
 
+    def names_of(asked: Sequence[str]) -> Sequence[str]:
+        if config.steps and run.traces and not (laws or "servo" in named):  # that of the call that drove it
+            return list(dict.fromkeys(name.split("/")[-1] for name in run.traces))
+        return run_names(asked, config.control.mode)
+
     def planned(stages: Sequence[str], laws: Sequence[str]) -> list[Step]:
         steps: list[Step] = []
-        sources = _sources(laws, config, run) if "servo" in stages else {}
+        sources = _sources(names_of(laws), config, run) if "servo" in stages else {}
         if config.steps and len(sources) > 1:
             raise InputError(
                 f"task.steps: one law in one mode drives a sequence, and there are {', '.join(sources)}: "
@@ -137,8 +142,8 @@ class _Read(NamedTuple):
     unkeyed: bool = False  # whether the law is of a notebook or a script, whose source is in no module
 
 
-def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
-    """Return the files of the run of each law, by its name: sources of plug-in law and robot.
+def _sources(names: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
+    """Return the files of each run of a law, by its name: sources of plug-in law and robot.
 
     Where the source of a law is gone since, the stored hash stands. Another source of a robot outdates
     nothing: its motion cannot be repeated.
@@ -146,7 +151,7 @@ def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
     plant = "" if config.plant.simulated else config.plant.use or ""
     robot = f"source of {plant}"
     found: dict[str, _Read] = {}
-    for law in run_names(laws, config.control.mode):
+    for law in names:
         name = law_and_mode(law)[0]
         part = next((f"{part}/" for part, step in config.steps.items() if step.moves), "")
         stored = run.results.get(f"{SERVO}{part}{law}")

@@ -218,13 +218,13 @@ def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
     "report",
     epilog="Example: projservo calibrate plan servo report -c configs/ur5.yaml -o results/ur5 --view",
 )
-@click.argument("sweep", metavar="[SWEEP]", required=False, type=option.PATH)
+@click.argument("run", metavar="[RUN]", required=False, type=option.PATH)
 @click.option("--view", is_flag=True, help="A 3D view of robot, rig and paths with a time slider, view.html.")
 @click.option(
     "--animation", is_flag=True, help="Both camera images under several laws over time, animation.gif."
 )
 @option.of_stages
-def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **options: Any) -> int:
+def _report(stages: Sequence[str], console: Console, *, run: Path | None, **options: Any) -> int:
     """Draw the figures and check the paper's claims.
 
     Writes into the folder of the run: the figures, each with its numbers as CSV; the table of claims; and
@@ -235,11 +235,14 @@ def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **op
     what the cameras see under the direct and the classical laws. The page links to both; a report that is up
     to date is not made again for them.
 
-    projservo report SWEEP, with the folder of a sweep, writes its statistics and figures instead: success
+    RUN is short for -o RUN. With the folder of a sweep it writes its statistics and figures instead: success
     with intervals, final errors, laws compared on the same tasks.
     """
-    if sweep is not None:
-        return _print_sweep(console, sweep, options)
+    from projservo_cli.store import SWEEP, run_path
+
+    if run is not None and (run.name == SWEEP or not run_path(run).is_file()):
+        return _print_sweep(console, run, options)
+    options["output"] = option.one_run("report", run, options["output"])
     return _make(console, stages, options)
 
 

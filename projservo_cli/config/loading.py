@@ -596,7 +596,10 @@ def _taught(
     if not file.resolve().exists():
         if teaching:
             return None
-        command = f"projservo teach{' --start' * (path == ('start',))} -c FILE -o {file}"
+        of_start = path == ("start",)
+        if of_start and difflib.get_close_matches(name, [CURRENT]):
+            raise InputError(f"{where}: there is no file {file.resolve()}; {_nearest(name, [CURRENT])}")
+        command = f"projservo teach{' --start' * of_start} -c FILE -o {file}"
         raise InputError(
             f"{where}: there is no {file.resolve()} yet: teach it first, before a recording: {command}"
         )
