@@ -19,13 +19,11 @@ from projservo_cli.laws import CODES, mode_in
 from projservo_cli.progress import Listener
 from projservo_cli.records import (
     Calibration,
-    CrossValidation,
     InputError,
     Observation,
-    Report,
     WorkFailed,
 )
-from projservo_cli.results import ImageModel, MotionPlan, PlanScene, RunTrace
+from projservo_cli.results import HeldOutErrors, ImageModel, MotionPlan, PlanScene, RunTrace, WrittenReport
 from projservo_cli.stages import Progress
 from projservo_cli.steps import STAGES
 from projservo_cli.store import Result, Run, stored
@@ -179,14 +177,21 @@ class Experiment(Printed):
         return ImageModel.of(calibration, self._run.cross_validation, self._run.observation)
 
     @property
-    def cross_validation(self) -> CrossValidation | None:
+    def cross_validation(self) -> HeldOutErrors | None:
         """Held-out errors of the calibration; None where they were not asked for."""
-        return self._run.cross_validation
+        return self.calibration.cross_validation
 
     def at_step(self, name: str) -> "Experiment":
         """Return one step of a sequence as an experiment of its own, with its ``plan`` and its ``traces``.
 
-        Raises InputError where no motion of such a name was made.
+        Parameters
+        ----------
+        name : of the motion, as in ``traces``.
+
+        Raises
+        ------
+        InputError
+            Where no motion of such a name was made.
         """
         names = [one.removeprefix("plan/") for one in self.results if one.startswith("plan/")]
         if name not in names:
@@ -210,11 +215,10 @@ class Experiment(Printed):
         return {name: RunTrace.of(trace, face) for name, trace in self._run.traces.items()}
 
     @property
-    def report(self) -> Report:
+    def report(self) -> WrittenReport:
         """Claims and figures of the report."""
         self._require("report")
-        found: Report = self._run.results["report"].records[""]
-        return found
+        return WrittenReport.of(self._run.results["report"].records[""])
 
     def _require(self, stage: str) -> None:
         """Raise InputError for a missing result."""

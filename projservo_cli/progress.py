@@ -13,7 +13,7 @@ LINE_S = 60.0
 
 
 class _Bar:
-    """Progress bar, one at a time; a line a minute if standard error is no terminal."""
+    """Progress bar, one at a time; a line a minute if standard error is neither terminal nor notebook."""
 
     def __init__(self) -> None:
         self._bar: Any = None
@@ -21,14 +21,14 @@ class _Bar:
 
     def __call__(self, what: str, done: int, total: int, note: str = "") -> None:
         """Move the bar of ``what`` to ``done`` of ``total``, with a note, and remove it at the end."""
-        if not sys.stderr.isatty():
+        if not (sys.stderr.isatty() or "ipykernel.zmqshell" in sys.modules):  # the test of tqdm.auto
             self._line(what, done, total)
             return
         if self._bar is None or self._bar.desc != what:
-            from tqdm import tqdm
+            from tqdm.auto import tqdm
 
             self.close()
-            self._bar = tqdm(total=total, desc=what, leave=False, ncols=80)
+            self._bar = tqdm(total=total, desc=what, leave=False, ncols=80 if sys.stderr.isatty() else None)
             threading.Thread(target=self._tick, args=(self._bar,), daemon=True).start()
         self._bar.total = total
         self._bar.set_postfix_str(note, refresh=False)

@@ -45,6 +45,7 @@ from projservo_cli.records import (
     Model,
     Observation,
     Plan,
+    Report,
     Trace,
 )
 from projservo_cli.settings.task import Trajectory
@@ -71,6 +72,45 @@ def _fields_of(record: Any, kind: type) -> dict[str, Any]:
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class HeldOutErrors(Displayable, CrossValidation):
+    """A cross-validation that shows itself."""
+
+    def summary(self) -> dict[str, str]:
+        """Return a summary in words, by name."""
+        found = {"folds": f"{self.folds} of {self.unit}", "count": f"{self.count} marker-view pairs"}
+        if self.rms_px is not None:
+            found["held out"] = (
+                f"rms {self.rms_px:.3g} px (predicted {self.predicted_rms_px or math.nan:.3g}), "
+                f"median {self.median_px:.3g}, p95 {self.p95_px:.3g}"
+            )
+        if self.posture_rms_px is not None and self.time_rms_px is not None:
+            blocks = f"of posture rms {self.posture_rms_px:.3g} px, of time rms {self.time_rms_px:.3g} px"
+            found["in blocks"] = blocks
+        if self.failed:
+            found["failed"] = "; ".join(self.failed)
+        return found | {"reason": self.reason}
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class WrittenReport(Displayable, Report):
+    """A report that shows itself."""
+
+    @classmethod
+    def of(cls, report: Report) -> Self:
+        """Return a record with its functions."""
+        return cls(**_fields_of(report, Report))
+
+    def summary(self) -> dict[str, str]:
+        """Return a summary in words, by name."""
+        held = [claim["holds"] for claim in self.claims]
+        found = {"figures": f"{len(self.figures)} files", "omitted": f"{len(self.omitted)}"}
+        if held:
+            found["claims"] = f"{held.count(True)} hold, {held.count(False)} do not, of {len(held)}"
+        failing = [claim["claim"] for claim in self.claims if claim["holds"] is False]
+        return found | ({"do not hold": ", ".join(failing)} if failing else {})
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class ImageModel(Displayable, Calibration):
     """A calibration that predicts images: all of its arrays, with functions on them.
 
@@ -78,7 +118,7 @@ class ImageModel(Displayable, Calibration):
     readings rad or m. A point that is not in front of a camera has no pixels there: NaN.
     """
 
-    cross_validation: CrossValidation | None = None  # held-out errors, where they were asked for
+    cross_validation: HeldOutErrors | None = None  # held-out errors, where they were asked for
     observation: Observation | None = None  # of the calibration, if at hand
 
     @classmethod
@@ -91,9 +131,8 @@ class ImageModel(Displayable, Calibration):
         """Return a record with its functions."""
         if isinstance(calibration, cls):
             return calibration
-        return cls(
-            **_fields_of(calibration, Calibration), cross_validation=cross_validation, observation=observation
-        )
+        held_out = cross_validation and HeldOutErrors(**_fields_of(cross_validation, CrossValidation))
+        return cls(**_fields_of(calibration, Calibration), cross_validation=held_out, observation=observation)
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the residuals of the calibration and the observability of the joints, as the report does.
@@ -606,21 +645,24 @@ class RunTrace(Displayable, Trace):
         return figures.of_trace(self, self.face)
 
     def coordinates(self) -> dict[str, Any]:
-        """Return coordinates of dimensions, by their names; ``time`` in s."""
-        time = ("time", self.period * np.arange(len(self.q)), {"units": "s"})
+        """Return coordinates of dimensions, by their names; ``time`` is in the record."""
         face = {"marker": list(self.face)} if self.face else {}
-        return super().coordinates() | {"time": time} | face
+        return super().coordinates() | face
 
     def summary(self) -> dict[str, str]:
         """Return a summary in words, by name."""
         found = {
-            "law": self.law if self.mode == "regulate" else f"{self.law}, {self.mode}",
+            "law": self.law,
+            "mode": self.mode if self.planned_s is None else f"{self.mode}, a plan of {self.planned_s:.4g} s",
+            "features": self.features,
             "verdict": f"{self.verdict}: {self.reason}",
             "steps": f"{self.steps}, {self.steps * self.period:.4g} s",
             "image error": f"{self.image_error[-1]:.4g} px rms as seen",
         }
+        if self.incidences:
+            found["incidences"] = f"{', '.join(self.incidences)}; {self.free_dof or 'no'} joint motion free"
         if self.unplanned:
-            found["plan"] = f"none was followed, the law regulated to the goal: {self.unplanned}"
+            found["unplanned"] = f"regulated to the goal: {self.unplanned}"
         if self.untested:
             found["images"] = f"not tested against the calibration: {self.untested}"
         if self.features == "body":

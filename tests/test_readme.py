@@ -1,6 +1,7 @@
 """Test every command of README."""
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -64,6 +65,8 @@ def test_your_own_arm_in_five_commands(shared_data, tmp_path, monkeypatch, capsy
     simulated = blocks("yaml")[0].replace("{port: /dev/ttyUSB0}", "{truth: truth.json}")
     (tmp_path / "mine.yaml").write_text(simulated, encoding="utf-8")
     (tmp_path / "truth.json").symlink_to(shared_data / "ur5" / "truth.json")
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True, readline=lambda: "\n"))
+    monkeypatch.setattr("click.confirm", lambda question, **_: True)
     run_commands(MINE)
     said = capsys.readouterr().err.splitlines()  # a recording, a goal and a law
     ends = ["ready", "at rest", "closed"]

@@ -20,12 +20,15 @@ from projservo_cli.sweeps.study import Study
 
 # What Python users call, in the order of a run, and the members of each class.
 INTERFACE: dict[Any, tuple[str, ...]] = {
-    Config: ("load", "replace"),
+    Config: ("load", "from_dict", "replace"),
     Observations: ("from_arrays", "from_frame", "to_frame"),
     api.simulate: (),
     api.record: (),
     api.calibrate: (),
-    ImageModel: ("predict", "jacobian", "score", "refitted", "covariance", "metric", "project", "plot"),
+    ImageModel: (
+        *("predict", "jacobian", "score", "residuals", "suggest", "refitted", "displaced", "covariance"),
+        *("metric", "project", "plot"),
+    ),
     MetricModel: (
         *("pose", "pose_covariance", "position_std", "triangulate", "triangulation_covariance"),
         *("covariance", "in_frames_of", "errors_of", "to_xarray"),
@@ -34,7 +37,7 @@ INTERFACE: dict[Any, tuple[str, ...]] = {
     api.servo: (),
     api.sweep: (),
     Study: ("table", "traces", "failures", "success", "paired", "to_frame", "to_xarray"),
-    Experiment: ("make", "results", "calibration", "plan", "traces", "report"),
+    Experiment: ("make", "servo", "results", "calibration", "plan", "traces", "at_step", "report"),
     api.load: (),
     records.InputError: (),
     records.WorkFailed: (),

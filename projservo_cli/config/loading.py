@@ -294,7 +294,7 @@ class Config(Settings):
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Config":
-        """Check a configuration that is at hand, such as that of an arm of your own.
+        """Return a configuration of values at hand, such as that of an arm of your own.
 
         Parameters
         ----------

@@ -362,11 +362,15 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
             field.name,
             field.metadata["dims"],
             data=value.astype(np.int8) if boolean else value,
-            **({"chunks": _chunks(value), "fletcher32": True} if value.size else {}),
+            **_checked(value),
         )
         data.attrs.update({"units": field.metadata["units"], "long_name": field.metadata["about"]})
         if boolean:  # netCDF has no booleans; xarray marks them so
             data.attrs["dtype"] = "bool"
+    if isinstance(record, Trace):  # a coordinate, which reading makes of the period again
+        seconds = record.period * np.arange(sizes["time"])
+        time = group.create_variable("time", ("time",), data=seconds, **_checked(seconds))
+        time.attrs.update({"units": "s", "long_name": "time since the first instant"})
 
 
 def dataset_of(record: Any) -> Any:
@@ -379,10 +383,12 @@ def dataset_of(record: Any) -> Any:
     return xarray.load_dataset(image, engine="h5netcdf", group="record")
 
 
-def _chunks(value: npt.NDArray[Any]) -> tuple[int, ...]:
-    """Shape of a chunk of an array: all of it, or as many rows as ``_AT_ONCE`` bytes hold."""
+def _checked(value: npt.NDArray[Any]) -> dict[str, Any]:
+    """Options of an array with a checksum, in chunks of as many rows as ``_AT_ONCE`` bytes hold."""
+    if not value.size:
+        return {}
     rows = len(value) * _AT_ONCE // value.nbytes
-    return (min(max(1, rows), len(value)), *value.shape[1:])
+    return {"chunks": (min(max(1, rows), len(value)), *value.shape[1:]), "fletcher32": True}
 
 
 def _require_sizes(name: str, dims: tuple[str, ...], shape: tuple[int, ...], sizes: dict[str, int]) -> None:
