@@ -356,7 +356,7 @@ def sweep(
     config: Config,
     laws: Sequence[str | type],
     *,
-    tasks: int | None = None,
+    tasks: int | Mapping[str, Any] | Sequence[Any] | None = None,
     runs: int | None = None,
     calibrations: int = 1,
     grid: Mapping[str, Any] | None = None,
@@ -373,7 +373,9 @@ def sweep(
     ----------
     config : of a simulated robot with a task.
     laws : names, ``module:Class`` or classes; a name may contain its mode, such as ``exact_track``.
-    tasks : random tasks within sight of the cameras; by default that of the configuration alone.
+    tasks : number of random tasks within sight of the cameras; or a list of tasks, each joints (n,) at start
+        and goal, rad or m, or a mapping of keys of ``task``; or the section ``tasks`` of a sweep; by default
+        the task of the configuration alone.
     runs : of each cell; by default one a task, or twenty.
     calibrations : of a cell, from noisy trials; run r is made with number r mod this.
     grid : lists of values by key, such as ``{"noise.servo_px": [0.0, 0.5]}``.
@@ -414,11 +416,11 @@ def sweep(
         "grid": axes,
         "random": dict(random or {}),
         "calibrations": calibrations,
-        "tasks": None if tasks is None else {"random": tasks},
+        "tasks": _tasks(tasks),
     }
     asked = sweep_of(values)
     if runs is None and asked.tasks is not None:
-        asked = asked.model_copy(update={"runs": asked.tasks.random})
+        asked = asked.model_copy(update={"runs": asked.tasks.count})
     design = Design(asked, ((config.name, to_yaml(config)),))
     require_sound(design)
     # A law without source has no key: its stored results cannot be matched to it.
@@ -534,6 +536,23 @@ def _goal(config: Config, calibration: Calibration, goal: Any) -> Any:
         return {"joints": {"joints": joints.tolist(), "unit": "rad"}}
     pixels = checked_array("goal", goal, (V, m, 2), shape, finite=True).tolist()
     return {"images": dict(zip(view, pixels, strict=True))}
+
+
+def _tasks(tasks: Any) -> Any:
+    """Tasks as a sweep has them."""
+    if tasks is None or isinstance(tasks, Mapping):
+        return tasks
+    if isinstance(tasks, str) or not np.iterable(tasks):
+        return {"random": tasks}
+    return {"listed": [task if isinstance(task, Mapping) else _task_between(task) for task in tasks]}
+
+
+def _task_between(ends: npt.ArrayLike) -> dict[str, Any]:
+    """Return the task from joints (n,) to joints (n,), rad or m, given as (2, n)."""
+    said = "(2, n), joint readings at start and goal"
+    q = checked_array("tasks", ends, (2, None), said, finite=True)
+    start, goal = ({"joints": row, "unit": "rad"} for row in q.tolist())
+    return {"start": start, "start_offset": None, "goal": {"joints": goal}}
 
 
 def _law_of_sweep(law: str | type, workers: int) -> str:

@@ -34,6 +34,7 @@ from projservo_cli.simulation.described import (
 from projservo_cli.simulation.faults import SimulatedRobot
 from projservo_cli.simulation.mjcf import files_named
 from projservo_cli.simulation.rendering import RenderedScene
+from projservo_cli.simulation.streams import NORMAL, NoiseShape
 from projservo_cli.simulation.workspace import SceneObject, Truth
 from projservo_cli.stages.stage_inputs import (
     CalibrationInputs,
@@ -428,10 +429,17 @@ def _truth(config: Config, *, face: bool) -> Truth:
         raise InputError("this stage needs a simulated rig: set rig.left, rig.right and rig.image_size_px")
     if config.markers is None or config.markers.points is None:
         raise InputError("this stage needs the markers of the simulated robot: set markers.positions_m")
-    rendered = config.plant.rendered
-    k1 = 0.0 if rendered is None else rendered.k1
+    rendered, n = config.plant.rendered, config.noise
+    if rendered is not None and any(any(camera.lens) for camera in config.rig.cameras.values()):
+        raise InputError(
+            "rig: lens is that of cameras that see points: of rendered ones set plant.options.k1"
+        )
+    factor = n.outlier_factor if n.outlier_share else NORMAL.outlier_factor
+    noise = NoiseShape(math.inf if n.tail_dof is None else n.tail_dof, n.outlier_share, factor)
     markers = config.markers if face else config.markers.model_copy(update={"center": "midpoint"})
-    return described_truth(config.arm, config.rig, markers, k1, face)
+    return described_truth(
+        config.arm, config.rig, markers, noise, face, 0.0 if rendered is None else rendered.k1
+    )
 
 
 def scene_of(

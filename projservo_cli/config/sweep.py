@@ -71,9 +71,31 @@ class Distribution(Section):
 
 
 class _Tasks(Section):
-    """Reaching tasks instead of that of the base."""
+    """Tasks instead of that of the base, which the runs of a cell take in turn."""
 
-    random: Count = Field(description="number of random tasks, which the runs of a cell take in turn")
+    random: Count | None = Field(
+        None, description="number of random tasks, which the runs of a cell take in turn"
+    )
+    rotation_deg: tuple[Number, Number] = Field(
+        (0.0, 180.0),
+        description="minimum and maximum rotation of random tasks, with as many in each sixth of it",
+    )
+    listed: Annotated[tuple[dict[str, Plain], ...], Field(min_length=1)] | None = Field(
+        None,
+        description="tasks instead of random ones, each with keys of task that replace those of the base",
+    )
+
+    @property
+    def count(self) -> int:
+        """Number of tasks."""
+        return len(self.listed) if self.listed is not None else self.random or 0
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Random and listed tasks, or none; rotations that are no range."""
+        if (self.random is None) == (self.listed is None):
+            yield (), "give exactly one of random and listed"
+        if not 0.0 <= self.rotation_deg[0] < self.rotation_deg[1] <= 180.0:
+            yield ("rotation_deg",), "needs a minimum below the maximum, both within 0 and 180"
 
 
 class SweepConfig(Root):
@@ -101,7 +123,7 @@ class SweepConfig(Root):
         {}, description="distribution of the value of a key, drawn for each run, or for each calibration "
         "that depends on the key",
     )  # fmt: skip
-    tasks: _Tasks | None = Field(None, description="random tasks; null: the task of the base")
+    tasks: _Tasks | None = Field(None, description="random or listed tasks; null: the task of the base")
     calibrations: Count = Field(
         1, description="number of calibrations of a cell; run r uses number r mod this"
     )

@@ -214,6 +214,11 @@ class Camera(Section):
     position_m: Vector3 | None = Field(None, description="optical centre in the base frame")
     target_m: Vector3 | None = Field(None, description="point at which the camera looks, in the base frame")
     up: Vector3 = Field((0.0, 0.0, 1.0), description="direction in the base frame that is up in the image")
+    lens: Vector2 = Field(
+        (0.0, 0.0),
+        description="radial distortion k1 and k2 of a simulated camera that sees points, in units of the "
+        "focal length",
+    )
 
     def contradictions(self) -> Iterator[Finding]:
         """Two descriptions, half a one, or one that is no camera."""

@@ -28,6 +28,15 @@ class Noise(Section):
     averaged_frames: Count = Field(
         1, description="number of images averaged at the start and at the goal, where the robot rests"
     )
+    tail_dof: Number | None = Field(
+        None, gt=2, description="degrees of freedom of Student's t, of the same deviation; null: normal noise"
+    )
+    outlier_share: Number = Field(
+        0.0, ge=0, lt=1, description="share of the markers of an image that are outliers"
+    )
+    outlier_factor: Number = Field(
+        20.0, ge=1, description="standard deviation of outliers, over that of the noise"
+    )
 
 
 class Refit(Section):

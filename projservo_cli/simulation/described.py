@@ -19,6 +19,7 @@ from projservo_cli.settings.markers import Markers, Tag
 from projservo_cli.settings.robot import Camera, Rig, RobotSettings
 from projservo_cli.simulation.arm import Link, SerialArm, dh_twists
 from projservo_cli.simulation.rendering import RenderedScene, lens_of
+from projservo_cli.simulation.streams import NoiseShape
 from projservo_cli.simulation.workspace import Truth
 from projservo_cli.task.face import MIDPOINT
 
@@ -87,12 +88,15 @@ def center_in_face(markers: Markers) -> int:
 
 
 @lru_cache(maxsize=32)
-def described_truth(robot: RobotSettings, rig: Rig, markers: Markers, k1: float, face: bool) -> Truth:
-    """Robot, rig and markers as they are.
+def described_truth(
+    robot: RobotSettings, rig: Rig, markers: Markers, noise: NoiseShape, face: bool, k1: float = 0.0
+) -> Truth:
+    """Robot, rig and markers as they are, and how pixels err.
 
-    k1 : radial distortion of both lenses, in units of the focal length.
     face : whether the truth has the face, of which a calibration knows nothing.
+    k1 : radial distortion of all rendered lenses, in units of the focal length, instead of those of the rig.
     """
+    bent = np.array([(k1, 0.0) if k1 else camera.lens for camera in rig.cameras.values()])
     arm, P, numbers = arm_of(robot), cameras_of(rig), markers.known
     assert numbers is not None
     points, on_tool = np.c_[markers.points, np.ones(len(numbers))], rig.mount == TOOL
@@ -106,10 +110,11 @@ def described_truth(robot: RobotSettings, rig: Rig, markers: Markers, k1: float,
         face=tuple(numbers.index(number) for number in markers.front or ()) if face else (),
         center=center_in_face(markers),
         image_size=image_sizes(rig.image_size_px, len(P)),
-        lens=lens_of(P, k1) if k1 else no_lenses(len(P)),
+        lens=lens_of(P, *bent.T) if bent.any() else no_lenses(len(P)),
         normals=np.zeros(3) if markers.normals is None else markers.normals @ base_tool[:3, :3].T,
         view=tuple(rig.cameras),
         on_tool=on_tool,
+        noise=noise,
     )
 
 

@@ -95,7 +95,7 @@ class Points(NamedTuple):
         mean_pixels = np.mean([self.see(joints, M)[view] for joints in q], axis=0)
         if self.standing.size:
             mean_pixels = np.concatenate([mean_pixels, self.standing[view]])
-        return np.asarray(mean_pixels + self.sigma_px * rng.standard_normal(mean_pixels.shape)), None
+        return np.asarray(mean_pixels + self.sigma_px * self.truth.noise.draw(rng, mean_pixels.shape)), None
 
 
 class _Servos(Protocol):

@@ -15,21 +15,27 @@ from projservo_cli.simulation.workspace import Truth
 _RANGE = 0.9  # share of the range of a joint that is drawn from
 _LEAST_COSINE = math.cos(math.radians(75.0))  # of the angle between the normal of the face and a ray
 STRATA = 6
-"""Equal parts of half a turn, of each of which there are as many tasks."""
+"""Equal parts of the range of rotations, of each of which there are as many tasks."""
 _BATCH = 2_000  # joint vectors drawn at once
 _MOST_DRAWS = 20_000_000  # joint vectors
 
 
 def random_tasks(
-    truth: Truth, q_front: FloatArray, count: int, rng: np.random.Generator, least_views: int = 0
+    truth: Truth,
+    q_front: FloatArray,
+    count: int,
+    rng: np.random.Generator,
+    least_views: int = 0,
+    angles: tuple[float, float] = (0.0, math.pi),
 ) -> tuple[FloatArray, FloatArray]:
-    """Draw tasks within sight of the cameras, one of each sixth of half a turn in turn.
+    """Draw tasks within sight of the cameras, one of each sixth of a range of rotations in turn.
 
     q_front : (n,) joints at which the first camera sees the front of the face, rad or m.
     least_views : number of cameras that see it at both ends, 0 for all.
+    angles : least and greatest rotation, rad.
     Returns joints (count, n) at start and goal, rad or m.
     """
-    limits = truth.robot.limits
+    limits, (low, high) = truth.robot.limits, angles
     middle, half = 0.5 * (limits.lower + limits.upper), 0.5 * _RANGE * (limits.upper - limits.lower)
     if not np.isfinite(half).all():
         raise InputError("random tasks need joint limits: set limits of every joint of the robot")
@@ -52,8 +58,8 @@ def random_tasks(
         while len(waiting) >= 2:
             (start, R), (goal, R_goal) = waiting.pop(0), waiting.pop(0)
             angle = math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(R.T @ R_goal)) - 1.0))))
-            stratum = min(STRATA - 1, int(STRATA * angle / math.pi))
-            if len(found[stratum]) < quota[stratum]:
+            stratum = min(STRATA - 1, math.floor(STRATA * (angle - low) / (high - low)))
+            if low <= angle <= high and len(found[stratum]) < quota[stratum]:
                 found[stratum].append((start, goal))
     tasks = [tasks[k] for k in range(max(quota)) for tasks in found if k < len(tasks)]
     starts, goals = (np.array(column) for column in zip(*tasks, strict=True))

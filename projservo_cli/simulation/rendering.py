@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 
@@ -104,11 +105,11 @@ def _decomposed(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return np.asarray(K / K[2, 2]), np.asarray(R), np.asarray(t)
 
 
-def lens_of(P: FloatArray, k1: float) -> FloatArray:
-    """Lenses (V, 5) of metric cameras (V, 3, 4), with k1 in units of the focal length."""
+def lens_of(P: FloatArray, k1: npt.ArrayLike, k2: npt.ArrayLike = 0.0) -> FloatArray:
+    """Lenses (V, 5) of metric cameras (V, 3, 4), with k1 and k2 (V,) in units of the focal length."""
     K = np.array([_decomposed(camera)[0] for camera in P])
     radius = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
-    return np.column_stack([K[:, 0, 2], K[:, 1, 2], radius, np.full(len(P), k1), np.zeros(len(P))])
+    return np.column_stack([K[:, 0, 2], K[:, 1, 2], radius, *(np.full(len(P), k) for k in (k1, k2))])
 
 
 @lru_cache(maxsize=4)

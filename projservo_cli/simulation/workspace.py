@@ -24,6 +24,7 @@ from projservo_cli.simulation.arm import (
     inverse_kinematics,
     roll_axis,
 )
+from projservo_cli.simulation.streams import NORMAL, NoiseShape
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 
 _EDGE_OF_FACE = 1e-9  # of a·O, from where a face is seen edge-on
@@ -46,6 +47,7 @@ class Truth:
     normals: FloatArray = field(default_factory=lambda: np.zeros(3))
     view: tuple[str, ...] = VIEWS  # names of the views
     on_tool: bool = False  # whether the cameras are on the tool, and markers belong to the scene
+    noise: NoiseShape = NORMAL  # distribution of the noise of pixels
 
     @cached_property
     def model(self) -> Model:

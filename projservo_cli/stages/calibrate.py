@@ -12,6 +12,7 @@ from projservo_cli.calibration.checks.screening import screened
 from projservo_cli.calibration.checks.undecided import undecided_pairs
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.files import write_whole
+from projservo_cli.geometry.lens import K1
 from projservo_cli.nominal import read_nominal
 from projservo_cli.observations import Observations
 from projservo_cli.planning.pose_selection import FARTHER, Suggestion, region_around, suggest
@@ -25,7 +26,7 @@ from projservo_cli.records import (
     Observation,
     WorkFailed,
 )
-from projservo_cli.simulation.streams import SUGGESTIONS, generator
+from projservo_cli.simulation.streams import NORMAL, SUGGESTIONS, generator
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed
 from projservo_cli.stages.stage_inputs import (
@@ -93,19 +94,20 @@ def simulated(
     """Simulate the trial motions, or poses (K, n), rad or m; the observations."""
     observation, noise_px = observed(trials, q, seed, progress=progress)
     assert trials.truth is not None
-    ideal = trials.driven is None
-    sizes = tuple(map(tuple, trials.truth.image_size.astype(int).tolist()))
+    truth, ideal = trials.truth, trials.driven is None
+    normal, straight = truth.noise == NORMAL, not truth.lens[:, K1:].any()
+    sizes = tuple(map(tuple, truth.image_size.astype(int).tolist()))
     return Observations.of(
         observation,
         joint_types=trials.joints.types,
         image_size=sizes[0] if len({*sizes}) == 1 else sizes,
-        noise_px=noise_px,
+        noise_px=noise_px if normal else None,
         # Where joints or images have faults, χ² of pixel noise alone decides no more than in a recording.
         joint_noise=0.0 if ideal else None,
         source="simulated",
-        exact=ideal,
+        exact=ideal and normal and straight,
         seed=trials.motions.seed,
-        mount=TOOL if trials.truth.on_tool else WORLD,
+        mount=TOOL if truth.on_tool else WORLD,
     )
 
 

@@ -168,7 +168,7 @@ def _simulated(scenario: Scenario, carrier: CarryingObject, *, now: bool) -> Loo
         return Look(s[:, which], sigma[:, which])
     s = placed.images(truth, placed.T if now else np.eye(4))
     noise = inputs.noise_px / math.sqrt(inputs.averaged_frames)
-    s += noise * generator(*drawn).standard_normal(s.shape)
+    s += noise * truth.noise.draw(generator(*drawn), s.shape)
     return Look(s, np.full(s.shape[:2], noise) if noise > 0.0 else None)
 
 

@@ -206,7 +206,7 @@ def noisy_observation(truth: Truth, q: FloatArray, noise_px: float, drawn: tuple
     drawn : seed and stream of the noise.
     """
     exact = np.stack([truth.images(row, truth.M) for row in q])
-    images = truth.within(exact + noise_px * generator(*drawn).standard_normal(exact.shape))
+    images = truth.within(exact + noise_px * truth.noise.draw(generator(*drawn), exact.shape))
     return Observation(np.arange(len(q)), np.array(truth.number), q, images, view=truth.view)
 
 

@@ -43,6 +43,7 @@ from projservo_cli.simulation.faults import observed_in_frames
 from projservo_cli.simulation.rendering import RenderedScene
 from projservo_cli.simulation.streams import (
     GOAL_FRAMES,
+    NORMAL,
     PIN_NOISE,
     PIN_TARGET_NOISE,
     SERVO_NOISE,
@@ -259,13 +260,13 @@ class Scenario:
         sigma = self.inputs.noise_px / math.sqrt(self.inputs.averaged_frames)
         if sigma == 0.0 or self.truth is None:
             return self.exact
-        m, others = self.m, self.truth.pins
+        m, others, draw = self.m, self.truth.pins, self.truth.noise.draw
         which = [others.index(self.truth.number.index(number)) for number in self.numbers[m:]]
         images = np.array([self.exact.s_start, self.exact.s_star])
         drawn, V = 2 if self.goal_images is None else 1, len(self.view)  # given images stay as they are
-        images[:drawn, :, :m] += sigma * generator(seed, TARGET_NOISE).standard_normal((drawn, V, m, 2))
+        images[:drawn, :, :m] += sigma * draw(generator(seed, TARGET_NOISE), (drawn, V, m, 2))
         if which:
-            noise = generator(seed, PIN_TARGET_NOISE).standard_normal((drawn, V, len(others), 2))
+            noise = draw(generator(seed, PIN_TARGET_NOISE), (drawn, V, len(others), 2))
             images[:drawn, :, m:] += sigma * noise[:, :, which]
         return self.exact._replace(s_start=images[0], s_star=images[1])
 
@@ -368,11 +369,11 @@ class RunScenario(Scenario):
         """
         numbers = self.numbers_of(law)
         noise = np.zeros((times, len(self.view), len(numbers), 2))
-        sigma = self.inputs.noise_px
+        sigma, shape = self.inputs.noise_px, NORMAL if self.truth is None else self.truth.noise
         if sigma > 0.0:
             for these, stream in ((slice(self.m), SERVO_NOISE), (slice(self.m, None), PIN_NOISE)):
                 if noise[:, :, these].size > 0:
-                    drawn = generator(seed, stream).standard_normal(noise[:, :, these].shape)
+                    drawn = shape.draw(generator(seed, stream), noise[:, :, these].shape)
                     np.multiply(sigma, drawn, out=noise[:, :, these])
         return noise
 

@@ -170,7 +170,7 @@ class Design:
         """Return the places of runs (k,)."""
         cell, draw = np.divmod(runs, self.sweep.runs)
         tasks = self.sweep.tasks
-        task = draw % tasks.random if tasks else np.full_like(draw, -1)
+        task = draw % tasks.count if tasks else np.full_like(draw, -1)
         return _RunIndex(runs, cell, draw, draw % self.sweep.calibrations, task)
 
     def values(self, cell: int) -> dict[str, Any]:
@@ -195,11 +195,7 @@ class Design:
             raise InputError(f"base {name}: a sweep drives the simulated robot; leave plant.use out")
         name_of_run(config)
         assert config.task is not None
-        if config.task.steps or config.task.start_joints is None:
-            raise InputError(
-                f"base {name}: a sweep is of one motion from given joints: leave task.steps out, and set "
-                "task.start"
-            )
+        _require_one_motion(f"base {name}", config.task)
         control = config.control.model_copy(update={"must_converge": ()})
         reference = config.calibration.reference or config.task.start_joints
         calibration = config.calibration.model_copy(update={"reference": reference})
@@ -251,16 +247,33 @@ class Design:
     @lru_cache(maxsize=64)  # noqa: B019 - a process has one design
     def tasks(self, base: int) -> tuple[FloatArray, FloatArray]:
         """Random tasks of a base: joints (k, n) at start and goal, rad or m, one of each stratum in turn."""
+        tasks = self.sweep.tasks
         config = self.cell(base * (self.cells // len(self.bases)))
         assert config.task is not None
         assert config.robot is not None
-        assert self.sweep.tasks is not None
+        assert tasks is not None
+        assert tasks.random is not None
         assert config.task.start_joints is not None
         q_front = np.array(config.task.start_joints.values(config.robot.joint_types))
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(TASKS,)))
         asked = config.trajectory.visible_views
         least_views = 0 if asked == "all" else asked
-        return random_tasks(truth_of(config), q_front, self.sweep.tasks.random, rng, least_views)
+        low, high = np.radians(tasks.rotation_deg)
+        return random_tasks(truth_of(config), q_front, tasks.random, rng, least_views, (low, high))
+
+    @lru_cache(maxsize=1024)  # noqa: B019 - a process has one design
+    def listed(self, base: int, task: int) -> TaskSettings:
+        """Return a listed task, with the keys of that of a base which it does not give."""
+        config = self.cell(base * (self.cells // len(self.bases)))
+        assert config.task is not None
+        assert self.sweep.tasks is not None
+        assert self.sweep.tasks.listed is not None
+        given = config.task.model_dump(mode="json", exclude_defaults=True) | self.sweep.tasks.listed[task]
+        change = Override(f"tasks.listed[{task}]", "task", given)
+        found = load_config(config.name, [change], text=to_yaml(config)).task
+        assert found is not None
+        _require_one_motion(f"tasks.listed[{task}]", found)
+        return found
 
     def config(self, run: int) -> Config:
         """Configuration of a run."""
@@ -270,12 +283,19 @@ class Design:
             config = _changed(config, drawn, f"run {run}")
         update: dict[str, Any] = {"seed": self.seed(RUNS, draw)}
         if task >= 0:
-            assert config.task is not None
-            ends = self.tasks(self.base_of(cell))
-            start, goal = (JointVector(joints=tuple(q[task].tolist()), unit="rad") for q in ends)
-            offset = config.task.start_offset  # stays
-            update["task"] = TaskSettings(start=start, start_offset=offset, goal=Goal(joints=goal))
+            update["task"] = self._task(config, self.base_of(cell), task)
         return config.model_copy(update=update)
+
+    def _task(self, config: Config, base: int, task: int) -> TaskSettings:
+        """Return a task of a base, random or listed, in the configuration of a run."""
+        assert config.task is not None
+        assert self.sweep.tasks is not None
+        if self.sweep.tasks.listed is not None:
+            return self.listed(base, task)
+        ends = self.tasks(base)
+        start, goal = (JointVector(joints=tuple(q[task].tolist()), unit="rad") for q in ends)
+        offset = config.task.start_offset  # stays
+        return TaskSettings(start=start, start_offset=offset, goal=Goal(joints=goal))
 
     def drawn(self, run: int) -> dict[str, Any]:
         """Values drawn for a run and for its calibration, in the order of ``random``."""
@@ -329,8 +349,20 @@ def require_sound(design: Design) -> None:
         raise InputError(f"traces: there is no run {run}; the sweep has runs 0 to {design.total - 1}")
     for cell in range(design.cells):
         design.cell(cell)
+    if sweep.tasks is not None and sweep.tasks.listed is not None:
+        for base, task in product(range(len(design.bases)), range(sweep.tasks.count)):
+            design.listed(base, task)
     for draw in range(min(3, sweep.runs) if sweep.random else 0):
         _changed(design.cell(0), design.drawn(draw), f"run {draw}")
+
+
+def _require_one_motion(where: str, task: TaskSettings) -> None:
+    """Refuse a task that is no single motion from given joints, with an InputError."""
+    if task.steps or task.start_joints is None:
+        raise InputError(
+            f"{where}: a run of a sweep is one motion from given joints: set task.start, and leave "
+            "task.steps out; the motions of a sequence may stand one by one in tasks.listed"
+        )
 
 
 def name_of_run(config: Config) -> str:

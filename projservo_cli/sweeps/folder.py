@@ -249,8 +249,10 @@ def run_sweep(
     if force:
         folder.clear()
     try:
-        for base in range(len(design.bases) if design.sweep.tasks else 0):
-            design.tasks(base)  # or say that there are none, before anything else is made
+        columns_of(design)  # or say why there can be no table, before anything else is made
+        random = design.sweep.tasks is not None and design.sweep.tasks.random is not None
+        for base in range(len(design.bases) if random else 0):
+            design.tasks(base)  # likewise
         _compile_once(design, engine, say)
         wanted = folder.missing_calibrations(design)
         max_workers = 1 + len(wanted) // CALIBRATIONS
@@ -300,7 +302,7 @@ def _make_parts(design: Design, folder: Folder, engine: Engine, status: _Status,
 
 def _shares_settings(design: Design) -> bool:
     """Tell whether all runs are compiled ones, many of which differ in their images alone."""
-    tasks = design.sweep.tasks.random if design.sweep.tasks is not None else 1
+    tasks = design.sweep.tasks.count if design.sweep.tasks is not None else 1
     settings = math.lcm(design.sweep.calibrations, tasks)
     if design.sweep.random or settings > SETTINGS or design.sweep.runs < settings:
         return False

@@ -15,7 +15,16 @@ from projservo_cli.laws import CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Batch, Setting
 from projservo_cli.loop.compiled import Course
 from projservo_cli.loop.verdicts import FAILED, RUNNING, VERDICTS
-from projservo_cli.records import VIEWS, Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
+from projservo_cli.records import (
+    VIEWS,
+    Calibration,
+    FloatArray,
+    InputError,
+    IntArray,
+    Plan,
+    Trace,
+    WorkFailed,
+)
 from projservo_cli.result_hashes import key_of
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rotation_sense
@@ -95,11 +104,20 @@ BETWEEN = Heading("center_deviation_mm", "f8", "mm", "maximum distance of the ce
 
 
 def columns_of(design: Design) -> tuple[Heading, ...]:
-    """All columns of the table of a sweep: numbers, inputs, measured values."""
+    """All columns of the table of a sweep: numbers, inputs, measured values.
+
+    Raises InputError for an axis that has the name of another column.
+    """
     axes = [_input(axis.name, axis.values, "value of the grid") for axis in design.axes]
     random = design.sweep.random.items()
     drawn = [_input(key, given.choice or (0.0,), "value drawn for the run") for key, given in random]
     between = (BETWEEN,) if design.sweep.between_samples else ()
+    others = (*NUMBERED, *measured_columns(design.view), *between)
+    for name in {column.name for column in others} & {axis.name for axis in (*axes, *drawn)}:
+        raise InputError(
+            f"grid.{name}: the table has another column of this name: call the axis otherwise, such as "
+            f"my_{name}: {{keys: [{name}], values: [...]}}"
+        )
     return (*NUMBERED, *axes, *drawn, *measured_columns(design.view), *between)
 
 

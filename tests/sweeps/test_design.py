@@ -99,6 +99,8 @@ def test_distributions_keep_to_their_bounds_and_moments():
         ({"set": {"plant.use": "my_robot:Robot"}}, r"leave plant\.use out"),
         ({"random": {"control.gain_t": {"uniform": [-2, -1]}}}, r"run 0: control\.gain_t.*greater than 0"),
         ({"traces": [8]}, "no run 8"),
+        ({"tasks": {"listed": [{"gaol": 1}]}}, r"tasks\.listed\[0\]: task\.gaol: .*did you mean goal"),
+        ({"set": {"task.steps": [{"to": "goal"}]}}, r"leave task\.steps out.*one by one in tasks\.listed"),
         ({"grid": {"law": {"exact": {"stop.steps": 5}}}}, r"grid\.law: stop\.steps=5.*did you mean"),
     ],
 )

@@ -27,7 +27,22 @@ CASES = {
     "constrained": {"set": {"trajectory.profile": "constrained"}, "runs": 1, "between_samples": True},
     "python loop": {"set": {"plant.speed_scale": 0.5, "stop.max_steps": 10}, "runs": 1},
     "half turn": {"base": "paper", "runs": 2, "set": {"noise.calibration_px": 0.5}},
-    "tasks": {"tasks": {"random": 4}, "grid": {"law": ["direct_two"]}, "runs": 4},
+    "tasks": {
+        "tasks": {"random": 4, "rotation_deg": [60, 90]},
+        "set": {
+            "noise.servo_px": 0.3,
+            "noise.tail_dof": 3,
+            "noise.outlier_share": 0.02,
+            "rig.left.lens": [-0.1, 0.01],
+        },
+        "grid": {"law": ["direct_two"]},
+        "runs": 4,
+    },
+    "listed tasks": {
+        "tasks": {"listed": [{"goal": {"roll_deg": 30}}, {"goal": {"roll_deg": 60}}]},
+        "grid": {"law": ["direct_two"]},
+        "runs": 2,
+    },
     "a camera that sees little": {
         "set": {"rig.back": BEHIND, "trajectory.visible_views": 2},
         "tasks": {"random": 2},
@@ -93,6 +108,8 @@ def test_every_run_redone_by_the_stages_is_its_row(name):
         R = trace.pose[0, :3, :3].T @ trace.goal_pose[:3, :3]
         angle = math.degrees(math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
         assert row["rotation_deg"] == pytest.approx(angle, abs=1e-4)
+        assert name != "tasks" or 60 <= row["rotation_deg"] <= 90
+        assert name != "listed tasks" or angle == pytest.approx(30 * (i + 1), abs=1e-6)
         centre = trace.center[-1] - trace.center[0]
         assert abs(np.linalg.norm(centre) * 1e3 - row["distance_mm"]) <= row["position_error_mm"] + 1e-6
         assert row["path_length_mm"] >= np.linalg.norm(centre) * 1e3 - 1e-9
