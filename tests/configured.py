@@ -156,7 +156,9 @@ calibrate = _Stage(
     suggest_motions=lambda config, *more: calibrating.suggest_motions(given.suggestion_inputs(config), *more),
 )
 plan = _Stage(planning, run=lambda config, calibration: planning.run(plan_inputs(config), calibration))
-servo = _Stage(driving, run=lambda config, *more: driving.run(servo_inputs(config), *more))
+servo = _Stage(
+    driving, run=lambda config, *more, **brought: driving.run(servo_inputs(config), *more, **brought)
+)
 record = _Stage(
     recording,
     trial_motions=trial_motions,

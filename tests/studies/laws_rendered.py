@@ -13,29 +13,13 @@ from collections import Counter
 
 import numpy as np
 
-from projservo_cli.laws import law_and_mode
-from projservo_cli.records import WorkFailed
-from projservo_cli.stages import servo
-from tests.configured import plan, scenario_of, servo_inputs, truth_of
+from tests.configured import scenario_of, truth_of
 from tests.studies import visp
 from tests.studies.common import parser_of, write_rows
-from tests.studies.rendered import calibrated, judged, near
+from tests.studies.rendered import calibrated, near, run_of
 from tests.studies.rendered_conditions import LATEST, SEEDS, base_of, task_config, tasks_of
 
 LAWS = ("exact_track", "exact", "stacked", "blockwise", "euclidean_points")
-
-
-def driven(config, calibration, name, goal, factory=None):
-    """Row of the run of a law, or of what a factory makes, to joints (n,)."""
-    control = config.control.model_copy(update={"mode": (law_and_mode(name)[1],)})
-    config = config.model_copy(update={"control": control})
-    try:
-        planned = plan.run(config, calibration)
-        trace = servo.run(servo_inputs(config), calibration, planned, name, factory=factory)
-    except WorkFailed as error:
-        return {"verdict": "not started", "reason": str(error), "arrived": False}
-    row = judged(near(truth_of(config), trace.pose[-1], goal), trace.verdict)
-    return row | {"steps": trace.steps, "reason": trace.reason}
 
 
 def of_task(seed, calibration, cells, program):
@@ -46,10 +30,10 @@ def of_task(seed, calibration, cells, program):
     config = config.model_copy(update={"control": control, "stop": stop})
     told = {"seed": seed}
     for name in LAWS:
-        yield told | {"by": name} | driven(config, calibration, name, goal)
+        yield told | {"by": name} | run_of(config, calibration, name, goal, near)
     tolerance_px = scenario_of(config, calibration).termination.image_error_px
     for name, factory in program.laws(cells, tolerance_px):
-        yield told | {"by": name} | driven(config, calibration, name, goal, factory)
+        yield told | {"by": name} | run_of(config, calibration, name, goal, near, factory=factory)
 
 
 def main():
