@@ -24,7 +24,7 @@ from projservo_cli.sweeps.runs import Part, run_part
 from tests.configured import calibrate, plan, record, truth_of
 from tests.conftest import ROOT
 from tests.studies import visp
-from tests.studies.common import parser_of, rate, write_rows
+from tests.studies.common import parser_of, write_rows
 
 FEATURES = ("points", "body")
 NOISE_PX = 0.5  # of columns of one noise
@@ -88,22 +88,22 @@ def rows_of(design, features):
                 yield from by_visp(design, run, calibrations[key], cells[key], program)
 
 
-def tell(rows, tasks):
+def tell(rows):
     """Print the table."""
     cells = defaultdict(list)
     for row in rows:
         cells[row["law"], row["noise_px"]].append(row)
     noises = sorted({noise for _, noise in cells})
-    heads = [f"{noise:g} px" for noise in noises]
-    print(f"{tasks} tasks of each arm; success in percent (95 %)")
-    print(f"| law | guidance | {' | '.join(heads)} | face hidden | steps | error | path ratio |")
+    heads = " | ".join(f"{noise:g} px" for noise in noises)
+    print(f"| law | guidance | {heads} | face hidden | steps | error | path ratio |")
     print("|" + "---|" * (len(noises) + 6))
     for law in dict.fromkeys(law for law, _ in cells):
         name, mode = law_and_mode(law)
-        runs = [[row["success"] for row in cells[law, noise]] for noise in noises]
-        rates = " | ".join(rate(sum(good), len(good)) for good in runs)
+        rates = " | ".join(
+            f"{100 * np.mean([row['success'] for row in cells[law, px]]):.0f}" for px in noises
+        )
         mine = cells[law, NOISE_PX]
-        hidden = 100 * np.mean([any(row[name] > 0 for name in HIDDEN) for row in mine])
+        hidden = 100 * np.mean([any(row[side] > 0 for side in HIDDEN) for row in mine])
         good = [row for row in mine if row["success"]]
         ratios = [row["path_length_mm"] / row["distance_mm"] for row in good]
         columns = [[row[key] for row in good] for key in ("steps", "position_error_mm")]
@@ -122,8 +122,10 @@ def main():
         rows = list(rows_of(design_of(features, given.tasks), features))
         every += [{"features": features} | row for row in rows]
         write_rows(given.output, every)
-        print(f"features: {features}")
-        tell(rows, given.tasks)
+        print(
+            f"Features: {features}; success (%) of {2 * given.tasks} tasks; columns of runs at {NOISE_PX} px"
+        )
+        tell(rows)
 
 
 if __name__ == "__main__":
