@@ -17,7 +17,9 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
+from filelock import FileLock
 from numba.core.caching import UserProvidedCacheLocator
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
 _Params = ParamSpec("_Params")
@@ -112,6 +114,9 @@ if CACHE_FOLDER is not None:
 # The third level of the optimiser takes a sixth more compilation time and saves a tenth of a step.
 if "NUMBA_OPT" not in os.environ:
     SETTINGS.OPT = type(SETTINGS.OPT)(2)
+# Loops over joints and markers are too short for vectors of numbers, which take a twentieth more.
+if "NUMBA_LOOP_VECTORIZE" not in os.environ:
+    SETTINGS.LOOP_VECTORIZE = 0
 
 
 # These functions borrow the arrays of their caller and allocate none, so they need no runtime that counts
@@ -133,10 +138,23 @@ def njit(function: Callable[_Params, _Result], *, allocates: bool = False) -> Ca
 
     allocates : whether it makes arrays, or a structure of the compiler.
     """
-    return cast(Callable[_Params, _Result], numba.njit(**{**_OPTIONS, "_nrt": allocates})(function))
+    return _compiled(_Shared, function, _nrt=allocates)
 
 
-class _Internal(CPUDispatcher):
+class _Shared(CPUDispatcher):
+    """A compiled function that two processes never compile at the same time: one waits and loads it."""
+
+    def compile(self, sig: Any) -> Any:
+        """Compile the function for a signature, or load what another process compiled."""
+        if CACHE_FOLDER is None:
+            return super().compile(sig)
+        function = self.py_func
+        lock = FileLock(CACHE_FOLDER / f"{function.__module__}.{function.__qualname__}.lock")
+        with global_compiler_lock, lock:  # in this order, in which the compiler comes to further functions
+            return super().compile(sig)
+
+
+class _Internal(_Shared):
     """A compiled function whose machine code takes no arguments from Python.
 
     The first call from Python compiles a caller for it; a small function is interpreted instead.
@@ -160,10 +178,16 @@ def internal(function: Callable[_Params, _Result], **further: Any) -> Callable[_
     Without the interface to Python it compiles a fifth faster, for a record of a hundred arrays.
     further : further options of the compiler.
     """
+    return _compiled(_Internal, function, no_cpython_wrapper=True, **further)
+
+
+def _compiled(
+    kind: type[_Shared], function: Callable[_Params, _Result], **further: Any
+) -> Callable[_Params, _Result]:
+    """Return a function of a kind, or as it is without the compiler; further : options of the compiler."""
     if not COMPILED:
         return function
-    options = {**_UNCACHED, "nopython": True, "no_cpython_wrapper": True, **further}
-    dispatcher = _Internal(function, targetoptions=options)
+    dispatcher = kind(function, targetoptions={**_UNCACHED, "nopython": True, **further})
     if _OPTIONS["cache"]:
         dispatcher.enable_caching()
     return cast(Callable[_Params, _Result], dispatcher)

@@ -1,4 +1,7 @@
-"""JIT warm-up: compile for the first run in another process while one calibrates, 10 s of 50."""
+"""JIT warm-up: compile for the first run in another process while one calibrates and plans, 20 s of 60.
+
+Both share the work: what one compiles the other waits for and loads.
+"""
 
 import sys
 from collections.abc import Iterator
@@ -9,17 +12,15 @@ from typing import Any
 import numpy as np
 from numba import typeof
 
-from projservo_cli.control.law import ERRORS, new_state, pseudo_inverse, single_rotation, view_into
-from projservo_cli.geometry.algebra import IDENTITY
+from projservo_cli.control import command
+from projservo_cli.control.law import ERRORS, Gains, Law, new_state
 from projservo_cli.geometry.jit import CACHE_FOLDER
-from projservo_cli.geometry.mechanisms import MeasuredFace, reach
 from projservo_cli.loop.run_metrics import Ended, path_deviation, summarize
 from projservo_cli.loop.verdicts import new_log
 from projservo_cli.planning.margins import Reaching, carried_into, carrier_of, limits_alone, room_along
 from projservo_cli.records import JointLimits, Model
 from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.task.face import Task
-from projservo_cli.task.partition import NO_PARTS
 
 
 @contextmanager
@@ -72,6 +73,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         least_views=2,
     )
     state, log = new_state(4, 4), new_log(4, 4, 1, len(ERRORS))
+    gains = Gains(*(1.0,) * 8, limits=limits)
     reaching = Reaching(
         model=model,
         demands=limits_alone(limits),
@@ -84,10 +86,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
         q_start=q,
     )
     along = room_along(reaching, 1)
-    yield reach, (model, MeasuredFace(matrices[0], IDENTITY), IDENTITY, q, state.work, 1.0)
-    yield pseudo_inverse, (state, 8, q)
-    yield view_into, (model, task, task.s_star, state, 0, 0)
-    yield single_rotation, (model, NO_PARTS, 1.0, state)
-    yield carried_into, (carrier_of(reaching), O, along)
+    yield command, (Law(0, model, task, gains), task.s_star, q, state)
     yield summarize, (plant, log, Ended(0, 1, 0.0), 0.04, Ends(np.eye(4), np.eye(4), q))
     yield path_deviation, (plant, log, 1, 0.04, q, q)
+    yield carried_into, (carrier_of(reaching), O, along)

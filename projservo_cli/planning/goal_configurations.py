@@ -284,10 +284,11 @@ def _solutions_into(
         if count == maximum or k > _AT_LEAST + _PATIENCE * last:
             break
         q = starts[k]
-        _settled(c, goal, False, NEAR, q, scratch)
+        # Expressions, as the compiler would compile the function again for each constant.
+        _settled(c, goal, k < 0, NEAR, q, scratch)
         if _is_known(c, q, solutions.q, count):
             continue
-        left = _settled(c, goal, True, SETTLED, q, scratch)
+        left = _settled(c, goal, k >= 0, SETTLED, q, scratch)
         explained = _explained(c, goal, q, scratch, solutions.deviation[count])
         if left <= explained and not _is_known(c, q, solutions.q, count):
             row_into(solutions.q[count], q)

@@ -283,7 +283,9 @@ def carrier_of(reaching: Reaching) -> Carrier:
     n = len(reaching.q_start)
     rows = rows_of(len(reaching.O), len(reaching.A))
     work = workspace(n, rows, make_span(reaching.model, reaching.A))
-    return Carrier(reaching, work, np.empty(n))
+    # Every other number of names would be a type of its own, to compile for.
+    nameless = reaching.demands._replace(units=(), view=())
+    return Carrier(reaching._replace(demands=nameless), work, np.empty(n))
 
 
 @internal

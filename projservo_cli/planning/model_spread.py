@@ -73,7 +73,7 @@ def spread_of(
     # LAPACK's singular value decomposition fails on some of these rows, finite as they are.
     main = np.linalg.eigh(rows.T @ rows)[1][:, : -_DIRECTIONS - 1 : -1]
     rest = float(np.sqrt(np.median(np.maximum(variance - ((J @ main) ** 2).sum(axis=-1), 0.0))))
-    moved = (factor @ main).T
+    moved = np.ascontiguousarray((factor @ main).T)  # for other strides all constraints are compiled again
     model, V, b = calibration.model(), len(calibration.P), len(calibration.M)
     n = len(model.H_hat_0)
     P, H_hat, M = moved[:, : 12 * V], moved[:, 12 * V : 12 * V + 16 * n], moved[:, -4 * b :]

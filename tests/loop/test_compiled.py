@@ -12,9 +12,7 @@ from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.jit_warmup import calls
 from projservo_cli.loop.run_metrics import SUBSAMPLES, Ended, path_deviation, summarize
 from projservo_cli.loop.verdicts import CONVERGED, MAX_STEPS, Log, new_log
-from projservo_cli.records import Model
 from projservo_cli.simulation.analytic_plant import Ends, Plant
-from projservo_cli.task.face import Task
 from tests.known import configured, known_scenario
 from tests.samples import poe
 from tests.scene import FACE_LAWS, GAINS, STEP, Run, limits, scene
@@ -152,8 +150,7 @@ def test_success_is_told_of_the_truth(rng):
 def test_records_are_of_the_types_of_a_run():
     scenario = known_scenario(configured("paper"))
     real = {
-        Model: scenario.model,
-        Task: scenario.ends.task(scenario.model),
+        Law: Law(0, scenario.model, scenario.ends.task(scenario.model), scenario.gains),
         Plant: scenario.plant_of("exact"),
         State: new_state(6, scenario.m),
         Log: new_log(6, scenario.m, 3, len(ERRORS)),
