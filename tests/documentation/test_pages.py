@@ -296,6 +296,11 @@ def test_every_block_is_run_or_excused(name):
     assert all(block.excuse or block.file for block in blocks if block.language == "yaml")
 
 
+def test_tasks_in_python_are_short():
+    blocks = [block for block in blocks_of(PAGES["python"]) if block.language == "python"]
+    assert max(len(block.text.splitlines()) for block in blocks) <= 15
+
+
 def test_messages_of_the_troubleshooting_page_stand_in_the_sources():
     """The middle column quotes messages, in pieces between the numbers and names."""
     sources = " ".join(
