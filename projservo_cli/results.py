@@ -131,7 +131,9 @@ class ImageModel(Displayable, Calibration):
         """Return a record with its functions."""
         if isinstance(calibration, cls):
             return calibration
-        held_out = cross_validation and HeldOutErrors(**_fields_of(cross_validation, CrossValidation))
+        held_out = None
+        if cross_validation is not None:
+            held_out = HeldOutErrors(**_fields_of(cross_validation, CrossValidation))
         return cls(**_fields_of(calibration, Calibration), cross_validation=held_out, observation=observation)
 
     def plot(self, ax: Any = None) -> Any:

@@ -312,6 +312,19 @@ def _disturbed_markers(disturbance: Disturbance, markers: Markers | None) -> Ite
             yield ("disturbance", "marker_moved", "marker"), what
 
 
+def _disturbed_objects(disturbance: Disturbance, objects: Objects, plant: PlantSettings) -> Iterator[Finding]:
+    moved = disturbance.object_moved
+    if moved is None:
+        return
+    placed = [name for name, one in objects.named.items() if one.is_placed]
+    if moved.name not in placed:
+        known = ", ".join(placed) or "none"
+        what = f"there is no object {moved.name} with places under objects; objects: {known}"
+        yield ("disturbance", "object_moved", "name"), what
+    elif plant.rendered is not None:
+        yield ("disturbance", "object_moved"), "moves no object before rendered cameras; leave plant.use out"
+
+
 def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Finding]:
     limits = (control.joint_speed_limit_deg_s, control.prismatic_speed_limit_m_s)
     if any(mode != REGULATE for mode in control.mode) and {*limits, trajectory.duration_s} == {None}:
@@ -361,6 +374,7 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
             _moving_images,
             _disturbed_joints,
             _disturbed_markers,
+            _disturbed_objects,
             _plan_to_follow,
             _keeping_out,
         ),

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, Field, StrictBool
 
 from projservo_cli.records import VIEWS
+from projservo_cli.settings.objects import Displacement
 from projservo_cli.settings.sections import (
     ByView,
     Count,
@@ -79,6 +80,13 @@ class _MarkerMoved(Section):
     at_step: Whole = Field(description="first step at the new position")
     marker: Whole = Field(description="number of the marker")
     by_m: Vector3 = Field(description="displacement in the frame of the tool")
+
+
+class _ObjectMoved(Displacement):
+    """An object that moves, in the base frame, which no calibration knows of."""
+
+    at_step: Count = Field(description="first step at the new place")
+    name: str = Field(description="name of the object")
 
 
 class EachView(ByView):
@@ -163,6 +171,7 @@ class Events(Section):
     stuck_encoder: StuckEncoder | None = None
     camera_moved: _CameraMoved | None = None
     marker_moved: _MarkerMoved | None = None
+    object_moved: _ObjectMoved | None = None
 
 
 class Disturbance(Events, Faults):

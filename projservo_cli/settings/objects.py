@@ -32,6 +32,11 @@ class Displacement(Section):
     translation_m: Vector3 = Field((0.0, 0.0, 0.0), description="of the middle of its markers")
     rotation_deg: Vector3 = Field((0.0, 0.0, 0.0), description="rotation vector, about that middle")
 
+    def about(self, middle: FloatArray) -> FloatArray:
+        """Return it as a matrix (4, 4), the middle (3,) of the markers given, m."""
+        R = Rotation.from_rotvec(self.rotation_deg, degrees=True)
+        return rigid(R, middle - R.apply(middle) + self.translation_m)
+
 
 class ObjectSettings(Section):
     """Markers of an object, and where it is in a simulation."""
@@ -86,9 +91,7 @@ class ObjectSettings(Section):
     def moved(self) -> FloatArray:
         """Its displacement (4, 4) since the goal was taught, in the base frame."""
         assert self.points is not None
-        middle, by = self.points[:, :3].mean(axis=0), self.displacement
-        R = Rotation.from_rotvec(by.rotation_deg, degrees=True)
-        return rigid(R, middle - R.apply(middle) + by.translation_m)
+        return self.displacement.about(self.points[:, :3].mean(axis=0))
 
     def contradictions(self) -> Iterator[Finding]:
         """No markers, too few or the same twice, and places of others than these."""

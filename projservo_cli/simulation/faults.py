@@ -8,7 +8,7 @@ Rolling shutters are not modelled.
 
 import bisect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
@@ -129,6 +129,7 @@ class World(NamedTuple):
     seed: int
     stream: int  # of the random numbers of the seed
     servos: _Servos | None = None  # at rest at q_start; None for those of first order
+    eyes_later: _Eyes | None = None  # since an object moved
 
     def random(self, view: int, k: int) -> np.random.Generator:
         """Random numbers of a frame of a view."""
@@ -156,13 +157,21 @@ def robot_of(
     """
     truth, faults, scene, period, objects = robot
     if scene is None:
+        later, moved = None, events.object_moved
         if objects:
-            standing = np.concatenate([one.images(truth, one.T) for one in objects], axis=1)
-            points = points._replace(standing=standing)
-        return FaultyRobot(World(truth, q_start, points, period, *drawn), faults, events)
+            points = points._replace(standing=_images_of(objects, truth))
+        if moved is not None:
+            after = [one.displaced(moved) if one.name == moved.name else one for one in objects]
+            later = points._replace(standing=_images_of(after, truth))
+        return FaultyRobot(World(truth, q_start, points, period, *drawn, eyes_later=later), faults, events)
     rendered = rendered_model(scene)
     servos = Physics(rendered, q_start, faults.servo_time_constant_s, math.radians(faults.gravity_sag_deg))
     return FaultyRobot(World(truth, q_start, Frames(rendered), period, *drawn, servos), faults, events)
+
+
+def _images_of(objects: Sequence[SceneObject], truth: Truth) -> FloatArray:
+    """Pixels (V, k, 2) of the markers of objects, NaN where unseen."""
+    return np.concatenate([one.images(truth, one.T) for one in objects], axis=1)
 
 
 def observed_in_frames(
@@ -462,7 +471,10 @@ class _Camera:
         rng = world.random(self._view, _BEFORE + k)
         rng.standard_normal()  # that of the jitter
         q = np.array([self._joints.at(t) for t in times])
-        pixels, sigma = world.eyes.capture(self._view, q, moved, rng)
+        eyes = world.eyes
+        if (shifted := events.object_moved) is not None and step >= shifted.at_step:
+            eyes = world.eyes_later or eyes
+        pixels, sigma = eyes.capture(self._view, q, moved, rng)
         if (knocked := events.camera_moved) is not None and step >= knocked.at_step:
             pixels += knocked.shift_of(truth.view[self._view])
         if (lost := events.lost_markers) is not None and _lasts(lost, step):

@@ -14,6 +14,7 @@ from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.image_size import within_images
 from projservo_cli.records import VIEWS, BoolArray, FloatArray, Model, WorkFailed
+from projservo_cli.settings.objects import Displacement
 from projservo_cli.settings.task import Goal
 from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.simulation.arm import (
@@ -121,6 +122,10 @@ class SceneObject(NamedTuple):
     X: FloatArray  # (k, 4) these when the goal was taught, in the base frame, m
     normals: FloatArray  # (k, 3) directions that they looked in; zero where they are seen from anywhere
     T: FloatArray  # (4, 4) displacement since
+
+    def displaced(self, by: Displacement) -> "SceneObject":
+        """Return the object after another displacement about where its middle is."""
+        return self._replace(T=by.about((self.X @ self.T.T)[:, :3].mean(axis=0)) @ self.T)
 
     def images(self, truth: Truth, T: FloatArray) -> FloatArray:
         """True pixels (V, k, 2) of its markers after a displacement T (4, 4), NaN where unseen."""

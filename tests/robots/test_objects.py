@@ -130,6 +130,17 @@ def test_an_object_that_moves_ends_the_run_and_the_arm_goes_back(call, taught):
     assert hidden.code == 0, hidden.err
 
 
+def test_a_simulated_object_that_is_pushed_ends_the_run_likewise(projservo, taught):
+    pushed = "disturbance.object_moved={at_step: 20, name: %s, translation_m: [0, 0.02, 0]}"
+    command = ("servo", "-c", CONFIG, "-o", taught / "run", "--law", "exact", "--set")
+    assert "there is no object prt with places" in projservo(*command, pushed % "prt").err
+    answer = projservo(*command, pushed % "part", "--set", "control.mode=[regulate]")
+    assert answer.code == 1
+    trace = load(taught / "run").traces["exact"]
+    assert trace.verdict == "object moved"
+    assert 20 < trace.steps < 30
+
+
 def test_an_object_that_moved_since_it_was_planned_keeps_the_robot_still(call):
     answer = call("servo", "--law", "exact", later=(12, nudged(3.0)))  # the first of servo
     assert answer.code == 1
