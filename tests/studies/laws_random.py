@@ -117,6 +117,8 @@ def main():
     """Make the runs and print a table for each of the features."""
     counted = [("tasks", 60, "of each arm")]
     given = parser_of("laws_random_study", __doc__, counted, features=(FEATURES, ["points"])).parse_args()
+    if "points" in given.features:
+        visp.require()
     every = []
     for features in given.features:
         rows = list(rows_of(design_of(features, given.tasks), features))

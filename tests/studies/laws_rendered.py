@@ -39,6 +39,7 @@ def of_task(seed, calibration, cells, program):
 def main():
     """Record, drive all tasks by all laws, and print the table."""
     given = parser_of("laws_rendered_study", __doc__, [("tasks", len(SEEDS), "by seed")]).parse_args()
+    visp.require()
     config = base_of("ideal")
     seen, calibration, why = calibrated(config)
     if calibration is None:

@@ -93,6 +93,12 @@ def missing():
     return "" if found else "no libvisp-dev"
 
 
+def require():
+    """End the program where ViSP cannot be run, with what mends it."""
+    if what := missing():
+        raise SystemExit(f"ViSP cannot be run, {what}: apt install g++ pkg-config libvisp-dev")
+
+
 class Program:
     """The process of ViSP, compiled where its source is newer; a context manager."""
 
