@@ -30,10 +30,9 @@ SPHINX = [
 TUTORIAL = [PYTHON, "-m", "pytest", "-q", "tests/studies/so101_tutorial.py", "-k"]
 PACKAGE = ROOT / "projservo_cli"
 DOCSTRINGS = [PYTHON, "-m", "numpydoc", "lint", *sorted(map(str, PACKAGE.rglob("*.py")))]
-# Tests of compiled functions, once more without the compiler: the same bits, and indices that are looked at.
-MATHEMATICS = [
-    f"tests/{name}" for name in ("geometry", "task", "control", "loop", "simulation/test_ideal.py")
-]
+# Tests of compiled functions, once more without the compiler: indices are looked at. That runs of all laws are
+# equal to the bit, and that none leaves its arrays, tests/loop/test_bits.py shows.
+MATHEMATICS = ["tests/geometry", "tests/task", "tests/control", "tests/simulation/test_ideal.py"]
 UNCOMPILED = ["-m", "not volume", *MATHEMATICS]
 WITHOUT_COMPILER = {"NUMBA_DISABLE_JIT": "1"}
 
@@ -43,7 +42,7 @@ ATTEMPTS = {"tutorial": 2}
 Check = tuple[Sequence[str | Path], dict[str, str]]
 # Three at a time, in this order: the tutorial, whose emulator runs in real time, and the others behind it, in
 # the time that it leaves.
-SINGLE: dict[str, Check] = {
+TOGETHER: dict[str, Check] = {
     "tutorial": ([*TUTORIAL, "not one_webcam"], {}),
     "types": ([BIN / "mypy"], {}),
     "mathematics without the compiler": (
@@ -55,18 +54,16 @@ SINGLE: dict[str, Check] = {
     "format": ([BIN / "ruff", "format", "--check", "."], {}),
     "imports": ([BIN / "lint-imports"], {}),
     "docstrings": (DOCSTRINGS, {}),
-}
-# Each on both processors, or timed.
-WHOLE: dict[str, Check] = {
     "tests": ([*PYTEST, "--ignore=tests/benchmarks"], {}),
-    "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
+# Timed, when nothing else runs.
+ALONE: dict[str, Check] = {"speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {})}
 # Only by name. Coverage doubles the time of the first pass and adds a fifth to the second; lines of both add
 # up, one after the other. The rendered study takes forty minutes, the tutorials with one webcam and with a
 # part two and five.
 BY_NAME: dict[str, Check] = {
     "coverage without the compiler": (
-        [*PYTEST, "--cov=projservo_cli", "--cov-report=", *UNCOMPILED],
+        [*PYTEST, "--cov=projservo_cli", "--cov-report=", *UNCOMPILED, "tests/loop"],
         WITHOUT_COMPILER,
     ),
     "coverage": (
@@ -82,7 +79,7 @@ BY_NAME: dict[str, Check] = {
 def run(name: str, check: Check) -> bool:
     """Run a check, print what it says once it is over, and return whether it passed."""
     command, environment = check
-    behind = ["nice", "-n", "10"] if name in SINGLE and name != "tutorial" else []
+    behind = ["nice", "-n", "10"] if name in TOGETHER and name != "tutorial" else []
     start = time.monotonic()
     for _ in range(ATTEMPTS.get(name, 1)):
         done = subprocess.run(
@@ -107,14 +104,14 @@ def run(name: str, check: Check) -> bool:
 
 def main(names: Sequence[str]) -> int:
     """Run the named checks, or all, and return how many failed."""
-    known = SINGLE | WHOLE | BY_NAME
+    known = TOGETHER | ALONE | BY_NAME
     unknown = [name for name in names if name not in known]
     if unknown:
         print(f"unknown check {unknown[0]!r}: choose among {', '.join(known)}", file=sys.stderr)
         return 2
-    names = names or [*SINGLE, *WHOLE]
+    names = names or [*TOGETHER, *ALONE]
     passed: dict[str, bool] = {}
-    for group, processors in ((SINGLE, 3), (WHOLE | BY_NAME, 1)):
+    for group, processors in ((TOGETHER, 3), (ALONE | BY_NAME, 1)):
         chosen = [name for name in names if name in group]
         with ThreadPoolExecutor(processors) as pool:
             passed |= dict(zip(chosen, pool.map(run, chosen, [group[name] for name in chosen]), strict=True))

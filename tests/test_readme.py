@@ -40,7 +40,7 @@ def test_both_first_commands_are_those_of_the_newcomer():
 
 
 def test_the_documentation_is_a_check_by_itself():
-    assert "documentation" in check.SINGLE
+    assert "documentation" in check.TOGETHER
     assert "python -m tests.check documentation" in README.read_text(encoding="utf-8")
 
 
