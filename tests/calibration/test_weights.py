@@ -30,7 +30,7 @@ def draws():
     rng = np.random.default_rng(5)
     robot = random_robot("RPR", rng, markers=6)
     q, held_out = trials(robot, frames=5), around(robot, 40, rng)
-    return robot, q, held_out, [stated(robot, q, seed) for seed in range(6)]
+    return robot, q, held_out, [stated(robot, q, seed) for seed in range(4)]
 
 
 def test_the_bound_is_reached_and_chi2_is_one(draws):

@@ -107,7 +107,7 @@ def at_once(q):
 def test_residuals_of_the_model_itself_set_nothing_off(arm, monkeypatch):
     """Errors of calibration, joints and instants of the first order, at a chance of one run in five."""
     arm = arm.with_joint_noise(1e-3)
-    calibration, runs, alarms = arm.calibration, 15, 0
+    calibration, runs, alarms = arm.calibration, 10, 0
     monkeypatch.setattr(innovation_tests, "_FALSE_ALARM", 0.2)
     for seed in range(runs):
         rng = np.random.default_rng(seed)
