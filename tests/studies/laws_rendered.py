@@ -15,25 +15,27 @@ import numpy as np
 
 from tests.configured import scenario_of, truth_of
 from tests.studies import visp
-from tests.studies.common import parser_of, write_rows
+from tests.studies.common import in_two_processes, parser_of, write_rows
 from tests.studies.rendered import calibrated, near, run_of
 from tests.studies.rendered_conditions import LATEST, SEEDS, base_of, task_config, tasks_of
 
 LAWS = ("exact_track", "exact", "stacked", "blockwise", "euclidean_points")
 
 
-def of_task(seed, calibration, cells, program):
+def driven(job):
     """Rows of all laws on a task."""
+    seed, calibration, cells = job
     config, goal = task_config(base_of("ideal"), seed), tasks_of()[seed][1]
     control = config.control.model_copy(update={"features": "points"})
     stop = config.stop.model_copy(update={"max_steps": LATEST})
     config = config.model_copy(update={"control": control, "stop": stop})
-    told = {"seed": seed}
-    for name in LAWS:
-        yield told | {"by": name} | run_of(config, calibration, name, goal, near)
     tolerance_px = scenario_of(config, calibration).termination.image_error_px
-    for name, factory in program.laws(cells, tolerance_px):
-        yield told | {"by": name} | run_of(config, calibration, name, goal, near, factory=factory)
+    with visp.Program() as program:
+        laws = [*((name, None) for name in LAWS), *program.laws(cells, tolerance_px)]
+        return [
+            {"seed": seed, "by": name} | run_of(config, calibration, name, goal, near, factory=factory)
+            for name, factory in laws
+        ]
 
 
 def main():
@@ -46,10 +48,11 @@ def main():
         raise SystemExit(why)
     truth, rows = truth_of(config), []
     cells = {"true": visp.true_cell(truth), "calibrated": visp.calibrated_cell(truth, seen)}
-    with visp.Program() as program:
-        for seed in list(SEEDS)[: given.tasks]:
-            rows += of_task(seed, calibration, cells, program)
-            write_rows(given.output, rows)  # what is cut off leaves what was driven
+    visp.Program().close()  # compiles it once for all processes
+    jobs = [(seed, calibration, cells) for seed in list(SEEDS)[: given.tasks]]
+    for mine in in_two_processes(driven, jobs, "tasks"):
+        rows += mine
+        write_rows(given.output, rows)  # what is cut off leaves what was driven
     print(f"| law | arrived of {given.tasks} | median error of these | else |\n|---|---|---|---|")
     for by in dict.fromkeys(row["by"] for row in rows):
         mine = [row for row in rows if row["by"] == by]

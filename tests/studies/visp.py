@@ -114,6 +114,10 @@ class Program:
         return self
 
     def __exit__(self, *_):
+        self.close()
+
+    def close(self):
+        """End the process."""
         self.process.communicate()  # closes both ends and waits
 
     def ask(self, *values):
