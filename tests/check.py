@@ -30,8 +30,8 @@ SPHINX = [
 TUTORIAL = [PYTHON, "-m", "pytest", "-q", "tests/studies/so101_tutorial.py", "-k"]
 PACKAGE = ROOT / "projservo_cli"
 DOCSTRINGS = [PYTHON, "-m", "numpydoc", "lint", *sorted(map(str, PACKAGE.rglob("*.py")))]
-# Tests of compiled functions, once more without the compiler: indices are looked at. That runs of all laws are
-# equal to the bit, and that none leaves its arrays, tests/loop/test_bits.py shows.
+# Tests of compiled functions, once more without the compiler, where indices are looked at. Whole runs of all
+# laws are compared by tests/loop/test_bits.py.
 MATHEMATICS = ["tests/geometry", "tests/task", "tests/control", "tests/simulation/test_ideal.py"]
 UNCOMPILED = ["-m", "not volume", *MATHEMATICS]
 WITHOUT_COMPILER = {"NUMBA_DISABLE_JIT": "1"}

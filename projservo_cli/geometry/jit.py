@@ -12,6 +12,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -80,6 +81,8 @@ def cache_folder(root: Path) -> Path | None:
     return folder
 
 
+# Maximum time that a function is waited for, s: several times that of the largest.
+_MOST_S = 120.0
 # Settings of Numba, attributes made at run time that its types do not list.
 SETTINGS: Any = numba.config
 # Whether the compiler is enabled.
@@ -148,9 +151,10 @@ class _Shared(CPUDispatcher):
         """Compile the function for a signature, or load what another process compiled."""
         if CACHE_FOLDER is None:
             return super().compile(sig)
-        function = self.py_func
-        lock = FileLock(CACHE_FOLDER / f"{function.__module__}.{function.__qualname__}.lock")
-        with global_compiler_lock, lock:  # in this order, in which the compiler comes to further functions
+        path = CACHE_FOLDER / f"{self.py_func.__module__}.{self.py_func.__qualname__}.lock"
+        with global_compiler_lock, ExitStack() as held:  # in this order, as where functions call others
+            with suppress(OSError, NotImplementedError):  # no locks, or none for so long: both compile
+                held.enter_context(FileLock(path, timeout=_MOST_S))
             return super().compile(sig)
 
 

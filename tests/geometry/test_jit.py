@@ -3,12 +3,15 @@
 import importlib
 import shutil
 import sys
+import threading
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 from numba.core.registry import CPUDispatcher
 
 import projservo_cli
+from projservo_cli.geometry import jit
 from projservo_cli.geometry.jit import cache_folder, compiled_sources
 from tests.conftest import INTERPRETED
 
@@ -67,3 +70,20 @@ def test_no_cache_where_nothing_can_be_written(copy, tmp_path, monkeypatch):
     (tmp_path / "occupied").write_text("a file, not a folder", encoding="utf-8")
     monkeypatch.setenv("PROJSERVO_CACHE_DIR", str(tmp_path / "occupied"))
     assert cache_folder(copy) is None
+
+
+def after(x):
+    return x + 1.0
+
+
+@pytest.mark.skipif(INTERPRETED, reason="nothing is compiled: NUMBA_DISABLE_JIT is set")
+def test_what_another_process_compiles_is_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(jit, "CACHE_FOLDER", tmp_path)
+    function, found = jit.inline(after), []
+    thread = threading.Thread(target=lambda: found.append(function.compile("float64(float64)")))
+    with FileLock(tmp_path / f"{__name__}.after.lock"):
+        thread.start()
+        thread.join(0.3)
+        assert not found
+    thread.join(60.0)
+    assert found

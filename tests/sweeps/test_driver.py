@@ -32,7 +32,7 @@ def test_interrupted_then_killed_it_is_in_the_end_as_if_nothing_had_been(whole, 
         assert table.column(name).tobytes() == full.column(name)[rows].tobytes()
     stored = len(processes.parts(tmp_path))
     assert processes.CHUNK * stored == len(rows)
-    process = processes.start(config, tmp_path)
+    process = processes.start(config, tmp_path, "-j", "1")
     processes.wait_for_parts(process, tmp_path, stored + 2)
     processes.kill_group(process)
     stored = len(processes.parts(tmp_path))
