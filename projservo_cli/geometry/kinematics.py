@@ -163,13 +163,13 @@ def row(P: FloatArray, i: int, A: tuple[float, float, float, float]) -> float:
 
 def forward_kinematics(model: Model, q: FloatArray) -> FloatArray:
     """Displacement (4, 4) of the end-effector from the reference at joints (n,), rad or m: [RH00] eq. (6)."""
-    return as_array(forward(model, np.asarray(q, dtype=np.float64)))
+    return as_array(forward(model, np.array(q, dtype=np.float64)))  # a copy: of one layout, and writable
 
 
 def joint_operators(model: Model, q: FloatArray) -> FloatArray:
     """Joint operators (n, 4, 4) at joints q (n,), rad or m: [RH00] eq. (19)."""
     H_hat = np.empty_like(model.H_hat_0)
-    operators_at(model, np.asarray(q, dtype=np.float64), H_hat)
+    operators_at(model, np.array(q, dtype=np.float64), H_hat)
     return H_hat
 
 
