@@ -237,7 +237,7 @@ def main():
     parser.add_argument("--rate", type=float, default=0.25, help="of the emulated clock; slower is safer")
     parser.add_argument("--killed", action="store_true", help="interrupt each run in another step")
     parser.add_argument(
-        "--picture", type=Path, help="PNG of the first run: taught, elsewhere, gripped, placed"
+        "--pictures", type=Path, help="folder of a PNG a run: taught, elsewhere, gripped, placed"
     )
     given = parser.parse_args()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in the background of a shell

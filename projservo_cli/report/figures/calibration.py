@@ -282,23 +282,20 @@ def _poses(axes: "style.Axes", data: Data) -> None:
 
 
 def _excitation(axes: "style.Axes", data: Data) -> None:
-    """Range of each joint, revolute in deg on the left, prismatic in m on the right."""
+    """Range of each joint, deg, or m where all are prismatic; beside revolute ones these say their range."""
     prismatic, weak = data["prismatic"], data["weak"]
-    mixed = bool(prismatic.any() and not prismatic.all())
-    other = axes.twinx() if mixed else axes
-    if mixed:
-        other.grid(visible=False)
-    for chosen, kind, scale, unit, color in (
-        (~prismatic, axes, np.degrees(1.0), "deg", style.BLUE),
-        (prismatic, other, 1.0, "m", style.SKY),
-    ):
-        for i in np.flatnonzero(chosen):
-            line = _WEAK if weak[i] else {"color": color}
-            kind.bar(i, scale * data["excitation"][i], width=0.6, **line)
-        if chosen.any():
-            kind.set_ylabel(f"range ({unit})")
-    units = [" (m)" if mixed and slides else "" for slides in prismatic]
-    axes.set_xticks(range(len(units)), [f"$q_{{{i + 1}}}${unit}" for i, unit in enumerate(units)])
+    mixed, amount = bool(prismatic.any() and not prismatic.all()), data["excitation"].copy()
+    amount[~prismatic] = np.degrees(amount[~prismatic])
+    height = amount.copy()
+    if mixed and amount[prismatic].max() > 0.0:  # bars of both kinds are as high at most
+        height[prismatic] *= amount[~prismatic].max() / amount[prismatic].max()
+    for i, slides in enumerate(prismatic):
+        line = _WEAK if weak[i] else {"color": style.SKY if slides else style.BLUE}
+        axes.bar(i, height[i], width=0.6, **line)
+        if mixed and slides:
+            axes.text(i, 0.5 * height[i], f"{amount[i]:.3g} m", rotation=90, ha="center", va="center")
+    axes.set_ylabel(f"range ({'m' if prismatic.all() else 'deg'})")
+    axes.set_xticks(range(len(prismatic)), [f"$q_{{{i + 1}}}$" for i in range(len(prismatic))])
     axes.set_xlim(-0.6, len(prismatic) - 0.4)
     axes.grid(visible=False, axis="x")
     axes.set_title(f"excitation, {int(weak.sum())} of {len(weak)} joints weak")

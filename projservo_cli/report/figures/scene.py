@@ -223,6 +223,9 @@ def _show(axes: Any, figure: "style.Figure", rig: FloatArray, points: FloatArray
     towards = rig[:, 0].mean(axis=0) - points.mean(axis=0)
     above = np.linalg.norm(towards[:2]) < 0.3 * np.linalg.norm(towards)  # a rig that looks along z
     azim = 45.0 if above else float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62.0
+    if above:  # its numbers are on the left, and would stand on the axis
+        axes.zaxis.set_tick_params(pad=12)
+        axes.zaxis.labelpad = 18
     axes.view_init(elev=22, azim=azim)
     figure.set_layout_engine()
     style.legend_below(figure, 3)
