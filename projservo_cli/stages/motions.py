@@ -145,8 +145,9 @@ def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> F
 def _require_time(duration: float, min_duration: float) -> None:
     if min_duration > duration:
         raise WorkFailed(
-            f"a duration of {duration:g} s: the minimum within the joint-speed limit is {min_duration:.4g} s: "
-            "set trajectory.duration_s, or that of the step, to a longer one, or to null for the minimum"
+            f"a duration of {duration:g} s: the minimum within the joint-speed limit is "
+            f"{min_duration:.4g} s: set trajectory.duration_s, or that of the step, to a longer one, or to "
+            "null for the minimum"
         )
 
 
