@@ -271,7 +271,7 @@ def test_page(request, folder, name, capsys, monkeypatch):
         shutil.copytree(request.getfixturevalue("first_chain"), folder / "results" / "paper")
         monkeypatch.setattr(report, "FIGURES", report.FIGURES[:1])  # of the others claims alone are told
     monkeypatch.setattr(os, "cpu_count", lambda: 1)  # other processes would import all anew
-    if name in ("read-a-report", "recorded-table"):  # tasks that are reported on as a whole elsewhere
+    if name == "read-a-report":  # frames and figures of a task that is reported on as a whole elsewhere
         monkeypatch.setattr(film, "FRAMES", 6)
         monkeypatch.setattr(report, "FIGURES", report.FIGURES[:3])
     for put in HAS.get(name, ()):
