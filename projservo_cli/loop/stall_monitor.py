@@ -11,6 +11,7 @@ import numpy as np
 from projservo_cli.loop.verdicts import (
     CONVERGED,
     FOLLOWING_ERROR,
+    MARKERS_LOST,
     NO_PROGRESS,
     RUNNING,
     WAITING,
@@ -38,6 +39,8 @@ _DEVIATIONS, _LEAST = 4.0, 3e-4
 _STAYS = 2.0
 # Windows without progress after which a robot that moves to and fro is given up.
 _PATIENCE = 8
+# Share of a window that a robot is held, from which lost markers and no law keep it still.
+_MOSTLY = 0.5
 # A window lasts this multiple of the latency of images and servos.
 _TIMES_LATE = 4.0
 
@@ -59,6 +62,7 @@ class StallMonitor:
         self._read: list[FloatArray] = []
         self._sent: list[FloatArray] = []
         self._short: list[BoolArray] = []
+        self._held: list[bool] = []  # whether the robot was held, since markers were lost
         self._more = self._looks = 0  # periods and looks that are left at the goal
         self.reason, self.minimum = "", False
 
@@ -75,6 +79,7 @@ class StallMonitor:
         self._read.append(steered.reading.q)
         self._sent.append(steered.target)
         self._short.append(steered.set_point.short)
+        self._held.append(verdict == WAITING)
         error = float(log.judged[k])
         # Remaining error of the law, and the sag that is not yet learnt.
         left = error + self._robot.carried_px
@@ -105,8 +110,9 @@ class StallMonitor:
         return verdict if verdict == CONVERGED or not self._looks else WAITING
 
     def _stuck(self, now: int, verdict: int, near: bool) -> int:
-        """Return ``NO_PROGRESS`` or ``FOLLOWING_ERROR`` if the robot makes no progress; else the verdict.
+        """Return why the robot makes no progress, or the verdict.
 
+        ``MARKERS_LOST`` where it was held most of the time, since markers flicker.
         ``near``: whether it is so near the goal that its joints may not resolve the command.
         """
         idle, window = now - self._since, self._window
@@ -121,6 +127,8 @@ class StallMonitor:
             self._say_who_stays(stays)
             return FOLLOWING_ERROR
         if stands and (sent <= _LEAST).all():
+            if np.mean(self._held[-window:]) > _MOSTLY:
+                return MARKERS_LOST
             self.minimum = True
             maximum = self._robot.robot.bounds.text(int(np.argmax(sent)), float(sent.max()), 2)
             self.reason = (

@@ -9,6 +9,7 @@ from projservo_cli.loop.stall_monitor import StallMonitor
 from projservo_cli.loop.verdicts import (
     CONVERGED,
     FOLLOWING_ERROR,
+    MARKERS_LOST,
     NO_PROGRESS,
     RUNNING,
     WAITING,
@@ -49,7 +50,8 @@ def judged(error, read, sent, *, short=(False, False), verdict=RUNNING, carried=
         robot.steered.target = np.array(sent(k), dtype=float)
         robot.steered.set_point.short = np.array(short)
         robot.carried_px = carried(k)
-        told = CONVERGED if log.judged[k] <= LIMITS.image_error_px else verdict
+        given = verdict[k] if isinstance(verdict, list) else verdict
+        told = CONVERGED if log.judged[k] <= LIMITS.image_error_px else given
         ruled = stall.ruled(log, k, told, np.zeros(2))
         if ruled not in (RUNNING, WAITING):
             return ruled, stall, k
@@ -103,6 +105,19 @@ def _still(k):
 def _far(k):
     """A joint that moves on."""
     return 0.01 * k, 0.0
+
+
+def test_markers_that_flicker_are_lost_and_no_local_minimum():
+    """The robot is held, but for a frame now and then; a law that has images mostly is at fault itself."""
+    for lost, told in ((0.9, MARKERS_LOST), (0.2, NO_PROGRESS)):
+        seen = np.random.default_rng(3).random(900) > lost
+        verdicts = np.where(seen, RUNNING, WAITING).tolist()
+        ruled, stall, k = judged(
+            lambda k: 400.0, lambda k: (0.5, 0.1), lambda k: (0.5, 0.1), verdict=verdicts
+        )
+        assert ruled == told
+        assert stall.minimum == (told == NO_PROGRESS)
+        assert k < 100
 
 
 def test_a_robot_that_moves_or_comes_nearer_or_sees_nothing_goes_on():

@@ -19,6 +19,7 @@ import signal
 import tempfile
 import threading
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -38,7 +39,7 @@ from tests.emulated.arm import TAGS
 from tests.studies.carried_goals import seen
 from tests.studies.common import quantiles
 from tests.studies.so101_goals import goals, prepared, said
-from tests.studies.so101_tutorial import RATE, START, benched, by_hand
+from tests.studies.so101_tutorial import START, benched, by_hand
 
 RUNS = 20
 OPENED, CLOSED, PART = 2600, 1200, 1500  # counts of the gripper, and that at which the part stops it
@@ -200,22 +201,28 @@ def with_part(rate, fps):
 @pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="plans and drives")
 def test_the_commands_of_the_tutorial_pick_a_part_and_place_it():
     try:
-        with with_part(RATE, 15.0) as (bench, truth, grip):
+        with with_part(0.25, 15.0) as (bench, truth, grip):
             assert prepared(bench)
             written(bench)
             text = "\n".join(block.text for block in blocks_of(PAGES["pick-a-part"]))
-            by_name = {"grip.yaml": GRIP, "place.yaml": (place := goals(truth, 1)[0])}
+            by_name, at = {"grip.yaml": GRIP, "place.yaml": goals(truth, 1)[0]}, {}
             for line in (line for line in text.splitlines() if line.startswith("projservo ")):
                 words = line.split()[1:]
                 if words[0] == "teach":
-                    bench.arm.displacement = np.eye(4) if words[-1] == "grip.yaml" else AWAY
-                    bench.script[:] = [None, by_hand(bench.arm, by_name[words[-1]]), None]
+                    name, bench.arm.displacement = words[-1], AWAY
+                    if name == "grip.yaml":
+                        bench.arm.displacement = np.eye(4)
+                    held = partial(lambda name: at.update({name: bench.arm.link.copy()}), name)
+                    bench.script[:] = [None, by_hand(bench.arm, by_name[name]), held]
                 if words[0] == "servo":
+                    grip = truth.robot.pose(at["grip.yaml"])
                     put_at_start(bench, displacements(truth, grip, 1)[0])
                 with Part(bench, truth, grip) as part:
                     code, printed = said(words)
+                    bench.arm.clock.sleep(1.0)
                     assert code == 0, f"{line}: {printed}"
-            mm, deg = part.off(truth.robot.pose(np.radians(place)))
+                    print(line, printed)
+            mm, deg = part.off(truth.robot.pose(at["place.yaml"]))
             assert mm < IN_PLACE_MM
             assert deg < IN_PLACE_DEG
     except InputError as error:
