@@ -204,14 +204,7 @@ def disturbed(folder, k):
     T, numbers = pose(R.as_rotvec(), middle - R.apply(middle) + by), np.array(part.numbers)
     nudge = T.copy()
     nudge[:3, 3] += rng.uniform(0.005, 0.05) * direction(rng)
-    where = {
-        "shift": T,
-        "later": (10**9, None),
-        "hidden": (),
-        "unseen_from": 10**9,
-        "exchanged": 0.0,
-        "looks": 0,
-    }
+    where = AS_TAUGHT | {"shift": T}
     where |= {
         "hidden": {"unseen_from": int(rng.integers(12, 120))},
         "tags missing": {"hidden": tuple(rng.choice(numbers, rng.integers(2, 8), replace=False).tolist())},
