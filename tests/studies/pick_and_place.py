@@ -19,7 +19,6 @@ import signal
 import tempfile
 import threading
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -53,6 +52,7 @@ TAGS_AT = [
     for x, turn in ((-0.022, -25.0), (0.022, 25.0))
 ]
 NUMBERS = (10, 11)
+TEACH = ("teach", "-c", "arm.yaml", "--force", "-o")
 AWAY = rigid(Rotation.identity(), [-5.0, 0.0, 0.0])
 
 
@@ -209,19 +209,19 @@ def test_the_commands_of_the_tutorial_pick_a_part_and_place_it():
             for line in (line for line in text.splitlines() if line.startswith("projservo ")):
                 words = line.split()[1:]
                 if words[0] == "teach":
-                    name, bench.arm.displacement = words[-1], AWAY
-                    if name == "grip.yaml":
-                        bench.arm.displacement = np.eye(4)
-                    held = partial(lambda name: at.update({name: bench.arm.link.copy()}), name)
-                    bench.script[:] = [None, by_hand(bench.arm, by_name[name]), held]
-                if words[0] != "servo":
-                    code, printed = said(words)
-                else:
+                    name = words[-1]
+                    bench.arm.displacement = np.eye(4) if name == "grip.yaml" else AWAY
+                    at[name] = taught(bench, words, by_name[name])
+                    assert at[name] is not None
+                    continue
+                if words[0] == "servo":
                     grip = truth.robot.pose(at["grip.yaml"])
                     put_at_start(bench, displacements(truth, grip, 1)[0])
                     with Part(bench, truth, grip) as part:
                         code, printed = said(words)
                         bench.arm.clock.sleep(1.0)
+                else:
+                    code, printed = said(words)
                 print(line, printed)
                 assert code == 0
             mm, deg = part.off(truth.robot.pose(at["place.yaml"]))
@@ -264,26 +264,26 @@ def draw(path, jpegs):
     cv2.imwrite(str(path), np.block([parts[:2], parts[2:]]))
 
 
-def taught(bench, name, q):
-    """Have somebody put the arm to joints (n,), deg, and teach a goal; joints where that was, or None."""
+def taught(bench, words, q):
+    """Have somebody put the arm to joints (n,), deg, and teach; joints where that was, or None."""
     there = []
     bench.script[:] = [None, by_hand(bench.arm, q), lambda: there.append(bench.arm.link.copy())]
-    code, line = said(["teach", "-c", "arm.yaml", "-o", f"{name}.yaml", "--force"])
+    code, line = said(words)
     if code != 0:
-        print(f"{name} not taught, exit {code}: {line[-300:]}", flush=True)
+        print(f"{' '.join(words)}: exit {code}: {line[-300:]}", flush=True)
     return there[0] if code == 0 else None
 
 
 def _driven(bench, truth, given):
     arm, runs, errors, kept = bench.arm, given.runs, [], 0
     arm.displacement = np.eye(4)
-    if (q := taught(bench, "grip", GRIP)) is None:
+    if (q := taught(bench, [*TEACH, "grip.yaml"], GRIP)) is None:
         return
     grip, at_grip = truth.robot.pose(q), bench.cameras.picture(1)
     moved = displacements(truth, grip, runs)
     for k, (T, at) in enumerate(zip(moved, goals(truth, runs), strict=True)):
         arm.displacement = AWAY
-        if (q := taught(bench, "place", at)) is None:
+        if (q := taught(bench, [*TEACH, "place.yaml"], at)) is None:
             continue
         put_at_start(bench, T)
         with Part(bench, truth, grip) as part, pytest.MonkeyPatch.context() as patch:
