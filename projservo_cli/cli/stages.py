@@ -238,8 +238,14 @@ def _report(stages: Sequence[str], console: Console, *, run: Path | None, **opti
     RUN is short for -o RUN. With the folder of a sweep it writes its statistics and figures instead: success
     with intervals, final errors, laws compared on the same tasks.
     """
+    from projservo_cli.records import InputError
     from projservo_cli.store import SWEEP, run_path
 
+    if run is not None and not run.exists():
+        raise InputError(
+            f"{run}: there is no such folder: name that of a run, which projservo servo -o {run} makes, or "
+            "of a sweep"
+        )
     if run is not None and (run.name == SWEEP or not run_path(run).is_file()):
         return _print_sweep(console, run, options)
     options["output"] = option.one_run("report", run, options["output"])

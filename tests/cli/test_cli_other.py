@@ -126,3 +126,12 @@ def test_servo_goes_to_a_taught_goal_by_its_name(projservo, stages, tmp_path):
     other = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--goal", "place")
     assert other.code == 2
     assert "place.yaml yet: teach it first, before a recording: projservo teach -c FILE -o " in other.err
+
+
+def test_a_report_of_a_folder_that_is_not_there_takes_it_for_no_sweep(projservo, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for more in ((), ("--set", "seed=2")):
+        answer = projservo("report", "nowhere", *more)
+        assert answer.code == 2
+        assert "nowhere: there is no such folder: name that of a run" in " ".join(answer.err.split())
+    assert not list(tmp_path.iterdir())
