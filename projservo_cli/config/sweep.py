@@ -136,7 +136,7 @@ class SweepConfig(Root):
     )
 
     def between(self, sound: Mapping[str, Any]) -> Iterator[Finding]:
-        """Names and values that stand twice."""
+        """Names and values that stand twice, and axes without effect."""
         if len(names := {pathlib.Path(base).stem for base in self.base}) < len(self.base):
             yield ("base",), f"two files of one name, {', '.join(sorted(names))}: rename one"
         for name, axis in self.grid.items():
@@ -146,6 +146,18 @@ class SweepConfig(Root):
                 yield ("random", name), "stands in the grid as well; keep one"
             if len({json.dumps(value) for value in axis.values}) < len(axis.values):
                 yield ("grid", name), "a value stands there twice"
+        yield from self._replaced()
+
+    def _replaced(self) -> Iterator[Finding]:
+        """Yield axes over keys of task that the tasks take the place of."""
+        if self.tasks is None:
+            return
+        kept = () if self.tasks.listed is not None else ("task.start_offset",)
+        axes = [(("grid", name), key) for name in self.grid for key in self.keys_of(name)]
+        for place, key in [*axes, *((("random", key), key) for key in self.random)]:
+            if f"{key}.".startswith("task.") and not key.startswith(kept):
+                remedy = "list tasks with it" if not kept else "use tasks.listed"
+                yield place, f"{key} has no effect, since tasks take its place: {remedy}, or leave tasks out"
 
     def keys_of(self, name: str) -> tuple[str, ...]:
         """Keys of the configuration that an axis of the grid sets."""

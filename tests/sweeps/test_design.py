@@ -124,6 +124,14 @@ def test_what_no_run_can_be_made_of_is_refused_before_any_is(given, message):
         ("base: paper.yaml\ngrid: {law: []}\n", "grid.law"),
         ("base: paper.yaml\ngrid: {control.gain: [1, 1]}\n", "a value stands there twice"),
         (
+            "base: paper.yaml\ntasks: {random: 3}\ngrid: {task.goal.roll_deg: [1, 2]}\n",
+            "task.goal.roll_deg has no effect, since tasks take its place: use tasks.listed",
+        ),
+        (
+            "base: paper.yaml\ntasks: {listed: [{}]}\nrandom: {task.start_offset.joints.0: {choice: [1]}}\n",
+            "task.start_offset.joints.0 has no effect, since tasks take its place: list tasks with it",
+        ),
+        (
             "base: paper.yaml\ngrid: {control.gain: 0.5}\n",
             "grid.control.gain: must be a list of values, not 0.5",
         ),
