@@ -515,7 +515,8 @@ class Chain:
             return nullcontext()
         from projservo_cli.loop.jit_warmup import compiling_in_background
 
-        return compiling_in_background()
+        laws = {law_and_mode(law)[0] for law in self.laws}
+        return compiling_in_background({CODES[law] for law in laws if law in CODES})
 
 
 def _drives(step: Step) -> bool:

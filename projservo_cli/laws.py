@@ -1,6 +1,6 @@
 """Control laws of the package, one line each in one table, and the names of their runs.
 
-A law is added by its kernel in a file of ``control``, a line here and a branch of ``control.command``.
+A law is added by its kernel in a file of ``control``, a line here and its function in ``control``.
 """
 
 from collections.abc import Sequence

@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.control.law import ERRORS, Gains, Law, new_state
+from projservo_cli.control import make_law
+from projservo_cli.control.law import ERRORS, Gains, new_state
 from projservo_cli.geometry.lens import distort
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.laws import CODES, INCIDENCES
@@ -120,7 +121,7 @@ class Run:
         task = scene.task(G) if task is None else task
         gains = gains._replace(limits=gains.limits._replace(speed=bounds.speed))
         course = Course(scene.plant, bounds, scene.q_start.copy())
-        built_in = Law(CODES[law], scene.seen(G), task, gains)
+        built_in = make_law(CODES[law], scene.seen(G), task, gains)
         self.code, self.steps = run_compiled(built_in, course, noise, self.state, self.full)
         self.verdict = VERDICTS[self.code] if self.code >= 0 else None
         self.log = type(self.full)(*(rows[: self.steps + 1] for rows in self.full[:-4]), *self.full[-4:])

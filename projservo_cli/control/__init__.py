@@ -3,30 +3,44 @@
 Run files and tables know a law by its name, compiled code by its code in ``laws``.
 """
 
-from projservo_cli.control.classical import blockwise, euclidean_points, stacked
-from projservo_cli.control.direct import direct_three, direct_two, exact
+from projservo_cli.control.classical import classical
+from projservo_cli.control.direct import direct, exact
 from projservo_cli.control.incidence_law import incidences
-from projservo_cli.control.law import LOST, OK, Gains, Law, State, limit_speed
-from projservo_cli.geometry.jit import internal, merged
+from projservo_cli.control.law import LOST, OK, Gains, Law, State, example, limit_speed
+from projservo_cli.geometry.jit import ByAddress, internal, merged
 from projservo_cli.geometry.lens import distorts, undistort_into
 from projservo_cli.laws import LAWS
-from projservo_cli.records import FloatArray
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.face import Task
 from projservo_cli.task.trajectory import Reference, following, near_joint_path, on_joint_path, reference_into
 
 # Share of the image-based command of a period that corrects a joint-space path.
 _CORRECTED = 0.2
-# Codes of the laws, in the order of their names.
-_DIRECT_THREE, _DIRECT_TWO, _STACKED, _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT, _ = range(len(LAWS))
+# Functions of the laws in the order of their codes.
+FUNCTIONS = (direct, direct, classical, classical, classical, exact, incidences)
+_EXACT = LAWS.index("exact")
+_BY_ADDRESS = ByAddress(example)
+_call_law = _BY_ADDRESS.caller()
+
+
+def make_law(code: int, model: Model, task: Task, gains: Gains) -> Law:
+    """A built-in law with its inputs, compiled or loaded."""
+    return Law(code, address_of(code), model, task, gains)
+
+
+def address_of(code: int) -> int:
+    """Address in this process of the compiled function of a law."""
+    return _BY_ADDRESS.address(FUNCTIONS[code])
 
 
 @internal
 def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
-    """Run a law on undistorted images; the only dispatch on its code.
+    """Run a law on undistorted images, along a plan if it follows one.
 
     s : (V, b, 2) pixels as the cameras report them, NaN if unseen.
     Returns the status of the law; ``LOST`` for a state made for another number of markers.
     """
-    code, model, task, gains = law
+    code, _, model, task, gains = law
     straight = s
     if distorts(model.lens):
         if state.straight.shape[1] != s.shape[1]:
@@ -38,20 +52,7 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
         reference_into(
             model, task.reference, float(state.clock[0]), lead, state.A_ref, state.s_ref, state.q_ahead
         )
-    if code == _DIRECT_THREE:
-        status = direct_three(model, task, gains, straight, q, state)
-    elif code == _DIRECT_TWO:
-        status = direct_two(model, task, gains, straight, q, state)
-    elif code == _STACKED:
-        status = stacked(model, task, gains, straight, q, state)
-    elif code == _BLOCKWISE:
-        status = blockwise(model, task, gains, straight, q, state)
-    elif code == _EUCLIDEAN_POINTS:
-        status = euclidean_points(model, task, gains, straight, q, state)
-    elif code == _EXACT:
-        status = exact(model, task, gains, straight, q, state)
-    else:
-        status = incidences(model, task, gains, straight, q, state)
+    status = _call_law(law.address, (code, model, task, gains, straight, q, state))
     if following(task.reference):
         limited = code == _EXACT
         if status != LOST and on_joint_path(task.reference, float(state.clock[0])):

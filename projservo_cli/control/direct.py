@@ -26,11 +26,13 @@ from projservo_cli.geometry.displacements import rotation, translation
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.mechanisms import SETTLED, MeasuredFace, reach
+from projservo_cli.laws import CODES
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.trajectory import following, follows_joint_path, on_joint_path, planned_step
 
+_DIRECT_THREE = CODES["direct_three"]
 # Joint step of one part of the continuation, rad or m: linear joint motion then deviates from the path of a
 # robot of a metre's size by about 0.1 mm.
 _PART_STEP = math.radians(2.5)
@@ -42,44 +44,49 @@ _HALVINGS = 48
 _BRANCH_FACTOR = 2.0
 
 
-@merged
-def direct_three(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
-    """Joint velocity λ_t τ q̂_t + λ_r θ_r q̂_r + λ_p θ_p q̂_p, [RH00] eq. (20) as corrected."""
+@internal
+def direct(
+    code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
+    """Joint velocity of directTHREE or directTWO by the code, plus that of a plan."""
     status, parts = partitioned(model, task, s, q, state)
     if status != OK:
         return status
-    t = translation_rate(task, gains, parts, state)
-    r = gains.gain_r * parts.theta_r
-    p = gains.gain_p * parts.theta_p
-    for i in range(state.xi_dot.shape[0]):
-        state.xi_dot[i] = t * state.q_hat[0, i] + r * state.q_hat[1, i] + p * state.q_hat[2, i]
-    return _commanded(gains, state)
-
-
-@merged
-def direct_two(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
-    """Joint velocity λ_t τ q̂_t + λ_s θ_s q̂_s, [RH00] eqs. (23)–(25) as corrected."""
-    status, parts = partitioned(model, task, s, q, state)
-    if status != OK:
-        return status
-    unique, theta_s, sense, _ = single_rotation(model, parts, gains.ratio_rp, state)
-    if not unique:
+    if code == _DIRECT_THREE:
+        direct_three(task, gains, parts, state)
+    elif not direct_two(model, task, gains, parts, state):
         return SINGULAR
-    rate = gains.gain_s * theta_s * sense
-    t = translation_rate(task, gains, parts, state)
-    for i in range(state.xi_dot.shape[0]):
-        state.xi_dot[i] = t * state.q_hat[0, i] + rate * state.q_hat[3, i]
-    return _commanded(gains, state)
-
-
-@merged
-def _commanded(gains: Gains, state: State) -> int:
-    """Convert ``xi_dot`` to the joint velocity, plus that of a plan; the status."""
     if not joint_velocity_into(state):
         return SINGULAR
     for i in range(state.q_dot.shape[0]):
         state.q_dot[i] += state.q_ahead[i] / gains.period
     return OK
+
+
+@merged
+def direct_three(task: Task, gains: Gains, parts: Parts, state: State) -> None:
+    """Velocity λ_t τ q̂_t + λ_r θ_r q̂_r + λ_p θ_p q̂_p into ``xi_dot``, [RH00] eq. (20) as corrected."""
+    t = translation_rate(task, gains, parts, state)
+    r = gains.gain_r * parts.theta_r
+    p = gains.gain_p * parts.theta_p
+    for i in range(state.xi_dot.shape[0]):
+        state.xi_dot[i] = t * state.q_hat[0, i] + r * state.q_hat[1, i] + p * state.q_hat[2, i]
+
+
+@merged
+def direct_two(model: Model, task: Task, gains: Gains, parts: Parts, state: State) -> bool:
+    """Velocity λ_t τ q̂_t + λ_s θ_s q̂_s into ``xi_dot``, [RH00] eqs. (23)–(25) as corrected.
+
+    Returns False if the joint motion is not unique.
+    """
+    unique, theta_s, sense, _ = single_rotation(model, parts, gains.ratio_rp, state)
+    if not unique:
+        return False
+    rate = gains.gain_s * theta_s * sense
+    t = translation_rate(task, gains, parts, state)
+    for i in range(state.xi_dot.shape[0]):
+        state.xi_dot[i] = t * state.q_hat[0, i] + rate * state.q_hat[3, i]
+    return True
 
 
 class _Step(NamedTuple):
@@ -198,8 +205,10 @@ def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _S
     return share
 
 
-@merged
-def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
+@internal
+def exact(
+    _code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
     """Joint velocity whose step moves the face by exp(λ_t τ T Ĥ_t) exp(λ_s θ_s T Ĥ_s) exactly.
 
     The joint-speed limit shortens the amplitude along the path, by the first-order joint step, before any

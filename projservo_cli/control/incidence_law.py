@@ -22,7 +22,9 @@ _FREE = 0.1
 
 
 @internal
-def incidences(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
+def incidences(
+    _code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
     """Joint velocity −λ J⁺ e + (I − J⁺ J) z of the weighted errors e of all incidences, and their Jacobian J.
 
     With fewer joints than errors, by least squares.

@@ -1,9 +1,9 @@
 """Contract of every control law.
 
-A compiled law is ``law(model, task, gains, s, q, state) -> status``. Its inputs are the model, the task, the
-undistorted pixels ``s`` of the face and then of further markers of its body, and the joint readings ``q``,
-never the truth. It writes joint velocities to ``state.q_dot`` (rad/s or m/s) and control errors to
-``state.errors``.
+A compiled law is ``law(code, model, task, gains, s, q, state) -> status``; one function may serve several
+codes. Its inputs are the model, the task, the undistorted pixels ``s`` of the face and then of further
+markers of its body, and the joint readings ``q``, never the truth. It writes joint velocities to
+``state.q_dot`` (rad/s or m/s) and control errors to ``state.errors``.
 """
 
 import math
@@ -99,6 +99,7 @@ class Law(NamedTuple):
     """A built-in law with its inputs."""
 
     code: int  # of the law
+    address: int  # of its compiled function, in this process
     model: Model  # calibrated or metric
     task: Task  # in the frame of the model
     gains: Gains
@@ -170,6 +171,27 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN, views: int = 
         s_ref=np.zeros((views, m, 2)),
         q_ahead=np.zeros(n),
     )
+
+
+def example() -> tuple[int, Model, Task, Gains, FloatArray, FloatArray, State]:
+    """Arguments of a law of the types that all runs have; their values mean nothing."""
+    q, matrices, order = np.zeros(4), np.zeros((4, 4, 4)), np.zeros(4, np.int64)
+    model = Model(
+        np.zeros((2, 3, 4)), matrices, np.zeros(4, np.bool_), q_reference=q, a_inf=q, lens=np.zeros((2, 5))
+    )
+    task = Task(
+        s_star=np.zeros((2, 4, 2)),
+        A_star=matrices[0],
+        order=order,
+        center=0,
+        pair=order,
+        F=np.zeros((3, 3)),
+        O=np.zeros((2, 4)),
+        visible=q,
+        least_views=2,
+    )
+    gains = Gains(*(1.0,) * 8, limits=JointLimits(q, q, q, q))
+    return 0, model, task, gains, task.s_star, q, new_state(4, 4)
 
 
 @njit
@@ -269,7 +291,7 @@ def _current_target(task: Task, state: State) -> Task:
     return Task(task.s_star, state.A_ref, *task[2:])
 
 
-@internal
+@merged
 def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> tuple[int, Parts]:
     """Measure the face and partition the remaining task, or that to the current pose of the plan.
 

@@ -6,22 +6,27 @@ imports; every installation of the same sources shares it. If no folder is writa
 functions again.
 """
 
+import gc
 import hashlib
 import os
 import re
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
 from filelock import FileLock
+from numba.core import cgutils
 from numba.core.caching import UserProvidedCacheLocator
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.errors import TypingError
 from numba.core.registry import CPUDispatcher
+from numba.extending import intrinsic
 
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
@@ -144,6 +149,18 @@ def njit(function: Callable[_Params, _Result], *, allocates: bool = False) -> Ca
     return _compiled(_Shared, function, _nrt=allocates)
 
 
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Hold back the garbage collector, which takes a tenth of the compilation time."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
 class _Shared(CPUDispatcher):
     """A compiled function that two processes never compile at the same time: one waits and loads it."""
 
@@ -152,7 +169,8 @@ class _Shared(CPUDispatcher):
         if CACHE_FOLDER is None:
             return super().compile(sig)
         path = CACHE_FOLDER / f"{self.py_func.__module__}.{self.py_func.__qualname__}.lock"
-        with global_compiler_lock, ExitStack() as held:  # in this order, as where functions call others
+        # Locks in this order, as where functions call others.
+        with global_compiler_lock, _uncollected(), ExitStack() as held:
             with suppress(OSError, NotImplementedError):  # no locks, or none for so long: both compile
                 held.enter_context(FileLock(path, timeout=_MOST_S))
             return super().compile(sig)
@@ -212,3 +230,61 @@ def merged(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
     A call from Python compiles it on its own.
     """
     return cast(Callable[_Params, _Result], numba.njit(**_OPTIONS, inline="always")(function))
+
+
+class ByAddress:
+    """Compiled functions of the same arguments and an integer result, which compiled code calls by address.
+
+    Machine code holds a copy of every function that it calls by name, and of all that these call. A function
+    called by its address is compiled by itself, when its address is first asked for.
+
+    arguments : returns arguments of their types; their values mean nothing.
+    """
+
+    def __init__(self, arguments: Callable[[], tuple[Any, ...]]) -> None:
+        self._arguments = arguments
+        self._addresses: dict[Any, int] = {}
+        self._functions: dict[int, Callable[..., int]] = {}
+
+    @cached_property
+    def types(self) -> tuple[Any, ...]:
+        """The compiler's types of the arguments."""
+        return tuple(map(numba.typeof, self._arguments()))
+
+    def address(self, function: Any) -> int:
+        """Address of a function in this process, which compiles or loads it."""
+        if function not in self._addresses:
+            address = id(function)
+            if COMPILED:
+                made = function.get_compile_result(numba.int64(*self.types))
+                address = made.library.get_pointer_to_function(made.fndesc.llvm_func_name)
+            self._addresses[function] = address
+            self._functions[address] = function
+        return self._addresses[function]
+
+    def caller(self) -> Callable[..., int]:
+        """Return the function that calls the one of an address with a tuple of arguments."""
+        if not COMPILED:
+            return lambda address, arguments: self._functions[address](*arguments)
+        expected = self
+        utilities: Any = cgutils  # whose functions have no types
+
+        @intrinsic
+        def call(typing_context: Any, address: Any, arguments: Any) -> Any:
+            if arguments.types != expected.types:
+                raise TypingError(f"called with {arguments.types}, compiled for {expected.types}")
+
+            def lowered(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                convention = context.call_conv
+                returned, types = signature.return_type, arguments.types
+                kind = convention.get_function_type(returned, types).as_pointer()
+                function = builder.inttoptr(values[0], kind)
+                unpacked = utilities.unpack_tuple(builder, values[1])
+                status, result = convention.call_function(builder, function, returned, types, unpacked)
+                with utilities.if_unlikely(builder, status.is_error):
+                    convention.return_status_propagate(builder, status)
+                return result
+
+            return numba.int64(address, arguments), lowered
+
+        return cast(Callable[..., int], call)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import literal_unroll
 
+from projservo_cli.control import address_of
 from projservo_cli.control.law import (
     ERRORS,
     MAX_PARTS,
@@ -67,6 +68,7 @@ class _Scratch(NamedTuple):
     state: State
     own_state: State  # state, own_state: of the partition and of the law
     log: Log  # of the run
+    address: int  # of the compiled law
 
 
 class Batch:
@@ -92,6 +94,7 @@ class Batch:
             log=new_log(
                 n, observed, limits.max_steps, len(ERRORS), MAX_PARTS if setting.gains.substeps else 0, V
             ),
+            address=address_of(setting.code),
         )
         self.rehearsal = Rehearsal(setting.model, q_start, m, plant.limits)
 
@@ -185,7 +188,7 @@ def _drive(setting: Setting, status: int, noise: FloatArray, scratch: _Scratch, 
         for i in range(state.driven.shape[1]):
             state.driven[part, i] = scratch.state.driven[part, i]
     task = scratch.task if setting.shares_task else scratch.own_task
-    law = Law(setting.code, setting.believed, task, setting.gains)
+    law = Law(setting.code, scratch.address, setting.believed, task, setting.gains)
     verdict, steps = run_compiled(law, setting.course, noise, state, scratch.log)
     numbers[VERDICT] = verdict
     numbers[STEPS] = steps

@@ -21,7 +21,7 @@ import numpy as np
 from numba import types
 from numba.experimental import structref
 
-from projservo_cli.control import command
+from projservo_cli.control import command, make_law
 from projservo_cli.control.law import ERRORS, OK, Gains, Law, State, new_state
 from projservo_cli.geometry.jit import COMPILED, njit
 from projservo_cli.geometry.mechanisms import make_span
@@ -204,7 +204,7 @@ class BuiltInLaw:
         n, m, V = len(model.H_hat_0), len(task.A_star), len(model.P)
         self.state = new_state(n, m, len(task.body.M), span, V)
         self._weight = np.ones((V, len(task.body.M)))
-        self.law = Law(code, model, self._weighed(task), gains)
+        self.law = make_law(code, model, self._weighed(task), gains)
         self._bound: Any = None  # until it is called from Python
         self.errors, self.share, self.fit = self.state.errors, self.state.share, self.state.fit
         self.face_px, self.blocked = self.state.face_px, self.state.blocked

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from projservo_cli.control.law import ERRORS, Gains, Law, State, make_split, measure, new_state, reset
+from projservo_cli.control import make_law
+from projservo_cli.control.law import ERRORS, Gains, State, make_split, measure, new_state, reset
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.jit import inline
 from projservo_cli.geometry.kinematics import backward
@@ -77,7 +78,7 @@ class Rehearsal:
         )
         # The face alone is shown, by points where a pair of views shows it.
         body = NO_BODY if len(task.pair) else task.body._replace(weight=np.ones_like(task.body.weight))
-        law = Law(_DIRECT_TWO, seen, task._replace(body=body), _REHEARSAL)
+        law = make_law(_DIRECT_TWO, seen, task._replace(body=body), _REHEARSAL)
         step = np.full(len(self.q_start), _REHEARSAL_STEP)
         q_hat_p = state.q_hat[2].copy()
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from projservo_cli.control import address_of, make_law
 from projservo_cli.control.law import ERRORS, Law, State, new_state
 from projservo_cli.laws import CODES, INCIDENCES, LAWS
 from projservo_cli.loop.compiled import Course, many_steps, run_compiled
@@ -57,13 +58,13 @@ class Case:
         self.points = self._run(shown.by_points().task(self.model), scenario.plant_of("stacked"))
         posed = shown._replace(incidences=whole_pose(shown.body.M[: self.m]))
         self.incidences = self._run(posed.task(self.model), scenario.plant_of("exact"))
-        self.law = BuiltInLaw(*self.points.law)
+        self.law = BuiltInLaw(CODE, *self.points.law[2:])
 
     def _run(self, task: Task, plant: Plant) -> _Job:
         """A run, whose log has the states that are cycled through."""
         n, seen = len(self.q_start), self.m + len(plant.pins)
         noise = np.ascontiguousarray(self.noise[:, :, :seen])
-        law, course = Law(CODE, self.model, task, self.gains), Course(plant, self.limits, self.q_start)
+        law, course = make_law(CODE, self.model, task, self.gains), Course(plant, self.limits, self.q_start)
         log = new_log(n, seen, self.limits.max_steps, len(ERRORS))
         job = _Job(law, course, noise, new_state(n, self.m), log)
         run_compiled(*job)
@@ -72,7 +73,9 @@ class Case:
     def steps(self, law: str, *, body: bool = False) -> float:
         """One step of a law in each state."""
         job = self.incidences if law == INCIDENCES else self.whole if body else self.points
-        return many_steps(job.law._replace(code=CODES[law]), job.course, job.state, job.log)
+        return many_steps(
+            job.law._replace(code=CODES[law], address=address_of(CODES[law])), job.course, job.state, job.log
+        )
 
     def whole_run(self) -> _Job:
         """A run of 150 steps, traced."""

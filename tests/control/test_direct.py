@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.control import classical, direct, incidence_law
+from projservo_cli.control import FUNCTIONS
 from projservo_cli.control.law import TAU_AFFINE, THETA_P, THETA_R, THETA_S
 from projservo_cli.laws import CODES, LAWS
 from tests.samples import pixels, poe, revolute
@@ -97,9 +97,16 @@ def test_a_marker_as_center(center):
 
 
 def test_laws_are_given_images_joints_and_a_model_and_nothing_else():
-    """Each is the function of its name in one of the files of laws."""
-    found = {**vars(classical), **vars(direct), **vars(incidence_law)}
-    for law in LAWS:
-        parameters = inspect.signature(getattr(found[law], "py_func", found[law])).parameters
-        assert list(parameters) == ["model", "task", "gains", "s", "q", "state"]
+    for function in FUNCTIONS:
+        parameters = inspect.signature(getattr(function, "py_func", function)).parameters
+        assert [name.strip("_") for name in parameters] == [
+            "code",
+            "model",
+            "task",
+            "gains",
+            "s",
+            "q",
+            "state",
+        ]
+    assert len(FUNCTIONS) == len(LAWS)
     assert [*CODES.items()] == [(law, code) for code, law in enumerate(LAWS)]

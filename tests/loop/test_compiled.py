@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numba import typeof
 
+from projservo_cli.control import make_law
 from projservo_cli.control.law import ERRORS, Law, State, new_state, reset
 from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
@@ -47,7 +48,7 @@ def test_arrays_that_another_run_left_are_as_good_as_new(law, rng):
     fresh = Run(sc, law, bounds=bounds._replace(max_lost_periods=5), noise=noise)
     used = Run(sc, law, bounds=bounds, noise=7.0 * rng.normal(size=noise.shape))
     reset(used.state)
-    built_in = Law(
+    built_in = make_law(
         CODES[law], sc.model, sc.task(None), GAINS._replace(limits=GAINS.limits._replace(speed=bounds.speed))
     )
     course = Course(sc.plant, bounds._replace(max_lost_periods=5), sc.q_start.copy())
@@ -150,7 +151,8 @@ def test_success_is_told_of_the_truth(rng):
 def test_records_are_of_the_types_of_a_run():
     scenario = known_scenario(configured("paper"))
     real = {
-        Law: Law(0, scenario.model, scenario.ends.task(scenario.model), scenario.gains),
+        Law: make_law(0, scenario.model, scenario.ends.task(scenario.model), scenario.gains),
+        Course: Course(scenario.plant_of("exact"), scenario.termination, scenario.exact.q_start),
         Plant: scenario.plant_of("exact"),
         State: new_state(6, scenario.m),
         Log: new_log(6, scenario.m, 3, len(ERRORS)),

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.control import command
-from projservo_cli.control.law import OK, UNLIMITED, Gains, Law, new_state
+from projservo_cli.control import command, make_law
+from projservo_cli.control.law import OK, UNLIMITED, Gains, new_state
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.laws import CODES
 from projservo_cli.records import InputError, position_limits
@@ -94,7 +94,7 @@ class Case:
         task = make_task(self.model, A @ poe(self.model, q).T, A @ self.H.T)
         task = task._replace(body=self.body, incidences=self.rows)
         state = new_state(len(q), 4, len(self.M))
-        return Law(CODES["incidences"], self.model, task, gains), state
+        return make_law(CODES["incidences"], self.model, task, gains), state
 
     def drive(self, q, gain=1.0, limits=UNLIMITED):
         """Joints (n,) where the law ends."""
