@@ -9,16 +9,12 @@ from projservo_cli.control.incidence_law import incidences
 from projservo_cli.control.law import LOST, OK, Gains, Law, State, example, limit_speed
 from projservo_cli.geometry.jit import ByAddress, internal, merged
 from projservo_cli.geometry.lens import distorts, undistort_into
-from projservo_cli.laws import LAWS
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.trajectory import Reference, following, near_joint_path, on_joint_path, reference_into
 
 # Share of the image-based command of a period that corrects a joint-space path.
 _CORRECTED = 0.2
-# Functions of the laws in the order of their codes.
-FUNCTIONS = (direct, direct, classical, classical, classical, exact, incidences)
-_EXACT = LAWS.index("exact")
 _BY_ADDRESS = ByAddress(example)
 _call_law = _BY_ADDRESS.caller()
 
@@ -33,18 +29,79 @@ def address_of(code: int) -> int:
     return _BY_ADDRESS.address(FUNCTIONS[code])
 
 
-@internal
+@merged
 def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
-    """Run a law on undistorted images, along a plan if it follows one.
+    """Run a law on images as the cameras report them, along a plan if it follows one.
 
-    s : (V, b, 2) pixels as the cameras report them, NaN if unseen.
+    s : (V, b, 2) pixels, NaN if unseen.
     Returns the status of the law; ``LOST`` for a state made for another number of markers.
     """
-    code, _, model, task, gains = law
+    return _call_law(law.address, (law.code, law.model, law.task, law.gains, s, q, state))
+
+
+@internal
+def _direct_period(
+    code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
+    """Run a direct law of the paper for a period."""
+    ready, straight = _prepared(model, task, gains, s, state)
+    if not ready:
+        return LOST
+    return _finished(task, gains, q, direct(code, model, task, gains, straight, q, state), False, state)
+
+
+@internal
+def _classical_period(
+    code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
+    """Run a classical law for a period."""
+    ready, straight = _prepared(model, task, gains, s, state)
+    if not ready:
+        return LOST
+    return _finished(task, gains, q, classical(code, model, task, gains, straight, q, state), False, state)
+
+
+@internal
+def _exact_period(
+    _code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
+    """Run the law without drift for a period."""
+    ready, straight = _prepared(model, task, gains, s, state)
+    if not ready:
+        return LOST
+    return _finished(task, gains, q, exact(model, task, gains, straight, q, state), True, state)
+
+
+@internal
+def _incidences_period(
+    _code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
+    """Run the law of a list of incidences for a period."""
+    ready, straight = _prepared(model, task, gains, s, state)
+    if not ready:
+        return LOST
+    return _finished(task, gains, q, incidences(model, task, gains, straight, q, state), False, state)
+
+
+# Functions of the laws in the order of their codes. Each measures and commands once for all its codes.
+FUNCTIONS = (
+    _direct_period,
+    _direct_period,
+    _classical_period,
+    _classical_period,
+    _classical_period,
+    _exact_period,
+    _incidences_period,
+)
+
+
+@merged
+def _prepared(model: Model, task: Task, gains: Gains, s: FloatArray, state: State) -> tuple[bool, FloatArray]:
+    """Undistort the images and look up the plan; whether the state is for as many markers, and the images."""
     straight = s
     if distorts(model.lens):
         if state.straight.shape[1] != s.shape[1]:
-            return LOST
+            return False, s
         undistort_into(model.lens, s, state.straight)
         straight = state.straight
     if following(task.reference):
@@ -52,9 +109,16 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
         reference_into(
             model, task.reference, float(state.clock[0]), lead, state.A_ref, state.s_ref, state.q_ahead
         )
-    status = _call_law(law.address, (code, model, task, gains, straight, q, state))
+    return True, straight
+
+
+@merged
+def _finished(task: Task, gains: Gains, q: FloatArray, status: int, limited: bool, state: State) -> int:
+    """Advance along the plan by what the law commanded, if there is one; the status.
+
+    limited : whether the law applies the joint-speed limit.
+    """
     if following(task.reference):
-        limited = code == _EXACT
         if status != LOST and on_joint_path(task.reference, float(state.clock[0])):
             _keep_near(task.reference, gains, q, status == OK, state)
             status, limited = OK, False

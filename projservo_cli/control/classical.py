@@ -2,7 +2,7 @@
 
 from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure, pseudo_inverse, view_into
 from projservo_cli.geometry.algebra import apply, mat, vec
-from projservo_cli.geometry.jit import internal, merged
+from projservo_cli.geometry.jit import merged
 from projservo_cli.laws import CODES
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
@@ -10,7 +10,7 @@ from projservo_cli.task.face import Task
 _STACKED, _BLOCKWISE = CODES["stacked"], CODES["blockwise"]
 
 
-@internal
+@merged
 def classical(
     code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
 ) -> int:

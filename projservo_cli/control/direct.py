@@ -44,7 +44,7 @@ _HALVINGS = 48
 _BRANCH_FACTOR = 2.0
 
 
-@internal
+@merged
 def direct(
     code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
 ) -> int:
@@ -205,10 +205,8 @@ def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _S
     return share
 
 
-@internal
-def exact(
-    _code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
-) -> int:
+@merged
+def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
     """Joint velocity whose step moves the face by exp(λ_t τ T Ĥ_t) exp(λ_s θ_s T Ĥ_s) exactly.
 
     The joint-speed limit shortens the amplitude along the path, by the first-order joint step, before any

@@ -8,7 +8,7 @@ import math
 
 from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
 from projservo_cli.geometry.algebra import Mat4, apply, dot, inverse, mat, vec
-from projservo_cli.geometry.jit import internal
+from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kernels import least_squares, minimum_norm
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
@@ -21,10 +21,8 @@ _BAND, _SIDE = 0.1, 0.5
 _FREE = 0.1
 
 
-@internal
-def incidences(
-    _code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
-) -> int:
+@merged
+def incidences(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
     """Joint velocity −λ J⁺ e + (I − J⁺ J) z of the weighted errors e of all incidences, and their Jacobian J.
 
     With fewer joints than errors, by least squares.
