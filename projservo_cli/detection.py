@@ -137,7 +137,7 @@ def _by_number(source: str, poses: list[int], where: str, columns: str) -> list[
 # Share of the mean grey value by which those of the four pixels of a cell of a Bayer mosaic differ at least.
 _MOSAIC = 0.04
 # Kinds of boards, and their minimum rows and columns.
-BOARDS, LEAST_ROWS = ("chessboard", "charuco"), 3
+_BOARDS, LEAST_ROWS = ("chessboard", "charuco"), 3
 # Share of a square that a tag takes up on a ChArUco board: what OpenCV draws; the edges decide on corners.
 _TAG_SHARE = 0.75
 # Minimum number of corners of a board in an image, for the directions of its edges.
@@ -608,7 +608,7 @@ class Board(NamedTuple):
     @classmethod
     def of(cls, text: str) -> "Board":
         """Read such as ``chessboard:9x7``, 9 columns and 7 rows. Raises InputError for anything else."""
-        parts = re.fullmatch(rf"({'|'.join(BOARDS)}):(\d{{1,3}})x(\d{{1,3}})", text)
+        parts = re.fullmatch(rf"({'|'.join(_BOARDS)}):(\d{{1,3}})x(\d{{1,3}})", text)
         if parts is None or min(int(parts[2]), int(parts[3])) < LEAST_ROWS:
             raise InputError(
                 f"--board {text}: write kind:columnsxrows, of {LEAST_ROWS} or more, such as chessboard:9x7 "

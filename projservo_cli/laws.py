@@ -12,8 +12,8 @@ REGULATE = "regulate"
 TRACK = "track"
 IMAGE_TRACK = "image_track"
 INCIDENCES = "incidences"
-POINTS = "points"
-BODY = "body"
+_POINTS = "points"
+_BODY = "body"
 
 
 class _LawSpec(NamedTuple):
@@ -21,24 +21,24 @@ class _LawSpec(NamedTuple):
 
     title: str  # as figures write it
     modes: tuple[str, ...]  # it follows a plan in all but ``REGULATE``
-    features: str  # needs the ``POINTS`` of the face themselves, or can measure with the ``BODY``
+    features: str  # needs the ``_POINTS`` of the face themselves, or can measure with the ``_BODY``
     metric: bool = False  # is given the metric model
     paper: bool = True  # is one of [RH00]
 
 
 LAW_SPECS = {
-    "direct_three": _LawSpec("directTHREE", (REGULATE, TRACK), BODY),
-    "direct_two": _LawSpec("directTWO", (REGULATE, TRACK), BODY),
-    "stacked": _LawSpec("stacked Jacobians", (REGULATE, IMAGE_TRACK), POINTS),
-    "blockwise": _LawSpec("block-wise", (REGULATE,), POINTS),
-    "euclidean_points": _LawSpec("Euclidean points", (REGULATE,), POINTS, metric=True),
-    "exact": _LawSpec("exact", (REGULATE, TRACK), BODY, paper=False),
-    INCIDENCES: _LawSpec("incidences", (REGULATE,), BODY, paper=False),
+    "direct_three": _LawSpec("directTHREE", (REGULATE, TRACK), _BODY),
+    "direct_two": _LawSpec("directTWO", (REGULATE, TRACK), _BODY),
+    "stacked": _LawSpec("stacked Jacobians", (REGULATE, IMAGE_TRACK), _POINTS),
+    "blockwise": _LawSpec("block-wise", (REGULATE,), _POINTS),
+    "euclidean_points": _LawSpec("Euclidean points", (REGULATE,), _POINTS, metric=True),
+    "exact": _LawSpec("exact", (REGULATE, TRACK), _BODY, paper=False),
+    INCIDENCES: _LawSpec("incidences", (REGULATE,), _BODY, paper=False),
 }
 LAWS = tuple(LAW_SPECS)
 CODES = {law: code for code, law in enumerate(LAWS)}  # codes of the laws in compiled code
-POINT_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == POINTS)
-BODY_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == BODY)
+POINT_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == _POINTS)
+BODY_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == _BODY)
 _NAMES = {
     f"{law}_{mode}": (law, mode) for law, spec in LAW_SPECS.items() for mode in spec.modes if mode != REGULATE
 }

@@ -19,19 +19,19 @@ from typing import Any
 
 from projservo_cli.records import InputError, WorkFailed
 
-GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
+_GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
 _METHODS = {"plant": ("open", "read", "command", "stop", "close"), "law": ("__call__",)}
 _OPTIONAL = {"plant": ("now", "truth", "release", "hold", "identity"), "law": ("error",)}
 _OWN_PLANTS = {"so101": "projservo_cli.hardware.so101:SO101"}  # that projservo brings along
-DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
+_DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
 # How alike two names are of which one is a slip, from 0 to 1: of a letter in four or five.
 _ALIKE = 0.8
-TARGET = rf"^{DOTTED}:{DOTTED}$"
+TARGET = rf"^{_DOTTED}:{_DOTTED}$"
 
 
 def registered_names(kind: str) -> dict[str, str]:
     """Names of a ``plant`` or ``law``, projservo's own and those of installed packages, with the classes."""
-    found = {point.name: point.value for point in metadata.entry_points(group=GROUPS[kind])}
+    found = {point.name: point.value for point in metadata.entry_points(group=_GROUPS[kind])}
     return found | (_OWN_PLANTS if kind == "plant" else {})
 
 

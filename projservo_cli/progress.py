@@ -9,7 +9,7 @@ from typing import Any, Self
 # Period at which the clock of a bar advances, s.
 TICK_S = 0.5
 # Period of the lines that tell how far work is where there is no terminal, s.
-LINE_S = 60.0
+_LINE_S = 60.0
 
 
 class _Bar:
@@ -41,7 +41,7 @@ class _Bar:
         now = time.monotonic()
         if what != self._what:
             self._what, self._told = what, now
-        elif now - self._told >= LINE_S and done < total:
+        elif now - self._told >= _LINE_S and done < total:
             self._told = now
             self.say(f"{what}: {done} of {total}")
 

@@ -193,14 +193,14 @@ def _inputs(config: Config, run: Run, stages: Sequence[str]) -> _Inputs:
         files |= {name: file.path, name + _HASH: file.sha256}
     records: dict[str, Any] = {}
     for stage in stages:
-        for part, step in parts_of(stage, config.steps).items():
+        for part, step in _parts_of(stage, config.steps).items():
             with suppress(InputError):
                 moves = step is None or step.moves
                 records[f"{stage}/{part}"] = _INPUTS[stage](config.at_step(part), read) if moves else step
     return _Inputs(records, files)
 
 
-def parts_of(stage: str, steps: Mapping[str, TaskStep]) -> dict[str, TaskStep | None]:
+def _parts_of(stage: str, steps: Mapping[str, TaskStep]) -> dict[str, TaskStep | None]:
     """Return the steps of a sequence that a stage makes results of; of no name where it makes one alone."""
     if not steps or stage not in ("plan", "servo"):
         return {"": None}
@@ -230,7 +230,7 @@ def _needed(
     for stage in stages:
         keys: list[str] = []
         of_files = {"": _Read(inputs.files if stage == "calibrate" else {})}
-        for part, asked in parts_of(stage, steps).items():
+        for part, asked in _parts_of(stage, steps).items():
             record = inputs.records.get(f"{stage}/{part}")
             own = "" if record is None else key_of(record)
             moves = asked is None or asked.moves

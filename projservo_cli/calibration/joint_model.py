@@ -39,7 +39,7 @@ _FUNCTIONS = {
     "coupling": ("linear",),
     "sag": ("torque",),
 }
-KINDS = tuple(_FUNCTIONS)
+_KINDS = tuple(_FUNCTIONS)
 _ARGUMENTS = {
     "linear": "reading {}",
     "square": "square of reading {}",
@@ -94,7 +94,7 @@ def hypotheses_of(asked: str | Iterable[str], joint_types: str, mount: str) -> l
     for word in asked:
         kind, _, which = word.partition(":")
         if kind not in _FUNCTIONS or (which and kind == "sag"):
-            raise InputError(f"joint model {word!r}: choose auto, or of {', '.join(KINDS)}, such as scale:2")
+            raise InputError(f"joint model {word!r}: choose auto, or of {', '.join(_KINDS)}, such as scale:2")
         try:
             joints = tuple(int(number) for number in which.split("-") if number)
         except ValueError:
@@ -120,7 +120,7 @@ def hypotheses_of(asked: str | Iterable[str], joint_types: str, mount: str) -> l
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class JointModelFit:
+class _JointModelFit:
     """A fit with a curve of the joints."""
 
     solution: Solution
@@ -129,7 +129,7 @@ class JointModelFit:
 
 def fit_joint_model(
     start: Solution, asked: Sequence[Hypothesis] | None, epipolar: ImageGeometry
-) -> JointModelFit | None:
+) -> _JointModelFit | None:
     """Fit the curve of the hypotheses asked for, or for None of those that the data show.
 
     None if they show none. Raises WorkFailed naming a hypothesis that the data do not determine.
@@ -158,7 +158,7 @@ def fit_joint_model(
     now = left_out_px(found)
     owners = _terms(chosen, exact)
     without = {key: before.get(one, left_out_px(exact)) for one in chosen for key in owners[one]}
-    return JointModelFit(found, np.array([[without[key], now] for key in _keys(found.params.curve)]))
+    return _JointModelFit(found, np.array([[without[key], now] for key in _keys(found.params.curve)]))
 
 
 def _keys(curve: JointCurve) -> list[_Term]:

@@ -110,7 +110,7 @@ class JointNoise:
             return cls(0.0, np.array([0.0, high]), 0.0)
         if likelihood.contradicted(log_ratio):
             return NO_JOINT_NOISE
-        counted = tick_noise(problem.detections.q, problem.detections.prismatic)
+        counted = _tick_noise(problem.detections.q, problem.detections.prismatic)
         ticks, sigma_q = low <= counted <= high, likelihood.sigma_q(log_ratio)
         taken = counted if ticks else sigma_q
         return cls(taken, np.array([low, high]), float(np.exp(log_ratio)) * taken / sigma_q, ticks)
@@ -198,7 +198,7 @@ class _Likelihood:
         return float(np.exp(log_ratio) * self.sigma(log_ratio))
 
 
-def tick_noise(q: FloatArray, prismatic: BoolArray) -> float:
+def _tick_noise(q: FloatArray, prismatic: BoolArray) -> float:
     """Noise, rms of the joints, rad, of readings (K, n) rounded to encoder ticks; 0 without ticks."""
     ticks = np.array([_tick(column) for column in q.T])
     if (ticks == 0.0).any():

@@ -89,7 +89,7 @@ _POSES = 60
 _MAX_PREDICTED = 0.01
 
 
-class ViewError(NamedTuple):
+class _ViewError(NamedTuple):
     """Distance of the images of a view from their prediction, and the expected one, medians, px."""
 
     view: str
@@ -108,7 +108,7 @@ class ViewError(NamedTuple):
         return f"the {self.view} images are {self.off_px:.3g} px off ({limit:.3g} px allowed)"
 
 
-def view_errors(calibration: Calibration, observation: Observation) -> tuple[ViewError, ...]:
+def view_errors(calibration: Calibration, observation: Observation) -> tuple[_ViewError, ...]:
     """Compare the images of each view at joint readings with their prediction.
 
     Raises InputError if the calibration has no covariance, or readings have another number of joints.
@@ -186,14 +186,14 @@ class _Images:
             variance += ((self.problem.joint_derivative(params) * self.problem.tau) ** 2).sum(axis=(2, 3))
         return np.asarray(np.sqrt(0.5 * variance))
 
-    def errors_of_views(self, params: Parameters, errors: Errors) -> tuple[ViewError, ...]:
+    def errors_of_views(self, params: Parameters, errors: Errors) -> tuple[_ViewError, ...]:
         """Distances of all views from their prediction, and the expected ones."""
         found, result = self.problem.detections, []
         distance = np.linalg.norm(self.problem.residual(params), axis=2) / found.weight
         expected = RAYLEIGH * self.deviation(params, errors) / found.weight
         for v, (name, seen) in enumerate(zip(found.view, found.seen, strict=True)):
             off = (float(np.median(px[v, seen])) if seen.any() else np.nan for px in (distance, expected))
-            result.append(ViewError(name, *off))
+            result.append(_ViewError(name, *off))
         return tuple(result)
 
     @property

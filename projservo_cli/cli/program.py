@@ -21,7 +21,7 @@ from click.shell_completion import CompletionItem, shell_complete
 from projservo_cli.cli.output import visible
 from projservo_cli.provenance import __version__
 
-DONE, FAILED, MALFORMED, INTERRUPTED = 0, 1, 2, 130
+_DONE, FAILED, _MALFORMED, _INTERRUPTED = 0, 1, 2, 130
 _COMPLETE = "_PROJSERVO_COMPLETE"
 _COMING = threading.Event()  # an interrupt that was lost and is raised again
 _LEFT_OUT = {"--suggest": "5"}  # default number of an option
@@ -175,17 +175,17 @@ def run(arguments: Sequence[str]) -> int:
     try:
         code = _invoked(arguments)
         sys.stdout.flush()
-        return code or DONE
+        return code or _DONE
     except click.exceptions.Exit as end:  # after help and version
         return end.exit_code
     except click.UsageError as error:
-        return _complain(error.format_message(), MALFORMED)
+        return _complain(error.format_message(), _MALFORMED)
     except KeyboardInterrupt:
         _COMING.clear()
-        return _complain("interrupted", INTERRUPTED)
+        return _complain("interrupted", _INTERRUPTED)
     except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return DONE
+        return _DONE
     except Exception as error:
         return _failure(error, verbose="-v" in arguments or "--verbose" in arguments)
 
@@ -206,7 +206,7 @@ def _failure(error: Exception, *, verbose: bool) -> int:
     from projservo_cli.records import InputError, WorkFailed
 
     if isinstance(error, InputError):
-        return _complain(str(error), MALFORMED)
+        return _complain(str(error), _MALFORMED)
     if isinstance(error, WorkFailed):
         return _complain(str(error), FAILED)
     if verbose:

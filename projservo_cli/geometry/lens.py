@@ -23,15 +23,15 @@ _MAX_STEPS = 50
 # Newton step, over the radius, that is the last: the next would be its square, below round-off.
 _SETTLED = 1e-9
 
-Number = TypeVar("Number", float, FloatArray)
+_Number = TypeVar("_Number", float, FloatArray)
 
 
-def _factor(k1: Number, k2: Number, square: Number) -> Number:
+def _factor(k1: _Number, k2: _Number, square: _Number) -> _Number:
     """Factor 1 + k1 ρ² + k2 ρ⁴ of a radius, from its square."""
     return 1.0 + square * (k1 + square * k2)
 
 
-def _factor_rate(k1: Number, k2: Number, square: Number) -> Number:
+def _factor_rate(k1: _Number, k2: _Number, square: _Number) -> _Number:
     """Derivative k1 + 2 k2 ρ² of the factor by the square of the radius."""
     return k1 + 2.0 * (square * k2)
 

@@ -197,7 +197,7 @@ class CameraRobot:
         ]
 
 
-class Exposure(NamedTuple):
+class _Exposure(NamedTuple):
     """Exposure and sharpness of a frame."""
 
     mean: float  # grey value
@@ -219,7 +219,7 @@ class Exposure(NamedTuple):
         return wrong
 
 
-def exposure_of(grey: ByteArray) -> Exposure:
+def exposure_of(grey: ByteArray) -> _Exposure:
     """Measure a frame (height, width).
 
     An edge of contrast c, blurred by a normal distribution of deviation σ, has the slope c/(σ √(2π)).
@@ -234,4 +234,4 @@ def exposure_of(grey: ByteArray) -> Exposure:
     c, s = contrast.ravel()[steepest], slope.ravel()[steepest]
     edges = c > _DARK
     blur = float(np.median(c[edges] / s[edges])) / math.sqrt(2.0 * math.pi) if edges.sum() > 20 else math.nan
-    return Exposure(float(grey.mean()), float(grey.max()), float((grey >= _WHITE).mean()), blur)
+    return _Exposure(float(grey.mean()), float(grey.max()), float((grey >= _WHITE).mean()), blur)

@@ -197,7 +197,7 @@ def _of_all_views(robot: RobotAtRest) -> Iterator[Finding]:
             yield Finding(WARNING, images, what, remedy)
             break
     if len(robot.views) > 1:
-        angles = [view_angle_deg(one.tags, other.tags) for one, other in combinations(robot.views, 2)]
+        angles = [_view_angle_deg(one.tags, other.tags) for one, other in combinations(robot.views, 2)]
         angle = max(angles, key=lambda one: -math.inf if math.isnan(one) else one)
         if angle < _GOOD_ANGLE_DEG:
             what = (
@@ -223,7 +223,7 @@ def _of_all_views(robot: RobotAtRest) -> Iterator[Finding]:
         yield Finding(WARNING, images, what, remedy)
 
 
-def view_angle_deg(left: Mapping[int, Corners], right: Mapping[int, Corners]) -> float:
+def _view_angle_deg(left: Mapping[int, Corners], right: Mapping[int, Corners]) -> float:
     """Angle between the directions from which two cameras see the tags, median over tags; NaN without one.
 
     Tags whose perspective does not show to which side they are tilted count where there are no others; of the

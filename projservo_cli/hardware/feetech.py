@@ -34,7 +34,7 @@ _WRITES = 5
 _SYNC_READ, _SYNC_WRITE, _ALL = 0x82, 0x83, 0xFE
 
 
-class Reply(NamedTuple):
+class _Reply(NamedTuple):
     """Reply of a servo."""
 
     status: int  # bits of its faults
@@ -73,13 +73,13 @@ class FeetechBus:
 
     def read(
         self, ids: Sequence[int], address: int, size: int, *, together: bool = False
-    ) -> dict[int, Reply]:
+    ) -> dict[int, _Reply]:
         """Return so many bytes, 15 at most, of the memory of each servo; silent ones are asked again.
 
         together : all are asked again, so that all replies are of ``read_at``.
         Raises ServoSilent, or PortLost.
         """
-        answered: dict[int, Reply] = {}
+        answered: dict[int, _Reply] = {}
         garbled: set[int] = set()
         end = self.now() + _PATIENCE_S
         while missing := [i for i in ids if i not in answered]:
@@ -112,21 +112,21 @@ class FeetechBus:
                 "off and on, then run the command again"
             )
 
-    def _asked(self, ids: Sequence[int], address: int, size: int) -> tuple[dict[int, Reply], set[int]]:
+    def _asked(self, ids: Sequence[int], address: int, size: int) -> tuple[dict[int, _Reply], set[int]]:
         """Replies to one request by servo, and those of which there is none, but bytes that are no reply."""
         with self._lock:
             longer = _SHORTEST + self._failed % _LENGTHS
             start = min(address, _MEMORY - longer)
             self._checked(self._serial.reset_input_buffer)
             sent = self._send(_SYNC_READ, bytes([start, longer, *ids]))
-            answered: dict[int, Reply] = {}
+            answered: dict[int, _Reply] = {}
             before = self.now()
             heard, end = b"", before + self._reply_s
             while len(answered) < len(ids) and self.now() < end:
                 heard += self._received()
                 for number, status, values in _packets(heard):
                     if number in ids and len(values) == longer:
-                        answered[number] = Reply(status, values[address - start :][:size])
+                        answered[number] = _Reply(status, values[address - start :][:size])
             self.read_at = 0.5 * (before + self.now())
             missing = {*ids} - {*answered}
             self._failed += bool(missing)

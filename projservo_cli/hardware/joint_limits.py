@@ -16,30 +16,30 @@ _PERIOD_S, _MEDIAN = 0.02, 3
 _MOVED_DEG, _WITHIN_DEG = 20.0, 1.0
 
 
-class Moved(NamedTuple):
+class _Moved(NamedTuple):
     """Range of a joint moved by hand, in counts that continue over a whole turn."""
 
     lowest: int
     highest: int
 
 
-def watch(servos: Servos, done: Callable[[], bool]) -> dict[int, Moved]:
+def watch(servos: Servos, done: Callable[[], bool]) -> dict[int, _Moved]:
     """Return how far each joint is moved until that is done, by the number of its servo."""
     last = {i: measured.at for i, measured in servos.measured().items()}
     counts = {i: deque([float(last[i])] * _MEDIAN, _MEDIAN) for i in servos.ids}
-    ranges = {i: Moved(last[i], last[i]) for i in servos.ids}
+    ranges = {i: _Moved(last[i], last[i]) for i in servos.ids}
     while not done():
         servos.bus.sleep(_PERIOD_S)
         for i, measured in servos.measured().items():
             if i in counts:
                 counts[i].append(counts[i][-1] + (measured.at - last[i] + MIDDLE) % TURN - MIDDLE)
                 last[i], now = measured.at, int(np.median(counts[i]))
-                ranges[i] = Moved(min(ranges[i].lowest, now), max(ranges[i].highest, now))
+                ranges[i] = _Moved(min(ranges[i].lowest, now), max(ranges[i].highest, now))
     return ranges
 
 
 def limits_deg(
-    servos: Servos, moved: dict[int, Moved], shift: Sequence[int] = ()
+    servos: Servos, moved: dict[int, _Moved], shift: Sequence[int] = ()
 ) -> list[tuple[float, float]]:
     """Return lowest and highest angle of each joint, deg, within where it was moved.
 
@@ -70,12 +70,12 @@ def limits_deg(
     return limits
 
 
-def _crosses(moved: Moved) -> bool:
+def _crosses(moved: _Moved) -> bool:
     """Whether a range crosses the end of the turn of its servo."""
     return moved.lowest < 0 or moved.highest >= TURN
 
 
-def _kept_from(moved: Moved, kept: Registers) -> str:
+def _kept_from(moved: _Moved, kept: Registers) -> str:
     """Return how the limits that a servo stores cut the range of its joint; empty where they hardly do.
 
     Those of a servo that is shifted must be those of a whole turn: its counts will mean other angles.
@@ -91,7 +91,7 @@ def _kept_from(moved: Moved, kept: Registers) -> str:
     )
 
 
-def _unusable(moved: Moved, joint: int, shift: Sequence[int]) -> str:
+def _unusable(moved: _Moved, joint: int, shift: Sequence[int]) -> str:
     """Return the reason why the range of a joint gives no limits, with the remedy; empty if it does."""
     span = math.degrees((moved.highest - moved.lowest) * COUNT)
     if span < _MOVED_DEG:

@@ -52,7 +52,7 @@ _LEAP = math.radians(3.0)
 _SWITCH_S = 0.1  # after which torque has come on
 
 
-class Measured(NamedTuple):
+class _Measured(NamedTuple):
     """Measurements of one servo."""
 
     at: int  # counts
@@ -144,10 +144,10 @@ class Servos:
         servo = f"servo {number}"
         return f"joint {self.ids.index(number) + 1} ({servo})" if number in self.ids else servo
 
-    def measured(self) -> dict[int, Measured]:
+    def measured(self) -> dict[int, _Measured]:
         """Return what each servo measures that is not lost."""
         replies = self.bus.read(self.alive, _PRESENT, 8, together=True).items()
-        return {i: Measured(_number(x), 0.1 * x[6], x[7], status) for i, (status, x) in replies}
+        return {i: _Measured(_number(x), 0.1 * x[6], x[7], status) for i, (status, x) in replies}
 
     def registers(self) -> dict[int, Registers]:
         """Return the registers of each servo."""
@@ -242,7 +242,7 @@ class SO101:
         known = limits is not None and bool(np.isfinite([limits.lower, limits.upper]).all())
         self._limits = limits if known else None
         self._opened = self._on = self._released = False
-        self._before: dict[int, Measured] = {}  # the last reading
+        self._before: dict[int, _Measured] = {}  # the last reading
         self._read_at, self._agreed = -math.inf, False  # when that was, and whether a second one agreed
         self._sent: dict[int, int] = {}  # set-points, counts
         self.registers: dict[int, Registers] = {}
@@ -421,12 +421,12 @@ class SO101:
             "(registers 9 and 11): run projservo limits again"
         )
 
-    def _read(self) -> dict[int, Measured]:
+    def _read(self) -> dict[int, _Measured]:
         """Return the measurements of all servos; repeat an impossible reading, or one with a fault.
 
         The first one counts where a second agrees with it.
         """
-        servos, wrong = dict[int, Measured](), ""
+        servos, wrong = dict[int, _Measured](), ""
         for _ in range(_REPEATS):
             try:
                 servos = self._servos.measured()
@@ -442,7 +442,7 @@ class SO101:
         self._servos.lost |= {i for i, servo in servos.items() if servo.status}
         raise WorkFailed(wrong)
 
-    def _leapt(self, servos: Mapping[int, Measured], seconds: float) -> str:
+    def _leapt(self, servos: Mapping[int, _Measured], seconds: float) -> str:
         """Return the joint whose reading is impossible since the last one; empty for none."""
         most = _FASTEST * seconds + _SCATTER
         if self._on and self._limits is not None:
@@ -458,7 +458,7 @@ class SO101:
                 )
         return ""
 
-    def _faulty(self, servos: Mapping[int, Measured]) -> str:
+    def _faulty(self, servos: Mapping[int, _Measured]) -> str:
         """Return the servo that reports a fault, with the remedy; empty for none."""
         for i, servo in servos.items():
             for bit, words in _WRONG.items():

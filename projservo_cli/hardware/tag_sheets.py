@@ -36,7 +36,7 @@ _CUT: Any = {"color": "0.35", "linewidth": 0.4, "fill": False}
 _FOLD: Any = {"color": "0.35", "linewidth": 0.4, "linestyle": (0, (4, 3)), "fill": False}
 
 
-class FlatTag(NamedTuple):
+class _FlatTag(NamedTuple):
     """A tag on the sheet."""
 
     number: int
@@ -51,17 +51,17 @@ class _Line(NamedTuple):
     fold: bool  # whether to fold there, else to cut
 
 
-class Net(NamedTuple):
+class _Net(NamedTuple):
     """A body of tags, unfolded around the origin."""
 
-    tags: tuple[FlatTag, ...]
+    tags: tuple[_FlatTag, ...]
     lines: tuple[_Line, ...]
     size: FloatArray  # (2,) width and height, mm
     labels: tuple[tuple[str, FloatArray], ...]  # what stands where, mm
     fixed: FloatArray  # (2,) the part of the size that does not grow with the tags, mm
 
 
-def unfolded(numbers: Sequence[int], poses: FloatArray) -> Net:
+def unfolded(numbers: Sequence[int], poses: FloatArray) -> _Net:
     """Unfold a tag and those around it, tilted away from it, whose bright margins meet it.
 
     numbers, poses : (m, 4, 4) of the tags on the body, m; the first is the middle one.
@@ -74,11 +74,11 @@ def unfolded(numbers: Sequence[int], poses: FloatArray) -> Net:
     away = around[:, :2, 3] - middle[:2, 3]
     width = float(2e3 * np.linalg.norm(away[0]) / (1.0 + math.cos(tilt)))
     gap = math.acos(math.sin(tilt) ** 2)
-    tags, lines, labels = [FlatTag(numbers[0], np.zeros(2), middle[:2, 1])], [], []
+    tags, lines, labels = [_FlatTag(numbers[0], np.zeros(2), middle[:2, 1])], [], []
     for number, pose, direction in zip(numbers[1:], around, away, strict=True):
         out = direction / np.linalg.norm(direction)
         left = np.array([-out[1], out[0]])
-        tags.append(FlatTag(number, width * out, pose[:2, 1]))
+        tags.append(_FlatTag(number, width * out, pose[:2, 1]))
         corner, end = 0.5 * width * (out + left), 0.5 * width * (3.0 * out + left)
         right_end = 0.5 * width * (3.0 * out - left)
         # Outwards from the corner, at an angle from the side of this tag towards its left neighbour.
@@ -100,22 +100,22 @@ def unfolded(numbers: Sequence[int], poses: FloatArray) -> Net:
             ("base", width * 1.5 * out + 0.5 * _FLAP * out),
         ]
     flaps = np.full(2, 2.0 * _FLAP)
-    return Net(tuple(tags), tuple(lines), 3.0 * width + flaps, tuple(labels), flaps)
+    return _Net(tuple(tags), tuple(lines), 3.0 * width + flaps, tuple(labels), flaps)
 
 
-def plate(numbers: Sequence[int], poses: FloatArray, margin_mm: float) -> Net:
+def plate(numbers: Sequence[int], poses: FloatArray, margin_mm: float) -> _Net:
     """Tags in one plane: poses (m, 4, 4), m, with bright margins up to a width ``margin_mm`` of each."""
     at = 1e3 * (poses[:, :2, 3] - poses[:, :2, 3].mean(axis=0))
-    tags = tuple(FlatTag(n, c, pose[:2, 1]) for n, c, pose in zip(numbers, at, poses, strict=True))
+    tags = tuple(_FlatTag(n, c, pose[:2, 1]) for n, c, pose in zip(numbers, at, poses, strict=True))
     half = np.abs(at).max(axis=0) + 0.5 * margin_mm
     corners = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
     label_at = [np.array([math.copysign(half[0] + 3.0, c[0]), c[1]]) for c in at]
     labels = tuple((f"{number}", place) for number, place in zip(numbers, label_at, strict=True))
     label = np.array([12.0, 0.0])
-    return Net(tags, (_Line(corners, fold=False),), 2.0 * half + label, labels, label)
+    return _Net(tags, (_Line(corners, fold=False),), 2.0 * half + label, labels, label)
 
 
-def single(numbers: Sequence[int] | None, known: int, size_mm: float, margin_mm: float, paper: str) -> Net:
+def single(numbers: Sequence[int] | None, known: int, size_mm: float, margin_mm: float, paper: str) -> _Net:
     """Tags in rows, each to be cut out, with bright margins up to a width ``margin_mm``.
 
     numbers : of the tags; None for as many of the ``known`` ones as the paper takes.
@@ -139,11 +139,11 @@ def single(numbers: Sequence[int] | None, known: int, size_mm: float, margin_mm:
         pitch * np.array([i % columns - 0.5 * (columns - 1), 0.5 * (count - 1) - i // columns])
         for i in range(len(wanted))
     ]
-    tags = tuple(FlatTag(n, at, np.array([0.0, 1.0])) for n, at in zip(wanted, place, strict=True))
+    tags = tuple(_FlatTag(n, at, np.array([0.0, 1.0])) for n, at in zip(wanted, place, strict=True))
     square = 0.5 * margin_mm * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)])
     lines = tuple(_Line(tag.center + square, fold=False) for tag in tags)
     labels = tuple((f"{tag.number}", tag.center - [0.0, 0.5 * pitch]) for tag in tags)
-    return Net(tags, lines, pitch * np.array([columns, count]) - _GAP, labels, np.zeros(2))
+    return _Net(tags, lines, pitch * np.array([columns, count]) - _GAP, labels, np.zeros(2))
 
 
 def _grid(paper: str, margin_mm: float) -> tuple[int, int]:
@@ -158,7 +158,7 @@ def _room(paper: str) -> tuple[float, float]:
     return width - 2.0 * _BORDER, height - 2.0 * _BORDER - _HEAD - _FOOT
 
 
-def sheet(net: Net, finder: TagFinder, size_mm: float, paper: str, head: Sequence[str]) -> "Figure":
+def sheet(net: _Net, finder: TagFinder, size_mm: float, paper: str, head: Sequence[str]) -> "Figure":
     """Figure of the size of the paper, of which one unit of its only axes is a millimetre.
 
     size_mm : side of the black square of each tag. head : lines of text above, the first one larger.

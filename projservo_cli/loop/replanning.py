@@ -33,7 +33,7 @@ from projservo_cli.records import FloatArray, Plan
 from projservo_cli.task.face import Task
 
 # Periods between checks of the path ahead, by the mean offset of the images in the last ones.
-_EVERY, LAST = 10, 5
+_EVERY, _LAST = 10, 5
 # Senses along a path.
 _BACK, _ON = -1, 1
 # What stops a law.
@@ -171,7 +171,7 @@ class ExecutionMonitor:
 
     def _off(self, log: Log, k: int) -> FloatArray:
         """Return the offset (V, 2) of the images from their prediction, px; 0 if unseen."""
-        rows = slice(max(0, k + 1 - LAST), k + 1)
+        rows = slice(max(0, k + 1 - _LAST), k + 1)
         predicted = np.array([self.replanner.predicted(q) for q in log.read[rows]])
         b = min(log.s.shape[2], predicted.shape[2])
         off = log.s[rows, :, :b] - predicted[:, :, :b]

@@ -29,14 +29,14 @@ _FACTORS = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 0.8, 1.25, 4.0 / 3.0, 1.5, 2.
 # By so much a link may flex under its load, rad, which looks like a joint that slipped.
 _MOST_FLEXIBLE = np.radians(3.0)
 # Numbers of all joints, views or markers of a cause, and of some of several.
-ALL, SOME = -1, -2
+ALL, _SOME = -1, -2
 # Readings that differ by no more stand still, rad or m.
 _STILL = 1e-9
 # Most observations that are explained together.
 _MAX_PAIRS = 12
 
 
-class Changed(NamedTuple):
+class _Changed(NamedTuple):
     """Scene and joints as a cause leaves them."""
 
     P: FloatArray  # (V, 3, 4)
@@ -47,13 +47,13 @@ class Changed(NamedTuple):
     shift: FloatArray  # (V, 2) px, after that
 
 
-class Cause(NamedTuple):
-    """A cause, by its kind and the joint, view or marker that it is of, or ``ALL`` or ``SOME`` of them."""
+class _Cause(NamedTuple):
+    """A cause, by its kind and the joint, view or marker that it is of, or ``ALL`` or ``_SOME`` of them."""
 
     kind: str
     which: int
     starts: FloatArray  # (s, p) parameters that a fit starts from
-    change: Callable[[Changed, FloatArray], Changed]
+    change: Callable[[_Changed, FloatArray], _Changed]
     markers: tuple[int, ...] = ()  # that it touches alone
     views: tuple[int, ...] = ()  # of whose cameras it is; for an exchange the camera that each view shows
 
@@ -61,7 +61,7 @@ class Cause(NamedTuple):
 class Explanation(NamedTuple):
     """A cause as fitted."""
 
-    cause: Cause
+    cause: _Cause
     theta: FloatArray  # (p,)
     gain: float  # by which χ² falls
     cost: float  # of its parameters, by their prior
@@ -123,7 +123,7 @@ class Evidence:
         self._factor = cho_factor(prior + self._beside.T @ self._beside)
         self._offset = float(self._known @ cho_solve(cho_factor(prior), self._known))
         self.rows = float(2.0 * (self.seen * factor[:, None, None] ** 2).sum())
-        self.nothing = Changed(
+        self.nothing = _Changed(
             P=self.scene.P,
             lens=self.scene.lens,
             M=self.scene.M,
@@ -141,7 +141,7 @@ class Evidence:
         whitened = self._inverses @ rows.reshape(*rows.shape[:2], -1)
         return np.asarray(whitened.reshape(-1, *rows.shape[2:]))
 
-    def _off(self, changed: Changed) -> FloatArray:
+    def _off(self, changed: _Changed) -> FloatArray:
         """Return the residuals (K, 2 V m) of images from the prediction of a cause, px; zero if unseen."""
         K, V, n = changed.away.shape
         scene = Parameters(
@@ -164,7 +164,7 @@ class Evidence:
         b = self._beside.T @ r + self._known
         return float(r @ r + self._offset - b @ cho_solve(self._factor, b))
 
-    def explanations(self, causes: Iterable[Cause]) -> list[Explanation]:
+    def explanations(self, causes: Iterable[_Cause]) -> list[Explanation]:
         """Fits of the causes that a first step of each makes the likeliest, and of all with one parameter.
 
         The first step of a joint that is far off says little, since its images move on curves.
@@ -205,10 +205,10 @@ class Evidence:
             left, theta = nearer.left, theta * nearer.theta if kind == "sized" else theta + nearer.theta
         return fit._replace(theta=theta, gain=self.before - left, left=left)
 
-    def _changed_by(self, cause: Cause, theta: FloatArray) -> FloatArray:
+    def _changed_by(self, cause: _Cause, theta: FloatArray) -> FloatArray:
         return self._off(cause.change(self.nothing, theta))
 
-    def _tried(self, cause: Cause) -> tuple[float, Cause, FloatArray]:
+    def _tried(self, cause: _Cause) -> tuple[float, _Cause, FloatArray]:
         """Score of a cause after one step from the best of its starts, and that start."""
         rows = [self._changed_by(cause, start) for start in cause.starts]
         squares = [self._square(self._whitened(row)) for row in rows]
@@ -218,7 +218,7 @@ class Evidence:
             _, cost, falls = self._step(cause, start, rows[best])
         return self.before - squares[best] + falls - cost, cause, start
 
-    def _step(self, cause: Cause, theta: FloatArray, here: FloatArray) -> tuple[FloatArray, float, float]:
+    def _step(self, cause: _Cause, theta: FloatArray, here: FloatArray) -> tuple[FloatArray, float, float]:
         """Step of Gauss and Newton, cost of the parameters by their prior, and greatest fall of χ²."""
         F = np.stack(
             [(self._changed_by(cause, theta + h) - here) / _EPSILON for h in _EPSILON * np.eye(theta.size)],
@@ -235,15 +235,15 @@ class Evidence:
         step = np.linalg.solve(normal, right)
         return -unit * step, float(np.linalg.slogdet(normal)[1]), float(right @ step)
 
-    def _touched(self, cause: Cause) -> BoolArray:
+    def _touched(self, cause: _Cause) -> BoolArray:
         """Detections (K, V, m') that a cause touches."""
         return self.seen[..., list(cause.markers)] if cause.markers else self.seen
 
-    def _count(self, cause: Cause) -> float:
+    def _count(self, cause: _Cause) -> float:
         """Coordinates seen that a cause touches."""
         return max(2.0 * float(self._touched(cause).sum()), 1.0)
 
-    def _fitted(self, cause: Cause, theta: FloatArray) -> Explanation:
+    def _fitted(self, cause: _Cause, theta: FloatArray) -> Explanation:
         """Fit of a cause, with the prior of its parameters."""
         here = self._changed_by(cause, theta)
         square, cost = self._square(self._whitened(here)), 0.0
@@ -273,7 +273,7 @@ class Evidence:
         )
 
 
-def causes_of(evidence: Evidence, numbers: IntArray, centre: FloatArray | None) -> Iterator[Cause]:
+def causes_of(evidence: Evidence, numbers: IntArray, centre: FloatArray | None) -> Iterator[_Cause]:
     """All causes that may be named, the simplest of a kind first.
 
     numbers : (m,) of the markers; centre : (V, 2) of the images, px; None where their size is not known.
@@ -286,10 +286,10 @@ def causes_of(evidence: Evidence, numbers: IntArray, centre: FloatArray | None) 
     yield from _body_causes(evidence, numbers)
 
 
-def _exchanges(views: int) -> Iterator[Cause]:
+def _exchanges(views: int) -> Iterator[_Cause]:
     """Causes in which two cameras take each other's place, or three in turn."""
 
-    def exchanged(s: Changed, _: FloatArray, order: list[int]) -> Changed:
+    def exchanged(s: _Changed, _: FloatArray, order: list[int]) -> _Changed:
         return s._replace(P=s.P[order], lens=None if s.lens is None else s.lens[order])
 
     for some in (some for count in (2, 3) for some in combinations(range(views), count)):
@@ -297,7 +297,7 @@ def _exchanges(views: int) -> Iterator[Cause]:
             order = np.arange(views)
             order[[*some]] = np.roll(some, turn)
             shown = order.tolist()
-            yield Cause("exchanged", ALL, _start(0), partial(exchanged, order=shown), views=tuple(shown))
+            yield _Cause("exchanged", ALL, _start(0), partial(exchanged, order=shown), views=tuple(shown))
 
 
 def _every_and_all(views: int) -> list[tuple[int, tuple[int, ...]]]:
@@ -311,60 +311,60 @@ def _start(parameters: int) -> FloatArray:
     return np.zeros((1, parameters))
 
 
-def _joint_causes(evidence: Evidence) -> Iterator[Cause]:
+def _joint_causes(evidence: Evidence) -> Iterator[_Cause]:
     """Causes in the joints, their readings and when these were taken."""
     q = np.array([pair.q for pair in evidence.pairs])
     velocity = np.array([pair.q_dot for pair in evidence.pairs])
     (K, V, n), q_reference = q.shape, evidence.q_reference
 
-    def mirrored(s: Changed, _: FloatArray, i: int) -> Changed:
+    def mirrored(s: _Changed, _: FloatArray, i: int) -> _Changed:
         away = s.away.copy()
         away[..., i] = -(away[..., i] + 2.0 * q_reference[i])
         return s._replace(away=away)
 
-    def slipped(s: Changed, theta: FloatArray, i: int) -> Changed:
+    def slipped(s: _Changed, theta: FloatArray, i: int) -> _Changed:
         return s._replace(away=s.away + theta[0] * np.eye(n)[i])
 
-    def frozen(s: Changed, theta: FloatArray, which: slice) -> Changed:
+    def frozen(s: _Changed, theta: FloatArray, which: slice) -> _Changed:
         away = s.away.copy()
         away[..., which] += theta.reshape(K, 1, -1)
         return s._replace(away=away)
 
-    def flexible(s: Changed, theta: FloatArray) -> Changed:
+    def flexible(s: _Changed, theta: FloatArray) -> _Changed:
         return s._replace(away=s.away + theta)
 
-    def late(s: Changed, theta: FloatArray, views: tuple[int, ...]) -> Changed:
+    def late(s: _Changed, theta: FloatArray, views: tuple[int, ...]) -> _Changed:
         delays = np.zeros(V)
         delays[[*views]] = theta
         return s._replace(away=s.away - delays[:, None] * velocity)
 
     turns = np.linspace(-np.pi, np.pi, _TURNS, endpoint=False)[:, None] + np.pi / _TURNS
     for i in range(n):
-        yield Cause("mirrored", i, _start(0), partial(mirrored, i=i))
+        yield _Cause("mirrored", i, _start(0), partial(mirrored, i=i))
         starts = _start(1) if evidence.prismatic[i] else np.concatenate([_start(1), turns])
-        yield Cause("slipped", i, starts, partial(slipped, i=i))
+        yield _Cause("slipped", i, starts, partial(slipped, i=i))
     still: BoolArray = np.ptp(q, axis=(0, 1)) <= _STILL
     if K > 1 and not still.all():
         for i in np.flatnonzero(still).tolist():
-            yield Cause("frozen", i, _start(K), partial(frozen, which=slice(i, i + 1)))
+            yield _Cause("frozen", i, _start(K), partial(frozen, which=slice(i, i + 1)))
     elif K > 2:
-        yield Cause("frozen", ALL, _start(n * K), partial(frozen, which=slice(n)))
-    yield Cause("flexible", ALL, _start(n), flexible)
+        yield _Cause("frozen", ALL, _start(n * K), partial(frozen, which=slice(n)))
+    yield _Cause("flexible", ALL, _start(n), flexible)
     for v, views in _every_and_all(V) if velocity.any() else ():
-        yield Cause("late", v, _start(len(views)), partial(late, views=views), views=views)
+        yield _Cause("late", v, _start(len(views)), partial(late, views=views), views=views)
 
 
-def _image_causes(count: int, centre: FloatArray | None) -> Iterator[Cause]:
+def _image_causes(count: int, centre: FloatArray | None) -> Iterator[_Cause]:
     """Causes in the images of so many views: cropped, of another size, or of another focal length."""
 
-    def shifted(s: Changed, theta: FloatArray, views: FloatArray) -> Changed:
+    def shifted(s: _Changed, theta: FloatArray, views: FloatArray) -> _Changed:
         return s._replace(shift=s.shift + views[:, None] * theta)
 
-    def sized(s: Changed, theta: FloatArray, views: FloatArray) -> Changed:
+    def sized(s: _Changed, theta: FloatArray, views: FloatArray) -> _Changed:
         factor = 1.0 + views * (theta[0] - 1.0)
         return s._replace(scale=factor * s.scale, shift=factor[:, None] * s.shift)
 
-    def focused(s: Changed, theta: FloatArray, views: FloatArray) -> Changed:
+    def focused(s: _Changed, theta: FloatArray, views: FloatArray) -> _Changed:
         factor = 1.0 + views * theta[0]
         about_centre = (
             views[:, None] * theta[1:] if centre is None else (1.0 - factor)[:, None] * (centre + 0.5)
@@ -373,78 +373,78 @@ def _image_causes(count: int, centre: FloatArray | None) -> Iterator[Cause]:
 
     for v, some in _every_and_all(count):
         views = np.isin(np.arange(count), some).astype(np.float64)
-        yield Cause("shifted", v, _start(2), partial(shifted, views=views), views=some)
-        yield Cause("sized", v, np.array(_FACTORS)[:, None], partial(sized, views=views), views=some)
+        yield _Cause("shifted", v, _start(2), partial(shifted, views=views), views=some)
+        yield _Cause("sized", v, np.array(_FACTORS)[:, None], partial(sized, views=views), views=some)
         if v >= 0:
             start = _start(3 if centre is None else 1)
-            yield Cause("focused", v, start, partial(focused, views=views), views=some)
+            yield _Cause("focused", v, start, partial(focused, views=views), views=some)
 
 
-def _camera_causes(count: int, twists: FloatArray) -> Iterator[Cause]:
+def _camera_causes(count: int, twists: FloatArray) -> Iterator[_Cause]:
     """Causes in where so many cameras stand, by rigid motions (d, 4, 4).
 
     Of one camera alone, motions of itself and of all cameras are the same.
     """
     d = len(twists)
 
-    def turned(s: Changed, theta: FloatArray, views: tuple[int, ...]) -> Changed:
+    def turned(s: _Changed, theta: FloatArray, views: tuple[int, ...]) -> _Changed:
         P = s.P.copy()
         for part, v in zip(theta.reshape(-1, d), views, strict=True):
             P[v] = P[v] @ expm(np.tensordot(part, twists, 1))
         return s._replace(P=P)
 
-    def each_shifted(s: Changed, theta: FloatArray, views: tuple[int, ...]) -> Changed:
+    def each_shifted(s: _Changed, theta: FloatArray, views: tuple[int, ...]) -> _Changed:
         shift = s.shift.copy()
         shift[[*views]] += theta.reshape(-1, 2)
         return s._replace(shift=shift)
 
-    def rig(s: Changed, theta: FloatArray) -> Changed:
+    def rig(s: _Changed, theta: FloatArray) -> _Changed:
         return s._replace(P=s.P @ expm(np.tensordot(theta, twists, 1)))
 
     every = tuple(range(count))
     for v in every:
-        yield Cause("camera", v, _start(d), partial(turned, views=(v,)), views=(v,))
+        yield _Cause("camera", v, _start(d), partial(turned, views=(v,)), views=(v,))
     several: list[tuple[int, ...]] = [*combinations(every, 2)] if count > 2 else []
     for some in [*several, *([every] if count > 1 else [])]:
-        which = ALL if some == every else SOME
-        yield Cause("cameras", which, _start(len(some) * d), partial(turned, views=some), views=some)
-        yield Cause("cameras", which, _start(2 * len(some)), partial(each_shifted, views=some), views=some)
+        which = ALL if some == every else _SOME
+        yield _Cause("cameras", which, _start(len(some) * d), partial(turned, views=some), views=some)
+        yield _Cause("cameras", which, _start(2 * len(some)), partial(each_shifted, views=some), views=some)
     if count > 1:
-        yield Cause("rig", ALL, _start(d), rig, views=every)
+        yield _Cause("rig", ALL, _start(d), rig, views=every)
 
 
-def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
+def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[_Cause]:
     """Causes in the markers, on the tool or in the scene: each, those of a tag, and all of them."""
     twists, d = evidence.twists, len(evidence.twists)
     visible: BoolArray = np.any(evidence.seen, axis=(0, 1))
     tags = [np.flatnonzero(numbers // CORNERS == t) for t in np.unique(numbers // CORNERS)]
     tags = [tag for tag in tags if len(tag) == CORNERS]
 
-    def displaced(s: Changed, theta: FloatArray, which: IntArray) -> Changed:
+    def displaced(s: _Changed, theta: FloatArray, which: IntArray) -> _Changed:
         M = s.M.copy()
         M[which] = M[which] @ expm(np.tensordot(theta, twists, 1)).T
         return s._replace(M=M)
 
-    def larger(s: Changed, theta: FloatArray) -> Changed:
+    def larger(s: _Changed, theta: FloatArray) -> _Changed:
         M = s.M.copy()
         for tag in tags:
             centre = M[tag].mean(axis=0)
             M[tag] = centre + (1.0 + theta[0]) * (M[tag] - centre)
         return s._replace(M=M)
 
-    def moved(s: Changed, theta: FloatArray, j: int) -> Changed:
+    def moved(s: _Changed, theta: FloatArray, j: int) -> _Changed:
         M = s.M.copy()
         M[j] += evidence.directions.T @ theta * np.linalg.norm(M[j])
         return s._replace(M=M)
 
-    yield Cause("tool", ALL, _start(d), partial(displaced, which=np.arange(len(numbers))))
+    yield _Cause("tool", ALL, _start(d), partial(displaced, which=np.arange(len(numbers))))
     if tags:
-        yield Cause("larger", ALL, _start(1), larger)
+        yield _Cause("larger", ALL, _start(1), larger)
     for tag in tags if len(tags) > 1 else ():
         if visible[tag].any():
-            yield Cause("tag", int(tag[0]), _start(d), partial(displaced, which=tag), tuple(tag.tolist()))
+            yield _Cause("tag", int(tag[0]), _start(d), partial(displaced, which=tag), tuple(tag.tolist()))
     for j in np.flatnonzero(visible).tolist():
-        yield Cause("marker", j, _start(3), partial(moved, j=j), (j,))
+        yield _Cause("marker", j, _start(3), partial(moved, j=j), (j,))
 
 
 def together(moved: list[Explanation]) -> Explanation:
@@ -473,7 +473,7 @@ _CONTAINS = {
 }
 
 
-def contains(cause: Cause, other: Cause) -> bool:
+def contains(cause: _Cause, other: _Cause) -> bool:
     """Whether a cause explains what another one does, with more parameters."""
     alike = set(other.views) <= set(cause.views) if cause.views else cause.which in (ALL, other.which)
     alike |= set(other.markers) <= set(cause.markers) != set()

@@ -43,7 +43,7 @@ _UNUSUAL = 1.0
 # Joints (rad or m) and instants (s) are known no better than this, whatever is stated.
 LEAST_ERROR = 1e-6
 # A direction counts where it keeps this share of its size after the others; ridge for solving.
-_RANK, RIDGE = 1e-6, 1e-9
+_RANK, _RIDGE = 1e-6, 1e-9
 # Frames that are so near show joints of one reading, s.
 _AT_ONCE_S = 1e-4
 # A view lasts while markers move by no more than this, px rms; its observations are forgotten at this rate.
@@ -326,7 +326,7 @@ class MemoryState(NamedTuple):
         return self.closed[-1].views + (self.length > 0.0)
 
 
-class Memory:
+class _Memory:
     """Observations that agreed, view by view: observations of one view share the errors of their corners."""
 
     def __init__(self, errors: ErrorModel) -> None:
@@ -517,7 +517,7 @@ class Detector:
     """
 
     def __init__(self, errors: ErrorModel, max_observations: int) -> None:
-        self._errors, self.memory = errors, Memory(errors)
+        self._errors, self.memory = errors, _Memory(errors)
         V, m = len(errors.calibration.P), len(errors.calibration.M)
         tail = _FALSE_ALARM / max_observations
         self._chance = _FALSE_ALARM / np.log1p(max_observations / _SOON)
@@ -577,7 +577,7 @@ class Detector:
         bias = np.repeat((self._errors.bias_px / residual.noise.ravel()) ** 2, 2)[parts]
         bias = bias + _UNUSUAL**2 * (1.0 - self.memory.fresh)
         maximum = self._most_once[detected.sum(axis=1)] + np.sqrt((detected * bias).sum(axis=1))
-        gain = gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
+        gain = _gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
         return np.asarray(gain > maximum**2)
 
     def significant(
@@ -614,14 +614,14 @@ class Detector:
         across = (total.normal - since.normal)[:, e:]
         across[:, :f] = across[:, :f] @ line.T
         across[e:-1] = line @ across[e:-1]
-        minimum = RIDGE * across[e:].diagonal()
+        minimum = _RIDGE * across[e:].diagonal()
         across[:e, -1] = total.normal[:e, -1]
         root = self._errors.root(total)
         along = solve_triangular(root, across[:e], lower=True, check_finite=False)
         normal = across[e:] - along.T @ along
         fixed = self._errors.fixed
         nuisance = np.concatenate([np.arange(fixed), *free]).astype(np.int64)
-        weight = np.diag(np.maximum(minimum[nuisance], RIDGE))
+        weight = np.diag(np.maximum(minimum[nuisance], _RIDGE))
         weight[:fixed, :fixed] = self._errors.persistent_prior(total.t - since.t, sigma_t)
         solved = np.linalg.solve(normal[np.ix_(nuisance, nuisance)] + weight, normal[nuisance])
         normal -= normal[:, nuisance] @ solved
@@ -697,7 +697,7 @@ class Detector:
                     continue
                 size = np.sqrt(np.maximum(reduced.normal.diagonal(), _LEAST_INFORMATION))[part]
                 unit, block = np.outer(size, size), np.ix_(part, part)
-                inverse = np.linalg.inv(reduced.normal[block] / unit + RIDGE * np.eye(len(part))) / unit
+                inverse = np.linalg.inv(reduced.normal[block] / unit + _RIDGE * np.eye(len(part))) / unit
                 by_score = carry @ at.F[:, part] @ inverse
                 off = np.square(by_score @ reduced.normal[part, -1]).sum()
                 may = np.trace(by_score @ spread[block] @ by_score.T)
@@ -709,18 +709,18 @@ class Detector:
         normal, gain = reduced.normal, np.zeros(len(self._sizes))
         covariance = normal[:-1, :-1] + more
         for which, columns in self._by_size:
-            gain[which] = gains(covariance, normal[:-1, -1], columns, reduced.minimum[:-1])[0]
+            gain[which] = _gains(covariance, normal[:-1, -1], columns, reduced.minimum[:-1])[0]
         return np.sqrt(gain)
 
 
-def gains(
+def _gains(
     normal: FloatArray, right: FloatArray, parts: IntArray, minimum: FloatArray | float
 ) -> tuple[FloatArray, FloatArray]:
     """bᵀ A⁻¹ b (h,) and A⁻¹ b (h, p) for parts (h, p) of A x = b, its diagonal not below a minimum."""
     size = np.sqrt(np.maximum(np.maximum(normal.diagonal(), minimum), 1e-300))[parts]
     blocks = normal[parts[:, :, None], parts[:, None, :]] / (size[:, :, None] * size[:, None, :])
     b = right[parts] / size
-    x = np.linalg.solve(blocks + RIDGE * np.eye(parts.shape[1]), b[..., None])[..., 0]
+    x = np.linalg.solve(blocks + _RIDGE * np.eye(parts.shape[1]), b[..., None])[..., 0]
     return np.maximum((b * x).sum(axis=1), 0.0), x / size
 
 

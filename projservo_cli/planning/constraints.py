@@ -61,7 +61,7 @@ DEVIATIONS = 3.0
 # Maximum error of a marker of the body, over the maximum error of the face.
 _FAR_OFF = 5.0
 # Half the length, px, of the shortest pieces of a segment that are checked at a region.
-PIECE = 0.5
+_PIECE = 0.5
 
 
 class Constraints(NamedTuple):
@@ -345,7 +345,7 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
             )
             here, along, half = max(here, clear), max(along, clear - radius), max(half, radius)
         decided = along >= c.full[CLEAR] or here < c.full[CLEAR]
-        if half > PIECE and not (decided and half <= 0.5 * abs(here)):
+        if half > _PIECE and not (decided and half <= 0.5 * abs(here)):
             step *= 0.5
             continue
         minimum = min(minimum, along)

@@ -29,12 +29,12 @@ from projservo_cli.planning.margins import FRONT, IMAGE, column, straight_pixel
 from projservo_cli.records import FloatArray
 
 # Maximum number of Newton steps from one start.
-STEPS = 400
+_STEPS = 400
 # Step at which a start is given up that still has more than this share of its squares.
 _JUDGED_AT, _GIVEN_UP = 20, 0.25
 _DAMPED = 1e6
 # A Newton step below this, rad or m, is the last: of points, which are near then, and of images.
-NEAR, SETTLED = 1e-3, 1e-7
+_NEAR, _SETTLED = 1e-3, 1e-7
 # Longest Newton step of a joint, rad or m.
 _STRIDE = 0.7
 # Noise that is allowed for where none is known, px.
@@ -50,16 +50,16 @@ _REDUNDANT = 0.01
 _UNTOLD = 1e6
 # Rank, s, from which on goals are unsure.
 UNSURE = 1e3
-ROUND_OFF = 1e-9
+_ROUND_OFF = 1e-9
 # Starts; the search for further goals ends early if this multiple of the starts until the last new one, and
 # ``_AT_LEAST``, have found none.
 STARTS, _PATIENCE, _AT_LEAST = 400, 3, 40
 # Whole turns to both sides of the nearest goal that are separate goals.
-TURNS = 2
+_TURNS = 2
 # Solutions of an arm of more joints than six.
 _SAMPLED = 96
 # Where the body is at a solution: in sight, or not, or within a region that is kept out of.
-_SHOWN, HIDDEN, _BLOCKED = range(3)
+_SHOWN, _HIDDEN, _BLOCKED = range(3)
 
 
 class GoalFeatures(NamedTuple):
@@ -173,7 +173,7 @@ def _settled(
     n = q.shape[0]
     damping = 1e-3
     left = first = _normal_equations_into(c, goal, q, images, scratch)
-    for step in range(STEPS):
+    for step in range(_STEPS):
         if (step == _JUDGED_AT and left > _GIVEN_UP * first and not images) or not _damped_step_into(
             scratch.N, damping, scratch.L
         ):
@@ -285,10 +285,10 @@ def _solutions_into(
             break
         q = starts[k]
         # Expressions, as the compiler would compile the function again for each constant.
-        _settled(c, goal, k < 0, NEAR, q, scratch)
+        _settled(c, goal, k < 0, _NEAR, q, scratch)
         if _is_known(c, q, solutions.q, count):
             continue
-        left = _settled(c, goal, k >= 0, SETTLED, q, scratch)
+        left = _settled(c, goal, k >= 0, _SETTLED, q, scratch)
         explained = _explained(c, goal, q, scratch, solutions.deviation[count])
         if left <= explained and not _is_known(c, q, solutions.q, count):
             row_into(solutions.q[count], q)
@@ -300,12 +300,12 @@ def _solutions_into(
 
 @njit
 def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
-    """Whether joints (n,) show the goal, but for their limits: ``_SHOWN``, ``HIDDEN`` or ``_BLOCKED``."""
+    """Whether joints (n,) show the goal, but for their limits: ``_SHOWN``, ``_HIDDEN`` or ``_BLOCKED``."""
     margins_into(c, q, trial)
     V = c.O.shape[0]
     for j in range(column(FRONT, V), column(IMAGE, V)):
         if not trial.margins[j] > 0.0:
-            return HIDDEN
+            return _HIDDEN
     # A goal was chosen, and is seen on arrival: what its prediction may be off speaks for it.
     H = forward(c.model, q)
     doubt = min(DEVIATIONS * max_error(c, q, H, trial), FINE_PX)
@@ -315,15 +315,15 @@ def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
 def _turns(c: Constraints, start: FloatArray, q: FloatArray, slack: FloatArray) -> FloatArray:
     """Whole turns (t, n) of joints (n,) within the limits and some slack (n,); else nearest to the start.
 
-    No more than ``TURNS`` to both sides of the nearest: of many joints that turn often there is no end.
+    No more than ``_TURNS`` to both sides of the nearest: of many joints that turn often there is no end.
     """
     turn, slides = 2.0 * math.pi, c.model.prismatic
     half = np.where(slides, math.inf, 0.5 * turn)
     low = np.where(np.isfinite(c.limits.lower), c.limits.lower, start - half) - slack - q
     high = np.where(np.isfinite(c.limits.upper), c.limits.upper, start + half) + slack - q
     nearest = np.round((start - q) / turn)
-    first = np.where(slides, 0.0, np.maximum(np.ceil(low / turn), nearest - TURNS))
-    last = np.minimum(np.floor(high / turn), nearest + TURNS) + 1.0
+    first = np.where(slides, 0.0, np.maximum(np.ceil(low / turn), nearest - _TURNS))
+    last = np.minimum(np.floor(high / turn), nearest + _TURNS) + 1.0
     last = np.where(slides, (low <= 0.0) & (high >= 0.0), last)
     counts = np.maximum(last - first, 0.0).astype(int)
     whole = first + np.indices(tuple(counts.tolist())).reshape(len(q), -1, order="F").T
@@ -370,13 +370,13 @@ def goals_of(
     goals, ranks, met, trial = [np.zeros((0, n))], [np.zeros(0)], [0, 0, 0], new_trial(c)
     for k in good:
         solution, deviation, certain = solutions.q[k], solutions.deviation[k], solutions.left[k] == 0.0
-        slack = ROUND_OFF + (0.0 if certain else 1.0) * np.minimum(DEVIATIONS * deviation, _DEFINITE)
+        slack = _ROUND_OFF + (0.0 if certain else 1.0) * np.minimum(DEVIATIONS * deviation, _DEFINITE)
         turns = _turns(c, start, solution, slack)
-        where = _where(c, solution, trial) if len(turns) > 0 else HIDDEN
+        where = _where(c, solution, trial) if len(turns) > 0 else _HIDDEN
         met[where] += 1
         if where == _SHOWN:
             goals.append(np.clip(turns, c.limits.lower, c.limits.upper))
             ranks.append(_rank(c, start, turns, deviation, certain))
     rank = np.concatenate(ranks)
     order = np.argsort(rank, kind="stable")
-    return np.vstack(goals)[order], rank[order], (len(good), met[HIDDEN], met[_BLOCKED])
+    return np.vstack(goals)[order], rank[order], (len(good), met[_HIDDEN], met[_BLOCKED])

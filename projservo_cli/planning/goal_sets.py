@@ -37,7 +37,7 @@ def _share(c: Constraints, q: FloatArray) -> float:
     return min(share, float(told[min(len(q), COORDINATES) - 1]))
 
 
-def joints_meeting(
+def _joints_meeting(
     model: Model, incidences: Incidences, q: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
     """Joints (n,) within limits (n,) near q at which all incidences hold, or nearly, by Newton's method."""
@@ -71,7 +71,7 @@ def goals_meeting(
     rank: list[tuple[bool, float]] = []
     nearest, least = q_start, np.inf
     for start in np.vstack(starts):
-        q = joints_meeting(c.model, incidences, start, low, high)
+        q = _joints_meeting(c.model, incidences, start, low, high)
         left = image_error_at(incidences, forward_kinematics(c.model, q))
         if left < least:
             nearest, least = q, left

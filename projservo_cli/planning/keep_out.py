@@ -15,7 +15,7 @@ from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.records import FloatArray, IntArray
 
 SEVERAL = -1  # in place of the only image in which a region is drawn
-Pixel = tuple[float, float]
+_Pixel = tuple[float, float]
 
 
 class KeepOut(NamedTuple):
@@ -61,14 +61,14 @@ def only(keep: KeepOut, region: int) -> KeepOut:
 
 
 @merged
-def squared(s: Pixel, t: Pixel) -> float:
+def squared(s: _Pixel, t: _Pixel) -> float:
     """Squared distance of two pixels."""
     du, dv = s[0] - t[0], s[1] - t[1]
     return du * du + dv * dv
 
 
 @merged
-def _away(s: Pixel, a: Pixel, b: Pixel) -> float:
+def _away(s: _Pixel, a: _Pixel, b: _Pixel) -> float:
     """Squared distance of a pixel from the segment between two."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     length = dx * dx + dy * dy
@@ -78,7 +78,7 @@ def _away(s: Pixel, a: Pixel, b: Pixel) -> float:
 
 
 @internal
-def outside_polygon(corners: FloatArray, first: int, last: int, s: Pixel) -> float:
+def outside_polygon(corners: FloatArray, first: int, last: int, s: _Pixel) -> float:
     """Distance of a pixel from a polygon of corners first … last − 1, px; negative within."""
     minimum, within = math.inf, False
     b = (float(corners[last - 1, 0]), float(corners[last - 1, 1]))
@@ -100,7 +100,7 @@ def draws(keep: KeepOut, region: int, view: int) -> bool:
 
 
 @merged
-def clearance(keep: KeepOut, region: int, view: int, s: Pixel) -> float:
+def clearance(keep: KeepOut, region: int, view: int, s: _Pixel) -> float:
     """Distance of a pixel of one image from the polygon of a region, px; infinite where none is drawn."""
     for p in range(keep.image.shape[0]):
         if keep.region[p] == region and keep.image[p] == view:

@@ -26,7 +26,7 @@ from projservo_cli.records import (
 
 # The range of the recorded readings is widened at each end by this share of itself; for a robot
 # whose limits are known, the candidates' by more.
-WIDER, FARTHER = 0.15, 1.0
+_WIDER, FARTHER = 0.15, 1.0
 # Poses drawn to choose from, and to judge by; batches before giving up.
 _CANDIDATES, _TARGETS = 300, 150
 _BATCHES = 20
@@ -55,7 +55,7 @@ class Suggestion:
 
 
 def region_around(
-    observation: Observation, size: Any, low: FloatArray, high: FloatArray, share: float = WIDER
+    observation: Observation, size: Any, low: FloatArray, high: FloatArray, share: float = _WIDER
 ) -> Region:
     """Region of the recorded readings, widened at each end by a share of their range within limits (n,).
 

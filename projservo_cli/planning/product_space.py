@@ -36,23 +36,23 @@ from projservo_cli.planning.time_parameterization import minimum_time
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 # Values of each share; the second where no path stays in view on the first.
-NODES = (13, 19)
+_NODES = (13, 19)
 # A joint that moves more than this between two nodes, rad or m, has changed its branch.
 _MOST_STRIDE = 1.5
 # Parts in which the path between them is made where the joints do not settle in one.
-BETWEEN = 4
+_BETWEEN = 4
 # Newton step, rad or m, after which joints at a node are good enough: they are off by its square.
 _ROUGH = 1e-2
 # Of two paths equally short, that with longer straight steps: a share of the duration of a rad at 1 rad/s.
 _STRAIGHTER = 1e-4
 # A straight piece may take this much longer than the steps of the lattice that it replaces.
 _DETOUR = 1.01
-ROUND_OFF = 1e-9
+_ROUND_OFF = 1e-9
 # Points of a path at which its joints and margins are looked at.
-CHECKS = 151
+_CHECKS = 151
 # Shares of this part of the best one are as good; the quicker path is better.
 _EQUALLY = 0.95
-SIGHT = [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]
+_SIGHT = [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]
 
 
 def duration(motion: Motion) -> float:
@@ -82,10 +82,10 @@ def plan_path(reaching: Reaching) -> Motion:
     constraints, one is taken that keeps at least the face in sight and in both images.
     """
     short = abs(float(reaching.amplitudes[2])) <= 0.5 * math.pi
-    paths = [along_shares(reaching, np.linspace(0.0, 1.0, CHECKS)[:, None] * np.ones(3))]
+    paths = [along_shares(reaching, np.linspace(0.0, 1.0, _CHECKS)[:, None] * np.ones(3))]
     good = max(0.0, _EQUALLY * float(paths[0].shares().min()))
-    best: tuple[float, Reaching, int] = (-math.inf, reaching, NODES[0])
-    for size in NODES:
+    best: tuple[float, Reaching, int] = (-math.inf, reaching, _NODES[0])
+    for size in _NODES:
         for amplitudes in _senses(reaching.amplitudes):
             if short and good > 0.0:
                 break
@@ -115,7 +115,7 @@ def _senses(amplitudes: FloatArray) -> list[FloatArray]:
 
 def _best_of(paths: list[Motion]) -> Motion:
     """Of the paths in view, or of all if none is, the quickest whose smallest share is as good as any."""
-    paths = [path for path in paths if path.shares()[:, SIGHT].min() > 0.0] or paths
+    paths = [path for path in paths if path.shares()[:, _SIGHT].min() > 0.0] or paths
     minimum = [float(path.shares().min()) for path in paths]
     good = min(_EQUALLY * max(minimum), max(minimum))
     paths = [path for path, share in zip(paths, minimum, strict=True) if share >= good]
@@ -137,7 +137,7 @@ class _Lattice(NamedTuple):
         """Smallest share (s,) along a motion in the lattice."""
         ends = self.nodes.along.margins[[0, -1]].min(axis=0)
         shares = motion.along.margins / np.where(ends > 0.0, ends, 1.0)
-        return np.asarray(shares[:, slice(None) if self.follows else SIGHT].min(axis=1))
+        return np.asarray(shares[:, slice(None) if self.follows else _SIGHT].min(axis=1))
 
     def moved(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
         """Return the duration terms along a motion in the lattice (s, n), and its speeds (n,)."""
@@ -169,7 +169,7 @@ def _quickest(lattice: _Lattice) -> Motion:
     value = widest(lattice.minimum(lattice.nodes))
     corners = _straightened(lattice, shortest(value >= value[-1], *lattice.moved(lattice.nodes)))
     length = np.r_[0.0, np.cumsum(np.abs(np.diff(corners, axis=0)).max(axis=1))]
-    positions = np.linspace(0.0, length[-1], CHECKS)
+    positions = np.linspace(0.0, length[-1], _CHECKS)
     mu = np.stack([np.interp(positions, length, column) for column in corners.T], axis=1)
     return along_shares(lattice.nodes.reaching, mu)
 
@@ -186,8 +186,8 @@ def _straightened(lattice: _Lattice, path: IntArray) -> FloatArray:
         """Whether the piece from one node of the path to another does."""
         x = np.linspace(0.0, 1.0, 2 * (j - i) + 1)[:, None]
         piece = along_shares(reaching, (1.0 - x) * mu[path[i]] + x * mu[path[j]], along.q[path[i]])
-        detour = minimum_time(speed, lattice.moved(piece)[0])[-1] > _DETOUR * (time[j] - time[i]) + ROUND_OFF
-        return not detour and bool(lattice.minimum(piece).min() >= worth - ROUND_OFF)
+        detour = minimum_time(speed, lattice.moved(piece)[0])[-1] > _DETOUR * (time[j] - time[i]) + _ROUND_OFF
+        return not detour and bool(lattice.minimum(piece).min() >= worth - _ROUND_OFF)
 
     kept, last = [0], len(path) - 1
     while kept[-1] < last:
@@ -287,7 +287,7 @@ def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int,
         row_into(along.q[node], carrier.reaching.q_start if node == 0 else along.q[before])
         if not free or best == 0.0:
             continue
-        for parts in (1, BETWEEN):
+        for parts in (1, _BETWEEN):
             ends = (mu[before], mu[node])
             condition = carry_joints(carrier, ends, parts, _ROUGH, _MOST_STRIDE / parts, along.q[node])
             if condition >= 0.0:

@@ -28,17 +28,17 @@ from projservo_cli.planning.time_parameterization import TimedPath, minimum_time
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, JointLimits
 
 # Longest edge of a tree, s at the speed limits.
-REACH = 0.8
+_REACH = 0.8
 # A path shorter than this, s, is none.
-LEAST = 1e-9
+_LEAST = 1e-9
 # Draws that the trees are given at a time.
-CHUNK = 250
+_CHUNK = 250
 # Number of paths of the search, and draws after which no further one begins.
-_WAYS, FURTHER = 2, 300
+_WAYS, _FURTHER = 2, 300
 # A straight line that takes so much longer than to the nearest goal is held against what trees find.
-LONGER = 1.2
+_LONGER = 1.2
 _SHORTENINGS = 60
-ROUND_OFF = 1e-9
+_ROUND_OFF = 1e-9
 # Goals within this distance of excluded joints, rad or m, are excluded too.
 _NEARBY = 0.1
 
@@ -92,7 +92,7 @@ def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
     demands = np.array([margins_at(c, q)[0] for q in ends])
     measured = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
     measured = np.where(np.isfinite(measured), measured, 0.0)
-    less = np.where(measured > 0.0, demands - (1.0 - SHARE) * measured, demands - ROUND_OFF)
+    less = np.where(measured > 0.0, demands - (1.0 - SHARE) * measured, demands - _ROUND_OFF)
     demands = np.where(SHARE * demands >= c.full, c.full, np.minimum(c.full, less))
     poor = (demands < c.full).any(axis=1)
     return c._replace(ends=np.ascontiguousarray(ends[poor]), end_demands=np.ascontiguousarray(demands[poor]))
@@ -182,7 +182,7 @@ def find_path(
     sure = goals[rank < UNSURE]
     for asked in (sure, goals) if 0 < len(sure) < len(goals) else (goals,):
         max_draws = (
-            search.max_samples - path.draws if asked is goals else min(search.max_samples // 2, FURTHER)
+            search.max_samples - path.draws if asked is goals else min(search.max_samples // 2, _FURTHER)
         )
         best, draws, trees = _shortest(c, start, asked, max_draws, rng, trial)
         path = path._replace(draws=path.draws + draws, trees=trees)
@@ -217,9 +217,9 @@ def _shortest(
         best = np.stack([start, straight])
         shortest = minimum_time(c.limits.speed, best)[-1]
     trees: tuple[Tree, Tree] | None = None
-    if not shortest <= LONGER * (np.abs(goals - start) / c.limits.speed).max(axis=1).min():
+    if not shortest <= _LONGER * (np.abs(goals - start) / c.limits.speed).max(axis=1).min():
         for _ in range(_WAYS):
-            left = (max_draws if math.isinf(shortest) else FURTHER) - draws
+            left = (max_draws if math.isinf(shortest) else _FURTHER) - draws
             if left <= 0:
                 break
             path, used, grown = _by_trees(c, start, goals, left, rng, trial)
@@ -244,7 +244,7 @@ def _by_trees(
     trees = _new_tree(nodes, start[None]), _new_tree(nodes, goals)
     draws = 0
     while draws < max_draws:
-        chunk = _drawn(c, start, min(CHUNK, max_draws - draws), rng)
+        chunk = _drawn(c, start, min(_CHUNK, max_draws - draws), rng)
         first, last, used = _grow(c, trees, chunk, trial)
         draws += used
         if first >= 0:
@@ -283,11 +283,11 @@ def _extended(c: Constraints, tree: Tree, q: FloatArray, trial: Trial) -> tuple[
     n = q.shape[0]
     while True:
         time = time_between(c.limits.speed, tree.q[node], q)
-        if time <= LEAST:
+        if time <= _LEAST:
             return node, True
         if tree.size[0] == tree.q.shape[0]:
             return node, False
-        share = min(1.0, REACH / time)
+        share = min(1.0, _REACH / time)
         new = tree.size[0]
         here, there = tree.q[node], tree.q[new]
         for i in range(n):

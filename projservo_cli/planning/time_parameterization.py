@@ -27,7 +27,7 @@ _HALVINGS = 12
 _STRAIGHT, _ROUNDED = 64, 24
 _BISECTIONS = 48
 # Motion between two corners, rad or m, or s, below which it is none.
-LEAST = 1e-12
+_LEAST = 1e-12
 
 
 class TimedPath(NamedTuple):
@@ -52,7 +52,7 @@ def minimum_time(speed: FloatArray, q: FloatArray) -> FloatArray:
 
 def time_parameterized(c: Constraints, path: FloatArray, trial: Trial) -> TimedPath:
     """The pace of a path of corners (k, n), from rest to rest at ``ROOM`` of the limits."""
-    path = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > LEAST]]
+    path = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > _LEAST]]
     if len(path) == 1:
         still = np.zeros((2, path.shape[1]))
         return TimedPath(
@@ -96,7 +96,7 @@ def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: Flo
     x = np.arange(1, _ROUNDED + 1)[:, None] / _ROUNDED
     for k, slope in enumerate(slopes):
         straight = times[k] - sizes[k] - sizes[k + 1]
-        if straight > LEAST:
+        if straight > _LEAST:
             step = straight / _STRAIGHT * even
             steps.append(step[:, 0])
             q.append(path[k] + (sizes[k] + np.cumsum(step, axis=0)) * slope)

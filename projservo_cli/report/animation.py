@@ -32,7 +32,7 @@ from projservo_cli.simulation.analytic_plant import Plant
 from projservo_cli.simulation.arm import SerialArm
 from projservo_cli.task.face import center_of
 
-MOST_INSTANTS = 60
+_MOST_INSTANTS = 60
 _DOTS = 9  # on the planned path
 _DIGITS = 4  # of coordinates in m: a tenth of a millimetre
 _HEIGHT = 640  # px of the scene
@@ -120,16 +120,16 @@ def motion_of(
 
 
 def _sample_times(q: FloatArray) -> IntArray:
-    """At most ``MOST_INSTANTS`` instants of the joints q (t, n), the first and the last among them.
+    """At most ``_MOST_INSTANTS`` instants of the joints q (t, n), the first and the last among them.
 
     They are spread half over the time, half over the path of the joints: no end of a run is skipped.
     """
-    if len(q) <= MOST_INSTANTS:
+    if len(q) <= _MOST_INSTANTS:
         return np.arange(len(q))
     even = np.linspace(0.0, 1.0, len(q))
     distance = np.append(0.0, np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1)))
     done = 0.5 * (even + (distance / distance[-1] if distance[-1] > 0.0 else even))
-    marks = np.linspace(0.0, 1.0, MOST_INSTANTS)
+    marks = np.linspace(0.0, 1.0, _MOST_INSTANTS)
     return np.unique(np.minimum(np.searchsorted(done, marks), len(q) - 1))
 
 
@@ -333,7 +333,7 @@ def _coordinates(points: FloatArray) -> dict[str, list[float]]:
     return {name: np.round(points[:, i], _DIGITS).tolist() for i, name in enumerate("xyz")}
 
 
-FRAMES = 60
+_FRAMES = 60
 _MOST_COLUMNS = 4
 SEEN, HIDDEN = style.GREEN, style.ORANGE
 _PATH = style.line(SEEN, width=0.9, label="path of a marker")
@@ -366,7 +366,7 @@ def write_animation(
     images = []
     for pixels in _frames(columns, order, sizes):
         images.append(Image.fromarray(pixels))
-        progress("animation", len(images), FRAMES)
+        progress("animation", len(images), _FRAMES)
     # The last frame has all colours; one palette for all keeps what does not move the same.
     palette = images[-1].quantize(_COLORS, method=Image.Quantize.MAXCOVERAGE)
     colors = np.array((palette.getpalette() or [])[: 3 * _COLORS]).reshape(-1, 3)
@@ -423,7 +423,7 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
 
     with style.styled():
         figure = style.drawn(draw, traces, views * _PANEL * style.aspect(near) + 1.6, width)
-        for seconds in np.linspace(0.0, end, FRAMES):
+        for seconds in np.linspace(0.0, end, _FRAMES):
             figure.suptitle(f"time {seconds:.2f} s", fontsize=9)
             for column, (name, run) in zip(columns, traces.items(), strict=True):
                 now = min(int((seconds + 1e-9) / run.period), run.steps)

@@ -25,12 +25,13 @@ WIDTH = 6.9  # inches across both columns of a page
 _PNG_DPI = 200
 LineStyle = dict[str, Any]  # how a curve is drawn, in keywords of matplotlib, and its name in the legend
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-IMAGE = "image"  # label of axes that show pixels
+_IMAGE = "image"  # label of axes that show pixels
 
 # M. Okabe, K. Ito, "Color Universal Design", 2008; ordered so that neighbours differ in lightness.
 BLACK, ORANGE, BLUE, SKY = "#000000", "#E69F00", "#0072B2", "#56B4E9"
 VERMILION, GREEN, PURPLE = "#D55E00", "#009E73", "#CC79A7"
-BROWN, VIOLET = "#7F4F24", "#5E3C99"  # of further cameras: the others have their meaning in the same figures
+# Of further cameras: the other colours have their meaning in the same figures.
+_BROWN, _VIOLET = "#7F4F24", "#5E3C99"
 GREY, PALE = "#999999", "#DDDDDD"
 SOLID, NO_LINE = "-", "none"
 DASHED, DOTTED, DASH_DOTTED = (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5))
@@ -74,7 +75,7 @@ LAW_LINES = {
 HIDDEN = line(ORANGE, width=4.0, label="face hidden from this camera", alpha=0.6, solid_capstyle="butt")
 # Colour and dashes of the views, the same in every figure; from the fifth view on they come again.
 _VIEWS: tuple[tuple[str, Any], ...] = (
-    *((BLUE, SOLID), (ORANGE, DASHED), (BROWN, DASH_DOTTED), (VIOLET, (0, (3, 1, 1, 1, 1, 1)))),
+    *((BLUE, SOLID), (ORANGE, DASHED), (_BROWN, DASH_DOTTED), (_VIOLET, (0, (3, 1, 1, 1, 1, 1)))),
 )
 _FIRST_MARKER = 3.0  # size of the dot on the first marker of a face, points
 
@@ -146,7 +147,7 @@ def _arrange(figure: "Figure") -> None:
     engine: Any = figure.get_layout_engine()
     if engine is None:
         return
-    images: list[Any] = [axes for axes in figure.axes if axes.get_label() == IMAGE]
+    images: list[Any] = [axes for axes in figure.axes if axes.get_label() == _IMAGE]
     for axes in images:  # matplotlib calls it for each size that it tries, before it looks at tick labels
         axes.apply_aspect = partial(_equal_scales, axes, axes.get_xlim(), axes.get_ylim())
     height = figure.get_figheight()
@@ -253,7 +254,7 @@ def zero_line(axes: "Axes") -> None:
 
 def image_axes(axes: "Axes", title: str, pixels: FloatArray, margin: float = 0.06) -> None:
     """Axes of an image that show all pixels (…, 2) with a margin, v down, and widen to fill their panel."""
-    axes.set(title=title, xlabel="u (px)", ylabel="v (px)", label=IMAGE)
+    axes.set(title=title, xlabel="u (px)", ylabel="v (px)", label=_IMAGE)
     points = pixels.reshape(-1, 2)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)

@@ -15,7 +15,7 @@ from projservo_cli.calibration.time_offset import is_repeated_frame
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 # Deviation of an unknown delay, and of a single frame where no calibration gives it, s.
-UNKNOWN_S, _JITTER_S = 0.3, 0.012
+_UNKNOWN_S, _JITTER_S = 0.3, 0.012
 # Readings that are kept, and how far beyond the last one joints are taken to move on, s.
 _KEPT, _AHEAD_S = 256, 0.1
 # Delays that are reckoned with while little is known, s.
@@ -82,7 +82,7 @@ class DelayPrior(NamedTuple):
     @classmethod
     def unknown(cls, views: int) -> "DelayPrior":
         """Return the prior of a number of views of which nothing is known."""
-        return cls(np.zeros(views), np.full(views, UNKNOWN_S), np.full(views, _JITTER_S))
+        return cls(np.zeros(views), np.full(views, _UNKNOWN_S), np.full(views, _JITTER_S))
 
 
 class _Frames(NamedTuple):
@@ -212,8 +212,8 @@ class _View:
             return t_q
         if math.isnan(self._stamp) and not -_AHEAD_S <= t_q - stamp + self.mean <= self._timeout_s:
             # Clocks that have nothing in common, or not as when it was calibrated, start together.
-            self._offset, self.mean, self._variance = stamp - t_q, 0.0, UNKNOWN_S**2
-            self._log_chance = self._open(0.0, UNKNOWN_S)
+            self._offset, self.mean, self._variance = stamp - t_q, 0.0, _UNKNOWN_S**2
+            self._log_chance = self._open(0.0, _UNKNOWN_S)
         return stamp - self._offset
 
     def _is_fresh(self, stamp: float, image: FloatArray) -> bool:
@@ -296,8 +296,8 @@ class _View:
         here, *others = self._misfit(image, nominal - np.append(self.mean, _DELAYS), history)
         self._strays += here > _CLEARLY * max(min(others), self.error_px**2)
         if self._follows and self._strays >= _STRAYS:
-            self._strays, self._variance = 0, UNKNOWN_S**2
-            self._log_chance = self._open(self.mean, UNKNOWN_S)
+            self._strays, self._variance = 0, _UNKNOWN_S**2
+            self._log_chance = self._open(self.mean, _UNKNOWN_S)
 
     def _shift(self, image: FloatArray, t: float, history: History) -> tuple[float, float]:
         """Return the time of an image after t, to first order, and its standard deviation, s.

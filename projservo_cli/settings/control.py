@@ -49,7 +49,7 @@ _TARGET = {"type": "string", "pattern": plugins.TARGET}
 
 
 # A registered name is stored as the class it stands for, so that a run can be read where it is not installed.
-Law = Annotated[str, AfterValidator(_law), WithJsonSchema({"anyOf": [{"enum": list(LAWS)}, _TARGET]})]
+_Law = Annotated[str, AfterValidator(_law), WithJsonSchema({"anyOf": [{"enum": list(LAWS)}, _TARGET]})]
 _PlantClass = Annotated[str, AfterValidator(_plant), WithJsonSchema({"type": "string"})]
 
 
@@ -76,7 +76,7 @@ _Modes = Annotated[tuple[_Mode, ...], Field(min_length=1)]
 class Control(Section):
     """Control laws, their modes and gains, and the speed limits of the joints."""
 
-    laws: tuple[Law, ...] = Field(
+    laws: tuple[_Law, ...] = Field(
         tuple(law for law, spec in LAW_SPECS.items() if spec.paper),
         min_length=1,
         description="control laws to run, each from the start; module:Class for a plug-in law",
@@ -96,7 +96,7 @@ class Control(Section):
         3,
         description="maximum number of replanning attempts of a run, profiles joint_space and auto",
     )
-    must_converge: tuple[Law, ...] | None = Field(
+    must_converge: tuple[_Law, ...] | None = Field(
         None,
         description="laws that fail the call (exit code 1) if they do not converge; null: "
         "direct_three, direct_two, exact and plug-in laws",

@@ -121,7 +121,7 @@ _Relation = Literal["meet", "parallel", "perpendicular"] | Annotated[Number, Fie
 Pair = Annotated[tuple[Name, Name] | tuple[Name, Name, _Relation], BeforeValidator(_pair)]
 
 
-def in_words(pair: Pair) -> str:
+def _in_words(pair: Pair) -> str:
     """Return a pair as messages and figures write it."""
     relation = pair[2] if len(pair) == 3 else MEET
     between = {MEET: "on", PARALLEL: "parallel to", PERPENDICULAR: "perpendicular to"}
@@ -133,8 +133,8 @@ def incidence_of(pair: Pair, features: Mapping[str, Feature]) -> Incidence:
     relation = pair[2] if len(pair) == 3 else MEET
     tool, scene = (features[name].flat(features) for name in pair[:2])
     if isinstance(relation, str):
-        return Incidence(in_words(pair), tool, scene, relation)
-    return Incidence(in_words(pair), tool, scene, ANGLE, float(relation))
+        return Incidence(_in_words(pair), tool, scene, relation)
+    return Incidence(_in_words(pair), tool, scene, ANGLE, float(relation))
 
 
 def misplaced(pair: Pair, features: Mapping[str, Feature]) -> str:

@@ -279,7 +279,7 @@ def _put_light(spec: Any, light: str, P: FloatArray) -> None:
     )
 
 
-def drawn_at(P: FloatArray, lens: FloatArray, pixels: FloatArray) -> FloatArray:
+def _drawn_at(P: FloatArray, lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """Return pixels (V, N, 2) of cameras (V, 3, 4) and lenses (V, 5) in drawings without lens and skew."""
     straight = undistort(lens, pixels).copy()
     for view, camera in enumerate(P):
@@ -293,7 +293,7 @@ def _margin(P: FloatArray, k1: float, width: int, height: int) -> int:
     """Return the margin of a drawing around the field of a lens, px."""
     u, v = np.linspace(0.0, width - 1.0, 65), np.linspace(0.0, height - 1.0, 65)
     sides = [(x, y) for x in u for y in v[[0, -1]]] + [(x, y) for x in u[[0, -1]] for y in v]
-    drawn = drawn_at(P, lens_of(P, k1), np.array([sides] * len(P)))
+    drawn = _drawn_at(P, lens_of(P, k1), np.array([sides] * len(P)))
     if not np.isfinite(drawn).all():
         raise InputError("plant.options.k1: a lens that bends so much does not show the whole image")
     beyond = max(-float(drawn.min()), float((drawn - [width - 1.0, height - 1.0]).max()))
@@ -433,7 +433,7 @@ class Frames:
         u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
         pixels = (np.stack([u, v], axis=-1).reshape(-1, 2) - offset) / _FINER
         lens = lens_of(P, self._scene.options.k1)
-        drawn = drawn_at(P, lens, np.stack([pixels] * len(P)))
+        drawn = _drawn_at(P, lens, np.stack([pixels] * len(P)))
         if all(np.array_equal(one, pixels) for one in drawn):
             return None
         finer = (_FINER * (drawn + self.rendered.margin) + offset).astype(np.float32)

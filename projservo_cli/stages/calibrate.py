@@ -39,15 +39,15 @@ from projservo_cli.stages.stage_inputs import (
 )
 from projservo_cli.store.observation_tables import mount_in, read_detections, read_table, to_csv
 
-Calibrated = tuple[Observation, Calibration, CrossValidation | None]
+_Calibrated = tuple[Observation, Calibration, CrossValidation | None]
 
 
 def run(
     inputs: CalibrationInputs | RefitInputs,
-    before: Calibrated | None = None,
+    before: _Calibrated | None = None,
     *,
     progress: Progress = silent,
-) -> Calibrated:
+) -> _Calibrated:
     """Calibrate from a recorded table or from simulated trial motions, or fit a camera again.
 
     before : the result of the inputs before a refit, if at hand.
@@ -62,7 +62,7 @@ def run(
     return estimate(seen, inputs.estimation, progress=progress)
 
 
-def _refitted(inputs: RefitInputs, before: Calibrated) -> Calibrated:
+def _refitted(inputs: RefitInputs, before: _Calibrated) -> _Calibrated:
     """Fit a camera again."""
     old, calibration, _ = before
     kind, path = (calibration.joint_types, inputs.joint_unit), inputs.file.path

@@ -88,15 +88,15 @@ def _joint_motions(state: State) -> FloatArray:
 
 
 # What noise and calibration may leave of images that the joints can reach, px rms per marker and view.
-LEFT_PX = 3.0
-STAGES = 20
+_LEFT_PX = 3.0
+_STAGES = 20
 # Distance of a marker of the face from its plane, over its size, that noise of the calibration may show.
 _UNEVEN = 0.05
-STAGES = 20
+_STAGES = 20
 
 
 def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: FloatArray) -> None:
-    """Refuse a task whose goal leaves more than ``LEFT_PX`` wherever the joints bring the face.
+    """Refuse a task whose goal leaves more than ``_LEFT_PX`` wherever the joints bring the face.
 
     The joints that bring the face A (m, 4) nearest to its planned images (s, V, m, 2), in px, are carried
     along the plan from those at the start (n,); SciPy's least squares do for twenty images.
@@ -107,13 +107,13 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
     def miss(q: FloatArray, wanted: FloatArray) -> FloatArray:
         return (project(model.P, M @ forward_kinematics(model, q).T, model.lens) - wanted).ravel()
 
-    for k in np.unique(np.linspace(0, len(images) - 1, STAGES).astype(int)):
+    for k in np.unique(np.linspace(0, len(images) - 1, _STAGES).astype(int)):
         q = least_squares(miss, q, args=(images[k],), method="lm", xtol=1e-12).x
     left = float(np.sqrt(np.mean(np.sum(miss(q, images[-1]).reshape(-1, 2) ** 2, axis=1))))
-    if not left <= LEFT_PX:
+    if not left <= _LEFT_PX:
         raise WorkFailed(
             f"the task does not lie in what {len(q)} joints can do: the nearest they bring the face is "
-            f"{left:.3g} px rms from its goal images, more than the {LEFT_PX:g} px that noise may leave; "
+            f"{left:.3g} px rms from its goal images, more than the {_LEFT_PX:g} px that noise may leave; "
             "choose a goal by joint readings, or one that moves the face as these joints do"
         )
 
@@ -143,7 +143,7 @@ def run(
     carried: dict[str, Any] = {}
     if inputs.carrier is not None:
         scenario, carried = carried_goal(scenario, inputs.carrier, before, session)
-    plan = _to_any_goal(scenario) if inputs.incidences else plan_in(scenario)
+    plan = _to_any_goal(scenario) if inputs.incidences else _plan_in(scenario)
     face = metric_points(scenario.model, calibration.M[calibration.indices_of(inputs.face)])
     notes = [
         plan.reason,
@@ -154,7 +154,7 @@ def run(
     return replace(plan, reason="; ".join(filter(None, notes)), **carried)
 
 
-def plan_in(scenario: Scenario) -> Plan:
+def _plan_in(scenario: Scenario) -> Plan:
     """Plan the task of a scenario as its trajectory is asked for; raises as ``plan_task``."""
     asked = scenario.inputs.trajectory
     search = search_of(scenario) if asked.needs_covariance else None
@@ -190,7 +190,7 @@ def _to_any_goal(scenario: Scenario) -> Plan:
         s_goal = project(model.P, task.body.M @ H.T, model.lens)
         chosen = replace(scenario, s_chosen=s_goal, goal_joints=q[None])
         try:
-            plan = plan_in(chosen)
+            plan = _plan_in(chosen)
         except WorkFailed as error:
             failures.append(error)
             continue

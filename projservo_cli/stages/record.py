@@ -42,7 +42,7 @@ from projservo_cli.stages.external_robot import path_to, plugin_robot, simulated
 from projservo_cli.stages.stage_inputs import OwnRobot, RecordingInputs, Trials
 from projservo_cli.store.observation_tables import identity_in, read_table, recording_of, write_table
 
-SAVE_EVERY = 1.0  # s; maximum loss by an interruption without warning
+_SAVE_EVERY = 1.0  # s; maximum loss by an interruption without warning
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
 _MOST_MOVING = 200  # frames in motion in a table
 
@@ -306,7 +306,7 @@ def record_poses(
     poses = (
         _simulated(trials, recording, drawn) if robot is None else _recorded(robot, trials, recording, sight)
     )
-    stored, due = len(recording.done), time.monotonic() + SAVE_EVERY
+    stored, due = len(recording.done), time.monotonic() + _SAVE_EVERY
     try:
         with nullcontext() if robot is None else at_rest_after(robot):
             if robot is not None:
@@ -321,7 +321,7 @@ def record_poses(
                         _show(recording, robot)
                     stored, now = len(recording.done), time.monotonic()
                     # A long table takes long to write: most of the time must stay for recording.
-                    due = now + max(SAVE_EVERY, 10.0 * (now - start))
+                    due = now + max(_SAVE_EVERY, 10.0 * (now - start))
     finally:
         if kept and len(recording.done) > stored:
             recording.save()

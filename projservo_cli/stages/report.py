@@ -86,7 +86,7 @@ def run(inputs: ReportInputs, run: "Run", directory: Path, *, progress: Progress
         known = run.calibration, run.observation.at_rest, plan, run.traces, lacks
         report_data = Driven(*known, held_out=run.cross_validation)
     report_data = replace(report_data, metric=metric, no_metric=no_metric)
-    figures = draw_all(report_data, directory, inputs.formats, left_out, progress)
+    figures = _draw_all(report_data, directory, inputs.formats, left_out, progress)
     report = Report(
         figures=tuple(figures),
         omitted=tuple(left_out),
@@ -142,7 +142,7 @@ def _report_data(
     )
 
 
-def draw_all(
+def _draw_all(
     report_data: Fit,
     directory: Path,
     formats: Sequence[str],

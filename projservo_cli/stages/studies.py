@@ -31,12 +31,12 @@ from projservo_cli.stages.stage_inputs import ServoInputs
 from projservo_cli.task.body import make_body
 from projservo_cli.task.target import is_stereo
 
-GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
-PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)
+_GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
+_PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)
 STEP_LIMIT_DEG = 5.0
-LAMBDAS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+_LAMBDAS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 # Share of the translation that a step takes where its gain is as high as can be.
-FAST_PER_STEP = 0.9
+_FAST_PER_STEP = 0.9
 # Instants of a planned rotation, and steps of a law towards it.
 _INSTANTS, _STEPS = 4001, 400
 
@@ -129,8 +129,8 @@ def _with_gain(gains: Gains, gain_per_step: float) -> Gains:
 
 def run_studies(
     bench: Comparison,
-    gains: Sequence[float] = GAINS,
-    periods: Sequence[float] = PERIODS_S,
+    gains: Sequence[float] = _GAINS,
+    periods: Sequence[float] = _PERIODS_S,
     progress: Progress = silent,
 ) -> Studies:
     """Make all extra runs, over gains per step, and over periods, s, at the configured gains.
@@ -150,7 +150,7 @@ def run_studies(
     for done, (case, chosen, operators, limited) in enumerate(cases):
         progress("studies", done, len(cases))
         made[case] = bench.run(case[0], operators, chosen, limited=limited)
-    fast = own._replace(gain_t=FAST_PER_STEP / own.period)
+    fast = own._replace(gain_t=_FAST_PER_STEP / own.period)
     further = {"fast": bench.run(DIRECT[0], "true", fast, limited=False), "tracked": bench.followed()}
     progress("studies", len(cases), len(cases))
     sweep, by_model, rate = ({c: trace for c, trace in made.items() if len(c) == n} for n in (4, 3, 2))
@@ -174,7 +174,7 @@ def metric_plan(bench: Comparison) -> Plan:
     return plan_task(bench.models["true"], shown, trajectory, limits)
 
 
-def composition_error(plan: Plan, lambdas: Sequence[float] = LAMBDAS) -> FloatArray:
+def composition_error(plan: Plan, lambdas: Sequence[float] = _LAMBDAS) -> FloatArray:
     """Difference of both sides of [RH00] eq. (22) for a metric plan in shares λ of τ and θ_s.
 
     Returns the distance (k,) of the centre under exp(λτ Ĥ_t) exp(λθ_s Ĥ_s) and exp(λτ Ĥ_t + λθ_s Ĥ_s), m.
@@ -235,5 +235,5 @@ def composition_of(plan: Plan, gains: Gains) -> Composition:
     way = screws(plan.H_hat)[0, 3:]
     cosine = abs(float(way @ axis)) / max(float(np.linalg.norm(way) * np.linalg.norm(axis)), 1e-300)
     return Composition(
-        np.array(LAMBDAS), distance, math.acos(min(1.0, cosine)), orientation_bias(plan, gains)
+        np.array(_LAMBDAS), distance, math.acos(min(1.0, cosine)), orientation_bias(plan, gains)
     )

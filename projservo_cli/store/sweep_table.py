@@ -34,7 +34,7 @@ _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletc
 _TRACES = "traces"
 _FAILURES = "failures"
 
-Array = npt.NDArray[Any]
+_Array = npt.NDArray[Any]
 
 
 class Heading(NamedTuple):
@@ -70,7 +70,7 @@ def merge_failures(found: dict[str, Failure], more: Iterable[tuple[str, Failure]
 
 def write_part(
     path: Path,
-    columns: Mapping[str, Array],
+    columns: Mapping[str, _Array],
     traces: Mapping[int, Trace],
     failures: Mapping[str, Failure] | None = None,
 ) -> None:
@@ -133,15 +133,17 @@ def _new_column(
     return data
 
 
-def _values(data: h5py.Dataset) -> Array:
+def _values(data: h5py.Dataset) -> _Array:
     """Decode the values (k,) of a column."""
     values = np.asarray(data[()])
     return values.view(f"S{values.shape[1]}")[:, 0] if values.ndim == 2 else values
 
 
-def _blocks(file: "h5netcdf.File", parts: Sequence[Path], names: Sequence[str]) -> Iterator[dict[str, Array]]:
+def _blocks(
+    file: "h5netcdf.File", parts: Sequence[Path], names: Sequence[str]
+) -> Iterator[dict[str, _Array]]:
     """Yield rows of parts in blocks of about a chunk, and copy their traces into the file."""
-    waiting: list[dict[str, Array]] = []
+    waiting: list[dict[str, _Array]] = []
     for part in parts:
         with opened(part, _AGAIN) as source:
             waiting.append({name: _values(source[name]) for name in names})
@@ -186,20 +188,20 @@ class SweepTable:
             self.failures = {law: Failure(*one) for law, one in stored.items()}  # by law
             self.rows = len(file["run"])
             self.traces = tuple(sorted(map(int, file.get(_TRACES, ()))))  # numbers of runs
-        self._read: dict[str, Array] = {}
+        self._read: dict[str, _Array] = {}
 
     @property
     def axes(self) -> list[tuple[str, list[Any]]]:
         """Name and values of each axis of the grid, the last one running fastest."""
         return [(name, values) for name, values in self.attributes["axes"]]
 
-    def __getitem__(self, name: str) -> Array:
+    def __getitem__(self, name: str) -> _Array:
         """A column, or what follows from some, read once."""
         if name not in self._read:
             self._read[name] = self._derived(name)
         return self._read[name]
 
-    def _derived(self, name: str) -> Array:
+    def _derived(self, name: str) -> _Array:
         if name == "success":
             return np.asarray(self.column(name) == 1)
         if name == "converged":
@@ -228,7 +230,7 @@ class SweepTable:
         for cell in np.unique(self["cell"]):
             yield int(cell), self["cell"] == cell
 
-    def column(self, name: str) -> Array:
+    def column(self, name: str) -> _Array:
         """Values (k,) of a column; texts as Python texts would be, of fixed width."""
         with opened(self.path, _AGAIN) as file:
             values = _values(file[name])

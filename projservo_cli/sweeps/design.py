@@ -57,7 +57,7 @@ def _overrides(what: str, key: str, value: Any) -> list[Override]:
 
 
 # Streams of the sweep's seed.
-RUNS, CALIBRATIONS, TASKS, VALUES, CALIBRATION_VALUES, PROBES = range(6)
+RUNS, _CALIBRATIONS, _TASKS, _VALUES, _CALIBRATION_VALUES, PROBES = range(6)
 _PROBES = 4  # values that show whether a calibration depends on them
 
 
@@ -206,9 +206,9 @@ class Design:
     def calibrated(self, cell: int, calibration: int) -> Config:
         """Return the configuration of a cell with the seed and the draws of a calibration."""
         config = self.cell(cell)
-        if drawn := self._drawn(CALIBRATION_VALUES, calibration):
+        if drawn := self._drawn(_CALIBRATION_VALUES, calibration):
             config = _changed(config, drawn, f"calibration {calibration}")
-        seed = self.seed(CALIBRATIONS, calibration)
+        seed = self.seed(_CALIBRATIONS, calibration)
         update = {"calibration": config.calibration.model_copy(update={"seed": seed})}
         return config.model_copy(update=update)
 
@@ -255,7 +255,7 @@ class Design:
         assert tasks.random is not None
         assert config.task.start_joints is not None
         q_front = np.array(config.task.start_joints.values(config.robot.joint_types))
-        rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(TASKS,)))
+        rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(_TASKS,)))
         asked = config.trajectory.visible_views
         least_views = 0 if asked == "all" else asked
         low, high = np.radians(tasks.rotation_deg)
@@ -279,7 +279,7 @@ class Design:
         """Configuration of a run."""
         cell, draw, calibration, task = self.numbers(run)
         config = self.calibrated(cell, calibration)
-        if drawn := self._drawn(VALUES, draw):
+        if drawn := self._drawn(_VALUES, draw):
             config = _changed(config, drawn, f"run {run}")
         update: dict[str, Any] = {"seed": self.seed(RUNS, draw)}
         if task >= 0:
@@ -300,7 +300,7 @@ class Design:
     def drawn(self, run: int) -> dict[str, Any]:
         """Values drawn for a run and for its calibration, in the order of ``random``."""
         _, draw, calibration, _ = self.numbers(run)
-        found = self._drawn(VALUES, draw) | self._drawn(CALIBRATION_VALUES, calibration)
+        found = self._drawn(_VALUES, draw) | self._drawn(_CALIBRATION_VALUES, calibration)
         return {key: found[key] for key in self.sweep.random}
 
     def seed(self, stream: int, number: int) -> int:
@@ -325,7 +325,7 @@ class Design:
 
     def _drawn(self, stream: int, number: int) -> dict[str, Any]:
         """Values of the keys that a stream is for: whether the calibration depends on them."""
-        of_calibration = stream == CALIBRATION_VALUES
+        of_calibration = stream == _CALIBRATION_VALUES
         keys = [key for key in self.sweep.random if (key in self._of_calibrations) is of_calibration]
         if not keys:
             return {}

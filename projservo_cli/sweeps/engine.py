@@ -30,12 +30,12 @@ from threadpoolctl import threadpool_limits
 from projservo_cli import provenance
 from projservo_cli.records import InputError, WorkFailed
 
-Job = TypeVar("Job")
-Result = TypeVar("Result")
+_Job = TypeVar("_Job")
+_Result = TypeVar("_Result")
 
 MOST_LOSSES = 5  # of workers in a row, without a job done in between
-PATIENCE_S = 10.0  # for the scheduler to answer and for a first worker
-DECISIVE = ("projservo", "python", "numpy", "scipy", "numba", "jit")  # for the last digits of a result
+_PATIENCE_S = 10.0  # for the scheduler to answer and for a first worker
+_DECISIVE = ("projservo", "python", "numpy", "scipy", "numba", "jit")  # for the last digits of a result
 
 
 class Engine:
@@ -49,12 +49,12 @@ class Engine:
 
     def completed(
         self,
-        function: Callable[[Job], Result],
-        jobs: Iterable[Job],
+        function: Callable[[_Job], _Result],
+        jobs: Iterable[_Job],
         *,
         max_workers: int | None = None,
         threads: bool = False,
-    ) -> Generator[Result, None, None]:
+    ) -> Generator[_Result, None, None]:
         """Yield results of jobs as they are done, in any order; jobs of a lost worker are repeated.
 
         No more jobs wait than keep all workers busy, and a result is released at the next request.
@@ -67,9 +67,9 @@ class Engine:
             yield from map(function, jobs)
             return
         left, losses = iter(jobs), 0
-        todo: list[Job] = []
+        todo: list[_Job] = []
         while True:
-            futures: dict[Future[Result], Job] = {}
+            futures: dict[Future[_Result], _Job] = {}
             with self.pool(workers, threads=threads) as pool:
                 try:
                     while True:
@@ -165,12 +165,12 @@ class Cluster(Engine):
                 logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             make: Any = distributed.Client
-            self._client = make(address, timeout=PATIENCE_S, set_as_default=False)
-            self._client.wait_for_workers(1, timeout=PATIENCE_S)
+            self._client = make(address, timeout=_PATIENCE_S, set_as_default=False)
+            self._client.wait_for_workers(1, timeout=_PATIENCE_S)
         except (OSError, TimeoutError, ValueError) as error:
             what = " ".join(str(error).split())
             raise WorkFailed(
-                f"{self._name}: no answer within {PATIENCE_S:g} s, or no worker ({what}): start "
+                f"{self._name}: no answer within {_PATIENCE_S:g} s, or no worker ({what}): start "
                 "dask scheduler and dask worker, and see whether the address is right"
             ) from error
         self._compare_versions()
@@ -217,4 +217,4 @@ class Cluster(Engine):
 def versions() -> dict[str, Any]:
     """Versions that decide the bits of a result."""
     found = provenance.collect(seed=0)
-    return {name: found[name] for name in DECISIVE}
+    return {name: found[name] for name in _DECISIVE}

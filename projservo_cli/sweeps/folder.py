@@ -31,14 +31,14 @@ from projservo_cli.sweeps.design import Design, name_of_run
 from projservo_cli.sweeps.engine import Engine, versions
 from projservo_cli.sweeps.runs import Part, columns_of, is_compiled, run_part
 
-REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
-PARTS = 4  # of each worker at least
+_REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
+_PARTS = 4  # of each worker at least
 # Runs that take a second or two, by whether many have all but their images in common.
-SHARED, OWN = 2_000, 100
-CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
-SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
+_SHARED, _OWN = 2_000, 100
+_CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
+_SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
 # Indices of the machine code of the closed loop, by whether many runs are made in one call.
-LOOPS = ("compiled.run_compiled-*.nbi", "batch._until_rehearsal-*.nbi")
+_LOOPS = ("compiled.run_compiled-*.nbi", "batch._until_rehearsal-*.nbi")
 
 
 class _Status(NamedTuple):
@@ -191,14 +191,14 @@ class Folder:
         return [
             (key, config)
             for key, config in design.calibrations()
-            if not any(self.calibration(key).with_suffix(kind).exists() for kind in (".h5", REFUSED))
+            if not any(self.calibration(key).with_suffix(kind).exists() for kind in (".h5", _REFUSED))
         ]
 
     def keep_calibration(self, made: _Calibrated) -> None:
         """Store a calibration as a separate run file, or the reason of its failure."""
         path = self.calibration(made.key)
         if made.records is None:
-            write_whole(path.with_suffix(REFUSED), made.reason + "\n")
+            write_whole(path.with_suffix(_REFUSED), made.reason + "\n")
             return
         (step,) = steps_for(made.config, Run(path), ["calibrate"])
         save(Run(path, stored_yaml(made.config), {"calibrate": result_of(step, made.config, *made.records)}))
@@ -224,7 +224,7 @@ def run_of(target: str) -> tuple[Config, Result | None]:
     cell, _, number, _ = design.numbers(run)
     config = design.config(run).model_copy(update={"name": f"{design.sweep.name}-{run}"})
     path = folder.calibration(design.calibration_key(cell, number))
-    refused = path.with_suffix(REFUSED)
+    refused = path.with_suffix(_REFUSED)
     if refused.exists():
         raise WorkFailed(f"run {run}: {refused.read_text(encoding='utf-8').strip()}")
     if not path.exists():
@@ -255,7 +255,7 @@ def run_sweep(
             design.tasks(base)  # likewise
         _compile_once(design, engine, say)
         wanted = folder.missing_calibrations(design)
-        max_workers = 1 + len(wanted) // CALIBRATIONS
+        max_workers = 1 + len(wanted) // _CALIBRATIONS
         with closing(engine.completed(_calibrate, wanted, max_workers=max_workers)) as calibrated:
             for count, one in enumerate(calibrated, 1):
                 folder.keep_calibration(one)
@@ -279,7 +279,7 @@ def _make_parts(design: Design, folder: Folder, engine: Engine, status: _Status,
     calibrations, threads = folder.calibrations(design), _shares_settings(design)
     chunk = status.chunk or design.sweep.chunk
     if not chunk:
-        chunk = min(SHARED if threads else OWN, math.ceil(design.total / (PARTS * engine.workers)))
+        chunk = min(_SHARED if threads else _OWN, math.ceil(design.total / (_PARTS * engine.workers)))
     if not status.chunk:
         folder.begin(design, chunk)
 
@@ -304,7 +304,7 @@ def _shares_settings(design: Design) -> bool:
     """Tell whether all runs are compiled ones, many of which differ in their images alone."""
     tasks = design.sweep.tasks.count if design.sweep.tasks is not None else 1
     settings = math.lcm(design.sweep.calibrations, tasks)
-    if design.sweep.random or settings > SETTINGS or design.sweep.runs < settings:
+    if design.sweep.random or settings > _SETTINGS or design.sweep.runs < settings:
         return False
     return all(_in_kernel(design, cell) for cell in range(design.cells))
 
@@ -326,7 +326,7 @@ def _calibrate(wanted: tuple[str, Config]) -> _Calibrated:
 
 def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) -> None:
     """Fill an empty cache by one process, which ends here: the compiler keeps hundreds of megabytes."""
-    loop = LOOPS[_in_kernel(design, 0)]
+    loop = _LOOPS[_in_kernel(design, 0)]
     if not engine.here or engine.workers == 1 or CACHE_FOLDER is None or any(CACHE_FOLDER.rglob(loop)):
         return
     say("compiling kernels, once, before the processes start")

@@ -34,12 +34,12 @@ from projservo_cli.stages.stage_inputs import PlanInputs, ServoInputs
 from projservo_cli.store.sweep_table import Failure, Heading, merge_failures
 from projservo_cli.sweeps.design import RUNS, Design, name_of_run
 
-NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
-ALL_VERDICTS = (*VERDICTS, NOT_CALIBRATED, NOT_STARTED)
+_NOT_CALIBRATED, _NOT_STARTED = "not calibrated", "not started"
+ALL_VERDICTS = (*VERDICTS, _NOT_CALIBRATED, _NOT_STARTED)
 # Reason of a compiled run that did not start.
 _UNMEASURED = "its images of start and goal do not show the task"
 _LONGEST = 300  # characters of a reason that is kept
-NONE = -1  # in columns of counts, where a run did not begin
+_NONE = -1  # in columns of counts, where a run did not begin
 
 
 def _text(name: str, values: Sequence[str], about: str) -> Heading:
@@ -173,7 +173,7 @@ def run_part(part: Part) -> _Made:
             inputs = design.values(cell) | design.drawn(first)
             _put(table, rows, {name: _displayed(value) for name, value in inputs.items()})
             if calibration is None:
-                _put(table, rows, {"verdict": NOT_CALIBRATED, "usable": 0})
+                _put(table, rows, {"verdict": _NOT_CALIBRATED, "usable": 0})
                 continue
             _put(table, rows, {"usable": int(calibration.usable)})
             config = design.config(first)
@@ -213,7 +213,7 @@ def is_compiled(design: Design, given: ServoInputs, name: str) -> bool:
 
 def _numbered(design: Design, runs: IntArray) -> _Columns:
     """Rows of runs that are not made yet, with their numbers and seeds."""
-    missing = {"f8": math.nan, "i8": NONE, "i1": NONE, "u1": 0}
+    missing = {"f8": math.nan, "i8": _NONE, "i1": _NONE, "u1": 0}
     table = {
         column.name: np.full(len(runs), missing.get(column.dtype, b""), dtype=column.dtype)
         for column in columns_of(design)
@@ -239,21 +239,21 @@ def _measured(
         scenario = run_scenario(given, calibration)
         numbers = _numbers_of(scenario, name, seeds.tolist())
     except WorkFailed as error:
-        return {"verdict": NOT_STARTED}, [str(error)] * len(seeds)
+        return {"verdict": _NOT_STARTED}, [str(error)] * len(seeds)
     names = (*NUMBERS, *_self_occluded(scenario.view))
     found: dict[str, Any] = dict(zip(names, numbers.T, strict=True))
     for column in measured_columns(scenario.view):
         if column.dtype == "i8":
-            found[column.name] = np.where(numbers[:, VERDICT] < 0, NONE, found[column.name])
+            found[column.name] = np.where(numbers[:, VERDICT] < 0, _NONE, found[column.name])
     found["success"] = found["success"] == 1.0
-    found["verdict"] = [_SAID.get(int(code), NOT_STARTED.encode()) for code in numbers[:, VERDICT]]
+    found["verdict"] = [_SAID.get(int(code), _NOT_STARTED.encode()) for code in numbers[:, VERDICT]]
     return found, ["" if code in _SAID else _UNMEASURED for code in numbers[:, VERDICT].tolist()]
 
 
 # Noise is drawn for this number of steps, and for this multiple if a run is longer.
-INSTANTS, FURTHER = 192, 4
+_INSTANTS, _FURTHER = 192, 4
 # Runs that compiled code makes in one call: their noise is a few hundred kilobytes.
-TOGETHER = 16
+_TOGETHER = 16
 
 
 def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatArray:
@@ -273,8 +273,8 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
     )
     batch = Batch(setting, len(scenario.numbers))
     found = np.empty((len(seeds), len(NUMBERS) + len(scenario.view)))
-    for first in range(0, len(seeds), TOGETHER):
-        running, instants = list(range(first, min(first + TOGETHER, len(seeds)))), INSTANTS
+    for first in range(0, len(seeds), _TOGETHER):
+        running, instants = list(range(first, min(first + _TOGETHER, len(seeds)))), _INSTANTS
         while running:  # those that outlast their noise are repeated with more
             drawn = min(instants, scenario.termination.max_steps + 1)
             displayed = [scenario.images_at(seeds[i]) for i in running]
@@ -282,7 +282,7 @@ def _numbers_of(scenario: RunScenario, law: str, seeds: Sequence[int]) -> FloatA
             noise = np.array([scenario.noise_of(law, seeds[i], drawn) for i in running])
             found[running] = batch.numbers(images, noise)
             running = [i for i in running if found[i, VERDICT] == RUNNING]
-            instants *= FURTHER
+            instants *= _FURTHER
     return found
 
 
@@ -298,7 +298,7 @@ def _interned(design: Design) -> Design:
 
 
 _plans: dict[str, Plan] = {}
-PLANS = 128  # that are kept
+_PLANS = 128  # that are kept
 
 
 def _plan(given: PlanInputs, calibration: Calibration, calibration_key: str) -> Plan:
@@ -306,7 +306,7 @@ def _plan(given: PlanInputs, calibration: Calibration, calibration_key: str) -> 
     key = key_of(given, before=calibration_key)
     if key not in _plans:
         made = planning.run(given, calibration)
-        if len(_plans) >= PLANS:
+        if len(_plans) >= _PLANS:
             del _plans[next(iter(_plans))]
         _plans[key] = made
     return _plans[key]
@@ -325,7 +325,7 @@ def _run(
         else:
             made = drive(scenario, _plan(given.plan, calibration, design.calibration_key(cell, number)), name)
     except WorkFailed as error:
-        return {"verdict": NOT_STARTED}, None, str(error)
+        return {"verdict": _NOT_STARTED}, None, str(error)
     row = {"verdict": made.verdict, "steps": made.steps, **made.summary._asdict()}
     row |= zip(_self_occluded(scenario.view), made.self_occluded_steps, strict=True)
     if design.sweep.between_samples:

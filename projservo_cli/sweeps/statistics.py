@@ -19,8 +19,8 @@ from projservo_cli.stages import Progress
 from projservo_cli.store.observation_tables import to_csv
 from projservo_cli.store.sweep_table import SweepTable
 
-QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-MEASURES = (
+_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+_MEASURES = (
     "steps",
     "position_error_mm",
     "rotation_error_deg",
@@ -28,7 +28,7 @@ MEASURES = (
     "center_deviation_at_samples_mm",
     "effort",
 )
-PAIRED = ("steps", "position_error_mm", "path_length_ratio")
+_PAIRED = ("steps", "position_error_mm", "path_length_ratio")
 
 
 def of_runs(table: SweepTable, these: BoolArray) -> dict[str, Any]:
@@ -45,15 +45,15 @@ def of_runs(table: SweepTable, these: BoolArray) -> dict[str, Any]:
         "self_occluded_rate": float(table["self_occluded"][these].mean()),
         "left_image_rate": float(table["left_image"][these].mean()),
         "verdicts": dict(zip(verdicts.tolist(), counts.tolist(), strict=True)),
-        "quantiles": {name: _quantiles(table[name][good]) for name in MEASURES},
+        "quantiles": {name: _quantiles(table[name][good]) for name in _MEASURES},
     }
 
 
 def _quantiles(values: npt.NDArray[Any]) -> dict[str, float | None]:
     """Quantiles of values that are numbers; None where there is none."""
     numbers = values[np.isfinite(values)]
-    found = np.quantile(numbers, QUANTILES).tolist() if len(numbers) else [None] * len(QUANTILES)
-    return {f"{share:g}": value for share, value in zip(QUANTILES, found, strict=True)}
+    found = np.quantile(numbers, _QUANTILES).tolist() if len(numbers) else [None] * len(_QUANTILES)
+    return {f"{share:g}": value for share, value in zip(_QUANTILES, found, strict=True)}
 
 
 def paired(table: SweepTable, laws: Sequence[str] | None = None) -> Iterator[dict[str, Any]]:
@@ -82,7 +82,7 @@ def _compared(table: SweepTable, one: BoolArray, other: BoolArray) -> dict[str, 
     a, b = table["success"][one][i], table["success"][other][j]
     only = [int((a & ~b).sum()), int((b & ~a).sum())]
     both = a & b
-    differences = {name: (table[name][one][i] - table[name][other][j])[both] for name in PAIRED}
+    differences = {name: (table[name][one][i] - table[name][other][j])[both] for name in _PAIRED}
     return {
         "pairs": len(i),
         "both": int(both.sum()),
@@ -102,7 +102,7 @@ def _chance(first: int, second: int) -> float:
     return float(binomtest(first, first + second).pvalue) if first + second else 1.0
 
 
-STATISTICS = "statistics.json"
+_STATISTICS = "statistics.json"
 
 
 def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict[str, Any], list[Path]]:
@@ -112,7 +112,7 @@ def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict
     found = {"runs": table.rows, "total": table.attributes["total"], "cells": cells}
     found["paired"] = list(paired(table))
     text = json.dumps(found, indent=1, allow_nan=False) + "\n"
-    files = [write_whole(folder / STATISTICS, text)]
+    files = [write_whole(folder / _STATISTICS, text)]
     figures = list(pictures(table))
     for done, (name, data, draw) in enumerate(figures):
         progress("figures", done, len(figures))

@@ -29,14 +29,14 @@ from projservo_cli.geometry.kernels import COORDINATES, solve_normal
 from projservo_cli.records import BoolArray, FloatArray, Model
 
 _Vec3 = tuple[float, float, float]
-Row = tuple[float, float, float, float, float, float, float]
+_Row = tuple[float, float, float, float, float, float, float]
 # Products of the columns of (J, e) with those of J, upper triangle by rows.
-Sums = tuple[
+_Sums = tuple[
     float, float, float, float, float, float, float, float, float, float, float, float, float, float,
     float, float, float, float, float, float, float, float, float, float, float, float, float,
 ]  # fmt: skip
 # Sums over no rows.
-_NO_SUMS: Sums = (
+_NO_SUMS: _Sums = (
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
 )  # fmt: skip
@@ -135,7 +135,7 @@ def make_body(model: Model, M: FloatArray) -> Body:
 
 
 @inline
-def _accumulate(N: Sums, a: Row, b: Row) -> Sums:
+def _accumulate(N: _Sums, a: _Row, b: _Row) -> _Sums:
     """Sums after two more rows (J, e) of Jacobian and residual."""
     return (
         N[0] + (a[0] * a[0] + b[0] * b[0]), N[1] + (a[0] * a[1] + b[0] * b[1]),
@@ -156,7 +156,7 @@ def _accumulate(N: Sums, a: Row, b: Row) -> Sums:
 
 
 @merged
-def _sums_into(N: FloatArray, sums: Sums) -> None:
+def _sums_into(N: FloatArray, sums: _Sums) -> None:
     """Write the sums into the upper triangle and the last column of an array (6, 7)."""
     n = 0
     for i in range(COORDINATES):
@@ -168,7 +168,7 @@ def _sums_into(N: FloatArray, sums: Sums) -> None:
 @inline
 def _image_row(
     t: _Vec3, t_depth: _Vec3, pixel: float, inverse_depth: float, turn: FloatArray, e: float
-) -> Row:
+) -> _Row:
     """Velocities of one image coordinate under the six motions, [RH00] eq. (7), and its residual.
 
     t, t_depth : numerator and denominator of the coordinate under the translations.

@@ -276,7 +276,7 @@ def _of_one_object(
 
 
 @dataclass(frozen=True, eq=False)
-class CarriedGoal:
+class _CarriedGoal:
     """Goal of the tool after the displacement of the object that it was taught on, with its errors."""
 
     s: FloatArray  # (V, m, 2) px of the markers of the tool, in the order of the calibration
@@ -373,7 +373,7 @@ class DisplacedObject:
             _fit=fit,
         )
 
-    def carry(self, goal: Look | FloatArray) -> CarriedGoal:
+    def carry(self, goal: Look | FloatArray) -> _CarriedGoal:
         """Carry a goal of the tool along that was taught at the first look.
 
         goal : images (V, m, 2) of the markers of the tool there, px, in the order of the calibration; NaN
@@ -412,7 +412,7 @@ class DisplacedObject:
         changes = np.concatenate([by_now @ xi, by_goal @ goal_s, of_calibration, bent], axis=1)
         pose = by(generators(rig.turns, placed[:, :3].mean(axis=0)), placed, np.eye(4))
         pose_changes = np.linalg.pinv(pose) @ changes
-        return CarriedGoal(
+        return _CarriedGoal(
             s=s,
             changes=changes.T.reshape(-1, *s.shape),
             H=np.linalg.inv(rig.G) @ H @ rig.G,

@@ -18,14 +18,14 @@ from projservo_cli.task.trajectory import NO_REFERENCE, Reference
 # Index of the centre if it is the mean of all markers.
 MIDPOINT = -1
 # Offset across the longest one, over its length, below which markers lie on one line.
-ON_A_LINE = 1e-6
+_ON_A_LINE = 1e-6
 # No axis, in a search for the longest offset.
 _NO_AXIS: Vec4 = (0.0, 0.0, 0.0, 0.0)
 
 # Codes of the check of a task's images: no problem.
 FOUND = 0
 # A marker cannot be triangulated.
-NO_POINT = 1
+_NO_POINT = 1
 # The markers lie on one line.
 ONE_LINE = 2
 # A camera sees other sides of the face at start and goal.
@@ -55,7 +55,7 @@ _MISFIT = (
     "point with control.features: points"
 )
 _PROBLEMS = {
-    NO_POINT: stereo.NO_POINT,
+    _NO_POINT: stereo.NO_POINT,
     _OTHER_SIDE: _SIDES,
     ONE_LINE: "the face markers lie on one line: choose markers.face that span a plane",
     NOT_UNIQUE: "the joint motion of the task is not unique at the start: the robot is near a singularity or "
@@ -126,7 +126,7 @@ def order_into(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     middle = center_of(A, MIDPOINT)
     x_axis = _longest_offset(A, middle, _NO_AXIS)
     y_axis = _longest_offset(A, middle, x_axis)
-    if not dot(y_axis, y_axis) > ON_A_LINE * ON_A_LINE * dot(x_axis, x_axis):
+    if not dot(y_axis, y_axis) > _ON_A_LINE * _ON_A_LINE * dot(x_axis, x_axis):
         return False
     x_axis, y_axis = unit(x_axis), unit(y_axis)
     for k in range(m):
@@ -199,7 +199,7 @@ def task_into(
     if lost < 0:
         lost = points_into(model.P, task.pair, task.F, model.a_inf, images[1], task.A_star)
     if lost >= 0:
-        return NO_POINT, lost
+        return _NO_POINT, lost
     if not order_into(task.A_star, task.order, angle):
         return ONE_LINE, 0
     if task.body.M.shape[0] > 0:  # the body determines the plane better than points do edge-on

@@ -43,7 +43,7 @@ _STEPS, _STRIDE, _SETTLED, _SINGULAR = 50, 0.5, 1e-12, 1e-9
 _FAR, _NUDGE = 1e6, 0.1
 
 # Measure (p, 6) of motions (6, 4, 4) of points (m, 4).
-Moved = Callable[[FloatArray, FloatArray], FloatArray]
+_Moved = Callable[[FloatArray, FloatArray], FloatArray]
 Flat = tuple[tuple[int, ...], ...]  # positions of markers in the body; a point is the middle of some
 
 
@@ -88,7 +88,7 @@ class Incidences(NamedTuple):
 _SCENE, _SENSE, _OFFSET, _GROUP, _WEIGHT = 4, 8, 9, 10, 11
 # Columns of the senses after those of the tool and the scene, and entries of the sight after the plane.
 _IS_PLANE, _TURN_PX = 8, 9
-VIEWS_USED, SHOWN = 4, 5
+_VIEWS_USED, SHOWN = 4, 5
 NO_INCIDENCES = Incidences(rows=np.zeros((0, _WEIGHT)), senses=np.zeros((0, 10)), sight=np.zeros(5))
 
 
@@ -136,7 +136,7 @@ def image_error(incidences: Incidences, H: Mat4, H_back: Mat4) -> float:
             moved = apply(H, vec(sense))
         if dot(moved, vec(sense[_SCENE:])) < 0.0:
             total += sense[_TURN_PX] * sense[_TURN_PX]
-    return math.sqrt(total / incidences.sight[VIEWS_USED])
+    return math.sqrt(total / incidences.sight[_VIEWS_USED])
 
 
 @njit
@@ -229,10 +229,10 @@ def _directions(points: FloatArray) -> FloatArray:
     return np.asarray(points[1:] - points[0])
 
 
-Row = tuple[FloatArray, FloatArray, float, float]  # of the tool, of the scene, sense, offset
+_Row = tuple[FloatArray, FloatArray, float, float]  # of the tool, of the scene, sense, offset
 
 
-def _incident(tool: FloatArray, scene: FloatArray, dual_of: FloatArray, own_dual: FloatArray) -> list[Row]:
+def _incident(tool: FloatArray, scene: FloatArray, dual_of: FloatArray, own_dual: FloatArray) -> list[_Row]:
     """Rows that put the points (k, 4) of the smaller feature on the planes that hold the other.
 
     dual_of, own_dual : points that span the feature of the scene and that of the tool.
@@ -242,7 +242,7 @@ def _incident(tool: FloatArray, scene: FloatArray, dual_of: FloatArray, own_dual
     return [(b, A, -1.0, 0.0) for A in scene for b in null_space(own_dual).T]
 
 
-def _rows(one: Incidence, model: Model, tool: FloatArray, scene: FloatArray) -> list[Row]:
+def _rows(one: Incidence, model: Model, tool: FloatArray, scene: FloatArray) -> list[_Row]:
     """Rows of an incidence between features that points (k, 4) at the reference and (l, 4) span."""
     if one.relation == MEET:
         return _incident(tool, scene, scene, tool)
@@ -292,7 +292,7 @@ def incidences_of(model: Model, body: Body, H_taught: FloatArray, asked: Sequenc
     return NO_INCIDENCES._replace(rows=np.array(rows), senses=np.concatenate(senses))
 
 
-def unweighted(incidences: Incidences) -> Incidences:
+def _unweighted(incidences: Incidences) -> Incidences:
     """Return the rows with errors of their own scale."""
     return incidences.weighing(np.eye(len(incidences.rows)))
 
@@ -303,7 +303,7 @@ def _motions(body: Body, H: FloatArray) -> FloatArray:
     return np.asarray(H @ np.concatenate([shifts, body.H_hat]) @ np.linalg.inv(H))
 
 
-def image_velocities(model: Model, shows: BoolArray) -> Moved:
+def image_velocities(model: Model, shows: BoolArray) -> _Moved:
     """Return the images (p, 6) of shown markers (V, m) by motions of a body, px, to measure these by."""
 
     def moved(M: FloatArray, motions: FloatArray) -> FloatArray:
@@ -328,7 +328,7 @@ def weighted(
     """
     motions = _motions(body, H)
     J = image_velocities(model, shows)(body.M @ H.T, motions)
-    _, B = linearized(unweighted(incidences), H, motions)
+    _, B = linearized(_unweighted(incidences), H, motions)
     if np.linalg.matrix_rank(J) < COORDINATES:
         raise WorkFailed("the images at the goal do not determine the pose of the body: show more markers")
     half = B @ np.linalg.pinv(J)
@@ -367,13 +367,13 @@ def _turn_px(sense: FloatArray, H: FloatArray, turns: FloatArray, J: FloatArray)
     return math.pi * float(np.sqrt(np.mean(np.sum((J @ across.T) ** 2, axis=0))))
 
 
-def nearest_goal(incidences: Incidences, body: Body, H: FloatArray, moved: Moved) -> FloatArray:
+def nearest_goal(incidences: Incidences, body: Body, H: FloatArray, moved: _Moved) -> FloatArray:
     """Displacement (4, 4) near H at which all incidences hold, by Gauss and Newton.
 
     moved : measures motions of the body; each step is the least of those that meet the incidences.
     Incidences that contradict each other leave an error, as of ``image_error``.
     """
-    rows = incidences if rank_of(incidences) else unweighted(incidences)
+    rows = incidences if rank_of(incidences) else _unweighted(incidences)
     for _ in range(_STEPS):
         motions = _motions(body, H)
         J = moved(body.M @ H.T, motions)

@@ -197,7 +197,7 @@ def check_model(solution: Solution, errors: Errors, sigma_px: float) -> ModelChe
 
 
 @dataclass(frozen=True, eq=False)
-class Assessment:
+class _Assessment:
     """Excitation and noise of each joint, and whether the calibration is usable."""
 
     span: FloatArray  # (n,) range in the data, rad or m
@@ -217,7 +217,7 @@ def assess(
     rejected: tuple[int, int, int],
     suspicion: str,
     max_predicted_px: float = np.inf,
-) -> Assessment:
+) -> _Assessment:
     """Assess a fit.
 
     errors : of its parameters; None for the closed form, which has none.
@@ -265,7 +265,7 @@ def assess(
     if errors is None and warned:
         # A method for comparison returns its result all the same.
         short = f"the closed_form method explains the images only to {found}"
-        return Assessment(
+        return _Assessment(
             span, noise, error, None, False, f"{short}, {share:.3g} times {wanted}: use bundle_adjustment", ()
         )
     reason = f"residuals of {found} agree with {wanted}"
@@ -312,7 +312,7 @@ def assess(
         advice.append(f"{times} a marker was seen under the number of another: check the numbering")
     if outliers and not many:
         advice.append(outlier_advice)
-    return Assessment(span, noise, error, check, usable, f"{reason}; limited by {limit}", tuple(advice))
+    return _Assessment(span, noise, error, check, usable, f"{reason}; limited by {limit}", tuple(advice))
 
 
 def _describe_joint_noise(solution: Solution) -> str:

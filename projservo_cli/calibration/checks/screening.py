@@ -23,7 +23,7 @@ _FENCE = 3.0
 _EXAMPLES = 3
 
 
-class Screening(NamedTuple):
+class _Screening(NamedTuple):
     """A recording without placeholders and unseen poses, and the findings."""
 
     observation: Observation
@@ -33,7 +33,7 @@ class Screening(NamedTuple):
     advice: tuple[str, ...]  # a line for each kind that was found
 
 
-def screened(observation: Observation, joint_types: str) -> Screening:
+def screened(observation: Observation, joint_types: str) -> _Screening:
     """Empty placeholders, drop poses that nobody saw, and unwrap readings; one letter a joint, R or P.
 
     Raises InputError if the arrays do not fit each other.
@@ -62,7 +62,7 @@ def screened(observation: Observation, joint_types: str) -> Screening:
                 f"readings of joint {i + 1} pass {end}° to {end - 358}°: taken as {first:.4g}° to "
                 f"{last:.4g}° (a range of {last - first:.3g}°, as given {high - low:.3g}°)",
             )
-    return Screening(dataclasses.replace(kept, q=q), unseen, count, np.array(joints, dtype=np.int64), advice)
+    return _Screening(dataclasses.replace(kept, q=q), unseen, count, np.array(joints, dtype=np.int64), advice)
 
 
 def _turns(q: FloatArray) -> FloatArray:

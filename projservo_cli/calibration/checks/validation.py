@@ -97,13 +97,13 @@ def cross_validate(
 
     residual, predicted, failed = _of_parts(solution, part, sigma_px, on_fold)
     distance = np.linalg.norm(residual, axis=3)
-    statistics = distance_statistics(distance[np.isfinite(distance)])
+    statistics = _distance_statistics(distance[np.isfinite(distance)])
     expected = _expected_px(predicted)
     of_blocks: dict[str, Any] = {}
     for name in names:
         apart, spread, _ = _of_parts(solution, _blocks(detections, folds, name), sigma_px, on_fold)
         length = np.linalg.norm(apart, axis=3)
-        of_blocks[f"{name}_rms_px"] = distance_statistics(length[np.isfinite(length)])["rms_px"]
+        of_blocks[f"{name}_rms_px"] = _distance_statistics(length[np.isfinite(length)])["rms_px"]
         of_blocks[f"{name}_predicted_px"] = _expected_px(spread)
     others = np.array([_of_others(solution, v, part, residual, sigma_px, on_fold) for v in alone])
     spoilt = _describe_others(detections.view, others) if len(others) else ""
@@ -310,7 +310,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     seen: BoolArray = np.asarray(np.isfinite(images).all(axis=-1))
     ahead = np.isfinite(pixels[..., 0])
     compared = seen[:, :, known] & ahead
-    found = distance_statistics(np.linalg.norm((pixels - observation.images[:, :, known])[compared], axis=1))
+    found = _distance_statistics(np.linalg.norm((pixels - observation.images[:, :, known])[compared], axis=1))
     stated = noise = limit = None
     if found["count"] and np.isfinite(calibration.sqrt_cov_shared).all():
         of_pairs = prediction_variance(calibration, observation.q).sum(axis=-1)[:, :, order][compared]
@@ -369,7 +369,7 @@ def _image_noise(calibration: Calibration, observation: Observation) -> float:
     return float(np.sqrt(2.0)) * sigma
 
 
-def distance_statistics(distance: FloatArray) -> dict[str, Any]:
+def _distance_statistics(distance: FloatArray) -> dict[str, Any]:
     """``count``, ``rms_px``, ``median_px``, ``p95_px`` of distances (L,), the last three None without one."""
     some = distance.size > 0
     return {

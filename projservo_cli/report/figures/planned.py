@@ -212,7 +212,7 @@ def _signed(value: float, decimals: int = 1) -> str:
     return f"{value:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
 
 
-STEEP = 0.35  # share of the path at which the steep profile has done the translation
+_STEEP = 0.35  # share of the path at which the steep profile has done the translation
 _FACES = 9
 _MIDDLE = "rig's centre"
 _NODES = 81
@@ -220,7 +220,7 @@ _TURNS = 41  # shares μ_p tried at each μ_t, μ_r
 _TICKS = 11  # points at equal steps of σ on the path
 _WIDE = 4.0  # margins beyond are drawn in powers of ten
 _LEVELS = [0.25, 0.5, 0.75, *(c * 2.0**k for k in range(12) for c in (1.0, 1.5))]  # of contours of a margin
-LABEL = 0.05  # room that the number on a contour needs, in shares
+_LABEL = 0.05  # room that the number on a contour needs, in shares
 _SIGMA, _SHARE = r"path parameter $\sigma$ (1)", r"share $\mu$ (1)"
 _SHARES = (  # equal shares lie on one another: the wider shows beneath
     style.line(style.SKY, width=3.0, label=r"$\mu_t$"),
@@ -251,7 +251,7 @@ def _data_steep(report_data: ReportData) -> Data:
     """The same task with linear shares of the rotations and a steep one of the translation."""
     plan, model = report_data.plan, report_data.calibrated
     mu = np.stack(
-        [np.minimum(plan.path_parameter / STEEP, 1.0), plan.path_parameter, plan.path_parameter], axis=1
+        [np.minimum(plan.path_parameter / _STEEP, 1.0), plan.path_parameter, plan.path_parameter], axis=1
     )
     amplitudes = (plan.tau, plan.theta_r, plan.theta_p)
     H_d = np.array([trajectory_displacement(plan.H_hat, amplitudes, row) for row in mu])
@@ -274,7 +274,7 @@ def _rendered(
     faces, where = s[:, 0], f"{report_data.view[0]} camera"
     with suppress(WorkFailed):
         if len(P) > 1:
-            camera = middle_camera(P, report_data.plant.image_size.mean(axis=0))
+            camera = _middle_camera(P, report_data.plant.image_size.mean(axis=0))
             points = np.array([triangulate_points(P, METRIC_A_INF, row) for row in s])
             if (points @ camera[2] > 0.0).all():
                 faces, where = project(camera[None], points)[0], _MIDDLE
@@ -289,7 +289,7 @@ def _rendered(
     }
 
 
-def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
+def _middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
     """Camera (3, 4) amid metric cameras (V, 3, 4), looking along the roll axis of the rig, px.
 
     Its focal length is their mean, its principal point the middle of the image.
@@ -479,6 +479,6 @@ def _clear(contours: Any, lines: FloatArray) -> list[FloatArray]:
         taken = np.concatenate([lines, np.reshape(positions, (-1, 2))])
         room = np.linalg.norm(piece[:, None] - taken, axis=2).min(axis=1)
         room = np.minimum(room, np.minimum(piece, 1.0 - piece).min(axis=1))
-        if room.max() > LABEL:
+        if room.max() > _LABEL:
             positions.append(piece[room.argmax()])
     return positions

@@ -69,7 +69,7 @@ def standing(robot: SerialArm, plant: Plant, q: FloatArray) -> tuple[FloatArray,
     arm = robot.model(plant.model.P)
     moved, still = forward_kinematics(arm, q), np.eye(4)
     tool = (moved @ robot.base_tool)[:3, 3]
-    polyline = skeleton(joint_operators(arm, q), robot.prismatic, tool)
+    polyline = _skeleton(joint_operators(arm, q), robot.prismatic, tool)
     return polyline, *((still, moved) if plant.model.on_tool else (moved, still))
 
 
@@ -110,7 +110,7 @@ def features_in_space(plant: Plant, traces: Mapping[str, Trace]) -> tuple[FloatA
     return tool, scene
 
 
-def skeleton(H_hat: FloatArray, prismatic: BoolArray, tool: FloatArray) -> FloatArray:
+def _skeleton(H_hat: FloatArray, prismatic: BoolArray, tool: FloatArray) -> FloatArray:
     """Points (k, 3) of a polyline from the base over all revolute axes to the tool, m.
 
     From each point the perpendicular is dropped onto the next axis, known by the metric operators
@@ -334,7 +334,7 @@ def _data_metric(report_data: Fit) -> Data:
         "position_std_mm": metric.position_std(q),
         "semi_axes": semi_axes,
         "factor": np.array(style.magnification(float(radius.max()), _ELLIPSOID_SIZE * extent)),
-        "robot": skeleton(joint_operators(arm, q[0]), arm.prismatic, tools[0]),
+        "robot": _skeleton(joint_operators(arm, q[0]), arm.prismatic, tools[0]),
         "pyramids": _pyramids(metric.cameras(q[0]), _rectangle(low, high), seen),
         "view": np.array(metric.view),
     }
