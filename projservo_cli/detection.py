@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from projservo_cli.calibration.checks.board_numbering import numberings
 from projservo_cli.records import (
     CORNERS,
     BoolArray,
@@ -24,6 +23,7 @@ from projservo_cli.records import (
     JointList,
     Observation,
     WorkFailed,
+    board_numberings,
 )
 
 DICTIONARY = "4X4_50"
@@ -690,10 +690,8 @@ class BoardFinder(Finder):
         """Return the board numbered from the end that moved least since the frame before."""
         if not tags or not before or not self.board.symmetric:
             return tags
-        found = tags[0]
-        ends = [
-            Corners(found.pixels[k], found.sigma[k], found.clean[k]) for k in numberings(*self.board.shape)
-        ]
+        found, numberings = tags[0], board_numberings(*self.board.shape)
+        ends = [Corners(found.pixels[k], found.sigma[k], found.clean[k]) for k in numberings]
         far = [np.nanmedian(np.linalg.norm(end.pixels - before[0].pixels, axis=1)) for end in ends]
         return {0: ends[int(np.argmin(far))]}
 

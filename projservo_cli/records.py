@@ -115,6 +115,12 @@ class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming err
         self.refutes = refutes
 
 
+def board_numberings(rows: int, columns: int) -> IntArray:
+    """Indices (g, N) of the corners of a board by each numbering of it turned, the first as it is."""
+    index = np.arange(rows * columns).reshape(rows, columns)
+    return np.stack([np.rot90(index, k).ravel() for k in range(0, 4, 1 if rows == columns else 2)])
+
+
 def no_lenses(views: int) -> FloatArray:
     """Lenses (V, 5) that do not distort."""
     return np.tile([0.0, 0.0, 1.0, 0.0, 0.0], (views, 1))

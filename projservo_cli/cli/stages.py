@@ -1,7 +1,7 @@
 """Commands of the stages and of their chain: dry run, work, summary."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,67 @@ from projservo_cli.cli.program import FAILED, main
 
 if TYPE_CHECKING:
     from projservo_cli.chain import Chain
+    from projservo_cli.config import Config
+    from projservo_cli.store import Run
 
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
 _AGAIN = ", and the robot is not moved: --force records all poses again"
+_TRIALS = "trials.csv"  # in the folder of a run: the default table of a recording
 _UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")  # by the report of a sweep
+
+
+_OF_STAGES = (
+    option.configuration(
+        help="Configuration (YAML). Default: the one stored in the run that -o names, else paper.yaml."
+    ),
+    option.override,
+    option.output(
+        metavar="DIR", help="Folder of the run, or its run.h5. Default: results/<configuration name>."
+    ),
+    click.option("--data", metavar="TABLE", type=click.Path(), help="Calibrate from this table (CSV)."),
+    click.option(
+        "--readings",
+        metavar="TABLE",
+        type=click.Path(),
+        help="Joints of each pose (CSV), where --data lists detections: pose, camera, marker, u, v.",
+    ),
+    click.option(
+        "--mount",
+        type=click.Choice(["world", "tool"]),
+        help="Where the table's cameras are: they stand still, or are on the tool. Default: world.",
+    ),
+    click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
+    option.joint_unit(help="Unit of the table's revolute joints. Default: rad."),
+    click.option(
+        "--noise-px", metavar="S", type=option.NUMBER, help="Pixel noise of the table. Default: estimated."
+    ),
+    click.option(
+        "--lens", is_flag=True, help="Estimate radial lens distortion, and its centre where it shows."
+    ),
+    click.option(
+        "--joint-model",
+        metavar="auto|LIST",
+        help="Fit curves of the joints: those that the images show, or of scale, quadratic, cubic, harmonic, "
+        "coupling, sag, such as scale:2,sag.",
+    ),
+    click.option(
+        "--image-size",
+        metavar="WxH[,WxH]",
+        help="Size of the images, px, or of the left and the right ones. Default: that of cameras or rig.",
+    ),
+    option.force(help="Make the named stages even where they are up to date."),
+    option.dry_run,
+    option.threads(help="Threads. Default: all processors."),
+    option.explained,
+    click.pass_obj,  # the names of the stages of the call
+)
+
+
+def _of_stages(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a stage the options of all stages, its console, and the names of the stages of the call."""
+    for decorate in reversed(_OF_STAGES):
+        function = decorate(function)
+    return function
 
 
 def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
@@ -137,7 +194,7 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
     metavar="NAME",
     help="Fit this camera of RUN, which moved, again by the images in --data; -o is another run.",
 )
-@option.of_stages
+@_of_stages
 def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Learn the projective kinematics from trial motions.
 
@@ -159,7 +216,7 @@ def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
 
 
 @main.stage("plan", epilog="Example: projservo plan -c configs/ur5.yaml --set trajectory.profile=exponential")
-@option.of_stages
+@_of_stages
 def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Plan the task as a translation and two rotations.
 
@@ -199,7 +256,7 @@ def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
     metavar="SWEEP:INDEX",
     help="The run of that number of a sweep, repeated as a separate run.",
 )
-@option.of_stages
+@_of_stages
 def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Run the control laws in closed loop.
 
@@ -223,7 +280,7 @@ def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
 @click.option(
     "--animation", is_flag=True, help="Both camera images under several laws over time, animation.gif."
 )
-@option.of_stages
+@_of_stages
 def _report(stages: Sequence[str], console: Console, *, run: Path | None, **options: Any) -> int:
     """Draw the figures and check the paper's claims.
 
@@ -295,7 +352,7 @@ def _asked(
     from projservo_cli.config import Override
 
     laws, records = _law_names(options.get("laws", ())), "record" in names
-    config, stored = option.resolve(options, recording=records)
+    config, stored = _resolve(options, recording=records)
     if options.get("suggest") is not None and config.calibration.method != "bundle_adjustment":
         raise click.UsageError(
             f"--suggest: the method {config.calibration.method} has no covariance to judge poses by; "
@@ -312,6 +369,95 @@ def _asked(
         named = {kind for kind, those in _NAMING.items() if options["config"] or keys & those}
         chain.require_permitted(named | ({"law"} if laws else set()))
     return chain
+
+
+def _resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Config", "Run"]:
+    """The configuration with all overrides, and the run as stored so far.
+
+    A table next to the run, or the one that a ``recording`` puts there, is that of the configuration unless
+    it names another.
+    """
+    from projservo_cli.config import Override, load_config, to_yaml
+    from projservo_cli.store import stored
+
+    if options.get("origin") is not None:
+        return _from_sweep(options)
+    if options.get("refit") is not None:
+        return _of_refit(options)
+    run = stored(options["output"]) if options["output"] else None
+    if not options["config"] and run is not None and run.configuration:
+        config = load_config(run.path, option.overrides(options), text=run.configuration)
+    elif not options["config"] and options["data"]:
+        config = load_config(None, option.overrides(options))
+    else:
+        config = option.configured(options["config"], options)
+    run = run or _run_of(options, config)
+    table = run.path.resolve().with_name(_TRIALS)
+    if config.data is None and (recording or table.is_file()):
+        in_folder = Override(f"{table}", "data.table", str(table))
+        config = load_config(config.name, [in_folder], text=to_yaml(config))
+    return config, run
+
+
+def _of_refit(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
+    """Configuration of a run with a camera fitted again, and another run that holds its calibration."""
+    from projservo_cli.config import Override, load_config, stored_yaml
+    from projservo_cli.store import Run, load, run_path, stored
+
+    flag, before = f"--refit {options['refit']}", load(options["run"])
+    if not options["data"] or not options["output"]:
+        raise click.UsageError(f"{flag}: takes --data TABLE, images by that camera, and -o, another run")
+    if run_path(options["output"]).resolve() == before.path.resolve():
+        raise click.UsageError(f"{flag}: -o {options['output']} is the run itself; name another")
+    for name in ("config", "mount", "joints", "noise_px", "lens", "init", "cross_validate", "image_size"):
+        if options[name]:
+            text = f"that of {before.path.parent} stands; leave it out"
+            raise click.UsageError(f"--{name.replace('_', '-')} and {flag}: {text}")
+    if options["refit"] not in before.calibration.view:
+        raise click.UsageError(f"{flag}: the cameras are {', '.join(before.calibration.view)}")
+    result, files = before.results["calibrate"], {"table": options["data"], "readings": options["readings"]}
+    one = {name: os.path.abspath(file) for name, file in files.items() if file}
+    one |= {"view": options["refit"], "joint_unit": options["joint_unit"]}
+    settings = load_config(before.path, text=result.configuration).calibration.model_dump(mode="json")
+    refits = Override(flag, "calibration.refits", [*settings["refits"], one])
+    sets = map(Override.parse, options["sets"])
+    config, run = (
+        load_config(before.path, [refits, *sets], text=result.configuration),
+        stored(options["output"]),
+    )
+    if run.configuration != stored_yaml(config):
+        run = Run(run.path, run.configuration, {"calibrate": result})
+    return config, run
+
+
+def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
+    """Configuration of a run of a sweep, and a run that holds the calibration it was made with."""
+    from projservo_cli.config import load_config, to_yaml
+    from projservo_cli.store import Run
+    from projservo_cli.sweeps.folder import run_of
+
+    if options["config"]:
+        raise click.UsageError("-c and --from: the configuration is that of the sweep; leave -c out")
+    config, calibration = run_of(options["origin"])
+    if overrides := option.overrides(options):
+        config = load_config(config.name, overrides, text=to_yaml(config))
+    run = _run_of(options, config)
+    before = run.results.get("calibrate")
+    if calibration is not None and (before is None or before.key != calibration.key):
+        run = Run(run.path, run.configuration, {"calibrate": calibration})
+    return config, run
+
+
+def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
+    """The run where the user says, else in the folder of the configuration's name; empty where none is."""
+    from projservo_cli.files import require_inside
+    from projservo_cli.store import stored
+
+    folder = options["output"]
+    if not folder:
+        folder = option.RESULTS / config.name
+        require_inside(folder, option.RESULTS)
+    return stored(folder)
 
 
 def _require_optional(config: Any, wanted: Sequence[str]) -> None:

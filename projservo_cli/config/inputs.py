@@ -22,7 +22,7 @@ from projservo_cli.records import CORNERS, TOOL, InputError
 from projservo_cli.result_hashes import File
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
-from projservo_cli.settings.features import incidence_of
+from projservo_cli.settings.features import Feature, Pair
 from projservo_cli.settings.objects import ObjectSettings
 from projservo_cli.simulation.described import (
     arm_of,
@@ -58,6 +58,7 @@ from projservo_cli.stages.stage_inputs import (
     Trials,
 )
 from projservo_cli.store.observation_tables import identity_in
+from projservo_cli.task.incidences import ANGLE, MEET, PARALLEL, PERPENDICULAR, Incidence
 from projservo_cli.task.stand_off import StandOff
 
 _RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults
@@ -228,10 +229,21 @@ def plan_inputs(config: Config, files: Files | None = None, *, predicted: bool =
         tests_images=config.stop.innovation_threshold > 0.0,
         trajectory=config.trajectory,
         lengths=markers.lengths(face),
-        incidences=tuple(incidence_of(pair, config.features) for pair in pairs),
+        incidences=tuple(_incidence(pair, config.features) for pair in pairs),
         carrier=_carrier(config, files),
         displaced=_displacement(config),
     )
+
+
+def _incidence(pair: Pair, features: Mapping[str, Feature]) -> Incidence:
+    """Return a pair of features, as messages and figures write it, with the numbers of its markers."""
+    relation = pair[2] if len(pair) == 3 else MEET
+    tool, scene = (features[name].flat(features) for name in pair[:2])
+    between = {MEET: "on", PARALLEL: "parallel to", PERPENDICULAR: "perpendicular to"}
+    name = f"{pair[0]} {between.get(str(relation), f'at {relation} deg to')} {pair[1]}"
+    if isinstance(relation, str):
+        return Incidence(name, tool, scene, relation)
+    return Incidence(name, tool, scene, ANGLE, float(relation))
 
 
 def _displacement(config: Config) -> StandOff | None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from projservo_cli.calibration import predict
+from projservo_cli.calibration.prediction import predict
 from projservo_cli.records import Calibration, FloatArray
 
 # Starts from which joints are sought; how near they must come, and how far off points behind cameras are, px.

@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.calibration import Nominal, Solution, calibrate, cross_validate
 from projservo_cli.calibration.checks.board_numbering import BoardNumbering
 from projservo_cli.calibration.checks.screening import screened
 from projservo_cli.calibration.checks.undecided import undecided_pairs
+from projservo_cli.calibration.checks.validation import cross_validate
+from projservo_cli.calibration.initialization import Nominal
+from projservo_cli.calibration.pipeline import calibrate
 from projservo_cli.calibration.refit import refit, since_moved
+from projservo_cli.calibration.robust_fit import Solution
 from projservo_cli.files import write_whole
 from projservo_cli.geometry.lens import K1
 from projservo_cli.nominal import read_nominal

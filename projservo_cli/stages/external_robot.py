@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from projservo_cli import plugins
-from projservo_cli.calibration import predict
+from projservo_cli.calibration.prediction import predict
 from projservo_cli.detection import finder_of
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.hardware.camera_robot import Arm, CameraRobot

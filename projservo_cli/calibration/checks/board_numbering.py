@@ -17,7 +17,15 @@ from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.calibration.single_view import moved_plane
 from projservo_cli.geometry.displacements import homogeneous
-from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation, WorkFailed
+from projservo_cli.records import (
+    BoolArray,
+    Calibration,
+    FloatArray,
+    IntArray,
+    Observation,
+    WorkFailed,
+    board_numberings,
+)
 
 # Minimum number of rows and of columns of a grid: four points lie on any.
 _LEAST_SIDE = 3
@@ -33,12 +41,6 @@ _MUCH_NOISE_PX = 1.0
 _MAX_LOOKS = 2
 # Noise of a geometry, or median error of an image, over that as numbered, up to which another one holds.
 _DECIDED = 0.25
-
-
-def numberings(rows: int, columns: int) -> IntArray:
-    """Indices (g, N) of the corners of a board by each numbering of it turned, the first as it is."""
-    index = np.arange(rows * columns).reshape(rows, columns)
-    return np.stack([np.rot90(index, k).ravel() for k in range(0, 4, 1 if rows == columns else 2)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,7 @@ class _Grid:
     @property
     def numberings(self) -> IntArray:
         """Indices (g, N) of the corners by each numbering."""
-        return numberings(self.rows, self.columns)
+        return board_numberings(self.rows, self.columns)
 
     @property
     def places(self) -> FloatArray:
