@@ -22,25 +22,11 @@ from projservo_cli.config.inputs import (
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.laws import CODES, POINT_LAWS, law_and_mode, must_converge, run_name
 from projservo_cli.progress import Listener
-from projservo_cli.records import (
-    Action,
-    FloatArray,
-    InputError,
-    JointList,
-    Plan,
-    WorkFailed,
-)
+from projservo_cli.records import Action, FloatArray, InputError, JointList, Plan, WorkFailed
 from projservo_cli.result_hashes import digest
 from projservo_cli.settings.task import TaskStep
 from projservo_cli.stages.stage_inputs import CarryingObject, PlanInputs, ServoInputs
-from projservo_cli.steps import (
-    STAGES,
-    Step,
-    inputs_of,
-    key_of_calibration,
-    result_of,
-    steps_for,
-)
+from projservo_cli.steps import STAGES, Step, inputs_of, key_of_calibration, result_of, steps_for
 from projservo_cli.store import SERVO, Run, save
 
 if TYPE_CHECKING:

@@ -17,12 +17,7 @@ from projservo_cli.files import working_in
 from projservo_cli.image_size import image_sizes
 from projservo_cli.laws import CODES, mode_in
 from projservo_cli.progress import Listener
-from projservo_cli.records import (
-    Calibration,
-    InputError,
-    Observation,
-    WorkFailed,
-)
+from projservo_cli.records import Calibration, InputError, Observation, WorkFailed
 from projservo_cli.results import HeldOutErrors, ImageModel, MotionPlan, PlanScene, RunTrace, WrittenReport
 from projservo_cli.stages import Progress
 from projservo_cli.steps import STAGES

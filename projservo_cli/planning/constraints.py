@@ -39,14 +39,7 @@ from projservo_cli.planning.margins import (
     straight_pixel,
     tag_planes,
 )
-from projservo_cli.records import (
-    NO_SPREAD,
-    FloatArray,
-    IntArray,
-    JointLimits,
-    Model,
-    Spread,
-)
+from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, JointLimits, Model, Spread
 from projservo_cli.task.face import Task, center_of, face_plane
 
 # Required fraction of the margins of start and goal near them.

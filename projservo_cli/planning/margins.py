@@ -29,18 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import (
-    Mat4,
-    Vec4,
-    apply,
-    axpy,
-    dot,
-    mat,
-    mat_into,
-    meet,
-    mul,
-    vec,
-)
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mat_into, meet, mul, vec
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
 from projservo_cli.geometry.kinematics import (

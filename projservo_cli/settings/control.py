@@ -10,15 +10,7 @@ from pydantic_core import PydanticCustomError
 from projservo_cli import plugins
 from projservo_cli.laws import LAW_SPECS, LAWS, mode_in
 from projservo_cli.settings.disturbance import Delays
-from projservo_cli.settings.sections import (
-    Count,
-    Finding,
-    NotNegative,
-    Number,
-    Positive,
-    Section,
-    Whole,
-)
+from projservo_cli.settings.sections import Count, Finding, NotNegative, Number, Positive, Section, Whole
 
 
 def _law(name: str) -> str:

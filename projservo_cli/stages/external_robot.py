@@ -26,13 +26,7 @@ from projservo_cli.robots.settings import Joints
 from projservo_cli.robots.standstill import STILL, Standstill, at_rest
 from projservo_cli.settings.disturbance import EachView, Events
 from projservo_cli.simulation.analytic_plant import Plant, observe
-from projservo_cli.simulation.faults import (
-    FaultyRobot,
-    Points,
-    SimulatedRobot,
-    obstruction_of,
-    robot_of,
-)
+from projservo_cli.simulation.faults import FaultyRobot, Points, SimulatedRobot, obstruction_of, robot_of
 from projservo_cli.simulation.streams import SERVO_NOISE
 from projservo_cli.stages.scenario import RunScenario
 from projservo_cli.stages.stage_inputs import Contract, Drive, OwnRobot

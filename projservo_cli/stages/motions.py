@@ -34,15 +34,7 @@ from projservo_cli.planning.rrt_connect import (
     within_region,
 )
 from projservo_cli.planning.time_parameterization import TimedPath, joints_at, minimum_time
-from projservo_cli.records import (
-    LIMITS_MISSING,
-    NO_SPREAD,
-    FloatArray,
-    Model,
-    Plan,
-    Spread,
-    WorkFailed,
-)
+from projservo_cli.records import LIMITS_MISSING, NO_SPREAD, FloatArray, Model, Plan, Spread, WorkFailed
 from projservo_cli.settings.task import Trajectory
 from projservo_cli.stages.plan_summary import sight_words, verdict_of
 from projservo_cli.stages.scenario import Scenario

@@ -22,14 +22,7 @@ from projservo_cli.calibration.detections import (
 from projservo_cli.calibration.joint_noise import quantile
 from projservo_cli.calibration.prediction import Parameters
 from projservo_cli.calibration.robust_fit import Expected, Solution
-from projservo_cli.records import (
-    BoolArray,
-    Errors,
-    FloatArray,
-    IntArray,
-    WorkFailed,
-    apart,
-)
+from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed, apart
 
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is undetermined.
 UNDETERMINED_NOISE = 1000.0

@@ -15,11 +15,7 @@ from projservo_cli.calibration.detections import Detections
 from projservo_cli.calibration.epipolar import ImageGeometry
 from projservo_cli.calibration.initialization import Search, starting_markers, starts
 from projservo_cli.calibration.lens_estimation import undistorted
-from projservo_cli.calibration.robust_fit import (
-    Expected,
-    Solution,
-    fit_from,
-)
+from projservo_cli.calibration.robust_fit import Expected, Solution, fit_from
 from projservo_cli.records import TOOL, WORLD, BoolArray, FloatArray, WorkFailed, letters_of
 
 # Maximum fitted over expected noise of a fit that rejects much, as wrong detections hide in the residuals.

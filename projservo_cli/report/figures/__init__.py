@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from projservo_cli.records import (
-    Calibration,
-    CrossValidation,
-    Observation,
-    Plan,
-    Trace,
-    position_limits,
-)
+from projservo_cli.records import Calibration, CrossValidation, Observation, Plan, Trace, position_limits
 from projservo_cli.report.figures import (
     calibration,
     errors,

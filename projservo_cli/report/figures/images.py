@@ -11,15 +11,7 @@ from projservo_cli.laws import BODY_LAWS, POINT_LAWS, title_of
 from projservo_cli.loop.verdicts import plateau_stretch
 from projservo_cli.records import ByteArray, FloatArray, IntArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.report_data import (
-    DIRECT,
-    Data,
-    Driven,
-    ReportData,
-    percent,
-    registered,
-    title,
-)
+from projservo_cli.report.report_data import DIRECT, Data, Driven, ReportData, percent, registered, title
 from projservo_cli.task.face import cyclic_order
 
 if TYPE_CHECKING:
