@@ -334,7 +334,9 @@ def _refined(
             suspicion = "outliers"
         require_poses(solution.kept().problem.detections)
         errors = solution.errors()
-        record = _record(Projective.of(solution), solution, expected, errors, found, suspicion, limit_px)
+        record = _record(
+            Projective.of(solution), solution, expected, errors, found, suspicion, limit_px=limit_px
+        )
         if much:
             why = contradiction(whole, solution, found, epipolar, record.predicted_rms_px or 0.0)
             if why or (doubt and share >= _DECISIVE_SHARE):
@@ -403,6 +405,7 @@ def _record(
     errors: Errors | None,
     found: Outliers,
     suspicion: str,
+    *,
     limit_px: float = np.inf,
 ) -> Calibration:
     """Record of a fit in its projective frame.

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.detection import Corners, Finder
-from projservo_cli.hardware.cameras import Camera, Frame
+from projservo_cli.hardware.video_cameras import Frame, VideoCamera
 from projservo_cli.records import ByteArray, FloatArray, WorkFailed
 from projservo_cli.settings.cameras import Cameras
 
@@ -74,7 +74,7 @@ class CameraRobot:
                 setattr(self, name, method)
         now: Callable[[], float] = getattr(arm, "now", time.monotonic)
         self.cameras = [
-            Camera(view, settings, rig.max_age_s, rig.reconnect_s, now)
+            VideoCamera(view, settings, rig.max_age_s, rig.reconnect_s, now)
             for view, settings in rig.sources.items()
         ]
         self.view = tuple(camera.name for camera in self.cameras)

@@ -10,7 +10,7 @@ import numpy as np
 
 from projservo_cli.detection import MIN_CELL, BoardFinder, Corners, Finder, TagFinder, dictionaries
 from projservo_cli.hardware.camera_robot import View, exposure_of
-from projservo_cli.hardware.cameras import Camera, stable_name
+from projservo_cli.hardware.video_cameras import VideoCamera, stable_name
 from projservo_cli.records import CORNERS, BoolArray, ByteArray, FloatArray, JointLimits, in_unit
 
 FAULT, WARNING, FINE = "fault", "warning", "fine"
@@ -50,7 +50,7 @@ class RobotAtRest:
     limits: JointLimits
     units: Sequence[str]  # of the joints, for messages
     views: Sequence[View] = ()  # the last one of each camera of projservo
-    cameras: Sequence[Camera] = ()
+    cameras: Sequence[VideoCamera] = ()
     health: Mapping[str, float | str] = field(default_factory=dict)  # such as the voltage
 
 
@@ -71,7 +71,7 @@ def findings_at_rest(
     yield from _of_joints(robot, FAULT if moves else WARNING)
 
 
-def _of_camera(camera: Camera) -> Iterator[Finding]:
+def _of_camera(camera: VideoCamera) -> Iterator[Finding]:
     """Rate, stamps, exposure and sharpness of a camera."""
     where, grey = f"{camera.name} camera", camera.newest().grey
     rate, asked = camera.rate_hz, camera.settings.rate_hz or _USUAL_HZ

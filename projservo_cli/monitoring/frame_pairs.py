@@ -13,7 +13,7 @@ _TOGETHER_S, _WAITING = 0.025, 25
 _STRAIGHT = 1.0 / 8.0
 
 
-class Frame(NamedTuple):
+class TimedImage(NamedTuple):
     """An image of one view."""
 
     t: float  # when it was taken, s
@@ -47,12 +47,12 @@ class Pairing:
     """Queues of the frames of each view."""
 
     def __init__(self, views: int) -> None:
-        self._waiting = [list[Frame]() for _ in range(views)]
+        self._waiting = [list[TimedImage]() for _ in range(views)]
         self._reached = np.full(views, -np.inf)
         self._start: float | None = None
-        self._last: Frame | None = None
+        self._last: TimedImage | None = None
 
-    def add(self, view: int, frame: Frame) -> None:
+    def add(self, view: int, frame: TimedImage) -> None:
         """Take in a new frame of a view."""
         self._waiting[view].append(frame)
 
@@ -76,7 +76,7 @@ class Pairing:
         earliest = next(filter(None, frames), None)
         return None if earliest is None else self._pair(earliest, frames)
 
-    def _pair(self, frame_now: Frame, frames: list[Frame | None]) -> FramePair:
+    def _pair(self, frame_now: TimedImage, frames: list[TimedImage | None]) -> FramePair:
         """Observation of the frames of all views, at least one of them."""
         every = [frame or frame_now._replace(image=np.full_like(frame_now.image, np.nan)) for frame in frames]
         last, self._last = self._last or frame_now, frame_now

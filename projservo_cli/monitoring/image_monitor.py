@@ -9,7 +9,7 @@ import numpy as np
 from projservo_cli.calibration.detections import even_choice
 from projservo_cli.calibration.prediction import predict
 from projservo_cli.monitoring.accuracy import Posture
-from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing, at_known_markers, mean_image
+from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage, at_known_markers, mean_image
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
     Explanation,
@@ -197,7 +197,7 @@ class ImageMonitor:
             uncertain = max(float(sigma_t[v]), LEAST_ERROR)
             self._pairing.add(
                 int(v),
-                Frame(
+                TimedImage(
                     t=float(t[v]), q=q[v], q_dot=q_dot[v], sigma_t=uncertain, image=images[v], noise=noise[v]
                 ),
             )

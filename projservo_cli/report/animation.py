@@ -19,12 +19,12 @@ from projservo_cli.report import style
 from projservo_cli.report.figures.images import OF_SCENE, OF_TOOL, frames_of, near_pixels, with_halo
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
 from projservo_cli.report.figures.scene import (
-    displaced,
     edges_of,
     features_in_space,
     goal_displacement,
     plant_pyramids,
     standing,
+    transformed,
 )
 from projservo_cli.report.html import html_page
 from projservo_cli.report.report_data import PAGE_FILE, title
@@ -104,16 +104,16 @@ def motion_of(
     rig, goal = plant_pyramids(plant, start), None
     if (displacement := goal_displacement(robot, traces)) is not None:
         gap = np.full((1, 3), np.nan)
-        at_goal = [np.concatenate([edges_of(camera), gap]) for camera in displaced(rig, displacement)]
+        at_goal = [np.concatenate([edges_of(camera), gap]) for camera in transformed(rig, displacement)]
         around = style.closed((face @ displacement.T)[:, :3])
         goal = np.concatenate(at_goal) if plant.model.on_tool else around
     planned = _centers(plant, plan.q[np.isfinite(plan.q).all(axis=1)])
     tool, scene = features_in_space(plant, traces) or np.zeros((2, 0, 3, 3))
-    features = displaced(style.outlines(tool), np.asarray(np.linalg.inv(of_face), dtype=np.float64))
+    features = transformed(style.outlines(tool), np.asarray(np.linalg.inv(of_face), dtype=np.float64))
     runs = {name: _driven(robot, plant, (markers, features), rig, trace) for name, trace in traces.items()}
     edges = () if plan.tree_q is None else tree_edges(plan)
     trees = tuple(with_gaps(_centers(plant, q.reshape(-1, q.shape[-1]))) for q in edges)
-    cameras = displaced(rig, of_rig)
+    cameras = transformed(rig, of_rig)
     return _Motion(
         plan.view, plant.model.on_tool, cameras, start, goal, planned, trees, style.outlines(scene), runs
     )
@@ -142,7 +142,7 @@ def _driven(
     for q in trace.q[instants]:
         polyline, H, of_rig = standing(robot, plant, q)
         face, points = ((M @ H.T)[:, :3] for M in (plant.M[plant.order], markers))
-        positions.append((polyline, face, points, displaced(rig, of_rig), displaced(features, H)))
+        positions.append((polyline, face, points, transformed(rig, of_rig), transformed(features, H)))
     moved = (np.stack(kind) for kind in zip(*positions, strict=True))
     verdict, path = f"{trace.verdict}, {trace.steps} steps", _centers(plant, trace.q)
     return _Driven(

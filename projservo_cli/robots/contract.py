@@ -170,6 +170,7 @@ class PluginRobot:
         bounds: Bounds,
         timeout_s: float,
         open_s: float,
+        *,
         image_size: ImageSize | None = None,
         view: Sequence[str] | None = None,
         objects: int = 0,

@@ -10,9 +10,9 @@ import numpy as np
 from projservo_cli.calibration.refit import view_errors
 from projservo_cli.detection import DICTIONARY, finder_of
 from projservo_cli.hardware.camera_robot import CameraRobot, View
-from projservo_cli.hardware.cameras import Camera
 from projservo_cli.hardware.checks_at_rest import FAULT, FINE, WARNING, Finding, RobotAtRest, findings_at_rest
 from projservo_cli.hardware.checks_in_motion import Strokes, findings_of, reach_of, strokes
+from projservo_cli.hardware.video_cameras import VideoCamera
 from projservo_cli.image_size import ImageSize, image_corners, image_sizes
 from projservo_cli.monitoring.accuracy import resting_error_mm
 from projservo_cli.monitoring.frame_pairs import at_known_markers, mean_image
@@ -123,7 +123,7 @@ def _seen(robot: PluginRobot, inputs: PreflightInputs, progress: Progress) -> Ro
         readings.append(robot.read())
         progress("look", len(readings), wanted)
     s, scatter = zip(*(_mean(readings, view) for view in range(len(robot.view))), strict=True)
-    own, cameras, views = robot.robot, list[Camera](), list[View]()
+    own, cameras, views = robot.robot, list[VideoCamera](), list[View]()
     if isinstance(own, CameraRobot):
         cameras, views = own.cameras, [view for view in own.views if view is not None]
     return RobotAtRest(

@@ -66,8 +66,10 @@ def plugin_robot(
     )
     if own.cameras is not None:  # a reading waits for a camera that reconnects
         timeout_s += own.cameras.reconnect_s
-    sizes = timeout_s, own.open_s, own.image_size
-    return PluginRobot(robot, name, len(numbers), bounds, *sizes, view, len(further))
+    waits, size = (timeout_s, own.open_s), own.image_size
+    return PluginRobot(
+        robot, name, len(numbers), bounds, *waits, image_size=size, view=view, objects=len(further)
+    )
 
 
 def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds, *, whole: bool) -> Robot:
@@ -188,16 +190,8 @@ def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> Plugin
     if driven.endless:
         endless = np.full(len(joints.types), math.inf)
         bounds = bounds._replace(limits=bounds.limits._replace(lower=-endless, upper=endless))
-    markers = len(robot.world.truth.number)
-    return PluginRobot(
-        robot,
-        "the simulated robot",
-        markers,
-        bounds,
-        _NEVER_LATE_S,
-        _NEVER_LATE_S,
-        objects=len(driven.further),
-    )
+    markers, late = len(robot.world.truth.number), (_NEVER_LATE_S, _NEVER_LATE_S)
+    return PluginRobot(robot, "the simulated robot", markers, bounds, *late, objects=len(driven.further))
 
 
 def _in_the_loop(scenario: RunScenario, robot: SimulatedRobot, events: Events) -> FaultyRobot:

@@ -14,7 +14,7 @@ pytest.importorskip("cv2")
 from projservo_cli.detection import TagFinder
 from projservo_cli.hardware import cameras
 from projservo_cli.hardware.camera_robot import CameraRobot
-from projservo_cli.hardware.cameras import Camera
+from projservo_cli.hardware.video_cameras import VideoCamera
 from projservo_cli.records import WorkFailed
 from projservo_cli.settings.cameras import Cameras as Stereo
 from projservo_cli.settings.cameras import Source
@@ -41,7 +41,7 @@ def camera():
     opened = []
 
     def make(source, max_age_s=0.3, reconnect_s=1.0, **settings):
-        opened.append(Camera("left", Source(source=source, **settings), max_age_s, reconnect_s))
+        opened.append(VideoCamera("left", Source(source=source, **settings), max_age_s, reconnect_s))
         opened[-1].open()
         return opened[-1]
 
@@ -82,7 +82,7 @@ def test_a_camera_that_is_lost_is_named_within_two_seconds(stream, camera):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="device nodes of Linux")
 def test_a_missing_or_forbidden_or_metadata_device_is_named_with_the_right_one(monkeypatch, tmp_path):
     with pytest.raises(WorkFailed, match=r"there is no /dev/video77; devices: "):
-        Camera("left", Source(source=77), 0.3, 1.0).open()
+        VideoCamera("left", Source(source=77), 0.3, 1.0).open()
     nodes = [tmp_path / "video0", tmp_path / "video1"]
     for node in nodes:
         node.touch()

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from projservo_cli.calibration import calibrate, prediction
 from projservo_cli.monitoring import innovation_tests
 from projservo_cli.monitoring.accuracy import Posture, resting_error_mm, rigid_fit
-from projservo_cli.monitoring.frame_pairs import Frame, FramePair, Pairing
+from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage
 from projservo_cli.monitoring.hypotheses import Evidence, causes_of
 from projservo_cli.monitoring.image_monitor import ImageMonitor, detected_fault
 from tests.calibration.simulated_robot import around, random_robot, revolute, trials
@@ -265,7 +265,7 @@ def test_every_frame_is_of_one_observation_in_the_order_of_time(views):
     for now in np.arange(0.0, 5.0, PERIOD):
         for v, k in np.argwhere((t >= now - PERIOD) & (t < now)):
             image = np.array([[v, k]], dtype=float)
-            pairing.add(int(v), Frame(t[v, k], np.zeros(2), np.zeros(2), 1e-3, image, np.ones(1)))
+            pairing.add(int(v), TimedImage(t[v, k], np.zeros(2), np.zeros(2), 1e-3, image, np.ones(1)))
         pairing.reach(np.full(views, now))
         while (found := pairing.next(False)) is not None:
             rows = found.images[np.isfinite(found.images[:, 0, 0]), 0].astype(int)

@@ -39,7 +39,7 @@ def _data(report_data: ReportData) -> Data:
     face = plant.M[plant.order]
     result: Data = {"robot": polyline, "face_start": (face @ start.T)[:, :3]}
     rig = plant_pyramids(plant, result["face_start"])
-    visible = displaced(rig, of_rig)
+    visible = transformed(rig, of_rig)
     result |= {"cameras": visible[:, 0], "pyramids": visible, "view": np.array(report_data.view)}
     with suppress(WorkFailed):  # cameras all around have none
         # From the middle of the rig to where it passes the face, which a task rolls about it.
@@ -49,7 +49,7 @@ def _data(report_data: ReportData) -> Data:
     if np.isfinite(q_goal).all():
         result["robot_goal"], _, of_rig = standing(robot, plant, q_goal)
         if plant.model.on_tool:
-            result["pyramids_goal"] = displaced(rig, of_rig)
+            result["pyramids_goal"] = transformed(rig, of_rig)
     if plant.model.on_tool:  # the face stands still
         return result
     if (goal := goal_displacement(robot, report_data.traces)) is not None:
@@ -73,7 +73,7 @@ def standing(robot: SerialArm, plant: Plant, q: FloatArray) -> tuple[FloatArray,
     return polyline, *((still, moved) if plant.model.on_tool else (moved, still))
 
 
-def displaced(points: FloatArray, H: FloatArray) -> FloatArray:
+def transformed(points: FloatArray, H: FloatArray) -> FloatArray:
     """Points (…, 3) after a displacement (4, 4)."""
     return points @ H[:3, :3].T + H[:3, 3]
 

@@ -53,7 +53,7 @@ _QUERYCAP, _SIZE_OF, _BUS, _CAPS = 0x80685600, 104, slice(48, 80), 88
 _GIVES_PICTURES = 0x1 | 0x1000
 
 
-class Camera:
+class VideoCamera:
     """A camera that is always grabbed.
 
     name : of it, such as ``left``. now : clock of the stamps, s.
