@@ -7,6 +7,8 @@ once, so that each keeps its own loop: two-view geometry, rigid motions, axis po
 
 import dataclasses
 from dataclasses import dataclass
+from numbers import Real
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -374,6 +376,23 @@ def require_moved(number: int, span: float, prismatic: bool, motion_px: float, s
 def format_motion(value: float, prismatic: bool) -> str:
     """Format a joint motion in mm or degrees."""
     return f"{1e3 * value:.3g} mm" if prismatic else f"{np.degrees(value):.3g}°"
+
+
+def require_size_and_noise(image_size: Any, sigma_px: Any) -> None:
+    """Refuse a width and height of images, px, or a noise of pixels, px, that are none; None is unknown."""
+    if sigma_px is not None and not _is_positive(sigma_px):
+        raise InputError(f"pixel noise {sigma_px!r}: give a positive number, or none to estimate it")
+    if image_size is not None:
+        given = tuple(image_size) if np.iterable(image_size) else ()
+        for lengths in given if given and all(map(np.iterable, given)) else (given,):
+            if len(lengths) != 2 or not all(map(_is_positive, lengths)):
+                raise InputError(
+                    f"image size {image_size!r}: give a positive width and height, px, or one pair a camera"
+                )
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, Real) and 0.0 < float(value) < np.inf
 
 
 def require_images(detections: Detections, sigma_px: float | None) -> None:

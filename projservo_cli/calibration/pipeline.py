@@ -4,7 +4,6 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,12 @@ from projservo_cli.calibration.checks.refusal import (
     straight_joints,
 )
 from projservo_cli.calibration.checks.undecided import require_poses
-from projservo_cli.calibration.detections import Detections, require_images, require_motion
+from projservo_cli.calibration.detections import (
+    Detections,
+    require_images,
+    require_motion,
+    require_size_and_noise,
+)
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, ImageGeometry
 from projservo_cli.calibration.initialization import Nominal, Progress, Search
 from projservo_cli.calibration.joint_model import AUTO, Hypothesis, fit_joint_model, hypotheses_of
@@ -214,23 +218,6 @@ def calibrate(
         if method == "bundle_adjustment":
             result = with_time_offset(result, observation)
     return dataclasses.replace(result, source=source, seconds=seconds)
-
-
-def require_size_and_noise(image_size: Any, sigma_px: Any) -> None:
-    """Refuse a width and height of images, px, or a noise of pixels, px, that are none; None is unknown."""
-    if sigma_px is not None and not _is_positive(sigma_px):
-        raise InputError(f"pixel noise {sigma_px!r}: give a positive number, or none to estimate it")
-    if image_size is not None:
-        given = tuple(image_size) if np.iterable(image_size) else ()
-        for lengths in given if given and all(map(np.iterable, given)) else (given,):
-            if len(lengths) != 2 or not all(map(_is_positive, lengths)):
-                raise InputError(
-                    f"image size {image_size!r}: give a positive width and height, px, or one pair a camera"
-                )
-
-
-def _is_positive(value: Any) -> bool:
-    return isinstance(value, Real) and 0.0 < float(value) < np.inf
 
 
 def _require_inside(detections: Detections, image_size: ImageSize, strays: float) -> None:

@@ -16,7 +16,7 @@ from projservo_cli.image_size import ImageSize, image_sizes
 from projservo_cli.laws import BODY_LAWS, POINT_LAWS
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
-from projservo_cli.report.figures.images import OF_SCENE, OF_TOOL, frames_of, near_pixels, with_halo
+from projservo_cli.report.figures.images import OF_SCENE, OF_TOOL, frames_of, with_halo
 from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
 from projservo_cli.report.figures.scene import (
     edges_of,
@@ -388,7 +388,7 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, sizes: FloatArray) -> 
     end = max(ends or [run.period * run.steps for run in traces.values()])
     every = [t[:, :, order].reshape(-1, 2) for run in traces.values() for t in (run.s, run.s_star[None])]
     size, views = sizes.max(axis=0), len(sizes)
-    near = near_pixels(np.concatenate(every), size)
+    near = style.near_pixels(np.concatenate(every), size)
     films = {name: frames_of(run, width=_FILM_WIDTH) for name, run in traces.items()}
     margin = 0.06
     if any(film is not None for film in films.values()):  # whole images

@@ -349,3 +349,21 @@ def paths(axes: "Axes", points: FloatArray, line_style: LineStyle, *, mask: Bool
     if mask is not None:
         points = np.where(mask[:, None, None], points, np.nan)
     axes.plot(points[..., 0], points[..., 1], **line_style)
+
+
+_OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
+_NEAR_BORDER = 0.42  # distance from the middle, as a share of the image, from which its border shows
+_BORDER = line(GREY, DOTTED, 0.8, label="border of the image")
+
+
+def border(axes: "Axes", size: FloatArray, pixels: FloatArray) -> None:
+    """Draw the border of an image of a size (2,), px; the legend names it where pixels (k, 2) are near it."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
+    near = (np.abs(pixels / size - 0.5) > _NEAR_BORDER).any()
+    axes.plot(*closed(corners).T, **_BORDER | {"label": _BORDER["label"] if near else ""})
+
+
+def near_pixels(pixels: FloatArray, size: FloatArray) -> FloatArray:
+    """Of pixels (…, 2) those (k, 2) that were measured, none farther outside the image than is drawn."""
+    measured = pixels[np.isfinite(pixels).all(axis=-1)]
+    return np.clip(measured, -_OUTSIDE * size, (1.0 + _OUTSIDE) * size)

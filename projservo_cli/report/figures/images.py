@@ -17,13 +17,10 @@ from projservo_cli.task.face import cyclic_order
 if TYPE_CHECKING:
     from matplotlib.gridspec import GridSpec
 
-_OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
-_NEAR_BORDER = 0.42  # distance from the middle, as a share of the image, from which its border shows
 _PANELS_WIDTH, _PANEL_WIDTH = 5.8, 3.6  # inches, of all panels side by side, and of one at most
 _PATH = style.line(style.BLACK, width=0.9, label="path of a marker")
 _PLATEAU = style.line(style.VERMILION, width=2.0, marker="s", label="plateau of the image error")
 _STOPPED = style.dots(style.BLACK, "x", "end of the run", markersize=4)
-_BORDER = style.line(style.GREY, style.DOTTED, 0.8, label="border of the image")
 
 
 def _data_classical(report_data: ReportData) -> Data:
@@ -65,7 +62,7 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
     laws, size = [law for law in POINT_LAWS if f"s_{law}" in data], data["image_size"]
     names = data["view"]
     drawn = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
-    near = [[near_pixels(s[:, view], size[view]) for view in range(len(names))] for s in drawn]
+    near = [[style.near_pixels(s[:, view], size[view]) for view in range(len(names))] for s in drawn]
     heights = [_panel_width(len(names)) * style.aspect(np.concatenate(pixels)) for pixels in near]
     # Of two cameras the second has a name of its own; else each has, below that of the law.
     titles = 0.62 if len(names) == 2 else 0.78
@@ -86,22 +83,9 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
                 below = "" if len(names) == 2 else f"\n{heading}"
                 heading = f"{title_of(law)}: {data[f'verdict_{law}']}{below}"
             style.image_axes(panel, heading, pixels[view])
-            border(panel, size[view], pixels[view])
+            style.border(panel, size[view], pixels[view])
         style.name_first_ordinate(row)
     style.legend_below(figure, 4)
-
-
-def border(axes: "style.Axes", size: FloatArray, pixels: FloatArray) -> None:
-    """Draw the border of an image of a size (2,), px; the legend names it where pixels (k, 2) are near it."""
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
-    near = (np.abs(pixels / size - 0.5) > _NEAR_BORDER).any()
-    axes.plot(*style.closed(corners).T, **_BORDER | {"label": _BORDER["label"] if near else ""})
-
-
-def near_pixels(pixels: FloatArray, size: FloatArray) -> FloatArray:
-    """Of pixels (…, 2) those (k, 2) that were measured, none farther outside the image than is drawn."""
-    measured = pixels[np.isfinite(pixels).all(axis=-1)]
-    return np.clip(measured, -_OUTSIDE * size, (1.0 + _OUTSIDE) * size)
 
 
 def _data_direct(report_data: ReportData) -> Data:

@@ -9,7 +9,6 @@ from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.image_size import BEHIND
 from projservo_cli.records import FloatArray, Plan
 from projservo_cli.report import style
-from projservo_cli.report.figures.images import border, near_pixels
 from projservo_cli.report.report_data import Data, ReportData, joint_kinds, joint_units, registered
 
 PIECES = 4  # of each edge of a tree, which is no straight line in an image
@@ -171,7 +170,9 @@ def _visible(data: Data, view: int) -> FloatArray:
     lines = ["center", *(f"tree_{name}" for name in _TREES if f"tree_{name}" in data)]
     drawn = [data[name][..., view, :, :] for name in ("s", "s_star")]
     drawn += [*(data[name][:, view] for name in lines), *_kept_out(data, view)]
-    return near_pixels(np.concatenate([pixels.reshape(-1, 2) for pixels in drawn]), data["image_size"][view])
+    return style.near_pixels(
+        np.concatenate([pixels.reshape(-1, 2) for pixels in drawn]), data["image_size"][view]
+    )
 
 
 def _image(axes: "style.Axes", data: Data, view: int, visible: FloatArray) -> None:
@@ -189,7 +190,7 @@ def _image(axes: "style.Axes", data: Data, view: int, visible: FloatArray) -> No
     style.start_and_goal(axes, s[0], data["s_star"][view])
     names = data["view"]
     style.image_axes(axes, f"{names[view]} camera{style.separator(len(names))}{data['name']}", visible)
-    border(axes, data["image_size"][view], visible)
+    style.border(axes, data["image_size"][view], visible)
 
 
 def _time(data: Data) -> tuple[FloatArray, str]:
