@@ -92,10 +92,10 @@ def called(kind: str, target: str, found: Any, arguments: Sequence[Any], options
     return result
 
 
-def takes(kind: str, target: str, name: str) -> bool:
-    """Tell whether a class says that it takes an argument of a name; one that takes any does not say so."""
+def takes(target: str, name: str) -> bool:
+    """Tell whether the class of a robot names an argument that it takes; one that takes any names none."""
     try:
-        return name in inspect.signature(find(kind, target)).parameters
+        return name in inspect.signature(find("plant", target)).parameters
     except ValueError:  # of a class in C
         return False
 

@@ -139,7 +139,9 @@ def compared(runs, path):
     """Write a page that shows runs side by side."""
     configs = [config_of(run) for run in runs]
     abouts = [(run, given.about_of(config)) for run, config in zip(runs, configs, strict=True)]
-    page.write_comparison(abouts, [given.settings_of(config) for config in configs], path)
+    page.write_comparison(
+        abouts, [config.model_dump(mode="json", exclude_none=True) for config in configs], path
+    )
 
 
 def view_of(run, *more):

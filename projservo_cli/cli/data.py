@@ -74,7 +74,6 @@ def _teach(
     if at is not None:
         try:
             joints = tuple(float(value) for value in at.split(","))
-
         except ValueError as error:
             raise InputError(f"--at {at}: expected a number for each joint, with commas") from error
         unit: Literal["deg", "rad"] = "deg" if at_unit == "deg" else "rad"
@@ -89,9 +88,7 @@ def _teach(
             if start:
                 stage.require_start(taught)
             else:
-                asked = settings.trajectory.visible_views
-                least = None if asked == "all" else asked
-                stage.require_face(settings.face_numbers, taught, least)
+                stage.require_face(settings.face_numbers, taught, settings.trajectory.least_views)
                 several = settings.task is not None and bool(settings.task.goals)
                 hidden = stage.require_objects(taught, one_goal=not several)
             check = None

@@ -76,7 +76,7 @@ def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: b
     if len(runs) < 2:
         raise click.UsageError("compare needs two runs or more: projservo compare RUN RUN")
     from projservo_cli.config import load_config
-    from projservo_cli.config.inputs import about_of, settings_of
+    from projservo_cli.config.inputs import about_of
     from projservo_cli.report.page import write_comparison
     from projservo_cli.store import load
 
@@ -86,7 +86,9 @@ def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: b
     found = [load(target) for target in runs]
     configs = [load_config(run.path, text=run.configuration) for run in found]
     abouts = [(run, about_of(config)) for run, config in zip(found, configs, strict=True)]
-    write_comparison(abouts, [settings_of(config) for config in configs], output)
+    write_comparison(
+        abouts, [config.model_dump(mode="json", exclude_none=True) for config in configs], output
+    )
     value = {"page": output.resolve(), "runs": [run.path.resolve() for run in found]}
     console.report(value, [f"compare: {len(runs)} runs: {output}"])
 

@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -88,7 +87,7 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
         source = Table(table, readings, *kind, size, data.noise_px, _seed(config), mount, stated)
     else:
         # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
-        source = _trials(config, _truth(config, face=False), files, speed_scale=1.0)
+        source = _trials(config, truth_of(config, face=False), files, speed_scale=1.0)
     noise = None if settings.joint_noise_deg is None else float(np.radians(settings.joint_noise_deg))
     how = Estimation(
         settings.method,
@@ -110,7 +109,7 @@ def calibration_inputs(config: Config, files: Files | None = None) -> Calibratio
 def recording_inputs(config: Config) -> RecordingInputs:
     """Return the inputs of a recording."""
     markers, plant = config.markers, config.plant
-    truth = _truth(config, face=False) if plant.simulated else None
+    truth = truth_of(config, face=False) if plant.simulated else None
     numbers = _numbers(config, "record")
     assert markers is not None
     trials = _trials(config, truth)
@@ -381,12 +380,6 @@ def scenery_of(config: Config) -> Scenery:
     return Scenery(config.name, truth_of(config), opaque, config.plant.simulated)
 
 
-def settings_of(config: Config) -> dict[str, Any]:
-    """All values of a configuration that are set."""
-    found: dict[str, Any] = config.model_dump(mode="json", exclude_none=True)
-    return found
-
-
 def files_of(config: Config, gone: Mapping[str, str] | None = None) -> Files:
     """Read the input files, by their roles; InputError if one cannot be read.
 
@@ -425,16 +418,12 @@ def _read(config: Config, kind: str, gone: Mapping[str, str]) -> File | None:
 # Robot, rig and markers.
 
 
-def truth_of(config: Config) -> Truth:
+def truth_of(config: Config, *, face: bool = True) -> Truth:
     """Robot, rig and markers as they are; an InputError where a part of it is missing.
 
     The same values give the same object, so that derived results are kept.
+    face : whether it has the face, of which a calibration knows nothing.
     """
-    return _truth(config, face=True)
-
-
-def _truth(config: Config, *, face: bool) -> Truth:
-    """The truth, perhaps without a face, of which a calibration knows nothing."""
     if config.arm is None:
         raise InputError("this stage drives a simulated robot: set robot.dh or robot.screws")
     if config.rig is None:

@@ -249,9 +249,9 @@ class Override:
         return tuple(int(step) if step.isdecimal() and i else step for i, step in steps)
 
     @classmethod
-    def parse(cls, text: str, flag: str = "") -> "Override":
-        """Read ``a.b=v``; the value is YAML."""
-        flag = flag or f"--set {text}"
+    def parse(cls, text: str) -> "Override":
+        """Read ``a.b=v`` of ``--set``; the value is YAML."""
+        flag = f"--set {text}"
         key, sign, value = text.partition("=")
         steps = [step.strip() for step in key.split(".")]
         if not sign or not all(steps):
@@ -647,7 +647,7 @@ def _phrase(model: type[BaseModel], error: ErrorDetails) -> str:
         if path == ("law",):  # else it would have been spelt out
             both = isinstance(given, str)
             return "control.laws is set as well; keep one" if both else "must be the name of one law"
-        return f"unknown key; {_nearest(path[-1], _keys_at(model, path[:-1]))}"
+        return f"unknown key; {_nearest(path[-1], sorted(_model_at(model, path[:-1]).model_fields))}"
     if kind == "string_pattern_mismatch":
         return f"{_displayed(given)} must be letters R and P, one a joint"
     if kind == "literal_error":
@@ -674,11 +674,6 @@ def _takes_views(model: type[BaseModel], path: _Path) -> bool:
     """Whether the last key of a path is taken for the name of a view."""
     above = _model_at(model, path[:-1])
     return above.model_config.get("extra") == "allow" and path[-1] not in above.model_fields
-
-
-def _keys_at(model: type[BaseModel], path: _Path) -> list[str]:
-    """Keys that the mapping at ``path`` may have."""
-    return sorted(_model_at(model, path).model_fields)
 
 
 def _model_at(model: type[BaseModel], path: _Path) -> type[BaseModel]:

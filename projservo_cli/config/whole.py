@@ -121,8 +121,7 @@ def _images_of(
             yield (*path, key), f"{len(given)} entries for {len(numbers)} markers"
         elif key in images.view:
             counts.update(number for number, at in zip(numbers, given or (), strict=True) if at is not None)
-    asked = trajectory.visible_views
-    enough = len(images.view) if asked == "all" else asked
+    enough = trajectory.least_views or len(images.view)
     for key in images.view:
         pixels = dict(zip(numbers, images.side(key) or (), strict=False))
         whole = len(pixels) == len(numbers) == len(images.side(key) or ())

@@ -518,6 +518,11 @@ class Trajectory(Section):
         return self.profile not in ("constrained", "auto")
 
     @property
+    def least_views(self) -> int | None:
+        """Number of cameras that must see the whole face; None for all."""
+        return None if self.visible_views == "all" else self.visible_views
+
+    @property
     def needs_covariance(self) -> bool:
         """Whether a plan takes the covariance of the calibration: searches through joint space, regions."""
         return self.profile in ("joint_space", "auto") or bool(self.keep_out)

@@ -87,7 +87,7 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds, *, whole: bool)
         )
     if takes_limits(own):
         options["limits"] = bounds.limits
-    if "numbers" not in options and plugins.takes("plant", own.target, "numbers"):
+    if "numbers" not in options and plugins.takes(own.target, "numbers"):
         options["numbers"] = tuple(numbers)
     if own.cameras is not None:
         arm: Arm = plugins.make("plant", own.target, (), options)
@@ -99,7 +99,7 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds, *, whole: bool)
         finder = finder_of(own.board, own.dictionary)
         return CameraRobot(arm, own.cameras, finder, numbers, whole=whole)
     if own.dictionary is not None and own.board is None:
-        if not plugins.takes("plant", own.target, "dictionary"):
+        if not plugins.takes(own.target, "dictionary"):
             raise InputError(
                 f"markers.dictionary: is without effect: plant.use {own.target} takes no argument "
                 "dictionary; leave it out, or let the class take it"
@@ -115,7 +115,7 @@ def _made(own: OwnRobot, numbers: Sequence[int], bounds: Bounds, *, whole: bool)
 
 def takes_limits(own: OwnRobot) -> bool:
     """Whether the class of a robot is made with the limits of its joints."""
-    return "limits" not in own.options and plugins.takes("plant", own.target, "limits")
+    return "limits" not in own.options and plugins.takes(own.target, "limits")
 
 
 def _require_no_turn_off(bounds: Bounds, q: FloatArray) -> None:

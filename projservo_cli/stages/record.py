@@ -317,16 +317,14 @@ def record_poses(
                 progress("record", len(recording.done), len(recording.targets))
                 if kept and (start := time.monotonic()) >= due:
                     recording.save()
-                    if robot is not None and robot.frames is not None:
-                        _show(recording, robot)
+                    _show(recording, robot)
                     stored, now = len(recording.done), time.monotonic()
                     # A long table takes long to write: most of the time must stay for recording.
                     due = now + max(_SAVE_EVERY, 10.0 * (now - start))
     finally:
         if kept and len(recording.done) > stored:
             recording.save()
-            if robot is not None and robot.frames is not None:
-                _show(recording, robot)
+            _show(recording, robot)
 
 
 def _require_same_views(recording: _Recording, robot: PluginRobot) -> None:
@@ -340,15 +338,13 @@ def _require_same_views(recording: _Recording, robot: PluginRobot) -> None:
     recording.view = robot.view
 
 
-def _show(recording: _Recording, robot: PluginRobot) -> None:
-    """Write a page next to the table: how far it is, and the images of the last pose with the tags."""
-    last = recording.done[max(recording.done)]
-    nothing = np.empty((0, 2))
-    assert robot.frames is not None
-    pictures = [
-        annotated(grey, recording.marker.tolist(), s, nothing)
-        for grey, s in zip(robot.frames, last.s, strict=True)
-    ]
+def _show(recording: _Recording, robot: PluginRobot | None) -> None:
+    """Write a page next to the table where a robot has frames: how far it is, and the last pose with tags."""
+    if robot is None or robot.frames is None:
+        return
+    last, nothing, marker = recording.done[max(recording.done)], np.empty((0, 2)), recording.marker.tolist()
+    each = zip(robot.frames, last.s, strict=True)
+    pictures = [annotated(grey, marker, s, nothing) for grey, s in each]
     done = f"{len(recording.done)} of {len(recording.targets)} poses; {recording.note(robot.bounds.units)}"
     images = dict(zip(recording.view, pictures, strict=True))
     text = recording_page(recording.path.name, done, images, whole=not recording.pending)

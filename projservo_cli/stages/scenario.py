@@ -106,12 +106,10 @@ class Scenario:
     @property
     def least_views(self) -> int:
         """Number of views that are to see the whole face. Raises InputError if there are not so many."""
-        asked, V = self.inputs.trajectory.visible_views, len(self.view)
-        if asked == "all":
-            return V
-        if asked > V:
+        asked, V = self.inputs.trajectory.least_views, len(self.view)
+        if asked is not None and asked > V:
             raise InputError(f"trajectory.visible_views: {asked}, of {V} views: set {V} or all")
-        return asked
+        return asked or V
 
     @property
     def untested(self) -> str:
@@ -530,27 +528,11 @@ def _joints_near_goal(
 
 
 def run_scenario(inputs: ServoInputs, calibration: Calibration | None = None) -> RunScenario:
-    """Make the scenario of runs; raises as ``scenario_of``."""
-    found = scenario_of(inputs.plan, calibration)
-    gains, termination = _gains(inputs, found.joints), _termination(inputs, found)
-    # What was just made holds its fields alone: nothing is derived from them yet.
-    return RunScenario(**vars(found), servo=inputs, gains=gains, termination=termination)
-
-
-def _gains(inputs: ServoInputs, joints: Joints) -> Gains:
-    """Gains of the laws with the limits of the joints, which end no path where a run may pass them."""
-    limits, endless = joints.limits, np.full(len(joints.types), math.inf)
-    if not inputs.at_joint_limit:
-        limits = limits._replace(lower=-endless, upper=endless)
-    return inputs.gains._replace(limits=limits)
-
-
-def _termination(inputs: ServoInputs, found: Scenario) -> Limits:
-    """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
-    stop = inputs.stop
-    noise_px = stop.noise_factor * found.noise_px
-    return Limits(
-        speed=found.joints.limits.speed,
+    """Make the scenario of runs; raises as ``scenario_of``. Noise widens the tolerance of the image error."""
+    found, stop = scenario_of(inputs.plan, calibration), inputs.stop
+    limits, noise_px = found.joints.limits, stop.noise_factor * found.noise_px
+    termination = Limits(
+        speed=limits.speed,
         image_error_px=stop.image_error_px + noise_px,
         diverged_factor=stop.diverged_factor,
         stall_periods=stop.stall_periods,
@@ -560,6 +542,12 @@ def _termination(inputs: ServoInputs, found: Scenario) -> Limits:
         max_lost_periods=stop.max_lost_periods,
         noise_px=noise_px,
     )
+    if not inputs.at_joint_limit:  # a run may pass them, so that they end no path
+        endless = np.full(len(found.joints.types), math.inf)
+        limits = limits._replace(lower=-endless, upper=endless)
+    gains = inputs.gains._replace(limits=limits)
+    # What was just made holds its fields alone: nothing is derived from them yet.
+    return RunScenario(**vars(found), servo=inputs, gains=gains, termination=termination)
 
 
 def _by_points(features: str | None, calibration: Calibration | None, view: Sequence[str]) -> bool:
@@ -686,8 +674,8 @@ def _predicted_ends(
     inputs: PlanInputs, task: TaskSettings, calibration: Calibration, joints: Joints, numbers: Sequence[int]
 ) -> tuple[TaskImages, Ends, FloatArray | None]:
     """Start and goal of a robot that is not simulated, as the calibration predicts them, as above."""
-    m, columns, V = len(inputs.face), calibration.indices_of(numbers), len(calibration.view)
-    least = V if inputs.trajectory.visible_views == "all" else inputs.trajectory.visible_views
+    m, columns = len(inputs.face), calibration.indices_of(numbers)
+    least = inputs.trajectory.least_views or len(calibration.view)
     taught = None if task.goal.images is None else task.goal.images.joints
     given = (task.start_joints, "start"), (task.goal.joints, "goal.joints"), (taught, "goal.images.joints")
     for vector, key in given:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -69,13 +69,6 @@ _RETREAT = 10  # periods by which an arm goes back where the object of its goal 
 _NOT_DRIVEN: Any = None  # in place of what a run leaves
 
 
-class _Judged(NamedTuple):
-    """Error that decides convergence, as words name it."""
-
-    name: str
-    unit: str
-
-
 @dataclass(eq=False)
 class LawRun:
     """A run of a law: made, driven to its verdict, and summed up."""
@@ -107,20 +100,17 @@ class LawRun:
     @property
     def own_unit(self) -> float:
         """Factor of errors that decide convergence, in px, to what they are told in."""
-        return (
-            1.0
-            if self.own_tolerance is None
-            else self.own_tolerance / self.scenario.termination.image_error_px
-        )
+        own = self.own_tolerance
+        return 1.0 if own is None else own / self.scenario.termination.image_error_px
 
     @property
-    def judged(self) -> "_Judged":
-        """Error that decides convergence, in words."""
+    def judged(self) -> tuple[str, str]:
+        """Name and unit of the error that decides convergence, as words have them."""
         if self.own_tolerance is not None:
-            return _Judged("error of the law", "")
+            return "error of the law", ""
         if self.scenario.exact.incidences and not math.isnan(float(self.log.fit[self.steps, 2])):
-            return _Judged("error of the incidences", " px")
-        return _Judged("image error", " px")
+            return "error of the incidences", " px"
+        return "image error", " px"
 
     @property
     def replans(self) -> bool:
@@ -386,6 +376,7 @@ class LawRun:
             _blind_view(log.s[:rows], scenario.view, WINDOW) if driven and self.verdict == "converged" else ""
         )
         untested = "" if driven is None else scenario.untested
+        replanned = f"; replanned {', '.join(self.replannings)}" if self.replannings else ""
         if driven is not None:  # the log has the predicted rest of the robot instead of readings
             read = _whole(driven.readings, rows)
         values = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
@@ -406,7 +397,7 @@ class LawRun:
             mode=self.mode,
             planned_s=self.planned_s,
             verdict=self.verdict,
-            reason="; ".join([_reason(self, joint, remaining), *_replanned(self.replannings)]),
+            reason=_reason(self, joint, remaining) + replanned,
             replan_attempts=len(self.replannings),
             steps=steps,
             period=scenario.gains.period,
@@ -522,10 +513,6 @@ def _stated_mm(run: LawRun, views: FloatArray) -> dict[str, Any]:
     return found | {"estimated_position_error_mm": float(np.linalg.norm([*parts, *found.values()]))}
 
 
-def _replanned(replannings: tuple[str, ...]) -> list[str]:
-    return [f"replanned {', '.join(replannings)}"] if replannings else []
-
-
 def _left(log: Log, steps: int) -> tuple[float | None, float | None]:
     """Share of the translation and rotation, deg, that were left; None where the law measures neither."""
     first, last = (float(log.errors[k, TAU_AFFINE]) for k in (0, steps))
@@ -562,26 +549,26 @@ def _stalled_by(run: LawRun) -> str:
 
 def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None]) -> str:
     """Return the reason of the verdict, one sentence."""
-    log, steps, limits, judged = run.log, run.steps, run.scenario.termination, run.judged
-    error, first = (f"{run.own_unit * float(log.judged[k]):.3g}{judged.unit}" for k in (steps, 0))
-    within = f"{run.own_unit * tolerance(limits, float(log.fit[steps, 2]), run.noise_ratio):.3g}{judged.unit}"
+    log, steps, limits, (judged, unit) = run.log, run.steps, run.scenario.termination, run.judged
+    error, first = (f"{run.own_unit * float(log.judged[k]):.3g}{unit}" for k in (steps, 0))
+    within = f"{run.own_unit * tolerance(limits, float(log.fit[steps, 2]), run.noise_ratio):.3g}{unit}"
     share, turn = remaining
     left = [
         *([] if share is None else [f"{share:.1%} of the translation"]),
         *([] if turn is None else [f"{turn:.3g} deg of rotation"]),
-        f"an {judged.name} of {error}",
+        f"an {judged} of {error}",
     ]
     rest = f"{' and '.join(left)} {'are' if len(left) > 1 else 'is'} left"
     at_limit = in_unit(float(log.read[steps, joint]), run.scenario.joints.units[joint])
     reasons = {
-        "converged": f"{judged.name} {error} is within {within}{_vague(run)}{_apart(run)}",
-        "no progress": f"the robot stands still at an {judged.name} of {error}: {run.why}"
+        "converged": f"{judged} {error} is within {within}{_vague(run)}{_apart(run)}",
+        "no progress": f"the robot stands still at an {judged} of {error}: {run.why}"
         if run.why
-        else f"no step left; {judged.name} {error} fell by less than 1 % in the last "
+        else f"no step left; {judged} {error} fell by less than 1 % in the last "
         f"{limits.stall_periods} steps: {_stalled_by(run)}",
         "following error": f"{run.why}; {rest}",
-        "max steps": f"no step left; {judged.name} {error} was still changing",
-        "diverged": f"{judged.name} {error} (at first {first}) or the distance of the face grew "
+        "max steps": f"no step left; {judged} {error} was still changing",
+        "diverged": f"{judged} {error} (at first {first}) or the distance of the face grew "
         f"{limits.diverged_factor:g}-fold",
         "out of view": f"a face marker left an image at step {steps}",
         "behind camera": f"a face marker passed behind a camera at step {steps}",

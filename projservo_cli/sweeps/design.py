@@ -256,8 +256,7 @@ class Design:
         assert config.task.start_joints is not None
         q_front = np.array(config.task.start_joints.values(config.robot.joint_types))
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(_TASKS,)))
-        asked = config.trajectory.visible_views
-        least_views = 0 if asked == "all" else asked
+        least_views = config.trajectory.least_views or 0
         low, high = np.radians(tasks.rotation_deg)
         return random_tasks(truth_of(config), q_front, tasks.random, rng, least_views, (low, high))
 
