@@ -76,6 +76,16 @@ def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
     return field(metadata={"units": units, "about": about}, **default)
 
 
+def _optional_array(dims: str, units: str = "1", about: str = "") -> Any:
+    """Declare an array field that is None where there is none."""
+    return _array(dims, units, about, default=None)
+
+
+def _optional_scalar(units: str = "1", about: str = "") -> Any:
+    """Declare a scalar or text field that is None where there is none."""
+    return _scalar(units, about, default=None)
+
+
 def _by_view(about: str, **default: Any) -> Any:
     """Declare a tuple of numbers, one a view; files and JSON have each by its name and that of its view."""
     return field(metadata={"units": "1", "about": about, "by_view": True}, **default)
@@ -287,18 +297,15 @@ class Observation:
     marker: IntArray = _array("marker", about="number of the marker")
     q: FloatArray = _array("pose joint", "rad or m", "joint readings")
     images: FloatArray = _array("pose view marker xy", "px", "pixels, NaN if unseen")
-    moving: IntArray | None = _array(
-        "pose", about="number of the motion during which the pose was recorded, 0 at rest", default=None
+    moving: IntArray | None = _optional_array(
+        "pose", about="number of the motion during which the pose was recorded, 0 at rest"
     )
-    t_q: FloatArray | None = _array("pose", "s", "time of the joint readings, NaN if unknown", default=None)
-    t_view: FloatArray | None = _array(
-        "pose view", "s", "timestamps of both images, NaN if there are none", default=None
+    t_q: FloatArray | None = _optional_array("pose", "s", "time of the joint readings, NaN if unknown")
+    t_view: FloatArray | None = _optional_array(
+        "pose view", "s", "timestamps of both images, NaN if there are none"
     )
-    sigma: FloatArray | None = _array(
-        "pose view marker",
-        "px",
-        "standard deviation of the pixels, per coordinate, NaN if unseen",
-        default=None,
+    sigma: FloatArray | None = _optional_array(
+        "pose view marker", "px", "standard deviation of the pixels, per coordinate, NaN if unseen"
     )
     view: tuple[str, ...] = _scalar(about="names of the views", default=VIEWS)
 
@@ -334,23 +341,19 @@ class ProjectiveKinematics:
     a_inf: FloatArray = _array("coordinate", about="common plane at infinity")
     marker: IntArray = _array("marker", about="number of the marker")
     M: FloatArray = _array("marker coordinate", about="markers at the reference, a_inf @ M = 1")
-    lens: FloatArray | None = _array(
-        "view lens_term",
-        about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2",
-        default=None,
+    lens: FloatArray | None = _optional_array(
+        "view lens_term", about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2"
     )
-    joint_curve: FloatArray | None = _array(
+    joint_curve: FloatArray | None = _optional_array(
         "joint_curve_row joint_curve_column",
         about="terms of true joints less readings, if fitted: index into BASIS, joint moved and joint read "
         "from 1, coefficient and its standard deviation in rad or m, typical error at left-out poses in px "
         "without and with it; their errors are the last rows of sqrt_cov_shared",
-        default=None,
     )
-    joint_curve_arm: FloatArray | None = _array(
+    joint_curve_arm: FloatArray | None = _optional_array(
         "joint_curve_motion joint_curve_part coordinate",
         about="arm by which torques are known: of each joint its twist over a weight on its axis, at last "
         "gravity in the first row over the weight at the tool",
-        default=None,
     )
     # The covariance of all these, as ``Errors`` says; of a method without one they are not finite.
     sqrt_cov_shared: FloatArray = _array(
@@ -423,35 +426,29 @@ class FitQuality:
 
     rms_px: float = _scalar("px", "reprojection residual, rms per marker and view (Euclidean)")
     sigma_px: float = _scalar("px", "noise per image coordinate: configured, given or estimated")
-    sigma_view_px: FloatArray | None = _array(
-        "view", "px", "noise per coordinate of each view, if it is not common to all", default=None
+    sigma_view_px: FloatArray | None = _optional_array(
+        "view", "px", "noise per coordinate of each view, if it is not common to all"
     )
     sigma_fitted_px: float = _scalar("px", "noise per coordinate from the residuals of the fit")
     chi2_per_dof: float = _scalar(about="squared residuals over sigma_px squared, per degree of freedom")
     dof: int = _scalar(about="degrees of freedom of the fit")
-    sigma_scale: float | None = _scalar(
-        about="true standard deviation of pixels over the stated one, if the images determine it",
-        default=None,
+    sigma_scale: float | None = _optional_scalar(
+        about="true standard deviation of pixels over the stated one, if the images determine it"
     )
-    sigma_scale_interval: FloatArray | None = _array(
-        "limit", about="95 % interval of sigma_scale", default=None
-    )
+    sigma_scale_interval: FloatArray | None = _optional_array("limit", about="95 % interval of sigma_scale")
     model_px: float = _scalar("px", "model error per coordinate, 0 if it is within the noise", default=0.0)
-    corner_squares: FloatArray | None = _array(
+    corner_squares: FloatArray | None = _optional_array(
         "corner_pose view marker",
         about="squared residuals over their variance, mean of both coordinates, NaN if unseen",
-        default=None,
     )
-    corner_q: FloatArray | None = _array(
-        "corner_pose joint", "rad or m", "joint readings of corner_squares", default=None
+    corner_q: FloatArray | None = _optional_array(
+        "corner_pose joint", "rad or m", "joint readings of corner_squares"
     )
-    sigma_q: float | None = _scalar(
-        "rad",
-        "standard deviation of joint readings, prismatic × 0.3 m/rad; 0 if none is significant",
-        default=None,
+    sigma_q: float | None = _optional_scalar(
+        "rad", "standard deviation of joint readings, prismatic × 0.3 m/rad; 0 if none is significant"
     )
-    sigma_q_interval: FloatArray | None = _array(
-        "limit", "rad", "95 % interval of sigma_q, if estimated", default=None
+    sigma_q_interval: FloatArray | None = _optional_array(
+        "limit", "rad", "95 % interval of sigma_q, if estimated"
     )
     encoder_counts: bool = _scalar(about="whether sigma_q is that of encoder counts", default=False)
     excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
@@ -482,31 +479,28 @@ class Rejections:
         "id_switch_row id_switch_column",
         about="observations under a wrong marker number: pose, number read, true number",
     )
-    rejected_markers: IntArray | None = _array(
+    rejected_markers: IntArray | None = _optional_array(
         "rejected_marker_row rejected_marker_column",
         about="rejected markers: number, and reason as an index into WHY_LOST",
-        default=None,
     )
-    rejected_poses: IntArray | None = _array(
-        "rejected_pose", about="rejected poses without one suspect joint reading", default=None
+    rejected_poses: IntArray | None = _optional_array(
+        "rejected_pose", about="rejected poses without one suspect joint reading"
     )
-    moved_images: IntArray | None = _array(
+    moved_images: IntArray | None = _optional_array(
         "moved_row moved_column",
         about="images of a camera that moved, or had not settled: pose, index of the view",
-        default=None,
     )
-    turned_images: IntArray | None = _array(
+    turned_images: IntArray | None = _optional_array(
         "turned_row turned_column",
         about="images of a board, numbered from another end and turned right: pose, index of the view",
-        default=None,
     )
     placeholders: int = _scalar(about="number of detections that stood for unseen markers", default=0)
-    unseen_poses: IntArray | None = _array("unseen_pose", about="poses that no camera saw", default=None)
-    circular_joints: IntArray | None = _array(
-        "circular_joint", about="joints, from 1, whose readings passed a full turn", default=None
+    unseen_poses: IntArray | None = _optional_array("unseen_pose", about="poses that no camera saw")
+    circular_joints: IntArray | None = _optional_array(
+        "circular_joint", about="joints, from 1, whose readings passed a full turn"
     )
-    undecided_order: IntArray | None = _array(
-        "undecided_pair pair_end", about="pairs of joints, from 1, whose order no pose shows", default=None
+    undecided_order: IntArray | None = _optional_array(
+        "undecided_pair pair_end", about="pairs of joints, from 1, whose order no pose shows"
     )
 
     @property
@@ -523,42 +517,34 @@ class Rejections:
 class StatedErrors:
     """Errors of predicted images, with the deviations from the model that limit them."""
 
-    predicted_rms_px: float | None = _scalar(
-        "px",
-        "expected error of images within the joint ranges, rms per marker and view",
-        default=None,
+    predicted_rms_px: float | None = _optional_scalar(
+        "px", "expected error of images within the joint ranges, rms per marker and view"
     )
-    predicted_p99_px: float | None = _scalar(
-        "px", "99th percentile of that rms over draws of the noise", default=None
+    predicted_p99_px: float | None = _optional_scalar(
+        "px", "99th percentile of that rms over draws of the noise"
     )
-    predicted_recorded_px: float | None = _scalar(
-        "px", "expected error of images at the recorded poses, rms per marker and view", default=None
+    predicted_recorded_px: float | None = _optional_scalar(
+        "px", "expected error of images at the recorded poses, rms per marker and view"
     )
-    predicted_worst_px: float | None = _scalar(
-        "px",
-        "expected error within the joint ranges if the deviation is there that these data do not show",
-        default=None,
+    predicted_worst_px: float | None = _optional_scalar(
+        "px", "expected error within the joint ranges if the deviation is there that these data do not show"
     )
     model_error: tuple[str, ...] = _scalar(
         about="deviations from the model that limit predictions: kind, joints and view of each", default=()
     )
-    model_error_numbers: FloatArray | None = _array(
+    model_error_numbers: FloatArray | None = _optional_array(
         "model_error_row model_error_column",
         about="of each its estimate, standard deviation, effect on predictions in px, and first pose",
-        default=None,
     )
-    model_error_bias: FloatArray | None = _array(
+    model_error_bias: FloatArray | None = _optional_array(
         "parameter_and_coordinate model_error_row",
         about="error of P, H_hat_0, lenses and M by each of them, to first order",
-        default=None,
     )
     unshown_error: tuple[str, ...] = _scalar(
         about="the deviation that these data do not show and that would spoil predictions most", default=()
     )
-    unshown_numbers: FloatArray | None = _array(
-        "model_error_column",
-        about="its usual or smallest detectable size, 0, and its effect in px",
-        default=None,
+    unshown_numbers: FloatArray | None = _optional_array(
+        "model_error_column", about="its usual or smallest detectable size, 0, and its effect in px"
     )
 
     @property
@@ -588,24 +574,23 @@ class Calibration(StatedErrors, Rejections, FitQuality, ProjectiveKinematics):
     reason: str = _scalar(about="reason why it is usable or not")
     advice: tuple[str, ...] = _scalar(about="remedies, one sentence each")
     seconds: float = _scalar("s", "computing time")
-    time_offset_s: FloatArray | None = _array(
-        "view", "s", "time of a joint reading less the time of its image", default=None
+    time_offset_s: FloatArray | None = _optional_array(
+        "view", "s", "time of a joint reading less the time of its image"
     )
-    time_offset_interval_s: FloatArray | None = _array(
-        "view limit", "s", "95 % interval of the time offset", default=None
+    time_offset_interval_s: FloatArray | None = _optional_array(
+        "view limit", "s", "95 % interval of the time offset"
     )
-    time_offset_jitter_s: FloatArray | None = _array(
-        "view", "s", "standard deviation of the time offset of single images", default=None
+    time_offset_jitter_s: FloatArray | None = _optional_array(
+        "view", "s", "standard deviation of the time offset of single images"
     )
 
     refit: tuple[str, ...] = _scalar(
         about="names of cameras that were fitted again, in this order", default=()
     )
-    refit_numbers: FloatArray | None = _array(
+    refit_numbers: FloatArray | None = _optional_array(
         "refit refit_column",
         about="of each the number of poses, and the error of its images within the joint ranges now and "
         "before it moved, rms px",
-        default=None,
     )
 
     def without_covariance(self) -> "Calibration":
@@ -661,15 +646,14 @@ class CrossValidation:
     predicted: FloatArray = _array(
         "pose view marker xy", "px", "standard deviation of the residual from noise and covariance"
     )
-    posture_rms_px: float | None = _scalar("px", "rms residual in folds of like postures", default=None)
-    posture_predicted_px: float | None = _scalar("px", "expected rms of it", default=None)
-    time_rms_px: float | None = _scalar("px", "rms residual in folds of consecutive poses", default=None)
-    time_predicted_px: float | None = _scalar("px", "expected rms of it", default=None)
-    others_px: FloatArray | None = _array(
+    posture_rms_px: float | None = _optional_scalar("px", "rms residual in folds of like postures")
+    posture_predicted_px: float | None = _optional_scalar("px", "expected rms of it")
+    time_rms_px: float | None = _optional_scalar("px", "rms residual in folds of consecutive poses")
+    time_predicted_px: float | None = _optional_scalar("px", "expected rms of it")
+    others_px: FloatArray | None = _optional_array(
         "view with_or_without",
         "px",
         "rms residual of the other views, by fits with this view and without it; none of two views",
-        default=None,
     )
 
 
@@ -745,50 +729,38 @@ class TaskPartition:
 class JointSpaceSearch:
     """A search through joint space: its numbers, trees and required margins; none in other profiles."""
 
-    n_goal_configurations: int | None = _scalar(
-        about="number of goal configurations within the limits; none but in the profile joint_space",
-        default=None,
+    n_goal_configurations: int | None = _optional_scalar(
+        about="number of goal configurations within the limits; none but in the profile joint_space"
     )
-    n_search_samples: int | None = _scalar(
-        about="number of samples of the search; none but in the profile joint_space", default=None
+    n_search_samples: int | None = _optional_scalar(
+        about="number of samples of the search; none but in the profile joint_space"
     )
-    n_goals_tried: int | None = _scalar(
-        about="number of goal configurations tried, nearest in time; none but in the profile joint_space",
-        default=None,
+    n_goals_tried: int | None = _optional_scalar(
+        about="number of goal configurations tried, nearest in time; none but in the profile joint_space"
     )
-    seed: int | None = _scalar(about="seed of the search; none but in the profile joint_space", default=None)
-    tree_nodes: int | None = _scalar(
+    seed: int | None = _optional_scalar(about="seed of the search; none but in the profile joint_space")
+    tree_nodes: int | None = _optional_scalar(
         about="number of nodes of both search trees, of which the first are stored; none but in the "
-        "profile joint_space",
-        default=None,
+        "profile joint_space"
     )
-    margins: FloatArray | None = _array(
+    margins: FloatArray | None = _optional_array(
         "sample margin_kind",
         about="in the profile joint_space: distance from the joint limits over the required one; for "
         "each view minimum depth (start = 1), visibility a·O (start = 1), width of the face in "
         "px, distance from the image border less three standard deviations in px; distance from "
         "keep-out regions in px",
-        default=None,
     )
-    required_margins: FloatArray | None = _array(
-        "sample margin_kind",
-        about="required values of these margins, smaller near start and goals",
-        default=None,
+    required_margins: FloatArray | None = _optional_array(
+        "sample margin_kind", about="required values of these margins, smaller near start and goals"
     )
-    blends: FloatArray | None = _array(
-        "blend end",
-        "s",
-        "in the profile joint_space: begin and end of each blend of a waypoint",
-        default=None,
+    blends: FloatArray | None = _optional_array(
+        "blend end", "s", "in the profile joint_space: begin and end of each blend of a waypoint"
     )
-    tree_q: FloatArray | None = _array(
-        "node joint",
-        "rad or m",
-        "nodes of the search trees: that from the start, then that from the goals",
-        default=None,
+    tree_q: FloatArray | None = _optional_array(
+        "node joint", "rad or m", "nodes of the search trees: that from the start, then that from the goals"
     )
-    tree_parent: IntArray | None = _array(
-        "node", about="index of the parent of each node, -1 at a root", default=None
+    tree_parent: IntArray | None = _optional_array(
+        "node", about="index of the parent of each node, -1 at a root"
     )
 
 
@@ -796,36 +768,36 @@ class JointSpaceSearch:
 class CarriedByObject:
     """Object that the goal was taught on, where it is now, and the goal carried along; none without one."""
 
-    object_name: str | None = _scalar(about="name of the object that carries the goal", default=None)
-    object_shift_mm: float | None = _scalar(
-        "mm", "motion of its middle since the goal was taught; none if no length is known", default=None
+    object_name: str | None = _optional_scalar(about="name of the object that carries the goal")
+    object_shift_mm: float | None = _optional_scalar(
+        "mm", "motion of its middle since the goal was taught; none if no length is known"
     )
-    object_angle_deg: float | None = _scalar(
-        "deg", "its rotation since; none if the joints do not determine the metric", default=None
+    object_angle_deg: float | None = _optional_scalar(
+        "deg", "its rotation since; none if the joints do not determine the metric"
     )
-    object_shift_px: float | None = _scalar(
-        "px", "motion of its images since, rms per marker and view", default=None
+    object_shift_px: float | None = _optional_scalar(
+        "px", "motion of its images since, rms per marker and view"
     )
-    goal_deviation_mm: float | None = _scalar(
-        "mm", "deviation of the carried goal, rms; none if no length is known", default=None
+    goal_deviation_mm: float | None = _optional_scalar(
+        "mm", "deviation of the carried goal, rms; none if no length is known"
     )
-    goal_deviation_deg: float | None = _scalar(
-        "deg", "deviation of its rotation; none if the joints do not determine the metric", default=None
+    goal_deviation_deg: float | None = _optional_scalar(
+        "deg", "deviation of its rotation; none if the joints do not determine the metric"
     )
-    goal_deviation_px: float | None = _scalar(
-        "px", "deviation of its images, rms per marker and view", default=None
+    goal_deviation_px: float | None = _optional_scalar(
+        "px", "deviation of its images, rms per marker and view"
     )
-    object_marker: IntArray | None = _array(
-        "object_marker", about="numbers of the markers of the object", default=None
+    object_marker: IntArray | None = _optional_array(
+        "object_marker", about="numbers of the markers of the object"
     )
-    object_left_out: str | None = _scalar(
-        about="numbers of its markers that were off by themselves in a look, and left out of it", default=None
+    object_left_out: str | None = _optional_scalar(
+        about="numbers of its markers that were off by themselves in a look, and left out of it"
     )
-    s_object: FloatArray | None = _array(
-        "view object_marker xy", "px", "images of these when it was planned, NaN if unseen", default=None
+    s_object: FloatArray | None = _optional_array(
+        "view object_marker xy", "px", "images of these when it was planned, NaN if unseen"
     )
-    s_carried: FloatArray | None = _array(
-        "view observed xy", "px", "images of all markers of the body at the carried goal", default=None
+    s_carried: FloatArray | None = _optional_array(
+        "view observed xy", "px", "images of all markers of the body at the carried goal"
     )
 
     @property
@@ -893,15 +865,13 @@ class Plan(CarriedByObject, JointSpaceSearch, TaskPartition, PlannedMotion):
     incidences: tuple[str, ...] = _scalar(
         about="incidences that are to hold at the goal; none for the whole pose", default=()
     )
-    free_dof: int | None = _scalar(
-        about="number of joint motions at the goal that keep all incidences; none for the whole pose",
-        default=None,
+    free_dof: int | None = _optional_scalar(
+        about="number of joint motions at the goal that keep all incidences; none for the whole pose"
     )
-    s_goal: FloatArray | None = _array(
+    s_goal: FloatArray | None = _optional_array(
         "view observed xy",
         "px",
         "images of all markers of the body at the goal that was chosen, of those that incidences leave open",
-        default=None,
     )
     relaxed_constraints: tuple[str, ...] = _scalar(
         about="constraints relaxed at the start and the goal, which have smaller margins themselves",
@@ -929,27 +899,24 @@ class RunMetrics:
     remaining_rotation_deg: float | None = _scalar(
         "deg", "rotation that remains at the end, as the law measures it"
     )
-    image_error_px: float | None = _scalar(
-        "px", "image_error at the end; none if a marker of the face was unseen", default=None
+    image_error_px: float | None = _optional_scalar(
+        "px", "image_error at the end; none if a marker of the face was unseen"
     )
-    estimated_position_error_mm: float | None = _scalar(
+    estimated_position_error_mm: float | None = _optional_scalar(
         "mm",
         "estimated distance of the face from the goal, rms: by the images, with undetected_position_error_mm "
         "and what goal images leave open; none if no length on the face is known, or images disagree with "
         "the calibration",
-        default=None,
     )
-    undetected_position_error_mm: float | None = _scalar(
+    undetected_position_error_mm: float | None = _optional_scalar(
         "mm",
         "part of it: by what no test tells from none, at two deviations, such as tags that moved less than "
         "backlash hides; none if images are not tested",
-        default=None,
     )
-    success: bool | None = _scalar(
+    success: bool | None = _optional_scalar(
         about="whether it converged and at every time, in truth, no joint was past a limit, no camera "
         "behind the face and every marker of the face in both images; none if the truth is "
-        "unknown",
-        default=None,
+        "unknown"
     )
     self_occluded_steps: tuple[int, ...] = _by_view("times at which this camera is behind the face")
     center_deviation_mm: float | None = _scalar(
@@ -1016,47 +983,40 @@ class RunHistory:
     pose: FloatArray = _array("time row coordinate", "m", "true pose of the tool")
     goal_pose: FloatArray = _array("row coordinate", "m", "true goal pose, NaN if unknown")
     center: FloatArray = _array("time axis", "m", "true centre of the face")
-    incidence_px: FloatArray | None = _array(
+    incidence_px: FloatArray | None = _optional_array(
         "time incidence",
         "px",
         "error of each incidence over its deviation at one pixel of noise; none for the whole pose",
-        default=None,
     )
-    feature_s: FloatArray | None = _array(
+    feature_s: FloatArray | None = _optional_array(
         "time incidence span view xy",
         "px",
         "images of the points that span each feature of the tool, as the body was measured; NaN beyond the "
         "one, two or three of a point, line or plane",
-        default=None,
     )
-    feature_s_star: FloatArray | None = _array(
-        "incidence span view xy", "px", "images of those of the scene, where they were taught", default=None
+    feature_s_star: FloatArray | None = _optional_array(
+        "incidence span view xy", "px", "images of those of the scene, where they were taught"
     )
-    incidence_mm: FloatArray | None = _array(
+    incidence_mm: FloatArray | None = _optional_array(
         "incidence",
         "mm",
         "distance of features that are to meet, at the end by the images; NaN without a known length, or of "
         "others",
-        default=None,
     )
-    incidence_deg: FloatArray | None = _array(
+    incidence_deg: FloatArray | None = _optional_array(
         "incidence",
         "deg",
         "angle that an incidence is off at the end by the images; NaN of points, or where the joints leave "
         "angles open",
-        default=None,
     )
-    force: FloatArray | None = _array(
-        "time", "N", "force on the tool; none without stop.max_force_n", default=None
+    force: FloatArray | None = _optional_array(
+        "time", "N", "force on the tool; none without stop.max_force_n"
     )
-    latency: FloatArray | None = _array(
-        "time view",
-        "s",
-        "time of the joint reading less the time of the image, as estimated in the run",
-        default=None,
+    latency: FloatArray | None = _optional_array(
+        "time view", "s", "time of the joint reading less the time of the image, as estimated in the run"
     )
-    q_read: FloatArray | None = _array(
-        "time joint", "rad or m", "joint readings, if they differ from the joints", default=None
+    q_read: FloatArray | None = _optional_array(
+        "time joint", "rad or m", "joint readings, if they differ from the joints"
     )
 
 
@@ -1064,16 +1024,14 @@ class RunHistory:
 class RecordedFrames:
     """Camera images that were kept of a run; absent if the robot provides none."""
 
-    frame_index: IntArray | None = _array(
-        "frame", about="time indices of the stored frames; absent if the robot provides none", default=None
+    frame_index: IntArray | None = _optional_array(
+        "frame", about="time indices of the stored frames; absent if the robot provides none"
     )
-    frame_s: FloatArray | None = _array(
-        "frame view observed xy", "px", "all markers that were found in the frames", default=None
+    frame_s: FloatArray | None = _optional_array(
+        "frame view observed xy", "px", "all markers that were found in the frames"
     )
-    frame_size: IntArray | None = _array(
-        "frame view", about="bytes of each frame in frame_jpeg", default=None
-    )
-    frame_jpeg: ByteArray | None = _array("frame_byte", about="frames as JPEG, concatenated", default=None)
+    frame_size: IntArray | None = _optional_array("frame view", about="bytes of each frame in frame_jpeg")
+    frame_jpeg: ByteArray | None = _optional_array("frame_byte", about="frames as JPEG, concatenated")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -1094,18 +1052,16 @@ class Trace(RecordedFrames, RunHistory, RunMetrics):
     incidences: tuple[str, ...] = _scalar(
         about="incidences that were to hold at the goal; none for the whole pose", default=()
     )
-    free_dof: int | None = _scalar(
-        about="number of joint motions at the goal that keep all incidences; none for the whole pose",
-        default=None,
+    free_dof: int | None = _optional_scalar(
+        about="number of joint motions at the goal that keep all incidences; none for the whole pose"
     )
     replan_attempts: int = _scalar(about="number of replanning attempts", default=0)
     unplanned: str = _scalar(
         about="reason why a run in a following mode ran without the plan; empty if it followed", default=""
     )
     untested: str = _scalar(about="reason why the images were not tested against the calibration", default="")
-    overruns: int | None = _scalar(
-        about="number of missed periods; none for the ideal simulated robot",
-        default=None,
+    overruns: int | None = _optional_scalar(
+        about="number of missed periods; none for the ideal simulated robot"
     )
 
 
