@@ -7,11 +7,11 @@ from scipy.special import fdtri
 
 from projservo_cli.calibration.bundle_adjustment import LeastSquares
 from projservo_cli.calibration.detections import MAX_JUDGED, Detections
-from projservo_cli.calibration.epipolar import ImageFrame, ImageGeometry
+from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, ImageGeometry
 from projservo_cli.calibration.initialization import Search
 from projservo_cli.calibration.prediction import LENS, Parameters
 from projservo_cli.calibration.robust_fit import Solution, fit_from, left_out_px
-from projservo_cli.calibration.single_view import geometry_of
+from projservo_cli.calibration.single_view import RigidBody
 from projservo_cli.geometry.lens import before_fold, undistort
 from projservo_cli.records import FloatArray, WorkFailed
 
@@ -79,6 +79,11 @@ def _cleared_columns(solution: Solution, params: Parameters, terms: int) -> Floa
     return np.asarray(left.T.reshape(-1, *solution.residual.shape))
 
 
+def _geometry_of(detections: Detections, frame: ImageFrame, rng: np.random.Generator) -> ImageGeometry:
+    """Geometry of the images of the pair of views, or of the only view."""
+    return RigidBody.of(detections, frame) if len(detections.pair) == 1 else Epipolar.of(detections, rng)
+
+
 def fit_lens(solution: Solution, search: Search) -> tuple[Solution, ImageGeometry]:
     """Fit with radial distortion, and estimate the epipolar geometry of the undistorted detections.
 
@@ -96,7 +101,7 @@ def fit_lens(solution: Solution, search: Search) -> tuple[Solution, ImageGeometr
             if freed is not None and left_out_px(freed) < left_out_px(found):
                 found = freed
         detections = undistorted(solution.problem.detections, found.params.lens)
-        return found, geometry_of(detections, search.frame, search.rng)
+        return found, _geometry_of(detections, search.frame, search.rng)
     raise WorkFailed(
         "the images do not determine the distortion of the lenses: record poses with markers all over "
         "both images, or calibrate without lens (calibration.lens)"

@@ -22,7 +22,6 @@ from projservo_cli.calibration.detections import MAD, MIN_SIGMA, RAYLEIGH, Detec
 from projservo_cli.calibration.epipolar import (
     OUTLIER,
     Core,
-    Epipolar,
     ImageFrame,
     ImageGeometry,
     planar_homography,
@@ -439,8 +438,3 @@ def _left_jacobian(w: FloatArray) -> FloatArray:
     a = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     b = np.where(angle > 1e-4, (1.0 - np.sinc(angle / np.pi)) / np.maximum(angle, 1e-4) ** 2, 1.0 / 6.0)
     return np.asarray(np.eye(3) + a * W + b * (W @ W))
-
-
-def geometry_of(detections: Detections, frame: ImageFrame, rng: np.random.Generator) -> ImageGeometry:
-    """Geometry of the images of the pair of views, or of the only view."""
-    return RigidBody.of(detections, frame) if len(detections.pair) == 1 else Epipolar.of(detections, rng)

@@ -197,7 +197,7 @@ def _in_metres(
 
     from projservo_cli.config import load_config
     from projservo_cli.config.inputs import joints_of
-    from projservo_cli.metric.contradictions import contradictions, kinematic_words
+    from projservo_cli.metric.kinematic_errors import contradictions, kinematic_words
     from projservo_cli.metric.opencv import opencv_cameras
     from projservo_cli.records import TOOL, WorkFailed
     from projservo_cli.results import ImageModel

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.detections import even_choice
-from projservo_cli.calibration.prediction import predict
+from projservo_cli.calibration.prediction import CAMERA, predict
 from projservo_cli.monitoring.accuracy import Posture
 from projservo_cli.monitoring.frame_pairs import FramePair, Pairing, TimedImage, at_known_markers, mean_image
 from projservo_cli.monitoring.hypotheses import (
@@ -26,7 +26,6 @@ from projservo_cli.monitoring.innovation_tests import (
     MemoryState,
     Residual,
     Sums,
-    columns_of_marker,
     is_same_view,
 )
 from projservo_cli.monitoring.messages import PLACE, group_of, is_slight, sentence
@@ -91,6 +90,12 @@ class _Recent(NamedTuple):
     hidden: BoolArray  # (V,) whether it shows less than half of them
     covered: BoolArray  # (V,) whether something passes before it
     state: MemoryState  # observations that agreed before it
+
+
+def _columns_of_marker(errors: ErrorModel, marker: int) -> IntArray:
+    """Columns of the displacement of a marker among the directions of faults."""
+    first = errors.fixed + len(errors.calibration.P) * (CAMERA - 1)
+    return np.asarray(first + 3 * marker + np.arange(3))
 
 
 class ImageMonitor:
@@ -283,7 +288,7 @@ class ImageMonitor:
         self._crowded = (self._crowded + 1) * bool(crowd.any() and not covered)
         disagrees = tested.disagrees or self._crowd_is_fault()
         if not disagrees:
-            free = [columns_of_marker(self._errors, j) for j in self._forgiven]
+            free = [_columns_of_marker(self._errors, j) for j in self._forgiven]
             since = self._detector.significant(self.observations, pair.sigma_t, free, self.pending)
         if not disagrees and since is None:
             self.agreeing = 1 + self.agreeing * lasts

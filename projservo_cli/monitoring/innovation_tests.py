@@ -804,9 +804,3 @@ def _directions_of(V: int, n: int, m: int, d: int) -> tuple[list[IntArray], Floa
     directions += [(at_tool + np.arange(d), everything), (at_tool + d + np.arange(d), everything)]
     columns, touches = zip(*directions, strict=True)
     return list(columns), np.array([part.ravel() for part in touches]), at_tool + 2 * d
-
-
-def columns_of_marker(errors: ErrorModel, marker: int) -> IntArray:
-    """Columns of the displacement of a marker among the directions of faults."""
-    first = errors.fixed + len(errors.calibration.P) * (CAMERA - 1)
-    return np.asarray(first + 3 * marker + np.arange(3))

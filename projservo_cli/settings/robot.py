@@ -23,7 +23,6 @@ from projservo_cli.settings.sections import (
     Vector3,
     not_a_screw,
     not_rigid,
-    upside_down,
 )
 
 _File = Annotated[str, StringConstraints(min_length=1)]
@@ -41,6 +40,11 @@ def like_degrees(low: float, high: float) -> str:
     """Return the reason why limits of a revolute joint that are to be rad look like degrees, else nothing."""
     alike = TWO_TURNS < max(abs(low), abs(high)) <= _MOST_DEG
     return f"{low:g} to {high:g} rad is more than two turns to a side: degrees?" if alike else ""
+
+
+def _upside_down(low: float, high: float) -> str:
+    """Return the reason why two limits are none; empty if they are some."""
+    return "" if low < high else f"the lower limit {low:g} must be below the upper limit {high:g}"
 
 
 class _Joint(Section):
@@ -69,7 +73,7 @@ class _Joint(Section):
                 units = "limits_m" if self.type == "P" else "limits_deg or limits_rad"
                 yield (name,), f"a joint of type {self.type} takes {units}"
             low, high = getattr(self, name)
-            if what := upside_down(low, high):
+            if what := _upside_down(low, high):
                 yield (name,), what
             elif name == "limits_rad" and (what := like_degrees(low, high)):
                 yield (name,), f"{what} set limits_deg"
@@ -149,7 +153,7 @@ class _Limits(Section):
         if (self.joints is None) != (self.unit is None):
             yield ("unit",), "is that of joints: give both or neither"
         for i, (low, high) in enumerate(self.joints or ()):
-            if what := upside_down(low, high):
+            if what := _upside_down(low, high):
                 yield ("joints", i), what
 
     def values(self, joint_types: str) -> tuple[tuple[float, float], ...]:

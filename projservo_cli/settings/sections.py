@@ -165,11 +165,6 @@ class JointVector(Section):
             yield (*path, "joints"), what
 
 
-def upside_down(low: float, high: float) -> str:
-    """Return the reason why two limits are none; empty if they are some."""
-    return "" if low < high else f"the lower limit {low:g} must be below the upper limit {high:g}"
-
-
 def not_rigid(T: Matrix44) -> str:
     """Return the reason why a matrix is no pose; empty if it is one."""
     R = np.array(T)[:3, :3]

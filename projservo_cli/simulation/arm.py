@@ -74,12 +74,6 @@ def roll_axis(P: FloatArray) -> tuple[FloatArray, FloatArray]:
     return point, direction / np.linalg.norm(direction)
 
 
-def about_axis(point: FloatArray, direction: FloatArray, theta: float) -> FloatArray:
-    """4×4 rotation by θ, rad, about the axis through a point (3,), m, along a direction (3,)."""
-    R = Rotation.from_rotvec(theta * direction / np.linalg.norm(direction))
-    return rigid(R, point - R.as_matrix() @ point)
-
-
 class Link(NamedTuple):
     """A row of the table; the joint reading adds to theta (R) or d (P)."""
 

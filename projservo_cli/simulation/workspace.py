@@ -20,7 +20,6 @@ from projservo_cli.simulation.analytic_plant import Ends, Plant
 from projservo_cli.simulation.arm import (
     METRIC_A_INF,
     SerialArm,
-    about_axis,
     camera_center,
     inverse_kinematics,
     roll_axis,
@@ -134,6 +133,12 @@ class SceneObject(NamedTuple):
         return truth.within(np.where(seen[..., None], project(truth.P, X, truth.lens), np.nan))
 
 
+def _about_axis(point: FloatArray, direction: FloatArray, theta: float) -> FloatArray:
+    """4×4 rotation by θ, rad, about the axis through a point (3,), m, along a direction (3,)."""
+    R = Rotation.from_rotvec(theta * direction / np.linalg.norm(direction))
+    return rigid(R, point - R.as_matrix() @ point)
+
+
 def turned(goal: Goal, arm: SerialArm, P: FloatArray, q_start: FloatArray) -> FloatArray:
     """Joints (n,) of a goal that is a turn of the tool about the roll axis of the rig from joints (n,).
 
@@ -142,11 +147,11 @@ def turned(goal: Goal, arm: SerialArm, P: FloatArray, q_start: FloatArray) -> Fl
     """
     assert goal.roll_deg is not None
     point, direction = roll_axis(P)
-    pose = about_axis(point, direction, math.radians(goal.roll_deg)) @ arm.pose(q_start)
+    pose = _about_axis(point, direction, math.radians(goal.roll_deg)) @ arm.pose(q_start)
     if goal.perturbation is not None:
         t, v = np.array(goal.perturbation.translation_m), np.array(goal.perturbation.rotation_rad)
         angle = float(np.linalg.norm(v))
-        turn = about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
+        turn = _about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
         pose = pose @ rigid(Rotation.identity(), t) @ turn
     return inverse_kinematics(arm, pose, q_start)
 

@@ -178,12 +178,6 @@ def path_to(
         )
 
 
-def stands_at(driven: DrivenRobot, q: FloatArray) -> bool:
-    """Whether a robot stands at joints (n,), as near as it is held."""
-    away = np.abs(driven.steered.observe().q - q)
-    return bool((away <= np.maximum(driven.robot.bounds.sag, STILL)).all())
-
-
 def simulated_robot(driven: Drive, joints: Joints, robot: FaultyRobot) -> PluginRobot:
     """A simulated robot of the contract, which is never late, and goes beyond its limits where it may."""
     bounds = driven.following.bounds(joints)

@@ -20,7 +20,7 @@ from projservo_cli.monitoring.accuracy import RigidFit, metric_points, rigid_fit
 from projservo_cli.monitoring.image_monitor import detected_fault
 from projservo_cli.planning.constraints import constraints_of
 from projservo_cli.planning.goal_sets import MET_PX, goals_meeting
-from projservo_cli.planning.margins import Demands, Reaching
+from projservo_cli.planning.margins import Demands, Motion, Reaching, best_views
 from projservo_cli.planning.shown_joints import NEAR_PX, joints_showing
 from projservo_cli.records import (
     NO_SPREAD,
@@ -48,7 +48,7 @@ from projservo_cli.stages.motions import (
     search_of,
     why_closed,
 )
-from projservo_cli.stages.plan_summary import minimum_of, reason_of, search_summary, verdict_of
+from projservo_cli.stages.plan_summary import reason_of, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.stage_inputs import PlanInputs
 from projservo_cli.task.face import Task, center_of, face_plane
@@ -355,6 +355,15 @@ def _found(
     return found
 
 
+def _minimum_of(motion: Motion) -> tuple[FloatArray, FloatArray]:
+    """Smallest value (4,) of each constraint in its own unit, and the shares (4, 3) where it is."""
+    along = motion.along
+    best = best_views(motion.reaching.demands, along.visibility, along.distance)
+    constraints = [best[0].min(axis=1), best[1].min(axis=1), along.limit, along.condition]
+    instants = [0 if np.isnan(column).all() else int(np.nanargmin(column)) for column in constraints]
+    return np.array([column[i] for column, i in zip(constraints, instants, strict=True)]), motion.mu[instants]
+
+
 def _planned(
     model: Model,
     images: TaskImages,
@@ -394,7 +403,7 @@ def _planned(
         _require_in_span(model, state.A, images.q_start, along.s)
     sense, sense_margin = _senses(parts, task)
     holds, constraint, words = verdict_of(found.judged)
-    min_margin, min_margin_mu = minimum_of(found.judged)
+    min_margin, min_margin_mu = _minimum_of(found.judged)
     plan = Plan(
         profile=trajectory.profile,
         feasible=found.feasible,

@@ -82,15 +82,6 @@ def _border_words(distance: float, view: str, demands: Demands) -> str:
     )
 
 
-def minimum_of(motion: Motion) -> tuple[FloatArray, FloatArray]:
-    """Smallest value (4,) of each constraint in its own unit, and the shares (4, 3) where it is."""
-    along = motion.along
-    best = best_views(motion.reaching.demands, along.visibility, along.distance)
-    constraints = [best[0].min(axis=1), best[1].min(axis=1), along.limit, along.condition]
-    instants = [0 if np.isnan(column).all() else int(np.nanargmin(column)) for column in constraints]
-    return np.array([column[i] for column, i in zip(constraints, instants, strict=True)]), motion.mu[instants]
-
-
 def sight_words(profile: str, motion: Motion) -> tuple[bool, str]:
     """Tell whether enough cameras see the face all along, and give the reason."""
     margins, demands = motion.along.visibility, motion.reaching.demands

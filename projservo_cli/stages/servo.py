@@ -44,6 +44,7 @@ from projservo_cli.records import (
 from projservo_cli.results import ImageModel
 from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.session import Session
+from projservo_cli.robots.standstill import STILL
 from projservo_cli.simulation.analytic_plant import AnalyticPlant, Ends, Plant
 from projservo_cli.simulation.faults import obstruction_of
 from projservo_cli.simulation.workspace import Truth
@@ -60,13 +61,23 @@ from projservo_cli.task.incidences import (
     incidences_of,
     metric_errors,
     nearest_goal,
-    point_velocities,
     whole_pose,
 )
 from projservo_cli.task.target import TaskImages, followed
 
 _RETREAT = 10  # periods by which an arm goes back where the object of its goal moves
 _NOT_DRIVEN: Any = None  # in place of what a run leaves
+
+
+def _point_velocities(M: FloatArray, motions: FloatArray) -> FloatArray:
+    """Return the velocities (3 m, 6) of metric points (m, 4) by motions (6, 4, 4), to measure these by."""
+    return np.asarray(np.einsum("kab,mb->mak", motions, M)[:, :3].reshape(-1, COORDINATES))
+
+
+def _stands_at(driven: DrivenRobot, q: FloatArray) -> bool:
+    """Whether a robot stands at joints (n,), as near as it is held."""
+    away = np.abs(driven.steered.observe().q - q)
+    return bool((away <= np.maximum(driven.robot.bounds.sag, STILL)).all())
 
 
 @dataclass(eq=False)
@@ -175,7 +186,7 @@ class LawRun:
                 assert contract.settle_s is not None
                 start, settle_s = scenario.ends.q_start, contract.settle_s
                 unseen = self._require_images(driven, "the robot did not move, since where it stands", 1)
-                stands = scenario.starts_here and external_robot.stands_at(driven, start)
+                stands = scenario.starts_here and _stands_at(driven, start)
                 path = external_robot.path_to(driven.steered, start, settle_s, "servo")
                 for _ in () if stands else path:
                     if wrong := driven.agrees():
@@ -354,7 +365,7 @@ class LawRun:
         rows = incidences_of(
             model, body, np.linalg.inv(H_taught) if on_tool else H_taught, scenario.exact.incidences
         )
-        H = nearest_goal(rows, body, self.log.H[self.steps], point_velocities)
+        H = nearest_goal(rows, body, self.log.H[self.steps], _point_velocities)
         pose = (np.linalg.inv(H) if on_tool else H) @ ends.base_tool
         return Ends(ends.base_tool, pose, H @ np.array(center_of(self.plant.M, self.plant.center)))
 

@@ -312,11 +312,6 @@ def image_velocities(model: Model, shows: BoolArray) -> _Moved:
     return moved
 
 
-def point_velocities(M: FloatArray, motions: FloatArray) -> FloatArray:
-    """Return the velocities (3 m, 6) of metric points (m, 4) by motions (6, 4, 4), to measure these by."""
-    return np.asarray(np.einsum("kab,mb->mak", motions, M)[:, :3].reshape(-1, COORDINATES))
-
-
 def weighted(
     incidences: Incidences, model: Model, body: Body, H: FloatArray, shows: BoolArray, a: FloatArray
 ) -> Incidences:
