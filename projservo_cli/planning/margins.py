@@ -155,9 +155,8 @@ class Reaching(NamedTuple):
     O: FloatArray  # (V, 4) optical centres
     visible: FloatArray  # (V,) sign of a·O on the visible side of the face
     q_start: FloatArray  # (n,) joints at the start, rad or m
-    body: FloatArray = np.zeros(
-        (0, 4)
-    )  # (b, 4) all markers of the body at the start, those of the face first
+    # (b, 4) all markers of the body at the start, those of the face first
+    body: FloatArray = np.zeros((0, 4))
 
 
 class Along(NamedTuple):

@@ -87,9 +87,8 @@ class _Motion(NamedTuple):
     # (e, 3) line around it, or along the pyramids, at the goal; None where only images of it are known
     goal: FloatArray | None
     planned: FloatArray  # (s, 3) centre of what moves along the joints of the plan, as far as they follow it
-    trees: tuple[
-        FloatArray, ...
-    ]  # (e, 3) centre of the face along the edges of each search tree, NaN between
+    # (e, 3) centre of the face along the edges of each search tree, NaN between
+    trees: tuple[FloatArray, ...]
     features: FloatArray  # (e, 3) line along the features of the scene
     runs: Mapping[str, _Driven]
 

@@ -49,9 +49,8 @@ Data = dict[str, npt.NDArray[Any]]
 
 PAGE_FILE, VIEW_FILE, ANIMATION_FILE = "report.html", "view.html", "animation.gif"
 CLAIMS_FILE = "claims.json"
-NEAREST = tuple(
-    CONSTRAINTS[constraint].value for constraint in OF_MOTION
-)  # smallest along the planned motion
+# Names of the constraints whose smallest values along the planned motion are told.
+NEAREST = tuple(CONSTRAINTS[constraint].value for constraint in OF_MOTION)
 # Lists of what does not fit: observations, and deviations from the model.
 _LISTS = (
     *("outliers", "suspect_joint_readings", "id_switches", "moved_images", "turned_images"),

@@ -92,9 +92,8 @@ class Following(NamedTuple):
     speed_scale: float  # factor of every command
     max_servo_lag_s: float  # by how much joints may lag behind their set-points
     max_steady_state_error_deg: float  # how far a joint at rest may stay from its set-point
-    max_relative_target_deg: (
-        float | None
-    )  # how far a set-point may lead the reading; None for what lag and sag ask for
+    # How far a set-point may lead the reading; None for what lag and sag ask for.
+    max_relative_target_deg: float | None
 
     def bounds(self, joints: Joints) -> Bounds:
         """Return the bounds of commands, and limits of the servos."""

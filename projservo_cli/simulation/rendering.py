@@ -23,10 +23,8 @@ from projservo_cli.simulation.mjcf import chain_of, compiled, mujoco, no_gl, spe
 
 # Thickness of the first link of an arm and of the last, in lengths of the arm, and of none in any.
 _THICK, _THIN, _LEAST_LINK_M = 0.05, 0.03, 1e-3
-_LINK, _HOLDER = (
-    (0.75, 0.5, 0.25, 1.0),
-    (0.3, 0.3, 0.3, 1.0),
-)  # colours of links, and of the holder of the tags
+# Colours of links, and of the holder of the tags.
+_LINK, _HOLDER = (0.75, 0.5, 0.25, 1.0), (0.3, 0.3, 0.3, 1.0)
 _PLATE_M, _ROD_M = 5e-4, 4e-3  # half the thickness of a tag, and of the rod that holds it
 _TOOL_DENSITY = 500.0  # kg/m³
 _SIDES = ("front", "back")  # of a plate: the tag, and what hides it from behind

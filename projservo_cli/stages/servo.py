@@ -701,9 +701,8 @@ def sense_is_enough(inputs: ServoInputs, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
     asked = inputs.plan
-    pose = (
-        law != INCIDENCES and not asked.incidences and asked.carrier is None
-    )  # others need that of the plan
+    # Any other goal than a pose needs that of the plan.
+    pose = law != INCIDENCES and not asked.incidences and asked.carrier is None
     return mode == REGULATE and _in_compiled_loop(inputs, law) and pose
 
 

@@ -218,9 +218,8 @@ class PlanInputs:
     incidences: tuple[Incidence, ...] = ()
     # Width and height to which recorded images reach at least, px, where their size is not known.
     seen_px: ImageSize | None = None
-    carrier: "CarryingObject | None" = (
-        None  # object that the goal was taught on; None for a goal that stands still
-    )
+    # Object that the goal was taught on; None for a goal that stands still.
+    carrier: "CarryingObject | None" = None
     displaced: StandOff | None = None  # of the goal, or of the start in its place
     q_current: FloatArray | None = None  # (n,) joints where the arm stands, rad or m, once that is known
 

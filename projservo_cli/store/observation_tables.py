@@ -53,9 +53,8 @@ _MOUNT = "mount"  # column of the mount of the cameras
 _RECORDING = "recording"  # column of the recording that a row belongs to
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
 _INTEGER = re.compile(r"([+-]?[0-9]{1,18})(\.0*)?")
-_UNKNOWN = frozenset(
-    {"nan", "na", "n/a", "#n/a", "null", "none", "-"}
-)  # cells as good as empty, where one may be
+# Cells as good as empty, where one may be.
+_UNKNOWN = frozenset({"nan", "na", "n/a", "#n/a", "null", "none", "-"})
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 

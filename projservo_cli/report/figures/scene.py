@@ -209,9 +209,8 @@ def _show(axes: Any, figure: "style.Figure", rig: FloatArray, points: FloatArray
     points = np.concatenate([points, rig.reshape(-1, 3)])
     low, high = points.min(axis=0), points.max(axis=0)
     longest = (high - low).max()
-    half = np.maximum(
-        0.5 * (high - low) + 0.05 * longest, 0.15 * longest
-    )  # room for the numbers of each axis
+    # Room for the numbers of each axis.
+    half = np.maximum(0.5 * (high - low) + 0.05 * longest, 0.15 * longest)
     extent = 0.5 * (low + high)[:, None] + np.outer(half, [-1.0, 1.0])
     for name, (a, b) in zip("xyz", extent, strict=True):
         getattr(axes, f"set_{name}lim")(a, b)
