@@ -16,6 +16,7 @@ from projservo_cli.calibration.prediction import (
     joint_derivative,
     predict,
     prediction_variance,
+    require_covariance,
 )
 from projservo_cli.calibration.refit import refit, since_moved
 from projservo_cli.display import (
@@ -188,8 +189,7 @@ class ImageModel(Displayable, Calibration):
         pixels = predict(self, rows)
         if not return_std:
             return pixels[0] if single else pixels
-        if not self.has_covariance or not self.sqrt_cov_shared.size:
-            raise InputError(f"return_std: the method {self.method} has no covariance: use bundle_adjustment")
+        require_covariance("return_std", self)
         sigma = np.sqrt(prediction_variance(self, rows))
         return (pixels[0], sigma[0]) if single else (pixels, sigma)
 
@@ -364,8 +364,7 @@ class ImageModel(Displayable, Calibration):
             If the joints determine no metric, the images of one camera are mirrored, the length is not known,
             or the method has no covariance.
         """
-        if not self.has_covariance or not self.sqrt_cov_shared.size:
-            raise InputError(f"metric: the method {self.method} has no covariance: use bundle_adjustment")
+        require_covariance("metric", self)
         return MetricModel.of(
             self,
             error_factor_with_model(self),

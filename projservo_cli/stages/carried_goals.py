@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from projservo_cli.calibration.prediction import error_factor_with_model, require_covariance
 from projservo_cli.metric.frame import Metric, Scale
 from projservo_cli.records import Calibration, CarriedByObject, InputError, Plan, WorkFailed
-from projservo_cli.results import ImageModel
 from projservo_cli.robots.contract import Reading
 from projservo_cli.robots.session import Session
 from projservo_cli.robots.standstill import seen_at_rest
@@ -39,7 +39,9 @@ def in_metres(calibration: Calibration, known: KnownLengths) -> tuple[Metric | N
         return None, f"no length on the tool is known: set {keys}"
     face = [number for number in known.face if number in calibration.marker]
     try:
-        return ImageModel.of(calibration).metric(length_m, between, face=face or None), ""
+        require_covariance("metric", calibration)
+        factor = error_factor_with_model(calibration)
+        return Metric.of(calibration, factor, length_m=length_m, between=between, face=face or None), ""
     except (InputError, WorkFailed) as error:
         return None, str(error)
 

@@ -18,6 +18,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
+from projservo_cli.calibration.prediction import require_covariance
 from projservo_cli.geometry.displacements import homogeneous
 from projservo_cli.geometry.lens import undistort
 from projservo_cli.geometry.stereo import optical_centers
@@ -349,8 +350,7 @@ class DisplacedObject:
             raise InputError(
                 "objects: cameras on the tool see the scene that the goal is on: its own images are the goal"
             )
-        if not c.has_covariance or not c.sqrt_cov_shared.size:
-            raise InputError(f"objects: the method {c.method} has no covariance: use bundle_adjustment")
+        require_covariance("objects", c)
         rig = LookRig.of(c)
         fit, known, left_out = _of_one_object(rig, marker, looks)
         numbers = tuple(np.asarray(marker)[known].tolist())
