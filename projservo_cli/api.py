@@ -45,7 +45,7 @@ from projservo_cli.store.sweep_table import TABLE, SweepTable
 from projservo_cli.sweeps.design import Design, require_sound
 from projservo_cli.sweeps.engine import Engine
 from projservo_cli.sweeps.folder import Folder, run_sweep
-from projservo_cli.sweeps.study import Study
+from projservo_cli.sweeps.statistics import Study
 
 _WITHOUT_TASKS = 20  # default runs of a cell
 _NO_LAW = "law {!r:.40}: expected a name, or a class or function that makes a law"

@@ -89,10 +89,9 @@ def _joint_motions(state: State) -> FloatArray:
 
 # What noise and calibration may leave of images that the joints can reach, px rms per marker and view.
 _LEFT_PX = 3.0
-_STAGES = 20
+_STAGES = 20  # instants of the plan at which the joints are sought
 # Distance of a marker of the face from its plane, over its size, that noise of the calibration may show.
 _UNEVEN = 0.05
-_STAGES = 20
 
 
 def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: FloatArray) -> None:
