@@ -7,10 +7,11 @@ registers. Sums are written pairwise; their order is part of the result.
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from projservo_cli.geometry.jit import inline, njit
-from projservo_cli.records import FloatArray
 
+_Array = npt.NDArray[np.float64]
 Vec4 = tuple[float, float, float, float]
 Mat4 = tuple[
     float, float, float, float, float, float, float, float,
@@ -19,13 +20,13 @@ Mat4 = tuple[
 
 
 @inline
-def vec(A: FloatArray) -> Vec4:
+def vec(A: _Array) -> Vec4:
     """Row of an array as a value."""
     return (float(A[0]), float(A[1]), float(A[2]), float(A[3]))
 
 
 @inline
-def vec_into(target: FloatArray, A: Vec4) -> None:
+def vec_into(target: _Array, A: Vec4) -> None:
     """Write a value into a row of an array."""
     target[0] = A[0]
     target[1] = A[1]
@@ -34,13 +35,13 @@ def vec_into(target: FloatArray, A: Vec4) -> None:
 
 
 @inline
-def mat(H: FloatArray) -> Mat4:
+def mat(H: _Array) -> Mat4:
     """4×4 array as a value."""
     return vec(H[0]) + vec(H[1]) + vec(H[2]) + vec(H[3])
 
 
 @inline
-def mat_into(target: FloatArray, H: Mat4) -> None:
+def mat_into(target: _Array, H: Mat4) -> None:
     """Write a value into a 4×4 array."""
     vec_into(target[0], H[0:4])
     vec_into(target[1], H[4:8])
@@ -204,7 +205,7 @@ def dual_pencil(A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
 IDENTITY: Mat4 = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
-def as_array(H: Mat4) -> FloatArray:
+def as_array(H: Mat4) -> _Array:
     """Tuple of sixteen floats as a (4, 4) array."""
     return np.array(H, dtype=np.float64).reshape(4, 4)
 
