@@ -22,7 +22,7 @@ from projservo_cli.geometry.displacements import (
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators, project
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import Model, no_lenses, prismatic_of
-from projservo_cli.stages.studies import composition_error
+from projservo_cli.stages.report import composition_error
 from projservo_cli.task.partition import partition
 from projservo_cli.task.trajectory import profile_shares, trajectory_displacement
 from projservo_cli.task.visibility import visibility_angles, visibility_translation

@@ -9,7 +9,7 @@ import pytest
 from projservo_cli.records import InputError, position_limits
 from projservo_cli.simulation.random_tasks import STRATA, random_tasks
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.studies import projective_twin
+from projservo_cli.stages.report import projective_twin
 from projservo_cli.task.target import TaskImages
 from tests.configured import truth_of
 from tests.known import asked, configured, known_scenario

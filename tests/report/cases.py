@@ -12,7 +12,7 @@ from projservo_cli.records import Calibration
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import ReportData
 from projservo_cli.robots.frame_recorder import FrameRecorder
-from projservo_cli.stages import studies
+from projservo_cli.stages import report as stage
 from projservo_cli.stages.carried_goals import in_metres
 from tests.configured import record, truth_of
 from tests.fake_records import fake, seen_by
@@ -37,7 +37,7 @@ def case(name="paper", steps=SHORT, whole=False):
     config = configured(name, f"stop.max_steps={steps}")
     scenario = known_scenario(config)
     true = scenario.truth
-    model = studies.projective_twin(true.model)
+    model = stage.projective_twin(true.model)
     plan = planned(scenario, model, samples=21, duration=3.0)
     sense = plan.rotation_sense()
     traces = {
@@ -51,8 +51,8 @@ def case(name="paper", steps=SHORT, whole=False):
         known_scenario(config.idealized), termination=scenario.termination._replace(stop_at_joint_limit=False)
     )
     models = {"true": true.model, "twin": model, "calibrated": model}
-    bench = studies.Comparison(clean, models, plan)
-    extra = studies.run_studies(bench) if whole else studies.run_studies(bench, GAINS, PERIODS_S)
+    bench = stage.Comparison(clean, models, plan)
+    extra = stage.run_studies(bench) if whole else stage.run_studies(bench, GAINS, PERIODS_S)
     observation = record.simulate(config, true)
     calibration = known(config, true, model, observation.q)
     numbers = tuple(true.number[i] for i in true.face)
@@ -128,7 +128,7 @@ def filmed(trace, width, height):
 
 def known(config, true, model, q):
     """The record of a model known in the frame of ``projective_twin``, as if it had been fitted freely."""
-    M = np.linalg.solve(studies.H_PE, true.M.T).T
+    M = np.linalg.solve(stage.H_PE, true.M.T).T
     scene = Parameters(model.P, model.H_hat_0, model.prismatic, M)
     J, own = scene.derivative(q - model.q_reference)
     own = np.einsum("kvmia,mn->kvmina", own, np.eye(len(M))).reshape(*own.shape[:-1], -1)

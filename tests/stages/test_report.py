@@ -10,7 +10,8 @@ from projservo_cli.geometry.displacements import screws, twists
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures.path_deviation import study_numbers
 from projservo_cli.report.report_data import Composition
-from projservo_cli.stages import report, studies
+from projservo_cli.stages import report
+from projservo_cli.stages.report import run_studies
 from projservo_cli.store import Result, load, save
 from tests.configured import report_on
 from tests.report.cases import GAINS, PERIODS_S, SPECS, case
@@ -29,9 +30,7 @@ def changed(material, **traces):
 @pytest.fixture
 def few(monkeypatch):
     """Studies of few gains and periods."""
-    monkeypatch.setattr(
-        report, "run_studies", lambda bench, progress: studies.run_studies(bench, GAINS, PERIODS_S)
-    )
+    monkeypatch.setattr(report, "run_studies", lambda bench, progress: run_studies(bench, GAINS, PERIODS_S))
 
 
 @pytest.mark.usefixtures("few")
@@ -100,14 +99,14 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
 
 def test_both_sides_of_eq_22_agree_to_first_order_only():
     _, bench, material = case()
-    plan = studies.metric_plan(bench)
+    plan = report.metric_plan(bench)
     lambdas = np.array([0.02, 0.01, 0.005])
-    distance = studies.composition_error(plan, lambdas)
+    distance = report.composition_error(plan, lambdas)
     # the third order adds a few per mille at λ = 0.02
     np.testing.assert_allclose(distance[:-1] / distance[1:], 4.0, rtol=2e-2)
     # without a translation both sides are the same
     still = dataclasses.replace(plan, tau=0.0)
-    assert studies.composition_error(still, lambdas).max() < 1e-12
+    assert report.composition_error(still, lambdas).max() < 1e-12
     *_, differs = claims_of(material, Composition(lambdas, distance, math.pi / 2, np.zeros(2)))
     *_, same = claims_of(material, Composition(lambdas, np.zeros(3), 0.0, np.zeros(2)))
     assert (differs.holds, same.holds) == (False, True)
@@ -116,21 +115,21 @@ def test_both_sides_of_eq_22_agree_to_first_order_only():
 
 def test_eq_22_has_its_counter_example_in_the_turn_of_the_paper_and_holds_along_the_axis():
     """The translation of a pure turn is perpendicular to its axis; along the axis both sides are the same."""
-    plan = studies.metric_plan(case()[1])
-    of_paper = studies.composition_of(plan, GAINS_OF_LAWS)
+    plan = report.metric_plan(case()[1])
+    of_paper = report.composition_of(plan, GAINS_OF_LAWS)
     assert math.degrees(of_paper.axis_angle) == pytest.approx(90.0, abs=1e-6)
     assert of_paper.distance[0] > 0.4
     turn = screws(plan.H_hat[1])[:3]
     for direction, angle in ((turn, 0.0), (np.cross(turn, [0.3, 0.5, 0.7]), math.pi / 2)):
         along = twists(np.r_[0.0, 0.0, 0.0, direction])
         H_hat = np.array([along, *plan.H_hat[1:]])
-        other = studies.composition_of(dataclasses.replace(plan, H_hat=H_hat, theta_p=0.0), GAINS_OF_LAWS)
+        other = report.composition_of(dataclasses.replace(plan, H_hat=H_hat, theta_p=0.0), GAINS_OF_LAWS)
         assert other.axis_angle == pytest.approx(angle, abs=1e-7)
         assert (other.distance.max() < 1e-12) == (angle == 0.0)
     # Rotations that do not commute turn the face off its planned rotation, one rotation does not: eq. (21).
     assert np.degrees(of_paper.bias) == pytest.approx([8.3, 0.0], abs=0.05)
     assert np.degrees(of_paper.bias[1]) < 1e-9
-    assert studies.orientation_bias(dataclasses.replace(plan, theta_p=0.0), GAINS_OF_LAWS).max() < 1e-3
+    assert report.orientation_bias(dataclasses.replace(plan, theta_p=0.0), GAINS_OF_LAWS).max() < 1e-3
 
 
 @pytest.mark.volume
@@ -143,8 +142,8 @@ def test_claims_of_a_whole_run_with_exact_operators(name):
         "stacked Jacobians: runs through self-occlusion, then converges",
         "Euclidean points: runs through self-occlusion, then converges",
     )
-    plan = studies.metric_plan(bench)
-    claims = claims_of(material, studies.composition_of(plan, bench.scenario.gains))
+    plan = report.metric_plan(bench)
+    claims = claims_of(material, report.composition_of(plan, bench.scenario.gains))
     assert len({claim.claim for claim in claims}) == len(claims) >= 24
     for claim in claims:
         assert claim.holds is not None

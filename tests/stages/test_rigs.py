@@ -12,7 +12,7 @@ from projservo_cli.experiment import plan_scene_of
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report import figures
 from projservo_cli.simulation.arm import camera_center
-from projservo_cli.stages.studies import comparison_of, metric_plan
+from projservo_cli.stages.report import comparison_of, metric_plan
 from tests.configured import calibrate, plan, scenario_of, servo, truth_of
 from tests.known import configured
 
