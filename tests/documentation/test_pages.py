@@ -279,7 +279,7 @@ def test_page(request, folder, name, capsys, monkeypatch):
         monkeypatch.setattr(report, "FIGURES", report.FIGURES[:1])  # of the others claims alone are told
     monkeypatch.setattr(os, "cpu_count", lambda: 1)  # other processes would import all anew
     if name == "read-a-report":  # frames and figures of a task that is reported on as a whole elsewhere
-        monkeypatch.setattr(film, "FRAMES", 6)
+        monkeypatch.setattr(film, "_FRAMES", 6)
         monkeypatch.setattr(report, "FIGURES", report.FIGURES[:3])
     for put in HAS.get(name, ()):
         put(folder)

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("cv2")
 
 from projservo_cli.detection import TagFinder
-from projservo_cli.hardware import cameras
+from projservo_cli.hardware import video_cameras
 from projservo_cli.hardware.camera_robot import CameraRobot
 from projservo_cli.hardware.video_cameras import VideoCamera
 from projservo_cli.records import WorkFailed
@@ -94,24 +94,24 @@ def test_a_missing_or_forbidden_or_metadata_device_is_named_with_the_right_one(m
         answer[48:60] = b"usb-0000:1.2"
 
     monkeypatch.setattr("fcntl.ioctl", ioctl)
-    monkeypatch.setattr(cameras, "_nodes", lambda: nodes)
-    assert cameras._wrong_device(nodes[0]) == ""
-    assert cameras._wrong_device(nodes[1]) == (
+    monkeypatch.setattr(video_cameras, "_nodes", lambda: nodes)
+    assert video_cameras._wrong_device(nodes[0]) == ""
+    assert video_cameras._wrong_device(nodes[1]) == (
         f"{nodes[1]} gives no pictures: it is the second node of a webcam, for metadata: take {nodes[0]}"
     )
     monkeypatch.setattr("os.access", lambda *_: False)
-    assert "sudo usermod -aG video $USER" in cameras._wrong_device(nodes[0])
+    assert "sudo usermod -aG video $USER" in video_cameras._wrong_device(nodes[0])
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc tells who has it")
 def test_a_camera_that_another_program_has_is_named_with_that_program(tmp_path):
     device = tmp_path / "video0"
     device.touch()
-    assert cameras._holder(device) == ""
+    assert video_cameras._holder(device) == ""
     code = f"import time; f = open({str(device)!r}); print('open', flush=True); time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as other:
         assert other.stdout.readline()
-        told = cameras._holder(device)
+        told = video_cameras._holder(device)
         other.kill()
     assert told.startswith(f"{device} is in use by python")
     assert f"(process {other.pid}): close that" in told

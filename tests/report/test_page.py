@@ -74,7 +74,7 @@ def test_page_and_words_name_the_cameras(tmp_path, run, names):
     film = tmp_path / "film.gif"
     some = {name: material.traces[name] for name in ("direct_three", "stacked")}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("projservo_cli.report.animation.FRAMES", 2)
+        patch.setattr("projservo_cli.report.animation._FRAMES", 2)
         write_animation(film, some, material.plant.order, None, lambda *_: None)
     with Image.open(film) as pictures:
         assert pictures.n_frames == 2

@@ -285,7 +285,7 @@ def test_a_report_never_moves_a_robot(servo, projservo):
 def test_a_real_robot_moves_whenever_it_is_asked_to_and_a_report_shows_what_is_stored(
     servo, projservo, monkeypatch
 ):
-    monkeypatch.setattr(report, "draw_all", lambda *_: [])
+    monkeypatch.setattr(report, "_draw_all", lambda *_: [])
     asked = servo(*faulty("bumped camera", 70), "--json")
     assert (asked.code, asked.json["laws"][0]["verdict"]) == (1, "fault detected")
     for call in range(2):  # what is wrong is mended, and nothing else is said about it

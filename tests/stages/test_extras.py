@@ -43,7 +43,7 @@ def test_the_view_is_one_file_that_loads_nothing(view):
 
 
 def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):
-    monkeypatch.setattr(film, "FRAMES", 6)  # a tenth of them, each of which takes its time
+    monkeypatch.setattr(film, "_FRAMES", 6)  # a tenth of them, each of which takes its time
     told = []
     path = animation_of(run, lambda *progress: told.append(progress))
     assert told == [("animation", k, 6) for k in range(1, 7)]
@@ -64,7 +64,7 @@ def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):
 
 
 def test_the_page_links_to_what_there_is_and_a_new_report_removes_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "draw_all", lambda *arguments: [])
+    monkeypatch.setattr(report, "_draw_all", lambda *arguments: [])
     monkeypatch.setattr(report, "run_studies", lambda bench, progress: case()[2].studies)
     run = stored(tmp_path)
     made = Result("k", "", MADE, {}, {"": report_on(run, tmp_path)})

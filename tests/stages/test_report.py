@@ -30,7 +30,7 @@ def changed(material, **traces):
 @pytest.fixture
 def few(monkeypatch):
     """Studies of few gains and periods."""
-    monkeypatch.setattr(report, "run_studies", lambda bench, progress: run_studies(bench, GAINS, PERIODS_S))
+    monkeypatch.setattr(report, "run_studies", lambda bench, *_, **__: run_studies(bench, GAINS, PERIODS_S))
 
 
 @pytest.mark.usefixtures("few")
