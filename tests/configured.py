@@ -135,6 +135,11 @@ def page_of(run):
     return page.write_page(run, given.about_of(config_of(run)))
 
 
+def draw_only(patch, *names):
+    """Let reports draw some figures alone; all are drawn by the first chain and by tests/report."""
+    patch.setattr(reporting, "FIGURES", [spec for spec in reporting.FIGURES if spec.name in names])
+
+
 def compared(runs, path):
     """Write a page that shows runs side by side."""
     configs = [config_of(run) for run in runs]

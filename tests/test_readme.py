@@ -8,6 +8,7 @@ import pytest
 
 import projservo_cli
 from tests import check
+from tests.configured import draw_only
 from tests.documentation.blocks import PAGES, ROOT, blocks_of, matches, run_commands
 
 README = ROOT / "README.md"
@@ -62,6 +63,7 @@ def test_your_own_arm_in_five_commands(shared_data, tmp_path, monkeypatch, capsy
     monkeypatch.setattr(sys, "path", list(sys.path))
     (robot,) = (block.text for block in blocks_of(PAGES["robot-class"]) if block.file == "my_robot.py")
     (tmp_path / "my_robot.py").write_text(robot, encoding="utf-8")
+    draw_only(monkeypatch, "fig13_calibration")
     simulated = blocks("yaml")[0].replace("{port: /dev/ttyUSB0}", "{truth: truth.json}")
     (tmp_path / "mine.yaml").write_text(simulated, encoding="utf-8")
     (tmp_path / "truth.json").symlink_to(shared_data / "ur5" / "truth.json")

@@ -17,8 +17,7 @@ from projservo_cli import cli
 from projservo_cli.config import load_config
 from projservo_cli.report import animation as film
 from projservo_cli.simulation.mjcf import mujoco
-from projservo_cli.stages import report
-from tests.configured import truth_of
+from tests.configured import draw_only, truth_of
 from tests.detection.rendering import render, square
 from tests.documentation.blocks import PAGES, ROOT, blocks_of, run_page
 
@@ -262,6 +261,8 @@ CHECK = {
     "run-file": check_run_file,
     "teach-a-goal": check_teach,
 }
+# Those that pages name; README draws all.
+FIGURES = {"python": ("fig21_runs",), "read-a-report": ("fig01_partition",)}
 NEEDS = {"run-file": ("xarray", "h5netcdf"), "benchmark-a-law": ("xarray",), "read-a-report": ("plotly",)}
 
 
@@ -276,11 +277,9 @@ def test_page(request, folder, name, capsys, monkeypatch):
         require_gl()
     if name == "reproduce-the-paper":  # its command is that of README, and finds all up to date
         shutil.copytree(request.getfixturevalue("first_chain"), folder / "results" / "paper")
-        monkeypatch.setattr(report, "FIGURES", report.FIGURES[:1])  # of the others claims alone are told
     monkeypatch.setattr(os, "cpu_count", lambda: 1)  # other processes would import all anew
-    if name == "read-a-report":  # frames and figures of a task that is reported on as a whole elsewhere
-        monkeypatch.setattr(film, "_FRAMES", 6)
-        monkeypatch.setattr(report, "FIGURES", report.FIGURES[:3])
+    monkeypatch.setattr(film, "_FRAMES", 6)
+    draw_only(monkeypatch, *FIGURES.get(name, ("fig13_calibration", "fig18_metric")))
     for put in HAS.get(name, ()):
         put(folder)
 

@@ -8,9 +8,9 @@ import pytest
 from projservo_cli.config import to_yaml
 from projservo_cli.stages import report
 from projservo_cli.store import Result, Run
-from tests.configured import report_on
+from tests.configured import draw_only, report_on
 from tests.known import configured
-from tests.report.cases import SHORT, SPECS, case
+from tests.report.cases import SHORT, case
 
 SOME = ("fig01_partition", "fig08_drift", "fig11_image_errors", "fig13_calibration")
 VOID = {"meta", "br", "img", "link", "hr", "input"}
@@ -36,7 +36,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     run = stored(folder, "report.formats=[svg]")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "FIGURES", [SPECS[name] for name in SOME])
+        draw_only(patch, *SOME)
         patch.setattr(report, "run_studies", lambda bench, progress: case()[2].studies)
         record = report_on(run, folder)
     return dataclasses.replace(run, results=run.results | {"report": Result("k", "", MADE, {}, {"": record})})

@@ -5,26 +5,18 @@ from matplotlib.text import Text
 from projservo_cli.report import style
 from tests.report.cases import SPECS, case, seen
 
-NAMES = [*SPECS]
-
-
-def drawn(spec, material):
-    return style.drawn(spec.draw, spec.data(material), spec.height)
-
-
 VIEWS = "left", "right", "ceiling"
 
 
-@pytest.fixture(scope="module", params=[2, 3])
-def figures(request):
-    """All figures of two cameras, and those that show other numbers of three."""
-    material, other = case()[2], seen(VIEWS) if request.param == 3 else None
-    return {
-        name: drawn(spec, other or material)
-        for name, spec in SPECS.items()
-        if not spec.lacking(other or material)
-        and not (other and alike(spec.data(other), spec.data(material)))
-    }
+def figure(name, views):
+    """A figure of two cameras; of three if it shows other numbers then; None where it has none."""
+    spec, material = SPECS[name], case()[2] if views == 2 else seen(VIEWS)
+    if spec.lacking(material):
+        return None
+    data = spec.data(material)
+    if views == 3 and alike(data, spec.data(case()[2])):
+        return None
+    return style.drawn(spec.draw, data, spec.height)
 
 
 def alike(one, two):
@@ -32,10 +24,12 @@ def alike(one, two):
     return one.keys() == two.keys() and all(np.array_equal(one[key], two[key]) for key in one)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_no_text_is_clipped_by_the_figure_or_lies_on_another(figures, name, monkeypatch):
-    if name in figures:
-        require_readable(figures[name], monkeypatch)
+@pytest.mark.parametrize("views", [2, 3])
+@pytest.mark.parametrize("name", SPECS)
+def test_axes_have_units_and_no_text_is_clipped_by_the_figure_or_lies_on_another(name, views, monkeypatch):
+    if (shown := figure(name, views)) is not None:
+        require_readable(shown, monkeypatch)
+        require_units(shown)
 
 
 def require_readable(figure, monkeypatch):
@@ -63,13 +57,13 @@ def require_readable(figure, monkeypatch):
             assert not clash, f"{text!r} on {other!r}"
 
 
-def test_axes_have_units(figures):
-    for axes in (axes for figure in figures.values() for axes in figure.axes):
+def require_units(figure):
+    for axes in figure.axes:
         labels = [axes.get_xlabel(), axes.get_ylabel(), getattr(axes, "get_zlabel", str)()]
         for label in labels:
             assert not label or ("(" in label and ")" in label), label
 
 
 def test_same_input_gives_the_same_bytes():
-    first, second = (drawn(SPECS["fig13_calibration"], case()[2]) for _ in range(2))
+    first, second = (figure("fig13_calibration", 2) for _ in range(2))
     assert style.contents(first, style.FORMATS) == style.contents(second, style.FORMATS)

@@ -15,7 +15,7 @@ from projservo_cli.records import InputError
 from projservo_cli.settings.task import TaskSettings
 from projservo_cli.stages import servo
 from projservo_cli.store import load
-from tests.configured import truth_of
+from tests.configured import draw_only, truth_of
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.volume  # a calibration and many steps
@@ -70,7 +70,7 @@ def pin(trace, truth):
     return (truth.of((10, 11)) @ H.T)[:, :3]
 
 
-def test_a_pin_is_brought_before_its_hole_goes_in_and_comes_out_along_it(call):
+def test_a_pin_is_brought_before_its_hole_goes_in_and_comes_out_along_it(call, monkeypatch):
     answer = call("--json")
     assert answer.code == 0, answer.err
     steps, laws = answer.json["steps"], answer.json["laws"]
@@ -108,6 +108,7 @@ def test_a_pin_is_brought_before_its_hole_goes_in_and_comes_out_along_it(call):
     assert [line for line in planned if line.startswith("plan of")] == [
         f"plan of {name}:" for name in MOTIONS
     ]
+    draw_only(monkeypatch, "fig20_sequence", "fig01_partition")
     assert cli.run(["report", "run", "-q"]) == 0  # names no law: that of the call before
     page = Path("run/report.html").read_text()
     assert "fig20_sequence" in page
