@@ -270,24 +270,22 @@ class Law:
     def __call__(self, s, q):
         return 0.0 * q
 
-{guard}
-    study = ps.sweep(ps.Config.load("ur5"), laws=[Law], runs=2, tasks=2, workers=2)
+if __name__ == "__main__":
+    study = ps.sweep(ps.Config.load("ur5"), laws=[Law], runs=2, workers=2)
     print(study.table["verdict"].tolist())
 """
 
 
-def test_a_script_is_told_of_the_guard_it_lacks_and_its_classes_work_with_one(tmp_path):
-    def answer(guard):
-        (tmp_path / "study.py").write_text(SCRIPT.format(guard=guard), encoding="utf-8")
-        command = [sys.executable, "study.py"]
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        return subprocess.run(
-            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-
-    lacking = answer("if True:")
-    assert 'put its calls under if __name__ == "__main__":' in lacking.stderr.splitlines()[-1]
-    assert answer('if __name__ == "__main__":').stdout == "['no progress', 'no progress']\n"
+def test_a_script_is_told_of_the_guard_it_lacks_and_its_classes_work_with_one(tmp_path, config, monkeypatch):
+    study = tmp_path / "study.py"
+    study.write_text(SCRIPT.replace('__name__ == "__main__"', "True"), encoding="utf-8")
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(study), raising=False)
+    with pytest.raises(ps.InputError, match='put its calls under if __name__ == "__main__":'):
+        ps.sweep(config, laws=["exact"], runs=2, workers=2)
+    study.write_text(SCRIPT, encoding="utf-8")
+    command, environment = [sys.executable, "study.py"], {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout == "['no progress', 'no progress']\n", done.stderr
 
 
 def test_an_experiment_is_made_once_resumed_and_opened_again(config, tmp_path):
