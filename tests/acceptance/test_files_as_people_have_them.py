@@ -167,22 +167,18 @@ def test_a_table_of_a_spreadsheet_is_read(recorded, tmp_path, separator, comma, 
         read_table(tmp_path / "broken.csv")
 
 
-MIXED = [("9999", "9999"), ("-1", "-1"), ("-1000000000", "-1000000000")]
+# Of both coordinates, and of one alone.
+PLACEHOLDERS = [("9999", "9999"), ("-1", "-1"), ("-1000000000", "-1000000000"), ("-1", None), (None, "9999")]
 
 
-@pytest.mark.parametrize(
-    "placeholders",
-    [MIXED, [("-1", None), (None, "9999")]],
-    ids=["both", "one alone"],
-)
-def test_numbers_for_unseen_markers_are_named_and_taken_as_unseen(told, recorded, tmp_path, placeholders):
+def test_numbers_for_unseen_markers_are_named_and_taken_as_unseen(told, recorded, tmp_path):
     header, *rows = (line.split(",") for line in recorded.read_text().splitlines())
     draw, at, empty = np.random.default_rng(3), header.index("u_left"), []
     for row in rows:
         empty.append(list(row))
         for view in range(2):
             if draw.random() < 0.08 and row[at + 2 * view]:
-                given = placeholders[draw.integers(len(placeholders))]
+                given = PLACEHOLDERS[draw.integers(len(PLACEHOLDERS))]
                 for axis in range(2):
                     row[at + 2 * view + axis] = given[axis] or row[at + 2 * view + axis]
                     empty[-1][at + 2 * view + axis] = ""

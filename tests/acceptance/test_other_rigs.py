@@ -10,50 +10,36 @@ from tests.calibration.test_cameras_on_the_tool import Hand
 FEW = 4  # of the corners of the board, every so many
 
 
-@pytest.mark.parametrize("views", [1, 3])
-def test_a_chain_of_another_rig(answer, elsewhere, views):
+@pytest.mark.parametrize(
+    ("types", "views", "mount"), [("RRRRR", 1, "world"), ("RRRRR", 3, "world"), ("RRPRR", 2, "tool")]
+)
+def test_a_chain_of_another_rig(answer, elsewhere, types, views, mount):
     rng = np.random.default_rng(2)
-    robot = random_robot("RRRRR", rng, markers=8, views=views)
+    robot = random_robot(types, rng, markers=8, views=views)
+    robot = Hand(**vars(robot)) if mount == "tool" else robot
     poses = np.concatenate([trials(robot, frames=4), around(robot, 12, rng)])
     write_table(robot.observe(poses, 0.4, rng), "table.csv")
     write_table(robot.observe(around(robot, 8, rng), 0.4, rng), "ahead.csv")
-    words, sizes = ("calibrate", "--data", "table.csv"), ["1280x1024", "1281x1024", "1282x1024"]
-    sized = "-o", "out", "--image-size", ",".join(sizes[:views])
-    code, found, error = answer(*words, *sized, "--suggest", "1")
+    words = "calibrate", "--data", "table.csv", "--joints", types, "--mount", mount
+    sizes = [f"{1280 + view}x1024" for view in range(4)]
+    code, found, error = answer(
+        *words, "-o", "out", "--image-size", ",".join(sizes[:views]), "--suggest", "1"
+    )
     assert code == 0, error
-    assert (found["usable"], found["view"]) == (True, ["left", "right", "top"][:views])
+    assert (found["usable"], found["mount"]) == (True, mount)
+    assert found["view"] == ["left", "right", "top"][:views]
+    assert [joint["type"] for joint in found["joints"]] == [*types]
     assert (found["sigma_view_px"] is None) == (views < 3)
     assert len(found["suggestions"]) == 1
-    code, _, error = answer(*words, "-o", "other", "--image-size", ",".join(sizes[:2]))
+    code, _, error = answer(*words, "-o", "other", "--image-size", ",".join(sizes))
     assert code == 2
-    assert f"2 image sizes for the views {', '.join(found['view'])}: give one, or one a view" in error
+    assert f"4 image sizes for the views {', '.join(found['view'])}: give one, or one a view" in error
     code, value, _ = answer("validate", "out", "--data", "ahead.csv")
     assert (code, value["count"]) == (0, views * 8 * 8)
     assert value["median_px"] <= value["limit_px"]
     code, value, _ = answer("report", "-o", "out", "calibrate")
     assert code == 0, value
     assert any("calibration" in name for name in value["report"]["figures"])
-    for kind in ("opencv", "urdf", "ros", "json"):
-        code, _, error = answer("export", "out", "--to", kind, "--metric", "0.1", "--between", "5,8")
-        assert code in (0, 1), (kind, error)
-
-
-def test_cameras_on_the_tool(answer, elsewhere):
-    rng = np.random.default_rng(4)
-    arm = Hand(**vars(random_robot("RRPRR", rng, markers=9)))
-    write_table(
-        arm.observe(np.concatenate([trials(arm, frames=5), around(arm, 14, rng)]), 0.4, rng), "table.csv"
-    )
-    write_table(arm.observe(around(arm, 8, rng), 0.4, rng), "ahead.csv")
-    words = "calibrate", "--data", "table.csv", "--joints", "RRPRR", "-o", "out"
-    code, found, _ = answer(*words, "--mount", "tool", "--suggest", "2")
-    assert (code, found["usable"], found["mount"]) == (0, True, "tool")
-    assert [joint["type"] for joint in found["joints"]] == [*"RRPRR"]
-    assert len(found["suggestions"]) == 2
-    code, value, _ = answer("validate", "out", "--data", "ahead.csv")
-    assert code == 0
-    assert value["median_px"] <= value["limit_px"]
-    assert answer("report", "-o", "out", "calibrate")[0] == 0
     for kind in ("opencv", "urdf", "ros", "json"):
         code, _, error = answer("export", "out", "--to", kind, "--metric", "0.1", "--between", "5,8")
         assert code in (0, 1), (kind, error)
