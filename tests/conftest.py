@@ -103,23 +103,50 @@ def projservo(capsys):
 
 
 @pytest.fixture(scope="session")
-def first_chain(tmp_path_factory):
-    """Folder of the first chain of README, to be copied; with what it printed in told.txt.
-
-    It is made once for all processes that test.
-    """
-    from projservo_cli import cli
-
+def made_once(tmp_path_factory):
+    """Function that has a folder of a name made once for all processes that test."""
     base = tmp_path_factory.getbasetemp()
     root = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    folder = root / "first"
-    printed = folder / "told.txt"
-    with FileLock(root / "first.lock"):
-        if not printed.exists():
-            told = io.StringIO()
-            with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
-                stages = ["calibrate", "plan", "servo", "report"]
-                code = cli.run([*stages, "-c", str(ROOT / "configs" / "paper.yaml"), "-o", str(folder)])
-            assert code == 0, told.getvalue()
-            printed.write_text(told.getvalue(), encoding="utf-8")
-    return folder
+
+    def once(name, make):
+        folder, made = root / name, root / f"{name}.made"
+        with FileLock(root / f"{name}.lock"):
+            if not made.exists():
+                folder.mkdir()
+                make(folder)
+                made.touch()
+        return folder
+
+    return once
+
+
+@pytest.fixture(scope="session")
+def first_chain(made_once):
+    """Folder of the first chain of README, to be copied; with what it printed in told.txt."""
+    from projservo_cli import cli
+
+    def make(folder):
+        told = io.StringIO()
+        with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+            stages = ["calibrate", "plan", "servo", "report"]
+            code = cli.run([*stages, "-c", str(ROOT / "configs" / "paper.yaml"), "-o", str(folder)])
+        assert code == 0, told.getvalue()
+        (folder / "told.txt").write_text(told.getvalue(), encoding="utf-8")
+
+    return made_once("first", make)
+
+
+@pytest.fixture(scope="session")
+def calibrated_run(made_once):
+    """Function that gives the folder of a run of a shipped configuration, with a calibration and no more."""
+    from projservo_cli import cli
+
+    def calibrated(name):
+        words = ["calibrate", "-q", "-c", str(ROOT / "configs" / f"{name}.yaml"), "-o"]
+
+        def make(folder):
+            assert cli.run([*words, str(folder)]) == 0
+
+        return made_once(f"calibrated {name}", make)
+
+    return calibrated

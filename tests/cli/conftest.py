@@ -120,20 +120,16 @@ def stages(monkeypatch, tmp_path):
     return pretend(monkeypatch, tmp_path)
 
 
-@pytest.fixture(scope="session")
-def made_once(tmp_path_factory):
-    """The folder of a run through all pretended stages."""
-    folder = tmp_path_factory.mktemp("once")
-    with pytest.MonkeyPatch.context() as patch:
-        pretend(patch, folder)
-        assert cli.run(["report", "-c", "tiny.yaml", "-o", "out", "-q"]) == 0
-    return folder / "out"
-
-
 @pytest.fixture
 def reported(stages, made_once, tmp_path):
-    """The pretended stages, and such a run in out."""
-    shutil.copytree(made_once, tmp_path / "out")
+    """The pretended stages, and a run through all of them in out."""
+
+    def make(folder):
+        with pytest.MonkeyPatch.context() as patch:
+            pretend(patch, folder)
+            assert cli.run(["report", "-c", "tiny.yaml", "-o", "out", "-q"]) == 0
+
+    shutil.copytree(made_once("pretended", make) / "out", tmp_path / "out")
     return stages
 
 

@@ -14,7 +14,7 @@ from tests.hardware.still import Quiet
 
 SETTINGS = ("markers={tags: roof, tag_size_m: 0.03}", "control.joint_speed_limit_deg_s=60")
 COUNT = 2.0 * np.pi / 4096
-STEP_S = 0.002
+STEP_S = 0.004
 
 
 @dataclass
@@ -70,7 +70,7 @@ class Wiggled(Quiet):
             q[faults.link :] = self.first[faults.link :]
             s = self.truth.images(q, self.truth.M)[view]
             if faults.loose is not None:
-                rising = self.past[k][1].sum() >= self.past[max(0, k - 600)][1].sum()
+                rising = self.past[k][1].sum() >= self.past[max(0, k - 300)][1].sum()
                 s[self.tag == faults.loose, 0] += faults.loose_px * (1.0 if rising else -1.0) / 2
             noise = np.random.default_rng([view, max(k, 0)]).standard_normal(s.shape)
             views.append(s + faults.noise_px * noise)

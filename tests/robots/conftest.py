@@ -5,18 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from projservo_cli import cli
 from tests.robots.robots import CALLS
 
 UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
 
 
-@pytest.fixture(scope="module")
-def calibrated(tmp_path_factory):
+@pytest.fixture(scope="session")
+def calibrated(calibrated_run):
     """A run with a calibration and nothing else."""
-    folder = tmp_path_factory.mktemp("calibrated")
-    assert cli.run(["calibrate", "-c", str(UR5), "-o", str(folder), "-q"]) == 0
-    return folder
+    return calibrated_run("ur5")
 
 
 @pytest.fixture

@@ -132,7 +132,7 @@ def test_after_a_failure_no_other_law_drives_the_robot(servo):
     assert answer.json["laws"][0]["verdict"] == "failed"
     assert answer.json["failed"] == "servo/direct_three"
     assert CALLS.count("stop") == 1
-    again = servo(*SOUND, "--json")
+    again = servo(*SOUND, *NEAR, "--json")
     assert again.json["laws"][0]["verdict"] == "converged"
 
 

@@ -41,13 +41,9 @@ PUMA = ROOT / "configs" / "insertion.yaml"
 
 
 @pytest.fixture(scope="module")
-def calibrated(tmp_path_factory):
+def calibrated(calibrated_run):
     """A run with a calibration and nothing else."""
-    folder = tmp_path_factory.mktemp("calibrated")
-    assert (
-        cli.run(["calibrate", "-c", str(ROOT / "configs" / "insertion.yaml"), "-o", str(folder), "-q"]) == 0
-    )
-    return folder
+    return calibrated_run("insertion")
 
 
 @pytest.fixture

@@ -9,9 +9,7 @@ from tests.sweeps.processes import written
 
 
 @pytest.fixture(scope="session")
-def whole(tmp_path_factory):
+def whole(made_once):
     """Configuration and folder of a sweep."""
-    folder = tmp_path_factory.mktemp("whole")
-    config = written(folder)
-    make(read_design(load_sweep(config)), folder / "out")
-    return config, folder / "out"
+    folder = made_once("whole", lambda folder: make(read_design(load_sweep(written(folder))), folder / "out"))
+    return folder / "small.yaml", folder / "out"
