@@ -13,12 +13,7 @@ from projservo_cli.calibration.joint_model import describe_curve, hypotheses_of
 from projservo_cli.calibration.prediction import Parameters, error_factor, joint_derivative
 from projservo_cli.geometry.displacements import twists
 from projservo_cli.geometry.joint_curve import backwards, slopes, true_joints
-from projservo_cli.geometry.kinematics import (
-    backward,
-    forward_between,
-    forward_kinematics,
-    joint_operators,
-)
+from projservo_cli.geometry.kinematics import backward, forward_between, forward_kinematics, joint_operators
 from projservo_cli.metric.frame import Metric
 from projservo_cli.records import BASIS, NO_CURVE, InputError, JointCurve, Model, WorkFailed, no_lenses
 from projservo_cli.store import Result, Run, load, save

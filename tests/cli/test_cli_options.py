@@ -133,17 +133,11 @@ USAGE = {
     "no configuration": (["plan", "-c", "none.yaml"], "none.yaml: cannot be read"),
     "no table": ([*RECORDED[:2], "none.csv"], "which projservo record calibrate makes"),
     "other letters": ([*RECORDED, "--joints", "RX"], "--joints RX: data.joints: 'RX' must be"),
-    "no noise at all": (
-        [*RECORDED, "--noise-px", "0"],
-        "--noise-px 0.0: data.noise_px: must be",
-    ),
+    "no noise at all": ([*RECORDED, "--noise-px", "0"], "--noise-px 0.0: data.noise_px: must be"),
     "joints of no table": ([*TINY, "--joints", "RR"], "--joints RR: data.table: is missing"),
     "override of nothing": ([*TINY, "--set", "sed=1"], "--set sed=1: sed: unknown key; did you mean"),
     "a file for a folder": ([*TINY, "-o", "t.csv/out"], "t.csv/out"),
-    "a folder below a file": (
-        ["calibrate", "-o", "t.csv/out"],
-        "cannot be written: Not a directory",
-    ),
+    "a folder below a file": (["calibrate", "-o", "t.csv/out"], "cannot be written: Not a directory"),
     "a table for a run": ([*TINY, "-o", "t.csv"], "not a run file"),
 }
 

@@ -267,8 +267,7 @@ NEEDS = {"run-file": ("xarray", "h5netcdf"), "benchmark-a-law": ("xarray",), "re
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.volume] if name in DRIVING else []) for name in PAGES],
+    "name", [pytest.param(name, marks=[pytest.mark.volume] if name in DRIVING else []) for name in PAGES]
 )
 def test_page(request, folder, name, capsys, monkeypatch):
     for module in NEEDS.get(name, ()):

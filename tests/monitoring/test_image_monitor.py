@@ -328,8 +328,7 @@ BENT_TAG = [
 
 
 @pytest.mark.parametrize(
-    ("seed", "off", "changed"),
-    [(6, 1.2, ""), (7, 1.0, ""), (0, 3.0, "at marker 6"), (2, 6.0, "at marker 6")],
+    ("seed", "off", "changed"), [(6, 1.2, ""), (7, 1.0, ""), (0, 3.0, "at marker 6"), (2, 6.0, "at marker 6")]
 )
 def test_a_tag_that_is_off_by_less_than_a_pixel_in_one_posture_is_no_fault(arm, seed, off, changed):
     """One view of the tool does not tell a slanted tag from one that moved by as little."""

@@ -10,10 +10,7 @@ from tests.studies.monitoring import Rig, calibrated, driven, tasks
 
 @pytest.mark.parametrize(
     ("rig", "number", "level"),
-    [
-        (Rig("five", "jpeg", 0.0, 0.0), 140240, ("hand", 1)),
-        (Rig("six", "none", 0.0, 0.0), 120259, ("blur",)),
-    ],
+    [(Rig("five", "jpeg", 0.0, 0.0), 140240, ("hand", 1)), (Rig("six", "none", 0.0, 0.0), 120259, ("blur",))],
     ids=["hand", "blur"],
 )
 def test_what_has_passed_is_no_fault(rig, number, level):

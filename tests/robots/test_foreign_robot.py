@@ -124,11 +124,7 @@ def test_nonsense_readings(answer, message):
     ("target", "speed", "message"),
     [
         ((0.0, np.nan), (0.0, 0.0), "is not finite"),
-        (
-            (0.1, 0.3),
-            (0.0, 0.0),
-            r"joint 2, 0.3 rad, is too far from the last one: .* 0.12 rad to 0.2",
-        ),
+        ((0.1, 0.3), (0.0, 0.0), r"joint 2, 0.3 rad, is too far from the last one: .* 0.12 rad to 0.2"),
         ((0.1, 0.2), (0.0, -1.1), r"speed of joint 2, -1.1 rad/s, is beyond its limit of 1 rad/s$"),
     ],
 )

@@ -192,10 +192,7 @@ def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
 
 @pytest.mark.parametrize(
     ("fault", "dark", "tested"),
-    [
-        ("lost", "neither camera shows a marker", True),
-        ("blind", "the left camera shows no marker", False),
-    ],
+    [("lost", "neither camera shows a marker", True), ("blind", "the left camera shows no marker", False)],
 )
 def test_without_an_image_nothing_moves_unless_that_is_asked_for(servo, fault, dark, tested):
     sets = [*NEAR, "--set", "stop.max_steps=40"]

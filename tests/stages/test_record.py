@@ -327,10 +327,7 @@ def shrunk(q, s):
             without(0, *range(2, 20)),
             r"both cameras see only 2 of the 20 markers where the robot stands \(3 at",
         ),
-        (
-            shrunk,
-            r"tags are 10\.\d px wide in the left image .*, 1\.\d+ px a cell \(1\.8 at least\)",
-        ),
+        (shrunk, r"tags are 10\.\d px wide in the left image .*, 1\.\d+ px a cell \(1\.8 at least\)"),
     ],
 )
 def test_what_cannot_be_used_is_named_before_anything_moves(seen, message):

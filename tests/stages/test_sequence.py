@@ -147,17 +147,11 @@ def test_an_interrupt_says_what_is_held(call, monkeypatch):
     [
         ({"steps": [{"to": "there"}], "goal": IN_HOLE}, "there is no goal there under task.goals"),
         ({"steps": [{"wait_s": 1.0}], "goal": IN_HOLE}, "no step moves the arm"),
-        (
-            {"steps": [{"to": "in_hole", "wait_s": 1.0}]},
-            "exactly one of to, approach, retreat, act",
-        ),
+        ({"steps": [{"to": "in_hole", "wait_s": 1.0}]}, "exactly one of to, approach, retreat, act"),
         ({"steps": [{"act": {"gripper": 1}, "duration_s": 2}, STEPS[2]]}, "duration_s: is of a motion"),
         ({"steps": [{"retreat": {"along": "pin"}}, STEPS[2]]}, "give exactly one of by_m and by_px"),
         ({"steps": [{"retreat": {"along": "tip", "by_m": 0.1}}, STEPS[2]]}, "tip is a point, which has no"),
-        (
-            {"steps": [{"retreat": {"along": "hook", "by_m": 0.1}}, STEPS[2]]},
-            "there is no feature hook;",
-        ),
+        ({"steps": [{"retreat": {"along": "hook", "by_m": 0.1}}, STEPS[2]]}, "there is no feature hook;"),
         ({"start": "curent"}, "did you mean current?"),
         ({"start": "current", "start_offset": {"joints": [0] * 6, "unit": "rad"}}, "is that of joints"),
         ({"steps": [{"to": "in_hole"}], "start": "nowhere.yaml"}, "there is no .*nowhere.yaml yet: teach"),

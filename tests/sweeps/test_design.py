@@ -40,10 +40,7 @@ def test_a_run_depends_on_its_number_alone_and_cells_share_their_draws():
     values = {
         "runs": 6,
         "calibrations": 4,
-        "random": {
-            "control.gain_t": {"uniform": [1, 3]},
-            "noise.calibration_px": {"log_uniform": [0.1, 1]},
-        },
+        "random": {"control.gain_t": {"uniform": [1, 3]}, "noise.calibration_px": {"log_uniform": [0.1, 1]}},
     }
     first, second = design(**values), design(**values)
     configs = [first.config(run) for run in range(first.total)]
@@ -116,10 +113,7 @@ def test_what_no_run_can_be_made_of_is_refused_before_any_is(given, message):
         ("base: paper.yaml\nruns: 0\n", "x.yaml:2:1: runs: must be at least 1"),
         ("base: paper.yaml\nrun: 5\n", "x.yaml:2:1: run: unknown key; did you mean runs"),
         ("runs: 5\n", "base: is missing"),
-        (
-            "base: paper.yaml\nrandom: {control.gain_t: {uniform: [3, 1]}}\n",
-            "a minimum below the maximum",
-        ),
+        ("base: paper.yaml\nrandom: {control.gain_t: {uniform: [3, 1]}}\n", "a minimum below the maximum"),
         ("base: paper.yaml\nrandom: {control.gain_t: {}}\n", "exactly one of uniform"),
         ("base: paper.yaml\ngrid: {law: []}\n", "grid.law"),
         ("base: paper.yaml\ngrid: {control.gain: [1, 1]}\n", "a value stands there twice"),
@@ -135,10 +129,7 @@ def test_what_no_run_can_be_made_of_is_refused_before_any_is(given, message):
             "base: paper.yaml\ngrid: {control.gain: 0.5}\n",
             "grid.control.gain: must be a list of values, not 0.5",
         ),
-        (
-            "base: paper.yaml\ngrid: {law: {exact: 5}}\n",
-            "grid.law.also.exact: must be a mapping",
-        ),
+        ("base: paper.yaml\ngrid: {law: {exact: 5}}\n", "grid.law.also.exact: must be a mapping"),
         (
             "base: paper.yaml\ngrid: {law: {keys: [law], values: [exact], also: {b: {}}}}\n",
             "grid.law.also.b: is none of the values",

@@ -14,10 +14,7 @@ from tests.sweeps.cases import design
 
 # Of each case every run is redone.
 CASES = {
-    "laws": {
-        "grid": {"law": ["direct_three", "exact", "exact_track", "euclidean_points"]},
-        "runs": 1,
-    },
+    "laws": {"grid": {"law": ["direct_three", "exact", "exact_track", "euclidean_points"]}, "runs": 1},
     "points": {
         "set": {"control.features": "points"},
         "runs": 2,
