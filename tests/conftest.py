@@ -112,7 +112,7 @@ def made_once(tmp_path_factory):
         folder, made = root / name, root / f"{name}.made"
         with FileLock(root / f"{name}.lock"):
             if not made.exists():
-                folder.mkdir()
+                folder.mkdir(exist_ok=True)  # of an attempt that failed
                 make(folder)
                 made.touch()
         return folder
