@@ -32,8 +32,10 @@ def compiling_in_background(codes: Collection[int]) -> Iterator[None]:
         yield
         return
     with ExitStack() as others:
-        for call in ("_compile_loop()", f"_compile_laws({sorted(codes)})"):
-            command = [sys.executable, "-c", f"import {__name__} as warmup; warmup.{call}"]
+        loop, laws = "warmup._compile_loop()", "warmup._compile_laws({})"
+        # One begins at the loop and the other at the laws; what either has done, the other loads.
+        for calls in ((loop, laws.format(sorted(codes)[::-1])), (laws.format(sorted(codes)), loop)):
+            command = [sys.executable, "-c", f"import {__name__} as warmup; {'; '.join(calls)}"]
             other = others.enter_context(Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL))
             others.callback(other.kill)
         yield
