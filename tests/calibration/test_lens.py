@@ -59,10 +59,11 @@ def test_known_distortion_is_recovered_within_its_uncertainty(robot, poses):
     assert fitted.outlier.size == 0
 
 
-def test_a_centre_of_the_lens_elsewhere_is_found(robot, poses):
+@pytest.mark.parametrize("size", [IMAGE_SIZE, None])
+def test_a_centre_of_the_lens_elsewhere_is_found(robot, poses, size):
     """Off the middle of the image by far more than it is uncertain, the centre is estimated too."""
     lens = LENS + np.array([[80.0, -60.0, 0.0, 0.0, 0.0], [-70.0, 90.0, 0.0, 0.0, 0.0]])
-    found = calibrated(robot, observed(robot, poses, lens), image_size=None, lens=True)
+    found = calibrated(robot, observed(robot, poses, lens), image_size=size, lens=True)
     assert found.lens_terms == 4
     off = (found.lens[:, :2] - lens[:, :2]).ravel()
     centers = found.sqrt_cov_shared[-8:].reshape(2, 4, -1)[:, 2:].reshape(4, -1)
