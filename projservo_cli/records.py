@@ -27,6 +27,9 @@ WORLD, TOOL = "world", "tool"  # where the cameras are mounted: the markers are 
 MM = 1e3  # mm in a metre
 TWO_TURNS = 4.0 * np.pi  # rad; no revolute joint of an arm with stops turns that far from its zero
 FARTHEST_M = 20.0  # no prismatic joint that two cameras watch goes farther
+# Features of an incidence, by the number of points that span one, and how two of them are to lie.
+KINDS = ("point", "line", "plane")
+MEET, PARALLEL, PERPENDICULAR, ANGLE = "meet", "parallel", "perpendicular", "angle"
 CORNERS = 4  # of a tag: corner k of tag t is marker 4 t + k
 # Reasons of rejected markers: a marker stands still in the images, is of another body, slips, or hardly any
 # of its readings fits.

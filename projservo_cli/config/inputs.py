@@ -17,7 +17,7 @@ from projservo_cli.config.whole import name_of_carrier
 from projservo_cli.control.law import Gains
 from projservo_cli.detection import Board
 from projservo_cli.display import About
-from projservo_cli.records import CORNERS, TOOL, InputError
+from projservo_cli.records import ANGLE, CORNERS, MEET, PARALLEL, PERPENDICULAR, TOOL, InputError
 from projservo_cli.result_hashes import File
 from projservo_cli.robots.settings import Following, JointSettings, SpeedLimits
 from projservo_cli.settings.disturbance import Disturbance, Events, Faults
@@ -57,7 +57,7 @@ from projservo_cli.stages.stage_inputs import (
     Trials,
 )
 from projservo_cli.store.observation_tables import identity_in
-from projservo_cli.task.incidences import ANGLE, MEET, PARALLEL, PERPENDICULAR, Incidence
+from projservo_cli.task.incidences import Incidence
 from projservo_cli.task.stand_off import StandOff
 
 _RANDOM_POSES = 12  # of trials where joints may be read or images taken with faults

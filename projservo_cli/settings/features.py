@@ -2,16 +2,15 @@
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
+from projservo_cli.records import KINDS, MEET, PARALLEL, PERPENDICULAR
 from projservo_cli.settings.sections import Finding, Number, Section, Whole
 
 _TOOL, _SCENE = "tool", "scene"
-_KINDS = ("point", "line", "plane")
-_Named = Literal["meet", "parallel", "perpendicular"]
-_RELATIONS, _MEET = get_args(_Named), "meet"
+_RELATIONS = (MEET, PARALLEL, PERPENDICULAR)
 _MOST = 100  # markers of which a point is the middle
 _NAME, _LONGEST = r"^[a-z][a-z0-9_]*$", 40
 
@@ -73,9 +72,9 @@ class Feature(Section):
 
     def contradictions(self) -> Iterator[Finding]:
         """No kind or several, markers of the scene, and a tool that names another feature."""
-        kinds = self.given(*_KINDS)
+        kinds = self.given(*KINDS)
         if len(kinds) != 1:
-            yield (), f"give exactly one of {', '.join(_KINDS)}"
+            yield (), f"give exactly one of {', '.join(KINDS)}"
             return
         if self.on == _TOOL and isinstance(self.source, str):
             yield (kinds[0],), "of the tool are numbers of its markers; a name stands for one of the scene"
@@ -88,7 +87,7 @@ class Feature(Section):
     @property
     def kind(self) -> str:
         """Return whether it is a point, a line or a plane."""
-        return self.given(*_KINDS)[0]
+        return self.given(*KINDS)[0]
 
     @property
     def source(self) -> tuple[int, ...] | str:
@@ -100,7 +99,7 @@ class Feature(Section):
         """Numbers of the markers of each point that spans it, of its own or of the feature that it names."""
         if isinstance(self.source, str):
             return features[self.source].flat(features)
-        return (self.source,) if self.kind == _KINDS[0] else tuple((number,) for number in self.source)
+        return (self.source,) if self.kind == KINDS[0] else tuple((number,) for number in self.source)
 
 
 def _pair(value: Any) -> Any:
@@ -117,7 +116,7 @@ def _pair(value: Any) -> Any:
     return value
 
 
-_Relation = _Named | Annotated[Number, Field(gt=0, lt=180)]
+_Relation = Literal["meet", "parallel", "perpendicular"] | Annotated[Number, Field(gt=0, lt=180)]
 # Of the tool and of the scene, which meet if not said.
 Pair = Annotated[tuple[Name, Name] | tuple[Name, Name, _Relation], BeforeValidator(_pair)]
 
@@ -129,6 +128,6 @@ def misplaced(pair: Pair, features: Mapping[str, Feature]) -> str:
             return f"there is no feature {name}; features: {', '.join(features) or 'none'}"
         if (features[name].on == _TOOL) != of_tool:
             return f"{name} is on the {features[name].on}: name a feature of the tool, then one of the scene"
-        if len(pair) == 3 and pair[2] != _MEET and features[name].given(*_KINDS) == [_KINDS[0]]:
+        if len(pair) == 3 and pair[2] != MEET and features[name].given(*KINDS) == [KINDS[0]]:
             return f"{name} is a point, which has no direction: leave {pair[2]} out, or name lines and planes"
     return ""

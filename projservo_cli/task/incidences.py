@@ -26,11 +26,19 @@ from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import image_jacobian, project
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.metric.frame import invariant_upgrade
-from projservo_cli.records import BoolArray, FloatArray, InputError, Model, WorkFailed
+from projservo_cli.records import (
+    KINDS,
+    MEET,
+    PARALLEL,
+    PERPENDICULAR,
+    BoolArray,
+    FloatArray,
+    InputError,
+    Model,
+    WorkFailed,
+)
 from projservo_cli.task.body import Body
 
-MEET, PARALLEL, PERPENDICULAR, ANGLE = "meet", "parallel", "perpendicular", "angle"
-KINDS = ("point", "line", "plane")  # by the number of points that span one
 # Variance of a combination of errors, of unit variance each, below which it depends on the others.
 _DEPENDENT = 1e-9
 # Angle between features, deg, by their relation.

@@ -10,14 +10,10 @@ from projservo_cli.control import command, make_law
 from projservo_cli.control.law import OK, UNLIMITED, Gains, new_state
 from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.laws import CODES
-from projservo_cli.records import InputError, position_limits
+from projservo_cli.records import ANGLE, MEET, PARALLEL, PERPENDICULAR, InputError, position_limits
 from projservo_cli.task.body import SETTLED, fit_body, make_body
 from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
 from projservo_cli.task.incidences import (
-    ANGLE,
-    MEET,
-    PARALLEL,
-    PERPENDICULAR,
     Incidence,
     errors_px,
     image_error_at,
