@@ -39,6 +39,7 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
     return _call_law(law.address, (law.code, law.model, law.task, law.gains, s, q, state))
 
 
+# One after the other, as the cache finds no function again that another function made.
 @internal
 def _direct_period(
     code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State

@@ -266,13 +266,12 @@ class ByAddress:
         """Return the function that calls the one of an address with a tuple of arguments."""
         if not COMPILED:
             return lambda address, arguments: self._functions[address](*arguments)
-        expected = self
         utilities: Any = cgutils  # whose functions have no types
 
         @intrinsic
         def call(typing_context: Any, address: Any, arguments: Any) -> Any:
-            if arguments.types != expected.types:
-                raise TypingError(f"called with {arguments.types}, compiled for {expected.types}")
+            if arguments.types != self.types:
+                raise TypingError(f"called with {arguments.types}, compiled for {self.types}")
 
             def lowered(context: Any, builder: Any, signature: Any, values: Any) -> Any:
                 convention = context.call_conv

@@ -48,7 +48,7 @@ def _compile_loop() -> None:
 
 
 def _compile_laws(codes: Collection[int]) -> None:
-    """Compile laws."""
+    """Compile the laws of codes."""
     for code in codes:
         address_of(code)
 

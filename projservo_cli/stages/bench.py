@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.control import address_of, make_law
+from projservo_cli.control import make_law
 from projservo_cli.control.law import ERRORS, Law, State, new_state
 from projservo_cli.laws import CODES, INCIDENCES, LAWS
 from projservo_cli.loop.compiled import Course, many_steps, run_compiled
@@ -73,9 +73,8 @@ class Case:
     def steps(self, law: str, *, body: bool = False) -> float:
         """One step of a law in each state."""
         job = self.incidences if law == INCIDENCES else self.whole if body else self.points
-        return many_steps(
-            job.law._replace(code=CODES[law], address=address_of(CODES[law])), job.course, job.state, job.log
-        )
+        built_in = make_law(CODES[law], *job.law[2:])
+        return many_steps(built_in, job.course, job.state, job.log)
 
     def whole_run(self) -> _Job:
         """A run of 150 steps, traced."""
