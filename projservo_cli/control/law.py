@@ -28,7 +28,7 @@ from projservo_cli.geometry.algebra import (
     vec_into,
 )
 from projservo_cli.geometry.displacements import composed_angle, composed_operator
-from projservo_cli.geometry.jit import inline, internal, merged, njit
+from projservo_cli.geometry.jit import inline, internal, merged, njit, separate
 from projservo_cli.geometry.kernels import COORDINATES, least_squares
 from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
 from projservo_cli.geometry.lens import undistort_pixel
@@ -218,6 +218,7 @@ def make_split(state: State) -> Split:
     )
 
 
+@separate
 @njit
 def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> bool:
     """Measure the face, with the body or point by point, and move the operators to the current joints.
@@ -354,6 +355,7 @@ def _axis_direction(H_s: Mat4, a_inf: FloatArray, A_c: Vec4) -> Vec4:
     return unit(best)
 
 
+@separate
 @internal
 def single_rotation(
     model: Model, parts: Parts, ratio: float, state: State
@@ -414,6 +416,7 @@ def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, 
     return shown
 
 
+@separate
 @internal
 def pseudo_inverse(state: State, rows: int, q_hat: FloatArray) -> bool:
     """Joint motion q̂ (n,) of least squares and minimum norm, by the matrix in the workspace.

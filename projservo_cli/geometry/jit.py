@@ -14,10 +14,14 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
+import llvmlite.binding
 import numba
 import numpy as np
 from filelock import FileLock
@@ -90,6 +94,8 @@ def cache_folder(root: Path) -> Path | None:
 _MOST_S = 120.0
 # Settings of Numba, attributes made at run time that its types do not list.
 SETTINGS: Any = numba.config
+# Its functions that write machine code, which have no types.
+_CODE: Any = cgutils
 # Whether the compiler is enabled.
 COMPILED = not SETTINGS.DISABLE_JIT
 # Folder of the package.
@@ -164,6 +170,17 @@ def _uncollected() -> Iterator[None]:
 class _Shared(CPUDispatcher):
     """A compiled function that two processes never compile at the same time: one waits and loads it."""
 
+    separate: Any = None  # what compiled code calls in its place, if not a copy
+
+    @property
+    def _numba_type_(self) -> Any:
+        """Type of the function in compiled code."""
+        if self.separate is None:
+            return super()._numba_type_
+        context: Any = self.typingctx
+        context.refresh()
+        return context.resolve_value_type(self.separate)
+
     def compile(self, sig: Any) -> Any:
         """Compile the function for a signature, or load what another process compiled."""
         if CACHE_FOLDER is None:
@@ -232,6 +249,78 @@ def merged(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
     return cast(Callable[_Params, _Result], numba.njit(**_OPTIONS, inline="always")(function))
 
 
+@dataclass(frozen=True)
+class _Separate:
+    """A compiled function for arguments of some types, which machine code calls by a symbol.
+
+    Machine code that is loaded again calls this first, to have the symbol defined.
+    """
+
+    module: str
+    function: str
+    types: tuple[Any, ...]
+
+    @property
+    def symbol(self) -> str:
+        """The name for the linker, the same in every process."""
+        types = hashlib.sha256(repr(self.types).encode()).hexdigest()
+        return f"{self.module}.{self.function}.{types}"
+
+    def __call__(self) -> Any:
+        """Compile or load the function, define its symbol, and return what the compiler knows of it."""
+        function = getattr(import_module(self.module), self.function)
+        if self.types not in function.overloads:
+            function.compile(self.types)
+        made = function.overloads[self.types]
+        address = made.library.get_pointer_to_function(made.fndesc.llvm_func_name)
+        llvmlite.binding.add_symbol(self.symbol, address)
+        return made
+
+
+def separate(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
+    """Let compiled code call a compiled function where it is, instead of a copy of its own.
+
+    Machine code holds a copy of every function that it calls, and of all that these call, each optimised
+    again. That of a large function costs more time than the call; that of a small one in a loop does not.
+
+    function : without default values.
+    """
+    if COMPILED:
+        cast(Any, function).separate = _caller(function)
+    return function
+
+
+def _caller(function: Any) -> Any:
+    """Return what compiled code calls in place of a function."""
+    own = signature(function.py_func)
+
+    def call(typing_context: Any, *given: Any, **named: Any) -> Any:
+        types = own.bind(*given, **named).args
+        one = _Separate(function.py_func.__module__, function.py_func.__qualname__, types)
+        made = one()
+
+        def lowered(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            kind = context.call_conv.get_function_type(signature.return_type, types)
+            callee = _CODE.get_or_insert_function(builder.module, kind, one.symbol)
+            context.active_code_library._reload_init.add(one)
+            return _called(context, builder, callee, signature.return_type, types, values)
+
+        return made.signature, lowered
+
+    stated: Any = call
+    typing = Parameter("typing_context", Parameter.POSITIONAL_OR_KEYWORD)
+    stated.__signature__ = own.replace(parameters=[typing, *own.parameters.values()])
+    return intrinsic(stated)
+
+
+def _called(context: Any, builder: Any, callee: Any, returned: Any, types: Any, values: Any) -> Any:
+    """Write the call of a compiled function, which passes an exception on."""
+    status, result = context.call_conv.call_function(builder, callee, returned, types, values)
+    with _CODE.if_unlikely(builder, status.is_error):
+        context.call_conv.return_status_propagate(builder, status)
+    return result
+
+
 class ByAddress:
     """Compiled functions of the same arguments and an integer result, which compiled code calls by address.
 
@@ -266,7 +355,6 @@ class ByAddress:
         """Return the function that calls the one of an address with a tuple of arguments."""
         if not COMPILED:
             return lambda address, arguments: self._functions[address](*arguments)
-        utilities: Any = cgutils  # whose functions have no types
 
         @intrinsic
         def call(typing_context: Any, address: Any, arguments: Any) -> Any:
@@ -274,15 +362,10 @@ class ByAddress:
                 raise TypingError(f"called with {arguments.types}, compiled for {self.types}")
 
             def lowered(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-                convention = context.call_conv
-                returned, types = signature.return_type, arguments.types
-                kind = convention.get_function_type(returned, types).as_pointer()
-                function = builder.inttoptr(values[0], kind)
-                unpacked = utilities.unpack_tuple(builder, values[1])
-                status, result = convention.call_function(builder, function, returned, types, unpacked)
-                with utilities.if_unlikely(builder, status.is_error):
-                    convention.return_status_propagate(builder, status)
-                return result
+                kind = context.call_conv.get_function_type(signature.return_type, arguments.types)
+                callee = builder.inttoptr(values[0], kind.as_pointer())
+                unpacked = _CODE.unpack_tuple(builder, values[1])
+                return _called(context, builder, callee, signature.return_type, arguments.types, unpacked)
 
             return numba.int64(address, arguments), lowered
 

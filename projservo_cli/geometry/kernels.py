@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.jit import inline, internal, merged
+from projservo_cli.geometry.jit import inline, internal, merged, separate
 from projservo_cli.records import FloatArray, IntArray
 
 # Number of coordinates of a displacement.
@@ -200,6 +200,7 @@ def _normalize(z: FloatArray, n: int) -> float:
     return size
 
 
+@separate
 @internal
 def least_squares(system: System, m: int, x: FloatArray) -> bool:
     """Least-squares solution x (n,) of B x = rhs, m rows of full column rank, both overwritten.

@@ -25,7 +25,7 @@ from projservo_cli.geometry.algebra import (
     vec_into,
 )
 from projservo_cli.geometry.displacements import invariant_rotations
-from projservo_cli.geometry.jit import internal, merged
+from projservo_cli.geometry.jit import internal, merged, separate
 from projservo_cli.geometry.kernels import (
     COORDINATES,
     System,
@@ -197,6 +197,7 @@ def in_span(span: Span, model: Model, q: FloatArray, q_hat: FloatArray) -> Float
     return np.asarray(H_hat.reshape(len(q_hat), 16) @ span.dual.T)
 
 
+@separate
 @internal
 def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
     """Joint motion of a displacement with coordinates ξ (6,), from the operators in ``work.H_hat``.
@@ -227,6 +228,7 @@ class MeasuredFace(NamedTuple):
     H_back: Mat4  # inverse of the forward kinematics
 
 
+@separate
 @internal
 def reach(model: Model, face: MeasuredFace, goal: Mat4, q: FloatArray, work: Work, settled: float) -> bool:
     """Newton steps on the joints ``q``, in place, until they displace a measured face by ``goal``.

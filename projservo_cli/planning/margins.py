@@ -30,7 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mat_into, meet, mul, vec
-from projservo_cli.geometry.jit import inline, internal, merged, njit
+from projservo_cli.geometry.jit import inline, internal, merged, njit, separate
 from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, row_into
 from projservo_cli.geometry.kinematics import (
     backward,
@@ -276,6 +276,7 @@ def carrier_of(reaching: Reaching) -> Carrier:
     return Carrier(reaching._replace(demands=nameless), work, np.empty(n))
 
 
+@separate
 @internal
 def carry_joints(
     carrier: Carrier, ends: _Ends, parts: int, settled: float, stride: float, q: FloatArray

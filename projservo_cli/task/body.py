@@ -24,7 +24,7 @@ from projservo_cli.geometry.algebra import (
     vec_into,
 )
 from projservo_cli.geometry.displacements import invariant_rotations, twist_exponential
-from projservo_cli.geometry.jit import inline, internal, merged, njit
+from projservo_cli.geometry.jit import inline, internal, merged, njit, separate
 from projservo_cli.geometry.kernels import COORDINATES, solve_normal
 from projservo_cli.records import BoolArray, FloatArray, Model
 
@@ -252,6 +252,7 @@ def _displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
     return mul(H, twist_exponential(X))
 
 
+@separate
 @njit
 def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: _Until, normal: FloatArray) -> _Fit:
     """Displacement of minimum reprojection error over all markers seen, by Gauss–Newton steps.

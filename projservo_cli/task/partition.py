@@ -23,7 +23,7 @@ from projservo_cli.geometry.algebra import (
     vec_into,
 )
 from projservo_cli.geometry.displacements import rotation
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import merged, njit, separate
 from projservo_cli.geometry.mechanisms import (
     NO_OPERATOR,
     Work,
@@ -249,6 +249,7 @@ def _within_plane_part(
     return True, theta, H_p
 
 
+@separate
 @njit
 def partition(task: Task, split: Split) -> Parts:
     """Partition of the remaining task, [RH00] eqs. (8)–(16).

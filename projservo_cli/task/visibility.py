@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, incidence_angles, vec
-from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.jit import internal, merged, njit, separate
 from projservo_cli.records import FloatArray
 from projservo_cli.task.face import Task
 
@@ -76,6 +76,7 @@ def _violations(a: Vec4, H_r: Mat4, theta: float, task: Task) -> tuple[int, floa
     return lost, worst
 
 
+@separate
 @internal
 def choose_sense(a: Vec4, a_t: Vec4, H_r: Mat4, theta: float, task: Task, against_previous: bool) -> float:
     """Sense of the rotation onto the target plane, [RH00] section 4.2: θ or θ − 2π, 0 ≤ θ ≤ π.

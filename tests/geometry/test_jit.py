@@ -1,7 +1,9 @@
 """Where machine code is cached: keyed by every source it depends on, or not at all."""
 
 import importlib
+import os
 import shutil
+import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -87,3 +89,46 @@ def test_what_another_process_compiles_is_waited_for(tmp_path, monkeypatch):
         assert not found
     thread.join(60.0)
     assert found
+
+
+_CALLER = """
+import sys
+import numpy as np
+from projservo_cli.geometry.jit import njit, separate
+
+@separate
+@njit
+def inverse(x, y):
+    if x == 0.0:
+        raise ValueError("nothing")
+    return y / x
+
+@njit
+def caller(x):
+    return inverse(x, 3.0) + inverse(y=1.0, x=x)
+
+if __name__ == "__main__":
+    import one
+    print(one.caller(2.0), sum(one.caller.stats.cache_hits.values()), "fdiv" in one.caller.inspect_llvm(
+        one.caller.signatures[0]) if "look" in sys.argv else "")
+    try:
+        one.caller(0.0)
+    except ValueError as error:
+        print(error)
+"""
+
+
+@pytest.mark.skipif(INTERPRETED, reason="nothing is compiled: NUMBA_DISABLE_JIT is set")
+def test_a_separate_function_is_called_where_it_is_and_found_again_by_another_process(tmp_path):
+    (tmp_path / "one.py").write_text(_CALLER, encoding="utf-8")
+    environment = {**os.environ, "PROJSERVO_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(PACKAGE.parent)}
+
+    def told(*arguments):
+        command = [sys.executable, "one.py", *arguments]
+        run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert run.returncode == 0, run.stderr
+        return run.stdout.split()
+
+    # The caller holds no division of its own, and the error of the function comes through it.
+    assert told("look") == ["2.0", "0", "False", "nothing"]
+    assert told() == ["2.0", "1", "nothing"]
