@@ -256,7 +256,8 @@ def orientation_bias(plan: Plan, gains: Gains) -> FloatArray:
             R = Rotation.from_rotvec(gains.period * (three, two)[law]) * R
             # Sine of half the turn about other axes.
             half = float(np.linalg.norm(np.cross(axis, R.as_quat()[:3])))
-            from_plan = (two_turns.inv() * R).magnitude().min(), 2.0 * math.asin(min(1.0, half))
+            nearest = int(np.argmax(np.abs(two_turns.as_quat() @ R.as_quat())))
+            from_plan = (two_turns[nearest].inv() * R).magnitude(), 2.0 * math.asin(min(1.0, half))
             off[law] = max(off[law], from_plan[law])
     return off
 
