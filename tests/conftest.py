@@ -58,12 +58,14 @@ def reference_truth(shared_data):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def quick_disk():
-    """Nothing is forced onto the disk, which may take its time."""
+def quick():
+    """Nothing is forced onto the disk, which may take its time; no figure is drawn by another process."""
     from projservo_cli import files
+    from projservo_cli.report import drawing
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(files, "_synchronise", lambda path: None)
+        patch.setattr(drawing, "PROCESSORS", 1)
         yield
 
 

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import product
@@ -30,6 +30,7 @@ from projservo_cli.records import VIEWS, Calibration, FloatArray, Model, Plan, R
 from projservo_cli.report import style
 from projservo_cli.report.animation import motion_of, write_animation, write_view
 from projservo_cli.report.claims import claims_of
+from projservo_cli.report.drawing import Drawing, SecondProcess
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows, study_numbers
 from projservo_cli.report.figures.scene import chosen_poses, metric_rows
@@ -281,6 +282,14 @@ def run(inputs: ReportInputs, run: Run, directory: Path, *, progress: Progress =
         a model the page has plan and runs, and the figures that need no model.
     directory : folder of the run; receives ``figures/``, ``claims.json`` and ``report.html``.
     """
+    with SecondProcess() as second:
+        return _run(inputs, run, directory, progress, second)
+
+
+def _run(
+    inputs: ReportInputs, run: Run, directory: Path, progress: Progress, second: SecondProcess
+) -> Report:
+    """Make a report as ``run`` does, with the help of a second process."""
     left_out: list[dict[str, str]] = []
     report_data: Fit = Fit(run.calibration, run.observation.at_rest, held_out=run.cross_validation)
     metric, no_metric = in_metres(run.calibration, inputs.lengths)
@@ -303,7 +312,7 @@ def run(inputs: ReportInputs, run: Run, directory: Path, *, progress: Progress =
         known = run.calibration, run.observation.at_rest, plan, run.traces, lacks
         report_data = Driven(*known, held_out=run.cross_validation)
     report_data = replace(report_data, metric=metric, no_metric=no_metric)
-    figures = _draw_all(report_data, directory, inputs.formats, left_out, progress)
+    figures = _draw_all(report_data, directory, inputs.formats, left_out, progress, second)
     report = Report(
         figures=tuple(figures),
         omitted=tuple(left_out),
@@ -364,7 +373,8 @@ def _draw_all(
     directory: Path,
     formats: Sequence[str],
     left_out: list[dict[str, str]],
-    progress: Progress = silent,
+    progress: Progress,
+    second: SecondProcess,
 ) -> list[str]:
     """Draw every figure that the material supports, in all formats; the others are named with the reason.
 
@@ -373,28 +383,33 @@ def _draw_all(
     """
     folder = directory / FOLDER
     require_inside(folder, directory)
-    written: list[str] = []
-    for done, spec in enumerate(FIGURES):
-        progress("figures", done, len(FIGURES))
-        contents: dict[str, bytes] = {}
+    drawings: list[Drawing] = []
+    for spec in FIGURES:
         if reason := spec.lacking(report_data):
             left_out += [] if spec.optional else [{"what": spec.name, "reason": reason}]
-        else:
-            if partial := spec.partly(report_data):
-                left_out.append({"what": f"{spec.name}, in part", "reason": partial})
-            data = spec.data(report_data)
-            numbers = {name: array for name, array in data.items() if array.dtype != np.uint8}
-            if tuple(data.get("view", VIEWS)) == VIEWS:  # which need no names
-                numbers.pop("view", None)
-            contents = {_NUMBERS: to_csv(numbers).encode(), **style.contents(spec.drawn(data), formats)}
-        for kind in {*style.FORMATS, _NUMBERS} - {*contents}:
-            (folder / f"{spec.name}.{kind}").unlink(missing_ok=True)
-        for kind, content in contents.items():
-            with replacing(folder / f"{spec.name}.{kind}", durable=False) as path:
-                path.write_bytes(content)
-        written += [f"{FOLDER}/{spec.name}.{kind}" for kind in contents if kind != _NUMBERS]
-    progress("figures", len(FIGURES), len(FIGURES))
+            _replace_figure(folder, spec.name, {})
+            continue
+        if partial := spec.partly(report_data):
+            left_out.append({"what": f"{spec.name}, in part", "reason": partial})
+        drawings.append(Drawing(spec.name, spec.data(report_data), tuple(formats)))
+    written: list[str] = []
+    for done, (drawing, files) in enumerate(zip(drawings, second.contents(drawings), strict=True)):
+        numbers = {name: array for name, array in drawing.data.items() if array.dtype != np.uint8}
+        if tuple(drawing.data.get("view", VIEWS)) == VIEWS:  # which need no names
+            numbers.pop("view", None)
+        _replace_figure(folder, drawing.name, {_NUMBERS: to_csv(numbers).encode(), **files})
+        written += [f"{FOLDER}/{drawing.name}.{kind}" for kind in files]
+        progress("figures", done + 1, len(drawings))
     return written
+
+
+def _replace_figure(folder: Path, name: str, contents: Mapping[str, bytes]) -> None:
+    """Write the files of a figure by their kinds, and remove those of other kinds."""
+    for kind in {*style.FORMATS, _NUMBERS} - {*contents}:
+        (folder / f"{name}.{kind}").unlink(missing_ok=True)
+    for kind, content in contents.items():
+        with replacing(folder / f"{name}.{kind}", durable=False) as path:
+            path.write_bytes(content)
 
 
 def view(scenery: Scenery, run: Run, progress: Progress = silent) -> Path:

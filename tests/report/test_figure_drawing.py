@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
-from projservo_cli.report import style
+from projservo_cli.report import drawing, style
 from tests.report.cases import SPECS, case, seen
 
 VIEWS = "left", "right", "ceiling"
@@ -64,6 +64,17 @@ def require_units(figure):
             assert not label or ("(" in label and ")" in label), label
 
 
-def test_same_input_gives_the_same_bytes():
-    first, second = (figure("fig13_calibration", 2) for _ in range(2))
-    assert style.contents(first, style.FORMATS) == style.contents(second, style.FORMATS)
+@pytest.mark.parametrize("ended", [False, True])
+def test_two_processes_draw_the_same_bytes_as_one_even_where_the_second_ends(ended, monkeypatch):
+    names = ("fig13_calibration", "fig01_partition", "fig15_modes_path")
+    figures = [drawing.Drawing(name, SPECS[name].data(case()[2]), style.FORMATS) for name in names]
+    alone = [figure.contents() for figure in figures]
+    here = []
+    monkeypatch.setattr(drawing, "PROCESSORS", 2)
+    contents = style.contents
+    monkeypatch.setattr(style, "contents", lambda *given: here.append(1) or contents(*given))
+    with drawing.SecondProcess() as second:
+        if ended:
+            second._process.kill()
+        assert list(second.contents(figures)) == alone
+    assert len(here) == 3 if ended else 0 < len(here) < 3
