@@ -117,7 +117,8 @@ def triangulate_points(P: FloatArray, a_inf: FloatArray, s: FloatArray) -> Float
     Raises WorkFailed if the rays of a marker do not determine a finite point.
     """
     M = np.empty((s.shape[1], 4))
-    lost = points_into(P, np.arange(2), fundamental_matrix(P), a_inf, s, M)
+    # Contiguous, as machine code is made for one layout of arrays alone.
+    lost = points_into(P, np.arange(2), fundamental_matrix(P), a_inf, np.ascontiguousarray(s), M)
     if lost >= 0:
         raise WorkFailed(NO_POINT.format(lost))
     return M

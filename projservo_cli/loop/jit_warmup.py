@@ -6,6 +6,7 @@ All share the work: what one compiles the others wait for and load.
 import sys
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from subprocess import DEVNULL, Popen
 from typing import Any
 
@@ -32,25 +33,22 @@ def compiling_in_background(codes: Collection[int]) -> Iterator[None]:
         yield
         return
     with ExitStack() as others:
-        loop, laws = "warmup._compile_loop()", "warmup._compile_laws({})"
         # One begins at the loop and the other at the laws; what either has done, the other loads.
-        for calls in ((loop, laws.format(sorted(codes)[::-1])), (laws.format(sorted(codes)), loop)):
-            command = [sys.executable, "-c", f"import {__name__} as warmup; {'; '.join(calls)}"]
+        for first, order in (("loop", -1), ("laws", 1)):
+            call = f"warmup._compile({first!r}, {sorted(codes)[::order]})"
+            command = [sys.executable, "-c", f"import {__name__} as warmup; {call}"]
             other = others.enter_context(Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL))
             others.callback(other.kill)
         yield
 
 
-def _compile_loop() -> None:
-    """Compile the loop, and what begins and sums up a run."""
-    for kernel, arguments in calls():
-        kernel.compile(tuple(map(typeof, arguments)))
-
-
-def _compile_laws(codes: Collection[int]) -> None:
-    """Compile the laws of codes."""
-    for code in codes:
-        address_of(code)
+def _compile(first: str, codes: Collection[int]) -> None:
+    """Compile the ``loop`` or the ``laws`` of codes first, then the other, then what sums up a run."""
+    kernels = [partial(kernel.compile, tuple(map(typeof, values))) for kernel, values in calls()]
+    laws = [partial(address_of, code) for code in codes]
+    loop, last = kernels[:2], kernels[2:]
+    for compiled in (*loop, *laws, *last) if first == "loop" else (*laws, *loop, *last):
+        compiled()
 
 
 def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
