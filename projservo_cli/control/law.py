@@ -416,7 +416,6 @@ def view_into(model: Model, task: Task, s: FloatArray, state: State, view: int, 
     return shown
 
 
-@separate
 @internal
 def pseudo_inverse(state: State, rows: int, q_hat: FloatArray) -> bool:
     """Joint motion q̂ (n,) of least squares and minimum norm, by the matrix in the workspace.
