@@ -121,8 +121,9 @@ class FeetechBus:
             sent = self._send(_SYNC_READ, bytes([start, longer, *ids]))
             answered: dict[int, _Reply] = {}
             before = self.now()
-            heard, end = b"", before + self._reply_s
-            while len(answered) < len(ids) and self.now() < end:
+            heard, end, late = b"", before + self._reply_s, False
+            while len(answered) < len(ids) and not late:
+                late = self.now() >= end  # then once more: on a busy machine replies wait to be read
                 heard += self._received()
                 for number, status, values in _packets(heard):
                     if number in ids and len(values) == longer:
