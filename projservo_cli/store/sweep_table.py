@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from projservo_cli.records import SIZES, BoolArray, InputError, Trace
 from projservo_cli.store import (
-    SCHEMA_VERSION,
     SWEEP,
     as_attribute,
     attribute,
@@ -27,9 +26,11 @@ if typing.TYPE_CHECKING:
     import h5netcdf
 
 _SCHEMA = "projservo sweep"
+_VERSION = 4  # of the layout of a table
 _AGAIN = "move it elsewhere and run the sweep again"
 TABLE = SWEEP
 _ROWS = 16_384  # of a chunk of the file
+_TEXT = 48  # bytes that the name of a law or a verdict takes in it
 _PACKED = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 _TRACES = "traces"
 _FAILURES = "failures"
@@ -90,53 +91,42 @@ def assemble(
 ) -> None:
     """Write a table from parts in the given order, a few at a time, with attributes of the file."""
     rows = sum(_rows(part) for part in parts)
-    size = rows * sum(np.dtype(dtype).itemsize for _, dtype, _, _ in headings)
+    size = rows * sum(
+        _TEXT if dtype.startswith("S") else np.dtype(dtype).itemsize for _, dtype, _, _ in headings
+    )
     size += sum(part.stat().st_size for part in parts)  # their traces
     with new_file(path, size) as new, labelled(new) as file:
-        file.attrs.update({"schema": _SCHEMA, "schema_version": SCHEMA_VERSION})
+        file.attrs.update({"schema": _SCHEMA, "schema_version": _VERSION})
         file.attrs.update({name: as_attribute(value) for name, value in attributes.items()})
+        file.dimensions["run"] = rows
         failures: dict[str, Failure] = {}
         for part in parts:
             merge_failures(failures, _failures(part))
         file.attrs[_FAILURES] = json.dumps(failures)
+        chunks = (max(1, min(rows, _ROWS)),)
         for name, dtype, units, about in headings:
-            data = _new_column(file, name, np.dtype(dtype), rows, **_PACKED)
-            data.attrs["long_name"] = about
-            if not dtype.startswith("S"):
+            if dtype.startswith("S"):  # HDF5 packs no texts of any length
+                data = file.create_variable(name, ("run",), h5py.string_dtype(), chunks=chunks)
+            else:
+                data = file.create_variable(name, ("run",), dtype, chunks=chunks, **_PACKED)
                 data.attrs["units"] = units
+            data.attrs["long_name"] = about
         first = 0
         for block in _blocks(file, parts, [heading[0] for heading in headings]):
             last = first + len(block["run"])
             for name, dtype, _, _ in headings:
-                values = np.ascontiguousarray(block[name], dtype=dtype)
-                cells = values.view("S1").reshape(len(values), -1) if dtype.startswith("S") else values
-                file[name][first:last] = cells
+                values = np.asarray(block[name], dtype=dtype)
+                is_text = dtype.startswith("S")
+                file[name][first:last] = np.char.decode(values, "utf-8").astype(object) if is_text else values
             first = last
 
 
-def _new_column(
-    file: "h5netcdf.File", name: str, dtype: np.dtype[Any], rows: int, **options: Any
-) -> "h5netcdf.Variable":
-    """Create a variable over the runs, with texts as arrays of characters.
-
-    For 10⁶ rows of law names these take 1.2 MB, netCDF strings 44 MB and three times as long; enumerations
-    open as numbers.
-    """
-    dims, width = {"run": rows}, (dtype.itemsize,) if dtype.kind == "S" else ()
-    if width:
-        dims[f"characters_{dtype.itemsize}"] = dtype.itemsize
-    file.dimensions.update({dim: size for dim, size in dims.items() if dim not in file.dimensions})
-    chunks = (max(1, min(rows, _ROWS)), *width)
-    data = file.create_variable(name, tuple(dims), "S1" if width else dtype, chunks=chunks, **options)
-    if width:
-        data.attrs["_Encoding"] = "utf-8"
-    return data
-
-
 def _values(data: h5py.Dataset) -> _Array:
-    """Decode the values (k,) of a column."""
-    values = np.asarray(data[()])
-    return values.view(f"S{values.shape[1]}")[:, 0] if values.ndim == 2 else values
+    """Decode the values (k,) of a column; texts of a table a few at a time, to those of fixed width."""
+    if h5py.check_string_dtype(data.dtype) is None or data.dtype.kind == "S":
+        return np.asarray(data[()])
+    texts = data.asstr()
+    return np.concatenate([texts[i : i + _ROWS].astype(str) for i in range(0, max(len(data), 1), _ROWS)])
 
 
 def _blocks(
@@ -176,7 +166,7 @@ class SweepTable:
         with opened(path, _AGAIN, unchanged=True) as file:
             if "schema" not in file.attrs or attribute(file, "schema") != _SCHEMA:
                 raise InputError(f"{path}: not the table of a sweep; name a folder that projservo sweep made")
-            if attribute(file, "schema_version") != SCHEMA_VERSION:
+            if attribute(file, "schema_version") != _VERSION:
                 raise InputError(
                     f"{path}: another version of projservo made it; run it again: projservo sweep --force"
                 )
@@ -233,8 +223,7 @@ class SweepTable:
     def column(self, name: str) -> _Array:
         """Values (k,) of a column; texts as Python texts would be, of fixed width."""
         with opened(self.path, _AGAIN) as file:
-            values = _values(file[name])
-        return np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values
+            return _values(file[name])
 
     def trace(self, run: int) -> Trace:
         """Stored trace of a run. Raises InputError if it was not stored."""
