@@ -233,7 +233,8 @@ class BuiltInLaw:
         """Status and joint velocity of one instant."""
         if self._bound is None:
             self._bound = _compiled_bind(self.law, self.state)
-        status = _compiled_command(self._bound, s, q)
+        # Contiguous, as machine code is made for one layout of arrays alone.
+        status = _compiled_command(self._bound, np.ascontiguousarray(s), np.ascontiguousarray(q))
         return status, self.state.q_dot.copy()
 
 

@@ -79,3 +79,12 @@ def test_a_state_that_is_reset_is_a_new_one(name):
     getattr(used, name)[:] = 7
     reset(used)
     np.testing.assert_array_equal(getattr(used, name), getattr(new, name))
+
+
+def test_arrays_of_any_layout_give_the_same_command():
+    sc, q, s, _ = instant("RRRRRR", 4, 1)
+    apart = np.empty(12)[::2]
+    apart[:] = q
+    wanted, found = commanded("stacked", sc, s, q), commanded("stacked", sc, np.asfortranarray(s), apart)
+    assert found[0] == wanted[0] == OK
+    assert (found[1] == wanted[1]).all()
