@@ -272,9 +272,14 @@ class _Separate:
         if self.types not in function.overloads:
             function.compile(self.types)
         made = function.overloads[self.types]
-        address = made.library.get_pointer_to_function(made.fndesc.llvm_func_name)
-        llvmlite.binding.add_symbol(self.symbol, address)
+        llvmlite.binding.add_symbol(self.symbol, _address(made))
         return made
+
+
+def _address(made: Any) -> int:
+    """Address in this process of the machine code of a compiled function."""
+    address: int = made.library.get_pointer_to_function(made.fndesc.llvm_func_name)
+    return address
 
 
 def separate(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
@@ -345,8 +350,7 @@ class ByAddress:
         if function not in self._addresses:
             address = id(function)
             if COMPILED:
-                made = function.get_compile_result(numba.int64(*self.types))
-                address = made.library.get_pointer_to_function(made.fndesc.llvm_func_name)
+                address = _address(function.get_compile_result(numba.int64(*self.types)))
             self._addresses[function] = address
             self._functions[address] = function
         return self._addresses[function]

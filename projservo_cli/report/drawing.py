@@ -4,13 +4,13 @@ import os
 import pickle
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from subprocess import DEVNULL, PIPE, Popen
 from threading import Condition, Thread
 from typing import Any, NamedTuple
 
 from projservo_cli.report import style
-from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.report_data import Data
+from projservo_cli.report.report_data import Data, FigureSpec
 
 # Processors that figures may be drawn on.
 PROCESSORS = os.cpu_count() or 1
@@ -19,14 +19,13 @@ PROCESSORS = os.cpu_count() or 1
 class Drawing(NamedTuple):
     """A figure to draw."""
 
-    name: str
+    spec: FigureSpec
     data: Data
     formats: tuple[str, ...]
 
     def contents(self) -> dict[str, bytes]:
         """Draw the figure; its files by format."""
-        spec = next(spec for spec in FIGURES if spec.name == self.name)
-        return style.contents(spec.drawn(self.data), self.formats)
+        return style.contents(self.spec.drawn(self.data), self.formats)
 
 
 class SecondProcess:
@@ -34,19 +33,23 @@ class SecondProcess:
 
     It takes a second to begin, so it is started before the data of the figures are there. What it does not
     do, or cannot, this process does.
+
+    useful : whether there will be many figures.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, useful: bool = True) -> None:
+        self._useful = useful and PROCESSORS > 1
         self._process: Popen[bytes] | None = None
         self._changed = Condition()
         self._drawn: dict[int, dict[str, bytes]] = {}
         self._working = False
 
     def __enter__(self) -> "SecondProcess":
-        """Start the process, where there is a processor for it."""
-        if PROCESSORS > 1:
+        """Start the process, where it is useful and there is a processor for it."""
+        if self._useful:
             command = [sys.executable, "-c", f"import {__name__} as drawing; drawing.serve()"]
-            self._process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
+            with suppress(OSError):  # of a system that starts no more processes
+                self._process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -63,8 +66,8 @@ class SecondProcess:
             Thread(target=self._receive, args=(self._process, drawings), daemon=True).start()
         for i, drawing in enumerate(drawings):
             with self._changed:
-                # A figure that the other process has begun is waited for.
-                while self._working and i == len(drawings) - len(self._drawn) - 1:
+                # A figure that the other process has begun is waited for, but not its first one.
+                while self._working and self._drawn and i == len(drawings) - len(self._drawn) - 1:
                     self._changed.wait()
                 done = self._drawn.get(i)
             yield drawing.contents() if done is None else done
@@ -91,6 +94,8 @@ class SecondProcess:
 
 def serve() -> None:
     """Draw figures that another process sends, from the last to the first."""
+    import projservo_cli.report.figures  # noqa: F401 - while the other process prepares the data
+
     drawings: list[Any] = pickle.load(sys.stdin.buffer)
     for drawing in reversed(drawings):
         pickle.dump(drawing.contents(), sys.stdout.buffer)

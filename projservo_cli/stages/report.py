@@ -282,7 +282,7 @@ def run(inputs: ReportInputs, run: Run, directory: Path, *, progress: Progress =
         a model the page has plan and runs, and the figures that need no model.
     directory : folder of the run; receives ``figures/``, ``claims.json`` and ``report.html``.
     """
-    with SecondProcess() as second:
+    with SecondProcess(useful=bool(run.traces)) as second:
         return _run(inputs, run, directory, progress, second)
 
 
@@ -391,15 +391,17 @@ def _draw_all(
             continue
         if partial := spec.partly(report_data):
             left_out.append({"what": f"{spec.name}, in part", "reason": partial})
-        drawings.append(Drawing(spec.name, spec.data(report_data), tuple(formats)))
+        drawings.append(Drawing(spec, spec.data(report_data), tuple(formats)))
     written: list[str] = []
-    for done, (drawing, files) in enumerate(zip(drawings, second.contents(drawings), strict=True)):
+    without = len(FIGURES) - len(drawings)
+    progress("figures", without, len(FIGURES))
+    for done, (drawing, files) in enumerate(zip(drawings, second.contents(drawings), strict=True), 1):
         numbers = {name: array for name, array in drawing.data.items() if array.dtype != np.uint8}
         if tuple(drawing.data.get("view", VIEWS)) == VIEWS:  # which need no names
             numbers.pop("view", None)
-        _replace_figure(folder, drawing.name, {_NUMBERS: to_csv(numbers).encode(), **files})
-        written += [f"{FOLDER}/{drawing.name}.{kind}" for kind in files]
-        progress("figures", done + 1, len(drawings))
+        _replace_figure(folder, drawing.spec.name, {_NUMBERS: to_csv(numbers).encode(), **files})
+        written += [f"{FOLDER}/{drawing.spec.name}.{kind}" for kind in files]
+        progress("figures", without + done, len(FIGURES))
     return written
 
 

@@ -123,7 +123,7 @@ def assemble(
 
 def _values(data: h5py.Dataset) -> _Array:
     """Decode the values (k,) of a column; texts of a table a few at a time, to those of fixed width."""
-    if h5py.check_string_dtype(data.dtype) is None or data.dtype.kind == "S":
+    if data.dtype.kind != "O":
         return np.asarray(data[()])
     texts = data.asstr()
     return np.concatenate([texts[i : i + _ROWS].astype(str) for i in range(0, max(len(data), 1), _ROWS)])

@@ -93,7 +93,6 @@ def test_what_another_process_compiles_is_waited_for(tmp_path, monkeypatch):
 
 _CALLER = """
 import sys
-import numpy as np
 from projservo_cli.geometry.jit import njit, separate
 
 @separate

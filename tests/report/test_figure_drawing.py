@@ -64,15 +64,27 @@ def require_units(figure):
             assert not label or ("(" in label and ")" in label), label
 
 
+def test_same_input_gives_the_same_bytes():
+    first, second = (figure("fig13_calibration", 2) for _ in range(2))
+    assert style.contents(first, style.FORMATS) == style.contents(second, style.FORMATS)
+
+
 @pytest.mark.parametrize("ended", [False, True])
 def test_two_processes_draw_the_same_bytes_as_one_even_where_the_second_ends(ended, monkeypatch):
     names = ("fig01_partition", "fig15_modes_path", "fig11_image_errors")
-    figures = [drawing.Drawing(name, SPECS[name].data(case()[2]), ("svg",)) for name in names]
+    figures = [drawing.Drawing(SPECS[name], SPECS[name].data(case()[2]), ("svg",)) for name in names]
     alone = [figure.contents() for figure in figures]
-    here = []
+    here, contents = [], style.contents
+
+    def drawn_here(*given):
+        """Draw once the other process has drawn a figure, or ended."""
+        here.append(1)
+        with second._changed:
+            assert second._changed.wait_for(lambda: second._drawn or not second._working, 60.0)
+        return contents(*given)
+
     monkeypatch.setattr(drawing, "PROCESSORS", 2)
-    contents = style.contents
-    monkeypatch.setattr(style, "contents", lambda *given: here.append(1) or contents(*given))
+    monkeypatch.setattr(style, "contents", drawn_here)
     with drawing.SecondProcess() as second:
         if ended:
             second._process.kill()

@@ -50,7 +50,7 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
     for name in record.figures:
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
     assert [entry["what"] for entry in record.omitted] == ["fig04_classical"]
-    assert steps[-1] == ("figures", 2, 2)
+    assert steps[-1] == ("figures", 3, 3)
     content = json.loads((tmp_path / "claims.json").read_text(encoding="utf-8"))
     assert content["claims"] == list(record.claims)
     assert len(content["drift"]) == 2 * 2 * 2 * len(GAINS)
