@@ -346,7 +346,7 @@ def servo(
     (name,) = run_names((name,), asked.control.mode)
     if robot is not None:
         asked = _with_robot(asked, robot)
-    _say_compilation()
+    _say_compilation(name)
     brought = {"factory": factory, "robot": robot, "blind": blind}
     trace = driving.run(servo_inputs(asked), calibration, plan, name, **brought)
     return RunTrace.of(trace, asked.face_numbers)
@@ -491,9 +491,9 @@ def _rows_of(q: npt.ArrayLike, n: int) -> FloatArray:
     return checked_array("q", np.atleast_2d(numbers_in("q", q, said)), (None, n), said, finite=True)
 
 
-def _say_compilation() -> None:
-    """Say once that what follows takes as long as the compiler does."""
-    if told := compilation():
+def _say_compilation(*laws: str) -> None:
+    """Say that what follows, runs of laws or none, takes as long as the compiler does."""
+    if told := compilation(laws):
         print(told, file=sys.stderr, flush=True)
 
 

@@ -1,7 +1,7 @@
 """A chain of stages: their order and permission, results made and saved, and findings of a call."""
 
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from pathlib import Path
@@ -141,7 +141,8 @@ class Chain:
             return
         for one in self.replayed():
             self.listener.say("{law}: the stored run of {plant}, recorded {date}".format_map(one))
-        if any(step.why for step in self.steps) and (notice := compilation()):
+        pending = [step for step in self.steps if step.why]
+        if pending and (notice := compilation(step.law for step in pending)):
             self.listener.say(notice)  # the first run on a machine is slower by that
         steps = [step for step in self.steps if step.stage != "record"]
         try:
@@ -501,8 +502,7 @@ class Chain:
             return nullcontext()
         from projservo_cli.loop.jit_warmup import compiling_in_background
 
-        laws = {law_and_mode(law)[0] for law in self.laws}
-        return compiling_in_background({CODES[law] for law in laws if law in CODES})
+        return compiling_in_background(_codes_of(step.law for step in self.steps if step.why))
 
 
 def _drives(step: Step) -> bool:
@@ -573,13 +573,26 @@ def require_simulated(config: Config) -> None:
         )
 
 
-def compilation() -> str:
-    """Whether kernels will have to be compiled, in words; empty where they are there or are not used."""
+def compilation(names: Iterable[str] = ()) -> str:
+    """Whether kernels will have to be compiled, in words; empty where they are there or are not used.
+
+    names : of the runs of laws that will be made.
+    """
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         return ""
     if CACHE_FOLDER is None:
         return "compiling kernels (in every run: no cache folder can be written)"
-    return "" if any(CACHE_FOLDER.rglob("*.nbi")) else "compiling kernels, once"
+    found = any(CACHE_FOLDER.rglob("*.nbi"))
+    if found and (codes := _codes_of(names)):
+        from projservo_cli.loop.jit_warmup import are_cached
+
+        found = are_cached(codes)
+    return "" if found else "compiling kernels, once"
+
+
+def _codes_of(names: Iterable[str]) -> set[int]:
+    """Codes of the built-in laws of runs."""
+    return {CODES[law] for name in names if (law := law_and_mode(name)[0]) in CODES}
 
 
 def _bounded(inputs: PlanInputs, run: Run) -> PlanInputs:

@@ -104,6 +104,13 @@ PACKAGE = Path(__file__).parents[1]
 CACHE_FOLDER = cache_folder(PACKAGE) if COMPILED else None
 
 
+def is_cached(function: Any) -> bool:
+    """Whether a process that calls a compiled function finds machine code of it."""
+    code = function.py_func.__code__
+    name = f"{Path(code.co_filename).stem}.{code.co_qualname}-{code.co_firstlineno}.*.nbi"
+    return CACHE_FOLDER is not None and any(CACHE_FOLDER.rglob(name))
+
+
 class _PlaceInPackage(UserProvidedCacheLocator):
     """Locator of machine code by the place of its source in the package, wherever that is installed."""
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numba import typeof
 
-from projservo_cli.control import address_of
+from projservo_cli.control import FUNCTIONS, address_of
 from projservo_cli.control.law import ERRORS, Law, example
-from projservo_cli.geometry.jit import CACHE_FOLDER
+from projservo_cli.geometry.jit import CACHE_FOLDER, is_cached
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.run_metrics import Ended, path_deviation, summarize
 from projservo_cli.loop.verdicts import Limits, new_log
@@ -25,11 +25,11 @@ from projservo_cli.simulation.analytic_plant import Ends, Plant
 
 @contextmanager
 def compiling_in_background(codes: Collection[int]) -> Iterator[None]:
-    """Let two other processes compile meanwhile, where no kernel of the loop is in the cache.
+    """Let two other processes compile meanwhile, where the loop or a law is not in the cache.
 
     codes : of the laws that will run.
     """
-    if CACHE_FOLDER is None or any(CACHE_FOLDER.rglob("compiled.run_compiled-*.nbi")):
+    if CACHE_FOLDER is None or (is_cached(run_compiled) and are_cached(codes)):
         yield
         return
     with ExitStack() as others:
@@ -40,6 +40,11 @@ def compiling_in_background(codes: Collection[int]) -> Iterator[None]:
             other = others.enter_context(Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL))
             others.callback(other.kill)
         yield
+
+
+def are_cached(codes: Collection[int]) -> bool:
+    """Whether the laws of codes need no compiler."""
+    return all(is_cached(FUNCTIONS[code]) for code in codes)
 
 
 def _compile(first: str, codes: Collection[int]) -> None:
