@@ -127,7 +127,12 @@ class StallMonitor:
             self._say_who_stays(stays)
             return FOLLOWING_ERROR
         if stands and (sent <= _LEAST).all():
-            if np.mean(self._held[-window:]) > _MOSTLY:
+            held = self._held[-window:]
+            if np.mean(held) > _MOSTLY:
+                self.reason = (
+                    f"a marker was not seen in {sum(held)} of the last {len(held)} periods, and the robot was "
+                    "held meanwhile: look at light and exposure there, or at what covers it"
+                )
                 return MARKERS_LOST
             self.minimum = True
             maximum = self._robot.robot.bounds.text(int(np.argmax(sent)), float(sent.max()), 2)

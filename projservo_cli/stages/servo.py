@@ -571,6 +571,9 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
     ]
     rest = f"{' and '.join(left)} {'are' if len(left) > 1 else 'is'} left"
     at_limit = in_unit(float(log.read[steps, joint]), run.scenario.joints.units[joint])
+    unseen = "a marker was not seen"
+    if limits.max_lost_periods:
+        unseen += f", {limits.max_lost_periods} periods after the last that was"
     reasons = {
         "converged": f"{judged} {error} is within {within}{_vague(run)}{_apart(run)}",
         "no progress": f"the robot stands still at an {judged} of {error}: {run.why}"
@@ -583,8 +586,7 @@ def _reason(run: LawRun, joint: int, remaining: tuple[float | None, float | None
         f"{limits.diverged_factor:g}-fold",
         "out of view": f"a face marker left an image at step {steps}",
         "behind camera": f"a face marker passed behind a camera at step {steps}",
-        "markers lost": f"the law could not measure the face at step {steps}: a marker was not seen"
-        + (f", {limits.max_lost_periods} periods after the last that was" if limits.max_lost_periods else ""),
+        "markers lost": f"the law could not measure the face at step {steps}: {run.why or unseen}",
         "joint limit": f"joint {joint + 1} stands at its limit, {at_limit}, and the task would take it "
         f"beyond; {rest}",
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",

@@ -117,6 +117,7 @@ def test_markers_that_flicker_are_lost_and_no_local_minimum():
         )
         assert ruled == told
         assert stall.minimum == (told == NO_PROGRESS)
+        assert stall.reason.startswith("a marker was not seen in ") == (told == MARKERS_LOST)
         assert k < 100
 
 
