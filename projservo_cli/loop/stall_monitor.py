@@ -130,7 +130,7 @@ class StallMonitor:
             held = self._held[-window:]
             if np.mean(held) > _MOSTLY:
                 self.reason = (
-                    f"a marker was not seen in {sum(held)} of the last {len(held)} periods, and the robot was "
+                    f"a marker was not seen in {sum(held)} of the last {len(held)} periods, with the robot "
                     "held meanwhile: look at light and exposure there, or at what covers it"
                 )
                 return MARKERS_LOST
